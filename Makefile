@@ -1,0 +1,33 @@
+# make demo   play the bundled bag through the predictor and draw what it predicts
+# make test   lint and run every test
+# make bench  run the benchmarks
+SHELL := /bin/bash
+.PHONY: demo test bench lint environment build graphics lock clean help
+
+help:
+	@sed -n 's/^# //p' Makefile
+
+environment:
+	@scripts/set_up.sh environment
+
+build: environment
+	@scripts/set_up.sh build
+
+graphics:
+	@scripts/set_up.sh graphics
+
+demo: build
+	@scripts/run.sh python scripts/demo.py --out out/demo
+
+lint: environment
+	@scripts/run.sh ruff check --quiet . && scripts/run.sh ruff format --check --quiet . && echo "[lint] clean"
+
+test: build graphics lint
+	@scripts/run.sh python -m pytest $(PYTEST_ARGUMENTS)
+
+# Pin anew after a change of requirements.in.
+lock: environment
+	@.venv/bin/uv pip compile --quiet --python .venv/bin/python --no-header requirements.in --output-file requirements.lock
+
+clean:
+	rm -rf build install log out

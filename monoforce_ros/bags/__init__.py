@@ -1,0 +1,7 @@
+"""Reading and writing rosbag files: ROS 2 (sqlite3, mcap) and ROS 1, without a ROS installation."""
+
+from monoforce_ros.bags.reader import BagError, BagReader
+from monoforce_ros.bags.recording import Recording
+from monoforce_ros.bags.writer import BagWriter
+
+__all__ = ["BagError", "BagReader", "BagWriter", "Recording"]

@@ -1,0 +1,149 @@
+"""BagReader: messages of a ROS 2 or ROS 1 bag, one at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import Connection
+
+from monoforce_ros.bags.types import type_store
+
+
+class BagError(ValueError):
+    """A bag that cannot be read; the message says which file, what is wrong and what to do."""
+
+
+@dataclass(frozen=True)
+class BagMessage:
+    """A message of a bag, decoded on demand."""
+
+    topic: str
+    message_type: str
+    received: int
+    """Time of reception [ns]."""
+    data: bytes
+    _reader: BagReader
+
+    def decode(self) -> Any:
+        """The message with the attributes of its ROS type; raises ``BagError`` where its bytes do not fit the type."""
+        try:
+            return self._reader._any.deserialize(self.data, self.message_type)
+        except Exception as error:
+            raise BagError(
+                f"{self._reader.path}: a {self.message_type} on {self.topic} cannot be decoded: {error}"
+            ) from error
+
+    def cdr(self) -> bytes:
+        """The message in ROS 2's encoding, whichever ROS the bag is of."""
+        if self._reader.is_ros2:
+            return bytes(self.data)
+        return bytes(self._reader._any.typestore.ros1_to_cdr(self.data, self.message_type))
+
+
+class BagReader:
+    """Read a bag in constant memory: ``with BagReader(path) as bag: for message in bag.messages(): ...``.
+
+    Args:
+        path: a rosbag2 folder, a single ``.mcap`` or ``.db3`` file, or a ROS 1 ``.bag`` file.
+
+    Raises:
+        BagError: on opening, where the bag is missing, truncated or of an unknown kind.
+    """
+
+    def __init__(self, path: str | Path):
+        self.path = Path(path)
+        self._any: AnyReader
+
+    @property
+    def is_ros2(self) -> bool:
+        """Whether messages are CDR-encoded (ROS 2)."""
+        return self._any.is2
+
+    def __enter__(self) -> BagReader:
+        path = self.path
+        if not path.exists():
+            raise BagError(f"{path} does not exist; expected a rosbag2 folder or a ROS 1 .bag file")
+        if path.is_file() and path.suffix in (".mcap", ".db3"):
+            path = path.parent
+        elif path.is_dir() and not (path / "metadata.yaml").is_file():
+            raise BagError(
+                f"{path} holds no metadata.yaml, so it is not a complete rosbag2 bag: "
+                "if the recording was cut off, rebuild the metadata with `ros2 bag reindex`"
+            )
+        try:
+            self._any = AnyReader([path], default_typestore=type_store())
+            self._any.open()
+        except Exception as error:  # rosbags lets errors of its parsers through; a user needs one message
+            raise BagError(
+                f"{self.path} cannot be read ({type(error).__name__}: {error}); it may be truncated or still being "
+                "written: try `ros2 bag reindex` (ROS 2) or `rosbag reindex` (ROS 1)"
+            ) from error
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._any.close()
+
+    @property
+    def topics(self) -> dict[str, str]:
+        """Message type of every topic."""
+        return {connection.topic: connection.msgtype for connection in self._any.connections}
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Number of messages on every topic."""
+        return {name: info.msgcount for name, info in self._any.topics.items()}
+
+    @property
+    def start(self) -> int:
+        """Time of reception of the first message [ns]."""
+        return self._any.start_time
+
+    @property
+    def end(self) -> int:
+        """Time just after the reception of the last message [ns]."""
+        return self._any.end_time
+
+    @property
+    def duration(self) -> float:
+        """Length of the bag [s]."""
+        return max(0, self.end - self.start) * 1e-9 if self.message_count else 0.0
+
+    @property
+    def message_count(self) -> int:
+        """Number of messages."""
+        return self._any.message_count
+
+    def of_type(self, *message_types: str) -> list[str]:
+        """Topics that carry one of the message types, in order of name."""
+        return sorted(topic for topic, message_type in self.topics.items() if message_type in message_types)
+
+    def messages(
+        self, topics: Collection[str] | None = None, *, start: int | None = None, stop: int | None = None
+    ) -> Iterator[BagMessage]:
+        """Messages in order of reception, of all topics or the named ones, from ``start`` to before ``stop`` [ns].
+
+        Raises ``BagError`` where the file ends or breaks in the middle; what came before has been yielded by then.
+        """
+        connections: list[Connection] = [
+            connection for connection in self._any.connections if topics is None or connection.topic in topics
+        ]
+        if not connections:
+            return
+        try:
+            for connection, received, data in self._any.messages(connections, start=start, stop=stop):
+                yield BagMessage(connection.topic, connection.msgtype, received, data, self)
+        except GeneratorExit:
+            raise
+        except BagError:
+            raise
+        except Exception as error:
+            raise BagError(
+                f"{self.path} breaks off while being read ({type(error).__name__}: {error}): it is truncated or damaged"
+            ) from error

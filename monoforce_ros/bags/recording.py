@@ -1,0 +1,216 @@
+"""Recording: a bag seen as a drive — motion, commands, cameras, and where its clouds and images are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from monoforce_ros.bags.reader import BagError, BagReader
+from monoforce_ros.camera import CameraModel
+from monoforce_ros.messages import decoding
+from monoforce_ros.motion import CommandTrack, MotionTrack
+
+ODOMETRY = "nav_msgs/msg/Odometry"
+COMMANDS = ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist")
+CLOUD = "sensor_msgs/msg/PointCloud2"
+IMAGES = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A cloud or image in a bag, not yet read."""
+
+    topic: str
+    stamp: int
+    """Header stamp [ns]."""
+    received: int
+    """Time of reception [ns]; finds the message again."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What a bag holds of a drive. Motion and commands are in memory, clouds and images are read when asked for."""
+
+    path: Path
+    motion: MotionTrack
+    commands: CommandTrack
+    clouds: tuple[Frame, ...]
+    images: dict[str, tuple[Frame, ...]]
+    cameras: dict[str, CameraModel]
+    """Camera model of each image topic that has a CameraInfo beside it."""
+    static_transforms: dict[tuple[str, str], np.ndarray]
+    topics: dict[str, str]
+    """The topics chosen: ``odometry``, ``commands``, ``cloud``."""
+    complaints: tuple[str, ...] = field(default=())
+    """What was wrong with single messages; they were left out."""
+
+    @classmethod
+    def open(
+        cls, path: str | Path, *, odometry: str | None = None, commands: str | None = None, cloud: str | None = None
+    ) -> Recording:
+        """Read a bag's motion and index its clouds and images.
+
+        Args:
+            path: the bag (see :class:`BagReader`).
+            odometry, commands, cloud: topics to use; by default the one of the right type with the most messages.
+
+        Raises:
+            BagError: the bag cannot be read, a named topic is absent or of another type, or there is no odometry.
+        """
+        with BagReader(path) as bag:
+            chosen = {
+                "odometry": _choose(bag, odometry, (ODOMETRY,)),
+                "commands": _choose(bag, commands, COMMANDS),
+                "cloud": _choose(bag, cloud, (CLOUD,)),
+            }
+            if chosen["odometry"] is None:
+                raise BagError(f"{bag.path} has no {ODOMETRY} topic; it holds {sorted(set(bag.topics.values()))}")
+            image_topics = bag.of_type(*IMAGES)
+            wanted = {topic for topic in chosen.values() if topic}
+            wanted.update(image_topics, bag.of_type(CAMERA_INFO), bag.of_type(TRANSFORMS))
+            collected = _Collector(bag, chosen)
+            for message in bag.messages(wanted):
+                collected.take(message)
+            return collected.recording(image_topics)
+
+    def cloud(self, frame: Frame) -> tuple[np.ndarray, str]:
+        """Points ``[n, 3]`` [m] of a cloud in its sensor frame, and that frame's name."""
+        message = self._read(frame)
+        return decoding.decode_cloud(message), message.header.frame_id
+
+    def image(self, frame: Frame) -> np.ndarray:
+        """RGB pixels ``[height, width, 3]`` of an image."""
+        return decoding.decode_image(self._read(frame))
+
+    def base_from(self, frame_id: str, base_frame: str) -> np.ndarray | None:
+        """Pose ``[4, 4]`` of a sensor frame in the base frame by the bag's static transforms; None if unconnected."""
+        return find_transform(self.static_transforms, base_frame, frame_id)
+
+    def _read(self, frame: Frame):
+        with BagReader(self.path) as bag:
+            for message in bag.messages([frame.topic], start=frame.received, stop=frame.received + 1):
+                decoded = message.decode()
+                if decoding.stamp_of(decoded) == frame.stamp:
+                    return decoded
+        raise BagError(f"{self.path}: the message on {frame.topic} at {frame.received} ns is gone: the bag has changed")
+
+
+def find_transform(transforms: dict[tuple[str, str], np.ndarray], parent: str, child: str) -> np.ndarray | None:
+    """``[4, 4]`` parent ← child through any chain of known transforms, or None where they are not connected."""
+    parent, child = parent.lstrip("/"), child.lstrip("/")
+    reached = {parent: np.eye(4)}
+    frontier = [parent]
+    while frontier:
+        frame = frontier.pop()
+        if frame == child:
+            return reached[frame]
+        for (upper, lower), matrix in transforms.items():
+            for start, end, step in ((upper, lower, matrix), (lower, upper, np.linalg.inv(matrix))):
+                if start == frame and end not in reached:
+                    reached[end] = reached[frame] @ step
+                    frontier.append(end)
+    return None
+
+
+def camera_info_topic(image_topic: str) -> str:
+    """The CameraInfo topic beside an image topic, by the convention of image_transport.
+
+    >>> camera_info_topic("/camera/front/image_raw/compressed")
+    '/camera/front/camera_info'
+    """
+    parts = image_topic.rsplit("/", 2)
+    base = image_topic.rsplit("/", 1)[0] if parts[-1] == "compressed" else image_topic
+    return f"{base.rsplit('/', 1)[0]}/camera_info" if "/" in base else "camera_info"
+
+
+def _choose(bag: BagReader, named: str | None, message_types: tuple[str, ...]) -> str | None:
+    if named:
+        if bag.topics.get(named) not in message_types:
+            raise BagError(
+                f"{bag.path}: topic {named} is {bag.topics.get(named, 'absent')}, expected {' or '.join(message_types)}"
+            )
+        return named
+    candidates = bag.of_type(*message_types)
+    return max(candidates, key=lambda topic: bag.counts[topic], default=None)
+
+
+class _Collector:
+    """Gathers what one pass over a bag yields."""
+
+    def __init__(self, bag: BagReader, chosen: dict[str, str | None]):
+        self.bag = bag
+        self.chosen = chosen
+        self.states: list = []
+        self.frames = ("odom", "base_link")
+        self.twists: list[tuple[int, np.ndarray]] = []
+        self.indexed: dict[str, list[Frame]] = {}
+        self.cameras: dict[str, CameraModel] = {}
+        self.transforms: dict[tuple[str, str], np.ndarray] = {}
+        self.complaints: list[str] = []
+
+    def take(self, message) -> None:
+        try:
+            decoded = message.decode()
+            # A header stamp of zero means that the driver never set it.
+            stamp = decoding.stamp_of(decoded) or message.received
+            if message.topic == self.chosen["odometry"]:
+                state, *self.frames = decoding.decode_odometry(decoded)
+                self.states.append((stamp, state))
+            elif message.topic == self.chosen["commands"]:
+                self.twists.append((stamp, decoding.decode_command(decoded)))
+            elif message.message_type == CAMERA_INFO:
+                if message.topic not in self.cameras:
+                    self.cameras[message.topic] = decoding.decode_camera_info(decoded)
+            elif message.message_type == TRANSFORMS:
+                if message.topic.endswith("tf_static"):
+                    self.transforms.update(decoding.decode_transforms(decoded))
+            else:
+                self.indexed.setdefault(message.topic, []).append(
+                    Frame(message.topic, decoding.stamp_of(decoded), message.received)
+                )
+        except ValueError as error:
+            if len(self.complaints) < 20:
+                self.complaints.append(f"{message.topic}: {error}")
+
+    def recording(self, image_topics: list[str]) -> Recording:
+        if not self.states:
+            raise BagError(f"{self.bag.path}: no usable message on {self.chosen['odometry']}: {self.complaints[:1]}")
+        self.states.sort(key=lambda entry: entry[0])
+        stamps, first = np.unique([stamp for stamp, _ in self.states], return_index=True)
+        states = [self.states[i][1] for i in first]
+        self.twists.sort(key=lambda entry: entry[0])
+        cloud_topic = self.chosen["cloud"]
+        return Recording(
+            path=self.bag.path,
+            motion=MotionTrack(
+                stamps=stamps.astype(np.int64),
+                positions=np.array([s.position for s in states]),
+                quaternions=Rotation.from_matrix(np.array([s.rotation for s in states])).as_quat(),
+                linear_velocities=np.array([s.linear_velocity for s in states]),
+                angular_velocities=np.array([s.angular_velocity for s in states]),
+                frame_id=self.frames[0],
+                child_frame_id=self.frames[1],
+            ),
+            commands=CommandTrack(
+                stamps=np.array([stamp for stamp, _ in self.twists], np.int64),
+                twists=np.array([twist for _, twist in self.twists]).reshape(-1, 2),
+            ),
+            clouds=tuple(sorted(self.indexed.get(cloud_topic, ()), key=lambda frame: frame.stamp)),
+            images={
+                topic: tuple(sorted(self.indexed.get(topic, ()), key=lambda frame: frame.stamp))
+                for topic in image_topics
+            },
+            cameras={
+                topic: self.cameras[camera_info_topic(topic)]
+                for topic in image_topics
+                if camera_info_topic(topic) in self.cameras
+            },
+            static_transforms=self.transforms,
+            topics={role: topic for role, topic in self.chosen.items() if topic},
+            complaints=tuple(self.complaints),
+        )

@@ -1,0 +1,103 @@
+"""BagWriter: a rosbag2 folder that appears under its name only when it is complete."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.rosbag2 import StoragePlugin, Writer
+
+from monoforce_ros.bags.types import type_store
+
+_STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
+_FOREVER = QosTime(sec=0x7FFFFFFF, nsec=0xFFFFFFFF)
+_LATCHED = Qos(
+    history=QosHistory.KEEP_LAST,
+    depth=1,
+    reliability=QosReliability.RELIABLE,
+    durability=QosDurability.TRANSIENT_LOCAL,
+    deadline=_FOREVER,
+    lifespan=_FOREVER,
+    liveliness=QosLiveliness.AUTOMATIC,
+    liveliness_lease_duration=_FOREVER,
+    avoid_ros_namespace_conventions=False,
+)
+
+
+class BagWriter:
+    """Write a rosbag2 bag: ``with BagWriter(path) as bag: bag.write("/odom", message, stamp)``.
+
+    The bag is written beside its target and renamed when the block ends without an error, so that a half-written
+    bag never stands under the final name. After an error the unfinished bag is removed.
+
+    Args:
+        path: folder of the bag; must not exist unless ``overwrite``.
+        storage: ``mcap`` or ``sqlite3``.
+        overwrite: replace an existing bag once the new one is complete.
+
+    Raises:
+        ValueError: the storage is unknown.
+        FileExistsError: the target exists and ``overwrite`` is off.
+    """
+
+    def __init__(self, path: str | Path, *, storage: str = "mcap", overwrite: bool = False):
+        if storage not in _STORAGES:
+            raise ValueError(f"storage: got {storage!r}, expected one of {sorted(_STORAGES)}")
+        self.path = Path(path)
+        if self.path.exists() and not overwrite:
+            raise FileExistsError(f"{self.path} exists already: remove it, choose another name or allow overwriting")
+        self._unfinished = self.path.with_name(f".{self.path.name}.unfinished-{os.getpid()}")
+        self._writer = Writer(self._unfinished, version=9, storage_plugin=_STORAGES[storage])
+        self._types = type_store()
+        self._connections: dict[str, Connection] = {}
+
+    def __enter__(self) -> BagWriter:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        shutil.rmtree(self._unfinished, ignore_errors=True)
+        self._writer.open()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if kind is not None:
+            self._writer.storage and self._writer.storage.abort()
+            shutil.rmtree(self._unfinished, ignore_errors=True)
+            return
+        self._writer.close()
+        if self.path.exists():
+            shutil.rmtree(self.path)
+        self._name_storage_file()
+        self._unfinished.rename(self.path)
+
+    def write(self, topic: str, message: Any, stamp: int) -> None:
+        """Append a message (from :mod:`monoforce_ros.bags.builders`) received at ``stamp`` [ns]."""
+        self.write_serialized(
+            topic, message.__msgtype__, self._types.serialize_cdr(message, message.__msgtype__), stamp
+        )
+
+    def write_serialized(self, topic: str, message_type: str, data: bytes | memoryview, stamp: int) -> None:
+        """Append a message that is CDR-encoded already; ``stamp`` is its time of reception [ns]."""
+        connection = self._connections.get(topic)
+        if connection is None:
+            latched = topic.rsplit("/", 1)[-1] == "tf_static"
+            connection = self._writer.add_connection(
+                topic, message_type, typestore=self._types, offered_qos_profiles=[_LATCHED] if latched else []
+            )
+            self._connections[topic] = connection
+        self._writer.write(connection, stamp, data)
+
+    def _name_storage_file(self) -> None:
+        """Name the storage file after the bag, not after the temporary folder it was written in."""
+        metadata = self._unfinished / "metadata.yaml"
+        text = metadata.read_text(encoding="utf-8")
+        for file in self._unfinished.iterdir():
+            if file.name.startswith(self._unfinished.name):
+                name = file.name.replace(self._unfinished.name, self.path.name, 1)
+                text = text.replace(file.name, name)
+                file.rename(file.with_name(name))
+        metadata.write_text(text, encoding="utf-8")

@@ -1,0 +1,69 @@
+"""Checkpoints: an encoder's weights as safetensors, its configuration as JSON beside them."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict
+from pathlib import Path
+
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+
+from monoforce_ros.encoder.config import EncoderConfig
+from monoforce_ros.encoder.terrain_encoder import TerrainEncoder
+
+MAXIMUM_BYTES = 2_000_000_000
+_HOW_TO_GET_ONE = (
+    "a checkpoint is a NAME.safetensors file with NAME.json beside it, as save_encoder writes them after training; "
+    "give its path as `checkpoint`, or use the terrain source `lidar`, which needs none"
+)
+
+
+class CheckpointError(ValueError):
+    """A checkpoint that is missing, damaged, or of another network; predictions never run on random weights."""
+
+
+def save_encoder(encoder: TerrainEncoder, path: str | Path) -> None:
+    """Write ``path`` (.safetensors) and its configuration (.json); both appear complete or not at all."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(f".{path.name}.unfinished-{os.getpid()}")
+    save_file({name: value.contiguous() for name, value in encoder.state_dict().items()}, str(unfinished))
+    description = unfinished.with_suffix(".json.part")
+    description.write_text(json.dumps(asdict(encoder.config), indent=2), encoding="utf-8")
+    description.rename(path.with_suffix(".json"))
+    unfinished.rename(path)
+
+
+def load_encoder(path: str | Path) -> TerrainEncoder:
+    """Read an encoder.
+
+    Raises:
+        CheckpointError: a file is missing, too large, damaged, or does not fit its configuration; the message says
+            which and how to get a working one.
+    """
+    if not str(path):
+        raise CheckpointError(f"no encoder checkpoint was given: {_HOW_TO_GET_ONE}")
+    path = Path(path).expanduser()
+    description = path.with_suffix(".json")
+    for file in (path, description):
+        if not file.is_file():
+            raise CheckpointError(f"encoder checkpoint {file} does not exist: {_HOW_TO_GET_ONE}")
+        if file.stat().st_size > MAXIMUM_BYTES:
+            raise CheckpointError(f"encoder checkpoint {file}: {file.stat().st_size} bytes, at most {MAXIMUM_BYTES}")
+    try:
+        config = EncoderConfig(**json.loads(description.read_text(encoding="utf-8")))
+    except (TypeError, ValueError) as error:
+        raise CheckpointError(f"{description}: not the configuration of an encoder: {error}") from error
+    encoder = TerrainEncoder(config)
+    try:
+        weights = load_file(str(path))
+        encoder.load_state_dict(weights)
+    except (SafetensorError, RuntimeError, OSError) as error:
+        raise CheckpointError(
+            f"{path}: damaged, or not the weights of the network in {description.name}: {error}"
+        ) from error
+    if any(not value.isfinite().all() for value in weights.values() if value.is_floating_point()):
+        raise CheckpointError(f"{path}: some weights are not finite, the training that wrote it had diverged")
+    return encoder.eval()

@@ -1,0 +1,1 @@
+"""Arrays ↔ ROS messages. Decoders take messages of rclpy and of bags alike: both have the same attributes."""

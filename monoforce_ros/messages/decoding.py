@@ -1,0 +1,193 @@
+"""ROS messages → arrays, with every size and value checked before it is used."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from monoforce_ros.camera import CameraModel
+from monoforce_ros.motion import MotionState
+
+MAXIMUM_IMAGE_PIXELS = 64_000_000
+MAXIMUM_CLOUD_POINTS = 8_000_000
+
+_POINT_DTYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+# encoding → (dtype, channels, OpenCV's conversion to RGB); Bayer names in ROS give the first two pixels of the first
+# row, OpenCV's names those of the second, hence the crossing over.
+_IMAGE_ENCODINGS = {
+    "rgb8": ("u1", 3, None),
+    "bgr8": ("u1", 3, cv2.COLOR_BGR2RGB),
+    "rgba8": ("u1", 4, cv2.COLOR_RGBA2RGB),
+    "bgra8": ("u1", 4, cv2.COLOR_BGRA2RGB),
+    "mono8": ("u1", 1, cv2.COLOR_GRAY2RGB),
+    "8UC1": ("u1", 1, cv2.COLOR_GRAY2RGB),
+    "8UC3": ("u1", 3, cv2.COLOR_BGR2RGB),
+    "mono16": ("u2", 1, cv2.COLOR_GRAY2RGB),
+    "bayer_rggb8": ("u1", 1, cv2.COLOR_BayerBG2RGB),
+    "bayer_bggr8": ("u1", 1, cv2.COLOR_BayerRG2RGB),
+    "bayer_gbrg8": ("u1", 1, cv2.COLOR_BayerGR2RGB),
+    "bayer_grbg8": ("u1", 1, cv2.COLOR_BayerGB2RGB),
+    "yuv422_yuy2": ("u1", 2, cv2.COLOR_YUV2RGB_YUY2),
+    "yuv422": ("u1", 2, cv2.COLOR_YUV2RGB_UYVY),
+    "uyvy": ("u1", 2, cv2.COLOR_YUV2RGB_UYVY),
+    "yuyv": ("u1", 2, cv2.COLOR_YUV2RGB_YUY2),
+}
+
+
+class MessageError(ValueError):
+    """A message whose content cannot be used; the message says what was got and what was expected."""
+
+
+def stamp_of(message: Any) -> int:
+    """Header stamp [ns] of a message; 0 if it has no header."""
+    header = getattr(message, "header", None)
+    return 0 if header is None else int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
+
+
+def decode_image(message: Any) -> np.ndarray:
+    """``sensor_msgs/Image`` or ``CompressedImage`` → RGB pixels ``[height, width, 3]`` uint8.
+
+    Raises ``MessageError`` for an empty image, an unknown encoding, or data that do not fit the stated size.
+    """
+    return _decode_compressed(message) if hasattr(message, "format") else _decode_raw(message)
+
+
+def _decode_compressed(message: Any) -> np.ndarray:
+    data = np.frombuffer(message.data, np.uint8)
+    if "compressedDepth" in message.format:
+        raise MessageError(f"image format: got {message.format!r}, a depth image; expected a colour or grey image")
+    # The header alone says how large the picture would be: a small file can claim a huge one.
+    decoded = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+    if decoded is None:
+        raise MessageError(
+            f"compressed image: {data.size} bytes of format {message.format!r} cannot be decoded, expected jpeg or png"
+        )
+    return cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB)
+
+
+def _decode_raw(message: Any) -> np.ndarray:
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    if height < 1 or width < 1 or height * width > MAXIMUM_IMAGE_PIXELS:
+        raise MessageError(f"image size: got {width} × {height}, expected 1 to {MAXIMUM_IMAGE_PIXELS} pixels")
+    if message.encoding not in _IMAGE_ENCODINGS:
+        raise MessageError(f"image encoding: got {message.encoding!r}, expected one of {sorted(_IMAGE_ENCODINGS)}")
+    kind, channels, conversion = _IMAGE_ENCODINGS[message.encoding]
+    dtype = np.dtype((">" if message.is_bigendian else "<") + kind)
+    data = np.frombuffer(message.data, np.uint8)
+    row = width * channels * dtype.itemsize
+    if step < row or data.size < step * height:
+        raise MessageError(
+            f"image data: got {data.size} bytes with a row step of {step}, expected at least {row} bytes in each of "
+            f"{height} rows of encoding {message.encoding}"
+        )
+    rows = np.ascontiguousarray(data[: step * height].reshape(height, step)[:, :row])
+    pixels = rows.view(dtype).reshape(height, width, channels)
+    if kind == "u2":
+        pixels = (pixels >> 8).astype(np.uint8)
+    return pixels.copy() if conversion is None else cv2.cvtColor(pixels, conversion)
+
+
+def decode_camera_info(message: Any) -> CameraModel:
+    """``sensor_msgs/CameraInfo`` → CameraModel; raises ``MessageError`` where it is not calibrated or inconsistent."""
+    model = message.distortion_model or "plumb_bob"
+    coefficients = np.asarray(message.d, np.float64)
+    # Drivers write "plumb_bob" with eight coefficients; OpenCV's rational model takes them as they are.
+    try:
+        return CameraModel(
+            width=int(message.width),
+            height=int(message.height),
+            matrix=np.asarray(message.k, np.float64).reshape(3, 3),
+            distortion=coefficients,
+            distortion_model={"fisheye": "equidistant"}.get(model, model),
+            frame_id=message.header.frame_id,
+        )
+    except ValueError as error:
+        raise MessageError(f"CameraInfo: {error}") from error
+
+
+def decode_cloud(message: Any) -> np.ndarray:
+    """``sensor_msgs/PointCloud2`` → finite returns ``[n, 3]`` float32 [m] in the sensor frame.
+
+    Empty returns (NaN, infinity, or all zeros) are left out. Raises ``MessageError`` where fields or sizes are wrong
+    or where not a single return remains.
+    """
+    count = int(message.width) * int(message.height)
+    if count < 1 or count > MAXIMUM_CLOUD_POINTS:
+        raise MessageError(f"point cloud size: got {count} points, expected 1 to {MAXIMUM_CLOUD_POINTS}")
+    point_step, row_step = int(message.point_step), int(message.row_step)
+    by_name = {field.name: field for field in message.fields}
+    missing = [name for name in "xyz" if name not in by_name]
+    if missing:
+        raise MessageError(f"point cloud fields: got {sorted(by_name)}, expected x, y and z")
+    data = np.frombuffer(message.data, np.uint8)
+    width, height = int(message.width), int(message.height)
+    if point_step < 1 or row_step < width * point_step or data.size < row_step * height:
+        raise MessageError(
+            f"point cloud data: got {data.size} bytes, point step {point_step}, row step {row_step}; "
+            f"expected at least {width * point_step} bytes in each of {height} rows"
+        )
+    rows = data[: row_step * height].reshape(height, row_step)[:, : width * point_step]
+    records = np.ascontiguousarray(rows).reshape(count, point_step)
+    order = ">" if message.is_bigendian else "<"
+    columns = []
+    for name in "xyz":
+        field = by_name[name]
+        kind = _POINT_DTYPES.get(int(field.datatype))
+        if kind not in ("f4", "f8"):
+            raise MessageError(f"point cloud field {name}: got datatype {field.datatype}, expected FLOAT32 or FLOAT64")
+        dtype = np.dtype(order + kind)
+        end = int(field.offset) + dtype.itemsize
+        if end > point_step:
+            raise MessageError(f"point cloud field {name}: ends at byte {end} of a point of {point_step} bytes")
+        columns.append(np.ascontiguousarray(records[:, int(field.offset) : end]).view(dtype)[:, 0])
+    points = np.stack([column.astype(np.float32) for column in columns], axis=1)
+    with np.errstate(invalid="ignore", over="ignore"):
+        kept = np.isfinite(points).all(axis=1) & (np.abs(points) < 1e4).all(axis=1) & (points != 0.0).any(axis=1)
+    if not kept.any():
+        raise MessageError(f"point cloud: none of its {count} points is a finite return")
+    return points[kept]
+
+
+def decode_odometry(message: Any) -> tuple[MotionState, str, str]:
+    """``nav_msgs/Odometry`` → state, frame and child frame; raises ``MessageError`` for NaNs or a zero quaternion."""
+    pose, twist = message.pose.pose, message.twist.twist
+    quaternion = np.array([pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w], float)
+    vectors = [
+        np.array([v.x, v.y, v.z], float) for v in (pose.position, twist.linear, twist.angular)
+    ]  # position, linear and angular velocity
+    if not all(np.isfinite(v).all() and (np.abs(v) < 1e7).all() for v in vectors):
+        raise MessageError("odometry: position or velocity is not finite")
+    norm = float(np.linalg.norm(quaternion))
+    if not abs(norm - 1.0) < 0.05:
+        raise MessageError(f"odometry: orientation has norm {norm:.3g}, expected a unit quaternion x, y, z, w")
+    rotation = Rotation.from_quat(quaternion).as_matrix()
+    state = MotionState(stamp_of(message), vectors[0], rotation, vectors[1], vectors[2])
+    return state, message.header.frame_id, message.child_frame_id
+
+
+def decode_command(message: Any) -> np.ndarray:
+    """``geometry_msgs/Twist`` or ``TwistStamped`` → forward speed [m/s] and yaw rate [rad/s], ``[2]``."""
+    twist = getattr(message, "twist", message)
+    command = np.array([twist.linear.x, twist.angular.z], float)
+    if not np.isfinite(command).all():
+        raise MessageError(f"command: got forward speed {command[0]}, yaw rate {command[1]}; expected finite numbers")
+    return command
+
+
+def decode_transforms(message: Any) -> dict[tuple[str, str], np.ndarray]:
+    """``tf2_msgs/TFMessage`` → ``{(parent, child): [4, 4] parent ← child}``."""
+    transforms = {}
+    for entry in message.transforms:
+        rotation, translation = entry.transform.rotation, entry.transform.translation
+        quaternion = np.array([rotation.x, rotation.y, rotation.z, rotation.w], float)
+        offset = np.array([translation.x, translation.y, translation.z], float)
+        if not (np.isfinite(quaternion).all() and np.isfinite(offset).all() and np.linalg.norm(quaternion) > 0.5):
+            raise MessageError(f"transform to {entry.child_frame_id!r}: not finite, or its quaternion is zero")
+        matrix = np.eye(4)
+        matrix[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
+        matrix[:3, 3] = offset
+        transforms[entry.header.frame_id.lstrip("/"), entry.child_frame_id.lstrip("/")] = matrix
+    return transforms

@@ -1,0 +1,110 @@
+"""Predictions → serialized ROS messages. Stamps are nanoseconds; positions are in the named frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from monoforce_ros.messages.cdr import CdrWriter
+
+_FLOAT32 = 7
+_LINE_LIST, _SPHERE_LIST = 5, 7
+
+
+def grid_cells(stamp: int, frame_id: str, resolution: float, points: np.ndarray) -> bytes:
+    """``nav_msgs/GridCells`` of cell centres ``[n, 3]`` [m]."""
+    writer = CdrWriter()
+    writer.header(stamp, frame_id)
+    writer.fields("ff", resolution, resolution)
+    writer.sequence(np.asarray(points, "<f8"), 8)
+    return writer.bytes()
+
+
+def point_cloud(stamp: int, frame_id: str, channels: dict[str, np.ndarray]) -> bytes:
+    """``sensor_msgs/PointCloud2`` with one float32 field per channel, each ``[n]``, in the order given."""
+    columns = np.stack([np.asarray(values, "<f4").ravel() for values in channels.values()], axis=1)
+    count, step = len(columns), 4 * columns.shape[1]
+    writer = CdrWriter()
+    writer.header(stamp, frame_id)
+    writer.fields("III", 1, count, len(channels))
+    for index, name in enumerate(channels):
+        writer.string(name)
+        writer.fields("IBI", 4 * index, _FLOAT32, 1)
+    writer.fields("BII", 0, step, step * count)
+    writer.sequence(columns.reshape(-1).view(np.uint8), 1)
+    writer.fields("B", int(np.isfinite(columns).all()))
+    return writer.bytes()
+
+
+def path(frame_id: str, stamps: np.ndarray, positions: np.ndarray, quaternions: np.ndarray) -> bytes:
+    """``nav_msgs/Path`` of poses ``[n, 3]`` [m] and ``[n, 4]`` (x, y, z, w) at ``stamps`` ``[n]`` [ns].
+
+    The path's own stamp is that of its first pose.
+    """
+    writer = CdrWriter()
+    writer.header(int(stamps[0]), frame_id)
+    writer.fields("I", len(stamps))
+    name = frame_id.encode() + b"\x00"
+    # Poses end on a multiple of 8 bytes, so all but the first have one layout.
+    for first, last in ((0, 1), (1, len(stamps))):
+        if first == last:
+            continue
+        padding = -(writer.position + 12 + len(name)) % 8
+        layout = np.dtype(
+            [("sec", "<i4"), ("nanosec", "<u4"), ("length", "<u4"), ("name", f"V{len(name)}"), ("pad", f"V{padding}")]
+            + [("position", "<f8", 3), ("orientation", "<f8", 4)]
+        )
+        poses = np.zeros(last - first, layout)
+        poses["sec"], poses["nanosec"] = np.divmod(stamps[first:last], 10**9)
+        poses["length"], poses["name"] = len(name), np.void(name)
+        poses["position"], poses["orientation"] = positions[first:last], quaternions[first:last]
+        writer.block(poses.view(np.uint8), 1)
+    return writer.bytes()
+
+
+@dataclass(frozen=True)
+class ListMarker:
+    """A ``visualization_msgs/Marker`` that draws a list of lines (pairs of points) or spheres in one colour each."""
+
+    namespace: str
+    kind: str
+    """``lines`` or ``spheres``."""
+    points: np.ndarray
+    """``[n, 3]`` [m]; for lines, two per line."""
+    colours: np.ndarray
+    """Red, green, blue, alpha in 0..1, ``[n, 4]`` or ``[4]``."""
+    size: float
+    """Width of the lines or diameter of the spheres [m]."""
+    identifier: int = 0
+
+
+def marker_array(stamp: int, frame_id: str, markers: Sequence[ListMarker]) -> bytes:
+    """``visualization_msgs/MarkerArray``; each marker replaces the one of its namespace and identifier."""
+    writer = CdrWriter()
+    writer.fields("I", len(markers))
+    for marker in markers:
+        lines = marker.kind == "lines"
+        writer.header(stamp, frame_id)
+        writer.string(marker.namespace)
+        # An empty list would keep the marker of the last message on screen, so it is deleted instead.
+        writer.fields("iii", marker.identifier, _LINE_LIST if lines else _SPHERE_LIST, 0 if len(marker.points) else 2)
+        writer.fields("ddddddd", 0, 0, 0, 0, 0, 0, 1)
+        writer.fields("ddd", marker.size, 0.0 if lines else marker.size, 0.0 if lines else marker.size)
+        colours = np.asarray(marker.colours, "<f4")
+        writer.fields("ffff", *(colours if colours.ndim == 1 else (1.0, 1.0, 1.0, 1.0)))
+        writer.fields("iIB", 0, 0, 0)  # lifetime: until replaced; frame_locked: no
+        writer.sequence(np.asarray(marker.points, "<f8"), 8)
+        writer.sequence(colours if colours.ndim == 2 else np.zeros((0, 4), "<f4"), 4)
+        writer.string("")  # texture_resource
+        writer.header(0, "")  # texture: an empty CompressedImage
+        writer.string("")
+        writer.fields("I", 0)
+        writer.fields("I", 0)  # uv_coordinates
+        writer.string("")  # text
+        writer.string("")  # mesh_resource
+        writer.string("")  # mesh_file: filename
+        writer.fields("I", 0)  # mesh_file: data
+        writer.fields("B", 0)  # mesh_use_embedded_materials
+    return writer.bytes()

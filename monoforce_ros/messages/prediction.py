@@ -1,0 +1,110 @@
+"""A Prediction → the messages that show it: height map, terrain, path, contact forces."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib import colormaps
+from scipy.spatial.transform import Rotation
+
+from monoforce_ros.messages import encoding
+from monoforce_ros.motion import transform_points
+from monoforce_ros.prediction import Prediction
+from monoforce_ros.robots import RobotModel
+from monoforce_ros.terrain import TerrainMap
+
+FORCE_LENGTH = 1.0
+"""Length of the arrow of a force as large as the robot's weight [m]."""
+FORCE_INTERVAL = 0.5
+"""Time between the poses at which forces are drawn [s]."""
+
+
+def cell_points(terrain: TerrainMap, odometry_from_terrain: np.ndarray) -> np.ndarray:
+    """Positions ``[rows · columns, 3]`` of the map's cells, at their height, in the odometry frame [m]."""
+    x, y = np.meshgrid(terrain.grid.x, terrain.grid.y)
+    points = np.stack([x, y, terrain.height.double().numpy()], axis=-1).reshape(-1, 3)
+    return transform_points(odometry_from_terrain, points)
+
+
+def height_map(prediction: Prediction, frame_id: str) -> bytes:
+    """``nav_msgs/GridCells``: every cell of the predicted map at its height."""
+    points = cell_points(prediction.terrain, prediction.motion.odometry_from_terrain)
+    return encoding.grid_cells(prediction.stamp, frame_id, prediction.terrain.grid.resolution, points)
+
+
+def terrain_cloud(prediction: Prediction, frame_id: str) -> bytes:
+    """``sensor_msgs/PointCloud2``: every cell with all channels; heights are z in the odometry frame."""
+    terrain, transform = prediction.terrain, prediction.motion.odometry_from_terrain
+    points = cell_points(terrain, transform)
+    return encoding.point_cloud(
+        prediction.stamp,
+        frame_id,
+        {
+            "x": points[:, 0],
+            "y": points[:, 1],
+            "z": points[:, 2],
+            "geometric_height": terrain.geometric_height.numpy().ravel() + transform[2, 3],
+            "stiffness": terrain.stiffness.numpy(),
+            "damping": terrain.damping.numpy(),
+            "friction": terrain.friction.numpy(),
+            "observed": terrain.observed.numpy().astype(np.float32),
+        },
+    )
+
+
+def usable_steps(prediction: Prediction) -> int:
+    """Number of leading poses of the rollout that lie on the map."""
+    outside = np.flatnonzero(~prediction.rollout.inside[0].numpy())
+    return int(outside[0]) if len(outside) else len(prediction.rollout.times)
+
+
+def path(prediction: Prediction, frame_id: str, time_step: float) -> bytes:
+    """``nav_msgs/Path`` every ``time_step`` [s], as far as the map reaches; poses carry their own time."""
+    times = prediction.rollout.times.double().numpy()
+    stride = max(1, round(time_step / (times[1] - times[0])))
+    chosen = np.arange(0, max(1, usable_steps(prediction)), stride)
+    return encoding.path(
+        frame_id,
+        prediction.stamp + np.rint(times[chosen] * 1e9).astype(np.int64),
+        prediction.positions()[chosen],
+        Rotation.from_matrix(prediction.rotations()[chosen]).as_quat(),
+    )
+
+
+def contact_points(prediction: Prediction, robot: RobotModel, step: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points ``[k, 3]`` [m] that carry load during a step, and the forces on them ``[k, 3]`` [N], odometry frame."""
+    result, transform = prediction.rollout, prediction.motion.odometry_from_terrain
+    loaded = (result.normal_forces[0, step] > 1.0).numpy()
+    body = robot.points.double().numpy()[loaded]
+    points = body @ result.rotation[0, step].double().numpy().T + result.position[0, step].double().numpy()
+    forces = result.forces[0, step].double().numpy()[loaded]
+    return transform_points(transform, points), forces @ transform[:3, :3].T
+
+
+def contact_forces(prediction: Prediction, robot: RobotModel, frame_id: str) -> bytes:
+    """``visualization_msgs/MarkerArray``: contact points and forces along the path, coloured by size.
+
+    ``contact_forces`` are lines as long as the force in units of the robot's weight, ``contact_points`` their feet.
+    """
+    weight = float(robot.mass.mean()) * 9.81
+    times = prediction.rollout.times.double().numpy()
+    stride = max(1, round(FORCE_INTERVAL / (times[1] - times[0])))
+    steps = np.arange(0, max(1, min(usable_steps(prediction), len(times) - 1)), stride)
+    feet, forces = (
+        np.concatenate(parts) for parts in zip(*[contact_points(prediction, robot, s) for s in steps], strict=True)
+    )
+    tips = feet + forces * (FORCE_LENGTH / weight)
+    colours = colormaps["turbo"](np.clip(np.linalg.norm(forces, axis=1) / (0.25 * weight), 0, 1)).astype(np.float32)
+    return encoding.marker_array(
+        prediction.stamp,
+        frame_id,
+        [
+            encoding.ListMarker(
+                "contact_forces",
+                "lines",
+                np.stack([feet, tips], axis=1).reshape(-1, 3),
+                np.repeat(colours, 2, axis=0),
+                0.012,
+            ),
+            encoding.ListMarker("contact_points", "spheres", feet, colours, 0.03),
+        ],
+    )

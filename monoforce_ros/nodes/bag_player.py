@@ -1,0 +1,161 @@
+"""bag_player: publishes a bag's messages into ROS with their timing."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+
+import rclpy
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
+from rosgraph_msgs.msg import Clock
+from tqdm import tqdm
+
+from monoforce_ros.bags import BagError, BagReader
+from monoforce_ros.messages.message_types import message_class
+from monoforce_ros.shared_files import share_directory
+
+_PROFILES = "FASTDDS_DEFAULT_PROFILES_FILE"
+
+
+def _arguments(arguments: list[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="bag_player", description="Publish a bag (ROS 2 or ROS 1) into ROS with the timing of its recording."
+    )
+    parser.add_argument("bag", nargs="?", help="rosbag2 folder or ROS 1 .bag file (default: the demo bag)")
+    parser.add_argument("--rate", type=float, default=1.0, help="speed relative to the recording (default 1)")
+    parser.add_argument("--start", type=float, default=0.0, help="seconds to skip at the beginning")
+    parser.add_argument("--duration", type=float, default=None, help="seconds of the bag to play")
+    parser.add_argument("--loop", action="store_true", help="start over at the end")
+    parser.add_argument("--clock", action="store_true", help="publish /clock with the bag's time")
+    parser.add_argument("--topics", nargs="+", default=None, metavar="TOPIC", help="play only these topics")
+    parser.add_argument(
+        "--wait", type=float, default=3.0, help="seconds to wait for a first subscriber before playing (default 3)"
+    )
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+    options = parser.parse_args(arguments)
+    if not 0.001 <= options.rate <= 1000:
+        parser.error(f"--rate: got {options.rate}, expected 0.001 to 1000")
+    if options.start < 0 or (options.duration is not None and options.duration <= 0):
+        parser.error("--start and --duration: expected positive seconds")
+    return options
+
+
+class BagPlayer(Node):
+    """Publishes serialized messages as they stand in the bag; nothing is decoded on the way."""
+
+    def __init__(self, bag: BagReader, options: argparse.Namespace):
+        super().__init__("bag_player")
+        self.bag = bag
+        self.options = options
+        self.playable: dict[str, Publisher] = {}
+        for topic, message_type in bag.topics.items():
+            if options.topics and topic not in options.topics:
+                continue
+            kind = message_class(message_type)
+            if kind is None:
+                self.get_logger().warning(f"{topic} is not played: {message_type} is not installed")
+                continue
+            latched = topic.rsplit("/", 1)[-1] == "tf_static"
+            quality = QoSProfile(
+                depth=10,
+                reliability=ReliabilityPolicy.RELIABLE,
+                durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+            )
+            self.playable[topic] = self.create_publisher(kind, topic, quality)
+        missing = sorted(set(options.topics or ()) - set(bag.topics))
+        if missing:
+            raise BagError(f"{bag.path} has no topics {missing}; it holds {sorted(bag.topics)}")
+        self.clock = self.create_publisher(Clock, "/clock", 10) if options.clock else None
+
+    def wait_for_subscribers(self) -> None:
+        """Wait until somebody listens, and then a little for those who are just about to."""
+        deadline = time.monotonic() + self.options.wait
+        while time.monotonic() < deadline and self.context.ok():
+            if any(publisher.get_subscription_count() for publisher in self.playable.values()):
+                self._sleep(min(1.0, self.options.wait))
+                return
+            self._sleep(0.05)
+        if self.options.wait and self.context.ok():
+            self.get_logger().warning("nobody listens to the bag's topics; playing anyway")
+
+    def play(self) -> int:
+        """Play once or in a loop; returns the number of messages published."""
+        self.wait_for_subscribers()
+        published = 0
+        while self.context.ok():
+            published += self._play_once()
+            if not self.options.loop:
+                break
+        return published
+
+    def _play_once(self) -> int:
+        start = self.bag.start + int(self.options.start * 1e9)
+        length = self.options.duration if self.options.duration is not None else (self.bag.end - start) * 1e-9
+        stop = start + int(length * 1e9)
+        published = 0
+        began = time.monotonic()
+        bar = tqdm(
+            total=round(max(length, 0.0), 1),
+            unit="s",
+            desc="playing",
+            bar_format="{desc} {percentage:3.0f}%|{bar}| {n:.1f}/{total:.1f} s",
+            disable=self.options.quiet or not sys.stderr.isatty(),
+        )
+        with bar:
+            for message in self.bag.messages(self.playable, start=start, stop=stop + 1):
+                elapsed = (message.received - start) * 1e-9
+                self._sleep(elapsed / self.options.rate - (time.monotonic() - began))
+                if not self.context.ok():
+                    break
+                if self.clock:
+                    now = Clock()
+                    now.clock.sec, now.clock.nanosec = divmod(message.received, 10**9)
+                    self.clock.publish(now)
+                self.playable[message.topic].publish(message.cdr())
+                published += 1
+                bar.update(elapsed - bar.n)
+        return published
+
+    def _sleep(self, seconds: float) -> None:
+        deadline = time.monotonic() + seconds
+        while self.context.ok() and (left := deadline - time.monotonic()) > 0:
+            time.sleep(min(left, 0.1))
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the player; see ``--help``."""
+    given = sys.argv if arguments is None else ["bag_player", *arguments]
+    options = _arguments(remove_ros_args(given)[1:])
+    # Raw images do not fit into the default shared memory; this must be set before the first node.
+    os.environ.setdefault(_PROFILES, str(share_directory() / "config" / "fastdds_large_messages.xml"))
+    rclpy.init(args=given, signal_handler_options=SignalHandlerOptions.ALL)
+    try:
+        with BagReader(options.bag or share_directory() / "bags" / "demo") as bag:
+            player = BagPlayer(bag, options)
+            player.get_logger().info(
+                f"playing {bag.path}: {bag.duration:.1f} s, {bag.message_count} messages on {len(player.playable)} topics"
+            )
+            published = player.play()
+            player.get_logger().info(f"published {published} messages")
+            # Reliable messages still on their way are lost with their publisher.
+            for publisher in player.playable.values():
+                publisher.wait_for_all_acked(rclpy.duration.Duration(seconds=1.0)) if player.context.ok() else None
+            player.destroy_node()
+    except BagError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        pass
+    finally:
+        rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

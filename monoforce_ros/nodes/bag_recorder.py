@@ -1,0 +1,100 @@
+"""bag_recorder: writes topics into a bag, for places where ros2 bag is not installed."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.utilities import remove_ros_args
+
+from monoforce_ros.bags import BagWriter
+from monoforce_ros.messages.message_types import message_class
+
+
+def _arguments(arguments: list[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="bag_recorder", description="Record topics into a rosbag2 bag until interrupted (SIGINT or SIGTERM)."
+    )
+    parser.add_argument("out", help="folder of the bag; must not exist")
+    parser.add_argument("--topics", nargs="+", default=None, metavar="TOPIC", help="topics (default: all there are)")
+    parser.add_argument("--storage", choices=["mcap", "sqlite3"], default="mcap", help="storage format (default mcap)")
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing bag")
+    return parser.parse_args(arguments)
+
+
+class BagRecorder(Node):
+    """Subscribes to topics as they appear and writes their messages undecoded."""
+
+    def __init__(self, bag: BagWriter, topics: list[str] | None):
+        super().__init__("bag_recorder")
+        self._bag = bag
+        self._topics = topics
+        self._subscribed: set[str] = set()
+        self.recorded = 0
+        self._timer = self.create_timer(0.2, self._look)
+        self._look()
+
+    def _look(self) -> None:
+        for topic, types in self.get_topic_names_and_types():
+            if topic in self._subscribed or (self._topics is not None and topic not in self._topics):
+                continue
+            publishers = self.get_publishers_info_by_topic(topic)
+            if not publishers:
+                continue
+            self._subscribed.add(topic)
+            kind = message_class(types[0])
+            if kind is None:
+                self.get_logger().warning(f"{topic} is not recorded: {types[0]} is not installed")
+                continue
+            # The strictest quality that every publisher offers loses the least.
+            reliable = all(p.qos_profile.reliability == ReliabilityPolicy.RELIABLE for p in publishers)
+            latched = all(p.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in publishers)
+            quality = QoSProfile(
+                depth=100,
+                reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+                durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+            )
+            self.create_subscription(
+                kind,
+                topic,
+                lambda data, topic=topic, name=types[0]: self._write(topic, name, data),
+                quality,
+                raw=True,
+            )
+            self.get_logger().info(f"recording {topic} ({types[0]})")
+
+    def _write(self, topic: str, message_type: str, data: bytes) -> None:
+        self._bag.write_serialized(topic, message_type, data, time.time_ns())
+        self.recorded += 1
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the recorder; see ``--help``."""
+    given = sys.argv if arguments is None else ["bag_recorder", *arguments]
+    options = _arguments(remove_ros_args(given)[1:])
+    rclpy.init(args=given)
+    try:
+        with BagWriter(options.out, storage=options.storage, overwrite=options.overwrite) as bag:
+            recorder = BagRecorder(bag, options.topics)
+            try:
+                rclpy.spin(recorder)
+            except (KeyboardInterrupt, ExternalShutdownException):
+                pass
+            finally:
+                print(f"recorded {recorder.recorded} messages into {options.out}", file=sys.stderr)
+                recorder.destroy_node()
+    except (OSError, ValueError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    finally:
+        rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,98 @@
+"""Health: what is wrong right now, part by part, as diagnostics and as log lines that are said once."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass, field
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.node import Node
+
+OK, WARN, ERROR, STALE = (
+    DiagnosticStatus.OK,
+    DiagnosticStatus.WARN,
+    DiagnosticStatus.ERROR,
+    DiagnosticStatus.STALE,
+)
+
+
+@dataclass
+class _Part:
+    level: bytes = STALE
+    message: str = "nothing received yet"
+    reason: str = ""
+    values: dict[str, str] = field(default_factory=dict)
+
+
+class Health:
+    """The state of a node's parts. A change is logged once and published at once; the rest is published every second.
+
+    Thread-safe.
+    """
+
+    def __init__(self, node: Node, parts: list[str]):
+        self._node = node
+        self._lock = threading.Lock()
+        self._parts = {name: _Part() for name in parts}
+        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._timer = node.create_timer(1.0, self.publish)
+
+    def report(self, part: str, level: bytes, message: str, *, reason: str = "", **values: object) -> None:
+        """Set a part's state.
+
+        Args:
+            part: which part.
+            level: OK, WARN, ERROR or STALE.
+            message: what is the case, for people.
+            reason: a short key of the fault; while it stays the same, changing numbers in the message are not logged
+                again. Defaults to the message.
+            values: figures that go along.
+        """
+        reason = reason or message
+        with self._lock:
+            state = self._parts.setdefault(part, _Part())
+            changed = (state.level, state.reason) != (level, reason)
+            started = state.level == STALE and level == OK
+            state.level, state.message, state.reason = level, message, reason
+            state.values.update({name.replace("_", " "): str(value) for name, value in values.items()})
+        if not changed:
+            return
+        logger = self._node.get_logger()
+        text = f"{part}: {message}"
+        # Each severity has a call of its own: rclpy ties a log line's place in the code to one severity.
+        if level == ERROR:
+            logger.error(text)
+        elif level in (WARN, STALE):
+            logger.warning(text)
+        elif not started:
+            logger.info(text)
+        self.publish()
+
+    def report_values(self, part: str, values: dict[str, str]) -> None:
+        """Attach figures to a part without changing its state."""
+        with self._lock:
+            self._parts[part].values.update(values)
+
+    def level(self, part: str) -> bytes:
+        """The level last reported for a part."""
+        with self._lock:
+            return self._parts[part].level
+
+    def publish(self) -> None:
+        """Publish all parts on ``/diagnostics``."""
+        array = DiagnosticArray()
+        array.header.stamp = self._node.get_clock().now().to_msg()
+        name = self._node.get_fully_qualified_name().lstrip("/")
+        with self._lock:
+            for part, state in self._parts.items():
+                array.status.append(
+                    DiagnosticStatus(
+                        level=state.level,
+                        name=f"{name}: {part}",
+                        message=state.message,
+                        hardware_id=name,
+                        values=[KeyValue(key=key, value=value) for key, value in state.values.items()],
+                    )
+                )
+        if self._node.context.ok():
+            self._publisher.publish(array)

@@ -1,0 +1,160 @@
+"""Inputs: the newest sensor data and a short memory of motion and commands, safe to use from several threads."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from monoforce_ros.motion import NANOSECOND, CommandTrack, MotionState, MotionTrack
+
+MEMORY = 10_000_000_000
+"""How long motion and commands are remembered [ns]."""
+JUMP = 1_000_000_000
+"""A stamp this much older than the one before it on the same topic means that time was set back [ns]."""
+
+
+@dataclass(frozen=True)
+class Received:
+    """A message with its stamp [ns] and the steady time of its arrival [s]."""
+
+    message: Any
+    stamp: int
+    arrival: float
+
+
+class Inputs:
+    """What the node knows. Every method may be called from any thread.
+
+    Args:
+        sensors: topics whose newest message is kept.
+        slop: largest difference of stamps within one set of sensor messages [s].
+        patience: how long a set waits for a sensor that has fallen silent [s].
+        on_time_jump: called with a topic and how far its time went back [s], after everything was forgotten.
+    """
+
+    def __init__(self, sensors: list[str], *, slop: float, patience: float, on_time_jump: Callable[[str, float], None]):
+        self.changed = threading.Condition()
+        self._sensors = sensors
+        self._slop = int(slop * 1e9)
+        self._patience = patience
+        self._on_time_jump = on_time_jump
+        self._last_stamps: dict[str, int] = {}
+        self.frame_id = ""
+        self.child_frame_id = ""
+        self.dropped = 0
+        self._clear()
+
+    def _clear(self) -> None:
+        self._last_stamps.clear()
+        self._states: deque[MotionState] = deque()
+        self._commands: deque[tuple[int, np.ndarray]] = deque()
+        self._newest: dict[str, Received] = {}
+        self._pending: dict[str, Received] = {}
+
+    def _admit(self, topic: str, stamp: int) -> bool:
+        """Whether a message may be used: not older than its predecessor, or first of a time that began anew."""
+        last = self._last_stamps.get(topic)
+        if last is not None and stamp < last - JUMP:
+            self._clear()
+            self._on_time_jump(topic, (last - stamp) * NANOSECOND)
+        elif last is not None and stamp < last:
+            return False
+        self._last_stamps[topic] = stamp
+        return True
+
+    def add_motion(self, topic: str, state: MotionState, frame_id: str, child_frame_id: str) -> None:
+        """Remember measured motion."""
+        with self.changed:
+            if not self._admit(topic, state.stamp) or (self._states and state.stamp == self._states[-1].stamp):
+                return
+            self.frame_id, self.child_frame_id = frame_id, child_frame_id
+            self._states.append(state)
+            while self._states[0].stamp < state.stamp - MEMORY:
+                self._states.popleft()
+            self.changed.notify_all()
+
+    def add_command(self, topic: str, stamp: int, twist: np.ndarray) -> None:
+        """Remember a command; one without a stamp (0) is dated by the newest odometry, the only clock it shares."""
+        with self.changed:
+            if not stamp:
+                stamp = self._states[-1].stamp if self._states else 0
+            if not stamp or not self._admit(topic, stamp):
+                return
+            self._commands.append((stamp, twist))
+            while self._commands[0][0] < stamp - MEMORY:
+                self._commands.popleft()
+
+    def add_sensor(self, topic: str, stamp: int, message: Any) -> None:
+        """Keep a sensor's newest message; a set that is complete replaces the one that waits to be used."""
+        with self.changed:
+            if not self._admit(topic, stamp):
+                self.dropped += 1
+                return
+            now = time.monotonic()
+            self._newest[topic] = Received(message, stamp, now)
+            live = [
+                entry for entry in self._newest.values() if now - entry.arrival <= self._patience
+            ]  # a sensor that died does not hold up the others
+            if len(self._newest) < len(self._sensors) and now - min(e.arrival for e in live) < self._patience:
+                return
+            if max(e.stamp for e in live) - min(e.stamp for e in live) > self._slop:
+                return
+            self.dropped += bool(self._pending)
+            self._pending = {name: entry for name, entry in self._newest.items() if entry in live}
+            self.changed.notify_all()
+
+    def take(self, *, odometry_timeout: float, wait: float) -> dict[str, Received] | None:
+        """The newest complete set of sensor messages once odometry has caught up with it, else None after ``wait`` [s].
+
+        Odometry that stays behind for ``odometry_timeout`` [s] is not waited for any longer.
+        """
+        deadline = time.monotonic() + wait
+        with self.changed:
+            while True:
+                now = time.monotonic()
+                if self._pending:
+                    stamp = max(entry.stamp for entry in self._pending.values())
+                    arrival = max(entry.arrival for entry in self._pending.values())
+                    caught_up = bool(self._states) and self._states[-1].stamp >= stamp
+                    if caught_up or now - arrival >= odometry_timeout:
+                        taken, self._pending = self._pending, {}
+                        return taken
+                    limit = min(deadline, arrival + odometry_timeout)
+                else:
+                    limit = deadline
+                if now >= deadline:
+                    return None
+                self.changed.wait(max(0.0, limit - now) + 1e-3)
+
+    def motion(self) -> MotionTrack:
+        """The remembered motion."""
+        with self.changed:
+            states = list(self._states)
+            frames = self.frame_id, self.child_frame_id
+        return MotionTrack(
+            stamps=np.array([s.stamp for s in states], np.int64),
+            positions=np.array([s.position for s in states]).reshape(-1, 3),
+            quaternions=(
+                Rotation.from_matrix(np.array([s.rotation for s in states])).as_quat() if states else np.zeros((0, 4))
+            ),
+            linear_velocities=np.array([s.linear_velocity for s in states]).reshape(-1, 3),
+            angular_velocities=np.array([s.angular_velocity for s in states]).reshape(-1, 3),
+            frame_id=frames[0],
+            child_frame_id=frames[1],
+        )
+
+    def commands(self) -> CommandTrack:
+        """The remembered commands."""
+        with self.changed:
+            commands = list(self._commands)
+        return CommandTrack(
+            stamps=np.array([stamp for stamp, _ in commands], np.int64),
+            twists=np.array([twist for _, twist in commands]).reshape(-1, 2),
+        )

@@ -1,0 +1,65 @@
+"""Node parameters from a YAML file that holds each one's type, default, range and meaning."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import yaml
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
+from rclpy.node import Node
+
+
+@dataclass(frozen=True)
+class ParameterEntry:
+    """A parameter as the YAML file describes it."""
+
+    name: str
+    type: str
+    default: Any
+    description: str
+    minimum: float | None = None
+    maximum: float | None = None
+    unit: str = ""
+    choices: tuple[str, ...] = ()
+
+    @property
+    def range_text(self) -> str:
+        """The allowed values in words."""
+        if self.choices:
+            return " | ".join(self.choices)
+        return "" if self.minimum is None else f"{self.minimum:g} … {self.maximum:g}"
+
+
+def read_parameter_file(path: Path) -> list[ParameterEntry]:
+    """Entries of a parameter file in its order."""
+    content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    return [
+        ParameterEntry(name, **{**entry, "choices": tuple(entry.get("choices", ()))}) for name, entry in content.items()
+    ]
+
+
+def declare_parameters(node: Node, entries: list[ParameterEntry]) -> SimpleNamespace:
+    """Declare the entries on a node and return their values.
+
+    Raises:
+        ValueError: a value is outside its choices (ranges are checked by rclpy when declaring).
+    """
+    values = SimpleNamespace()
+    for entry in entries:
+        descriptor = ParameterDescriptor(
+            description=f"{entry.description}{f' [{entry.unit}]' if entry.unit else ''}",
+            additional_constraints=entry.range_text if entry.choices else "",
+            read_only=True,
+        )
+        if entry.minimum is not None:
+            descriptor.floating_point_range = [
+                FloatingPointRange(from_value=entry.minimum, to_value=entry.maximum, step=0.0)
+            ]
+        value = node.declare_parameter(entry.name, entry.default, descriptor).value
+        if entry.choices and value not in entry.choices:
+            raise ValueError(f"parameter {entry.name}: got {value!r}, expected one of {list(entry.choices)}")
+        setattr(values, entry.name, value)
+    return values

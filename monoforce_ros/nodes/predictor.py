@@ -1,0 +1,350 @@
+"""The predictor node: sensor data, odometry and commands in; terrain, path and contact forces out."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+
+import torch
+from geometry_msgs.msg import Twist, TwistStamped
+from nav_msgs.msg import GridCells, Odometry, Path
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
+from visualization_msgs.msg import MarkerArray
+
+from monoforce_ros.bags.recording import camera_info_topic
+from monoforce_ros.camera import CameraModel
+from monoforce_ros.encoder import load_encoder
+from monoforce_ros.messages import decoding, prediction as encoders
+from monoforce_ros.motion import NANOSECOND, transform_points
+from monoforce_ros.nodes.frames import SensorFrames
+from monoforce_ros.nodes.health import ERROR, OK, STALE, WARN, Health
+from monoforce_ros.nodes.inputs import Inputs, Received
+from monoforce_ros.nodes.parameters import declare_parameters, read_parameter_file
+from monoforce_ros.nodes.process import run_node
+from monoforce_ros.nodes.subscriptions import AdaptiveSubscription
+from monoforce_ros.physics import PhysicsOptions
+from monoforce_ros.prediction import CameraTerrain, FlatTerrain, LidarTerrain, Observation, Prediction, Predictor
+from monoforce_ros.robots import load_robot
+from monoforce_ros.shared_files import share_directory
+from monoforce_ros.terrain import Grid, TerrainDefaults
+
+
+class PredictorNode(Node):
+    """Predicts from the newest data, in a thread of its own, so that callbacks never wait for physics."""
+
+    def __init__(self):
+        super().__init__("predictor")
+        self.settings = declare_parameters(self, read_parameter_file(share_directory() / "config" / "predictor.yaml"))
+        settings = self.settings
+        # One thread: on a small computer PyTorch's pool costs more than it brings at these sizes.
+        torch.set_num_threads(1)
+        self.robot = load_robot(settings.robot)
+        self.frames = SensorFrames(self, self.robot)
+        self.predictor = Predictor(
+            self.robot,
+            self._terrain_source(),
+            horizon=settings.horizon,
+            options=PhysicsOptions(time_step=settings.time_step),
+        )
+        self.sensor_topics = self._sensor_topics()
+        self.health = Health(self, ["odometry", "commands", *self.sensor_topics, "prediction"])
+        self.inputs = Inputs(
+            list(self.sensor_topics.values()),
+            slop=settings.camera_slop,
+            patience=settings.data_timeout,
+            on_time_jump=self._on_time_jump,
+        )
+        self.cameras: dict[str, tuple[CameraModel, str]] = {}
+        self._arrivals: dict[str, float] = {}
+        self._started = time.monotonic()
+        self._predictions = 0
+        self._last_prediction = self._started
+        self._durations: list[float] = []
+        self._subscribe()
+        newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST)
+        self._outputs = {
+            "height_map": self.create_publisher(GridCells, "predicted/height_map", newest),
+            "terrain": self.create_publisher(PointCloud2, "predicted/terrain", newest),
+            "path": self.create_publisher(Path, "predicted/path", newest),
+            "contact_forces": self.create_publisher(MarkerArray, "predicted/contact_forces", newest),
+        }
+        self._watch = self.create_timer(0.5, self._watch_inputs)
+        self._running = True
+        self._worker = threading.Thread(target=self._work, name="prediction", daemon=True)
+        self._worker.start()
+        self.get_logger().info(
+            f"predicting {settings.horizon:g} s ahead for {self.robot.name} with terrain from {settings.terrain_source}"
+        )
+
+    def destroy_node(self) -> None:
+        """Stop predicting, then end the node."""
+        self._running = False
+        with self.inputs.changed:
+            self.inputs.changed.notify_all()
+        self._worker.join(timeout=10.0)
+        super().destroy_node()
+
+    def _terrain_source(self) -> CameraTerrain | FlatTerrain | LidarTerrain:
+        settings = self.settings
+        if settings.terrain_source == "camera":
+            encoder = load_encoder(settings.checkpoint)
+            cuda = settings.device == "cuda" or (settings.device == "auto" and torch.cuda.is_available())
+            return CameraTerrain(encoder.to("cuda" if cuda else "cpu"))
+        grid = Grid.square(settings.map_size, settings.map_resolution)
+        material = TerrainDefaults(settings.stiffness, settings.damping, settings.friction)
+        kind = LidarTerrain if settings.terrain_source == "lidar" else FlatTerrain
+        return kind(self.robot, grid, material)
+
+    def _sensor_topics(self) -> dict[str, str]:
+        """Part name → resolved topic of every sensor that the terrain source uses."""
+        settings = self.settings
+        if settings.terrain_source == "lidar":
+            return {"lidar": self.resolve_topic_name(settings.cloud_topic)}
+        if settings.terrain_source == "camera":
+            return {f"camera {topic}": self.resolve_topic_name(topic) for topic in settings.image_topics if topic}
+        return {}
+
+    def _subscribe(self) -> None:
+        settings = self.settings
+        reliable = ReliabilityPolicy.RELIABLE if settings.image_qos == "reliable" else ReliabilityPolicy.BEST_EFFORT
+        # A short queue: the newest is what counts, and the executor empties it quickly.
+        large = QoSProfile(depth=2, reliability=reliable, durability=DurabilityPolicy.VOLATILE)
+        small = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE)
+        self._subscriptions_by_part = {
+            "odometry": AdaptiveSubscription(
+                self, settings.odometry_topic, {"nav_msgs/msg/Odometry": Odometry}, self._on_odometry, small
+            ),
+            "commands": AdaptiveSubscription(
+                self,
+                settings.command_topic,
+                {"geometry_msgs/msg/TwistStamped": TwistStamped, "geometry_msgs/msg/Twist": Twist},
+                self._on_command,
+                small,
+            ),
+        }
+        images = {"sensor_msgs/msg/CompressedImage": CompressedImage, "sensor_msgs/msg/Image": Image}
+        info_topics = [*settings.camera_info_topics, *[""] * len(self.sensor_topics)]
+        for index, (part, topic) in enumerate(self.sensor_topics.items()):
+            types = {"sensor_msgs/msg/PointCloud2": PointCloud2} if part == "lidar" else images
+            self._subscriptions_by_part[part] = AdaptiveSubscription(
+                self, topic, types, lambda message, part=part: self._on_sensor(part, message), large
+            )
+            if part != "lidar":
+                info = info_topics[index] or camera_info_topic(topic)
+                self._subscriptions_by_part[f"{part} info"] = AdaptiveSubscription(
+                    self,
+                    info,
+                    {"sensor_msgs/msg/CameraInfo": CameraInfo},
+                    lambda message, part=part: self._on_camera_info(part, message),
+                    small,
+                )
+
+    # Callbacks: decode what is small, keep what is large, never raise.
+
+    def _on_odometry(self, message: Odometry) -> None:
+        self._arrivals["odometry"] = time.monotonic()
+        try:
+            state, frame_id, child_frame_id = decoding.decode_odometry(message)
+        except decoding.MessageError as error:
+            self.health.report("odometry", ERROR, str(error), reason="unusable")
+            return
+        self.inputs.add_motion("odometry", state, frame_id, child_frame_id)
+        if child_frame_id.lstrip("/") not in ("", self.robot.base_frame):
+            self.health.report(
+                "odometry",
+                WARN,
+                f"its child frame is {child_frame_id!r}, the robot file's base frame {self.robot.base_frame!r}: "
+                "taken as the same place",
+                reason="frame",
+            )
+        else:
+            self.health.report("odometry", OK, "fresh")
+
+    def _on_command(self, message: Twist | TwistStamped) -> None:
+        self._arrivals["commands"] = time.monotonic()
+        try:
+            twist = decoding.decode_command(message)
+        except decoding.MessageError as error:
+            self.health.report("commands", ERROR, str(error), reason="unusable")
+            return
+        self.inputs.add_command("commands", decoding.stamp_of(message), twist)
+        self.health.report("commands", OK, "fresh")
+
+    def _on_sensor(self, part: str, message: PointCloud2 | Image | CompressedImage) -> None:
+        self._arrivals[part] = time.monotonic()
+        stamp = decoding.stamp_of(message)
+        if stamp == 0:
+            self.health.report(part, ERROR, "its stamps are zero: the driver does not set them", reason="zero stamp")
+            return
+        self.inputs.add_sensor(part, stamp, message)
+
+    def _on_camera_info(self, part: str, message: CameraInfo) -> None:
+        try:
+            self.cameras[part] = decoding.decode_camera_info(message), message.header.frame_id
+        except decoding.MessageError as error:
+            self.cameras.pop(part, None)
+            self.health.report(part, ERROR, str(error), reason="camera info")
+
+    def _on_time_jump(self, topic: str, seconds: float) -> None:
+        self.health.report(
+            "prediction",
+            WARN,
+            f"time went back by {seconds:.1f} s on {topic} (a bag that starts over?): older data were forgotten",
+            reason="time jump",
+        )
+
+    def _watch_inputs(self) -> None:
+        """Say which input has fallen silent; what was predicted before is never repeated."""
+        now, limit = time.monotonic(), self.settings.data_timeout
+        for part, subscription in self._subscriptions_by_part.items():
+            silence = now - self._arrivals.get(part, self._started)
+            if part.endswith(" info") or silence < limit:
+                continue
+            if subscription.wrong_type:
+                cause = f"{subscription.topic} carries {subscription.wrong_type}, which is not usable here"
+            elif not subscription.publishers:
+                cause = f"nobody publishes {subscription.topic}"
+            else:
+                cause = f"{subscription.publishers} publisher(s) on {subscription.topic} send nothing"
+            level = WARN if part == "commands" else ERROR
+            suffix = "; the robot is predicted to stand still" if part == "commands" else ""
+            self.health.report(part, level, f"nothing for {silence:.1f} s: {cause}{suffix}", reason=f"silent, {cause}")
+        if now - self._last_prediction > limit and self.health.level("prediction") == OK:
+            self.health.report("prediction", STALE, f"no new data to predict from for {limit:g} s", reason="no data")
+        if self._durations:
+            recent = sorted(self._durations[-50:])
+            self.health.report_values("prediction", self._figures(recent))
+
+    def _figures(self, recent: list[float]) -> dict[str, str]:
+        return {
+            "predictions": str(self._predictions),
+            "dropped inputs": str(self.inputs.dropped),
+            "median duration [ms]": f"{1e3 * recent[len(recent) // 2]:.0f}",
+        }
+
+    # The worker: one prediction after the other, always from the newest data.
+
+    def _work(self) -> None:
+        settings = self.settings
+        if not self.sensor_topics:
+            self._work_without_sensors()
+            return
+        while self._running:
+            started = time.monotonic()
+            received = self.inputs.take(odometry_timeout=settings.odometry_timeout, wait=0.5)
+            if received is None or not self._running:
+                continue
+            started = time.monotonic()
+            self._predict(received)
+            self._pause(started)
+
+    def _work_without_sensors(self) -> None:
+        """Flat ground needs no sensor: predict from each new odometry."""
+        last = 0
+        while self._running:
+            started = time.monotonic()
+            motion = self.inputs.motion()
+            if len(motion) and motion.stamps[-1] != last:
+                last = int(motion.stamps[-1])
+                self._predict({"odometry": Received(None, last, started)})
+            self._pause(started)
+
+    def _pause(self, started: float) -> None:
+        remaining = started + 1.0 / self.settings.rate - time.monotonic()
+        while remaining > 0 and self._running:
+            time.sleep(min(remaining, 0.05))
+            remaining = started + 1.0 / self.settings.rate - time.monotonic()
+
+    def _predict(self, received: dict[str, Received]) -> None:
+        started = time.monotonic()
+        stamp = max(entry.stamp for entry in received.values())
+        try:
+            observation = self._observe(stamp, received)
+            if observation is None:
+                return
+            motion = self.inputs.motion().at(stamp, maximum_gap=self.settings.odometry_timeout)
+            # The newest command is held over the horizon, unless it is too old to count at all.
+            held = self.inputs.commands().sample(stamp, timeout=self.settings.command_timeout)
+            twists = held[None].repeat(self.predictor.steps, axis=0)
+            prediction = self.predictor.predict(observation, motion, twists)
+        except ValueError as error:
+            self.health.report("prediction", ERROR, f"nothing published: {error}", reason=type(error).__name__)
+            return
+        except Exception as error:  # the node must outlive whatever its input brings about
+            self.health.report(
+                "prediction", ERROR, f"nothing published: {type(error).__name__}: {error}", reason=type(error).__name__
+            )
+            return
+        if not bool(prediction.rollout.valid.all()):
+            self.health.report("prediction", ERROR, "nothing published: the rollout diverged", reason="diverged")
+            return
+        self._publish(prediction)
+        self._predictions += 1
+        self._last_prediction = time.monotonic()
+        self._durations = [*self._durations[-199:], time.monotonic() - started]
+        self.health.report("prediction", OK, "predicting", latency_ms=f"{1e3 * self._durations[-1]:.0f}")
+
+    def _observe(self, stamp: int, received: dict[str, Received]) -> Observation | None:
+        """Decode sensor messages; a fault is reported on its part, and None returned where nothing usable remains."""
+        cloud, images, cameras, poses = None, {}, {}, {}
+        for part, entry in received.items():
+            if part == "odometry":
+                continue
+            try:
+                pose_of = self.frames.base_from(entry.message.header.frame_id)
+                if part == "lidar":
+                    cloud = transform_points(pose_of, decoding.decode_cloud(entry.message))
+                else:
+                    images[part], cameras[part] = self._view(part, entry.message)
+                    poses[part] = pose_of
+            except (decoding.MessageError, ValueError) as error:
+                self.health.report(part, ERROR, str(error), reason=str(error)[:40])
+                continue
+            age = (stamp - entry.stamp) * NANOSECOND
+            self.health.report(part, OK, "fresh", age_in_set_s=f"{age:.3f}")
+        if not received.keys() <= {"odometry"} and cloud is None and not images:
+            self.health.report(
+                "prediction", ERROR, "nothing published: no usable sensor data, see the sensors", reason="sensors"
+            )
+            return None
+        return Observation(stamp, cloud, images, cameras, poses)
+
+    def _view(self, part: str, message: Image | CompressedImage):
+        if part not in self.cameras:
+            topic = self._subscriptions_by_part[f"{part} info"].topic
+            raise decoding.MessageError(
+                f"no usable CameraInfo on {topic}, which the camera needs; name its topic in `camera_info_topics`"
+            )
+        image = decoding.decode_image(message)
+        camera, _ = self.cameras[part]
+        if image.shape[:2] != (camera.height, camera.width):
+            raise decoding.MessageError(
+                f"images are {image.shape[1]} × {image.shape[0]} px, but CameraInfo says {camera.width} × "
+                f"{camera.height} px"
+            )
+        return image, camera
+
+    def _publish(self, prediction: Prediction) -> None:
+        frame_id = self.inputs.frame_id or "odom"
+        messages = {
+            "height_map": encoders.height_map(prediction, frame_id),
+            "terrain": encoders.terrain_cloud(prediction, frame_id),
+            "contact_forces": encoders.contact_forces(prediction, self.robot, frame_id),
+            "path": encoders.path(prediction, frame_id, self.settings.path_time_step),
+        }
+        if not self.context.ok():
+            return
+        for name, data in messages.items():
+            self._outputs[name].publish(data)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the predictor node; see ``--ros-args -p`` and config/predictor.yaml for its parameters."""
+    return run_node(PredictorNode, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

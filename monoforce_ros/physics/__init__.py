@@ -1,0 +1,7 @@
+"""Differentiable robot–terrain physics (paper III-B to III-E)."""
+
+from monoforce_ros.physics.options import PhysicsOptions
+from monoforce_ros.physics.rollout import rollout
+from monoforce_ros.physics.state import Rollout, State
+
+__all__ = ["PhysicsOptions", "Rollout", "State", "rollout"]

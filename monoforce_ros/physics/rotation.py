@@ -1,0 +1,42 @@
+"""Rotations as tensors: exponential map, angles between rotations."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def exponential_map(vector: Tensor) -> Tensor:
+    """Rotation matrices ``[..., 3, 3]`` of rotation vectors ``[..., 3]`` [rad] (Rodrigues' formula)."""
+    square = (vector * vector).sum(-1, keepdim=True)[..., None]
+    small = square < 1e-8
+    safe = torch.where(small, torch.ones_like(square), square)
+    angle = torch.sqrt(safe)
+    # Taylor series near zero, where the quotients lose their digits and their gradients.
+    first = torch.where(small, 1.0 - square / 6.0, torch.sin(angle) / angle)
+    second = torch.where(small, 0.5 - square / 24.0, (1.0 - torch.cos(angle)) / safe)
+    cross = cross_matrix(vector)
+    identity = torch.eye(3, dtype=vector.dtype, device=vector.device)
+    return identity + first * cross + second * (cross @ cross)
+
+
+def cross_matrix(vector: Tensor) -> Tensor:
+    """Matrices ``[..., 3, 3]`` that multiply like the cross product with ``[..., 3]`` from the left."""
+    x, y, z = vector.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
+
+
+def rotation_angle(first: Tensor, second: Tensor) -> Tensor:
+    """Angle [rad] between rotations ``[..., 3, 3]`` (paper eq. 6), accurate for small angles too."""
+    relative = first.transpose(-1, -2) @ second
+    sine = 0.5 * torch.stack(
+        [
+            relative[..., 2, 1] - relative[..., 1, 2],
+            relative[..., 0, 2] - relative[..., 2, 0],
+            relative[..., 1, 0] - relative[..., 0, 1],
+        ],
+        dim=-1,
+    ).norm(dim=-1)
+    cosine = 0.5 * (relative.diagonal(dim1=-2, dim2=-1).sum(-1) - 1.0)
+    return torch.atan2(sine, cosine)

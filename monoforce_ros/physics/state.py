@@ -1,0 +1,75 @@
+"""State and Rollout: where a robot is, and where it will be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class State:
+    """Rigid-body state of a batch of robots, in the terrain's frame."""
+
+    position: Tensor
+    """Origin of the base frame [m], ``[B, 3]``."""
+    rotation: Tensor
+    """Rotation terrain ← base, ``[B, 3, 3]``."""
+    velocity: Tensor
+    """Velocity of the base frame's origin in terrain axes [m/s], ``[B, 3]``."""
+    angular_velocity: Tensor
+    """Angular velocity in terrain axes [rad/s], ``[B, 3]``."""
+
+    def __post_init__(self):
+        batch = self.position.shape[0]
+        for name, shape in (
+            ("position", (batch, 3)),
+            ("rotation", (batch, 3, 3)),
+            ("velocity", (batch, 3)),
+            ("angular_velocity", (batch, 3)),
+        ):
+            got = tuple(getattr(self, name).shape)
+            if got != shape:
+                raise ValueError(f"state {name}: got shape {got}, expected {shape}")
+
+    @classmethod
+    def at_rest(
+        cls, height: float = 0.0, *, batch: int = 1, heading: float = 0.0, dtype: torch.dtype = torch.float32
+    ) -> State:
+        """Robots standing still and level above the map's origin."""
+        angle = torch.tensor(heading, dtype=dtype)
+        cos, sin, zero, one = (
+            torch.cos(angle),
+            torch.sin(angle),
+            torch.zeros((), dtype=dtype),
+            torch.ones((), dtype=dtype),
+        )
+        rotation = torch.stack([cos, -sin, zero, sin, cos, zero, zero, zero, one]).reshape(3, 3)
+        position = torch.zeros(batch, 3, dtype=dtype)
+        position[:, 2] = height
+        return cls(position, rotation.repeat(batch, 1, 1), torch.zeros_like(position), torch.zeros_like(position))
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """Predicted motion and forces; index 0 along time is the start state."""
+
+    times: Tensor
+    """Time since the start [s], ``[T + 1]``."""
+    position: Tensor
+    """``[B, T + 1, 3]`` [m]."""
+    rotation: Tensor
+    """``[B, T + 1, 3, 3]``."""
+    velocity: Tensor
+    """``[B, T + 1, 3]`` [m/s]."""
+    angular_velocity: Tensor
+    """``[B, T + 1, 3]`` [rad/s]."""
+    inside: Tensor
+    """Whether the base frame's origin is on the map, ``[B, T + 1]`` bool; beyond its edge the map is continued."""
+    valid: Tensor
+    """Whether a trajectory is finite throughout, ``[B]`` bool; an invalid one holds NaN and no gradient."""
+    normal_forces: Tensor | None = None
+    """Force of the ground along its normal on each body point during each step [N], ``[B, T, N]``, never negative."""
+    forces: Tensor | None = None
+    """Whole contact force on each body point during each step [N], ``[B, T, N, 3]`` in terrain axes."""

@@ -1,0 +1,98 @@
+"""Predictor: observation, motion and commands → where the robot will be and which forces will act on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from monoforce_ros.motion import MotionState, transform_points
+from monoforce_ros.physics import PhysicsOptions, Rollout, State, rollout
+from monoforce_ros.prediction.terrain_sources import Observation, TerrainSource
+from monoforce_ros.robots import RobotModel
+from monoforce_ros.terrain import TerrainMap
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A terrain map and what a robot will do on it."""
+
+    motion: MotionState
+    """The measured state that the prediction starts from."""
+    terrain: TerrainMap
+    rollout: Rollout
+    """A batch of one, in the terrain frame."""
+
+    @property
+    def stamp(self) -> int:
+        """Time of the observation [ns]."""
+        return self.motion.stamp
+
+    def positions(self) -> np.ndarray:
+        """Predicted positions of the base frame in the odometry frame [m], ``[T + 1, 3]``."""
+        return transform_points(self.motion.odometry_from_terrain, self.rollout.position[0].double().numpy())
+
+    def rotations(self) -> np.ndarray:
+        """Predicted rotations odometry ← base, ``[T + 1, 3, 3]``."""
+        return self.motion.odometry_from_terrain[:3, :3] @ self.rollout.rotation[0].double().numpy()
+
+
+def start_states(motions: list[MotionState], dtype: torch.dtype = torch.float32) -> State:
+    """Physics states of measured motions, each in its own terrain frame."""
+
+    def tensor(values: list[np.ndarray]) -> torch.Tensor:
+        return torch.as_tensor(np.array(values), dtype=dtype)
+
+    rotations = [motion.terrain_from_base[:3, :3] for motion in motions]
+    return State(
+        position=tensor([np.zeros(3)] * len(motions)),
+        rotation=tensor(rotations),
+        velocity=tensor([r @ m.linear_velocity for r, m in zip(rotations, motions, strict=True)]),
+        angular_velocity=tensor([r @ m.angular_velocity for r, m in zip(rotations, motions, strict=True)]),
+    )
+
+
+class Predictor:
+    """Predicts with one robot, one terrain source and one horizon.
+
+    Args:
+        robot: the robot's model.
+        source: where terrain comes from.
+        horizon: length of a prediction [s].
+        options: physics.
+    """
+
+    def __init__(
+        self,
+        robot: RobotModel,
+        source: TerrainSource,
+        *,
+        horizon: float = 5.0,
+        options: PhysicsOptions | None = None,
+    ):
+        self.robot = robot
+        self.source = source
+        self.options = options or PhysicsOptions()
+        self.steps = max(1, round(horizon / self.options.time_step))
+
+    def step_stamps(self, stamp: int) -> np.ndarray:
+        """Times [ns] at which each step of a prediction from ``stamp`` begins, ``[T]``."""
+        return stamp + np.rint(np.arange(self.steps) * self.options.time_step * 1e9).astype(np.int64)
+
+    def predict(self, observation: Observation, motion: MotionState, twists: np.ndarray) -> Prediction:
+        """Predict from one observation.
+
+        Args:
+            observation: what the sensors saw.
+            motion: the robot's state at that time.
+            twists: commanded forward speed [m/s] and yaw rate [rad/s] during each step, ``[T, 2]``.
+        """
+        terrain = self.source.terrain(observation, motion)
+        return Prediction(motion, terrain, self.roll_out(terrain, [motion], twists[None]))
+
+    def roll_out(self, terrain: TerrainMap, motions: list[MotionState], twists: np.ndarray) -> Rollout:
+        """Roll out a batch of motions ``[B]`` under twists ``[B, T, 2]`` on one map or a batch of maps."""
+        speeds = self.robot.drive_speeds(torch.as_tensor(twists, dtype=torch.float32))
+        with torch.no_grad():
+            return rollout(terrain, self.robot, speeds, start_states(motions), options=self.options)

@@ -1,0 +1,109 @@
+"""Terrain sources: a sensor's observation → TerrainMap in the terrain frame at the observation's time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from monoforce_ros.camera import CameraModel
+from monoforce_ros.encoder import CameraView, TerrainEncoder
+from monoforce_ros.motion import MotionState, transform_points
+from monoforce_ros.physics.rest import rest_depth
+from monoforce_ros.robots import RobotModel
+from monoforce_ros.terrain import Grid, LidarSettings, TerrainDefaults, TerrainMap, terrain_from_cloud
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What the sensors saw at one time."""
+
+    stamp: int
+    """[ns]."""
+    cloud: np.ndarray | None = None
+    """Lidar returns ``[n, 3]`` [m] in the base frame."""
+    images: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """RGB pixels ``[height, width, 3]`` of each camera, by any name."""
+    cameras: Mapping[str, CameraModel] = field(default_factory=dict)
+    base_from_cameras: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """Pose ``[4, 4]`` of each camera in the base frame."""
+
+
+class TerrainSource(Protocol):
+    """Makes a map of the ground around the robot."""
+
+    def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
+        """Map in the terrain frame (origin at the robot, x along its heading, z up)."""
+
+
+def support_points(robot: RobotModel, motion: MotionState, stiffness: float) -> np.ndarray:
+    """Where the ground must be under the wheels of a robot that stands or drives on it, ``[m, 3]`` in terrain axes."""
+    lowest = robot.points[robot.point_tangents[:, 0] < -0.97].numpy()
+    points = transform_points(motion.terrain_from_base, lowest.astype(np.float64))
+    points[:, 2] += rest_depth(robot, stiffness)
+    return points
+
+
+@dataclass(frozen=True)
+class FlatTerrain:
+    """Level ground at the height of the wheels; the terrain source that needs no sensor."""
+
+    robot: RobotModel
+    grid: Grid
+    material: TerrainDefaults
+
+    def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
+        """Level map; see :class:`TerrainSource`."""
+        height = float(support_points(self.robot, motion, self.material.stiffness)[:, 2].mean())
+        return TerrainMap.flat(self.grid, height=height, material=self.material)
+
+
+@dataclass(frozen=True)
+class LidarTerrain:
+    """Heights interpolated from a lidar cloud (the paper's baseline [19])."""
+
+    robot: RobotModel
+    grid: Grid
+    material: TerrainDefaults
+    settings: LidarSettings = field(default_factory=LidarSettings)
+
+    def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
+        """Interpolated map; raises ``TerrainError`` where the cloud does not suffice."""
+        if observation.cloud is None:
+            raise ValueError("the lidar terrain source needs a point cloud, and the observation has none")
+        cloud = observation.cloud[~self._on_robot(observation.cloud)].astype(np.float64)
+        return terrain_from_cloud(
+            transform_points(motion.terrain_from_base, cloud),
+            self.grid,
+            settings=self.settings,
+            material=self.material,
+            support=support_points(self.robot, motion, self.material.stiffness),
+        )
+
+    def _on_robot(self, points: np.ndarray) -> np.ndarray:
+        """Returns from the robot's own body and from what is mounted on it or hangs over it."""
+        low, high = (bound.numpy() for bound in self.robot.bounds)
+        across = ((points[:, :2] > low[:2] - 0.1) & (points[:, :2] < high[:2] + 0.1)).all(axis=1)
+        # Returns from the ground under the body stay.
+        return across & (points[:, 2] > low[2] + 0.05)
+
+
+@dataclass(frozen=True)
+class CameraTerrain:
+    """Terrain predicted from images by a trained encoder (paper III-A)."""
+
+    encoder: TerrainEncoder
+
+    def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
+        """Predicted map; raises ``ValueError`` where an image, calibration or camera pose is missing."""
+        views = []
+        for name, image in observation.images.items():
+            if name not in observation.cameras or name not in observation.base_from_cameras:
+                raise ValueError(f"camera {name}: its calibration or its pose on the robot is missing")
+            pose = motion.terrain_from_base @ observation.base_from_cameras[name]
+            views.append(CameraView(image, observation.cameras[name], pose))
+        if not views:
+            raise ValueError("the camera terrain source needs at least one image, and the observation has none")
+        return self.encoder.terrain(views)

@@ -1,0 +1,263 @@
+"""Robot files: YAML → RobotModel, with every key checked."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+from scipy.spatial.transform import Rotation
+
+from monoforce_ros.robots.belt import belt_outline
+from monoforce_ros.robots.robot_model import RobotModel
+from monoforce_ros.shared_files import share_directory
+
+MAXIMUM_FILE_BYTES = 1_000_000
+DEFAULT_SPACING = 0.05
+"""Largest distance of neighbouring samples along a belt [m]; across it, rows are twice as far apart at the most."""
+
+_TOP_KEYS = {
+    "name", "description", "base_frame", "mass", "centre_of_mass", "inertia", "inertia_box", "command", "friction",
+    "wheels", "tracks", "hull", "sensors",
+}  # fmt: skip
+
+
+class RobotFileError(ValueError):
+    """A robot file that cannot be used; the message names the file, the field, what was got and what was expected."""
+
+
+def shipped_robots() -> list[str]:
+    """Names of the robots that come with the package."""
+    return sorted(path.stem for path in (share_directory() / "config" / "robots").glob("*.yaml"))
+
+
+def robot_file(name_or_file: str | Path) -> Path:
+    """The YAML file of a shipped robot's name, or of a path.
+
+    Raises ``RobotFileError`` that lists the shipped robots if there is none.
+    """
+    text = str(name_or_file)
+    if text.endswith((".yaml", ".yml")) or "/" in text:
+        path = Path(text).expanduser()
+        if not path.is_file():
+            raise RobotFileError(f"robot file {path} does not exist; give a file or one of {shipped_robots()}")
+        return path
+    path = share_directory() / "config" / "robots" / f"{text}.yaml"
+    if not path.is_file():
+        raise RobotFileError(f"there is no robot named {text!r}; expected a file or one of {shipped_robots()}")
+    return path
+
+
+def load_robot(name_or_file: str | Path, *, spacing: float = DEFAULT_SPACING) -> RobotModel:
+    """Read a robot by name (``husky``) or file.
+
+    Args:
+        name_or_file: a shipped robot's name or the path of a YAML file.
+        spacing: distance between body samples [m]; results do not depend on it beyond discretisation.
+
+    Raises:
+        RobotFileError: the file is missing, is not YAML, or a field is unknown, missing, or out of its range.
+    """
+    path = robot_file(name_or_file)
+    if path.stat().st_size > MAXIMUM_FILE_BYTES:
+        raise RobotFileError(f"{path}: {path.stat().st_size} bytes; a robot file has at most {MAXIMUM_FILE_BYTES}")
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise RobotFileError(f"{path}: not readable as YAML: {error}") from error
+    return _Reader(path).robot(content, spacing)
+
+
+class _Reader:
+    """Turns parsed YAML into a RobotModel, naming file and field in every complaint."""
+
+    def __init__(self, path: Path):
+        self.path = path
+
+    def fail(self, where: str, got: object, expected: str) -> RobotFileError:
+        return RobotFileError(f"{self.path}: {where}: got {got!r}, expected {expected}")
+
+    def mapping(self, content: Any, where: str, known: set[str], required: Sequence[str] = ()) -> Mapping[str, Any]:
+        if not isinstance(content, Mapping):
+            raise self.fail(where, content, "a mapping")
+        for key in content:
+            if key not in known:
+                raise self.fail(where, key, f"one of the keys {sorted(known)}")
+        for key in required:
+            if key not in content:
+                raise self.fail(where, sorted(content), f"the key {key!r}, which is missing")
+        return content
+
+    def number(self, value: Any, where: str, low: float, high: float, unit: str) -> float:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+            raise self.fail(where, value, f"a number from {low:g} to {high:g} {unit}")
+        return float(value)
+
+    def vector(self, value: Any, where: str, count: int, bound: float, unit: str) -> np.ndarray:
+        if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != count:
+            raise self.fail(where, value, f"a list of {count} numbers [{unit}]")
+        return np.array([self.number(v, f"{where}[{i}]", -bound, bound, unit) for i, v in enumerate(value)])
+
+    def items(self, content: Any, where: str) -> Sequence[Any]:
+        if not isinstance(content, Sequence) or isinstance(content, str):
+            raise self.fail(where, content, "a list")
+        return content
+
+    def robot(self, content: Any, spacing: float) -> RobotModel:
+        top = self.mapping(content, "the file", _TOP_KEYS, ["name", "mass", "command"])
+        mass = self.number(top["mass"], "mass", 0.1, 1e5, "kg")
+        command = self.mapping(
+            top["command"], "command", {"track_width", "maximum_speed", "maximum_yaw_rate"}, ["track_width"]
+        )
+        track_width = self.number(command["track_width"], "command.track_width", 0.05, 10.0, "m")
+        friction = self.mapping(top.get("friction", {}), "friction", {"longitudinal", "lateral"})
+        samples = _Samples()
+        for index, wheel in enumerate(self.items(top.get("wheels", []), "wheels")):
+            self.wheel(wheel, f"wheels[{index}]", samples, spacing)
+        for index, track in enumerate(self.items(top.get("tracks", []), "tracks")):
+            self.track(track, f"tracks[{index}]", samples, spacing)
+        if not samples.drives:
+            raise self.fail("wheels, tracks", "none", "at least one driven wheel or track")
+        for index, box in enumerate(self.items(top.get("hull", []), "hull")):
+            self.box(box, f"hull[{index}]", samples, spacing)
+        areas = np.concatenate(samples.areas)
+        drive_sides = np.array(
+            [
+                np.sign(np.mean(np.concatenate(samples.points)[np.concatenate(samples.owners) == index, 1]))
+                for index in range(len(samples.drives))
+            ]
+        )
+
+        def tensor(values: Any) -> torch.Tensor:
+            return torch.as_tensor(values, dtype=torch.float32)
+
+        return RobotModel(
+            name=str(top["name"]),
+            base_frame=str(top.get("base_frame", "base_link")),
+            mass=tensor(mass),
+            centre_of_mass=tensor(self.vector(top.get("centre_of_mass", [0, 0, 0]), "centre_of_mass", 3, 5.0, "m")),
+            inertia=tensor(self.inertia(top, mass)),
+            points=tensor(np.concatenate(samples.points)),
+            point_areas=tensor(areas),
+            point_tangents=tensor(np.concatenate(samples.tangents)),
+            point_drives=torch.as_tensor(np.concatenate(samples.owners), dtype=torch.int64),
+            drive_names=tuple(samples.drives),
+            drive_offsets=tensor(drive_sides * track_width / 2),
+            friction_longitudinal=tensor(
+                self.number(friction.get("longitudinal", 1.0), "friction.longitudinal", 0.0, 10.0, "-")
+            ),
+            friction_lateral=tensor(self.number(friction.get("lateral", 1.0), "friction.lateral", 0.0, 10.0, "-")),
+            maximum_speed=self.number(
+                command.get("maximum_speed", math.inf), "command.maximum_speed", 0.01, math.inf, "m/s"
+            ),
+            maximum_yaw_rate=self.number(
+                command.get("maximum_yaw_rate", math.inf), "command.maximum_yaw_rate", 0.01, math.inf, "rad/s"
+            ),
+            sensors=self.sensors(top.get("sensors", {})),
+        )
+
+    def inertia(self, top: Mapping[str, Any], mass: float) -> np.ndarray:
+        if ("inertia" in top) == ("inertia_box" in top):
+            raise self.fail("inertia", sorted(set(top) & {"inertia", "inertia_box"}), "either inertia or inertia_box")
+        if "inertia_box" in top:
+            x, y, z = self.vector(top["inertia_box"], "inertia_box", 3, 20.0, "m") ** 2
+            matrix = np.diag([y + z, x + z, x + y]) * mass / 12.0
+        else:
+            xx, yy, zz, xy, xz, yz = self.vector(top["inertia"], "inertia", 6, 1e5, "kg m²")
+            matrix = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        moments = np.linalg.eigvalsh(matrix)
+        if moments[0] <= 0 or moments[0] + moments[1] < moments[2] * (1 - 1e-6):
+            raise self.fail(
+                "inertia", moments.round(4).tolist(), "positive principal moments, the largest at most the others' sum"
+            )
+        return matrix
+
+    def wheel(self, content: Any, where: str, samples: _Samples, spacing: float) -> None:
+        keys = {"name", "drive", "centre", "radius", "width"}
+        wheel = self.mapping(content, where, keys, sorted(keys))
+        radius = self.number(wheel["radius"], f"{where}.radius", 0.01, 3.0, "m")
+        self.belt(wheel, where, (0.0, radius, radius), samples, spacing)
+
+    def track(self, content: Any, where: str, samples: _Samples, spacing: float) -> None:
+        keys = {"name", "drive", "centre", "length", "radius", "width"}
+        track = self.mapping(content, where, keys, sorted(keys))
+        radius = self.number(track["radius"], f"{where}.radius", 0.01, 3.0, "m")
+        length = self.number(track["length"], f"{where}.length", 0.01, 20.0, "m")
+        self.belt(track, where, (length, radius, radius), samples, spacing)
+
+    def belt(
+        self, content: Mapping[str, Any], where: str, shape: tuple[float, float, float], samples: _Samples, spacing
+    ) -> None:
+        centre = self.vector(content["centre"], f"{where}.centre", 3, 20.0, "m")
+        width = self.number(content["width"], f"{where}.width", 0.005, 3.0, "m")
+        outline, directions, lengths = belt_outline(*shape, spacing)
+        rows = max(2, math.ceil(width / (2 * spacing)))
+        across = (np.arange(rows) + 0.5) / rows * width - width / 2
+        positions = np.concatenate(
+            [centre + np.stack([outline[:, 0], np.full(len(outline), y), outline[:, 1]], axis=1) for y in across]
+        )
+        tangents = np.stack([directions[:, 0], np.zeros(len(directions)), directions[:, 1]], axis=1)
+        samples.add(positions, np.tile(lengths * width / rows, rows), np.tile(tangents, (rows, 1)), content["drive"])
+
+    def box(self, content: Any, where: str, samples: _Samples, spacing: float) -> None:
+        box = self.mapping(content, where, {"name", "centre", "size"}, ["centre", "size"])
+        centre = self.vector(box["centre"], f"{where}.centre", 3, 20.0, "m")
+        size = self.vector(box["size"], f"{where}.size", 3, 20.0, "m")
+        if (size <= 0).any():
+            raise self.fail(f"{where}.size", size.tolist(), "positive edge lengths [m]")
+        # Faces are sampled three times as sparsely as belts: the hull meets the ground only when something goes wrong.
+        for axis in range(3):
+            first, second = (a for a in range(3) if a != axis)
+            counts = [max(2, math.ceil(size[a] / (4 * spacing))) for a in (first, second)]
+            grid = np.meshgrid(*[(np.arange(c) + 0.5) / c - 0.5 for c in counts], indexing="ij")
+            for side in (-0.5, 0.5):
+                face = np.zeros((grid[0].size, 3))
+                face[:, first], face[:, second], face[:, axis] = grid[0].ravel(), grid[1].ravel(), side
+                area = size[first] * size[second] / len(face)
+                samples.add(centre + face * size, np.full(len(face), area), np.zeros((len(face), 3)), None)
+
+    def sensors(self, content: Any) -> dict[str, torch.Tensor]:
+        if not isinstance(content, Mapping):
+            raise self.fail("sensors", content, "a mapping of frame names")
+        poses = {}
+        for frame, entry in content.items():
+            where = f"sensors.{frame}"
+            pose = self.mapping(entry, where, {"translation", "rotation", "quaternion"}, ["translation"])
+            if ("rotation" in pose) == ("quaternion" in pose):
+                raise self.fail(where, sorted(pose), "either rotation (roll, pitch, yaw) or quaternion (x, y, z, w)")
+            matrix = np.eye(4)
+            if "rotation" in pose:
+                matrix[:3, :3] = Rotation.from_euler(
+                    "xyz", self.vector(pose["rotation"], f"{where}.rotation", 3, 7.0, "rad")
+                ).as_matrix()
+            else:
+                quaternion = self.vector(pose["quaternion"], f"{where}.quaternion", 4, 1.01, "-")
+                if abs(np.linalg.norm(quaternion) - 1.0) > 1e-2:
+                    raise self.fail(f"{where}.quaternion", quaternion.tolist(), "a unit quaternion x, y, z, w")
+                matrix[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
+            matrix[:3, 3] = self.vector(pose["translation"], f"{where}.translation", 3, 20.0, "m")
+            poses[str(frame)] = torch.as_tensor(matrix, dtype=torch.float32)
+        return poses
+
+
+class _Samples:
+    """Body samples as they are collected from the parts of a robot file."""
+
+    def __init__(self):
+        self.points: list[np.ndarray] = []
+        self.areas: list[np.ndarray] = []
+        self.tangents: list[np.ndarray] = []
+        self.owners: list[np.ndarray] = []
+        self.drives: list[str] = []
+
+    def add(self, points: np.ndarray, areas: np.ndarray, tangents: np.ndarray, drive: str | None) -> None:
+        if drive is not None and drive not in self.drives:
+            self.drives.append(str(drive))
+        self.points.append(points)
+        self.areas.append(areas)
+        self.tangents.append(tangents)
+        self.owners.append(np.full(len(points), -1 if drive is None else self.drives.index(str(drive))))

@@ -1,0 +1,85 @@
+"""RobotModel: what the physics needs to know of a robot."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class RobotModel:
+    """A rigid body sampled by surface points, some of which are moved by drives (paper III-B, III-D).
+
+    All lengths are in the robot's base frame (x forward, y left, z up; REP 103) and in metres. Any of the physical
+    quantities may carry a leading batch dimension ``[B]`` where a rollout shall vary it from trajectory to trajectory.
+    """
+
+    name: str
+    base_frame: str
+    mass: Tensor
+    """Mass [kg], shape ``[]`` or ``[B]``."""
+    centre_of_mass: Tensor
+    """Position of the centre of mass [m], ``[3]`` or ``[B, 3]``."""
+    inertia: Tensor
+    """Inertia about the centre of mass, in base-frame axes [kg m²], ``[3, 3]`` or ``[B, 3, 3]``."""
+    points: Tensor
+    """Surface points [m], ``[N, 3]``."""
+    point_areas: Tensor
+    """Area that each point stands for [m²], ``[N]``; forces scale with it, so that sampling density does not matter."""
+    point_tangents: Tensor
+    """Velocity of the surface relative to the body for a drive speed of 1 m/s [-], ``[N, 3]``; zero on the hull."""
+    point_drives: Tensor
+    """Index of the drive that moves each point, ``[N]`` int64; -1 on the hull."""
+    drive_names: tuple[str, ...]
+    drive_offsets: Tensor
+    """Lateral offset y of each drive used to turn a twist into drive speeds [m], ``[D]``."""
+    friction_longitudinal: Tensor
+    """Factor on the terrain's friction along the rolling direction [-], ``[]`` or ``[B]``."""
+    friction_lateral: Tensor
+    """Factor on the terrain's friction across the rolling direction [-], ``[]`` or ``[B]``."""
+    maximum_speed: float = float("inf")
+    """Largest commanded forward speed [m/s]."""
+    maximum_yaw_rate: float = float("inf")
+    """Largest commanded yaw rate [rad/s]."""
+    sensors: Mapping[str, Tensor] = field(default_factory=dict)
+    """Pose of each sensor frame in the base frame: ``[4, 4]`` homogeneous matrix, base ← sensor."""
+
+    @property
+    def number_of_drives(self) -> int:
+        """How many drives the robot has."""
+        return len(self.drive_names)
+
+    @property
+    def bounds(self) -> tuple[Tensor, Tensor]:
+        """Smallest and largest coordinates of the body's points [m], each ``[3]``."""
+        return self.points.amin(dim=0), self.points.amax(dim=0)
+
+    @property
+    def ground_clearance(self) -> float:
+        """Height of the base frame over the lowest driven point [m]."""
+        return -float(self.points[self.point_drives >= 0][:, 2].min())
+
+    def drive_speeds(self, twist: Tensor) -> Tensor:
+        """Ideal drive speeds of a commanded twist, limited to what the robot accepts.
+
+        Args:
+            twist: forward speed [m/s] and yaw rate [rad/s], ``[..., 2]``.
+
+        Returns:
+            surface speed of each drive [m/s], ``[..., D]``, positive forward.
+        """
+        forward = twist[..., :1].clamp(-self.maximum_speed, self.maximum_speed)
+        yaw_rate = twist[..., 1:].clamp(-self.maximum_yaw_rate, self.maximum_yaw_rate)
+        return forward - yaw_rate * self.drive_offsets.to(twist)
+
+    def to(self, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> RobotModel:
+        """The same robot with its floating-point tensors in another precision or on another device."""
+        changed = {}
+        for entry in fields(self):
+            value = getattr(self, entry.name)
+            if isinstance(value, Tensor):
+                changed[entry.name] = value.to(device=device, dtype=dtype if value.is_floating_point() else None)
+        return replace(self, **changed)

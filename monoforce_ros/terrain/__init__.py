@@ -1,0 +1,7 @@
+"""Terrain maps: what they hold, how they come from lidar, and how they are stored."""
+
+from monoforce_ros.terrain.grid import Grid
+from monoforce_ros.terrain.lidar import LidarSettings, terrain_from_cloud
+from monoforce_ros.terrain.terrain_map import TerrainDefaults, TerrainMap
+
+__all__ = ["Grid", "LidarSettings", "TerrainDefaults", "TerrainMap", "terrain_from_cloud"]

@@ -1,0 +1,153 @@
+"""Lidar cloud → terrain map: heights of the cells that were hit, interpolation in between (the paper's [19])."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+
+from monoforce_ros.terrain.grid import Grid
+from monoforce_ros.terrain.terrain_map import TerrainDefaults, TerrainMap
+
+
+@dataclass(frozen=True)
+class LidarSettings:
+    """How a cloud becomes a height map."""
+
+    lowest: float = -4.0
+    """Returns further below the robot are errors [m]."""
+    highest: float = 3.0
+    """Returns further above the robot cannot stop it [m]."""
+    headroom: float = 0.9
+    """A vertical gap of this size lets the robot pass below: what hangs above it is left out [m]."""
+    quantile: float = 0.75
+    """Height of a cell among its returns: above the middle, so that edges of obstacles count."""
+    minimum_cells: int = 20
+    """With fewer observed cells there is no map."""
+
+    def __post_init__(self):
+        if not self.lowest < self.highest:
+            raise ValueError(f"lowest: got {self.lowest} m, expected less than highest = {self.highest} m")
+        if not 0.0 <= self.quantile <= 1.0:
+            raise ValueError(f"quantile: got {self.quantile}, expected 0 to 1")
+
+
+_NEARBY = 0.5
+"""Radius in which a cell's ground is looked for [m]; slopes up to 45° are allowed for over it."""
+
+
+class TerrainError(ValueError):
+    """Measurements that do not suffice for a map."""
+
+
+def terrain_from_cloud(
+    points: np.ndarray,
+    grid: Grid,
+    *,
+    settings: LidarSettings = LidarSettings(),  # noqa: B008  (frozen)
+    material: TerrainDefaults = TerrainDefaults(),  # noqa: B008
+    support: np.ndarray | None = None,
+) -> TerrainMap:
+    """Terrain map of a lidar cloud.
+
+    Args:
+        points: returns ``[n, 3]`` [m] in the terrain frame, without the robot's own body.
+        grid: where the map's cells lie.
+        support: points ``[m, 3]`` [m] on which the robot is known to stand. They fix ``height`` in their cells, where
+            the lidar sees nothing, and leave ``geometric_height`` and ``observed`` alone.
+
+    Returns:
+        float32 map; cells without a return hold interpolated heights and are False in ``observed``.
+
+    Raises:
+        TerrainError: hardly any return lies on the grid.
+    """
+    heights, observed = cell_heights(points, grid, settings)
+    if observed.sum() < settings.minimum_cells:
+        raise TerrainError(
+            f"the cloud's {len(points)} returns hit {int(observed.sum())} cells of the {grid.extent[1]:.1f} m map, "
+            f"expected at least {settings.minimum_cells}: is the lidar's frame right, is it covered?"
+        )
+    visible = fill_holes(heights, observed)
+    ground = visible
+    if support is not None and len(support):
+        rows, columns, inside = grid.cells(support[:, :2])
+        known, where = heights.copy(), observed.copy()
+        rows, columns = rows[inside], columns[inside]
+        known[rows, columns] = np.inf
+        np.minimum.at(known, (rows, columns), support[inside, 2])
+        where[rows, columns] = True
+        ground = fill_holes(known, where)
+    return TerrainMap.from_height(
+        torch.from_numpy(ground.astype(np.float32)),
+        grid,
+        geometric_height=torch.from_numpy(visible.astype(np.float32)),
+        observed=torch.from_numpy(observed),
+        material=material,
+    )
+
+
+def cell_heights(points: np.ndarray, grid: Grid, settings: LidarSettings) -> tuple[np.ndarray, np.ndarray]:
+    """Height of each cell that has returns, ``[rows, columns]`` [m], and the mask of these cells."""
+    z = points[:, 2]
+    rows, columns, inside = grid.cells(points[:, :2])
+    inside &= (z > settings.lowest) & (z < settings.highest)
+    flat, z = (rows * grid.columns + columns)[inside], z[inside]
+    heights = np.zeros((grid.rows, grid.columns))
+    observed = np.zeros((grid.rows, grid.columns), bool)
+    if not len(z):
+        return heights, observed
+    order = np.lexsort((z, flat))
+    flat, z = flat[order], z[order]
+    first = np.r_[True, flat[1:] != flat[:-1]]
+    # Count the gaps below each return; within a cell, only what lies under the first gap belongs to the ground.
+    gaps = np.cumsum(np.r_[False, ~first[1:] & (np.diff(z) > settings.headroom)])
+    cell = np.cumsum(first) - 1
+    ground = gaps == gaps[np.flatnonzero(first)][cell]
+    flat, z, cell = flat[ground], z[ground], cell[ground]
+    starts = np.flatnonzero(np.r_[True, cell[1:] != cell[:-1]])
+    standing = _stands_on_ground(z[starts], flat[starts], grid, settings)
+    counts = np.diff(np.r_[starts, len(cell)])
+    position = starts + (counts - 1) * settings.quantile
+    below = np.floor(position).astype(np.int64)
+    above = np.minimum(below + 1, starts + counts - 1)
+    values = z[below] + (position - below) * (z[above] - z[below])
+    heights.ravel()[flat[starts][standing]] = values[standing]
+    observed.ravel()[flat[starts][standing]] = True
+    return heights, observed
+
+
+def _stands_on_ground(lowest: np.ndarray, cells: np.ndarray, grid: Grid, settings: LidarSettings) -> np.ndarray:
+    """Which cells' lowest returns belong to the ground or to what stands on it, rather than to a crown in the air.
+
+    A crown whose ground below was not hit shows by hanging far over the lowest return nearby; what stands on the
+    ground has returns at its foot.
+    """
+    floor = np.full((grid.rows, grid.columns), np.inf, np.float32)
+    floor.ravel()[cells] = lowest
+    reach = max(1, round(_NEARBY / grid.resolution))
+    nearby = cv2.erode(floor, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8), borderValue=np.inf)
+    return lowest <= nearby.ravel()[cells] + settings.headroom + _NEARBY
+
+
+def fill_holes(heights: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Smooth interpolation into the cells that are not ``known``; known cells keep their value.
+
+    A pyramid of weighted averages (push–pull, Gortler et al. 1996): each hole takes its value from the finest level at
+    which it has neighbours, so that narrow gaps are bridged locally and wide ones by the trend around them.
+    """
+    levels = [(np.where(known, heights, 0.0).astype(np.float32), known.astype(np.float32))]
+    while min(levels[-1][0].shape) > 1 and (levels[-1][1] < 1.0).any():
+        weighted, weight = levels[-1]
+        coarser_weight = cv2.pyrDown(weight, borderType=cv2.BORDER_REFLECT_101)
+        coarser = cv2.pyrDown(weighted * weight, borderType=cv2.BORDER_REFLECT_101)
+        value = np.where(coarser_weight > 1e-6, coarser / np.maximum(coarser_weight, 1e-6), 0.0)
+        # A coarse cell that saw a quarter of its surroundings is as good as one that saw all of it.
+        levels.append((value.astype(np.float32), np.minimum(1.0, 4.0 * coarser_weight).astype(np.float32)))
+    filled = levels[-1][0]
+    for value, weight in reversed(levels[:-1]):
+        coarse = cv2.pyrUp(filled, dstsize=(value.shape[1], value.shape[0]))
+        filled = weight * value + (1.0 - weight) * coarse
+    return np.where(known, heights, filled)

@@ -1,0 +1,111 @@
+#!/usr/bin/env bash
+# Makes .venv with the locked packages and builds the package with colcon.
+# Finished work is stamped, so a second call only checks the stamps.
+#   scripts/set_up.sh environment | build | graphics
+set -euo pipefail
+cd "$(dirname "$0")/.."
+root=$PWD
+venv=$root/.venv
+
+say() { printf '[set-up] %s\n' "$*"; }
+
+# A command named python3.12 may be a shim that answers nothing, so each candidate is asked for its version.
+is_python_312() {
+  [ "$("$1" -c 'import sys, venv, ensurepip; print("%d.%d" % sys.version_info[:2])' 2>/dev/null)" = 3.12 ]
+}
+
+find_python() {
+  local candidate
+  for candidate in "${MONOFORCE_PYTHON:-}" python3.12 /usr/bin/python3.12 /usr/local/bin/python3.12 \
+    "${PYENV_ROOT:-$HOME/.pyenv}"/versions/3.12*/bin/python3.12 \
+    "${UV_PYTHON_INSTALL_DIR:-$HOME/.local/share/uv/python}"/cpython-3.12*/bin/python3.12 \
+    /opt/python*/bin/python3.12 /opt/homebrew/bin/python3.12 python3 python; do
+    [ -n "$candidate" ] || continue
+    if is_python_312 "$candidate"; then
+      command -v "$candidate"
+      return 0
+    fi
+  done
+  return 1
+}
+
+environment() {
+  local started=$SECONDS lock_hash python
+  lock_hash=$(sha256sum requirements.lock | cut -d' ' -f1)
+  if [ -f "$venv/.locked" ] && [ "$(cat "$venv/.locked")" = "$lock_hash" ]; then
+    say "the environment is up to date"
+    return
+  fi
+  if ! is_python_312 "$venv/bin/python"; then
+    if ! python=$(find_python); then
+      cat >&2 <<'TEXT'
+[set-up] No working Python 3.12 with the venv module was found.
+         Tried: $MONOFORCE_PYTHON, python3.12 on PATH, pyenv's and uv's versions, /usr, /opt.
+         Install one of:
+           Ubuntu 24.04:  sudo apt install python3.12 python3.12-venv
+           pyenv:         pyenv install 3.12
+           uv:            uv python install 3.12
+         or name one:     MONOFORCE_PYTHON=/path/to/python3.12 make test
+TEXT
+      exit 1
+    fi
+    say "making .venv with $python"
+    rm -rf "$venv"
+    "$python" -m venv "$venv"
+  fi
+  local uv_version
+  uv_version=$(sed -n 's/^uv==\([^ ;]*\).*/\1/p' requirements.lock)
+  say "fetching uv $uv_version, the installer"
+  "$venv/bin/python" -m pip install --quiet --disable-pip-version-check "uv==$uv_version"
+  say "installing $(grep -c '^[a-z0-9].*==' requirements.lock) locked packages (several GB, most of it torch's CUDA libraries)"
+  "$venv/bin/uv" pip sync --quiet --python "$venv/bin/python" requirements.lock
+  printf '%s' "$lock_hash" >"$venv/.locked"
+  say "environment ready after $((SECONDS - started)) s"
+}
+
+# rosidl and ament look below AMENT_PREFIX_PATH, which the wheels do not set; the guard variable must not
+# outlive the library path it stands for.
+ros_environment() {
+  unset _ROS_WHEELS_BOOTSTRAP_COMPLETE
+  export AMENT_PREFIX_PATH="$venv${AMENT_PREFIX_PATH:+:$AMENT_PREFIX_PATH}"
+  export PATH="$venv/bin:$PATH"
+}
+
+build() {
+  local stamp=install/.built started=$SECONDS
+  if [ -f "$stamp" ] && [ -z "$(find package.xml setup.py setup.cfg resource config launch msg_defs bags monoforce_ros \
+    -newer "$stamp" -not -name '*.pyc' -not -name __pycache__ -print -quit)" ]; then
+    say "the build is up to date"
+    return
+  fi
+  ros_environment
+  say "building with colcon"
+  mkdir -p out
+  if ! colcon --log-base log build --event-handlers console_cohesion- >out/colcon_build.log 2>&1; then
+    cat out/colcon_build.log >&2
+    exit 1
+  fi
+  touch "$stamp"
+  say "built into install/ after $((SECONDS - started)) s"
+}
+
+# Only drawing camera images of synthetic worlds needs a GL library; everything else runs without.
+graphics() {
+  if ldconfig -p 2>/dev/null | grep -q 'libOSMesa\.so'; then
+    say "OSMesa is there: synthetic cameras can be drawn"
+  elif [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null; then
+    say "installing OSMesa, which draws synthetic camera images without a display"
+    { apt-get -qq update && apt-get -qq install -y --no-install-recommends libosmesa6; } >/dev/null 2>&1 \
+      || say "OSMesa could not be installed: the tests that draw images will be skipped"
+  else
+    say "OSMesa is missing: tests that draw synthetic images will be skipped (sudo apt install libosmesa6)"
+  fi
+}
+
+case "${1:-}" in
+  environment | build | graphics) "$1" ;;
+  *)
+    echo "usage: scripts/set_up.sh environment|build|graphics" >&2
+    exit 2
+    ;;
+esac

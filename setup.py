@@ -1,0 +1,46 @@
+"""Installs the package the way ROS 2 expects: executables in lib/monoforce_ros, data in share/monoforce_ros."""
+
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+PACKAGE = "monoforce_ros"
+SHARED_FOLDERS = ("config", "launch", "msg_defs", "bags")
+
+
+def shared_files() -> list[tuple[str, list[str]]]:
+    """Every file of the shared folders, listed by the folder it is installed to."""
+    listed: dict[str, list[str]] = {}
+    for folder in SHARED_FOLDERS:
+        for path in sorted(Path(folder).rglob("*")):
+            if path.is_file():
+                listed.setdefault(f"share/{PACKAGE}/{path.parent.as_posix()}", []).append(path.as_posix())
+    return sorted(listed.items())
+
+
+setup(
+    name=PACKAGE,
+    version="0.1.0",
+    packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
+        (f"share/{PACKAGE}", ["package.xml"]),
+        *shared_files(),
+    ],
+    install_requires=["setuptools"],
+    extras_require={"test": ["pytest"]},
+    zip_safe=False,
+    maintainer="monoforce_ros maintainers",
+    maintainer_email="maintainers@monoforce-ros.example.org",
+    description="Predicts robot-terrain interaction from camera images and lidar through differentiable physics.",
+    license="Apache-2.0",
+    entry_points={
+        "console_scripts": [
+            "predictor = monoforce_ros.nodes.predictor:main",
+            "bag_player = monoforce_ros.nodes.bag_player:main",
+            "bag_recorder = monoforce_ros.nodes.bag_recorder:main",
+            "synthesize = monoforce_ros.synthetic.cli:main",
+            "evaluate = monoforce_ros.evaluation.cli:main",
+        ],
+    },
+)
