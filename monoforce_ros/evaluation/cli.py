@@ -22,10 +22,11 @@ from monoforce_ros.evaluation.drive import (
     predict_at,
 )
 from monoforce_ros.evaluation.report import figure_png, terminal_table, write_reports
+from monoforce_ros.evaluation.view import PredictionView
 from monoforce_ros.messages.decoding import MessageError
 from monoforce_ros.physics import PhysicsOptions
 from monoforce_ros.prediction import CameraTerrain, FlatTerrain, LidarTerrain, Predictor
-from monoforce_ros.robots import RobotFileError, load_robot, shipped_robots
+from monoforce_ros.robots import RobotFileError, RobotModel, load_robot, shipped_robots
 from monoforce_ros.shared_files import share_directory
 from monoforce_ros.terrain import Grid, TerrainDefaults
 
@@ -116,9 +117,9 @@ def run(options: argparse.Namespace) -> None:
         later = recording.motion.stamps - stamp
         ahead = (later >= 0) & (later <= max(options.horizons) * 1e9)
         figure = figures.prediction_figure(
-            prediction,
+            PredictionView.of_prediction(prediction, robot),
             robot,
-            picture=_picture(recording, robot, stamp),
+            picture=camera_picture(recording, robot, stamp),
             measured=recording.motion.positions[ahead],
             title=f"{(stamp - recording.motion.stamps[0]) * 1e-9:.1f} s into the drive, terrain from {options.terrain}",
         )
@@ -153,7 +154,7 @@ def _moments(evaluation) -> list[tuple[str, int]]:
     return [("typical", int(order[len(order) // 2])), ("worst", int(order[-1]))]
 
 
-def _picture(recording: Recording, robot, stamp: int) -> figures.CameraPicture | None:
+def camera_picture(recording: Recording, robot: RobotModel, stamp: int) -> figures.CameraPicture | None:
     """The image of a forward-looking camera near a stamp, if the bag has one with its calibration and pose."""
     best = None
     for topic, camera in recording.cameras.items():

@@ -14,9 +14,8 @@ from matplotlib.patches import Polygon
 from monoforce_ros.camera import CameraModel
 from monoforce_ros.evaluation.drive import CONSTANT_VELOCITY, FLAT_PHYSICS, PHYSICS, DriveEvaluation
 from monoforce_ros.evaluation.overlay import SURFACE_COLOURS, draw_prediction
-from monoforce_ros.messages.prediction import contact_points, usable_steps
+from monoforce_ros.evaluation.view import PredictionView
 from monoforce_ros.motion import transform_points
-from monoforce_ros.prediction import Prediction
 from monoforce_ros.robots import RobotModel
 
 COLOURS = {PHYSICS: "#0b84a5", FLAT_PHYSICS: "#9b59b6", CONSTANT_VELOCITY: "#e08214", "measured": "#1a1a1a"}
@@ -44,7 +43,7 @@ class CameraPicture:
 
 
 def prediction_figure(
-    prediction: Prediction,
+    view: PredictionView,
     robot: RobotModel,
     *,
     picture: CameraPicture | None = None,
@@ -54,13 +53,13 @@ def prediction_figure(
     """The prediction in the camera image beside its map from above.
 
     Args:
-        prediction: what to show.
+        view: the prediction to show.
         robot: whose prediction it is.
         picture: the camera image of the same moment, if there is one.
         measured: where the robot went, ``[n, 3]`` in the odometry frame [m].
         title: a line above the figure.
     """
-    height = prediction.terrain.height.numpy()
+    height = view.terrain.height.numpy()
     low, high = np.percentile(height, [2, 99])
     span = max(high - low, 0.4)
     colour_range = float(low - 0.1 * span), float(low + span)
@@ -71,14 +70,14 @@ def prediction_figure(
             picture.image,
             picture.camera,
             picture.base_from_camera,
-            prediction,
+            view,
             robot,
             colour_range=colour_range,
         )
         axes[0].imshow(drawn, interpolation="lanczos")
         axes[0].set_axis_off()
         axes[0].set_title("from the camera: predicted ground, path and contact forces")
-    _draw_map(axes[-1], prediction, robot, measured, colour_range)
+    _draw_map(axes[-1], view, robot, measured, colour_range)
     if title:
         figure.suptitle(title, x=0.01, ha="left", fontsize=13, fontweight="bold")
     return figure
@@ -86,12 +85,12 @@ def prediction_figure(
 
 def _draw_map(
     axes: Axes,
-    prediction: Prediction,
+    view: PredictionView,
     robot: RobotModel,
     measured: np.ndarray | None,
     colour_range: tuple[float, float],
 ) -> None:
-    terrain = prediction.terrain
+    terrain = view.terrain
     height = terrain.height.double().numpy()
     colours = matplotlib.colormaps[SURFACE_COLOURS]
     scaled = 0.25 + 0.7 * np.clip((height - colour_range[0]) / (colour_range[1] - colour_range[0]), 0, 1)
@@ -103,28 +102,25 @@ def _draw_map(
     shaded = np.where(seen, shaded, 0.55 * shaded + 0.45 * shaded.mean(axis=2, keepdims=True) * 0.5 + 0.2)
     axes.imshow(np.clip(shaded, 0, 1), origin="lower", extent=terrain.grid.extent, interpolation="nearest")
     axes.contour(terrain.grid.x, terrain.grid.y, height, levels=12, colors="k", linewidths=0.4, alpha=0.35)
-    to_terrain = np.linalg.inv(prediction.motion.odometry_from_terrain)
+    to_terrain = np.linalg.inv(view.motion.odometry_from_terrain)
     if measured is not None and len(measured):
         track = transform_points(to_terrain, measured)
         axes.plot(track[:, 0], track[:, 1], color="white", linewidth=4.5, alpha=0.85)
         axes.plot(track[:, 0], track[:, 1], color="black", linewidth=1.8, linestyle=(0, (4, 2)), label="measured")
-    steps = usable_steps(prediction)
-    path = prediction.rollout.position[0].double().numpy()[:steps]
-    axes.plot(path[:, 0], path[:, 1], color=_PATH, linewidth=3.0, label="predicted")
-    rotations = prediction.rollout.rotation[0].double().numpy()
-    per_second = round(1.0 / float(prediction.rollout.times[1]))
-    for index in range(0, steps, per_second):
-        _draw_robot(axes, robot, path[index], rotations[index], filled=index == 0)
-        if index:
+    axes.plot(view.positions[:, 0], view.positions[:, 1], color=_PATH, linewidth=3.0, label="predicted")
+    for second in range(int(view.times[-1] + 1e-6) + 1):
+        index = int(np.argmin(np.abs(view.times - second)))
+        _draw_robot(axes, robot, view.positions[index], view.rotations[index], filled=second == 0)
+        if second:
             axes.annotate(
-                f"{index // per_second} s",
-                path[index, :2],
-                xytext=(7, 7),
+                f"{second} s",
+                view.positions[index, :2],
+                xytext=(9, 9),
                 textcoords="offset points",
                 fontsize=9,
                 fontweight="bold",
             )
-    _draw_forces(axes, prediction, robot, to_terrain, range(0, min(steps, len(rotations) - 1), per_second // 2))
+    _draw_forces(axes, view)
     axes.set(xlabel="forward x [m]", ylabel="left y [m]", aspect="equal")
     axes.set_xlim(terrain.grid.extent[:2])
     axes.set_ylim(terrain.grid.extent[2:])
@@ -149,24 +145,22 @@ def _draw_robot(axes: Axes, robot: RobotModel, position: np.ndarray, rotation: n
     axes.plot(*np.stack([position[:2], nose]).T, color="black", linewidth=1.2)
 
 
-def _draw_forces(axes: Axes, prediction: Prediction, robot: RobotModel, to_terrain: np.ndarray, steps: range) -> None:
+def _draw_forces(axes: Axes, view: PredictionView) -> None:
     """Points that carry load, sized by it, and the horizontal part of the forces as arrows."""
-    weight = float(robot.mass.mean()) * 9.81
-    for step in steps:
-        points, forces = contact_points(prediction, robot, step)
-        points, forces = transform_points(to_terrain, points), forces @ to_terrain[:3, :3].T
-        load = np.linalg.norm(forces, axis=1) / weight
-        axes.scatter(points[:, 0], points[:, 1], s=260 * load, color="#d7263d", alpha=0.55, linewidths=0, zorder=4)
-        axes.quiver(
-            *points[:, :2].T,
-            *(forces[:, :2] / weight * 4.0).T,
-            angles="xy",
-            scale_units="xy",
-            scale=1.0,
-            color="#d7263d",
-            width=0.003,
-            zorder=5,
-        )
+    load = np.linalg.norm(view.contact_forces, axis=1)
+    axes.scatter(
+        *view.contact_points[:, :2].T, s=260 * load, color="#d7263d", alpha=0.55, linewidths=0, zorder=4, label="load"
+    )
+    axes.quiver(
+        *view.contact_points[:, :2].T,
+        *(view.contact_forces[:, :2] * 4.0).T,
+        angles="xy",
+        scale_units="xy",
+        scale=1.0,
+        color="#d7263d",
+        width=0.003,
+        zorder=5,
+    )
 
 
 def error_figure(evaluation: DriveEvaluation) -> Figure:

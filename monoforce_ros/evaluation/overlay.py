@@ -7,14 +7,14 @@ import numpy as np
 from matplotlib import colormaps
 
 from monoforce_ros.camera import CameraModel
-from monoforce_ros.messages.prediction import contact_points, usable_steps
+from monoforce_ros.evaluation.view import PredictionView
 from monoforce_ros.motion import transform_points
-from monoforce_ros.prediction import Prediction
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import TerrainMap
 
 SURFACE_COLOURS = "terrain"
 PATH_COLOUR = (40, 220, 255)
+FORCE_COLOUR = (255, 70, 60)
 _NEAREST = 0.35
 """Cells closer to the camera than this are not drawn [m]."""
 
@@ -23,7 +23,7 @@ def draw_prediction(
     image: np.ndarray,
     camera: CameraModel,
     base_from_camera: np.ndarray,
-    prediction: Prediction,
+    view: PredictionView,
     robot: RobotModel,
     *,
     width: int = 1280,
@@ -35,7 +35,7 @@ def draw_prediction(
         image: RGB ``[height, width, 3]``.
         camera: its model.
         base_from_camera: pose of the camera on the robot ``[4, 4]``.
-        prediction: what to draw.
+        view: what to draw.
         width: of the result [px].
         colour_range: heights at the two ends of the colour scale [m], terrain frame.
 
@@ -45,10 +45,10 @@ def draw_prediction(
     height = round(width * camera.height / camera.width)
     canvas = cv2.resize(image, (width, height), interpolation=cv2.INTER_CUBIC)
     camera = camera.resized(width, height)
-    camera_from_terrain = np.linalg.inv(prediction.motion.terrain_from_base @ base_from_camera)
-    canvas = _draw_surface(canvas, camera, camera_from_terrain, prediction.terrain, colour_range)
-    canvas = _draw_path(canvas, camera, camera_from_terrain, prediction, robot)
-    return _draw_forces(canvas, camera, camera_from_terrain, prediction, robot)
+    camera_from_terrain = np.linalg.inv(view.motion.terrain_from_base @ base_from_camera)
+    canvas = _draw_surface(canvas, camera, camera_from_terrain, view.terrain, colour_range)
+    canvas = _draw_path(canvas, camera, camera_from_terrain, view, robot)
+    return _draw_forces(canvas, camera, camera_from_terrain, view)
 
 
 def _project(camera: CameraModel, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -110,11 +110,10 @@ def _draw_surface(
 
 
 def _draw_path(
-    canvas: np.ndarray, camera: CameraModel, camera_from_terrain: np.ndarray, prediction: Prediction, robot: RobotModel
+    canvas: np.ndarray, camera: CameraModel, camera_from_terrain: np.ndarray, view: PredictionView, robot: RobotModel
 ) -> np.ndarray:
-    steps = np.arange(0, usable_steps(prediction), 5)
-    positions = prediction.rollout.position[0].double().numpy()[steps]
-    rotations = prediction.rollout.rotation[0].double().numpy()[steps]
+    stride = max(1, round(0.05 / (view.times[1] - view.times[0]))) if len(view.times) > 1 else 1
+    times, positions, rotations = (values[::stride] for values in (view.times, view.positions, view.rotations))
     half = float(robot.points[:, 1].abs().max())
     edges = []
     for side in (half, 0.0, -half):
@@ -123,7 +122,7 @@ def _draw_path(
         edges.append((pixels, usable))
     (left, left_ok), (centre, centre_ok), (right, right_ok) = edges
     layer = canvas.copy()
-    for i in range(len(steps) - 1):
+    for i in range(len(times) - 1):
         if left_ok[i] and left_ok[i + 1] and right_ok[i] and right_ok[i + 1]:
             quad = np.rint(np.array([left[i], left[i + 1], right[i + 1], right[i]]) * 8).astype(np.int32)
             cv2.fillConvexPoly(layer, quad, PATH_COLOUR, cv2.LINE_AA, shift=3)
@@ -132,9 +131,9 @@ def _draw_path(
         line = [np.rint(p * 8).astype(np.int32) for p, ok in zip(pixels, usable, strict=True) if ok]
         if len(line) > 1:
             cv2.polylines(canvas, [np.array(line)], False, PATH_COLOUR, 3, cv2.LINE_AA, shift=3)
-    for second in range(1, int(prediction.rollout.times[-1]) + 1):
-        index = round(second / float(prediction.rollout.times[1]) / 5)
-        if index < len(steps) and centre_ok[index]:
+    for second in range(1, int(times[-1] + 1e-6) + 1):
+        index = int(np.argmin(np.abs(times - second)))
+        if centre_ok[index]:
             place = tuple(int(v) for v in np.rint(centre[index]))
             cv2.circle(canvas, place, 9, (20, 40, 60), -1, cv2.LINE_AA)
             cv2.circle(canvas, place, 6, (255, 255, 255), -1, cv2.LINE_AA)
@@ -147,18 +146,12 @@ def _draw_path(
 
 
 def _draw_forces(
-    canvas: np.ndarray, camera: CameraModel, camera_from_terrain: np.ndarray, prediction: Prediction, robot: RobotModel
+    canvas: np.ndarray, camera: CameraModel, camera_from_terrain: np.ndarray, view: PredictionView
 ) -> np.ndarray:
-    terrain_from_odometry = np.linalg.inv(prediction.motion.odometry_from_terrain)
-    weight = float(robot.mass.mean()) * 9.81
-    steps = min(usable_steps(prediction), len(prediction.rollout.times) - 1)
-    for step in range(0, steps, round(1.0 / float(prediction.rollout.times[1]))):
-        points, forces = contact_points(prediction, robot, step)
-        feet = transform_points(terrain_from_odometry, points)
-        tips = feet + (forces @ terrain_from_odometry[:3, :3].T) * (2.0 / weight)
-        lower, lower_ok = _project(camera, transform_points(camera_from_terrain, feet))
-        upper, upper_ok = _project(camera, transform_points(camera_from_terrain, tips))
-        for start, end in zip(lower[lower_ok & upper_ok], upper[lower_ok & upper_ok], strict=True):
-            ends = [tuple(int(v) for v in np.rint(p)) for p in (start, end)]
-            cv2.arrowedLine(canvas, *ends, (255, 70, 60), 2, cv2.LINE_AA, tipLength=0.25)
+    tips = view.contact_points + 1.5 * view.contact_forces
+    lower, lower_ok = _project(camera, transform_points(camera_from_terrain, view.contact_points))
+    upper, upper_ok = _project(camera, transform_points(camera_from_terrain, tips))
+    for start, end in zip(lower[lower_ok & upper_ok], upper[lower_ok & upper_ok], strict=True):
+        ends = [tuple(int(v) for v in np.rint(p)) for p in (start, end)]
+        cv2.arrowedLine(canvas, *ends, FORCE_COLOUR, 2, cv2.LINE_AA, tipLength=0.2)
     return canvas

@@ -70,6 +70,13 @@ def path(prediction: Prediction, frame_id: str, time_step: float) -> bytes:
     )
 
 
+def force_steps(prediction: Prediction) -> np.ndarray:
+    """Steps at which contact forces are drawn."""
+    times = prediction.rollout.times.double().numpy()
+    stride = max(1, round(FORCE_INTERVAL / (times[1] - times[0])))
+    return np.arange(0, max(1, min(usable_steps(prediction), len(times) - 1)), stride)
+
+
 def contact_points(prediction: Prediction, robot: RobotModel, step: int) -> tuple[np.ndarray, np.ndarray]:
     """Points ``[k, 3]`` [m] that carry load during a step, and the forces on them ``[k, 3]`` [N], odometry frame."""
     result, transform = prediction.rollout, prediction.motion.odometry_from_terrain
@@ -86,12 +93,8 @@ def contact_forces(prediction: Prediction, robot: RobotModel, frame_id: str) -> 
     ``contact_forces`` are lines as long as the force in units of the robot's weight, ``contact_points`` their feet.
     """
     weight = float(robot.mass.mean()) * 9.81
-    times = prediction.rollout.times.double().numpy()
-    stride = max(1, round(FORCE_INTERVAL / (times[1] - times[0])))
-    steps = np.arange(0, max(1, min(usable_steps(prediction), len(times) - 1)), stride)
-    feet, forces = (
-        np.concatenate(parts) for parts in zip(*[contact_points(prediction, robot, s) for s in steps], strict=True)
-    )
+    contacts = [contact_points(prediction, robot, step) for step in force_steps(prediction)]
+    feet, forces = (np.concatenate(parts) for parts in zip(*contacts, strict=True))
     tips = feet + forces * (FORCE_LENGTH / weight)
     colours = colormaps["turbo"](np.clip(np.linalg.norm(forces, axis=1) / (0.25 * weight), 0, 1)).astype(np.float32)
     return encoding.marker_array(

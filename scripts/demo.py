@@ -1,0 +1,142 @@
+"""The demo: plays the bundled bag through the predictor, two processes of their own, and draws what it published.
+
+Writes into --out: prediction.png (what the node predicted), outputs/ (its messages as a bag), evaluation/ (the report).
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from monoforce_ros.bags import BagReader, Recording
+from monoforce_ros.evaluation import figures
+from monoforce_ros.evaluation.cli import camera_picture, main as evaluate
+from monoforce_ros.evaluation.report import figure_png
+from monoforce_ros.evaluation.view import PredictionView
+from monoforce_ros.messages.decoding import stamp_of
+from monoforce_ros.robots import load_robot
+from monoforce_ros.shared_files import share_directory
+
+OUTPUTS = ("height_map", "terrain", "path", "contact_forces")
+EXECUTABLES = share_directory().parent.parent / "lib" / "monoforce_ros"
+
+
+def say(text: str) -> None:
+    print(f"[demo] {text}", flush=True)
+
+
+def start(name: str, *arguments: str, log: Path | None) -> subprocess.Popen:
+    """Start an installed executable, as ``ros2 run monoforce_ros NAME`` does."""
+    output = log.open("w") if log else None
+    return subprocess.Popen([str(EXECUTABLES / name), *arguments], stdout=output, stderr=output)
+
+
+def wait_for(log: Path, text: str, process: subprocess.Popen, seconds: float) -> None:
+    """Wait until a process has written a text into its log."""
+    deadline = time.monotonic() + seconds
+    while text not in log.read_text():
+        if process.poll() is not None or time.monotonic() > deadline:
+            raise SystemExit(f"[demo] {log.stem} did not get ready:\n{log.read_text()}")
+        time.sleep(0.1)
+
+
+def stop(process: subprocess.Popen) -> int:
+    """End a process as Ctrl-C does and return its exit status."""
+    process.send_signal(signal.SIGINT)
+    try:
+        return process.wait(timeout=20)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return process.wait()
+
+
+def play(bag: Path, out: Path, robot: str) -> None:
+    """Run player and predictor, record what the predictor publishes."""
+    logs = {name: out / f"{name}.log" for name in ("predictor", "bag_recorder")}
+    topics = [*(f"/predicted/{name}" for name in OUTPUTS), "/diagnostics"]
+    say("starting the predictor and a recorder")
+    predictor = start("predictor", "--ros-args", "-p", f"robot:={robot}", log=logs["predictor"])
+    recorder = start("bag_recorder", str(out / "outputs"), "--overwrite", "--topics", *topics, log=logs["bag_recorder"])
+    try:
+        wait_for(logs["predictor"], "predicting", predictor, 90)
+        wait_for(logs["bag_recorder"], "/predicted/contact_forces", recorder, 30)
+        say(f"playing {bag.name} into it")
+        if start("bag_player", str(bag), log=None).wait() != 0:
+            raise SystemExit("[demo] the player failed")
+        time.sleep(1.5)
+    finally:
+        statuses = [stop(process) for process in (predictor, recorder)]
+    if any(statuses):
+        raise SystemExit(f"[demo] predictor and recorder ended with {statuses}; see {logs['predictor']}")
+
+
+def published(out: Path) -> dict[int, dict[str, object]]:
+    """The complete predictions in the recorded outputs, by stamp."""
+    by_stamp: dict[int, dict[str, object]] = {}
+    with BagReader(out / "outputs") as bag:
+        for message in bag.messages([f"/predicted/{name}" for name in OUTPUTS]):
+            decoded = message.decode()
+            first = decoded.markers[0] if hasattr(decoded, "markers") else decoded
+            by_stamp.setdefault(stamp_of(first), {})[message.topic.rsplit("/", 1)[-1]] = decoded
+    return {stamp: found for stamp, found in sorted(by_stamp.items()) if len(found) == len(OUTPUTS)}
+
+
+def draw(bag: Path, out: Path, robot_name: str, moment: float) -> int:
+    """Draw the published prediction nearest to ``moment`` [s]; returns how many predictions there were."""
+    robot = load_robot(robot_name)
+    recording = Recording.open(bag)
+    predictions = published(out)
+    if not predictions:
+        raise SystemExit(f"[demo] the predictor published nothing; see {out / 'predictor.log'}")
+    begin = int(recording.motion.stamps[0])
+    stamp = min(predictions, key=lambda s: abs((s - begin) * 1e-9 - moment))
+    found = predictions[stamp]
+    later = recording.motion.stamps - stamp
+    view = PredictionView.of_messages(
+        found["terrain"], found["path"], found["contact_forces"], recording.motion.at(stamp)
+    )
+    figure = figures.prediction_figure(
+        view,
+        robot,
+        picture=camera_picture(recording, robot, stamp),
+        measured=recording.motion.positions[(later >= 0) & (later <= 5e9)],
+    )
+    (out / "prediction.png").write_bytes(figure_png(figure))
+    gaps = np.diff([s * 1e-9 for s in predictions])
+    say(f"the predictor published {len(predictions)} predictions, one every {np.median(gaps):.2f} s of the bag")
+    return len(predictions)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("out/demo"), help="folder for what it makes")
+    parser.add_argument("--bag", type=Path, default=share_directory() / "bags" / "demo", help="bag to play")
+    parser.add_argument("--robot", default="husky", help="robot name or file")
+    parser.add_argument("--moment", type=float, default=2.4, help="time in the bag to draw [s]")
+    options = parser.parse_args()
+    began = time.monotonic()
+    # A domain of its own keeps the demo apart from robots and other runs on the network.
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    os.environ.setdefault("ROS_DOMAIN_ID", str(os.getpid() % 100))
+    shutil.rmtree(options.out, ignore_errors=True)
+    options.out.mkdir(parents=True)
+    play(options.bag, options.out, options.robot)
+    draw(options.bag, options.out, options.robot, options.moment)
+    say("evaluating predictions along the bag against the measured motion")
+    status = evaluate([str(options.bag), "--robot", options.robot, "--out", str(options.out / "evaluation")])
+    if status:
+        sys.exit(status)
+    say(f"done after {time.monotonic() - began:.0f} s; open")
+    print(f"  {options.out / 'prediction.png'}\n  {options.out / 'evaluation' / 'report.html'}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,104 @@
+"""What the tests share: where real recordings lie, and running installed executables as processes of their own."""
+
+import os
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+ROOT = Path(__file__).resolve().parent.parent
+INSTALLED = ROOT / "install" / "monoforce_ros"
+
+# Many small tensors: a pool of threads only adds waiting, above all when several processes share two cores.
+torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session")
+def real_data() -> Path:
+    """Folder of real recordings; tests that need it are skipped where it is absent."""
+    folder = Path(os.environ.get("MONOFORCE_REAL_DATA", ROOT.parent / "shared" / "data"))
+    if not (folder / "rough").is_dir():
+        pytest.skip(f"real recordings are not at {folder} (set MONOFORCE_REAL_DATA)")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def demo_bag() -> Path:
+    return ROOT / "bags" / "demo"
+
+
+@pytest.fixture(scope="session")
+def executables() -> Path:
+    """Folder of the installed executables, which `ros2 run` starts."""
+    folder = INSTALLED / "lib" / "monoforce_ros"
+    if not folder.is_dir():
+        pytest.fail(f"{folder} is missing: build first (make build)")
+    return folder
+
+
+class Process:
+    """An installed executable at work, with its output in a file."""
+
+    def __init__(self, command: list[str], log: Path, environment: dict[str, str]):
+        self.log = log
+        with log.open("w") as output:
+            self._process = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, env=environment)
+
+    @property
+    def output(self) -> str:
+        return self.log.read_text(errors="replace")
+
+    @property
+    def running(self) -> bool:
+        return self._process.poll() is None
+
+    def wait_for(self, text: str, seconds: float = 60.0) -> None:
+        deadline = time.monotonic() + seconds
+        while text not in self.output:
+            if not self.running or time.monotonic() > deadline:
+                pytest.fail(f"{text!r} did not appear; the process printed:\n{self.output}")
+            time.sleep(0.05)
+
+    def wait(self, seconds: float = 120.0) -> int:
+        return self._process.wait(timeout=seconds)
+
+    def stop(self, how: int = signal.SIGINT) -> int:
+        if self.running:
+            self._process.send_signal(how)
+        try:
+            return self._process.wait(timeout=20)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            pytest.fail(f"the process did not end on signal {how}; it printed:\n{self.output}")
+
+
+_domains = iter(range(10_000))
+
+
+@pytest.fixture(scope="module")
+def ros_environment() -> dict[str, str]:
+    """Environment with a ROS domain of its own, so that tests and robots do not hear each other."""
+    environment = dict(os.environ)
+    environment["ROS_DOMAIN_ID"] = str((os.getpid() * 7 + next(_domains)) % 100 + 1)
+    environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    return environment
+
+
+@pytest.fixture(scope="module")
+def start(executables, ros_environment, tmp_path_factory):
+    """Start installed executables; those still running at the end are killed."""
+    started: list[Process] = []
+
+    def _start(name: str, *arguments: object) -> Process:
+        log = tmp_path_factory.mktemp("logs") / f"{name}.log"
+        process = Process([str(executables / name), *map(str, arguments)], log, ros_environment)
+        started.append(process)
+        return process
+
+    yield _start
+    for process in started:
+        if process.running:
+            process.stop(signal.SIGKILL)
