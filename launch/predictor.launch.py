@@ -1,9 +1,10 @@
 """Start the predictor: ``ros2 launch monoforce_ros predictor.launch.py robot:=husky terrain_source:=lidar``."""
 
-from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
+
+from launch import LaunchDescription
 
 ARGUMENTS = {
     "robot": ("husky", "robot model, a shipped name or a file"),

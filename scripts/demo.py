@@ -18,7 +18,8 @@ import numpy as np
 
 from monoforce_ros.bags import BagReader, Recording
 from monoforce_ros.evaluation import figures
-from monoforce_ros.evaluation.cli import camera_picture, main as evaluate
+from monoforce_ros.evaluation.cli import camera_picture
+from monoforce_ros.evaluation.cli import main as evaluate
 from monoforce_ros.evaluation.report import figure_png
 from monoforce_ros.evaluation.view import PredictionView
 from monoforce_ros.messages.decoding import stamp_of

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from monoforce_ros.physics.lookup import TerrainLookup
 from monoforce_ros.terrain import Grid, TerrainMap

@@ -42,7 +42,13 @@ class BagMessage:
         """The message in ROS 2's encoding, whichever ROS the bag is of."""
         if self._reader.is_ros2:
             return bytes(self.data)
-        return bytes(self._reader._any.typestore.ros1_to_cdr(self.data, self.message_type))
+        # By the definitions of ROS 2: they tell the converter that headers have lost their sequence number.
+        try:
+            return bytes(type_store().ros1_to_cdr(self.data, self.message_type))
+        except Exception as error:
+            raise BagError(
+                f"{self._reader.path}: a {self.message_type} on {self.topic} cannot be converted to ROS 2: {error}"
+            ) from error
 
 
 class BagReader:

@@ -22,7 +22,8 @@ body { font: 15px/1.5 system-ui, sans-serif; color: #1c2733; background: #f5f7f8
 main { max-width: 1120px; margin: 0 auto; padding: 32px 24px 64px; }
 h1 { font-size: 26px; margin: 0 0 4px; } h2 { font-size: 18px; margin: 36px 0 10px; }
 p.lead { color: #51606e; margin: 0 0 20px; max-width: 80ch; }
-section.card { background: white; border-radius: 10px; padding: 18px 22px; box-shadow: 0 1px 3px #0002; margin: 18px 0; }
+section.card { background: white; border-radius: 10px; padding: 18px 22px; margin: 18px 0;
+  box-shadow: 0 1px 3px #0002; }
 img { max-width: 100%; display: block; margin: 0 auto; }
 table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }
 th, td { padding: 6px 10px; text-align: right; border-bottom: 1px solid #e3e8ec; white-space: nowrap; }

@@ -52,10 +52,9 @@ def path(frame_id: str, stamps: np.ndarray, positions: np.ndarray, quaternions: 
         if first == last:
             continue
         padding = -(writer.position + 12 + len(name)) % 8
-        layout = np.dtype(
-            [("sec", "<i4"), ("nanosec", "<u4"), ("length", "<u4"), ("name", f"V{len(name)}"), ("pad", f"V{padding}")]
-            + [("position", "<f8", 3), ("orientation", "<f8", 4)]
-        )
+        fields = [("sec", "<i4"), ("nanosec", "<u4"), ("length", "<u4"), ("name", f"V{len(name)}")]
+        fields += [("padding", f"V{padding}"), ("position", "<f8", 3), ("orientation", "<f8", 4)]
+        layout = np.dtype(fields)
         poses = np.zeros(last - first, layout)
         poses["sec"], poses["nanosec"] = np.divmod(stamps[first:last], 10**9)
         poses["length"], poses["name"] = len(name), np.void(name)

@@ -139,7 +139,7 @@ def main(arguments: list[str] | None = None) -> int:
         with BagReader(options.bag or share_directory() / "bags" / "demo") as bag:
             player = BagPlayer(bag, options)
             player.get_logger().info(
-                f"playing {bag.path}: {bag.duration:.1f} s, {bag.message_count} messages on {len(player.playable)} topics"
+                f"playing {bag.path}: {bag.duration:.1f} s, {len(player.playable)} topics, {bag.message_count} messages"
             )
             published = player.play()
             player.get_logger().info(f"published {published} messages")

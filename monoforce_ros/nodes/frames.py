@@ -14,8 +14,8 @@ from monoforce_ros.robots import RobotModel
 class SensorFrames:
     """Poses of sensor frames in the robot's base frame.
 
-    tf2 is part of every ROS installation but not of its Python wheels, so it is used where it can be imported. A robot's
-    own ``/tf_static`` goes before the robot file, which describes the model, not the unit.
+    tf2 is part of every ROS installation but not of its Python wheels, so it is used where it can be imported. The
+    ``/tf_static`` of a robot goes before the robot file, which describes the model, not the unit.
     """
 
     def __init__(self, node: Node, robot: RobotModel):

@@ -17,7 +17,8 @@ from visualization_msgs.msg import MarkerArray
 from monoforce_ros.bags.recording import camera_info_topic
 from monoforce_ros.camera import CameraModel
 from monoforce_ros.encoder import load_encoder
-from monoforce_ros.messages import decoding, prediction as encoders
+from monoforce_ros.messages import decoding
+from monoforce_ros.messages import prediction as encoders
 from monoforce_ros.motion import NANOSECOND, transform_points
 from monoforce_ros.nodes.frames import SensorFrames
 from monoforce_ros.nodes.health import ERROR, OK, STALE, WARN, Health

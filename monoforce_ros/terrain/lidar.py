@@ -46,7 +46,7 @@ def terrain_from_cloud(
     points: np.ndarray,
     grid: Grid,
     *,
-    settings: LidarSettings = LidarSettings(),  # noqa: B008  (frozen)
+    settings: LidarSettings = LidarSettings(),
     material: TerrainDefaults = TerrainDefaults(),  # noqa: B008
     support: np.ndarray | None = None,
 ) -> TerrainMap:

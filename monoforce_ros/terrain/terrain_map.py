@@ -78,7 +78,7 @@ class TerrainMap:
         *,
         geometric_height: Tensor | None = None,
         observed: Tensor | None = None,
-        material: TerrainDefaults = TerrainDefaults(),  # noqa: B008  (frozen)
+        material: TerrainDefaults = TerrainDefaults(),
     ) -> TerrainMap:
         """A map of one material; what is visible is the ground, and all of it observed, unless given."""
 
@@ -101,7 +101,7 @@ class TerrainMap:
         grid: Grid | None = None,
         *,
         height: float = 0.0,
-        material: TerrainDefaults = TerrainDefaults(),  # noqa: B008
+        material: TerrainDefaults = TerrainDefaults(),
         dtype: torch.dtype = torch.float32,
     ) -> TerrainMap:
         """Level ground."""

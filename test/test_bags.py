@@ -1,0 +1,153 @@
+"""Bags: written whole or not at all; read in either ROS, and refused in one sentence when broken."""
+
+import numpy as np
+import pytest
+from nav_msgs.msg import Odometry
+from rclpy.serialization import deserialize_message
+
+from monoforce_ros.bags import BagError, BagReader, BagWriter, Recording, builders
+from monoforce_ros.bags.recording import camera_info_topic, find_transform
+
+START = 1_700_000_000_000_000_000
+
+
+def write(path, storage="mcap", count=20, **options):
+    with BagWriter(path, storage=storage, **options) as bag:
+        for i in range(count):
+            at = START + i * 50_000_000
+            bag.write(
+                "/odom",
+                builders.odometry(at, "odom", "base_link", [0.05 * i, 0, 0], [0, 0, 0, 1], [1, 0, 0], [0] * 3),
+                at,
+            )
+            bag.write("/cmd_vel", builders.twist_stamped(at, "base_link", 1.0, 0.1), at)
+            bag.write("/points", builders.point_cloud(at, "lidar", np.full((30, 3), float(i + 1))), at)
+            bag.write("/cam/image_raw", builders.image(at, "cam", np.full((4, 6, 3), i, np.uint8)), at)
+            bag.write("/cam/camera_info", builders.camera_info(at, "cam", 6, 4, np.diag([5.0, 5, 1]), [0] * 5), at)
+        pose = np.eye(4)
+        pose[:3, 3] = [0.1, 0.2, 0.3]
+        bag.write("/tf_static", builders.static_transforms(START, "base_link", {"lidar": pose}), at)
+    return path
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_what_is_written_is_read(tmp_path, storage):
+    recording = Recording.open(write(tmp_path / "drive", storage))
+    assert recording.topics == {"odometry": "/odom", "commands": "/cmd_vel", "cloud": "/points"}
+    assert len(recording.motion) == len(recording.commands) == len(recording.clouds) == 20
+    assert recording.motion.at(START + 125_000_000).position[0] == pytest.approx(0.125)
+    points, frame = recording.cloud(recording.clouds[7])
+    assert frame == "lidar" and (points == 8.0).all()
+    assert (recording.image(recording.images["/cam/image_raw"][5]) == 5).all()
+    assert recording.cameras["/cam/image_raw"].matrix[0, 0] == 5.0
+    np.testing.assert_allclose(recording.base_from("lidar", "base_link")[:3, 3], [0.1, 0.2, 0.3])
+    assert recording.base_from("elsewhere", "base_link") is None
+    assert (tmp_path / "drive" / f"drive.{'mcap' if storage == 'mcap' else 'db3'}").is_file()
+
+
+def test_a_recording_that_fails_leaves_nothing_behind(tmp_path):
+    with pytest.raises(RuntimeError, match="stop"), BagWriter(tmp_path / "drive") as bag:
+        bag.write("/cmd_vel", builders.twist(1, 0), START)
+        raise RuntimeError("stop")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_existing_bag_is_kept_unless_told_otherwise(tmp_path):
+    write(tmp_path / "drive", count=3)
+    with pytest.raises(FileExistsError, match="exists already"):
+        BagWriter(tmp_path / "drive")
+    with pytest.raises(RuntimeError), BagWriter(tmp_path / "drive", overwrite=True) as bag:
+        bag.write("/cmd_vel", builders.twist(1, 0), START)
+        raise RuntimeError
+    assert len(Recording.open(tmp_path / "drive").motion) == 3
+    write(tmp_path / "drive", count=5, overwrite=True)
+    assert len(Recording.open(tmp_path / "drive").motion) == 5
+    with pytest.raises(ValueError, match="storage: got 'csv'"):
+        BagWriter(tmp_path / "other", storage="csv")
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+@pytest.mark.parametrize("part", [0.0, 0.3, 0.9])
+def test_truncated_bags_are_refused_in_one_sentence(tmp_path, storage, part):
+    path = write(tmp_path / "drive", storage)
+    file = next(f for f in path.iterdir() if f.suffix in (".mcap", ".db3"))
+    data = file.read_bytes()
+    file.write_bytes(data[: int(len(data) * part)])
+    with pytest.raises(BagError, match="drive.*(truncated|damaged)"):
+        Recording.open(path)
+
+
+def test_missing_and_unfinished_bags_are_named(tmp_path):
+    with pytest.raises(BagError, match="does not exist"):
+        Recording.open(tmp_path / "nowhere")
+    path = write(tmp_path / "drive")
+    (path / "metadata.yaml").unlink()
+    with pytest.raises(BagError, match=r"no metadata.yaml.*ros2 bag reindex"):
+        Recording.open(path)
+    junk = tmp_path / "junk.bag"
+    junk.write_bytes(b"not a bag at all")
+    with pytest.raises(BagError, match="cannot be read"):
+        Recording.open(junk)
+
+
+def test_a_bag_without_odometry_says_what_it_has(tmp_path):
+    with BagWriter(tmp_path / "drive") as bag:
+        bag.write("/cmd_vel", builders.twist(1, 0), START)
+    with pytest.raises(BagError, match=r"no nav_msgs/msg/Odometry topic; it holds \['geometry_msgs/msg/Twist'\]"):
+        Recording.open(tmp_path / "drive")
+    with pytest.raises(BagError, match="topic /cmd_vel is geometry_msgs/msg/Twist, expected nav_msgs"):
+        Recording.open(tmp_path / "drive", odometry="/cmd_vel")
+
+
+def test_single_bad_messages_are_left_out_and_said(tmp_path):
+    with BagWriter(tmp_path / "drive") as bag:
+        for i in range(10):
+            at = START + i * 10**8
+            speed = np.nan if i == 4 else 1.0
+            bag.write(
+                "/odom", builders.odometry(at, "odom", "base_link", [i, 0, 0], [0, 0, 0, 1], [speed, 0, 0], [0] * 3), at
+            )
+    recording = Recording.open(tmp_path / "drive")
+    assert len(recording.motion) == 9 and "not finite" in recording.complaints[0]
+
+
+def test_messages_out_of_order_are_sorted_by_their_stamps(tmp_path):
+    with BagWriter(tmp_path / "drive") as bag:
+        for i, k in enumerate([0, 2, 1, 3, 3]):
+            at = START + k * 10**8
+            message = builders.odometry(at, "odom", "base_link", [k, 0, 0], [0, 0, 0, 1], [1, 0, 0], [0] * 3)
+            bag.write("/odom", message, START + i * 10**8)
+    motion = Recording.open(tmp_path / "drive").motion
+    assert motion.positions[:, 0].tolist() == [0, 1, 2, 3] and (np.diff(motion.stamps) > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("image", "info"),
+    [
+        ("/cam/image_raw", "/cam/camera_info"),
+        ("/cam/image_raw/compressed", "/cam/camera_info"),
+        ("image", "camera_info"),
+    ],
+)
+def test_camera_info_lies_beside_its_image(image, info):
+    assert camera_info_topic(image) == info
+
+
+def test_transforms_are_chained_in_both_directions():
+    step = np.eye(4)
+    step[0, 3] = 1.0
+    transforms = {("base_link", "mast"): step, ("mast", "lidar"): step, ("camera", "mast"): step}
+    assert find_transform(transforms, "base_link", "lidar")[0, 3] == 2.0
+    assert find_transform(transforms, "base_link", "camera")[0, 3] == 0.0
+    assert find_transform(transforms, "base_link", "moon") is None
+
+
+def test_a_real_ros_1_bag_of_a_husky_is_read_without_conversion(real_data):
+    recording = Recording.open(real_data / "husky_outdoor" / "husky_odom_imu_gnss.bag")
+    assert recording.topics["odometry"] == "/husky_velocity_controller/odom"
+    length = np.linalg.norm(np.diff(recording.motion.positions, axis=0), axis=1).sum()
+    assert len(recording.motion) == 3952 and 330 < length < 390
+    with BagReader(real_data / "husky_outdoor" / "husky_odom_imu_gnss.bag") as bag:
+        message = next(m for m in bag.messages(["/husky_velocity_controller/odom"]))
+        converted = deserialize_message(message.cdr(), Odometry)
+        assert converted.child_frame_id == message.decode().child_frame_id

@@ -1,0 +1,60 @@
+"""Cameras: pixels and rays belong together, for every lens."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from monoforce_ros.camera import CameraModel
+
+MATRIX = np.array([[300.0, 0, 321.5], [0, 305.0, 238.0], [0, 0, 1]])
+LENSES = {
+    "none": ("plumb_bob", []),
+    "plumb_bob": ("plumb_bob", [-0.22, 0.065, -0.0001, -0.0002, 0.0]),
+    "rational": ("plumb_bob", [0.224, -0.0219, -4e-7, -1e-6, 0.0015, 0.4906, -0.026, 0.0019]),
+    "fisheye": ("equidistant", [0.02, -0.004, 0.001, 0.0]),
+}
+
+
+def camera(lens: str) -> CameraModel:
+    model, coefficients = LENSES[lens]
+    return CameraModel(640, 480, MATRIX, np.array(coefficients), model)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+@given(u=st.floats(0, 639), v=st.floats(0, 479), depth=st.floats(0.3, 50))
+@settings(max_examples=40, deadline=None)
+def test_a_ray_projects_back_to_its_pixel(lens, u, v, depth):
+    model = camera(lens)
+    pixels, inside = model.project(depth * model.rays(np.array([u, v])))
+    assert inside[0]
+    np.testing.assert_allclose(pixels[0], [u, v], atol=0.05)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_points_behind_or_far_beside_the_camera_have_no_pixel(lens):
+    points = np.array([[0, 0, -3.0], [30.0, 0, 1.0], [0, -40.0, 0.9], [0.0, 0.0, 0.0]])
+    pixels, inside = camera(lens).project(points)
+    assert not inside.any() and np.isnan(pixels).all()
+
+
+def test_a_resized_image_keeps_its_rays():
+    model = camera("plumb_bob")
+    half = model.resized(320, 240)
+    np.testing.assert_allclose(half.rays(np.array([100.0, 60.0])), model.rays(np.array([200.5, 120.5])), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"matrix": np.zeros((3, 3))}, "not calibrated"),
+        ({"distortion": np.zeros(3)}, "expected 0, 4, 5, 8, 12 or 14"),
+        ({"distortion_model": "wide"}, "got 'wide'"),
+        ({"width": 0}, "expected at least one pixel"),
+        ({"matrix": np.full((3, 3), np.nan)}, "finite"),
+    ],
+)
+def test_unusable_calibrations_are_named(change, message):
+    fields = {"width": 640, "height": 480, "matrix": MATRIX, "distortion": np.zeros(5)} | change
+    with pytest.raises(ValueError, match=message):
+        CameraModel(**fields)

@@ -1,0 +1,61 @@
+"""Measured motion and commands over time; the frame that predictions are made in."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from monoforce_ros.motion import CommandTrack, MotionState, MotionTrack, StaleDataError, transform_points
+
+SECOND = 10**9
+
+
+def track(times, headings=None) -> MotionTrack:
+    times = np.asarray(times, float)
+    headings = np.zeros(len(times)) if headings is None else np.asarray(headings)
+    return MotionTrack(
+        stamps=(times * SECOND).astype(np.int64),
+        positions=np.stack([times, 0 * times, 0 * times], axis=1),
+        quaternions=Rotation.from_euler("z", headings[:, None]).as_quat(),
+        linear_velocities=np.tile([1.0, 0, 0], (len(times), 1)),
+        angular_velocities=np.zeros((len(times), 3)),
+    )
+
+
+def test_motion_is_interpolated_also_across_half_a_turn():
+    state = track([0, 1], [np.radians(170), np.radians(-170)]).at(SECOND // 2, maximum_gap=1.0)
+    assert state.position[0] == pytest.approx(0.5)
+    assert abs(state.heading) == pytest.approx(np.pi)
+
+
+@pytest.mark.parametrize("seconds", [-1.0, 12.0, 5.0])
+def test_no_motion_is_invented_far_from_a_measurement(seconds):
+    with pytest.raises(StaleDataError, match="nearest odometry is"):
+        track([0, 1, 9, 10]).at(int(seconds * SECOND), maximum_gap=0.5)
+
+
+def test_close_to_one_side_of_a_gap_that_side_is_held():
+    assert track([0, 1, 9, 10]).at(int(1.2 * SECOND)).position[0] == 1.0
+    assert track([0, 1, 9, 10]).at(int(8.9 * SECOND)).position[0] == 9.0
+
+
+def test_an_empty_track_says_so():
+    with pytest.raises(StaleDataError, match="no odometry"):
+        track([]).at(0)
+
+
+def test_commands_hold_until_the_next_and_expire():
+    commands = CommandTrack(np.array([1, 2]) * SECOND, np.array([[0.5, 0.1], [1.0, 0.0]]))
+    at = (np.array([0.5, 1.0, 1.9, 2.0, 2.4, 2.6]) * SECOND).astype(np.int64)
+    assert commands.sample(at, timeout=0.5)[:, 0].tolist() == [0.0, 0.5, 0.0, 1.0, 1.0, 0.0]
+    assert commands.sample(at)[:, 0].tolist() == [0.0, 0.5, 0.5, 1.0, 1.0, 1.0]
+
+
+def test_the_terrain_frame_is_level_at_the_robot_and_along_its_heading():
+    rotation = Rotation.from_euler("xyz", [0.2, -0.3, 1.1]).as_matrix()
+    state = MotionState(0, np.array([3.0, -2.0, 1.0]), rotation, np.zeros(3), np.zeros(3))
+    transform = state.odometry_from_terrain
+    np.testing.assert_allclose(transform[:3, 2], [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(transform_points(transform, np.zeros(3)), [3, -2, 1])
+    forward = state.terrain_from_base[:3, 0]
+    assert forward[1] == pytest.approx(0, abs=1e-12) and forward[0] > 0
+    np.testing.assert_allclose(state.terrain_from_base[:3, 3], 0, atol=1e-12)

@@ -1,0 +1,109 @@
+"""Robot files: what they become, and what is said of those that are wrong."""
+
+import math
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from monoforce_ros.robots import RobotFileError, load_robot, robot_file, shipped_robots
+from monoforce_ros.robots.belt import belt_outline
+
+
+@pytest.mark.parametrize("name", shipped_robots())
+def test_shipped_robots_are_consistent(name):
+    robot = load_robot(name)
+    assert robot.name == name
+    driven = robot.point_drives >= 0
+    norms = robot.point_tangents.norm(dim=1)
+    np.testing.assert_allclose(norms[driven].numpy(), 1.0, atol=1e-6)
+    np.testing.assert_allclose(norms[~driven].numpy(), 0.0)
+    assert float(robot.inertia.det()) > 0 and 0 < robot.ground_clearance < 1
+    # The lowest points move backwards relative to a body that drives forward.
+    lowest = robot.points[:, 2] < robot.points[driven][:, 2].min() + 0.005
+    assert bool((robot.point_tangents[lowest & driven][:, 0] < -0.9).all())
+
+
+def test_area_does_not_depend_on_sampling():
+    areas = []
+    for spacing in (0.1, 0.05, 0.02):
+        robot = load_robot("husky", spacing=spacing)
+        areas.append(float(robot.point_areas[robot.point_drives >= 0].sum()))
+    wheel = 2 * math.pi * 0.1651 * 0.1143
+    np.testing.assert_allclose(areas, 4 * wheel, rtol=1e-5)
+
+
+def test_inertia_does_not_depend_on_sampling():
+    first, second = (load_robot("husky", spacing=s).inertia for s in (0.1, 0.02))
+    np.testing.assert_array_equal(first.numpy(), second.numpy())
+
+
+@given(st.floats(0.05, 3.0), st.floats(0.02, 0.5), st.floats(0.02, 0.5), st.sampled_from([0.02, 0.05]))
+@settings(max_examples=40, deadline=None)
+def test_belts_are_closed_and_run_backwards_at_the_bottom(length, rear, front, spacing):
+    if abs(rear - front) >= 0.95 * length:
+        return
+    positions, tangents, lengths = belt_outline(length, rear, front, spacing)
+    np.testing.assert_allclose(np.linalg.norm(tangents, axis=1), 1.0, atol=1e-9)
+    # Walking along the belt leads back to where it began.
+    np.testing.assert_allclose((tangents * lengths[:, None]).sum(axis=0), 0.0, atol=0.03 * lengths.sum())
+    assert tangents[np.argmin(positions[:, 1]), 0] < -0.7
+    tilt = math.asin((rear - front) / length)
+    circumference = front * (math.pi - 2 * tilt) + rear * (math.pi + 2 * tilt) + 2 * length * math.cos(tilt)
+    assert lengths.sum() == pytest.approx(circumference, rel=1e-9)
+
+
+def test_a_twist_becomes_drive_speeds():
+    import torch
+
+    robot = load_robot("husky")
+    left, right = robot.drive_names.index("left"), robot.drive_names.index("right")
+    speeds = robot.drive_speeds(torch.tensor([0.5, 1.0]))
+    assert float(speeds[left]) == pytest.approx(0.5 - 0.2854) and float(speeds[right]) == pytest.approx(0.5 + 0.2854)
+    assert float(robot.drive_speeds(torch.tensor([9.0, 0.0])).max()) == robot.maximum_speed
+
+
+CHANGES = [
+    (lambda c: c.update(wieght=3), r"the file: got 'wieght', expected one of the keys"),
+    (lambda c: c.update(mass="50 kg"), r"mass: got '50 kg', expected a number from 0.1 to 100000 kg"),
+    (lambda c: c.update(mass=-1), r"mass: got -1"),
+    (lambda c: c.pop("command"), r"the key 'command', which is missing"),
+    (lambda c: c["wheels"][0].update(radius=165.1), r"wheels\[0\].radius: got 165.1, expected a number .* m"),
+    (lambda c: c["wheels"][1].pop("drive"), r"wheels\[1\].*'drive', which is missing"),
+    (lambda c: c.update(wheels=[]), r"at least one driven wheel"),
+    (lambda c: c.update(inertia=[1, 1, 1, 0, 0, 0]), r"either inertia or inertia_box"),
+    (lambda c: (c.pop("inertia_box"), c.update(inertia=[1, 1, 9, 0, 0, 0])), r"principal moments"),
+    (lambda c: c.update(centre_of_mass=[0, 0]), r"a list of 3 numbers"),
+    (lambda c: c["sensors"]["lidar"].update(quaternion=[0, 0, 0, 1]), r"either rotation .* or quaternion"),
+    (lambda c: c.update(sensors={"lidar": {"translation": [0, 0, 0], "quaternion": [0, 0, 0, 0]}}), r"unit quaternion"),
+    (lambda c: c.update(mass=float("nan")), r"mass: got nan"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), CHANGES)
+def test_wrong_files_are_named_with_file_and_field(tmp_path, change, message):
+    content = yaml.safe_load(robot_file("husky").read_text())
+    change(content)
+    file = tmp_path / "robot.yaml"
+    file.write_text(yaml.safe_dump(content))
+    with pytest.raises(RobotFileError, match=message) as caught:
+        load_robot(file)
+    assert str(file) in str(caught.value)
+
+
+def test_unknown_names_list_what_there_is():
+    with pytest.raises(RobotFileError, match=r"no robot named 'huskey'.*husky"):
+        load_robot("huskey")
+    with pytest.raises(RobotFileError, match="does not exist"):
+        load_robot("nowhere/robot.yaml")
+
+
+@given(st.text(max_size=80))
+@settings(max_examples=60, deadline=None)
+def test_any_text_as_a_robot_file_is_refused_in_one_sentence(tmp_path_factory, text):
+    file = tmp_path_factory.mktemp("robots") / "robot.yaml"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(RobotFileError):
+        load_robot(file)
