@@ -121,7 +121,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("out/demo"), help="folder for what it makes")
     parser.add_argument("--bag", type=Path, default=share_directory() / "bags" / "demo", help="bag to play")
     parser.add_argument("--robot", default="husky", help="robot name or file")
-    parser.add_argument("--moment", type=float, default=2.4, help="time in the bag to draw [s]")
+    parser.add_argument("--moment", type=float, default=1.2, help="time in the bag to draw [s]")
     options = parser.parse_args()
     began = time.monotonic()
     # A domain of its own keeps the demo apart from robots and other runs on the network.

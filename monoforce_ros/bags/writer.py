@@ -9,7 +9,7 @@ from types import TracebackType
 from typing import Any
 
 from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from monoforce_ros.bags.types import type_store
 
@@ -52,6 +52,9 @@ class BagWriter:
             raise FileExistsError(f"{self.path} exists already: remove it, choose another name or allow overwriting")
         self._unfinished = self.path.with_name(f".{self.path.name}.unfinished-{os.getpid()}")
         self._writer = Writer(self._unfinished, version=9, storage_plugin=_STORAGES[storage])
+        if storage == "mcap":
+            # Chunks are compressed inside the file, as ros2 bag's own mcap presets do.
+            self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
         self._types = type_store()
         self._connections: dict[str, Connection] = {}
 

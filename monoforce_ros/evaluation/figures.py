@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LightSource
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
+from matplotlib.patheffects import withStroke
 
 from monoforce_ros.camera import CameraModel
 from monoforce_ros.evaluation.drive import CONSTANT_VELOCITY, FLAT_PHYSICS, PHYSICS, DriveEvaluation
@@ -19,7 +20,8 @@ from monoforce_ros.motion import transform_points
 from monoforce_ros.robots import RobotModel
 
 COLOURS = {PHYSICS: "#0b84a5", FLAT_PHYSICS: "#9b59b6", CONSTANT_VELOCITY: "#e08214", "measured": "#1a1a1a"}
-_PATH = "#00b8d9"
+_PATH = "#ffb020"
+_FORCE = "#e8285a"
 
 matplotlib.rcParams.update(
     {
@@ -59,12 +61,9 @@ def prediction_figure(
         measured: where the robot went, ``[n, 3]`` in the odometry frame [m].
         title: a line above the figure.
     """
-    height = view.terrain.height.numpy()
-    low, high = np.percentile(height, [2, 99])
-    span = max(high - low, 0.4)
-    colour_range = float(low - 0.1 * span), float(low + span)
-    figure = Figure(figsize=(16 if picture else 8.4, 7.2), layout="constrained", dpi=110)
-    axes = figure.subplots(1, 2 if picture else 1, width_ratios=[1.12, 1] if picture else None, squeeze=False)[0]
+    colour_range = _colour_range(view)
+    figure = Figure(figsize=(15.5 if picture else 8.0, 6.4), layout="constrained", dpi=110)
+    axes = figure.subplots(1, 2 if picture else 1, width_ratios=[1.18, 1] if picture else None, squeeze=False)[0]
     if picture:
         drawn = draw_prediction(
             picture.image,
@@ -83,6 +82,16 @@ def prediction_figure(
     return figure
 
 
+def _colour_range(view: PredictionView) -> tuple[float, float]:
+    """Heights for the ends of the colour scale: what lies around the path fills it, trees may exceed it."""
+    x, y = np.meshgrid(view.terrain.grid.x, view.terrain.grid.y)
+    offsets = np.stack([x, y], axis=-1)[None] - view.positions[:: max(1, len(view.positions) // 10), None, None, :2]
+    near = np.linalg.norm(offsets, axis=-1).min(axis=0) < 3.0
+    low, high = np.percentile(view.terrain.height.numpy()[near], [1, 97])
+    middle, half = (low + high) / 2, max((high - low) / 2, 0.25)
+    return float(middle - 1.1 * half), float(middle + 1.1 * half)
+
+
 def _draw_map(
     axes: Axes,
     view: PredictionView,
@@ -93,21 +102,23 @@ def _draw_map(
     terrain = view.terrain
     height = terrain.height.double().numpy()
     colours = matplotlib.colormaps[SURFACE_COLOURS]
-    scaled = 0.25 + 0.7 * np.clip((height - colour_range[0]) / (colour_range[1] - colour_range[0]), 0, 1)
+    scaled = np.clip((height - colour_range[0]) / (colour_range[1] - colour_range[0]), 0, 1)
     shaded = LightSource(azdeg=315, altdeg=50).shade_rgb(
         colours(scaled)[..., :3], height, blend_mode="soft", dx=terrain.grid.resolution, dy=terrain.grid.resolution
     )
-    # What no sensor saw is paler.
+    # What no sensor saw is greyer.
     seen = terrain.observed.numpy()[..., None]
-    shaded = np.where(seen, shaded, 0.55 * shaded + 0.45 * shaded.mean(axis=2, keepdims=True) * 0.5 + 0.2)
+    shaded = np.where(seen, shaded, 0.6 * shaded + 0.4 * shaded.mean(axis=2, keepdims=True))
     axes.imshow(np.clip(shaded, 0, 1), origin="lower", extent=terrain.grid.extent, interpolation="nearest")
     axes.contour(terrain.grid.x, terrain.grid.y, height, levels=12, colors="k", linewidths=0.4, alpha=0.35)
     to_terrain = np.linalg.inv(view.motion.odometry_from_terrain)
     if measured is not None and len(measured):
         track = transform_points(to_terrain, measured)
-        axes.plot(track[:, 0], track[:, 1], color="white", linewidth=4.5, alpha=0.85)
-        axes.plot(track[:, 0], track[:, 1], color="black", linewidth=1.8, linestyle=(0, (4, 2)), label="measured")
-    axes.plot(view.positions[:, 0], view.positions[:, 1], color=_PATH, linewidth=3.0, label="predicted")
+        axes.plot(track[:, 0], track[:, 1], color="white", linewidth=3.2, zorder=6.5)
+        axes.plot(
+            track[:, 0], track[:, 1], color="black", linewidth=1.8, linestyle=(0, (4, 2)), label="measured", zorder=7
+        )
+    axes.plot(view.positions[:, 0], view.positions[:, 1], color=_PATH, linewidth=3.5, label="predicted", zorder=6)
     for second in range(int(view.times[-1] + 1e-6) + 1):
         index = int(np.argmin(np.abs(view.times - second)))
         _draw_robot(axes, robot, view.positions[index], view.rotations[index], filled=second == 0)
@@ -119,6 +130,9 @@ def _draw_map(
                 textcoords="offset points",
                 fontsize=9,
                 fontweight="bold",
+                color="white",
+                path_effects=[withStroke(linewidth=2.5, foreground="black")],
+                zorder=8,
             )
     _draw_forces(axes, view)
     axes.set(xlabel="forward x [m]", ylabel="left y [m]", aspect="equal")
@@ -126,12 +140,8 @@ def _draw_map(
     axes.set_ylim(terrain.grid.extent[2:])
     axes.set_title("from above: height, robot each second, ground forces")
     axes.legend(loc="upper left", framealpha=0.9)
-    scale = matplotlib.cm.ScalarMappable(matplotlib.colors.Normalize(*colour_range), _upper_part(colours))
+    scale = matplotlib.cm.ScalarMappable(matplotlib.colors.Normalize(*colour_range), colours)
     axes.figure.colorbar(scale, ax=axes, label="height over the robot's base [m]", shrink=0.8, pad=0.01)
-
-
-def _upper_part(colours: matplotlib.colors.Colormap) -> matplotlib.colors.Colormap:
-    return matplotlib.colors.ListedColormap(colours(np.linspace(0.25, 0.95, 256)))
 
 
 def _draw_robot(axes: Axes, robot: RobotModel, position: np.ndarray, rotation: np.ndarray, *, filled: bool) -> None:
@@ -139,17 +149,23 @@ def _draw_robot(axes: Axes, robot: RobotModel, position: np.ndarray, rotation: n
     corners = np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]])
     outline = position[:2] + corners @ rotation[:2, :2].T
     axes.add_patch(
-        Polygon(outline, closed=True, fill=filled, facecolor=(1, 1, 1, 0.75), edgecolor="black", linewidth=1.2)
+        Polygon(outline, closed=True, fill=filled, facecolor=(1, 1, 1, 0.75), edgecolor="white", linewidth=1.4)
     )
     nose = position[:2] + rotation[:2, :2] @ np.array([high[0], 0.0])
-    axes.plot(*np.stack([position[:2], nose]).T, color="black", linewidth=1.2)
+    axes.plot(*np.stack([position[:2], nose]).T, color="white", linewidth=1.4)
 
 
 def _draw_forces(axes: Axes, view: PredictionView) -> None:
     """Points that carry load, sized by it, and the horizontal part of the forces as arrows."""
     load = np.linalg.norm(view.contact_forces, axis=1)
     axes.scatter(
-        *view.contact_points[:, :2].T, s=260 * load, color="#d7263d", alpha=0.55, linewidths=0, zorder=4, label="load"
+        *view.contact_points[:, :2].T,
+        s=260 * load,
+        color=_FORCE,
+        alpha=0.55,
+        linewidths=0,
+        zorder=4,
+        label="load on the ground",
     )
     axes.quiver(
         *view.contact_points[:, :2].T,
@@ -157,7 +173,7 @@ def _draw_forces(axes: Axes, view: PredictionView) -> None:
         angles="xy",
         scale_units="xy",
         scale=1.0,
-        color="#d7263d",
+        color=_FORCE,
         width=0.003,
         zorder=5,
     )

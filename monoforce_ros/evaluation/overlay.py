@@ -12,9 +12,9 @@ from monoforce_ros.motion import transform_points
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import TerrainMap
 
-SURFACE_COLOURS = "terrain"
-PATH_COLOUR = (40, 220, 255)
-FORCE_COLOUR = (255, 70, 60)
+SURFACE_COLOURS = "viridis"
+PATH_COLOUR = (255, 176, 32)
+FORCE_COLOUR = (232, 40, 90)
 _NEAREST = 0.35
 """Cells closer to the camera than this are not drawn [m]."""
 
@@ -88,7 +88,7 @@ def _draw_surface(
     mean_height = np.mean([z[c] for c in corners], axis=0)
     seen = np.mean([terrain.observed.numpy()[c] for c in corners], axis=0) >= 0.5
     low, high = colour_range
-    colours = colormaps[SURFACE_COLOURS](0.25 + 0.7 * np.clip((mean_height - low) / (high - low), 0, 1))[..., :3]
+    colours = colormaps[SURFACE_COLOURS](np.clip((mean_height - low) / (high - low), 0, 1))[..., :3]
     # Shading by the slope towards the light shows shape where colour alone is flat.
     slope_y, slope_x = np.gradient(z, terrain.grid.resolution)
     light = (1.0 - 0.6 * slope_x - 0.4 * slope_y)[:-1, :-1] / np.sqrt(1 + slope_x**2 + slope_y**2)[:-1, :-1]
@@ -148,7 +148,7 @@ def _draw_path(
 def _draw_forces(
     canvas: np.ndarray, camera: CameraModel, camera_from_terrain: np.ndarray, view: PredictionView
 ) -> np.ndarray:
-    tips = view.contact_points + 1.5 * view.contact_forces
+    tips = view.contact_points + view.contact_forces
     lower, lower_ok = _project(camera, transform_points(camera_from_terrain, view.contact_points))
     upper, upper_ok = _project(camera, transform_points(camera_from_terrain, tips))
     for start, end in zip(lower[lower_ok & upper_ok], upper[lower_ok & upper_ok], strict=True):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,6 +10,7 @@ from typing import Any
 
 import yaml
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.node import Node
 
 
@@ -45,7 +47,7 @@ def declare_parameters(node: Node, entries: list[ParameterEntry]) -> SimpleNames
     """Declare the entries on a node and return their values.
 
     Raises:
-        ValueError: a value is outside its choices (ranges are checked by rclpy when declaring).
+        ValueError: a value is of the wrong type or outside its range or choices.
     """
     values = SimpleNamespace()
     for entry in entries:
@@ -58,8 +60,26 @@ def declare_parameters(node: Node, entries: list[ParameterEntry]) -> SimpleNames
             descriptor.floating_point_range = [
                 FloatingPointRange(from_value=entry.minimum, to_value=entry.maximum, step=0.0)
             ]
-        value = node.declare_parameter(entry.name, entry.default, descriptor).value
+        try:
+            value = node.declare_parameter(entry.name, entry.default, descriptor).value
+        except (InvalidParameterTypeException, InvalidParameterValueException) as error:
+            expected = f"{entry.type} {entry.range_text}".strip()
+            raise ValueError(f"parameter {entry.name}: {error}; expected {expected} {entry.unit}".rstrip()) from error
         if entry.choices and value not in entry.choices:
             raise ValueError(f"parameter {entry.name}: got {value!r}, expected one of {list(entry.choices)}")
         setattr(values, entry.name, value)
     return values
+
+
+def parameter_help(executable: str, entries: list[ParameterEntry]) -> str:
+    """Text for ``--help``: how to start a node and every parameter it takes."""
+    lines = [
+        f"usage: {executable} [--ros-args -p NAME:=VALUE ... --params-file FILE -r OLD:=NEW ...]",
+        "",
+        "parameters:",
+    ]
+    for entry in entries:
+        limits = f" ({entry.range_text}{f' {entry.unit}' if entry.unit else ''})" if entry.range_text else ""
+        lines.append(f"  {entry.name}:={entry.default}{limits}")
+        lines += textwrap.wrap(entry.description, 100, initial_indent="      ", subsequent_indent="      ")
+    return "\n".join(lines)

@@ -10,7 +10,7 @@ import torch
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import GridCells, Odometry, Path
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from visualization_msgs.msg import MarkerArray
 
@@ -23,7 +23,7 @@ from monoforce_ros.motion import NANOSECOND, transform_points
 from monoforce_ros.nodes.frames import SensorFrames
 from monoforce_ros.nodes.health import ERROR, OK, STALE, WARN, Health
 from monoforce_ros.nodes.inputs import Inputs, Received
-from monoforce_ros.nodes.parameters import declare_parameters, read_parameter_file
+from monoforce_ros.nodes.parameters import declare_parameters, parameter_help, read_parameter_file
 from monoforce_ros.nodes.process import run_node
 from monoforce_ros.nodes.subscriptions import AdaptiveSubscription
 from monoforce_ros.physics import PhysicsOptions
@@ -32,13 +32,15 @@ from monoforce_ros.robots import load_robot
 from monoforce_ros.shared_files import share_directory
 from monoforce_ros.terrain import Grid, TerrainDefaults
 
+PARAMETER_FILE = share_directory() / "config" / "predictor.yaml"
+
 
 class PredictorNode(Node):
     """Predicts from the newest data, in a thread of its own, so that callbacks never wait for physics."""
 
     def __init__(self):
         super().__init__("predictor")
-        self.settings = declare_parameters(self, read_parameter_file(share_directory() / "config" / "predictor.yaml"))
+        self.settings = declare_parameters(self, read_parameter_file(PARAMETER_FILE))
         settings = self.settings
         # One thread: on a small computer PyTorch's pool costs more than it brings at these sizes.
         torch.set_num_threads(1)
@@ -110,20 +112,19 @@ class PredictorNode(Node):
 
     def _subscribe(self) -> None:
         settings = self.settings
-        reliable = ReliabilityPolicy.RELIABLE if settings.image_qos == "reliable" else ReliabilityPolicy.BEST_EFFORT
-        # A short queue: the newest is what counts, and the executor empties it quickly.
-        large = QoSProfile(depth=2, reliability=reliable, durability=DurabilityPolicy.VOLATILE)
-        small = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE)
+        # Of sensor data only the newest counts; motion and commands are all wanted.
+        large = {"depth": 2, "reliability": settings.image_qos}
+        small = {"depth": 50}
         self._subscriptions_by_part = {
             "odometry": AdaptiveSubscription(
-                self, settings.odometry_topic, {"nav_msgs/msg/Odometry": Odometry}, self._on_odometry, small
+                self, settings.odometry_topic, {"nav_msgs/msg/Odometry": Odometry}, self._on_odometry, **small
             ),
             "commands": AdaptiveSubscription(
                 self,
                 settings.command_topic,
                 {"geometry_msgs/msg/TwistStamped": TwistStamped, "geometry_msgs/msg/Twist": Twist},
                 self._on_command,
-                small,
+                **small,
             ),
         }
         images = {"sensor_msgs/msg/CompressedImage": CompressedImage, "sensor_msgs/msg/Image": Image}
@@ -131,7 +132,7 @@ class PredictorNode(Node):
         for index, (part, topic) in enumerate(self.sensor_topics.items()):
             types = {"sensor_msgs/msg/PointCloud2": PointCloud2} if part == "lidar" else images
             self._subscriptions_by_part[part] = AdaptiveSubscription(
-                self, topic, types, lambda message, part=part: self._on_sensor(part, message), large
+                self, topic, types, lambda message, part=part: self._on_sensor(part, message), **large
             )
             if part != "lidar":
                 info = info_topics[index] or camera_info_topic(topic)
@@ -140,7 +141,7 @@ class PredictorNode(Node):
                     info,
                     {"sensor_msgs/msg/CameraInfo": CameraInfo},
                     lambda message, part=part: self._on_camera_info(part, message),
-                    small,
+                    **small,
                 )
 
     # Callbacks: decode what is small, keep what is large, never raise.
@@ -343,7 +344,11 @@ class PredictorNode(Node):
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the predictor node; see ``--ros-args -p`` and config/predictor.yaml for its parameters."""
+    """Run the predictor node; ``--help`` lists its parameters, which config/predictor.yaml defines."""
+    given = sys.argv[1:] if arguments is None else arguments
+    if {"-h", "--help"} & set(given):
+        print(parameter_help("predictor", read_parameter_file(PARAMETER_FILE)))
+        return 0
     return run_node(PredictorNode, arguments)
 
 

@@ -1,0 +1,80 @@
+"""Labels: what the world truly is, for tests; kept beside a bag and never in it."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from pathlib import Path
+
+import numpy as np
+
+from monoforce_ros.synthetic.scenery import Scenery
+from monoforce_ros.synthetic.shapes import upper_surface
+
+_GRASS_FROM = 0.05
+
+
+class GroundClass(IntEnum):
+    """What a cell of the class map is."""
+
+    GROUND = 0
+    RAMP = 1
+    ROCK = 2
+    TREE = 3
+    GRASS = 4
+
+
+def world_labels(scenery: Scenery, odom_origin: np.ndarray) -> dict[str, np.ndarray]:
+    """Grids of the whole world in the odom frame, indexed ``[row = y, column = x]``.
+
+    Args:
+        scenery: the world.
+        odom_origin: ``[3]`` position of the odom frame's origin in the world [m].
+
+    Returns:
+        ``support_height``: of what bears a wheel, that is ground and rocks [m], float32;
+        ``visible_height``: with the grass on top [m], float32; crowns of trees hang above both and are in neither;
+        ``ground_class``: a ``GroundClass`` for each cell, uint8;
+        ``resolution`` [m], ``origin`` ``[2]`` position of cell (0, 0) [m], and ``class_names``.
+    """
+    ground = scenery.ground
+    x, y = ground.grid()
+    support = ground.heights.copy()
+    classes = np.zeros(support.shape, np.uint8)
+    if scenery.ramp is not None:
+        classes[scenery.ramp.height_at(x, y) > 0.01] = GroundClass.RAMP
+    classes[scenery.grass.canopy.heights > _GRASS_FROM] = GroundClass.GRASS
+    positions = np.stack([x, y], axis=-1)
+    for rock in scenery.rocks:
+        low = np.floor((rock.vertices[:, :2].min(axis=0) - ground.origin) / ground.resolution).astype(int)
+        high = np.ceil((rock.vertices[:, :2].max(axis=0) - ground.origin) / ground.resolution).astype(int) + 1
+        window = np.s_[low[1] : high[1], low[0] : high[0]]
+        top = upper_surface(rock.vertices, positions[window].reshape(-1, 2)).reshape(support[window].shape)
+        higher = np.nan_to_num(top, nan=-np.inf) > support[window]
+        support[window][higher] = top[higher]
+        classes[window][higher] = GroundClass.ROCK
+    for tree in scenery.trees:
+        classes[np.hypot(x - tree.base[0], y - tree.base[1]) < tree.trunk_radius + ground.resolution] = GroundClass.TREE
+    visible = np.maximum(support, ground.heights + scenery.grass.canopy.heights)
+    return {
+        "support_height": (support - odom_origin[2]).astype(np.float32),
+        "visible_height": (visible - odom_origin[2]).astype(np.float32),
+        "ground_class": classes,
+        "resolution": np.array(ground.resolution),
+        "origin": ground.origin - odom_origin[:2],
+        "class_names": np.array([entry.name.lower() for entry in GroundClass]),
+    }
+
+
+def labels_file(bag: Path) -> Path:
+    """Where a bag's labels lie: beside it."""
+    return bag.with_name(f"{bag.name}.labels.npz")
+
+
+def write_labels(bag: Path, labels: dict[str, np.ndarray]) -> Path:
+    """Write labels beside a bag; returns their file, which appears only when it is complete."""
+    target = labels_file(bag)
+    unfinished = target.with_name(f".{target.name}.unfinished")
+    with unfinished.open("wb") as file:
+        np.savez_compressed(file, **labels)
+    unfinished.replace(target)
+    return target

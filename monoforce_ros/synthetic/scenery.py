@@ -1,0 +1,136 @@
+"""Scenery: where rocks, trees and grass stand, and which shapes they have."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from monoforce_ros.synthetic import shapes
+from monoforce_ros.synthetic.random_streams import random_stream
+from monoforce_ros.synthetic.route import Route
+from monoforce_ros.synthetic.terrain_shape import HeightField, Ramp, TerrainSettings, build_ground
+from monoforce_ros.synthetic.vegetation import Grass, GrassPatch
+
+RAMP_STATION = 11.4
+# Along the route [m], to its left [m], radius along the route and across it [m].
+_GRASS_PATCHES = (
+    (4.9, 0.1, 1.5, 1.9),
+    (7.6, -3.6, 1.3, 1.0),
+    (17.5, 0.2, 1.6, 1.8),
+    (24.5, 2.4, 1.2, 1.4),
+    (31.0, -0.2, 1.7, 1.7),
+    (41.5, 0.3, 1.4, 1.9),
+)
+_BOULDERS, _STONES, _TREES, _RIM_TREES = 26, 46, 30, 26
+
+
+@dataclass(frozen=True)
+class Tree:
+    """A tree that stands at ``base`` ``[3]`` [m] (world); ``foliage`` is ``broad`` or ``conifer``."""
+
+    foliage: str
+    base: np.ndarray
+    trunk_radius: float
+    stem: shapes.Shape
+    crown: shapes.Shape
+
+
+@dataclass(frozen=True)
+class Scenery:
+    """Everything in a world but the robot; positions in world coordinates [m]."""
+
+    ground: HeightField
+    route: Route
+    ramp: Ramp | None
+    rocks: tuple[shapes.Shape, ...]
+    trees: tuple[Tree, ...]
+    grass: Grass
+
+
+def build_scenery(settings: TerrainSettings, seed: int) -> Scenery:
+    """Lay out a world: each kind of thing has its own random stream."""
+    route = Route(random_stream(seed, "route"))
+    if settings.flat:
+        ground = build_ground(settings, route, None, random_stream(seed, "ground"))
+        return Scenery(ground, route, None, (), (), Grass.grow((), ground, random_stream(seed, "grass")))
+    ramp = Ramp(*route.at(RAMP_STATION))
+    ground = build_ground(settings, route, ramp, random_stream(seed, "ground"))
+    patches = []
+    for station, lateral, along, across in _GRASS_PATCHES:
+        centre, heading = route.at(station, lateral)
+        patches.append(GrassPatch(centre, heading, along, across))
+    grass = Grass.grow(tuple(patches), ground, random_stream(seed, "grass"))
+    rocks = _place_rocks(ground, route, ramp, grass, random_stream(seed, "rocks"))
+    trees = _place_trees(ground, route, ramp, grass, random_stream(seed, "tree places"), random_stream(seed, "foliage"))
+    return Scenery(ground, route, ramp, rocks, trees, grass)
+
+
+def _place_rocks(
+    ground: HeightField, route: Route, ramp: Ramp, grass: Grass, random: np.random.Generator
+) -> tuple[shapes.Shape, ...]:
+    rocks = []
+    while len(rocks) < _BOULDERS + _STONES:
+        is_boulder = len(rocks) < _BOULDERS
+        # Boulders line the route, small stones lie on it.
+        width = random.uniform(0.45, 1.15) if is_boulder else random.uniform(0.14, 0.32)
+        lateral = random.choice([-1, 1]) * random.uniform(1.5, 5.0) if is_boulder else random.uniform(-1.3, 1.3)
+        centre, _ = route.at(random.uniform(0.0, route.length), lateral)
+        size = width * np.array([1.0, random.uniform(0.65, 1.0), random.uniform(0.55, 0.85)])
+        # A stone under the belly must be lower than the robot's clearance.
+        protrusion = size[2] * 0.62 if is_boulder else min(0.5 * size[2], random.uniform(0.03, 0.085))
+        clearance = 1.0 + width / 2 if is_boulder else 0.0
+        blocked = (
+            route.distance(centre) < clearance
+            or np.linalg.norm(centre) < 1.6 + width / 2
+            or ramp.height_at(*(centre + np.zeros((1, 2))).T).max() > 0.0
+            or grass.height_at(centre) > 0.05
+        )
+        if blocked:
+            continue
+        height = float(ground.height_at(centre)) + protrusion - size[2] / 2
+        rocks.append(shapes.rock(size, random).moved(np.array([*centre, height])))
+    return tuple(rocks)
+
+
+def _place_trees(
+    ground: HeightField,
+    route: Route,
+    ramp: Ramp,
+    grass: Grass,
+    random: np.random.Generator,
+    foliage: np.random.Generator,
+) -> tuple[Tree, ...]:
+    trees: list[Tree] = []
+    taken = np.empty((0, 2))
+    attempts = 0
+    while len(trees) < _TREES + _RIM_TREES and attempts < 5000:
+        attempts += 1
+        reach = ground.half_size - 1.0
+        offset = random.uniform(-reach, reach, 2)
+        on_rim = len(trees) >= _TREES
+        if on_rim != bool(np.abs(offset).max() > reach - 4.0):
+            continue
+        position = ground.centre + offset
+        crowded = len(taken) and np.linalg.norm(taken - position, axis=1).min() < 2.2
+        if crowded or route.distance(position) < 2.3 or grass.height_at(position) > 0.0:
+            continue
+        if np.linalg.norm(position - ramp.centre) < 3.5:
+            continue
+        taken = np.vstack([taken, position])
+        trees.append(_grow_tree(np.array([*position, float(ground.height_at(position))]), foliage))
+    return tuple(trees)
+
+
+def _grow_tree(base: np.ndarray, random: np.random.Generator) -> Tree:
+    height = random.uniform(3.6, 6.5)
+    radius = height * random.uniform(0.022, 0.032)
+    # The stem starts below the ground, so that no slope shows its end.
+    sunk = base - np.array([0.0, 0.0, 0.3])
+    if random.uniform() < 0.5:
+        crown = shapes.conifer_crown(height * random.uniform(0.22, 0.28), 0.86 * height, random)
+        stem = shapes.trunk(radius, 0.8 * height).moved(sunk)
+        return Tree("conifer", base, radius, stem, crown.moved(base + np.array([0.0, 0.0, 0.14 * height])))
+    crown = shapes.broad_crown(height * random.uniform(0.26, 0.36), 0.62 * height, random)
+    stem = shapes.trunk(radius, 0.75 * height).moved(sunk)
+    return Tree("broad", base, radius, stem, crown.moved(base + np.array([0.0, 0.0, 0.68 * height])))

@@ -1,0 +1,217 @@
+"""Shapes: triangle meshes of rocks, trunks, crowns and blades of grass."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import ConvexHull, Delaunay
+
+_UP = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A triangle mesh with its shading.
+
+    Attributes:
+        vertices: ``[n, 3]`` [m].
+        faces: ``[m, 3]`` vertex indices, counter-clockwise from outside.
+        normals: ``[n, 3]`` unit normals for shading, which need not be those of the faces.
+        texture_coordinates: ``[n, 2]`` in 0..1.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    normals: np.ndarray
+    texture_coordinates: np.ndarray
+
+    def moved(self, offset: np.ndarray) -> Shape:
+        """The same shape, shifted by ``offset`` ``[3]`` [m]."""
+        return Shape(self.vertices + offset, self.faces, self.normals, self.texture_coordinates)
+
+
+EMPTY = Shape(np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros((0, 3)), np.zeros((0, 2)))
+
+
+def merge(shapes: list[Shape]) -> Shape:
+    """One mesh of many: thousands of small meshes draw slowly, one large mesh does not."""
+    starts = np.cumsum([0] + [len(shape.vertices) for shape in shapes[:-1]])
+    return Shape(
+        np.concatenate([shape.vertices for shape in shapes]),
+        np.concatenate([shape.faces + start for shape, start in zip(shapes, starts, strict=True)]),
+        np.concatenate([shape.normals for shape in shapes]),
+        np.concatenate([shape.texture_coordinates for shape in shapes]),
+    )
+
+
+def rock(size: np.ndarray, random: np.random.Generator) -> Shape:
+    """An angular boulder: the convex hull of a sphere that was dented and stretched.
+
+    Args:
+        size: ``[3]`` edge lengths of its bounding box, roughly [m].
+        random: shapes this rock.
+    """
+    directions = _even_directions(70)
+    # A few flat cuts give the facets of broken stone; noise keeps them from being perfect.
+    cuts = _random_directions(7, random)
+    depths = random.uniform(0.62, 0.95, len(cuts))
+    reach = np.max(np.maximum(directions @ cuts.T, 1e-3) / depths, axis=1)
+    points = directions / np.maximum(reach, 1.0)[:, None] * random.uniform(0.94, 1.0, (len(directions), 1))
+    points *= size / np.ptp(points, axis=0)
+    hull = ConvexHull(points)
+    corners = points[hull.simplices]
+    face_normals = hull.equations[:, :3]
+    winding = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    corners[(winding * face_normals).sum(axis=1) < 0] = corners[(winding * face_normals).sum(axis=1) < 0][:, ::-1]
+    vertex_normals = np.repeat(face_normals, 3, axis=0)
+    rounded = corners.reshape(-1, 3) / np.linalg.norm(corners.reshape(-1, 3), axis=1, keepdims=True)
+    normals = _unit(0.75 * vertex_normals + 0.25 * rounded)
+    vertices = corners.reshape(-1, 3)
+    # The texture repeats every metre, seen along the steepest axis of each facet.
+    axis = np.argmax(np.abs(face_normals), axis=1).repeat(3)
+    planes = np.array([[1, 2], [0, 2], [0, 1]])[axis]
+    coordinates = np.take_along_axis(vertices, planes, axis=1) + random.uniform(0, 1, 2)
+    return Shape(vertices, np.arange(len(vertices)).reshape(-1, 3), normals, coordinates)
+
+
+def trunk(radius: float, height: float) -> Shape:
+    """A tapered stem that stands on the origin and is closed at both ends (convex)."""
+    sides = 10
+    angles = np.arange(sides + 1) / sides * 2 * math.pi
+    rim = np.stack([np.cos(angles), np.sin(angles), np.zeros(sides + 1)], axis=1)
+    bottom, top = rim * radius * [1, 1, 0], rim * radius * 0.6 + height * _UP
+    vertices = np.concatenate([bottom, top, [[0, 0, 0]], [height * _UP]])
+    normals = np.concatenate([rim, rim, [-_UP], [_UP]])
+    around = np.arange(sides + 1) / sides
+    coordinates = np.concatenate(
+        [
+            np.stack([around, np.zeros(sides + 1)], axis=1),
+            np.stack([around, np.full(sides + 1, height)], axis=1),
+            [[0.5, 0.0], [0.5, height]],
+        ]
+    )
+    low = np.arange(sides)
+    high = low + sides + 1
+    centres = np.full(sides, 2 * sides + 2)
+    faces = np.concatenate(
+        [
+            np.stack([low, low + 1, high + 1], axis=1),
+            np.stack([low, high + 1, high], axis=1),
+            np.stack([low + 1, low, centres], axis=1),
+            np.stack([high, high + 1, centres + 1], axis=1),
+        ]
+    )
+    return Shape(vertices, faces, normals, coordinates)
+
+
+def broad_crown(radius: float, height: float, random: np.random.Generator) -> Shape:
+    """Foliage in clumps around the origin: single leaves that are shaded as the clump they belong to."""
+    clumps = []
+    size = np.array([radius, radius, height / 2])
+    for direction in _random_directions(9, random):
+        centre = direction * size * random.uniform(0.35, 0.62)
+        clumps.append(_clump(centre, size * random.uniform(0.42, 0.58), 125, 0.125 * radius, random))
+    return merge([*clumps, _clump(np.zeros(3), 0.62 * size, 110, 0.2 * radius, random)])
+
+
+def conifer_crown(radius: float, height: float, random: np.random.Generator) -> Shape:
+    """Foliage in a cone whose base lies at the origin: twigs that hang outwards and down."""
+    count = 850
+    # The lateral area of a cone grows with the distance from its tip.
+    level = 1.0 - np.sqrt(random.uniform(0.0, 1.0, count))
+    angle = random.uniform(0.0, 2 * math.pi, count)
+    tier = 0.82 + 0.18 * (1.0 - (level * 7.0) % 1.0)
+    reach = radius * (1.0 - level) * tier * random.uniform(0.65, 1.0, count) + 0.03
+    outward = np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], axis=1)
+    centres = outward * reach[:, None] + (level * height)[:, None] * _UP
+    hanging = _unit(outward - random.uniform(0.3, 0.9, (count, 1)) * _UP)
+    sideways = np.cross(outward, _UP) + 0.35 * random.standard_normal((count, 3))
+    normals = _unit(outward + 0.55 * _UP + 0.25 * random.standard_normal((count, 3)))
+    length = radius * random.uniform(0.18, 0.30, (count, 1)) * (1.15 - level[:, None])
+    brightness = np.clip(0.25 + 0.6 * reach / radius / np.maximum(1.0 - level, 0.2) - 0.2 * (1 - tier) / 0.18, 0, 1)
+    return _leaves(centres, hanging * length * 1.5, _unit(sideways) * length * 0.7, normals, brightness, random)
+
+
+def blades(
+    roots: np.ndarray, heights: np.ndarray, width: float, lean: np.ndarray, random: np.random.Generator
+) -> Shape:
+    """Blades of grass, each a bent strip of three triangles that ends in a point.
+
+    Args:
+        roots: ``[n, 3]`` where they leave the ground [m].
+        heights: ``[n]`` height of the tips above the roots [m].
+        width: width at the root [m].
+        lean: ``[n, 2]`` horizontal offset of the tip per height [-].
+        random: turns and colours the blades.
+    """
+    count = len(roots)
+    turn = random.uniform(0.0, math.pi, count)
+    across = np.stack([np.cos(turn), np.sin(turn), np.zeros(count)], axis=1)
+    across *= (width / 2 * random.uniform(0.7, 1.3, count))[:, None]
+    bend = np.concatenate([lean, np.zeros((count, 1))], axis=1) * heights[:, None]
+    middle = roots + 0.3 * bend + (0.55 * heights)[:, None] * _UP
+    tip = roots + bend + heights[:, None] * _UP
+    vertices = np.stack([roots - across, roots + across, middle - 0.75 * across, middle + 0.75 * across, tip], axis=1)
+    # Shading of a meadow, not of single strips: normals lean with the blade but mostly point up.
+    normal = _unit(_UP + 0.55 * _unit(random.standard_normal((count, 3))) + 0.8 * bend)
+    tone = np.clip(random.normal(0.5, 0.2, count), 0.01, 0.99)
+    levels = np.array([0.04, 0.04, 0.55, 0.55, 0.97])
+    coordinates = np.stack([np.repeat(tone[:, None], 5, axis=1), np.tile(levels, (count, 1))], axis=-1)
+    strip = np.array([[0, 1, 3], [0, 3, 2], [2, 3, 4]])
+    faces = (strip[None] + 5 * np.arange(count)[:, None, None]).reshape(-1, 3)
+    return Shape(vertices.reshape(-1, 3), faces, np.repeat(normal, 5, axis=0), coordinates.reshape(-1, 2))
+
+
+def upper_surface(vertices: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """Height [m] of a convex body's upper side at horizontal positions ``[n, 2]``; NaN beside the body."""
+    hull = ConvexHull(vertices)
+    upper = hull.equations[hull.equations[:, 2] > 1e-6]
+    planes = -(positions @ upper[:, :2].T + upper[:, 3]) / upper[:, 2]
+    outline = Delaunay(vertices[ConvexHull(vertices[:, :2]).vertices, :2])
+    return np.where(outline.find_simplex(positions) >= 0, planes.min(axis=1), np.nan)
+
+
+def _clump(centre: np.ndarray, size: np.ndarray, count: int, leaf: float, random: np.random.Generator) -> Shape:
+    directions = _random_directions(count, random)
+    centres = centre + directions * size * random.uniform(0.75, 1.0, (count, 1))
+    first = np.cross(directions, random.standard_normal((count, 3)))
+    second = np.cross(directions, first) + 0.4 * random.standard_normal((count, 3))
+    sizes = leaf * random.uniform(0.6, 1.3, (count, 1))
+    normals = _unit(directions + 0.35 * random.standard_normal((count, 3)))
+    brightness = np.clip(0.5 + 0.35 * directions[:, 2] + random.normal(0.0, 0.12, count), 0.0, 1.0)
+    return _leaves(centres, _unit(first) * sizes, _unit(second) * sizes, normals, brightness, random)
+
+
+def _leaves(
+    centres: np.ndarray,
+    first: np.ndarray,
+    second: np.ndarray,
+    normals: np.ndarray,
+    brightness: np.ndarray,
+    random: np.random.Generator,
+) -> Shape:
+    """Rhombic leaves ``[n, 3]`` spanned by two half-diagonals, with a colour from dark to bright in 0..1 ``[n]``."""
+    count = len(centres)
+    vertices = np.stack([centres + first, centres + second, centres - first, centres - second], axis=1)
+    tone = np.clip(random.normal(0.5, 0.2, count), 0.01, 0.99)
+    coordinates = np.repeat(np.stack([tone, 0.05 + 0.9 * brightness], axis=1), 4, axis=0)
+    faces = (np.array([[0, 1, 2], [0, 2, 3]])[None] + 4 * np.arange(count)[:, None, None]).reshape(-1, 3)
+    return Shape(vertices.reshape(-1, 3), faces, np.repeat(normals, 4, axis=0), coordinates)
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def _random_directions(count: int, random: np.random.Generator) -> np.ndarray:
+    return _unit(random.standard_normal((count, 3)))
+
+
+def _even_directions(count: int) -> np.ndarray:
+    """Directions ``[n, 3]`` spread evenly on the sphere (Fibonacci lattice)."""
+    z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
+    angle = np.arange(count) * math.pi * (3.0 - math.sqrt(5.0))
+    radius = np.sqrt(1.0 - z * z)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)

@@ -1,0 +1,216 @@
+"""Vehicle: a robot file as a MuJoCo body with driven wheels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import yaml
+from scipy.spatial.transform import Rotation
+
+from monoforce_ros.robots import RobotFileError, RobotModel, load_robot, robot_file
+from monoforce_ros.synthetic.graphics import mujoco
+
+BODY = "base"
+IMU_SITE = "imu"
+GROUP = 5
+"""Geometry group of the robot, which its own sensors' rays pass through."""
+
+# Tyre and servo as measured to turn like the real robot and not to hop on its diagonals.
+_TYRE_STIFFNESS = 15_000.0
+_TYRE_DAMPING = 700.0
+_SERVO_GAIN = 300.0
+# Inertia of motor and gears as the wheel feels it [kg m²]; without it a standing robot trembles.
+_GEAR_INERTIA = 0.1
+_WHEEL_MASS_FRACTION = 0.03
+_GRAVITY = 9.81
+
+
+@dataclass(frozen=True)
+class Wheel:
+    """A driven wheel; lengths in metres, in the base frame.
+
+    Attributes:
+        side: lateral offset that turns a twist into this wheel's speed [m].
+        centre: ``[3]``.
+    """
+
+    name: str
+    side: float
+    centre: np.ndarray
+    radius: float
+    width: float
+
+    @property
+    def joint(self) -> str:
+        """Name of its joint in the model and in joint states."""
+        return f"{self.name}_wheel"
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """What a robot file says, as numpy arrays in the base frame.
+
+    Attributes:
+        inertia: ``[3, 3]`` about the centre of mass [kg m²].
+        hull: centre ``[3]`` and edge lengths ``[3]`` of each box [m].
+        sensors: ``[4, 4]`` pose of each sensor frame, base ← sensor.
+    """
+
+    name: str
+    base_frame: str
+    mass: float
+    centre_of_mass: np.ndarray
+    inertia: np.ndarray
+    wheels: tuple[Wheel, ...]
+    hull: tuple[tuple[np.ndarray, np.ndarray], ...]
+    sensors: Mapping[str, np.ndarray]
+    maximum_speed: float
+    maximum_yaw_rate: float
+
+    @classmethod
+    def load(cls, name_or_file: str | Path) -> Vehicle:
+        """Read a robot by name or file; it must drive on wheels alone.
+
+        Raises:
+            RobotFileError: the file cannot be used, or has tracks.
+        """
+        robot: RobotModel = load_robot(name_or_file)
+        path = robot_file(name_or_file)
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        if content.get("tracks") or not content.get("wheels"):
+            raise RobotFileError(f"{path}: tracks: synthetic worlds can simulate robots on wheels only")
+        offsets = dict(zip(robot.drive_names, robot.drive_offsets.tolist(), strict=True))
+        wheels = tuple(
+            Wheel(
+                str(wheel["name"]),
+                offsets[str(wheel["drive"])],
+                np.array(wheel["centre"], float),
+                float(wheel["radius"]),
+                float(wheel["width"]),
+            )
+            for wheel in content["wheels"]
+        )
+        hull = tuple((np.array(box["centre"], float), np.array(box["size"], float)) for box in content.get("hull", []))
+        return cls(
+            name=robot.name,
+            base_frame=robot.base_frame,
+            mass=float(robot.mass),
+            centre_of_mass=robot.centre_of_mass.double().numpy(),
+            inertia=robot.inertia.double().numpy(),
+            wheels=wheels,
+            hull=hull,
+            sensors={frame: _rigid(pose.double().numpy()) for frame, pose in robot.sensors.items()},
+            maximum_speed=robot.maximum_speed,
+            maximum_yaw_rate=robot.maximum_yaw_rate,
+        )
+
+    @property
+    def clearance(self) -> float:
+        """Height of the base frame above level ground [m]."""
+        return max(wheel.radius - float(wheel.centre[2]) for wheel in self.wheels)
+
+    def sensor(self, frame: str, option: str) -> np.ndarray:
+        """Pose ``[4, 4]`` of a sensor; raises a ``RobotFileError`` that names the option to do without it."""
+        if frame not in self.sensors:
+            raise RobotFileError(
+                f"robot {self.name}: sensors: got {sorted(self.sensors)}, expected one named {frame!r}; "
+                f"add it to the robot's file or use `{option}`"
+            )
+        return self.sensors[frame]
+
+    def wheel_speeds(self, forward: float, yaw_rate: float) -> np.ndarray:
+        """Wheel speeds ``[wheels]`` [rad/s] of a commanded forward speed [m/s] and yaw rate [rad/s]."""
+        forward = np.clip(forward, -self.maximum_speed, self.maximum_speed)
+        yaw_rate = np.clip(yaw_rate, -self.maximum_yaw_rate, self.maximum_yaw_rate)
+        return np.array([(forward - yaw_rate * wheel.side) / wheel.radius for wheel in self.wheels])
+
+    def add_to(self, spec: mujoco.MjSpec, height: float) -> None:
+        """Add the robot to a world: at the origin, heading along x, its base frame at ``height`` [m]."""
+        base = spec.worldbody.add_body(name=BODY, pos=[0.0, 0.0, height])
+        base.add_freejoint()
+        wheel_mass = _WHEEL_MASS_FRACTION * self.mass
+        self._set_inertia(base, wheel_mass)
+        for centre, size in self.hull:
+            base.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_BOX, pos=centre, size=size / 2, rgba=[0.92, 0.72, 0.10, 1], **_collides()
+            )
+        for wheel in self.wheels:
+            self._add_wheel(spec, base, wheel, wheel_mass)
+        imu = self.sensors.get("imu_link", np.eye(4))
+        base.add_site(name=IMU_SITE, pos=imu[:3, 3], quat=_quaternion_wxyz(imu[:3, :3]), group=GROUP)
+        spec.add_sensor(
+            name="accelerometer",
+            type=mujoco.mjtSensor.mjSENS_ACCELEROMETER,
+            objtype=mujoco.mjtObj.mjOBJ_SITE,
+            objname=IMU_SITE,
+        )
+        spec.add_sensor(
+            name="gyro", type=mujoco.mjtSensor.mjSENS_GYRO, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=IMU_SITE
+        )
+
+    def _set_inertia(self, base: mujoco.MjsBody, wheel_mass: float) -> None:
+        """Give the chassis what the wheels leave over of the robot's mass, centre of mass and inertia."""
+        chassis_mass = self.mass - wheel_mass * len(self.wheels)
+        centres = np.array([wheel.centre for wheel in self.wheels])
+        centre = (self.mass * self.centre_of_mass - wheel_mass * centres.sum(axis=0)) / chassis_mass
+        inertia = self.inertia - _point_inertia(chassis_mass, centre - self.centre_of_mass)
+        for wheel in self.wheels:
+            inertia -= _point_inertia(wheel_mass, wheel.centre - self.centre_of_mass)
+            inertia -= np.diag(_wheel_moments(wheel, wheel_mass))
+        base.explicitinertial = True
+        base.mass = chassis_mass
+        base.ipos = centre
+        base.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+
+    def _add_wheel(self, spec: mujoco.MjSpec, base: mujoco.MjsBody, wheel: Wheel, mass: float) -> None:
+        body = base.add_body(name=wheel.joint, pos=wheel.centre)
+        body.explicitinertial = True
+        body.mass = mass
+        body.inertia = _wheel_moments(wheel, mass)
+        tyre = body.add_joint(name=f"{wheel.name}_tyre", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1])
+        tyre.stiffness = [_TYRE_STIFFNESS, 0.0, 0.0]
+        tyre.damping = [_TYRE_DAMPING, 0.0, 0.0]
+        # At rest on level ground the tyre neither lifts nor lowers the base frame.
+        tyre.springref = -self.mass * _GRAVITY / len(self.wheels) / _TYRE_STIFFNESS
+        axle = body.add_joint(name=wheel.joint, type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 1, 0])
+        axle.armature = _GEAR_INERTIA
+        lying = Rotation.from_euler("x", 90, degrees=True).as_quat(scalar_first=True)
+        size = [wheel.radius, wheel.width / 2, 0.0]
+        body.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=size, quat=lying, rgba=[0.08, 0.08, 0.09, 1], **_collides()
+        )
+        hub = [0.5 * wheel.radius, wheel.width / 2 + 0.005, 0.0]
+        body.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=hub, quat=lying, rgba=[0.45, 0.45, 0.47, 1], group=GROUP,
+            contype=0, conaffinity=0,
+        )  # fmt: skip
+        servo = spec.add_actuator(name=wheel.joint, target=wheel.joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        servo.set_to_velocity(kv=_SERVO_GAIN)
+
+
+def _collides() -> dict[str, object]:
+    """The robot touches the world, not itself: a wheel would collide with the chassis above it."""
+    return {"contype": 2, "conaffinity": 1, "group": GROUP, "friction": [1.0, 0.005, 0.0001], "solref": [0.02, 1.0]}
+
+
+def _wheel_moments(wheel: Wheel, mass: float) -> np.ndarray:
+    across = mass * (3 * wheel.radius**2 + wheel.width**2) / 12
+    return np.array([across, mass * wheel.radius**2 / 2, across])
+
+
+def _point_inertia(mass: float, offset: np.ndarray) -> np.ndarray:
+    return mass * (offset @ offset * np.eye(3) - np.outer(offset, offset))
+
+
+def _rigid(pose: np.ndarray) -> np.ndarray:
+    """The pose with an exact rotation, which single precision is not."""
+    pose = pose.copy()
+    pose[:3, :3] = Rotation.from_matrix(pose[:3, :3]).as_matrix()
+    return pose
+
+
+def _quaternion_wxyz(rotation: np.ndarray) -> np.ndarray:
+    return Rotation.from_matrix(rotation).as_quat(scalar_first=True)

@@ -1,0 +1,224 @@
+"""The installed predictor as a process of its own: what it publishes, and how it takes bad input."""
+
+import signal
+
+import numpy as np
+import pytest
+from ros_peer import OUTPUTS, Peer, ground_cloud
+
+from monoforce_ros.bags import builders
+
+OK, WARN, ERROR = 0, 1, 2
+PREDICTED = [topic for topic in OUTPUTS if topic.startswith("/predicted")]
+
+
+@pytest.fixture(scope="module")
+def peer(ros_environment):
+    peer = Peer(ros_environment)
+    yield peer
+    peer.close()
+
+
+@pytest.fixture(scope="module")
+def predictor(start, peer):
+    """One node for all tests of this file: what it is fed in one must not harm it in the next."""
+    process = start("predictor", "--ros-args", "-p", "data_timeout:=1.0")
+    process.wait_for("predicting 5 s ahead for husky")
+    assert peer.until(lambda: peer.node.count_subscribers("/diagnostics") > 0)
+    return process
+
+
+def healthy(peer, predictor) -> None:
+    """Feed good data until predictions come back; publishers that are new need a moment to be found."""
+    peer.clear()
+    for _ in range(6):
+        peer.drive(0.8)
+        complete = all(peer.received[topic] for topic in PREDICTED)
+        if complete and peer.until(lambda: peer.status("prediction") == (OK, "predicting"), 0.5):
+            return
+    pytest.fail(f"no prediction from good data: {peer.status('prediction')}\n{predictor.output[-3000:]}")
+
+
+def test_outputs_carry_the_stamp_and_frame_of_their_input(peer, predictor):
+    peer.clear()
+    first = peer.now
+    healthy(peer, predictor)
+    sent = set(range(first, peer.now, 200_000_000))
+    for topic in PREDICTED:
+        assert set(peer.stamps(topic)) <= sent
+        message = peer.received[topic][-1]
+        header = message.markers[0].header if hasattr(message, "markers") else message.header
+        assert header.frame_id == "odom"
+    path = peer.received["/predicted/path"][-1]
+    start, end = path.poses[0].pose.position, path.poses[-1].pose.position
+    np.testing.assert_allclose([start.x, start.y, start.z], [1.0, 2.0, 0.3], atol=1e-6)
+    # From rest, five seconds at 0.5 m/s, along the level.
+    assert end.x - 1.0 == pytest.approx(2.45, abs=0.1) and end.y == pytest.approx(2.0, abs=0.01)
+    assert max(abs(p.pose.position.z - 0.3) for p in path.poses) < 0.02
+    assert len(path.poses) == 51
+    assert len(peer.received["/predicted/height_map"][-1].cells) == 128 * 128
+    terrain = peer.received["/predicted/terrain"][-1]
+    names = ["x", "y", "z", "geometric_height", "stiffness", "damping", "friction", "observed"]
+    assert [f.name for f in terrain.fields] == names
+    values = np.frombuffer(terrain.data, "<f4").reshape(-1, len(names))
+    assert np.isfinite(values).all()
+    np.testing.assert_allclose(values[values[:, 7] > 0.5, 2], 0.3 - 0.1323, atol=0.01)
+    forces = next(m for m in peer.received["/predicted/contact_forces"][-1].markers if m.ns == "contact_forces")
+    assert len(forces.points) > 20
+    first_time = forces.points[0]
+    assert abs(first_time.z - (0.3 - 0.14)) < 0.05
+
+
+def nothing_new(peer, predictor, part: str, text: str, seconds: float = 1.4, **bad) -> None:
+    """Feed something bad: a diagnostic that names it, no prediction, the node lives; then all is well again."""
+    healthy(peer, predictor)
+    peer.spin(0.8)
+    peer.clear()
+    bad_from = peer.now
+    peer.drive(seconds, **bad)
+    assert peer.until(lambda: peer.status(part) is not None and text in peer.status(part)[1], 5.0), (
+        peer.status(part),
+        predictor.output[-2000:],
+    )
+    assert peer.status(part)[0] == ERROR
+    for topic in PREDICTED:
+        assert [s for s in peer.stamps(topic) if s >= bad_from] == []
+    assert predictor.running
+    assert predictor.output.count("Traceback") == 0
+    healthy(peer, predictor)
+
+
+def test_clouds_full_of_nan(peer, predictor):
+    bad = lambda stamp: builders.point_cloud(stamp, "lidar", np.full((500, 3), np.nan))  # noqa: E731
+    nothing_new(peer, predictor, "lidar", "none of its 500 points is a finite return", cloud=bad)
+
+
+def test_clouds_with_some_nan_are_used(peer, predictor):
+    cloud = ground_cloud()
+    cloud[::2] = np.nan
+    peer.clear()
+    peer.drive(1.2, cloud=lambda stamp: builders.point_cloud(stamp, "lidar", cloud))
+    assert peer.until(lambda: bool(peer.received["/predicted/terrain"]))
+    data = np.frombuffer(peer.received["/predicted/terrain"][-1].data, "<f4")
+    assert np.isfinite(data).all()
+
+
+def test_clouds_in_an_unknown_frame(peer, predictor):
+    bad = lambda stamp: builders.point_cloud(stamp, "mystery", ground_cloud())  # noqa: E731
+    nothing_new(peer, predictor, "lidar", "the pose of frame 'mystery' on the robot is unknown", cloud=bad)
+
+
+def test_clouds_whose_size_is_a_lie(peer, predictor):
+    def bad(stamp):
+        message = builders.point_cloud(stamp, "lidar", ground_cloud())
+        message.width = 2_000_000
+        return message
+
+    nothing_new(peer, predictor, "lidar", "point cloud data: got", cloud=bad)
+
+
+def test_clouds_that_miss_the_map(peer, predictor):
+    bad = lambda stamp: builders.point_cloud(stamp, "lidar", ground_cloud() + np.float32([500, 0, 0]))  # noqa: E731
+    nothing_new(peer, predictor, "prediction", "hit 0 cells", cloud=bad)
+
+
+def test_stamps_of_zero(peer, predictor):
+    bad = lambda stamp: builders.point_cloud(0, "lidar", ground_cloud())  # noqa: E731
+    nothing_new(peer, predictor, "lidar", "stamps are zero", cloud=bad)
+
+
+def test_odometry_that_stops(peer, predictor):
+    nothing_new(peer, predictor, "odometry", "nothing for", seconds=2.5, odometry=lambda stamp: None)
+
+
+def test_odometry_of_nan(peer, predictor):
+    def bad(stamp):
+        return builders.odometry(stamp, "odom", "base_link", [0, 0, 0], [0, 0, 0, 1], [np.nan, 0, 0], [0] * 3)
+
+    nothing_new(peer, predictor, "odometry", "position or velocity is not finite", odometry=bad)
+
+
+def test_odometry_with_a_zero_quaternion(peer, predictor):
+    def bad(stamp):
+        return builders.odometry(stamp, "odom", "base_link", [0, 0, 0], [0, 0, 0, 0], [0, 0, 0], [0] * 3)
+
+    nothing_new(peer, predictor, "odometry", "expected a unit quaternion", odometry=bad)
+
+
+def test_a_lidar_that_falls_silent(peer, predictor):
+    nothing_new(peer, predictor, "lidar", "nothing for", seconds=2.5, cloud=lambda stamp: None)
+
+
+def test_commands_of_nan_are_not_obeyed(peer, predictor):
+    healthy(peer, predictor)
+    peer.clear()
+    peer.drive(1.6, command=lambda stamp: builders.twist_stamped(stamp, "base_link", np.nan, 0.0))
+    assert peer.status("commands")[0] == ERROR and "expected finite numbers" in peer.status("commands")[1]
+    # The last good command has expired by then: the robot is predicted to stop.
+    path = peer.received["/predicted/path"][-1]
+    assert path.poses[-1].pose.position.x == pytest.approx(1.0, abs=0.05)
+
+
+def test_without_commands_the_robot_is_predicted_to_stand_and_a_warning_says_so(peer, predictor):
+    peer.spin(0.6)
+    peer.clear()
+    peer.drive(2.0, command=lambda stamp: None)
+    level, text = peer.status("commands")
+    assert level == WARN and "predicted to stand still" in text
+    assert peer.received["/predicted/path"][-1].poses[-1].pose.position.x == pytest.approx(1.0, abs=0.05)
+
+
+def test_time_that_jumps_back(peer, predictor):
+    healthy(peer, predictor)
+    peer.spin(1.0)
+    peer.clear()
+    peer.now -= 60_000_000_000
+    jumped_to = peer.now
+    peer.drive(1.6)
+    assert peer.until(lambda: any(s >= jumped_to for s in peer.stamps("/predicted/path")))
+    assert "time went back by" in predictor.output
+    # Nothing of the time before the jump is mixed in: every output belongs to a cloud sent after it.
+    assert all(jumped_to <= s < peer.now for s in peer.stamps("/predicted/path"))
+
+
+def test_late_messages_out_of_order_are_dropped(peer, predictor):
+    healthy(peer, predictor)
+    peer.clear()
+    newest = peer.now
+    peer.publish("/points", builders.point_cloud(newest - 900_000_000, "lidar", ground_cloud()))
+    peer.spin(0.8)
+    assert not [s for s in peer.stamps("/predicted/path") if s == newest - 900_000_000]
+    healthy(peer, predictor)
+
+
+def test_diagnostics_say_why_only_once(predictor):
+    lines = [line for line in predictor.output.splitlines() if "none of its 500 points" in line]
+    assert len(lines) == 1
+
+
+def test_ends_cleanly_on_an_interrupt(predictor):
+    assert predictor.stop(signal.SIGINT) == 0
+    assert "Traceback" not in predictor.output
+
+
+def test_a_termination_ends_it_cleanly_too(start):
+    process = start("predictor", "--ros-args", "-p", "terrain_source:=flat")
+    process.wait_for("with terrain from flat")
+    assert process.stop(signal.SIGTERM) == 0
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        (["robot:=huskey"], "there is no robot named 'huskey'"),
+        (["terrain_source:=camera"], "no encoder checkpoint was given"),
+        (["terrain_source:=camera", "checkpoint:=/nowhere/encoder.safetensors"], "encoder.safetensors does not exist"),
+        (["terrain_source:=sonar"], "parameter terrain_source: got 'sonar', expected one of"),
+        (["horizon:=-1.0"], "horizon"),
+    ],
+)
+def test_a_node_that_cannot_work_says_why_and_does_not_start(start, parameters, message):
+    arguments = [word for parameter in parameters for word in ("-p", parameter)]
+    process = start("predictor", "--ros-args", *arguments)
+    assert process.wait() == 1
+    assert message in process.output and "Traceback" not in process.output
