@@ -125,7 +125,9 @@ def run(options: argparse.Namespace) -> None:
         )
         png = figure_png(figure)
         (folder / f"prediction_{name}.png").write_bytes(png)
-        pictures.append((f"The {name} prediction", "Predicted path in cyan, measured path dashed, forces in red.", png))
+        pictures.append(
+            (f"The {name} prediction", "Predicted path in orange, measured path dashed, forces in red.", png)
+        )
     settings = {
         "bag": str(bag),
         "robot": robot.name,
