@@ -1,5 +1,8 @@
 """The synthetic world: reproducible, plausible in its motion, and true to its own labels."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
@@ -325,3 +328,11 @@ def test_the_bundled_bag_is_what_the_command_in_the_readme_records(tmp_path, dem
     assert np.array_equal(bundled.stamps, remade.stamps)
     # Another processor may round differently, and contacts magnify that; it stays far below what can be seen.
     assert np.abs(bundled.positions - remade.positions).max() < 0.01
+
+
+def test_drawing_and_torchs_compiler_live_in_one_process():
+    # Loaded the other way round, the two libraries' LLVMs crash the process.
+    done = subprocess.run(
+        [sys.executable, "-c", "import monoforce_ros.synthetic.graphics, torchvision"], capture_output=True, timeout=60
+    )
+    assert done.returncode == 0, done.stderr.decode()[-500:]

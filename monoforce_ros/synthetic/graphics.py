@@ -5,6 +5,7 @@ MuJoCo decides at its import which library draws; every module here therefore ta
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 from ctypes.util import find_library
@@ -31,6 +32,11 @@ def _choose_backend() -> None:
 
 
 _choose_backend()
+if os.environ.get("MUJOCO_GL") == "osmesa":
+    # OSMesa and Triton (which torch imports when it pleases) each bring an LLVM; the process crashes unless Triton's
+    # is loaded first.
+    with contextlib.suppress(ImportError):
+        import triton  # noqa: F401
 
 import mujoco  # noqa: E402
 
