@@ -20,7 +20,8 @@ from monoforce_ros.bags import BagError, BagReader
 from monoforce_ros.messages.message_types import message_class
 from monoforce_ros.shared_files import share_directory
 
-_PROFILES = "FASTDDS_DEFAULT_PROFILES_FILE"
+# Fast DDS 2 (Jazzy) reads the first, Fast DDS 3 the second.
+_PROFILES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 
 
 def _arguments(arguments: list[str]) -> argparse.Namespace:
@@ -133,7 +134,8 @@ def main(arguments: list[str] | None = None) -> int:
     given = sys.argv if arguments is None else ["bag_player", *arguments]
     options = _arguments(remove_ros_args(given)[1:])
     # Raw images do not fit into the default shared memory; this must be set before the first node.
-    os.environ.setdefault(_PROFILES, str(share_directory() / "config" / "fastdds_large_messages.xml"))
+    for variable in _PROFILES:
+        os.environ.setdefault(variable, str(share_directory() / "config" / "fastdds_large_messages.xml"))
     rclpy.init(args=given, signal_handler_options=SignalHandlerOptions.ALL)
     try:
         with BagReader(options.bag or share_directory() / "bags" / "demo") as bag:

@@ -60,7 +60,7 @@ class PredictorNode(Node):
             patience=settings.data_timeout,
             on_time_jump=self._on_time_jump,
         )
-        self.cameras: dict[str, tuple[CameraModel, str]] = {}
+        self.cameras: dict[str, CameraModel | decoding.MessageError] = {}
         self._arrivals: dict[str, float] = {}
         self._started = time.monotonic()
         self._predictions = 0
@@ -185,10 +185,10 @@ class PredictorNode(Node):
 
     def _on_camera_info(self, part: str, message: CameraInfo) -> None:
         try:
-            self.cameras[part] = decoding.decode_camera_info(message), message.header.frame_id
+            self.cameras[part] = decoding.decode_camera_info(message)
         except decoding.MessageError as error:
-            self.cameras.pop(part, None)
-            self.health.report(part, ERROR, str(error), reason="camera info")
+            # Reported with the next image, which it keeps from being used.
+            self.cameras[part] = error
 
     def _on_time_jump(self, topic: str, seconds: float) -> None:
         self.health.report(
@@ -315,13 +315,15 @@ class PredictorNode(Node):
         return Observation(stamp, cloud, images, cameras, poses)
 
     def _view(self, part: str, message: Image | CompressedImage):
-        if part not in self.cameras:
+        camera = self.cameras.get(part)
+        if isinstance(camera, decoding.MessageError):
+            raise camera
+        if camera is None:
             topic = self._subscriptions_by_part[f"{part} info"].topic
             raise decoding.MessageError(
                 f"no usable CameraInfo on {topic}, which the camera needs; name its topic in `camera_info_topics`"
             )
         image = decoding.decode_image(message)
-        camera, _ = self.cameras[part]
         if image.shape[:2] != (camera.height, camera.width):
             raise decoding.MessageError(
                 f"images are {image.shape[1]} × {image.shape[0]} px, but CameraInfo says {camera.width} × "

@@ -1,0 +1,153 @@
+"""The installed player and recorder between processes: whole images, true timing, clear errors."""
+
+import time
+
+import numpy as np
+import pytest
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from ros_peer import Peer
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Image
+
+from monoforce_ros.bags import BagReader, BagWriter, builders
+from monoforce_ros.messages.decoding import stamp_of
+
+START = 1_700_000_000_000_000_000
+COUNT = 60
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory):
+    """Three seconds of raw 640 × 480 images at 20 Hz: 55 MB."""
+    path = tmp_path_factory.mktemp("bags") / "images"
+    with BagWriter(path) as writer:
+        for i in range(COUNT):
+            at = START + i * 50_000_000
+            pixels = np.full((480, 640, 3), i, np.uint8)
+            writer.write("/camera/image_raw", builders.image(at, "camera", pixels), at)
+            writer.write("/cmd_vel", builders.twist(0.1 * i, 0), at)
+    return path
+
+
+@pytest.fixture(scope="module")
+def peer(ros_environment):
+    peer = Peer(ros_environment)
+    yield peer
+    peer.close()
+
+
+class Listener:
+    def __init__(self, peer, kind, topic, reliable=True):
+        self.peer, self.messages, self.arrivals = peer, [], []
+        policy = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+        self.subscription = peer.node.create_subscription(
+            kind, topic, self._take, QoSProfile(depth=60, reliability=policy)
+        )
+
+    def _take(self, message):
+        self.messages.append(message)
+        self.arrivals.append(time.monotonic())
+
+    def close(self):
+        self.peer.node.destroy_subscription(self.subscription)
+
+
+def finish(peer, process, seconds=40.0):
+    assert peer.until(lambda: not process.running, seconds), process.output
+    peer.spin(0.5)
+    return process.wait()
+
+
+@pytest.mark.parametrize("reliable", [True, False])
+def test_large_raw_images_arrive_whole_with_their_timing(start, peer, bag, reliable):
+    images = Listener(peer, Image, "/camera/image_raw", reliable)
+    player = start("bag_player", bag, "--wait", "10", "--quiet")
+    assert finish(peer, player) == 0, player.output
+    images.close()
+    assert len(images.messages) == COUNT
+    for i, message in enumerate(images.messages):
+        assert stamp_of(message) == START + i * 50_000_000
+        assert (np.frombuffer(message.data, np.uint8) == i).all()
+    assert images.arrivals[-1] - images.arrivals[0] == pytest.approx(2.95, abs=0.4)
+
+
+def test_rate_start_duration_topics_and_clock(start, peer, bag):
+    images, clock = Listener(peer, Image, "/camera/image_raw"), Listener(peer, Clock, "/clock")
+    player = start(
+        "bag_player", bag, "--rate", "4", "--start", "1.0", "--duration", "1.0", "--clock", "--topics",
+        "/camera/image_raw", "--wait", "10", "--quiet",
+    )  # fmt: skip
+    assert finish(peer, player) == 0, player.output
+    images.close()
+    clock.close()
+    assert [int(m.data[0]) for m in images.messages] == list(range(20, 41))
+    assert images.arrivals[-1] - images.arrivals[0] == pytest.approx(0.25, abs=0.15)
+    times = [m.clock.sec * 10**9 + m.clock.nanosec for m in clock.messages]
+    assert times == sorted(times)
+    assert times[0] == START + 10**9 and times[-1] == START + 2 * 10**9
+
+
+def test_a_loop_goes_on_until_interrupted(start, peer, bag):
+    images = Listener(peer, Image, "/camera/image_raw")
+    player = start("bag_player", bag, "--loop", "--rate", "10", "--duration", "0.5", "--wait", "10", "--quiet")
+    assert peer.until(lambda: len(images.messages) > 25, 30)
+    assert player.stop() == 0
+    images.close()
+    first = [stamp_of(m) for m in images.messages].count(START)
+    assert first >= 2
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda path: (path / "images.mcap").write_bytes((path / "images.mcap").read_bytes()[:2000]), "truncated"),
+        (lambda path: (path / "metadata.yaml").unlink(), "no metadata.yaml"),
+        (lambda path: (path / "metadata.yaml").write_text("{"), "cannot be read"),
+    ],
+)
+def test_broken_bags_are_refused_in_one_line(start, bag, tmp_path, damage, message):
+    broken = tmp_path / "images"
+    broken.mkdir()
+    for file in bag.iterdir():
+        (broken / file.name).write_bytes(file.read_bytes())
+    damage(broken)
+    player = start("bag_player", broken, "--quiet", "--wait", "0")
+    assert player.wait(30) == 1
+    lines = [line for line in player.output.splitlines() if line.startswith("error:")]
+    assert len(lines) == 1 and message in lines[0] and "Traceback" not in player.output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [(["--topics", "/nothing"], "has no topics ['/nothing']"), (["--rate", "0"], "--rate: got 0.0")],
+)
+def test_wrong_arguments_are_named(start, bag, arguments, message):
+    player = start("bag_player", bag, *arguments)
+    assert player.wait(30) in (1, 2)
+    assert message in player.output and "Traceback" not in player.output
+
+
+def test_the_recorder_writes_what_it_hears(start, peer, tmp_path):
+    recorder = start("bag_recorder", tmp_path / "out", "--topics", "/cmd_vel", "/odom")
+    sent = 0
+
+    def publish():
+        nonlocal sent
+        peer.publish("/cmd_vel", builders.twist_stamped(START + sent, "base_link", 0.1 * sent, 0.0))
+        sent += 1
+        peer.spin(0.05)
+
+    deadline = time.monotonic() + 30
+    while "recording /cmd_vel (geometry_msgs/msg/TwistStamped)" not in recorder.output:
+        assert time.monotonic() < deadline
+        publish()
+    for _ in range(40):
+        publish()
+    assert not (tmp_path / "out").exists()
+    assert recorder.stop() == 0
+    with BagReader(tmp_path / "out") as bag:
+        speeds = [m.decode().twist.linear.x for m in bag.messages(["/cmd_vel"])]
+    assert len(speeds) >= 35 and np.allclose(np.diff(speeds), 0.1)
+    refused = start("bag_recorder", tmp_path / "out")
+    assert refused.wait(30) == 1
+    assert "exists already" in refused.output
