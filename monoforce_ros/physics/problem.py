@@ -1,0 +1,116 @@
+"""Problem: a rollout's inputs in the form that both backends integrate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from monoforce_ros.physics.state import State
+from monoforce_ros.robots import RobotModel
+from monoforce_ros.terrain import TerrainMap
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Everything in one precision, on one device, finite, and relative to the centre of mass."""
+
+    terrain: TerrainMap
+    """One map or a batch ``[B]``."""
+    centre: Tensor
+    """Start position of the centre of mass [m], ``[B, 3]``."""
+    rotation: Tensor
+    """Start rotation terrain ← base, ``[B, 3, 3]``."""
+    velocity: Tensor
+    """Start velocity of the centre of mass [m/s], ``[B, 3]``."""
+    angular_velocity: Tensor
+    """Start angular velocity in terrain axes [rad/s], ``[B, 3]``."""
+    drive_speeds: Tensor
+    """``[B, T, D]`` [m/s]."""
+    points: Tensor
+    """Body points in the base frame [m], ``[N, 3]``."""
+    point_areas: Tensor
+    """``[N]`` [m²]."""
+    point_tangents: Tensor
+    """``[N, 3]``."""
+    point_drives: Tensor
+    """``[N]`` int64; -1 on the hull."""
+    mass: Tensor
+    """``[B]`` [kg]."""
+    centre_of_mass: Tensor
+    """In the base frame [m], ``[B, 3]``."""
+    inertia: Tensor
+    """About the centre of mass in base axes [kg m²], ``[B, 3, 3]``."""
+    friction_factors: Tensor
+    """Longitudinal and lateral factor on the ground's friction, ``[B, 2]``."""
+
+    @classmethod
+    def pose(
+        cls, terrain: TerrainMap, robot: RobotModel, drive_speeds: Tensor, state: State
+    ) -> tuple[Problem, Tensor]:
+        """The problem and which of its trajectories started from finite numbers, ``[B]`` bool.
+
+        Those that did not are replaced by the robot standing at the map's origin: computed from NaN, they would poison
+        the gradient of the terrain that they share with the others.
+        """
+        batch, dtype, device = state.position.shape[0], state.position.dtype, state.position.device
+        terrain, robot = terrain.to(dtype, device), robot.to(dtype, device)
+        given = (state.position, state.rotation, state.velocity, state.angular_velocity, drive_speeds.to(dtype))
+        finite = torch.stack([torch.isfinite(t.detach()).reshape(batch, -1).all(1) for t in given]).all(0)
+        if bool(finite.all()):
+            position, rotation, velocity, angular_velocity, speeds = given
+        else:
+            identity = torch.eye(3, dtype=dtype, device=device)
+            neutral = (torch.zeros_like(t) if t is not given[1] else identity.expand_as(t) for t in given)
+            position, rotation, velocity, angular_velocity, speeds = (
+                torch.where(finite.view(-1, *[1] * (t.ndim - 1)), t, n) for t, n in zip(given, neutral, strict=True)
+            )
+        centre_of_mass = robot.centre_of_mass.expand(batch, 3)
+        offset = (rotation @ centre_of_mass[..., None])[..., 0]
+        factors = [robot.friction_longitudinal.expand(batch), robot.friction_lateral.expand(batch)]
+        problem = cls(
+            terrain=terrain,
+            centre=position + offset,
+            rotation=rotation,
+            velocity=velocity + torch.linalg.cross(angular_velocity, offset),
+            angular_velocity=angular_velocity,
+            drive_speeds=speeds,
+            points=robot.points,
+            point_areas=robot.point_areas,
+            point_tangents=robot.point_tangents,
+            point_drives=robot.point_drives,
+            mass=robot.mass.expand(batch),
+            centre_of_mass=centre_of_mass,
+            inertia=robot.inertia.expand(batch, 3, 3),
+            friction_factors=torch.stack(factors, dim=-1),
+        )
+        return problem, finite
+
+    @property
+    def batch_size(self) -> int:
+        """Number of trajectories."""
+        return self.centre.shape[0]
+
+    @property
+    def steps(self) -> int:
+        """Number of time steps."""
+        return self.drive_speeds.shape[1]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What a backend returns; index 0 along time is the start."""
+
+    centre: Tensor
+    """``[B, T + 1, 3]``."""
+    rotation: Tensor
+    """``[B, T + 1, 3, 3]``."""
+    velocity: Tensor
+    """``[B, T + 1, 3]``."""
+    angular_velocity: Tensor
+    """``[B, T + 1, 3]``."""
+    normal_forces: Tensor | None = None
+    """``[B, T, N]``."""
+    forces: Tensor | None = None
+    """``[B, T, N, 3]``."""

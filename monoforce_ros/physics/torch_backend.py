@@ -1,0 +1,80 @@
+"""The PyTorch backend: the reference that every other one is checked against, in any precision, on any device."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from monoforce_ros.physics.contact import contact
+from monoforce_ros.physics.lookup import TerrainLookup
+from monoforce_ros.physics.options import PhysicsOptions
+from monoforce_ros.physics.problem import Motion, Problem
+from monoforce_ros.physics.rotation import exponential_map
+
+
+def integrate(problem: Problem, options: PhysicsOptions, with_forces: bool) -> Motion:
+    """Integrate with autograd recording each step; see :func:`monoforce_ros.physics.rollout`."""
+    batch, dtype, device = problem.batch_size, problem.centre.dtype, problem.centre.device
+    step_time = options.time_step
+    lookup = TerrainLookup(problem.terrain, options.lookup, batch)
+    body_points = problem.points - problem.centre_of_mass[:, None]
+    factors = problem.friction_factors[:, None]
+    share = problem.point_areas / problem.point_areas.sum()
+    weights = problem.mass[:, None] * options.gravity * share
+    # Drive -1, the hull, finds its zero at the end.
+    speeds = torch.cat([problem.drive_speeds, torch.zeros_like(problem.drive_speeds[..., :1])], dim=-1)
+    gravity = problem.mass[:, None] * torch.tensor([0.0, 0.0, -options.gravity], dtype=dtype, device=device)
+    translation = problem.mass[:, None, None] * torch.eye(3, dtype=dtype, device=device)
+    zero = torch.zeros_like(translation)
+
+    def mass_matrix(inertia: Tensor) -> Tensor:
+        return torch.cat([torch.cat([translation, zero], 2), torch.cat([zero, inertia], 2)], 1)
+
+    centre, rotation = problem.centre, problem.rotation
+    velocity, angular_velocity = problem.velocity, problem.angular_velocity
+    history: list[tuple[Tensor, ...]] = [(centre, rotation, velocity, angular_velocity)]
+    normal_forces, forces = [], []
+    for step in range(problem.steps):
+        turned = rotation.transpose(1, 2)
+        arms = body_points @ turned
+        points = centre[:, None] + arms
+        belt = (speeds[:, step][:, problem.point_drives, None] * problem.point_tangents) @ turned
+        velocities = velocity[:, None] + torch.linalg.cross(angular_velocity[:, None], arms)
+        touch = contact(
+            lookup(points),
+            points,
+            velocities,
+            belt,
+            rotation[:, None, :, 1],
+            problem.point_areas,
+            weights,
+            factors,
+            options,
+        )
+        # Rows that turn the body's six velocities into the points' velocities along the contact directions, and by
+        # their transpose forces along these into the body's force and torque.
+        jacobian = torch.cat(
+            [touch.directions, torch.linalg.cross(arms[:, :, None].expand_as(touch.directions), touch.directions)], -1
+        ).flatten(1, 2)
+        force, gain = touch.force.flatten(1), touch.gain.flatten(1)
+        wrench = (force[:, None] @ jacobian)[:, 0]
+        inertia = rotation @ problem.inertia @ turned
+        gyroscopic = torch.linalg.cross(angular_velocity, (inertia @ angular_velocity[..., None])[..., 0])
+        external = torch.cat([gravity, -gyroscopic], dim=-1)
+        yielding = (jacobian * gain[..., None]).transpose(1, 2) @ jacobian
+        change = torch.linalg.solve(mass_matrix(inertia) + step_time * yielding, step_time * (wrench + external))
+        velocity = velocity + change[:, :3]
+        angular_velocity = angular_velocity + change[:, 3:]
+        centre = centre + step_time * velocity
+        rotation = exponential_map(step_time * angular_velocity) @ rotation
+        history.append((centre, rotation, velocity, angular_velocity))
+        if with_forces:
+            acted = (force - gain * (jacobian @ change[..., None])[..., 0]).unflatten(1, (-1, 3))
+            pressing = acted[..., 0].clamp_min(0.0)
+            normal_forces.append(pressing)
+            acted = torch.cat([pressing[..., None], acted[..., 1:]], dim=-1)
+            forces.append((acted[..., None] * touch.directions).sum(2))
+    states = [torch.stack(entries, dim=1) for entries in zip(*history, strict=True)]
+    if not normal_forces:
+        return Motion(*states)
+    return Motion(*states, torch.stack(normal_forces, dim=1), torch.stack(forces, dim=1))

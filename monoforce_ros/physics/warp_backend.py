@@ -1,0 +1,259 @@
+"""The Warp backend: the same rollout as compiled kernels on CPU or CUDA, differentiable through torch."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from monoforce_ros.physics import warp_kernels
+from monoforce_ros.physics.options import PhysicsOptions
+from monoforce_ros.physics.problem import Motion, Problem
+from monoforce_ros.terrain import Grid
+
+CPU_THREADS = 2
+"""Launches at a time on the CPU: a launch runs in one core and lets other Python threads go on."""
+SMALLEST_SHARE = 4
+"""Trajectories below which splitting a batch over threads does not pay."""
+
+_TANGENTIAL = {"none": warp_kernels.NO_FRICTION, "coulomb": warp_kernels.COULOMB, "sigmoid": warp_kernels.SIGMOID}
+_threads: ThreadPoolExecutor | None = None
+
+
+def integrate(problem: Problem, options: PhysicsOptions, with_forces: bool) -> Motion:
+    """Integrate with Warp; see :func:`monoforce_ros.physics.rollout`."""
+    terrain = problem.terrain
+    height = terrain.height if terrain.height.ndim == 3 else terrain.height[None]
+    material = torch.stack([terrain.stiffness, terrain.damping, terrain.friction], dim=-1)
+    material = material if material.ndim == 4 else material[None]
+    share = problem.point_areas / problem.point_areas.sum()
+    drives = problem.point_drives.to(torch.int32)
+    fixed = _Fixed(options, terrain.grid, drives)
+    common = (
+        height,
+        material,
+        problem.drive_speeds,
+        problem.points,
+        problem.point_areas,
+        problem.point_tangents,
+        share,
+        problem.mass,
+        problem.centre_of_mass,
+        problem.friction_factors,
+    )
+    start = (problem.centre, problem.rotation, problem.velocity, problem.angular_velocity)
+    states = _Integrate.apply(fixed, *common, problem.inertia, *start)
+    if not with_forces or not problem.steps:
+        return Motion(*states)
+    return Motion(*states, *_Forces.apply(fixed, *common, *states))
+
+
+class _Fixed:
+    """What a launch needs besides tensors that carry gradients."""
+
+    def __init__(self, options: PhysicsOptions, grid: Grid, drives: Tensor):
+        self.options = options
+        self.grid = grid
+        self.drives = drives.contiguous()
+
+    def structs(self, kernels: warp_kernels.Kernels):
+        grid = kernels.integrate.grid_type()
+        grid.rows, grid.columns = self.grid.rows, self.grid.columns
+        grid.origin_x, grid.origin_y = (kernels.scalar(value) for value in self.grid.origin)
+        grid.inverse_resolution = kernels.scalar(1.0 / self.grid.resolution)
+        options = kernels.integrate.options_type()
+        options.time_step = kernels.scalar(self.options.time_step)
+        options.gravity = kernels.scalar(self.options.gravity)
+        options.slip_square = kernels.scalar(self.options.slip_regularisation**2)
+        options.lookup = int(self.options.lookup == "bilinear")
+        options.normal = int(self.options.normal_force == "normal")
+        options.tangential = _TANGENTIAL[self.options.tangential_force]
+        return grid, options
+
+
+def _kernels(tensor: Tensor) -> warp_kernels.Kernels:
+    if tensor.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"rollout precision: got {tensor.dtype}, expected float32 or float64")
+    return warp_kernels.kernels(tensor.dtype == torch.float64)
+
+
+def _types(kernels: warp_kernels.Kernels) -> tuple:
+    """Warp element types of the tensors in ``common``, in their order."""
+    s, v2, v3 = kernels.scalar, kernels.vec2, kernels.vec3
+    return (s, v3, s, v3, s, v3, s, s, v3, v2)
+
+
+def _wrap(tensors, types, *, gradients: bool) -> list[wp.array]:
+    """Zero-copy Warp arrays of contiguous tensors, with fresh gradient arrays where asked for."""
+    return [
+        wp.from_torch(t, dtype=kind, requires_grad=gradients, grad=torch.zeros_like(t) if gradients else None)
+        for t, kind in zip(tensors, types, strict=True)
+    ]
+
+
+def _contiguous(tensors) -> list[Tensor]:
+    return [t.detach().contiguous() for t in tensors]
+
+
+class _Integrate(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, fixed, *tensors):
+        kernels = _kernels(tensors[0])
+        inputs = _contiguous(tensors)
+        (*common, inertia), start = inputs[:11], inputs[11:]
+        batch, steps = common[2].shape[:2]
+        states = []
+        for value in start:
+            history = value.new_empty((batch, steps + 1, *value.shape[1:]))
+            history[:, 0] = value
+            states.append(history)
+        needs_gradient = any(ctx.needs_input_grad)
+        _launch(kernels, fixed, common, inertia, states, keep=False)
+        if needs_gradient:
+            ctx.fixed = fixed
+            ctx.save_for_backward(*common, inertia, *states)
+        return tuple(states)
+
+    @staticmethod
+    def backward(ctx, *state_gradients):
+        (*common, inertia), states = ctx.saved_tensors[:11], ctx.saved_tensors[11:]
+        kernels = _kernels(common[0])
+        gradients = [torch.zeros_like(s) if g is None else g.contiguous().clone() for s, g in zip(states, state_gradients, strict=True)]
+        given = _launch(kernels, ctx.fixed, common, inertia, states, keep=True, state_gradients=gradients)
+        start = [g[:, 0] for g in gradients]
+        return (None, *given, *start)
+
+
+class _Forces(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, fixed, *tensors):
+        kernels = _kernels(tensors[0])
+        inputs = _contiguous(tensors)
+        batch, steps = inputs[2].shape[:2]
+        count = inputs[3].shape[0]
+        normal = inputs[0].new_zeros((batch, steps, count))
+        whole = inputs[0].new_zeros((batch, steps, count, 3))
+        _launch_forces(kernels, fixed, inputs, (normal, whole))
+        if any(ctx.needs_input_grad):
+            ctx.fixed = fixed
+            ctx.save_for_backward(*inputs, normal, whole)
+        return normal, whole
+
+    @staticmethod
+    def backward(ctx, normal_gradient, whole_gradient):
+        *inputs, normal, whole = ctx.saved_tensors
+        kernels = _kernels(inputs[0])
+        given = _launch_forces(
+            kernels,
+            ctx.fixed,
+            inputs,
+            (normal, whole),
+            output_gradients=(normal_gradient.contiguous(), whole_gradient.contiguous()),
+        )
+        return (None, *given)
+
+
+def _launch(kernels, fixed, common, inertia, states, *, keep, state_gradients=None):
+    """Launch the integration, or its adjoint if ``state_gradients`` are given; then return the inputs' gradients."""
+    batch, steps = common[2].shape[:2]
+    backward = state_gradients is not None
+    grid, options = fixed.structs(kernels)
+    device = common[0].device
+    slots = max(1, steps) if keep else 1
+    state_types = (kernels.vec3, kernels.mat33, kernels.vec3, kernels.vec3)
+    shares = _shares(batch, device)
+    summed = common[0].new_zeros((batch, slots, 6, 3))
+    coupling = common[0].new_zeros((batch, slots, 3, 3))
+    scratch_gradients = [torch.zeros_like(t) for t in (summed, coupling)] if backward else [None, None]
+
+    def work(part: tuple[int, int]) -> list[Tensor | None]:
+        first, count = part
+        types = (*_types(kernels), kernels.mat33)
+        arrays = _wrap((*common, inertia), types, gradients=backward)
+        *shared, inertia_array = arrays
+        height, material, speeds, points, areas, tangents, weights, mass, centre_of_mass, factors = shared
+        gradients = state_gradients or [None] * 4
+        moving = [
+            wp.from_torch(t, dtype=kind, requires_grad=backward, grad=g)
+            for t, kind, g in zip(states, state_types, gradients, strict=True)
+        ]
+        scratch = [
+            wp.from_torch(t, dtype=kind, requires_grad=backward, grad=g)
+            for t, kind, g in zip((summed, coupling), (kernels.vec3, kernels.mat33), scratch_gradients, strict=True)
+        ]
+        drives = wp.from_torch(fixed.drives, dtype=wp.int32)
+        before = [
+            first, steps, int(keep), height, material, grid, options, speeds, points, areas, tangents, drives, weights,
+            mass, centre_of_mass, inertia_array, factors,
+        ]  # fmt: skip
+        extra = _adjoint(before, outputs=6) if backward else {}
+        wp.launch(
+            kernels.integrate,
+            dim=count,
+            inputs=before,
+            outputs=[*moving, *scratch],
+            device=str(device),
+            record_tape=False,
+            **extra,
+        )
+        return [wp.to_torch(array.grad) if backward else None for array in arrays]
+
+    wp.init()
+    parts = list(_in_parallel(work, shares))
+    if not backward:
+        return []
+    return [torch.stack(entries).sum(0) if len(entries) > 1 else entries[0] for entries in zip(*parts, strict=True)]
+
+
+def _launch_forces(kernels, fixed, inputs, outputs, *, output_gradients=None):
+    backward = output_gradients is not None
+    grid, options = fixed.structs(kernels)
+    state_types = (kernels.vec3, kernels.mat33, kernels.vec3, kernels.vec3)
+    arrays = _wrap(inputs, (*_types(kernels), *state_types), gradients=backward)
+    height, material, speeds, points, areas, tangents, weights, mass, centre_of_mass, factors, *moving = arrays
+    gradients = output_gradients or (None, None)
+    results = [
+        wp.from_torch(t, dtype=kind, requires_grad=backward, grad=g)
+        for t, kind, g in zip(outputs, (kernels.scalar, kernels.vec3), gradients, strict=True)
+    ]
+    drives = wp.from_torch(fixed.drives, dtype=wp.int32)
+    before = [
+        height, material, grid, options, speeds, points, areas, tangents, drives, weights, mass, centre_of_mass,
+        factors, *moving,
+    ]  # fmt: skip
+    extra = _adjoint(before, outputs=2) if backward else {}
+    wp.launch(
+        kernels.forces,
+        dim=tuple(outputs[0].shape),
+        inputs=before,
+        outputs=results,
+        device=str(inputs[0].device),
+        record_tape=False,
+        **extra,
+    )
+    return [wp.to_torch(array.grad) for array in arrays] if backward else []
+
+
+def _adjoint(inputs: list, outputs: int) -> dict:
+    """Arguments that make a launch run a kernel's adjoint: arrays bring their gradients, the rest has none."""
+    adjoints = [None if isinstance(value, wp.array) else type(value)() for value in inputs]
+    return {"adjoint": True, "adj_inputs": adjoints, "adj_outputs": [None] * outputs}
+
+
+def _shares(batch: int, device: torch.device) -> list[tuple[int, int]]:
+    """First trajectory and number of trajectories of each launch."""
+    workers = 1 if device.type == "cuda" else max(1, min(CPU_THREADS, batch // SMALLEST_SHARE))
+    edges = [round(batch * k / workers) for k in range(workers + 1)]
+    return [(low, high - low) for low, high in zip(edges[:-1], edges[1:], strict=True)]
+
+
+def _in_parallel(work, shares):
+    global _threads
+    if len(shares) == 1:
+        return [work(shares[0])]
+    if _threads is None:
+        _threads = ThreadPoolExecutor(CPU_THREADS, thread_name_prefix="rollout")
+    # The first launch compiles the module; two threads must not do so at once.
+    return list(_threads.map(work, shares))

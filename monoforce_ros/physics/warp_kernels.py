@@ -1,0 +1,377 @@
+"""The rollout as Warp kernels: one thread a trajectory, loops over steps and body points inside.
+
+Warp's adjoint of a value that is summed in a dynamic loop and then used non-linearly in the same kernel is wrong, so the
+summed wrench and gains go through per-step arrays: stored after the loop over points, loaded again before the solve.
+
+Types follow the precision asked for; annotations must be real objects here, not strings.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+CONSTANT_LOOKUP, BILINEAR_LOOKUP = 0, 1
+VERTICAL_FORCE, NORMAL_FORCE = 0, 1
+NO_FRICTION, COULOMB, SIGMOID = 0, 1, 2
+
+wp.config.quiet = True
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """Kernels and vector types of one precision."""
+
+    scalar: Any
+    vec2: Any
+    vec3: Any
+    mat33: Any
+    integrate: Any
+    forces: Any
+
+
+@cache
+def kernels(double: bool) -> Kernels:
+    """Kernels in float64 (``double``) or float32; compiled at their first launch and cached on disk by Warp."""
+    scalar = wp.float64 if double else wp.float32
+    vec2 = wp.types.vector(length=2, dtype=scalar)
+    vec3 = wp.types.vector(length=3, dtype=scalar)
+    mat33 = wp.types.matrix(shape=(3, 3), dtype=scalar)
+
+    @wp.struct
+    class Grid:
+        rows: int
+        columns: int
+        origin_x: scalar
+        origin_y: scalar
+        inverse_resolution: scalar
+
+    @wp.struct
+    class Options:
+        time_step: scalar
+        gravity: scalar
+        slip_square: scalar
+        lookup: int
+        normal: int
+        tangential: int
+
+    @wp.struct
+    class Touch:
+        active: int
+        normal: vec3
+        along: vec3
+        across: vec3
+        force: vec3  # along normal, along, across
+        gain: vec3
+
+    @wp.func
+    def corner(raw: scalar, cells: int) -> int:
+        clamped = wp.clamp(raw, scalar(0.0), scalar(cells - 1))
+        return wp.min(int(wp.floor(clamped)), cells - 2)
+
+    @wp.func
+    def nearest(raw: scalar, cells: int) -> int:
+        # rint rounds halves to even, as torch does.
+        return int(wp.rint(wp.clamp(raw, scalar(0.0), scalar(cells - 1))))
+
+    @wp.func
+    def inside_axis(raw: scalar, cells: int) -> scalar:
+        return wp.where(raw >= scalar(0.0) and raw <= scalar(cells - 1), scalar(1.0), scalar(0.0))
+
+    @wp.func
+    def touch_ground(
+        height: wp.array3d(dtype=scalar),
+        material: wp.array3d(dtype=vec3),
+        page: int,
+        grid: Grid,
+        options: Options,
+        point: vec3,
+        velocity: vec3,
+        belt: vec3,
+        lateral: vec3,
+        area: scalar,
+        weight: scalar,
+        factors: vec2,
+    ) -> Touch:
+        touch = Touch()
+        raw_x = (point[0] - grid.origin_x) * grid.inverse_resolution
+        raw_y = (point[1] - grid.origin_y) * grid.inverse_resolution
+        column = corner(raw_x, grid.columns)
+        row = corner(raw_y, grid.rows)
+        u = wp.clamp(raw_x, scalar(0.0), scalar(grid.columns - 1)) - scalar(column)
+        w = wp.clamp(raw_y, scalar(0.0), scalar(grid.rows - 1)) - scalar(row)
+        level = scalar(0.0)
+        slope_x = scalar(0.0)
+        slope_y = scalar(0.0)
+        if options.lookup == 1:
+            h00 = height[page, row, column]
+            h01 = height[page, row, column + 1]
+            h10 = height[page, row + 1, column]
+            h11 = height[page, row + 1, column + 1]
+            bottom = h00 + u * (h01 - h00)
+            top = h10 + u * (h11 - h10)
+            level = bottom + w * (top - bottom)
+            # Where the coordinate was clamped the height no longer depends on it.
+            slope_x = (
+                ((scalar(1.0) - w) * (h01 - h00) + w * (h11 - h10))
+                * grid.inverse_resolution
+                * inside_axis(raw_x, grid.columns)
+            )
+            slope_y = (top - bottom) * grid.inverse_resolution * inside_axis(raw_y, grid.rows)
+        else:
+            level = height[page, nearest(raw_y, grid.rows), nearest(raw_x, grid.columns)]
+        gap = level - point[2]
+        # Most points are in the air: nothing more is computed for them.
+        if gap > scalar(0.0):
+            stuff = vec3()
+            if options.lookup == 1:
+                m00 = material[page, row, column]
+                m01 = material[page, row, column + 1]
+                m10 = material[page, row + 1, column]
+                m11 = material[page, row + 1, column + 1]
+                below = m00 + u * (m01 - m00)
+                above = m10 + u * (m11 - m10)
+                stuff = below + w * (above - below)
+            else:
+                stuff = material[page, nearest(raw_y, grid.rows), nearest(raw_x, grid.columns)]
+            normal = vec3(scalar(0.0), scalar(0.0), scalar(1.0))
+            if options.normal == 1:
+                upward = scalar(1.0) / wp.sqrt(scalar(1.0) + slope_x * slope_x + slope_y * slope_y)
+                normal = vec3(-slope_x * upward, -slope_y * upward, upward)
+            depth = gap * normal[2]
+            approach = -wp.dot(velocity, normal)
+            spring = stuff[0] * depth
+            load = area * wp.max(spring + stuff[1] * approach, scalar(0.0))
+            # Within the step the spring follows the motion: it acts as further damping.
+            damping = stuff[1] + options.time_step * stuff[0]
+            pressing = area * wp.max(spring + damping * approach, scalar(0.0))
+            normal_gain = wp.where(pressing > scalar(0.0), area * damping, scalar(0.0))
+            across = lateral - wp.dot(lateral, normal) * normal
+            across = across * (scalar(1.0) / wp.sqrt(wp.dot(across, across) + scalar(1.0e-12)))
+            along = wp.cross(across, normal)
+            moving = velocity + belt
+            slip_along = wp.dot(moving, along)
+            slip_across = wp.dot(moving, across)
+            friction_along = stuff[2] * factors[0]
+            friction_across = stuff[2] * factors[1]
+            force_along = scalar(0.0)
+            force_across = scalar(0.0)
+            gain_along = scalar(0.0)
+            gain_across = scalar(0.0)
+            if options.tangential == 1:
+                per_speed = load / wp.sqrt(slip_along * slip_along + slip_across * slip_across + options.slip_square)
+                gain_along = friction_along * per_speed
+                gain_across = friction_across * per_speed
+                force_along = -gain_along * slip_along
+                force_across = -gain_across * slip_across
+            if options.tangential == 2:
+                active_along = scalar(1.0) / (scalar(1.0) + wp.exp(slip_along))
+                active_across = scalar(1.0) / (scalar(1.0) + wp.exp(slip_across))
+                force_along = friction_along * weight * (active_along - scalar(0.5))
+                force_across = friction_across * weight * (active_across - scalar(0.5))
+                gain_along = friction_along * weight * active_along * (scalar(1.0) - active_along)
+                gain_across = friction_across * weight * active_across * (scalar(1.0) - active_across)
+            touch.active = 1
+            touch.normal = normal
+            touch.along = along
+            touch.across = across
+            touch.force = vec3(pressing, force_along, force_across)
+            touch.gain = vec3(normal_gain, gain_along, gain_across)
+        return touch
+
+    @wp.func
+    def exponential(turn: vec3) -> mat33:
+        square = wp.dot(turn, turn)
+        first = scalar(1.0) - square / scalar(6.0)
+        second = scalar(0.5) - square / scalar(24.0)
+        if square >= scalar(1.0e-8):
+            angle = wp.sqrt(square)
+            first = wp.sin(angle) / angle
+            second = (scalar(1.0) - wp.cos(angle)) / square
+        cross = wp.skew(turn)
+        return wp.identity(n=3, dtype=scalar) + first * cross + second * (cross * cross)
+
+    @wp.kernel(module="unique")
+    def integrate(
+        first_trajectory: int,
+        steps: int,
+        keep: int,
+        height: wp.array3d(dtype=scalar),
+        material: wp.array3d(dtype=vec3),
+        grid: Grid,
+        options: Options,
+        speeds: wp.array3d(dtype=scalar),
+        points: wp.array(dtype=vec3),
+        areas: wp.array(dtype=scalar),
+        tangents: wp.array(dtype=vec3),
+        drives: wp.array(dtype=wp.int32),
+        share: wp.array(dtype=scalar),
+        mass: wp.array(dtype=scalar),
+        centre_of_mass: wp.array(dtype=vec3),
+        inertia: wp.array(dtype=mat33),
+        factors: wp.array(dtype=vec2),
+        centre: wp.array2d(dtype=vec3),
+        rotation: wp.array2d(dtype=mat33),
+        velocity: wp.array2d(dtype=vec3),
+        angular_velocity: wp.array2d(dtype=vec3),
+        summed: wp.array3d(dtype=vec3),
+        coupling: wp.array2d(dtype=mat33),
+    ):
+        b = first_trajectory + wp.tid()
+        page = wp.min(b, height.shape[0] - 1)
+        weight_total = mass[b] * options.gravity
+        offset = centre_of_mass[b]
+        count = points.shape[0]
+        for step in range(steps):
+            slot = step * keep
+            position = centre[b, step]
+            turned = rotation[b, step]
+            linear = velocity[b, step]
+            angular = angular_velocity[b, step]
+            lateral = vec3(turned[0, 1], turned[1, 1], turned[2, 1])
+            force = vec3()
+            torque = vec3()
+            diagonal = vec3()
+            beside = vec3()
+            turning_diagonal = vec3()
+            turning_beside = vec3()
+            mixed = mat33()
+            for i in range(count):
+                arm = turned * (points[i] - offset)
+                point = position + arm
+                belt = vec3()
+                if drives[i] >= 0:
+                    belt = turned * (tangents[i] * speeds[b, step, drives[i]])
+                touch = touch_ground(
+                    height,
+                    material,
+                    page,
+                    grid,
+                    options,
+                    point,
+                    linear + wp.cross(angular, arm),
+                    belt,
+                    lateral,
+                    areas[i],
+                    weight_total * share[i],
+                    factors[b],
+                )
+                if touch.active == 1:
+                    acting = (
+                        touch.force[0] * touch.normal + touch.force[1] * touch.along + touch.force[2] * touch.across
+                    )
+                    force += acting
+                    torque += wp.cross(arm, acting)
+                    yielding = (
+                        touch.gain[0] * wp.outer(touch.normal, touch.normal)
+                        + touch.gain[1] * wp.outer(touch.along, touch.along)
+                        + touch.gain[2] * wp.outer(touch.across, touch.across)
+                    )
+                    lever = wp.skew(arm)
+                    product = yielding * lever
+                    rotary = lever * product
+                    diagonal += vec3(yielding[0, 0], yielding[1, 1], yielding[2, 2])
+                    beside += vec3(yielding[1, 2], yielding[0, 2], yielding[0, 1])
+                    turning_diagonal += vec3(rotary[0, 0], rotary[1, 1], rotary[2, 2])
+                    turning_beside += vec3(rotary[1, 2], rotary[0, 2], rotary[0, 1])
+                    mixed += product
+            summed[b, slot, 0] = force
+            summed[b, slot, 1] = torque
+            summed[b, slot, 2] = diagonal
+            summed[b, slot, 3] = beside
+            summed[b, slot, 4] = turning_diagonal
+            summed[b, slot, 5] = turning_beside
+            coupling[b, slot] = mixed
+
+            total_force = summed[b, slot, 0] + vec3(scalar(0.0), scalar(0.0), -options.gravity * mass[b])
+            total_torque = summed[b, slot, 1]
+            d = summed[b, slot, 2]
+            o = summed[b, slot, 3]
+            td = summed[b, slot, 4]
+            to = summed[b, slot, 5]
+            h = options.time_step
+            world_inertia = turned * inertia[b] * wp.transpose(turned)
+            total_torque = total_torque - wp.cross(angular, world_inertia * angular)
+            m = mass[b]
+            upper = mat33(
+                m + h * d[0], h * o[2], h * o[1],
+                h * o[2], m + h * d[1], h * o[0],
+                h * o[1], h * o[0], m + h * d[2],
+            )  # fmt: skip
+            # Velocities of points are v - [arm]× ω, hence the signs.
+            lower = world_inertia - h * mat33(
+                td[0], to[2], to[1],
+                to[2], td[1], to[0],
+                to[1], to[0], td[2],
+            )  # fmt: skip
+            side = -h * coupling[b, slot]
+            inverse = wp.inverse(upper)
+            reduced = wp.transpose(side) * inverse
+            right = h * total_force
+            turn_change = wp.inverse(lower - reduced * side) * (h * total_torque - reduced * right)
+            change = inverse * (right - side * turn_change)
+            new_linear = linear + change
+            new_angular = angular + turn_change
+            velocity[b, step + 1] = new_linear
+            angular_velocity[b, step + 1] = new_angular
+            centre[b, step + 1] = position + h * new_linear
+            rotation[b, step + 1] = exponential(h * new_angular) * turned
+
+    @wp.kernel(module="unique")
+    def forces(
+        height: wp.array3d(dtype=scalar),
+        material: wp.array3d(dtype=vec3),
+        grid: Grid,
+        options: Options,
+        speeds: wp.array3d(dtype=scalar),
+        points: wp.array(dtype=vec3),
+        areas: wp.array(dtype=scalar),
+        tangents: wp.array(dtype=vec3),
+        drives: wp.array(dtype=wp.int32),
+        share: wp.array(dtype=scalar),
+        mass: wp.array(dtype=scalar),
+        centre_of_mass: wp.array(dtype=vec3),
+        factors: wp.array(dtype=vec2),
+        centre: wp.array2d(dtype=vec3),
+        rotation: wp.array2d(dtype=mat33),
+        velocity: wp.array2d(dtype=vec3),
+        angular_velocity: wp.array2d(dtype=vec3),
+        normal_forces: wp.array3d(dtype=scalar),
+        whole_forces: wp.array3d(dtype=vec3),
+    ):
+        b, step, i = wp.tid()
+        page = wp.min(b, height.shape[0] - 1)
+        turned = rotation[b, step]
+        arm = turned * (points[i] - centre_of_mass[b])
+        belt = vec3()
+        if drives[i] >= 0:
+            belt = turned * (tangents[i] * speeds[b, step, drives[i]])
+        touch = touch_ground(
+            height,
+            material,
+            page,
+            grid,
+            options,
+            centre[b, step] + arm,
+            velocity[b, step] + wp.cross(angular_velocity[b, step], arm),
+            belt,
+            vec3(turned[0, 1], turned[1, 1], turned[2, 1]),
+            areas[i],
+            mass[b] * options.gravity * share[i],
+            factors[b],
+        )
+        if touch.active == 1:
+            # The forces that acted over the step: what the point's change of velocity left of them.
+            change = (velocity[b, step + 1] - velocity[b, step]) + wp.cross(
+                angular_velocity[b, step + 1] - angular_velocity[b, step], arm
+            )
+            pressing = wp.max(touch.force[0] - touch.gain[0] * wp.dot(touch.normal, change), scalar(0.0))
+            rolling = touch.force[1] - touch.gain[1] * wp.dot(touch.along, change)
+            sliding = touch.force[2] - touch.gain[2] * wp.dot(touch.across, change)
+            normal_forces[b, step, i] = pressing
+            whole_forces[b, step, i] = pressing * touch.normal + rolling * touch.along + sliding * touch.across
+
+    # Structs are reached through the kernels' signatures by the caller.
+    integrate.grid_type, integrate.options_type = Grid, Options
+    return Kernels(scalar, vec2, vec3, mat33, integrate, forces)
