@@ -31,3 +31,6 @@ lock: environment
 
 clean:
 	rm -rf build install log out
+
+bench: build
+	@mkdir -p out && scripts/run.sh python benchmarks/rollout.py --json out/rollout.json

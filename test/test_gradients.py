@@ -36,7 +36,7 @@ def inputs() -> dict[str, torch.Tensor]:
     }
 
 
-def outcome(given: dict[str, torch.Tensor], options: PhysicsOptions) -> torch.Tensor:
+def outcome(given: dict[str, torch.Tensor], options: PhysicsOptions, backend: str) -> torch.Tensor:
     terrain = TerrainMap(
         given["height"],
         given["height"],
@@ -55,7 +55,7 @@ def outcome(given: dict[str, torch.Tensor], options: PhysicsOptions) -> torch.Te
     )
     rotation = torch.eye(3, dtype=torch.float64)[None]
     state = State(given["position"], rotation, given["velocity"], given["angular_velocity"])
-    result = rollout(terrain, robot, given["speeds"], state, options=options)
+    result = rollout(terrain, robot, given["speeds"], state, options=options, backend=backend)
     # Weights make every component count and none cancel.
     weights = torch.linspace(0.5, 1.5, STEPS + 1, dtype=torch.float64)[:, None]
     return (
@@ -67,13 +67,18 @@ def outcome(given: dict[str, torch.Tensor], options: PhysicsOptions) -> torch.Te
     )
 
 
-@pytest.mark.parametrize("tangential", ["coulomb", "sigmoid"])
+BACKENDS = ["torch", "warp"]
+TANGENTIAL = ["coulomb", "sigmoid"]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("tangential", TANGENTIAL)
 @pytest.mark.parametrize("name", sorted(inputs()))
-def test_gradient_matches_finite_differences(name, tangential):
+def test_gradient_matches_finite_differences(name, tangential, backend):
     options = PhysicsOptions(tangential_force=tangential)
     given = inputs()
     given[name].requires_grad_(True)
-    (gradient,) = torch.autograd.grad(outcome(given, options), given[name])
+    (gradient,) = torch.autograd.grad(outcome(given, options, backend), given[name])
     generator = torch.Generator().manual_seed(1)
     direction = torch.randn(given[name].shape, generator=generator, dtype=torch.float64)
     if name == "inertia":
@@ -86,8 +91,26 @@ def test_gradient_matches_finite_differences(name, tangential):
         # Five points: the error of the difference itself is far below the tolerance.
         for factor in (-2, -1, 1, 2):
             given[name] = base + factor * step * direction
-            values.append(float(outcome(given, options)))
+            values.append(float(outcome(given, options, backend)))
     numeric = (values[0] - 8 * values[1] + 8 * values[2] - values[3]) / (12 * step)
     analytic = float((gradient * direction).sum())
     assert abs(analytic) > 0
     assert analytic == pytest.approx(numeric, rel=1e-6)
+
+
+@pytest.mark.parametrize("lookup", ["bilinear", "constant"])
+@pytest.mark.parametrize("normal", ["normal", "vertical"])
+@pytest.mark.parametrize("tangential", [*TANGENTIAL, "none"])
+def test_both_backends_have_the_same_outcome_and_gradients(lookup, normal, tangential):
+    options = PhysicsOptions(lookup=lookup, normal_force=normal, tangential_force=tangential)
+    outcomes, gradients = [], []
+    for backend in BACKENDS:
+        given = {name: value.requires_grad_(True) for name, value in inputs().items()}
+        outcomes.append(outcome(given, options, backend))
+        gradients.append(torch.autograd.grad(outcomes[-1], list(given.values()), allow_unused=True))
+    assert float(outcomes[1]) == pytest.approx(float(outcomes[0]), rel=1e-12)
+    for name, first, second in zip(inputs(), *gradients, strict=True):
+        first = torch.zeros(()) if first is None else first
+        second = torch.zeros(()) if second is None else second
+        scale = max(float(first.abs().max()), 1e-12)
+        assert float((first - second).abs().max()) <= 1e-10 * scale, name

@@ -1,6 +1,7 @@
 """The rollout against closed-form answers and invariants of mechanics."""
 
 import dataclasses
+import functools
 import math
 
 import numpy as np
@@ -8,7 +9,8 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 
-from monoforce_ros.physics import PhysicsOptions, State, rollout
+from monoforce_ros import physics
+from monoforce_ros.physics import PhysicsOptions, State
 from monoforce_ros.physics.rest import rest_depth
 from monoforce_ros.physics.rotation import exponential_map, rotation_angle
 from monoforce_ros.robots import load_robot
@@ -16,6 +18,13 @@ from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap
 
 GRID = Grid.square(40.0, 0.2)
 FAR_BELOW = -1000.0
+
+
+@pytest.fixture(params=["torch", "warp"], autouse=True)
+def backend(request, monkeypatch):
+    """Every test of this file runs with either backend."""
+    monkeypatch.setitem(globals(), "rollout", functools.partial(physics.rollout, backend=request.param))
+    return request.param
 
 
 @pytest.fixture(scope="module")
@@ -30,6 +39,9 @@ def flat(height: float = 0.0, friction: float = 0.8) -> TerrainMap:
 def slope(angle: float, friction: float) -> TerrainMap:
     height = -math.tan(angle) * torch.from_numpy(GRID.x).expand(GRID.rows, -1)
     return TerrainMap.from_height(height.contiguous(), GRID, material=TerrainDefaults(friction=friction))
+
+
+rollout = physics.rollout  # replaced by the fixture above for each backend
 
 
 def drive(robot, twist, seconds, *, terrain=None, state=None, options=PhysicsOptions(), batch=1, **more):

@@ -52,6 +52,7 @@ class PredictorNode(Node):
             horizon=settings.horizon,
             options=PhysicsOptions(time_step=settings.time_step),
         )
+        self.predictor.warm_up()
         self.sensor_topics = self._sensor_topics()
         self.health = Health(self, ["odometry", "commands", *self.sensor_topics, "prediction"])
         self.inputs = Inputs(

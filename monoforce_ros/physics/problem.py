@@ -46,9 +46,7 @@ class Problem:
     """Longitudinal and lateral factor on the ground's friction, ``[B, 2]``."""
 
     @classmethod
-    def pose(
-        cls, terrain: TerrainMap, robot: RobotModel, drive_speeds: Tensor, state: State
-    ) -> tuple[Problem, Tensor]:
+    def pose(cls, terrain: TerrainMap, robot: RobotModel, drive_speeds: Tensor, state: State) -> tuple[Problem, Tensor]:
         """The problem and which of its trajectories started from finite numbers, ``[B]`` bool.
 
         Those that did not are replaced by the robot standing at the map's origin: computed from NaN, they would poison

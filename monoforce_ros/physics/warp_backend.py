@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from concurrent.futures import ThreadPoolExecutor
 
 import torch
@@ -18,8 +19,13 @@ CPU_THREADS = 2
 SMALLEST_SHARE = 4
 """Trajectories below which splitting a batch over threads does not pay."""
 
+CHUNK = 8
+"""Trajectories whose per-step sums are kept at a time on the way back."""
+
 _TANGENTIAL = {"none": warp_kernels.NO_FRICTION, "coulomb": warp_kernels.COULOMB, "sigmoid": warp_kernels.SIGMOID}
 _threads: ThreadPoolExecutor | None = None
+
+wp.init()
 
 
 def integrate(problem: Problem, options: PhysicsOptions, with_forces: bool) -> Motion:
@@ -110,7 +116,7 @@ class _Integrate(torch.autograd.Function):
             history[:, 0] = value
             states.append(history)
         needs_gradient = any(ctx.needs_input_grad)
-        _launch(kernels, fixed, common, inertia, states, keep=False)
+        _launch(kernels, fixed, common, inertia, states)
         if needs_gradient:
             ctx.fixed = fixed
             ctx.save_for_backward(*common, inertia, *states)
@@ -120,8 +126,9 @@ class _Integrate(torch.autograd.Function):
     def backward(ctx, *state_gradients):
         (*common, inertia), states = ctx.saved_tensors[:11], ctx.saved_tensors[11:]
         kernels = _kernels(common[0])
-        gradients = [torch.zeros_like(s) if g is None else g.contiguous().clone() for s, g in zip(states, state_gradients, strict=True)]
-        given = _launch(kernels, ctx.fixed, common, inertia, states, keep=True, state_gradients=gradients)
+        # The adjoint adds to these while it walks back in time, hence copies.
+        gradients = [g.clone(memory_format=torch.contiguous_format) for g in state_gradients]
+        given = _launch(kernels, ctx.fixed, common, inertia, states, state_gradients=gradients)
         start = [g[:, 0] for g in gradients]
         return (None, *given, *start)
 
@@ -155,53 +162,47 @@ class _Forces(torch.autograd.Function):
         return (None, *given)
 
 
-def _launch(kernels, fixed, common, inertia, states, *, keep, state_gradients=None):
+def _launch(kernels, fixed, common, inertia, states, *, state_gradients=None):
     """Launch the integration, or its adjoint if ``state_gradients`` are given; then return the inputs' gradients."""
     batch, steps = common[2].shape[:2]
     backward = state_gradients is not None
     grid, options = fixed.structs(kernels)
-    device = common[0].device
-    slots = max(1, steps) if keep else 1
+    device = str(common[0].device)
+    types = (*_types(kernels), kernels.mat33)
     state_types = (kernels.vec3, kernels.mat33, kernels.vec3, kernels.vec3)
-    shares = _shares(batch, device)
-    summed = common[0].new_zeros((batch, slots, 6, 3))
-    coupling = common[0].new_zeros((batch, slots, 3, 3))
-    scratch_gradients = [torch.zeros_like(t) for t in (summed, coupling)] if backward else [None, None]
+    drives = wp.from_torch(fixed.drives, dtype=wp.int32)
 
     def work(part: tuple[int, int]) -> list[Tensor | None]:
         first, count = part
-        types = (*_types(kernels), kernels.mat33)
         arrays = _wrap((*common, inertia), types, gradients=backward)
-        *shared, inertia_array = arrays
-        height, material, speeds, points, areas, tangents, weights, mass, centre_of_mass, factors = shared
-        gradients = state_gradients or [None] * 4
+        height, material, speeds, points, areas, tangents, weights, mass, centre_of_mass, factors, moments = arrays
         moving = [
             wp.from_torch(t, dtype=kind, requires_grad=backward, grad=g)
-            for t, kind, g in zip(states, state_types, gradients, strict=True)
+            for t, kind, g in zip(states, state_types, state_gradients or [None] * 4, strict=True)
         ]
-        scratch = [
-            wp.from_torch(t, dtype=kind, requires_grad=backward, grad=g)
-            for t, kind, g in zip((summed, coupling), (kernels.vec3, kernels.mat33), scratch_gradients, strict=True)
-        ]
-        drives = wp.from_torch(fixed.drives, dtype=wp.int32)
-        before = [
-            first, steps, int(keep), height, material, grid, options, speeds, points, areas, tangents, drives, weights,
-            mass, centre_of_mass, inertia_array, factors,
-        ]  # fmt: skip
-        extra = _adjoint(before, outputs=6) if backward else {}
-        wp.launch(
-            kernels.integrate,
-            dim=count,
-            inputs=before,
-            outputs=[*moving, *scratch],
-            device=str(device),
-            record_tape=False,
-            **extra,
-        )
+        for chunk in range(first, first + count, CHUNK if backward else count):
+            width = min(CHUNK, first + count - chunk) if backward else count
+            # The adjoint reads the sums of every step; keeping them for a few trajectories at a time costs one more
+            # forward launch and saves most of the memory.
+            slots = max(1, steps) if backward else 1
+            scratch = _wrap(
+                (common[0].new_zeros((width, slots, 6, 3)), common[0].new_zeros((width, slots, 3, 3))),
+                (kernels.vec3, kernels.mat33),
+                gradients=backward,
+            )
+            inputs = [
+                chunk, steps, int(backward), height, material, grid, options, speeds, points, areas, tangents, drives,
+                weights, mass, centre_of_mass, moments, factors,
+            ]  # fmt: skip
+            launch = {"dim": width, "inputs": inputs, "outputs": [*moving, *scratch], "device": device}
+            wp.launch(kernels.integrate, record_tape=False, **launch)
+            if backward:
+                wp.launch(kernels.integrate, record_tape=False, **launch, **_adjoint(inputs, outputs=6))
         return [wp.to_torch(array.grad) if backward else None for array in arrays]
 
-    wp.init()
-    parts = list(_in_parallel(work, shares))
+    # Compiled here: two threads must not do so at once.
+    kernels.integrate.module.load(wp.get_device(device))
+    parts = list(_in_parallel(work, _shares(batch, common[0].device)))
     if not backward:
         return []
     return [torch.stack(entries).sum(0) if len(entries) > 1 else entries[0] for entries in zip(*parts, strict=True)]
@@ -246,7 +247,7 @@ def _shares(batch: int, device: torch.device) -> list[tuple[int, int]]:
     """First trajectory and number of trajectories of each launch."""
     workers = 1 if device.type == "cuda" else max(1, min(CPU_THREADS, batch // SMALLEST_SHARE))
     edges = [round(batch * k / workers) for k in range(workers + 1)]
-    return [(low, high - low) for low, high in zip(edges[:-1], edges[1:], strict=True)]
+    return [(low, high - low) for low, high in itertools.pairwise(edges)]
 
 
 def _in_parallel(work, shares):
@@ -255,5 +256,4 @@ def _in_parallel(work, shares):
         return [work(shares[0])]
     if _threads is None:
         _threads = ThreadPoolExecutor(CPU_THREADS, thread_name_prefix="rollout")
-    # The first launch compiles the module; two threads must not do so at once.
     return list(_threads.map(work, shares))

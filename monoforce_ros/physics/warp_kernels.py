@@ -1,7 +1,8 @@
 """The rollout as Warp kernels: one thread a trajectory, loops over steps and body points inside.
 
-Warp's adjoint of a value that is summed in a dynamic loop and then used non-linearly in the same kernel is wrong, so the
-summed wrench and gains go through per-step arrays: stored after the loop over points, loaded again before the solve.
+Warp's adjoint of a value that is summed in a dynamic loop and then used non-linearly in the same kernel is wrong, so
+the summed wrench and gains go through per-step arrays: stored after the loop over points, loaded again before the solve.
+On the way back Warp repeats the loads of a step but not its stores, so the arrays must hold every step by then.
 
 Types follow the precision asked for; annotations must be real objects here, not strings.
 """
@@ -16,7 +17,7 @@ CONSTANT_LOOKUP, BILINEAR_LOOKUP = 0, 1
 VERTICAL_FORCE, NORMAL_FORCE = 0, 1
 NO_FRICTION, COULOMB, SIGMOID = 0, 1, 2
 
-wp.config.quiet = True
+wp.config.log_level = wp.LOG_ERROR
 
 
 @dataclass(frozen=True)
@@ -218,7 +219,8 @@ def kernels(double: bool) -> Kernels:
         summed: wp.array3d(dtype=vec3),
         coupling: wp.array2d(dtype=mat33),
     ):
-        b = first_trajectory + wp.tid()
+        thread = wp.tid()
+        b = first_trajectory + thread
         page = wp.min(b, height.shape[0] - 1)
         weight_total = mass[b] * options.gravity
         offset = centre_of_mass[b]
@@ -261,8 +263,8 @@ def kernels(double: bool) -> Kernels:
                     acting = (
                         touch.force[0] * touch.normal + touch.force[1] * touch.along + touch.force[2] * touch.across
                     )
-                    force += acting
-                    torque += wp.cross(arm, acting)
+                    force = force + acting
+                    torque = torque + wp.cross(arm, acting)
                     yielding = (
                         touch.gain[0] * wp.outer(touch.normal, touch.normal)
                         + touch.gain[1] * wp.outer(touch.along, touch.along)
@@ -271,25 +273,25 @@ def kernels(double: bool) -> Kernels:
                     lever = wp.skew(arm)
                     product = yielding * lever
                     rotary = lever * product
-                    diagonal += vec3(yielding[0, 0], yielding[1, 1], yielding[2, 2])
-                    beside += vec3(yielding[1, 2], yielding[0, 2], yielding[0, 1])
-                    turning_diagonal += vec3(rotary[0, 0], rotary[1, 1], rotary[2, 2])
-                    turning_beside += vec3(rotary[1, 2], rotary[0, 2], rotary[0, 1])
-                    mixed += product
-            summed[b, slot, 0] = force
-            summed[b, slot, 1] = torque
-            summed[b, slot, 2] = diagonal
-            summed[b, slot, 3] = beside
-            summed[b, slot, 4] = turning_diagonal
-            summed[b, slot, 5] = turning_beside
-            coupling[b, slot] = mixed
+                    diagonal = diagonal + vec3(yielding[0, 0], yielding[1, 1], yielding[2, 2])
+                    beside = beside + vec3(yielding[1, 2], yielding[0, 2], yielding[0, 1])
+                    turning_diagonal = turning_diagonal + vec3(rotary[0, 0], rotary[1, 1], rotary[2, 2])
+                    turning_beside = turning_beside + vec3(rotary[1, 2], rotary[0, 2], rotary[0, 1])
+                    mixed = mixed + product
+            summed[thread, slot, 0] = force
+            summed[thread, slot, 1] = torque
+            summed[thread, slot, 2] = diagonal
+            summed[thread, slot, 3] = beside
+            summed[thread, slot, 4] = turning_diagonal
+            summed[thread, slot, 5] = turning_beside
+            coupling[thread, slot] = mixed
 
-            total_force = summed[b, slot, 0] + vec3(scalar(0.0), scalar(0.0), -options.gravity * mass[b])
-            total_torque = summed[b, slot, 1]
-            d = summed[b, slot, 2]
-            o = summed[b, slot, 3]
-            td = summed[b, slot, 4]
-            to = summed[b, slot, 5]
+            total_force = summed[thread, slot, 0] + vec3(scalar(0.0), scalar(0.0), -options.gravity * mass[b])
+            total_torque = summed[thread, slot, 1]
+            d = summed[thread, slot, 2]
+            o = summed[thread, slot, 3]
+            td = summed[thread, slot, 4]
+            to = summed[thread, slot, 5]
             h = options.time_step
             world_inertia = turned * inertia[b] * wp.transpose(turned)
             total_torque = total_torque - wp.cross(angular, world_inertia * angular)
@@ -305,7 +307,7 @@ def kernels(double: bool) -> Kernels:
                 to[2], td[1], to[0],
                 to[1], to[0], td[2],
             )  # fmt: skip
-            side = -h * coupling[b, slot]
+            side = -h * coupling[thread, slot]
             inverse = wp.inverse(upper)
             reduced = wp.transpose(side) * inverse
             right = h * total_force

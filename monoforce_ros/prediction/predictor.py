@@ -11,7 +11,7 @@ from monoforce_ros.motion import MotionState, transform_points
 from monoforce_ros.physics import PhysicsOptions, Rollout, State, rollout
 from monoforce_ros.prediction.terrain_sources import Observation, TerrainSource
 from monoforce_ros.robots import RobotModel
-from monoforce_ros.terrain import TerrainMap
+from monoforce_ros.terrain import Grid, TerrainMap
 
 
 @dataclass(frozen=True)
@@ -75,6 +75,11 @@ class Predictor:
         self.source = source
         self.options = options or PhysicsOptions()
         self.steps = max(1, round(horizon / self.options.time_step))
+
+    def warm_up(self) -> None:
+        """Make the first prediction as fast as the others: compile kernels, load libraries."""
+        still = MotionState(0, np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3))
+        self.roll_out(TerrainMap.flat(Grid.square(2.0, 0.5)), [still], np.zeros((1, 2, 2)))
 
     def step_stamps(self, stamp: int) -> np.ndarray:
         """Times [ns] at which each step of a prediction from ``stamp`` begins, ``[T]``."""
