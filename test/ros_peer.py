@@ -46,6 +46,7 @@ class Peer:
             )
         self._publishers: dict[str, object] = {}
         self.now = 1_700_000_000_000_000_000
+        self.clouds_sent: list[int] = []
 
     def close(self) -> None:
         self.executor.shutdown()
@@ -104,6 +105,7 @@ class Peer:
             # Like a robot's drivers: the cloud is stamped when it was taken and arrives before newer odometry.
             if step % 10 == 0 and (message := cloud(self.now)) is not None:
                 self.publish("/points", message)
+                self.clouds_sent.append(self.now)
             if (message := odometry(self.now)) is not None:
                 self.publish("/odom", message)
             if step % 2 == 0 and (message := command(self.now)) is not None:

@@ -36,6 +36,7 @@ def contact(
     areas: Tensor,
     weights: Tensor,
     friction_factors: Tensor,
+    rolling_resistance: Tensor,
     options: PhysicsOptions,
 ) -> Contact:
     """Forces on body points (paper III-C and III-D).
@@ -53,6 +54,7 @@ def contact(
         areas: ``[N]`` [m²].
         weights: share m g of each point in the robot's weight, ``[B, N]`` or ``[N]`` [N] (``sigmoid`` only).
         friction_factors: longitudinal and lateral factor on the ground's friction, ``[B, 1, 2]``.
+        rolling_resistance: force against rolling as a part of the load, ``[B, 1]``.
     """
     vertical = options.normal_force == "vertical"
     normal = torch.zeros_like(ground.normal) if vertical else ground.normal
@@ -72,7 +74,8 @@ def contact(
     across = across * torch.rsqrt((across * across).sum(-1, keepdim=True) + 1e-12)
     along = torch.linalg.cross(across, normal)
     tangential = torch.stack([along, across], dim=2)
-    slip = (tangential * (velocities + belt_velocities)[:, :, None]).sum(-1)
+    moved = (tangential * velocities[:, :, None]).sum(-1)
+    slip = moved + (tangential * belt_velocities[:, :, None]).sum(-1)
     friction = ground.friction[..., None] * friction_factors
     if options.tangential_force == "coulomb":
         speed = torch.sqrt((slip * slip).sum(-1, keepdim=True) + options.slip_regularisation**2)
@@ -86,6 +89,11 @@ def contact(
     else:
         tangential_force = torch.zeros_like(slip)
         tangential_gain = tangential_force
+    # What holds the body back, rather than the belt: rolling resistance and vegetation.
+    held = rolling_resistance * load / torch.sqrt(moved[..., 0] ** 2 + options.slip_regularisation**2)
+    held = torch.stack([held, torch.zeros_like(held)], dim=-1) + (areas * ground.drag * touching)[..., None]
+    tangential_force = tangential_force - held * moved
+    tangential_gain = tangential_gain + held
     return Contact(
         directions=torch.cat([normal[:, :, None], tangential], dim=2),
         force=torch.cat([pressing[..., None], tangential_force], dim=-1),

@@ -24,6 +24,8 @@ class Ground:
     """``[B, N]`` [N s/m³]."""
     friction: Tensor
     """``[B, N]``."""
+    drag: Tensor
+    """Drag of vegetation per area, ``[B, N]`` [N s/m³]."""
 
 
 class TerrainLookup:
@@ -33,8 +35,10 @@ class TerrainLookup:
     the slope across the border is zero there.
     """
 
-    def __init__(self, terrain: TerrainMap, kind: str, batch: int):
-        channels = torch.stack([terrain.height, terrain.stiffness, terrain.damping, terrain.friction], dim=-3)
+    def __init__(self, terrain: TerrainMap, kind: str, batch: int, drag: Tensor | None = None):
+        drag = torch.zeros_like(terrain.height) if drag is None else drag
+        listed = torch.broadcast_tensors(terrain.height, terrain.stiffness, terrain.damping, terrain.friction, drag)
+        channels = torch.stack(listed, dim=-3)
         if channels.ndim == 3:
             channels = channels[None]
         if channels.shape[0] not in (1, batch):
@@ -58,7 +62,7 @@ class TerrainLookup:
         return ((index >= -0.5) & (index <= self._limit + 0.5)).all(dim=-1)
 
     def _gather(self, flat: Tensor) -> Tensor:
-        """Channels ``[B, 4, M]`` at flat indices ``[B, M]``."""
+        """Channels ``[B, 5, M]`` at flat indices ``[B, M]``."""
         channels = self._channels
         if channels.shape[0] == 1:
             return channels[0][:, flat].transpose(0, 1)
@@ -99,5 +103,5 @@ class TerrainLookup:
     def _ground(value: Tensor, slope_x: Tensor, slope_y: Tensor) -> Ground:
         upward = torch.rsqrt(1.0 + slope_x * slope_x + slope_y * slope_y)
         normal = torch.stack([-slope_x * upward, -slope_y * upward, upward], dim=-1)
-        height, stiffness, damping, friction = value.unbind(1)
-        return Ground(height, normal, stiffness, damping, friction)
+        height, stiffness, damping, friction, drag = value.unbind(1)
+        return Ground(height, normal, stiffness, damping, friction, drag)

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from monoforce_ros.physics.effects.catalogue import applied_setup
+from monoforce_ros.physics.effects.effect import per_trajectory
 from monoforce_ros.physics.state import State
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import TerrainMap
@@ -44,6 +46,14 @@ class Problem:
     """About the centre of mass in base axes [kg m²], ``[B, 3, 3]``."""
     friction_factors: Tensor
     """Longitudinal and lateral factor on the ground's friction, ``[B, 2]``."""
+    gravity_tilt: Tensor
+    """Tilt of gravity about x and y [rad], ``[B, 2]``."""
+    resistance: Tensor
+    """Rolling resistance [-], linear [N s/m] and quadratic drag [N s²/m²], ``[B, 3]``."""
+    vegetation_drag: Tensor
+    """Drag map [N s/m³]: force against motion per area of a touching point; like the terrain, ``[(B,) rows, cols]``."""
+    wrench: Tensor
+    """Body-frame force and torque per feature of the motion, ``[B, 6, F]``."""
 
     @classmethod
     def pose(cls, terrain: TerrainMap, robot: RobotModel, drive_speeds: Tensor, state: State) -> tuple[Problem, Tensor]:
@@ -53,7 +63,8 @@ class Problem:
         the gradient of the terrain that they share with the others.
         """
         batch, dtype, device = state.position.shape[0], state.position.dtype, state.position.device
-        terrain, robot = terrain.to(dtype, device), robot.to(dtype, device)
+        setup = applied_setup(terrain.to(dtype, device), robot.to(dtype, device))
+        terrain, robot, loads = setup.terrain, setup.robot, setup.loads
         given = (state.position, state.rotation, state.velocity, state.angular_velocity, drive_speeds.to(dtype))
         finite = torch.stack([torch.isfinite(t.detach()).reshape(batch, -1).all(1) for t in given]).all(0)
         if bool(finite.all()):
@@ -66,6 +77,10 @@ class Problem:
             )
         centre_of_mass = robot.centre_of_mass.expand(batch, 3)
         offset = (rotation @ centre_of_mass[..., None])[..., 0]
+        resistance = (loads.rolling_resistance, loads.linear_drag, loads.quadratic_drag)
+        vegetation = (terrain.geometric_height - terrain.height).clamp_min(0.0)
+        if loads.vegetation_drag.ndim and vegetation.ndim == 2:
+            vegetation = vegetation.expand(batch, -1, -1)
         factors = [robot.friction_longitudinal.expand(batch), robot.friction_lateral.expand(batch)]
         problem = cls(
             terrain=terrain,
@@ -82,6 +97,10 @@ class Problem:
             centre_of_mass=centre_of_mass,
             inertia=robot.inertia.expand(batch, 3, 3),
             friction_factors=torch.stack(factors, dim=-1),
+            gravity_tilt=loads.gravity_tilt.expand(batch, 2),
+            resistance=torch.stack([value.expand(batch) for value in resistance], dim=-1),
+            vegetation_drag=vegetation * per_trajectory(loads.vegetation_drag, 3),
+            wrench=loads.wrench.expand(batch, 6, -1),
         )
         return problem, finite
 

@@ -11,21 +11,41 @@ from monoforce_ros.physics.options import PhysicsOptions
 from monoforce_ros.physics.problem import Motion, Problem
 from monoforce_ros.physics.rotation import exponential_map
 
+SMALLEST_SPEED = 1e-6
+"""Keeps the gradient of a speed finite at rest [m/s]."""
+
+
+def tilted_gravity(tilt: Tensor, gravity: float) -> Tensor:
+    """Gravity ``[B, 3]`` [m/s²] turned about the y axis, then about the x axis, by ``tilt`` ``[B, 2]`` (x, y) [rad]."""
+    about_x, about_y = tilt.unbind(-1)
+    level = torch.cos(about_y)
+    return -gravity * torch.stack([torch.sin(about_y), -torch.sin(about_x) * level, torch.cos(about_x) * level], -1)
+
+
+def features(in_body: Tensor, rotation: Tensor) -> Tensor:
+    """Features ``[B, F]`` (:data:`monoforce_ros.physics.setup.FEATURES`) of the body-frame velocities ``[B, 3, 2]``."""
+    forward, left, rate = in_body[:, 0, 0], in_body[:, 1, 0], in_body[:, 2, 1]
+    listed = [torch.ones_like(forward), forward, left, rate]
+    listed += [forward * forward.abs(), left * left.abs(), rate * rate.abs(), forward * rate, left * rate]
+    return torch.stack([*listed, rotation[:, 2, 0], rotation[:, 2, 1]], dim=-1)
+
 
 def integrate(problem: Problem, options: PhysicsOptions, with_forces: bool) -> Motion:
     """Integrate with autograd recording each step; see :func:`monoforce_ros.physics.rollout`."""
     batch, dtype, device = problem.batch_size, problem.centre.dtype, problem.centre.device
     step_time = options.time_step
-    lookup = TerrainLookup(problem.terrain, options.lookup, batch)
+    lookup = TerrainLookup(problem.terrain, options.lookup, batch, problem.vegetation_drag)
     body_points = problem.points - problem.centre_of_mass[:, None]
     factors = problem.friction_factors[:, None]
     share = problem.point_areas / problem.point_areas.sum()
     weights = problem.mass[:, None] * options.gravity * share
     # Drive -1, the hull, finds its zero at the end.
     speeds = torch.cat([problem.drive_speeds, torch.zeros_like(problem.drive_speeds[..., :1])], dim=-1)
-    gravity = problem.mass[:, None] * torch.tensor([0.0, 0.0, -options.gravity], dtype=dtype, device=device)
+    weight = problem.mass[:, None] * tilted_gravity(problem.gravity_tilt, options.gravity)
+    rolling, linear_drag, quadratic_drag = problem.resistance.unbind(-1)
     translation = problem.mass[:, None, None] * torch.eye(3, dtype=dtype, device=device)
     zero = torch.zeros_like(translation)
+    linear_part = torch.diag(torch.tensor([1.0, 1.0, 1.0, 0.0, 0.0, 0.0], dtype=dtype, device=device))
 
     def mass_matrix(inertia: Tensor) -> Tensor:
         return torch.cat([torch.cat([translation, zero], 2), torch.cat([zero, inertia], 2)], 1)
@@ -49,6 +69,7 @@ def integrate(problem: Problem, options: PhysicsOptions, with_forces: bool) -> M
             problem.point_areas,
             weights,
             factors,
+            rolling[:, None],
             options,
         )
         # Rows that turn the body's six velocities into the points' velocities along the contact directions, and by
@@ -60,9 +81,19 @@ def integrate(problem: Problem, options: PhysicsOptions, with_forces: bool) -> M
         wrench = (force[:, None] @ jacobian)[:, 0]
         inertia = rotation @ problem.inertia @ turned
         gyroscopic = torch.linalg.cross(angular_velocity, (inertia @ angular_velocity[..., None])[..., 0])
-        external = torch.cat([gravity, -gyroscopic], dim=-1)
+        in_body = turned @ torch.stack([velocity, angular_velocity], dim=-1)
+        extra = (problem.wrench @ features(in_body, rotation)[..., None])[..., 0]
+        drag = linear_drag + quadratic_drag * torch.sqrt((velocity * velocity).sum(-1) + SMALLEST_SPEED**2)
+        external = torch.cat(
+            [
+                weight - drag[:, None] * velocity + (rotation @ extra[:, :3, None])[..., 0],
+                (rotation @ extra[:, 3:, None])[..., 0] - gyroscopic,
+            ],
+            dim=-1,
+        )
         yielding = (jacobian * gain[..., None]).transpose(1, 2) @ jacobian
-        change = torch.linalg.solve(mass_matrix(inertia) + step_time * yielding, step_time * (wrench + external))
+        system = mass_matrix(inertia) + step_time * (yielding + drag[:, None, None] * linear_part)
+        change = torch.linalg.solve(system, step_time * (wrench + external))
         velocity = velocity + change[:, :3]
         angular_velocity = angular_velocity + change[:, 3:]
         centre = centre + step_time * velocity

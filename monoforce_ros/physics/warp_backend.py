@@ -32,8 +32,12 @@ def integrate(problem: Problem, options: PhysicsOptions, with_forces: bool) -> M
     """Integrate with Warp; see :func:`monoforce_ros.physics.rollout`."""
     terrain = problem.terrain
     height = terrain.height if terrain.height.ndim == 3 else terrain.height[None]
-    material = torch.stack([terrain.stiffness, terrain.damping, terrain.friction], dim=-1)
+    listed = torch.broadcast_tensors(terrain.stiffness, terrain.damping, terrain.friction, problem.vegetation_drag)
+    material = torch.stack(listed, dim=-1)
     material = material if material.ndim == 4 else material[None]
+    # Both are read at one page, so a map of which only the material varies is repeated.
+    pages = max(len(height), len(material))
+    height, material = height.expand(pages, -1, -1), material.expand(pages, -1, -1, -1)
     share = problem.point_areas / problem.point_areas.sum()
     drives = problem.point_drives.to(torch.int32)
     fixed = _Fixed(options, terrain.grid, drives)
@@ -48,6 +52,9 @@ def integrate(problem: Problem, options: PhysicsOptions, with_forces: bool) -> M
         problem.mass,
         problem.centre_of_mass,
         problem.friction_factors,
+        problem.gravity_tilt,
+        problem.resistance,
+        problem.wrench,
     )
     start = (problem.centre, problem.rotation, problem.velocity, problem.angular_velocity)
     states = _Integrate.apply(fixed, *common, problem.inertia, *start)
@@ -88,7 +95,7 @@ def _kernels(tensor: Tensor) -> warp_kernels.Kernels:
 def _types(kernels: warp_kernels.Kernels) -> tuple:
     """Warp element types of the tensors in ``common``, in their order."""
     s, v2, v3 = kernels.scalar, kernels.vec2, kernels.vec3
-    return (s, v3, s, v3, s, v3, s, s, v3, v2)
+    return (s, kernels.vec4, s, v3, s, v3, s, s, v3, v2, v2, v3, kernels.wrench)
 
 
 def _wrap(tensors, types, *, gradients: bool) -> list[wp.array]:
@@ -108,7 +115,7 @@ class _Integrate(torch.autograd.Function):
     def forward(ctx, fixed, *tensors):
         kernels = _kernels(tensors[0])
         inputs = _contiguous(tensors)
-        (*common, inertia), start = inputs[:11], inputs[11:]
+        (*common, inertia), start = inputs[:14], inputs[14:]
         batch, steps = common[2].shape[:2]
         states = []
         for value in start:
@@ -124,7 +131,7 @@ class _Integrate(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, *state_gradients):
-        (*common, inertia), states = ctx.saved_tensors[:11], ctx.saved_tensors[11:]
+        (*common, inertia), states = ctx.saved_tensors[:14], ctx.saved_tensors[14:]
         kernels = _kernels(common[0])
         # The adjoint adds to these while it walks back in time, hence copies.
         gradients = [g.clone(memory_format=torch.contiguous_format) for g in state_gradients]
@@ -175,7 +182,10 @@ def _launch(kernels, fixed, common, inertia, states, *, state_gradients=None):
     def work(part: tuple[int, int]) -> list[Tensor | None]:
         first, count = part
         arrays = _wrap((*common, inertia), types, gradients=backward)
-        height, material, speeds, points, areas, tangents, weights, mass, centre_of_mass, factors, moments = arrays
+        (
+            height, material, speeds, points, areas, tangents, weights, mass, centre_of_mass, factors, tilt, resistance,
+            wrench, moments,
+        ) = arrays  # fmt: skip
         moving = [
             wp.from_torch(t, dtype=kind, requires_grad=backward, grad=g)
             for t, kind, g in zip(states, state_types, state_gradients or [None] * 4, strict=True)
@@ -192,7 +202,7 @@ def _launch(kernels, fixed, common, inertia, states, *, state_gradients=None):
             )
             inputs = [
                 chunk, steps, int(backward), height, material, grid, options, speeds, points, areas, tangents, drives,
-                weights, mass, centre_of_mass, moments, factors,
+                weights, mass, centre_of_mass, moments, factors, tilt, resistance, wrench,
             ]  # fmt: skip
             launch = {"dim": width, "inputs": inputs, "outputs": [*moving, *scratch], "device": device}
             wp.launch(kernels.integrate, record_tape=False, **launch)
@@ -213,7 +223,10 @@ def _launch_forces(kernels, fixed, inputs, outputs, *, output_gradients=None):
     grid, options = fixed.structs(kernels)
     state_types = (kernels.vec3, kernels.mat33, kernels.vec3, kernels.vec3)
     arrays = _wrap(inputs, (*_types(kernels), *state_types), gradients=backward)
-    height, material, speeds, points, areas, tangents, weights, mass, centre_of_mass, factors, *moving = arrays
+    (
+        height, material, speeds, points, areas, tangents, weights, mass, centre_of_mass, factors, tilt, resistance,
+        wrench, *moving,
+    ) = arrays  # fmt: skip
     gradients = output_gradients or (None, None)
     results = [
         wp.from_torch(t, dtype=kind, requires_grad=backward, grad=g)
@@ -222,7 +235,7 @@ def _launch_forces(kernels, fixed, inputs, outputs, *, output_gradients=None):
     drives = wp.from_torch(fixed.drives, dtype=wp.int32)
     before = [
         height, material, grid, options, speeds, points, areas, tangents, drives, weights, mass, centre_of_mass,
-        factors, *moving,
+        factors, tilt, resistance, wrench, *moving,
     ]  # fmt: skip
     extra = _adjoint(before, outputs=2) if backward else {}
     wp.launch(

@@ -1,7 +1,7 @@
 """The rollout as Warp kernels: one thread a trajectory, loops over steps and body points inside.
 
 Warp's adjoint of a value that is summed in a dynamic loop and then used non-linearly in the same kernel is wrong, so
-the summed wrench and gains go through per-step arrays: stored after the loop over points, loaded again before the solve.
+the summed wrench and gains go through per-step arrays: stored after the loop over points, loaded before the solve.
 On the way back Warp repeats the loads of a step but not its stores, so the arrays must hold every step by then.
 
 Types follow the precision asked for; annotations must be real objects here, not strings.
@@ -13,9 +13,12 @@ from typing import Any
 
 import warp as wp
 
+from monoforce_ros.physics.setup import FEATURES
+
 CONSTANT_LOOKUP, BILINEAR_LOOKUP = 0, 1
 VERTICAL_FORCE, NORMAL_FORCE = 0, 1
 NO_FRICTION, COULOMB, SIGMOID = 0, 1, 2
+SMALLEST_SPEED_SQUARE = 1e-12
 
 wp.config.log_level = wp.LOG_ERROR
 
@@ -27,7 +30,9 @@ class Kernels:
     scalar: Any
     vec2: Any
     vec3: Any
+    vec4: Any
     mat33: Any
+    wrench: Any
     integrate: Any
     forces: Any
 
@@ -38,7 +43,10 @@ def kernels(double: bool) -> Kernels:
     scalar = wp.float64 if double else wp.float32
     vec2 = wp.types.vector(length=2, dtype=scalar)
     vec3 = wp.types.vector(length=3, dtype=scalar)
+    vec4 = wp.types.vector(length=4, dtype=scalar)
     mat33 = wp.types.matrix(shape=(3, 3), dtype=scalar)
+    features_vector = wp.types.vector(length=len(FEATURES), dtype=scalar)
+    wrench_matrix = wp.types.matrix(shape=(6, len(FEATURES)), dtype=scalar)
 
     @wp.struct
     class Grid:
@@ -83,7 +91,7 @@ def kernels(double: bool) -> Kernels:
     @wp.func
     def touch_ground(
         height: wp.array3d(dtype=scalar),
-        material: wp.array3d(dtype=vec3),
+        material: wp.array3d(dtype=vec4),
         page: int,
         grid: Grid,
         options: Options,
@@ -94,6 +102,7 @@ def kernels(double: bool) -> Kernels:
         area: scalar,
         weight: scalar,
         factors: vec2,
+        rolling: scalar,
     ) -> Touch:
         touch = Touch()
         raw_x = (point[0] - grid.origin_x) * grid.inverse_resolution
@@ -125,7 +134,7 @@ def kernels(double: bool) -> Kernels:
         gap = level - point[2]
         # Most points are in the air: nothing more is computed for them.
         if gap > scalar(0.0):
-            stuff = vec3()
+            stuff = vec4()
             if options.lookup == 1:
                 m00 = material[page, row, column]
                 m01 = material[page, row, column + 1]
@@ -151,9 +160,10 @@ def kernels(double: bool) -> Kernels:
             across = lateral - wp.dot(lateral, normal) * normal
             across = across * (scalar(1.0) / wp.sqrt(wp.dot(across, across) + scalar(1.0e-12)))
             along = wp.cross(across, normal)
-            moving = velocity + belt
-            slip_along = wp.dot(moving, along)
-            slip_across = wp.dot(moving, across)
+            moved_along = wp.dot(velocity, along)
+            moved_across = wp.dot(velocity, across)
+            slip_along = moved_along + wp.dot(belt, along)
+            slip_across = moved_across + wp.dot(belt, across)
             friction_along = stuff[2] * factors[0]
             friction_across = stuff[2] * factors[1]
             force_along = scalar(0.0)
@@ -173,6 +183,13 @@ def kernels(double: bool) -> Kernels:
                 force_across = friction_across * weight * (active_across - scalar(0.5))
                 gain_along = friction_along * weight * active_along * (scalar(1.0) - active_along)
                 gain_across = friction_across * weight * active_across * (scalar(1.0) - active_across)
+            # What holds the body back, rather than the belt: rolling resistance and vegetation.
+            held_across = area * stuff[3]
+            held_along = rolling * load / wp.sqrt(moved_along * moved_along + options.slip_square) + held_across
+            force_along = force_along - held_along * moved_along
+            force_across = force_across - held_across * moved_across
+            gain_along = gain_along + held_along
+            gain_across = gain_across + held_across
             touch.active = 1
             touch.normal = normal
             touch.along = along
@@ -199,7 +216,7 @@ def kernels(double: bool) -> Kernels:
         steps: int,
         keep: int,
         height: wp.array3d(dtype=scalar),
-        material: wp.array3d(dtype=vec3),
+        material: wp.array3d(dtype=vec4),
         grid: Grid,
         options: Options,
         speeds: wp.array3d(dtype=scalar),
@@ -212,6 +229,9 @@ def kernels(double: bool) -> Kernels:
         centre_of_mass: wp.array(dtype=vec3),
         inertia: wp.array(dtype=mat33),
         factors: wp.array(dtype=vec2),
+        tilt: wp.array(dtype=vec2),
+        resistance: wp.array(dtype=vec3),
+        wrench: wp.array(dtype=wrench_matrix),
         centre: wp.array2d(dtype=vec3),
         rotation: wp.array2d(dtype=mat33),
         velocity: wp.array2d(dtype=vec3),
@@ -258,6 +278,7 @@ def kernels(double: bool) -> Kernels:
                     areas[i],
                     weight_total * share[i],
                     factors[b],
+                    resistance[b][0],
                 )
                 if touch.active == 1:
                     acting = (
@@ -286,8 +307,25 @@ def kernels(double: bool) -> Kernels:
             summed[thread, slot, 5] = turning_beside
             coupling[thread, slot] = mixed
 
-            total_force = summed[thread, slot, 0] + vec3(scalar(0.0), scalar(0.0), -options.gravity * mass[b])
-            total_torque = summed[thread, slot, 1]
+            in_body = wp.transpose(turned) * linear
+            rate = (wp.transpose(turned) * angular)[2]
+            shown = features_vector(
+                scalar(1.0), in_body[0], in_body[1], rate,
+                in_body[0] * wp.abs(in_body[0]), in_body[1] * wp.abs(in_body[1]), rate * wp.abs(rate),
+                in_body[0] * rate, in_body[1] * rate, turned[2, 0], turned[2, 1],
+            )  # fmt: skip
+            extra = wrench[b] * shown
+            about_x = tilt[b][0]
+            about_y = tilt[b][1]
+            level = wp.cos(about_y)
+            weight = (-options.gravity * mass[b]) * vec3(
+                wp.sin(about_y), -wp.sin(about_x) * level, wp.cos(about_x) * level
+            )
+            drag = resistance[b][1] + resistance[b][2] * wp.sqrt(wp.dot(linear, linear) + scalar(SMALLEST_SPEED_SQUARE))
+            pushed = turned * vec3(extra[0], extra[1], extra[2])
+            twisted = turned * vec3(extra[3], extra[4], extra[5])
+            total_force = summed[thread, slot, 0] + (weight - drag * linear + pushed)
+            total_torque = summed[thread, slot, 1] + twisted
             d = summed[thread, slot, 2]
             o = summed[thread, slot, 3]
             td = summed[thread, slot, 4]
@@ -295,7 +333,7 @@ def kernels(double: bool) -> Kernels:
             h = options.time_step
             world_inertia = turned * inertia[b] * wp.transpose(turned)
             total_torque = total_torque - wp.cross(angular, world_inertia * angular)
-            m = mass[b]
+            m = mass[b] + h * drag
             upper = mat33(
                 m + h * d[0], h * o[2], h * o[1],
                 h * o[2], m + h * d[1], h * o[0],
@@ -323,7 +361,7 @@ def kernels(double: bool) -> Kernels:
     @wp.kernel(module="unique")
     def forces(
         height: wp.array3d(dtype=scalar),
-        material: wp.array3d(dtype=vec3),
+        material: wp.array3d(dtype=vec4),
         grid: Grid,
         options: Options,
         speeds: wp.array3d(dtype=scalar),
@@ -335,6 +373,9 @@ def kernels(double: bool) -> Kernels:
         mass: wp.array(dtype=scalar),
         centre_of_mass: wp.array(dtype=vec3),
         factors: wp.array(dtype=vec2),
+        tilt: wp.array(dtype=vec2),
+        resistance: wp.array(dtype=vec3),
+        wrench: wp.array(dtype=wrench_matrix),
         centre: wp.array2d(dtype=vec3),
         rotation: wp.array2d(dtype=mat33),
         velocity: wp.array2d(dtype=vec3),
@@ -362,6 +403,7 @@ def kernels(double: bool) -> Kernels:
             areas[i],
             mass[b] * options.gravity * share[i],
             factors[b],
+            resistance[b][0],
         )
         if touch.active == 1:
             # The forces that acted over the step: what the point's change of velocity left of them.
@@ -376,4 +418,4 @@ def kernels(double: bool) -> Kernels:
 
     # Structs are reached through the kernels' signatures by the caller.
     integrate.grid_type, integrate.options_type = Grid, Options
-    return Kernels(scalar, vec2, vec3, mat33, integrate, forces)
+    return Kernels(scalar, vec2, vec3, vec4, mat33, wrench_matrix, integrate, forces)

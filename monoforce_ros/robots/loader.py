@@ -22,7 +22,7 @@ DEFAULT_SPACING = 0.05
 
 _TOP_KEYS = {
     "name", "description", "base_frame", "mass", "centre_of_mass", "inertia", "inertia_box", "command", "friction",
-    "wheels", "tracks", "hull", "sensors",
+    "wheels", "tracks", "hull", "sensors", "effects",
 }  # fmt: skip
 
 
@@ -158,7 +158,25 @@ class _Reader:
                 command.get("maximum_yaw_rate", math.inf), "command.maximum_yaw_rate", 0.01, math.inf, "rad/s"
             ),
             sensors=self.sensors(top.get("sensors", {})),
+            effects=self.effects(top.get("effects", [])),
         )
+
+    def effects(self, content: Any) -> tuple[tuple[str, dict[str, float]], ...]:
+        """Names and values as they stand; whether the catalogue has them is checked where they act."""
+        listed = []
+        for index, entry in enumerate(self.items(content, "effects")):
+            where = f"effects[{index}]"
+            effect = self.mapping(entry, where, {"name", "parameters", "provenance"}, ["name", "parameters"])
+            if not isinstance(effect["parameters"], Mapping):
+                raise self.fail(f"{where}.parameters", effect["parameters"], "a mapping of parameter names")
+            values = {}
+            for key, value in effect["parameters"].items():
+                place = f"{where}.parameters.{key}"
+                if isinstance(value, Mapping):
+                    value = self.mapping(value, place, {"value", "low", "high", "unit"}, ["value"])["value"]
+                values[str(key)] = self.number(value, place, -math.inf, math.inf, "")
+            listed.append((str(effect["name"]), values))
+        return tuple(listed)
 
     def inertia(self, top: Mapping[str, Any], mass: float) -> np.ndarray:
         if ("inertia" in top) == ("inertia_box" in top):

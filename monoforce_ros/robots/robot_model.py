@@ -47,6 +47,9 @@ class RobotModel:
     sensors: Mapping[str, Tensor] = field(default_factory=dict)
     """Pose of each sensor frame in the base frame: ``[4, 4]`` homogeneous matrix, base ← sensor."""
 
+    effects: tuple[tuple[str, Mapping[str, float | Tensor]], ...] = ()
+    """Effects that act on the robot: name and parameter values, see :mod:`monoforce_ros.physics.effects`."""
+
     @property
     def number_of_drives(self) -> int:
         """How many drives the robot has."""

@@ -1,0 +1,25 @@
+"""The catalogue of effects: how physics grows. A new effect is one new file here and its test."""
+
+from monoforce_ros.physics.effects.catalogue import (
+    CATALOGUE,
+    EffectError,
+    applied_setup,
+    drive_speeds,
+    effect_values,
+    recorded_commands,
+    recorded_motion,
+)
+from monoforce_ros.physics.effects.effect import STAGES, Effect, Parameter
+
+__all__ = [
+    "CATALOGUE",
+    "STAGES",
+    "Effect",
+    "EffectError",
+    "Parameter",
+    "applied_setup",
+    "drive_speeds",
+    "effect_values",
+    "recorded_commands",
+    "recorded_motion",
+]

@@ -1,0 +1,48 @@
+"""Setup: what a rollout integrates, with the extra loads that effects add to it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from monoforce_ros.robots import RobotModel
+from monoforce_ros.terrain import TerrainMap
+
+FEATURES = ("1", "vx", "vy", "wz", "vx|vx|", "vy|vy|", "wz|wz|", "vx wz", "vy wz", "pitch", "roll")
+"""Features of a learned body wrench, from the body-frame velocity of the centre of mass [m/s], yaw rate [rad/s], and
+the sines of pitch (nose up) and roll (left side up)."""
+
+
+@dataclass(frozen=True)
+class Loads:
+    """Loads besides weight and ground; each is a scalar or ``[B]`` unless said otherwise. Zero means none."""
+
+    gravity_tilt: Tensor
+    """Tilt of gravity about the terrain frame's x and y axes [rad], ``[2]`` or ``[B, 2]``."""
+    rolling_resistance: Tensor
+    """Force against rolling as a part of the load on each point [-]."""
+    linear_drag: Tensor
+    """Force against the centre of mass's velocity [N s/m]."""
+    quadratic_drag: Tensor
+    """Force against the centre of mass's velocity times speed [N s²/m²]."""
+    vegetation_drag: Tensor
+    """Force against motion per area of a touching point and height of vegetation over the ground [N s/m⁴]."""
+    wrench: Tensor
+    """Body-frame force [N] and torque [N m] per feature of ``FEATURES``, ``[6, F]`` or ``[B, 6, F]``."""
+
+    @classmethod
+    def none(cls, like: Tensor) -> Loads:
+        """No extra load, in the precision and on the device of ``like``."""
+        zero = torch.zeros((), dtype=like.dtype, device=like.device)
+        return cls(zero.expand(2), zero, zero, zero, zero, zero.expand(6, len(FEATURES)))
+
+
+@dataclass(frozen=True)
+class Setup:
+    """Terrain, robot and loads; effects turn one setup into another."""
+
+    terrain: TerrainMap
+    robot: RobotModel
+    loads: Loads
