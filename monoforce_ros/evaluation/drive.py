@@ -100,7 +100,7 @@ def evaluate_drive(
     level = FlatTerrain(predictor.robot, predictor_grid(predictor), TerrainDefaults())
 
     def finish_batch(batch: list[MotionState], maps: list[TerrainMap]) -> None:
-        twists = np.stack([recording.commands.sample(predictor.step_stamps(m.stamp)) for m in batch])
+        twists = np.stack([recording.commands.sample(predictor.command_stamps(m.stamp)) for m in batch])
         for method, batch_maps in ((PHYSICS, maps), (FLAT_PHYSICS, [level.terrain(Observation(0), m) for m in batch])):
             if method == FLAT_PHYSICS and flat:
                 continue
@@ -166,7 +166,7 @@ def predict_at(recording: Recording, predictor: Predictor, stamp: int, image_top
     return predictor.predict(
         observe(recording, predictor.robot, stamp, image_topics, flat),
         recording.motion.at(stamp, maximum_gap=MAXIMUM_GAP),
-        recording.commands.sample(predictor.step_stamps(stamp)),
+        recording.commands.sample(predictor.command_stamps(stamp)),
     )
 
 

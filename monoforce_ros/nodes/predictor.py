@@ -6,6 +6,7 @@ import sys
 import threading
 import time
 
+import numpy as np
 import torch
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import GridCells, Odometry, Path
@@ -270,8 +271,8 @@ class PredictorNode(Node):
                 return
             motion = self.inputs.motion().at(stamp, maximum_gap=self.settings.odometry_timeout)
             # The newest command is held over the horizon, unless it is too old to count at all.
-            held = self.inputs.commands().sample(stamp, timeout=self.settings.command_timeout)
-            twists = held[None].repeat(self.predictor.steps, axis=0)
+            stamps = np.minimum(self.predictor.command_stamps(stamp), stamp)
+            twists = self.inputs.commands().sample(stamps, timeout=self.settings.command_timeout)
             prediction = self.predictor.predict(observation, motion, twists)
         except ValueError as error:
             self.health.report("prediction", ERROR, f"nothing published: {error}", reason=type(error).__name__)

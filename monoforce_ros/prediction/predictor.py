@@ -9,6 +9,7 @@ import torch
 
 from monoforce_ros.motion import MotionState, transform_points
 from monoforce_ros.physics import PhysicsOptions, Rollout, State, rollout
+from monoforce_ros.physics.effects import drive_speeds
 from monoforce_ros.prediction.terrain_sources import Observation, TerrainSource
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import Grid, TerrainMap
@@ -61,6 +62,7 @@ class Predictor:
         source: where terrain comes from.
         horizon: length of a prediction [s].
         options: physics.
+        history: seconds of commands before the start that delays and lags of the drives need.
     """
 
     def __init__(
@@ -70,20 +72,23 @@ class Predictor:
         *,
         horizon: float = 5.0,
         options: PhysicsOptions | None = None,
+        history: float = 2.0,
     ):
         self.robot = robot
         self.source = source
         self.options = options or PhysicsOptions()
         self.steps = max(1, round(horizon / self.options.time_step))
+        self.history = round(history / self.options.time_step)
 
     def warm_up(self) -> None:
         """Make the first prediction as fast as the others: compile kernels, load libraries."""
         still = MotionState(0, np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3))
-        self.roll_out(TerrainMap.flat(Grid.square(2.0, 0.5)), [still], np.zeros((1, 2, 2)))
+        self.roll_out(TerrainMap.flat(Grid.square(2.0, 0.5)), [still], np.zeros((1, self.history + 2, 2)))
 
-    def step_stamps(self, stamp: int) -> np.ndarray:
-        """Times [ns] at which each step of a prediction from ``stamp`` begins, ``[T]``."""
-        return stamp + np.rint(np.arange(self.steps) * self.options.time_step * 1e9).astype(np.int64)
+    def command_stamps(self, stamp: int) -> np.ndarray:
+        """Times [ns] of the commands that a prediction from ``stamp`` needs, ``[history + T]``."""
+        steps = np.arange(-self.history, self.steps)
+        return stamp + np.rint(steps * self.options.time_step * 1e9).astype(np.int64)
 
     def predict(self, observation: Observation, motion: MotionState, twists: np.ndarray) -> Prediction:
         """Predict from one observation.
@@ -91,13 +96,18 @@ class Predictor:
         Args:
             observation: what the sensors saw.
             motion: the robot's state at that time.
-            twists: commanded forward speed [m/s] and yaw rate [rad/s] during each step, ``[T, 2]``.
+            twists: commanded forward speed [m/s] and yaw rate [rad/s] at ``command_stamps``, ``[history + T, 2]``.
         """
         terrain = self.source.terrain(observation, motion)
         return Prediction(motion, terrain, self.roll_out(terrain, [motion], twists[None]))
 
     def roll_out(self, terrain: TerrainMap, motions: list[MotionState], twists: np.ndarray) -> Rollout:
-        """Roll out a batch of motions ``[B]`` under twists ``[B, T, 2]`` on one map or a batch of maps."""
-        speeds = self.robot.drive_speeds(torch.as_tensor(twists, dtype=torch.float32))
+        """Roll out motions ``[B]`` under twists ``[B, history + T, 2]`` on one map or a batch of maps."""
         with torch.no_grad():
+            speeds = drive_speeds(
+                self.robot,
+                torch.as_tensor(twists, dtype=torch.float32),
+                self.options.time_step,
+                history=self.history,
+            )
             return rollout(terrain, self.robot, speeds, start_states(motions), options=self.options)

@@ -25,7 +25,7 @@ class EffectError(ValueError):
 def _discover() -> dict[str, Effect]:
     found = {}
     for module in pkgutil.iter_modules(package.__path__):
-        if module.name in ("effect", "catalogue"):
+        if module.name in ("effect", "catalogue", "page"):
             continue
         content = importlib.import_module(f"{package.__name__}.{module.name}")
         for _, kind in inspect.getmembers(content, inspect.isclass):

@@ -1,0 +1,302 @@
+"""Effects: nothing at neutral values, the closed form at others, the same in both backends."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from conftest import ROOT
+from scipy.spatial.transform import Rotation
+
+from monoforce_ros.motion import CommandTrack, MotionTrack
+from monoforce_ros.physics import PhysicsOptions, State, rollout
+from monoforce_ros.physics.effects import (
+    CATALOGUE,
+    EffectError,
+    drive_speeds,
+    effect_values,
+    recorded_commands,
+    recorded_motion,
+)
+from monoforce_ros.physics.effects.page import catalogue_page
+from monoforce_ros.physics.rest import rest_depth
+from monoforce_ros.robots import RobotFileError, load_robot, robot_file
+from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap
+
+GRID = Grid.square(20.0, 0.2)
+BACKENDS = ["torch", "warp"]
+
+
+@pytest.fixture(scope="module")
+def husky():
+    return load_robot("husky").to(torch.float64)
+
+
+def having(robot, **effects):
+    return dataclasses.replace(robot, effects=tuple((name, values) for name, values in effects.items()))
+
+
+def run(robot, twist, seconds, *, terrain=None, state=None, backend="warp", options=PhysicsOptions()):
+    twists = torch.tensor(twist, dtype=torch.float64).expand(1, round(seconds / 0.01) + 200, 2)
+    speeds = drive_speeds(robot, twists, 0.01, history=200)
+    state = state or State.at_rest(robot.ground_clearance, dtype=torch.float64)
+    terrain = terrain or TerrainMap.flat(GRID, dtype=torch.float64)
+    return rollout(terrain, robot, speeds, state, backend=backend, options=options)
+
+
+def neutral(name):
+    return {p.name: p.neutral for p in CATALOGUE[name].parameters}
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_neutral_values_change_nothing_bit_for_bit(husky, name, backend):
+    plain = run(husky, (0.6, 0.4), 0.8, backend=backend)
+    with_effect = run(having(husky, **{name: neutral(name)}), (0.6, 0.4), 0.8, backend=backend)
+    for field in ("position", "rotation", "velocity", "angular_velocity", "forces"):
+        assert torch.equal(getattr(plain, field), getattr(with_effect, field)), field
+
+
+STRONG = {
+    "rolling_resistance": {"coefficient": 0.1},
+    "vegetation_drag": {"coefficient": 3e4},
+    "viscous_drag": {"coefficient": 40.0},
+    "quadratic_drag": {"coefficient": 30.0},
+    "gravity_tilt": {"about_x": 0.1, "about_y": -0.07},
+    "constant_force": {"x": 30.0, "y": -20.0},
+    "payload": {"mass": 15.0, "x": 0.2, "y": -0.1, "z": 0.3},
+    "friction_scale": {"factor": 0.5},
+    "friction_anisotropy": {"factor": 0.6},
+    "terrain_softness": {"factor": 4.0},
+    "learned_term": {"force_x:vx": -20.0, "torque_z:vx wz": 8.0, "force_y:roll": 30.0},
+}
+
+
+def grassy():
+    x, y = (torch.from_numpy(v) for v in np.meshgrid(GRID.x, GRID.y))
+    ground = 0.05 * torch.sin(1.1 * x) * torch.cos(0.8 * y)
+    return TerrainMap.from_height(ground, GRID, geometric_height=ground + 0.3 * torch.sigmoid(x))
+
+
+@pytest.mark.parametrize("name", [*STRONG, "all"])
+def test_both_backends_agree_on_effects_and_their_gradients(husky, name):
+    effects = STRONG if name == "all" else {name: STRONG[name]}
+    outcomes = []
+    for backend in BACKENDS:
+        values = {
+            effect: {k: torch.tensor(v, dtype=torch.float64, requires_grad=True) for k, v in given.items()}
+            for effect, given in effects.items()
+        }
+        result = run(having(husky, **values), (0.7, 0.5), 0.6, terrain=grassy(), backend=backend)
+        loss = result.position.sum() + result.rotation[0, -1, 0].sum() + 1e-3 * result.forces[0, -1].sum()
+        leaves = [v for given in values.values() for v in given.values()]
+        outcomes.append((float(loss), [float(g) for g in torch.autograd.grad(loss, leaves)]))
+    assert outcomes[0][0] == pytest.approx(outcomes[1][0], rel=1e-12)
+    np.testing.assert_allclose(outcomes[0][1], outcomes[1][1], rtol=1e-9, atol=1e-12)
+    assert all(g != 0.0 for g in outcomes[0][1])
+
+
+ALL_STAGES = {
+    **STRONG,
+    "command_delay": {"delay": 0.123},
+    "actuator_lag": {"time_constant": 0.21},
+    "actuator_saturation": {"limit": 0.63},
+    "actuator_deadband": {"width": 0.04},
+    "drive_gain": {"gain": 0.93},
+    "drive_asymmetry": {"difference": 0.07},
+    "turning_scrub": {"track_width_factor": 1.4},
+}
+
+
+@pytest.mark.parametrize("name", ALL_STAGES)
+def test_gradients_of_parameters_match_finite_differences(husky, name):
+    for key, value in ALL_STAGES[name].items():
+
+        def loss(at, key=key):
+            robot = having(husky, **{name: {**ALL_STAGES[name], key: at}})
+            time = torch.linspace(0, 1, 260, dtype=torch.float64)
+            twists = torch.stack([0.3 + 0.5 * time, 0.8 - time], dim=-1)[None]
+            speeds = drive_speeds(robot, twists, 0.01, history=200)
+            state = State.at_rest(0.14, dtype=torch.float64)
+            result = rollout(grassy(), robot, speeds, state, with_forces=False)
+            return (result.position * torch.tensor([1.0, 2.0, 0.5])).sum() + result.rotation[0, -1, 0].sum()
+
+        at = torch.tensor(value, dtype=torch.float64, requires_grad=True)
+        (gradient,) = torch.autograd.grad(loss(at), at)
+        step = 1e-5 * max(abs(value), 1e-2)
+        with torch.no_grad():
+            f = [float(loss(at + k * step)) for k in (-2, -1, 1, 2)]
+        numeric = (f[0] - 8 * f[1] + 8 * f[2] - f[3]) / (12 * step)
+        assert float(gradient) == pytest.approx(numeric, rel=1e-6, abs=1e-9), key
+
+
+def steps(robot, commands):
+    """Left-drive speeds for forward commands [m/s] at 100 Hz."""
+    twists = torch.stack([torch.as_tensor(commands), torch.zeros(len(commands))], dim=-1)[None].double()
+    return drive_speeds(robot, twists, 0.01)[0, :, 0].numpy()
+
+
+def test_command_effects_have_their_closed_forms(husky):
+    jump = np.r_[np.zeros(50), np.full(100, 0.8)]
+    time = np.arange(150) * 0.01
+    np.testing.assert_allclose(steps(having(husky, command_delay={"delay": 0.2}), jump)[70:], 0.8)
+    np.testing.assert_allclose(steps(having(husky, command_delay={"delay": 0.2}), jump)[:70], 0.0)
+    ramp = np.linspace(0, 0.9, 150)
+    delayed = steps(having(husky, command_delay={"delay": 0.137}), ramp)
+    np.testing.assert_allclose(delayed[20:], np.interp(time[20:] - 0.137, time, ramp), atol=1e-9)
+    lagging = steps(having(husky, actuator_lag={"time_constant": 0.3}), jump)
+    expected = 0.8 * (1 - np.exp(-(time[50:] - time[50] + 0.01) / 0.3))
+    np.testing.assert_allclose(lagging[50:], expected, atol=1e-9)
+    steady = steps(having(husky, actuator_lag={"time_constant": 0.3}), np.full(80, 0.5))
+    np.testing.assert_allclose(steady, 0.5, atol=1e-9)
+    np.testing.assert_allclose(steps(having(husky, actuator_saturation={"limit": 0.5}), ramp), np.minimum(ramp, 0.5))
+    band = steps(having(husky, actuator_deadband={"width": 0.1}), [-0.5, -0.05, 0.0, 0.08, 0.5])
+    np.testing.assert_allclose(band, [-0.4, 0, 0, 0, 0.4])
+    np.testing.assert_allclose(steps(having(husky, drive_gain={"gain": 0.9}), [0.5]), [0.45])
+
+
+def test_asymmetry_and_scrub_act_on_the_sides(husky):
+    turn = torch.tensor([[[0.5, 0.4]]], dtype=torch.float64)
+    left, right = drive_speeds(having(husky, drive_asymmetry={"difference": 0.2}), turn, 0.01)[0, 0].tolist()
+    assert left == pytest.approx(0.9 * (0.5 - 0.4 * 0.2854)) and right == pytest.approx(1.1 * (0.5 + 0.4 * 0.2854))
+    left, right = drive_speeds(having(husky, turning_scrub={"track_width_factor": 2.0}), turn, 0.01)[0, 0].tolist()
+    assert (left + right) / 2 == pytest.approx(0.5) and right - left == pytest.approx(0.4 * 0.2854)
+    veering = run(having(husky, drive_asymmetry={"difference": 0.1}), (0.6, 0.0), 3.0)
+    assert float(veering.position[0, -1, 1]) > 0.05  # the right side is faster: it veers to the left
+
+
+def test_history_decides_what_a_delayed_drive_does_first(husky):
+    robot = having(husky, command_delay={"delay": 0.5})
+    twists = torch.zeros(1, 200, 2, dtype=torch.float64)
+    twists[:, :100, 0] = 0.7  # driving before the start, stopped at it
+    speeds = drive_speeds(robot, twists, 0.01, history=100)
+    assert speeds.shape[1] == 100
+    assert float(speeds[0, 40, 0]) == pytest.approx(0.7) and float(speeds[0, 60, 0]) == 0.0
+
+
+def sliding(speed):
+    state = State.at_rest(0.12466, dtype=torch.float64)
+    return dataclasses.replace(state, velocity=torch.tensor([[speed, 0.0, 0.0]], dtype=torch.float64))
+
+
+FRICTIONLESS = PhysicsOptions(tangential_force="none")
+
+
+def test_drags_slow_a_free_body_as_the_formulas_say(husky):
+    free = {"state": sliding(1.0), "options": FRICTIONLESS}
+    viscous = run(having(husky, viscous_drag={"coefficient": 25.0}), (0, 0), 2.0, **free).velocity[0, -1, 0]
+    assert float(viscous) == pytest.approx(math.exp(-25.0 * 2.0 / 50.0), rel=0.01)
+    quadratic = run(having(husky, quadratic_drag={"coefficient": 25.0}), (0, 0), 2.0, **free).velocity[0, -1, 0]
+    assert float(quadratic) == pytest.approx(1 / (1 + 25.0 * 2.0 / 50.0), rel=0.01)
+    rolling = run(having(husky, rolling_resistance={"coefficient": 0.02}), (0, 0), 1.0, **free).velocity[0, -1, 0]
+    assert float(rolling) == pytest.approx(1.0 - 0.02 * 9.81, rel=0.01)
+
+
+def test_forces_and_tilted_gravity_accelerate_as_newton_says(husky):
+    free = {"state": sliding(0.0), "options": FRICTIONLESS}
+    pushed = run(having(husky, constant_force={"x": 20.0, "y": -10.0}), (0, 0), 1.0, **free).velocity[0, -1]
+    np.testing.assert_allclose(pushed[:2], [0.4, -0.2], rtol=0.03)
+    tilted = run(having(husky, gravity_tilt={"about_y": 0.05}), (0, 0), 1.0, **free).velocity[0, -1]
+    assert float(tilted[0]) == pytest.approx(-9.81 * math.sin(0.05), rel=0.03)
+    tilted = run(having(husky, gravity_tilt={"about_x": 0.05}), (0, 0), 1.0, **free).velocity[0, -1]
+    assert float(tilted[1]) == pytest.approx(9.81 * math.sin(0.05), rel=0.03)
+
+
+def test_a_learned_term_contains_the_effects_it_can_spell(husky):
+    free = {"state": sliding(1.0), "options": FRICTIONLESS}
+    spelled = run(having(husky, learned_term={"force_x:1": 5.0, "force_x:vx": -10.0}), (0, 0), 1.0, **free)
+    known = run(having(husky, constant_force={"x": 5.0}, viscous_drag={"coefficient": 10.0}), (0, 0), 1.0, **free)
+    assert float((spelled.velocity - known.velocity)[0, -1].norm()) < 0.005
+
+
+def test_payload_follows_the_parallel_axis_theorem(husky):
+    from monoforce_ros.physics.effects.catalogue import applied_setup
+
+    loaded = applied_setup(
+        TerrainMap.flat(GRID, dtype=torch.float64), having(husky, payload={"mass": 10.0, "x": 0.3, "y": 0.1, "z": 0.4})
+    ).robot
+    place, old = np.array([0.3, 0.1, 0.4]), husky.centre_of_mass.numpy()
+    centre = (50.0 * old + 10.0 * place) / 60.0
+
+    def shifted(mass, arm):
+        return mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+
+    inertia = husky.inertia.numpy() + shifted(50.0, old - centre) + shifted(10.0, place - centre)
+    np.testing.assert_allclose(loaded.centre_of_mass.numpy(), centre, atol=1e-7)
+    np.testing.assert_allclose(loaded.inertia.numpy(), inertia, atol=1e-6)
+    result = run(having(husky, payload={"mass": 10.0, "x": 0.0, "y": 0.0, "z": 0.05}), (0, 0), 1.5)
+    assert float(result.normal_forces[0, -1].sum()) == pytest.approx(60 * 9.81, rel=1e-4)
+
+
+def test_soft_ground_and_grass_and_ice(husky):
+    soft = run(having(husky, terrain_softness={"factor": 5.0}), (0, 0), 2.0)
+    sunk = husky.ground_clearance - float(soft.position[0, -1, 2])
+    assert sunk == pytest.approx(rest_depth(husky, TerrainDefaults.stiffness / 5.0), rel=0.01)
+    grass = TerrainMap.from_height(
+        torch.zeros(GRID.rows, GRID.columns, dtype=torch.float64), GRID,
+        geometric_height=torch.full((GRID.rows, GRID.columns), 0.5, dtype=torch.float64),
+    )  # fmt: skip
+    slowed = run(having(husky, vegetation_drag={"coefficient": 2e4}), (0, 0), 1.0, terrain=grass, state=sliding(1.0),
+                 options=FRICTIONLESS)  # fmt: skip
+    bare = run(having(husky, vegetation_drag={"coefficient": 2e4}), (0, 0), 1.0, state=sliding(1.0),
+               options=FRICTIONLESS)  # fmt: skip
+    assert float(slowed.velocity[0, -1, 0]) < 0.6 and float(bare.velocity[0, -1, 0]) == pytest.approx(1.0, abs=1e-3)
+    ice = run(having(husky, friction_scale={"factor": 0.1}), (1.0, 0.0), 0.6)
+    assert float(ice.velocity[0, -1, 0]) == pytest.approx(0.1 * 0.8 * 9.81 * 0.6, rel=0.1)
+
+
+def track():
+    stamps = np.arange(10) * 10**8
+    turned = Rotation.from_euler("z", np.linspace(0, 1, 10)[:, None]).as_quat()
+    return MotionTrack(stamps, np.zeros((10, 3)), turned, np.tile([1.0, 0, 0], (10, 1)), np.tile([0, 0, 1.0], (10, 1)))
+
+
+def test_measurement_effects_change_what_is_recorded(husky):
+    late = recorded_motion(track(), having(husky, pose_clock_offset={"offset": 0.25}))
+    assert (late.stamps - track().stamps == 250_000_000).all()
+    commands = CommandTrack(np.array([5]), np.ones((1, 2)))
+    assert recorded_commands(commands, having(husky, command_clock_offset={"offset": -1e-9})).stamps.tolist() == [4]
+    turned = recorded_motion(track(), having(husky, sensor_yaw_offset={"angle": 0.3}))
+    assert turned.at(0).heading == pytest.approx(0.3)
+    np.testing.assert_allclose(turned.linear_velocities[0], [np.cos(0.3), -np.sin(0.3), 0], atol=1e-12)
+    moved = recorded_motion(track(), having(husky, sensor_lever_arm={"x": 0.4, "y": 0.0}))
+    np.testing.assert_allclose(moved.positions[-1], [0.4 * np.cos(1), 0.4 * np.sin(1), 0], atol=1e-12)
+    np.testing.assert_allclose(moved.linear_velocities[0], [1.0, 0.4, 0], atol=1e-12)
+    biased = recorded_motion(track(), having(husky, gyro_bias={"bias": 0.02}))
+    assert biased.angular_velocities[0, 2] == pytest.approx(1.02)
+
+
+def test_effects_come_from_the_robot_file(tmp_path):
+    content = yaml.safe_load(robot_file("husky").read_text())
+    content["effects"] = [
+        {"name": "actuator_lag", "parameters": {"time_constant": {"value": 0.3, "low": 0.2, "high": 0.4, "unit": "s"}},
+         "provenance": {"bag": "yard"}},
+        {"name": "friction_scale", "parameters": {"factor": 0.5}},
+    ]  # fmt: skip
+    file = tmp_path / "robot.yaml"
+    file.write_text(yaml.safe_dump(content))
+    robot = load_robot(file)
+    assert robot.effects == (("actuator_lag", {"time_constant": 0.3}), ("friction_scale", {"factor": 0.5}))
+    slow = run(robot.to(torch.float64), (1.0, 0.0), 0.3).velocity[0, -1, 0]
+    assert float(slow) == pytest.approx(1.0, abs=0.02)  # the command had held long before
+    content["effects"] = [{"name": "friction_scale", "parameters": {"factor": "half"}}]
+    file.write_text(yaml.safe_dump(content))
+    with pytest.raises(RobotFileError, match=r"effects\[0\].parameters.factor: got 'half'"):
+        load_robot(file)
+
+
+def test_unknown_effects_parameters_and_values_out_of_bounds_are_named():
+    with pytest.raises(EffectError, match="effect 'anti_gravity' is unknown; expected one of"):
+        effect_values("anti_gravity", {})
+    with pytest.raises(EffectError, match=r"drive_gain: parameters \['factor'\] are unknown"):
+        effect_values("drive_gain", {"factor": 1.0})
+    with pytest.raises(EffectError, match="drive_gain: gain is 7.0, expected 0.2 to 2"):
+        effect_values("drive_gain", {"gain": 7.0})
+    with pytest.raises(EffectError, match="is nan"):
+        effect_values("drive_gain", {"gain": float("nan")})
+
+
+def test_the_page_of_the_documents_is_what_the_code_says():
+    assert (ROOT / "docs" / "effects.md").read_text() == catalogue_page()
