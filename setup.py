@@ -27,7 +27,17 @@ setup(
         (f"share/{PACKAGE}", ["package.xml"]),
         *shared_files(),
     ],
-    install_requires=["setuptools"],
+    # What rosdep installs (numpy, scipy, OpenCV, matplotlib, tqdm, PyYAML) stands in package.xml.
+    install_requires=[
+        "setuptools",
+        "mujoco",
+        "rosbags",
+        "safetensors",
+        "torch",
+        "torchdiffeq",
+        "torchvision",
+        "warp-lang",
+    ],
     extras_require={"test": ["pytest"]},
     zip_safe=False,
     maintainer="monoforce_ros maintainers",

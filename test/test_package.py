@@ -1,6 +1,8 @@
 """The package as ROS tooling sees it, and the documents that are made from its files."""
 
+import re
 import subprocess
+import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -9,6 +11,7 @@ from conftest import INSTALLED, ROOT
 
 from monoforce_ros.nodes.parameters import read_parameter_file
 
+SETUP = (ROOT / "setup.py").read_text()
 EXECUTABLES = ["bag_player", "bag_recorder", "evaluate", "predictor", "synthesize"]
 
 
@@ -53,6 +56,11 @@ def test_the_licence_and_the_dependencies_are_stated():
     }
     ros = {name for name in imported if name.endswith(("_msgs", "_interfaces")) or name == "rclpy"}
     assert ros - {"rcl_interfaces"} <= depends
+    # What is not ROS's comes by rosdep or pip, and is named for the one or the other.
+    named = {name.removeprefix("python3-") for name in depends} | set(re.findall(r'"([a-z-]+)",', SETUP))
+    others = {"cv2": "opencv", "yaml": "yaml", "warp": "warp-lang", "launch": "launch", "launch_ros": "launch"}
+    third = {others.get(name, name) for name in imported - set(sys.stdlib_module_names) - ros - {"monoforce_ros"}}
+    assert third - {"tf2_ros", "ament_index_python"} <= named
 
 
 def test_only_nodes_and_messages_import_rclpy():
@@ -83,8 +91,6 @@ def test_the_readme_lists_every_parameter_as_the_file_has_it():
 
 @pytest.mark.parametrize("document", ["README.md", "docs/architecture.md"])
 def test_documents_point_to_files_that_exist(document):
-    import re
-
     text = (ROOT / document).read_text()
     for target in re.findall(r"\]\(([^)#]+)\)", text):
         if "://" not in target:

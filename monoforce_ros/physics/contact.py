@@ -38,6 +38,7 @@ def contact(
     friction_factors: Tensor,
     rolling_resistance: Tensor,
     options: PhysicsOptions,
+    step_time: float | None = None,
 ) -> Contact:
     """Forces on body points (paper III-C and III-D).
 
@@ -55,6 +56,9 @@ def contact(
         weights: share m g of each point in the robot's weight, ``[B, N]`` or ``[N]`` [N] (``sigmoid`` only).
         friction_factors: longitudinal and lateral factor on the ground's friction, ``[B, 1, 2]``.
         rolling_resistance: force against rolling as a part of the load, ``[B, 1]``.
+        options: which laws.
+        step_time: over which the spring follows the motion [s]; the options' time step unless given, 0 for the force
+            at this very moment.
     """
     vertical = options.normal_force == "vertical"
     normal = torch.zeros_like(ground.normal) if vertical else ground.normal
@@ -66,7 +70,7 @@ def contact(
     spring = ground.stiffness * depth
     load = areas * (spring + ground.damping * approach).clamp_min(0.0) * touching
     # Within the step the spring follows the motion: it acts as further damping (linearly implicit Euler).
-    damping = ground.damping + options.time_step * ground.stiffness
+    damping = ground.damping + (options.time_step if step_time is None else step_time) * ground.stiffness
     pressing = areas * (spring + damping * approach).clamp_min(0.0) * touching
     normal_gain = areas * damping * (pressing > 0)
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from monoforce_ros.physics import torch_backend
+from monoforce_ros.physics import neural_ode, torch_backend
+from monoforce_ros.physics.neural_ode import OdeOptions
 from monoforce_ros.physics.options import PhysicsOptions
 from monoforce_ros.physics.problem import Motion, Problem
 from monoforce_ros.physics.state import Rollout, State
@@ -24,6 +25,7 @@ def rollout(
     options: PhysicsOptions = PhysicsOptions(),  # noqa: B008  (frozen)
     with_forces: bool = True,
     backend: str = "auto",
+    ode: OdeOptions | None = None,
 ) -> Rollout:
     """Predict the motion of a batch of robots.
 
@@ -40,6 +42,7 @@ def rollout(
         drive_speeds: surface speed of each drive during each step [m/s], ``[B, T, D]``.
         state: start states, ``[B]``.
         with_forces: whether to return per-point forces (memory grows with B · T · N).
+        ode: integrate by a solver of torchdiffeq instead, as the paper's Neural-ODE variant does; without forces.
         backend: ``warp`` (compiled kernels), ``torch`` (the reference), or ``auto``: Warp where it is installed.
 
     Raises:
@@ -54,7 +57,10 @@ def rollout(
     if terrain.batch_size not in (None, 1, batch):
         raise ValueError(f"terrain: got a batch of {terrain.batch_size} maps, expected 1 or {batch}")
     problem, finite = Problem.pose(terrain, robot, drive_speeds, state)
-    motion = _backend(backend).integrate(problem, options, with_forces)
+    if ode is not None:
+        motion = neural_ode.integrate(problem, options, ode)
+    else:
+        motion = _backend(backend).integrate(problem, options, with_forces)
     return _result(problem, motion, finite, options)
 
 
