@@ -4,12 +4,15 @@ import math
 
 import numpy as np
 import pytest
+import torch
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from monoforce_ros.physics import State, rollout
 from monoforce_ros.robots import RobotFileError, load_robot, robot_file, shipped_robots
 from monoforce_ros.robots.belt import belt_outline
+from monoforce_ros.terrain import Grid, TerrainMap
 
 
 @pytest.mark.parametrize("name", shipped_robots())
@@ -23,7 +26,7 @@ def test_shipped_robots_are_consistent(name):
     assert float(robot.inertia.det()) > 0 and 0 < robot.ground_clearance < 1
     # The lowest points move backwards relative to a body that drives forward.
     lowest = robot.points[:, 2] < robot.points[driven][:, 2].min() + 0.005
-    assert bool((robot.point_tangents[lowest & driven][:, 0] < -0.9).all())
+    assert bool((robot.point_tangents[lowest & driven][:, 0] < -0.85).all())
 
 
 def test_area_does_not_depend_on_sampling():
@@ -55,9 +58,40 @@ def test_belts_are_closed_and_run_backwards_at_the_bottom(length, rear, front, s
     assert lengths.sum() == pytest.approx(circumference, rel=1e-9)
 
 
-def test_a_twist_becomes_drive_speeds():
-    import torch
+def test_flippers_move_their_points_and_the_inertia():
+    marv = load_robot("marv").to(torch.float64)
+    raised = marv.posed(torch.tensor([0.8, 0.8, -0.14, -0.14]))
+    front = (marv.point_flippers == 0) | (marv.point_flippers == 1)
+    assert float(raised.points[front][:, 2].max()) > float(marv.points[front][:, 2].max()) + 0.2
+    assert torch.equal(raised.points[~front], marv.points[~front])
+    # Raised to the front only: mass moves up and back, none is lost.
+    assert float(raised.mass) == pytest.approx(float(marv.mass))
+    shift = raised.centre_of_mass - marv.centre_of_mass
+    lift = 2 * 4.0 * 0.18 * (math.sin(0.8) - math.sin(-0.14)) / 60.0
+    assert float(shift[2]) == pytest.approx(lift, rel=1e-6) and float(shift[0]) < 0
+    upright = marv.posed(torch.full((4,), math.pi / 2))
+    assert float(upright.inertia[2, 2]) < float(marv.inertia[2, 2])
+    back = upright.posed(marv.flipper_angles)
+    np.testing.assert_allclose(back.points.numpy(), marv.points.numpy(), atol=1e-12)
+    np.testing.assert_allclose(back.inertia.numpy(), marv.inertia.numpy(), atol=1e-9)
+    with pytest.raises(ValueError, match=r"flipper angles: got shape \(2,\), expected \[4\]"):
+        marv.posed(torch.zeros(2))
 
+
+@pytest.mark.parametrize("angles", [[0.0] * 4, [-0.6, -0.6, 0.3, 0.3], [-0.5] * 4])
+def test_a_robot_stands_and_drives_on_its_flippers(angles):
+    marv = load_robot("marv").posed(torch.tensor(angles))
+    speeds = marv.drive_speeds(torch.tensor([0.4, 0.0]).expand(1, 400, 2))
+    result = rollout(TerrainMap.flat(Grid.square(20.0)), marv, speeds, State.at_rest(marv.ground_clearance + 0.02))
+    assert bool(result.valid.all())
+    assert float(result.normal_forces[0, -1].sum()) == pytest.approx(60 * 9.81, rel=0.02)
+    assert float(result.velocity[0, -1, 0]) == pytest.approx(0.4, rel=0.05)
+    pitch = math.asin(float(result.rotation[0, -1, 2, 0]))
+    # Front flippers pushed down lift the nose.
+    assert (pitch > 0.05) == (angles[0] < angles[2] - 0.1)
+
+
+def test_a_twist_becomes_drive_speeds():
     robot = load_robot("husky")
     left, right = robot.drive_names.index("left"), robot.drive_names.index("right")
     speeds = robot.drive_speeds(torch.tensor([0.5, 1.0]))
@@ -72,7 +106,7 @@ CHANGES = [
     (lambda c: c.pop("command"), r"the key 'command', which is missing"),
     (lambda c: c["wheels"][0].update(radius=165.1), r"wheels\[0\].radius: got 165.1, expected a number .* m"),
     (lambda c: c["wheels"][1].pop("drive"), r"wheels\[1\].*'drive', which is missing"),
-    (lambda c: c.update(wheels=[]), r"at least one driven wheel"),
+    (lambda c: c.update(wheels=[]), r"at least one driven wheel, track or flipper"),
     (lambda c: c.update(inertia=[1, 1, 1, 0, 0, 0]), r"either inertia or inertia_box"),
     (lambda c: (c.pop("inertia_box"), c.update(inertia=[1, 1, 9, 0, 0, 0])), r"principal moments"),
     (lambda c: c.update(centre_of_mass=[0, 0]), r"a list of 3 numbers"),

@@ -13,7 +13,7 @@ from monoforce_ros import physics
 from monoforce_ros.physics import PhysicsOptions, State
 from monoforce_ros.physics.rest import rest_depth
 from monoforce_ros.physics.rotation import exponential_map, rotation_angle
-from monoforce_ros.robots import load_robot
+from monoforce_ros.robots import load_robot, shipped_robots
 from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap
 
 GRID = Grid.square(40.0, 0.2)
@@ -183,7 +183,7 @@ def test_no_energy_is_gained_at_rest_or_on_landing(husky):
     assert float(result.velocity[0, -1].abs().max()) < 1e-4
 
 
-@pytest.mark.parametrize("name", ["husky", "tradr"])
+@pytest.mark.parametrize("name", shipped_robots())
 @pytest.mark.parametrize("stiffness", [2e6, 2e8])
 def test_survives_a_drop_on_any_ground(name, stiffness):
     robot = load_robot(name).to(torch.float64)

@@ -13,7 +13,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.robots.belt import belt_outline
-from monoforce_ros.robots.robot_model import RobotModel
+from monoforce_ros.robots.robot_model import Flipper, RobotModel
 from monoforce_ros.shared_files import share_directory
 
 MAXIMUM_FILE_BYTES = 1_000_000
@@ -22,7 +22,7 @@ DEFAULT_SPACING = 0.05
 
 _TOP_KEYS = {
     "name", "description", "base_frame", "mass", "centre_of_mass", "inertia", "inertia_box", "command", "friction",
-    "wheels", "tracks", "hull", "sensors", "effects",
+    "wheels", "tracks", "flippers", "hull", "sensors", "effects",
 }  # fmt: skip
 
 
@@ -120,8 +120,10 @@ class _Reader:
             self.wheel(wheel, f"wheels[{index}]", samples, spacing)
         for index, track in enumerate(self.items(top.get("tracks", []), "tracks")):
             self.track(track, f"tracks[{index}]", samples, spacing)
+        for index, flipper in enumerate(self.items(top.get("flippers", []), "flippers")):
+            self.flipper(flipper, f"flippers[{index}]", samples, spacing)
         if not samples.drives:
-            raise self.fail("wheels, tracks", "none", "at least one driven wheel or track")
+            raise self.fail("wheels, tracks, flippers", "none", "at least one driven wheel, track or flipper")
         for index, box in enumerate(self.items(top.get("hull", []), "hull")):
             self.box(box, f"hull[{index}]", samples, spacing)
         areas = np.concatenate(samples.areas)
@@ -159,6 +161,9 @@ class _Reader:
             ),
             sensors=self.sensors(top.get("sensors", {})),
             effects=self.effects(top.get("effects", [])),
+            flippers=tuple(samples.flippers),
+            flipper_angles=tensor(samples.angles),
+            point_flippers=torch.as_tensor(np.concatenate(samples.arms), dtype=torch.int64),
         )
 
     def effects(self, content: Any) -> tuple[tuple[str, dict[str, float]], ...]:
@@ -206,6 +211,34 @@ class _Reader:
         radius = self.number(track["radius"], f"{where}.radius", 0.01, 3.0, "m")
         length = self.number(track["length"], f"{where}.length", 0.01, 20.0, "m")
         self.belt(track, where, (length, radius, radius), samples, spacing)
+
+    def flipper(self, content: Any, where: str, samples: _Samples, spacing: float) -> None:
+        keys = {"name", "drive", "end", "joint", "length", "root_radius", "tip_radius", "width", "mass", "angle"}
+        entry = self.mapping(content, where, keys, sorted(keys))
+        if entry["end"] not in ("front", "rear"):
+            raise self.fail(f"{where}.end", entry["end"], "front or rear")
+        joint = self.vector(entry["joint"], f"{where}.joint", 3, 20.0, "m")
+        length = self.number(entry["length"], f"{where}.length", 0.01, 5.0, "m")
+        radii = [self.number(entry[k], f"{where}.{k}", 0.01, 2.0, "m") for k in ("root_radius", "tip_radius")]
+        if abs(radii[0] - radii[1]) >= length:
+            raise self.fail(f"{where}.length", length, "more than the difference of the radii [m]")
+        angle = self.number(entry["angle"], f"{where}.angle", -7.0, 7.0, "rad")
+        flipper = Flipper(
+            name=str(entry["name"]),
+            joint=tuple(joint.tolist()),
+            end=entry["end"],
+            mass=self.number(entry["mass"], f"{where}.mass", 0.0, 1e4, "kg"),
+            centre=length / 2,
+        )
+        first = len(samples.points)
+        level = {**entry, "centre": [length / 2, 0.0, 0.0]}
+        self.belt(level, where, (length, *radii), samples, spacing)
+        turn = flipper.turned(torch.tensor(angle, dtype=torch.float64)).numpy()
+        samples.points[first] = joint + samples.points[first] @ turn.T
+        samples.tangents[first] = samples.tangents[first] @ turn.T
+        samples.arms[first][:] = len(samples.flippers)
+        samples.flippers.append(flipper)
+        samples.angles.append(angle)
 
     def belt(
         self, content: Mapping[str, Any], where: str, shape: tuple[float, float, float], samples: _Samples, spacing
@@ -270,7 +303,10 @@ class _Samples:
         self.areas: list[np.ndarray] = []
         self.tangents: list[np.ndarray] = []
         self.owners: list[np.ndarray] = []
+        self.arms: list[np.ndarray] = []
         self.drives: list[str] = []
+        self.flippers: list[Flipper] = []
+        self.angles: list[float] = []
 
     def add(self, points: np.ndarray, areas: np.ndarray, tangents: np.ndarray, drive: str | None) -> None:
         if drive is not None and drive not in self.drives:
@@ -278,4 +314,5 @@ class _Samples:
         self.points.append(points)
         self.areas.append(areas)
         self.tangents.append(tangents)
+        self.arms.append(np.full(len(points), -1))
         self.owners.append(np.full(len(points), -1 if drive is None else self.drives.index(str(drive))))

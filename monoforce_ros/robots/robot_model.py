@@ -8,6 +8,30 @@ from dataclasses import dataclass, field, fields, replace
 import torch
 from torch import Tensor
 
+from monoforce_ros.robots.mass import add_point_mass
+
+
+@dataclass(frozen=True)
+class Flipper:
+    """An arm with a driven belt that turns about a lateral axis; its pose is kinematic (paper III-D)."""
+
+    name: str
+    joint: tuple[float, float, float]
+    """Centre of the axle in the base frame [m]."""
+    end: str
+    """``front``: at angle 0 it points forward; ``rear``: backward. Positive angles raise the tip."""
+    mass: float
+    """[kg], part of the robot's mass."""
+    centre: float
+    """Distance of its centre of mass from the axle [m]."""
+
+    def turned(self, angle: Tensor) -> Tensor:
+        """Rotation ``[3, 3]`` of the arm, which at the identity points forward."""
+        about_y = -angle if self.end == "front" else angle + torch.pi
+        cos, sin = torch.cos(about_y), torch.sin(about_y)
+        zero, one = torch.zeros_like(cos), torch.ones_like(cos)
+        return torch.stack([cos, zero, sin, zero, one, zero, -sin, zero, cos]).reshape(3, 3)
+
 
 @dataclass(frozen=True)
 class RobotModel:
@@ -47,6 +71,11 @@ class RobotModel:
     sensors: Mapping[str, Tensor] = field(default_factory=dict)
     """Pose of each sensor frame in the base frame: ``[4, 4]`` homogeneous matrix, base ← sensor."""
 
+    flippers: tuple[Flipper, ...] = ()
+    flipper_angles: Tensor | None = None
+    """Angles at which the flippers are posed [rad], ``[F]``."""
+    point_flippers: Tensor | None = None
+    """Index of the flipper that each point belongs to, ``[N]`` int64; -1 elsewhere."""
     effects: tuple[tuple[str, Mapping[str, float | Tensor]], ...] = ()
     """Effects that act on the robot: name and parameter values, see :mod:`monoforce_ros.physics.effects`."""
 
@@ -64,6 +93,37 @@ class RobotModel:
     def ground_clearance(self) -> float:
         """Height of the base frame over the lowest driven point [m]."""
         return -float(self.points[self.point_drives >= 0][:, 2].min())
+
+    def posed(self, angles: Tensor) -> RobotModel:
+        """The robot with its flippers at ``angles`` [rad] ``[F]``: their points move, mass and inertia follow.
+
+        Raises ``ValueError`` where the robot has another number of flippers.
+        """
+        if angles.shape != (len(self.flippers),):
+            raise ValueError(f"flipper angles: got shape {tuple(angles.shape)}, expected [{len(self.flippers)}]")
+        angles = angles.to(self.points)
+        points, tangents = self.points.clone(), self.point_tangents.clone()
+        mass, centre, inertia = self.mass, self.centre_of_mass, self.inertia
+        for index, flipper in enumerate(self.flippers):
+            before, after = flipper.turned(self.flipper_angles[index]), flipper.turned(angles[index])
+            turn = after @ before.T
+            joint = points.new_tensor(flipper.joint)
+            own = self.point_flippers == index
+            points[own] = joint + (self.points[own] - joint) @ turn.T
+            tangents[own] = self.point_tangents[own] @ turn.T
+            own_mass = points.new_tensor(flipper.mass)
+            for sign, pose in ((-1.0, before), (1.0, after)):
+                place = joint + flipper.centre * pose[:, 0]
+                mass, centre, inertia = add_point_mass(mass, centre, inertia, sign * own_mass, place)
+        return replace(
+            self,
+            points=points,
+            point_tangents=tangents,
+            mass=mass,
+            centre_of_mass=centre,
+            inertia=inertia,
+            flipper_angles=angles,
+        )
 
     def drive_speeds(self, twist: Tensor) -> Tensor:
         """Ideal drive speeds of a commanded twist, limited to what the robot accepts.

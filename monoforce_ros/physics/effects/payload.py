@@ -8,6 +8,7 @@ import torch
 
 from monoforce_ros.physics.effects.effect import Effect, Parameter, Values
 from monoforce_ros.physics.setup import Setup
+from monoforce_ros.robots.mass import add_point_mass
 
 
 class Payload(Effect):
@@ -30,11 +31,5 @@ class Payload(Effect):
         robot = setup.robot
         added = values["mass"]
         place = torch.stack(torch.broadcast_tensors(values["x"], values["y"], values["z"]), dim=-1).to(robot.mass)
-        total = robot.mass + added
-        arm = place - robot.centre_of_mass
-        centre = robot.centre_of_mass + (added / total)[..., None] * arm
-        # Two bodies about their common centre: the reduced mass at the distance between them.
-        reduced = (robot.mass * added / total)[..., None, None]
-        square = (arm * arm).sum(-1)[..., None, None] * torch.eye(3, dtype=arm.dtype, device=arm.device)
-        inertia = robot.inertia + reduced * (square - arm[..., :, None] * arm[..., None, :])
+        total, centre, inertia = add_point_mass(robot.mass, robot.centre_of_mass, robot.inertia, added, place)
         return replace(setup, robot=replace(robot, mass=total, centre_of_mass=centre, inertia=inertia))
