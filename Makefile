@@ -33,4 +33,7 @@ clean:
 	rm -rf build install log out
 
 bench: build
-	@mkdir -p out && scripts/run.sh python benchmarks/rollout.py --json out/rollout.json
+	@mkdir -p out
+	@scripts/run.sh python benchmarks/rollout.py --json out/rollout.json
+	@scripts/run.sh python benchmarks/integrators.py --json out/integrators.json
+	@scripts/run.sh python benchmarks/mujoco_check.py --json out/mujoco_check.json

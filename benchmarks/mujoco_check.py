@@ -2,8 +2,8 @@
 
     scripts/run.sh python benchmarks/mujoco_check.py [--json FILE] [--figure FILE]
 
-The ground is gentle and bare. Friction and the effective track width are set once for all runs, from the first arc on level
-ground: the tyres of the two engines slip differently when the robot turns.
+The ground is gentle and bare. Friction and the effective track width are set once for all runs, from the first arc on
+level ground: the tyres of the two engines slip differently when the robot turns.
 """
 
 from __future__ import annotations
@@ -54,7 +54,9 @@ def bare_scenery(roughness: float, seed: int) -> Scenery:
     return Scenery(ground, route, None, (), (), Grass.grow((), ground, random_stream(seed, "grass")))
 
 
-def drive_in_mujoco(scenery: Scenery, twist: tuple[float, float], seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def drive_in_mujoco(
+    scenery: Scenery, twist: tuple[float, float], seed: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Positions ``[T + 1, 3]``, rotations ``[T + 1, 3, 3]`` in the odom frame, and where its origin is in the world."""
     vehicle = Vehicle.load("husky")
     simulation = Simulation(build_model(scenery, vehicle, seed, {}), scenery, vehicle)

@@ -8,11 +8,15 @@ Every figure is the median of several runs after a warm-up; the first call, with
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import os
 import platform
 import resource
 import statistics
+import subprocess
+import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -143,6 +147,38 @@ def backward_memory(batch: int, robot: RobotModel, steps: int) -> int:
     return kept
 
 
+ALL_EFFECTS = (
+    ("rolling_resistance", {"coefficient": 0.03}),
+    ("vegetation_drag", {"coefficient": 1e4}),
+    ("viscous_drag", {"coefficient": 10.0}),
+    ("quadratic_drag", {"coefficient": 5.0}),
+    ("gravity_tilt", {"about_x": 0.02, "about_y": 0.02}),
+    ("constant_force", {"x": 5.0, "y": 5.0}),
+    ("payload", {"mass": 5.0, "x": 0.1, "y": 0.0, "z": 0.2}),
+    ("friction_scale", {"factor": 0.9}),
+    ("friction_anisotropy", {"factor": 0.9}),
+    ("terrain_softness", {"factor": 1.5}),
+    ("learned_term", {"force_x:vx": -3.0, "torque_z:wz": -2.0}),
+)
+
+
+def cold_start() -> float:
+    """Seconds of the first Warp rollout in a new process with an empty kernel cache, imports left out."""
+    with tempfile.TemporaryDirectory() as cache:
+        lines = [
+            "import time, torch, warp as wp",
+            f"wp.config.kernel_cache_dir = {cache!r}",
+            "from monoforce_ros.physics import State, rollout",
+            "from monoforce_ros.robots import load_robot",
+            "from monoforce_ros.terrain import TerrainMap",
+            "robot, terrain, began = load_robot('husky'), TerrainMap.flat(), time.perf_counter()",
+            "rollout(terrain, robot, torch.zeros(1, 10, 2), State.at_rest(0.14), backend='warp')",
+            "print(time.perf_counter() - began)",
+        ]
+        done = subprocess.run([sys.executable, "-c", "; ".join(lines)], capture_output=True, text=True, check=True)
+    return float(done.stdout.split()[-1])
+
+
 def table(rows: list[dict]) -> str:
     """Markdown, with the ratio to PyTorch eager measured in the same run."""
     eager = {(r["batch"], r["backward"]): r["seconds"] for r in rows if r["backend"] == "torch eager"}
@@ -191,9 +227,29 @@ def main() -> None:
             )
             print(f"{rows[-1]['backend']:>14} B={batch:<4} {'backward' if backward else 'forward':<9}", end=" ")
             print(f"first {rows[-1]['first_call_s']:7.2f} s  median {1e3 * rows[-1]['seconds']:9.1f} ms", flush=True)
+    loaded = dataclasses.replace(robot, effects=ALL_EFFECTS)
+    ratios = {}
+    for batch, backward in ((64, False), (32, True)):
+        pair = [
+            measure(
+                "warp",
+                backends(options.device)["warp"],
+                batch,
+                backward=backward,
+                quick=options.quick,
+                device=options.device,
+                robot=which,
+            )["seconds"]
+            for which in (robot, loaded)
+        ]
+        ratios[f"B = {batch}, {'forward + backward' if backward else 'forward'}"] = pair[1] / pair[0]
     kept = backward_memory(64, robot, 50 if options.quick else STEPS)
     print("\n" + table(rows))
-    print(f"\nkept for the backward pass at B = 64: {kept / 1e6:.1f} MB; body points: {len(robot.points)}")
+    cold = cold_start()
+    print(f"\nfirst Warp rollout ever, compiling its kernels: {cold:.1f} s; later processes load them from the cache")
+    for case, ratio in ratios.items():
+        print(f"all contact and body effects on, {case}: {ratio:.2f} times the time without")
+    print(f"kept for the backward pass at B = 64: {kept / 1e6:.1f} MB; body points: {len(robot.points)}")
     if options.json:
         machine = {
             "processor": platform.processor() or platform.machine(),
@@ -201,7 +257,13 @@ def main() -> None:
             "torch": torch.__version__,
             "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         }
-        content = {"machine": machine, "rows": rows, "kept_for_backward_b64_bytes": kept}
+        content = {
+            "machine": machine,
+            "rows": rows,
+            "kept_for_backward_b64_bytes": kept,
+            "effects": ratios,
+            "cold_s": cold,
+        }
         write_text(options.json, json.dumps(content, indent=2))
 
 

@@ -10,7 +10,7 @@ from monoforce_ros.physics import State, rollout
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainMap
 
-FIELDS = ("position", "rotation", "velocity", "angular_velocity", "normal_forces", "forces")
+FIELDS = ("position", "rotation", "velocity", "angular_velocity", "normal_forces", "tangential_forces", "forces")
 GRID = Grid(90, 120, 0.1, (-4.0, -4.5))  # neither square nor centred
 
 

@@ -209,6 +209,19 @@ def test_ground_never_pulls(husky):
     assert float((velocity[1:] - velocity[:-1]).min()) >= -9.81 * 0.01 - 1e-9
 
 
+def test_forces_split_into_normal_and_tangential_parts_within_the_friction_cone(husky):
+    result = drive(husky, (0.8, 0.6), 2.0, terrain=bumpy())
+    normal = result.forces - result.tangential_forces
+    np.testing.assert_allclose(normal.norm(dim=-1).numpy(), result.normal_forces.numpy(), atol=1e-9)
+    loaded = result.normal_forces > 1.0
+    across = (normal * result.tangential_forces).sum(-1)[loaded].abs()
+    assert float(across.max()) < 1e-6
+    assert float((result.tangential_forces.norm(dim=-1)[loaded]).max()) > 5.0
+    # The whole of it is held by the friction that the load allows (within a step, the load that was).
+    share = result.tangential_forces[0, 50:].norm(dim=-1).sum(-1) / result.normal_forces[0, 50:].sum(-1)
+    assert float(share.median()) < 0.8
+
+
 def test_a_turned_world_gives_the_turned_trajectory(husky):
     angle = 0.7
     turn = exponential_map(torch.tensor([0.0, 0.0, angle], dtype=torch.float64))

@@ -25,6 +25,7 @@ from monoforce_ros.evaluation.report import figure_png, terminal_table, write_re
 from monoforce_ros.evaluation.view import PredictionView
 from monoforce_ros.messages.decoding import MessageError
 from monoforce_ros.physics import PhysicsOptions
+from monoforce_ros.physics.effects import EffectError
 from monoforce_ros.prediction import CameraTerrain, FlatTerrain, LidarTerrain, Predictor
 from monoforce_ros.robots import RobotFileError, RobotModel, load_robot, shipped_robots
 from monoforce_ros.shared_files import share_directory
@@ -67,7 +68,7 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error(f"--friction: got {options.friction}, expected 0 to 3")
     try:
         run(options)
-    except (BagError, CheckpointError, EvaluationError, MessageError, RobotFileError, OSError) as error:
+    except (BagError, CheckpointError, EffectError, EvaluationError, MessageError, RobotFileError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     return 0

@@ -53,6 +53,9 @@ class PredictorNode(Node):
             horizon=settings.horizon,
             options=PhysicsOptions(time_step=settings.time_step),
         )
+        self.get_logger().info(
+            "preparing the physics; the first time on a machine its kernels are compiled, about 10 s"
+        )
         self.predictor.warm_up()
         self.sensor_topics = self._sensor_topics()
         self.health = Health(self, ["odometry", "commands", *self.sensor_topics, "prediction"])

@@ -129,5 +129,7 @@ class Motion:
     """``[B, T + 1, 3]``."""
     normal_forces: Tensor | None = None
     """``[B, T, N]``."""
+    tangential_forces: Tensor | None = None
+    """``[B, T, N, 3]``."""
     forces: Tensor | None = None
     """``[B, T, N, 3]``."""

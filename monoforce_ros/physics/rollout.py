@@ -102,5 +102,6 @@ def _result(problem: Problem, motion: Motion, finite: Tensor, options: PhysicsOp
         inside=((points >= low) & (points <= high)).all(dim=-1),
         valid=valid,
         normal_forces=mark(motion.normal_forces),
+        tangential_forces=mark(motion.tangential_forces),
         forces=mark(motion.forces),
     )

@@ -71,5 +71,7 @@ class Rollout:
     """Whether a trajectory is finite throughout, ``[B]`` bool; an invalid one holds NaN and no gradient."""
     normal_forces: Tensor | None = None
     """Force of the ground along its normal on each body point during each step [N], ``[B, T, N]``, never negative."""
+    tangential_forces: Tensor | None = None
+    """Part of the contact force along the ground on each body point [N], ``[B, T, N, 3]`` in terrain axes."""
     forces: Tensor | None = None
     """Whole contact force on each body point during each step [N], ``[B, T, N, 3]`` in terrain axes."""

@@ -53,7 +53,7 @@ def integrate(problem: Problem, options: PhysicsOptions, with_forces: bool) -> M
     centre, rotation = problem.centre, problem.rotation
     velocity, angular_velocity = problem.velocity, problem.angular_velocity
     history: list[tuple[Tensor, ...]] = [(centre, rotation, velocity, angular_velocity)]
-    normal_forces, forces = [], []
+    normal_forces, tangential_forces, forces = [], [], []
     for step in range(problem.steps):
         turned = rotation.transpose(1, 2)
         arms = body_points @ turned
@@ -103,9 +103,10 @@ def integrate(problem: Problem, options: PhysicsOptions, with_forces: bool) -> M
             acted = (force - gain * (jacobian @ change[..., None])[..., 0]).unflatten(1, (-1, 3))
             pressing = acted[..., 0].clamp_min(0.0)
             normal_forces.append(pressing)
-            acted = torch.cat([pressing[..., None], acted[..., 1:]], dim=-1)
-            forces.append((acted[..., None] * touch.directions).sum(2))
+            tangential = (acted[..., 1:, None] * touch.directions[:, :, 1:]).sum(2)
+            tangential_forces.append(tangential)
+            forces.append(pressing[..., None] * touch.directions[:, :, 0] + tangential)
     states = [torch.stack(entries, dim=1) for entries in zip(*history, strict=True)]
     if not normal_forces:
         return Motion(*states)
-    return Motion(*states, torch.stack(normal_forces, dim=1), torch.stack(forces, dim=1))
+    return Motion(*states, *(torch.stack(f, dim=1) for f in (normal_forces, tangential_forces, forces)))

@@ -148,23 +148,24 @@ class _Forces(torch.autograd.Function):
         batch, steps = inputs[2].shape[:2]
         count = inputs[3].shape[0]
         normal = inputs[0].new_zeros((batch, steps, count))
-        whole = inputs[0].new_zeros((batch, steps, count, 3))
-        _launch_forces(kernels, fixed, inputs, (normal, whole))
+        tangential = inputs[0].new_zeros((batch, steps, count, 3))
+        whole = torch.zeros_like(tangential)
+        _launch_forces(kernels, fixed, inputs, (normal, tangential, whole))
         if any(ctx.needs_input_grad):
             ctx.fixed = fixed
-            ctx.save_for_backward(*inputs, normal, whole)
-        return normal, whole
+            ctx.save_for_backward(*inputs, normal, tangential, whole)
+        return normal, tangential, whole
 
     @staticmethod
-    def backward(ctx, normal_gradient, whole_gradient):
-        *inputs, normal, whole = ctx.saved_tensors
+    def backward(ctx, *output_gradients):
+        *inputs, normal, tangential, whole = ctx.saved_tensors
         kernels = _kernels(inputs[0])
         given = _launch_forces(
             kernels,
             ctx.fixed,
             inputs,
-            (normal, whole),
-            output_gradients=(normal_gradient.contiguous(), whole_gradient.contiguous()),
+            (normal, tangential, whole),
+            output_gradients=[gradient.contiguous() for gradient in output_gradients],
         )
         return (None, *given)
 
@@ -227,17 +228,17 @@ def _launch_forces(kernels, fixed, inputs, outputs, *, output_gradients=None):
         height, material, speeds, points, areas, tangents, weights, mass, centre_of_mass, factors, tilt, resistance,
         wrench, *moving,
     ) = arrays  # fmt: skip
-    gradients = output_gradients or (None, None)
+    gradients = output_gradients or (None, None, None)
     results = [
         wp.from_torch(t, dtype=kind, requires_grad=backward, grad=g)
-        for t, kind, g in zip(outputs, (kernels.scalar, kernels.vec3), gradients, strict=True)
+        for t, kind, g in zip(outputs, (kernels.scalar, kernels.vec3, kernels.vec3), gradients, strict=True)
     ]
     drives = wp.from_torch(fixed.drives, dtype=wp.int32)
     before = [
         height, material, grid, options, speeds, points, areas, tangents, drives, weights, mass, centre_of_mass,
         factors, tilt, resistance, wrench, *moving,
     ]  # fmt: skip
-    extra = _adjoint(before, outputs=2) if backward else {}
+    extra = _adjoint(before, outputs=3) if backward else {}
     wp.launch(
         kernels.forces,
         dim=tuple(outputs[0].shape),

@@ -95,40 +95,38 @@ def kernels(double: bool) -> Kernels:
         page: int,
         grid: Grid,
         options: Options,
-        point: vec3,
-        velocity: vec3,
-        belt: vec3,
-        lateral: vec3,
+        position: vec3,
+        arm: vec3,
+        turned: mat33,
+        linear: vec3,
+        angular: vec3,
+        tangent: vec3,
+        speed: scalar,
         area: scalar,
         weight: scalar,
         factors: vec2,
         rolling: scalar,
     ) -> Touch:
         touch = Touch()
+        point = position + arm
         raw_x = (point[0] - grid.origin_x) * grid.inverse_resolution
         raw_y = (point[1] - grid.origin_y) * grid.inverse_resolution
         column = corner(raw_x, grid.columns)
         row = corner(raw_y, grid.rows)
         u = wp.clamp(raw_x, scalar(0.0), scalar(grid.columns - 1)) - scalar(column)
         w = wp.clamp(raw_y, scalar(0.0), scalar(grid.rows - 1)) - scalar(row)
+        h00 = scalar(0.0)
+        h01 = scalar(0.0)
+        h10 = scalar(0.0)
+        h11 = scalar(0.0)
         level = scalar(0.0)
-        slope_x = scalar(0.0)
-        slope_y = scalar(0.0)
         if options.lookup == 1:
             h00 = height[page, row, column]
             h01 = height[page, row, column + 1]
             h10 = height[page, row + 1, column]
             h11 = height[page, row + 1, column + 1]
             bottom = h00 + u * (h01 - h00)
-            top = h10 + u * (h11 - h10)
-            level = bottom + w * (top - bottom)
-            # Where the coordinate was clamped the height no longer depends on it.
-            slope_x = (
-                ((scalar(1.0) - w) * (h01 - h00) + w * (h11 - h10))
-                * grid.inverse_resolution
-                * inside_axis(raw_x, grid.columns)
-            )
-            slope_y = (top - bottom) * grid.inverse_resolution * inside_axis(raw_y, grid.rows)
+            level = bottom + w * (h10 + u * (h11 - h10) - bottom)
         else:
             level = height[page, nearest(raw_y, grid.rows), nearest(raw_x, grid.columns)]
         gap = level - point[2]
@@ -147,8 +145,22 @@ def kernels(double: bool) -> Kernels:
                 stuff = material[page, nearest(raw_y, grid.rows), nearest(raw_x, grid.columns)]
             normal = vec3(scalar(0.0), scalar(0.0), scalar(1.0))
             if options.normal == 1:
+                # Where the coordinate was clamped the height no longer depends on it.
+                slope_x = (
+                    ((scalar(1.0) - w) * (h01 - h00) + w * (h11 - h10))
+                    * grid.inverse_resolution
+                    * inside_axis(raw_x, grid.columns)
+                )
+                slope_y = (
+                    ((scalar(1.0) - u) * (h10 - h00) + u * (h11 - h01))
+                    * grid.inverse_resolution
+                    * inside_axis(raw_y, grid.rows)
+                )
                 upward = scalar(1.0) / wp.sqrt(scalar(1.0) + slope_x * slope_x + slope_y * slope_y)
                 normal = vec3(-slope_x * upward, -slope_y * upward, upward)
+            velocity = linear + wp.cross(angular, arm)
+            belt = turned * (tangent * speed)
+            lateral = vec3(turned[0, 1], turned[1, 1], turned[2, 1])
             depth = gap * normal[2]
             approach = -wp.dot(velocity, normal)
             spring = stuff[0] * depth
@@ -251,7 +263,6 @@ def kernels(double: bool) -> Kernels:
             turned = rotation[b, step]
             linear = velocity[b, step]
             angular = angular_velocity[b, step]
-            lateral = vec3(turned[0, 1], turned[1, 1], turned[2, 1])
             force = vec3()
             torque = vec3()
             diagonal = vec3()
@@ -261,20 +272,21 @@ def kernels(double: bool) -> Kernels:
             mixed = mat33()
             for i in range(count):
                 arm = turned * (points[i] - offset)
-                point = position + arm
-                belt = vec3()
-                if drives[i] >= 0:
-                    belt = turned * (tangents[i] * speeds[b, step, drives[i]])
+                # The hull has no drive; its tangents are zero.
+                drive = wp.max(drives[i], 0)
                 touch = touch_ground(
                     height,
                     material,
                     page,
                     grid,
                     options,
-                    point,
-                    linear + wp.cross(angular, arm),
-                    belt,
-                    lateral,
+                    position,
+                    arm,
+                    turned,
+                    linear,
+                    angular,
+                    tangents[i],
+                    speeds[b, step, drive],
                     areas[i],
                     weight_total * share[i],
                     factors[b],
@@ -381,25 +393,27 @@ def kernels(double: bool) -> Kernels:
         velocity: wp.array2d(dtype=vec3),
         angular_velocity: wp.array2d(dtype=vec3),
         normal_forces: wp.array3d(dtype=scalar),
+        tangential_forces: wp.array3d(dtype=vec3),
         whole_forces: wp.array3d(dtype=vec3),
     ):
         b, step, i = wp.tid()
         page = wp.min(b, height.shape[0] - 1)
         turned = rotation[b, step]
         arm = turned * (points[i] - centre_of_mass[b])
-        belt = vec3()
-        if drives[i] >= 0:
-            belt = turned * (tangents[i] * speeds[b, step, drives[i]])
+        drive = wp.max(drives[i], 0)
         touch = touch_ground(
             height,
             material,
             page,
             grid,
             options,
-            centre[b, step] + arm,
-            velocity[b, step] + wp.cross(angular_velocity[b, step], arm),
-            belt,
-            vec3(turned[0, 1], turned[1, 1], turned[2, 1]),
+            centre[b, step],
+            arm,
+            turned,
+            velocity[b, step],
+            angular_velocity[b, step],
+            tangents[i],
+            speeds[b, step, drive],
             areas[i],
             mass[b] * options.gravity * share[i],
             factors[b],
@@ -414,7 +428,9 @@ def kernels(double: bool) -> Kernels:
             rolling = touch.force[1] - touch.gain[1] * wp.dot(touch.along, change)
             sliding = touch.force[2] - touch.gain[2] * wp.dot(touch.across, change)
             normal_forces[b, step, i] = pressing
-            whole_forces[b, step, i] = pressing * touch.normal + rolling * touch.along + sliding * touch.across
+            tangential = rolling * touch.along + sliding * touch.across
+            tangential_forces[b, step, i] = tangential
+            whole_forces[b, step, i] = pressing * touch.normal + tangential
 
     # Structs are reached through the kernels' signatures by the caller.
     integrate.grid_type, integrate.options_type = Grid, Options

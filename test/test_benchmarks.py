@@ -1,0 +1,48 @@
+"""The benchmarks run, and the outside check against MuJoCo holds; durations decide nothing here."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+from conftest import ROOT
+
+sys.path.insert(0, str(ROOT / "benchmarks"))
+
+
+@pytest.fixture(scope="module")
+def check():
+    import mujoco_check
+
+    return mujoco_check
+
+
+@pytest.fixture(scope="module")
+def husky(check):
+    return check.fitted_robot(1)
+
+
+@pytest.mark.parametrize(
+    ("roughness", "drive"), [(0.0, "straight, fast"), (0.4, "arc to the right"), (0.4, "wide arc")]
+)
+def test_the_rollout_follows_an_independent_engine(check, husky, roughness, drive):
+    row = check.compare(husky, roughness, 2, check.COMMANDS[drive])
+    assert row["distance_m"] > 2.0
+    assert row["position_error_m"] < 0.25
+    assert row["rotation_error_deg"] < 8.0
+
+
+def test_the_rollout_benchmark_writes_its_figures(tmp_path):
+    out = tmp_path / "rollout.json"
+    done = subprocess.run(
+        [sys.executable, "benchmarks/rollout.py", "--quick", "--backends", "warp", "--json", str(out)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=200,
+    )
+    assert done.returncode == 0, done.stderr
+    content = json.loads(out.read_text())
+    assert {row["backend"] for row in content["rows"]} == {"warp"}
+    assert content["kept_for_backward_b64_bytes"] > 0
+    assert len(content["effects"]) == 2
