@@ -77,9 +77,10 @@ def healthy(peer, predictor):
 
 
 def nothing_new(peer, predictor, text, **bad):
+    # Counted before the pause: a camera's silence may be noticed in it already.
+    said_before = sum(text in line for line in predictor.output.splitlines())
     peer.spin(0.8)
     peer.clear()
-    said_before = sum(text in line for line in predictor.output.splitlines())
     bad_from = peer.now
     look(peer, 1.4, **bad)
     assert peer.until(lambda: peer.status(PART) is not None and text in peer.status(PART)[1], 5.0), predictor.output
