@@ -88,6 +88,16 @@ def ros_environment() -> dict[str, str]:
 
 
 @pytest.fixture(scope="module")
+def peer(ros_environment):
+    """A ROS node of the test's own, in the same domain as the executables that it starts."""
+    from ros_peer import Peer
+
+    peer = Peer(ros_environment)
+    yield peer
+    peer.close()
+
+
+@pytest.fixture(scope="module")
 def start(executables, ros_environment, tmp_path_factory):
     """Start installed executables; those still running at the end are killed."""
     started: list[Process] = []

@@ -5,7 +5,6 @@ import time
 import numpy as np
 import pytest
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from ros_peer import Peer
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image
 
@@ -27,13 +26,6 @@ def bag(tmp_path_factory):
             writer.write("/camera/image_raw", builders.image(at, "camera", pixels), at)
             writer.write("/cmd_vel", builders.twist(0.1 * i, 0), at)
     return path
-
-
-@pytest.fixture(scope="module")
-def peer(ros_environment):
-    peer = Peer(ros_environment)
-    yield peer
-    peer.close()
 
 
 class Listener:

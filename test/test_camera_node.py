@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from ros_peer import Peer
 
 from monoforce_ros.bags import builders
 from monoforce_ros.encoder import EncoderConfig, TerrainEncoder, save_encoder
@@ -19,13 +18,6 @@ IMAGE, INFO = "/front/image_raw", "/front/camera_info"
 PART = f"camera {IMAGE}"
 WIDTH, HEIGHT = 160, 120
 MATRIX = np.array([[100.0, 0, 80], [0, 100.0, 60], [0, 0, 1]])
-
-
-@pytest.fixture(scope="module")
-def peer(ros_environment):
-    peer = Peer(ros_environment)
-    yield peer
-    peer.close()
 
 
 @pytest.fixture(scope="module")

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from monoforce_ros.physics import PhysicsOptions, State, rollout
+from monoforce_ros.physics.rotation import exponential_map
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainMap
 
@@ -25,6 +26,7 @@ def inputs() -> dict[str, torch.Tensor]:
         "damping": 4e4 * full,
         "friction": 0.8 * full,
         "speeds": speeds.clone(),
+        "turn": torch.tensor([[0.05, -0.08, 0.3]], dtype=torch.float64),
         "position": torch.tensor([[0.1, -0.05, 0.16]], dtype=torch.float64),
         "velocity": torch.tensor([[0.5, 0.1, -0.1]], dtype=torch.float64),
         "angular_velocity": torch.tensor([[0.1, -0.2, 0.3]], dtype=torch.float64),
@@ -53,7 +55,7 @@ def outcome(given: dict[str, torch.Tensor], options: PhysicsOptions, backend: st
             for name in ("mass", "centre_of_mass", "inertia", "friction_longitudinal", "friction_lateral")
         },
     )
-    rotation = torch.eye(3, dtype=torch.float64)[None]
+    rotation = exponential_map(given["turn"])
     state = State(given["position"], rotation, given["velocity"], given["angular_velocity"])
     result = rollout(terrain, robot, given["speeds"], state, options=options, backend=backend)
     # Weights make every component count and none cancel.

@@ -55,10 +55,10 @@ def test_the_licence_and_the_dependencies_are_stated():
         if line.startswith(("from ", "import "))
     }
     ros = {name for name in imported if name.endswith(("_msgs", "_interfaces")) or name == "rclpy"}
-    assert ros - {"rcl_interfaces"} <= depends
+    assert ros <= depends
     # What is not ROS's comes by rosdep or pip, and is named for the one or the other.
     named = {name.removeprefix("python3-") for name in depends} | set(re.findall(r'"([a-z-]+)",', SETUP))
-    others = {"cv2": "opencv", "yaml": "yaml", "warp": "warp-lang", "launch": "launch", "launch_ros": "launch"}
+    others = {"cv2": "opencv", "yaml": "yaml", "warp": "warp-lang"}
     third = {others.get(name, name) for name in imported - set(sys.stdlib_module_names) - ros - {"monoforce_ros"}}
     assert third - {"tf2_ros", "ament_index_python"} <= named
 

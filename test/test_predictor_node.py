@@ -4,19 +4,12 @@ import signal
 
 import numpy as np
 import pytest
-from ros_peer import OUTPUTS, Peer, ground_cloud
+from ros_peer import OUTPUTS, ground_cloud
 
 from monoforce_ros.bags import builders
 
 OK, WARN, ERROR = 0, 1, 2
 PREDICTED = [topic for topic in OUTPUTS if topic.startswith("/predicted")]
-
-
-@pytest.fixture(scope="module")
-def peer(ros_environment):
-    peer = Peer(ros_environment)
-    yield peer
-    peer.close()
 
 
 @pytest.fixture(scope="module")
