@@ -57,6 +57,7 @@ class Inputs:
         self._commands: deque[tuple[int, np.ndarray]] = deque()
         self._newest: dict[str, Received] = {}
         self._pending: dict[str, Received] = {}
+        self._first_sensor = 0.0
 
     def _admit(self, topic: str, stamp: int) -> bool:
         """Whether a message may be used: not older than its predecessor, or first of a time that began anew."""
@@ -102,8 +103,9 @@ class Inputs:
             live = [
                 entry for entry in self._newest.values() if now - entry.arrival <= self._patience
             ]  # a sensor that died does not hold up the others
-            if len(self._newest) < len(self._sensors) and now - min(e.arrival for e in live) < self._patience:
-                return
+            self._first_sensor = self._first_sensor or now
+            if len(self._newest) < len(self._sensors) and now - self._first_sensor < self._patience:
+                return  # the others may still be starting
             if max(e.stamp for e in live) - min(e.stamp for e in live) > self._slop:
                 return
             self.dropped += bool(self._pending)
