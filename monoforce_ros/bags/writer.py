@@ -68,7 +68,8 @@ class BagWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         if kind is not None:
-            self._writer.storage and self._writer.storage.abort()
+            if self._writer.storage:
+                self._writer.storage.abort()
             shutil.rmtree(self._unfinished, ignore_errors=True)
             return
         self._writer.close()

@@ -53,7 +53,6 @@ def splat(depth: Tensor, features: Tensor, cells: Tensor, size: int) -> Tensor:
         ``[B, C + 1, size]``: the summed features and, last, the summed probability (how much was seen there).
     """
     batch, channels = features.shape[:2]
-    bins = depth.shape[1]
     seen = torch.cat([features, torch.ones_like(features[:, :1])], dim=1)
     weighted = (depth[:, :, None] * seen[:, None]).permute(0, 1, 3, 4, 2).reshape(batch, -1, channels + 1)
     # One row more than there are cells takes what falls outside.
@@ -61,5 +60,4 @@ def splat(depth: Tensor, features: Tensor, cells: Tensor, size: int) -> Tensor:
     target = target + (size + 1) * torch.arange(batch, device=cells.device)[:, None]
     summed = torch.zeros(batch * (size + 1), channels + 1, dtype=weighted.dtype, device=weighted.device)
     summed = summed.index_add(0, target.flatten(), weighted.flatten(0, 1))
-    assert bins == cells.shape[1]
     return summed.unflatten(0, (batch, size + 1))[:, :size].transpose(1, 2)

@@ -59,7 +59,7 @@ def _project(camera: CameraModel, points: np.ndarray) -> tuple[np.ndarray, np.nd
         int(camera.width * (1 + 2 * margin)),
         int(camera.height * (1 + 2 * margin)),
         camera.matrix + np.array([[0, 0, margin * camera.width], [0, 0, margin * camera.height], [0, 0, 0]]),
-        camera.distortion * 0.0 if not camera.is_distorted else camera.distortion,
+        camera.distortion,
         camera.distortion_model,
     )
     target = camera if camera.is_distorted else wide

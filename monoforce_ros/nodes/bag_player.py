@@ -147,7 +147,8 @@ def main(arguments: list[str] | None = None) -> int:
             player.get_logger().info(f"published {published} messages")
             # Reliable messages still on their way are lost with their publisher.
             for publisher in player.playable.values():
-                publisher.wait_for_all_acked(rclpy.duration.Duration(seconds=1.0)) if player.context.ok() else None
+                if player.context.ok():
+                    publisher.wait_for_all_acked(rclpy.duration.Duration(seconds=1.0))
             player.destroy_node()
     except BagError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -240,7 +240,6 @@ class PredictorNode(Node):
             self._work_without_sensors()
             return
         while self._running:
-            started = time.monotonic()
             received = self.inputs.take(odometry_timeout=settings.odometry_timeout, wait=0.5)
             if received is None or not self._running:
                 continue
@@ -277,18 +276,14 @@ class PredictorNode(Node):
             stamps = np.minimum(self.predictor.command_stamps(stamp), stamp)
             twists = self.inputs.commands().sample(stamps, timeout=self.settings.command_timeout)
             prediction = self.predictor.predict(observation, motion, twists)
-        except ValueError as error:
-            self.health.report("prediction", ERROR, f"nothing published: {error}", reason=type(error).__name__)
-            return
+            if not bool(prediction.rollout.valid.all()):
+                raise ValueError("the rollout diverged")
+            self._publish(prediction)
         except Exception as error:  # the node must outlive whatever its input brings about
-            self.health.report(
-                "prediction", ERROR, f"nothing published: {type(error).__name__}: {error}", reason=type(error).__name__
-            )
+            # Errors that say what is wrong with the input are ValueErrors; others need their kind to be understood.
+            text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+            self.health.report("prediction", ERROR, f"nothing published: {text}", reason=type(error).__name__)
             return
-        if not bool(prediction.rollout.valid.all()):
-            self.health.report("prediction", ERROR, "nothing published: the rollout diverged", reason="diverged")
-            return
-        self._publish(prediction)
         self._predictions += 1
         self._last_prediction = time.monotonic()
         self._durations = [*self._durations[-199:], time.monotonic() - started]
