@@ -1,0 +1,44 @@
+"""From measured motion to the state that a prediction starts from."""
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from monoforce_ros.motion import MotionState
+from monoforce_ros.physics import State, rollout
+from monoforce_ros.prediction import FlatTerrain, Observation, Predictor
+from monoforce_ros.prediction.predictor import start_states
+from monoforce_ros.robots import load_robot
+from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap
+
+
+def test_the_start_has_the_robots_own_attitude_and_velocities():
+    rotation = Rotation.from_euler("xyz", [0.1, -0.2, 2.0])
+    velocity, rate = np.array([0.8, 0.1, 0.0]), np.array([0, 0, 0.4])
+    motion = MotionState(0, np.array([5.0, 6.0, 7.0]), rotation.as_matrix(), velocity, rate)
+    state = start_states([motion], torch.float64)
+    level = Rotation.from_euler("z", -motion.heading)
+    np.testing.assert_allclose(state.position[0], 0.0)
+    np.testing.assert_allclose(state.rotation[0], (level * rotation).as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(state.velocity[0], (level * rotation).apply([0.8, 0.1, 0.0]), atol=1e-12)
+    np.testing.assert_allclose(state.angular_velocity[0], (level * rotation).apply([0, 0, 0.4]), atol=1e-12)
+
+
+def test_a_moving_robot_is_predicted_onwards_in_the_odometry_frame():
+    robot = load_robot("husky")
+    predictor = Predictor(robot, FlatTerrain(robot, Grid.square(), TerrainDefaults()), horizon=1.0)
+    west = Rotation.from_euler("z", np.pi).as_matrix()
+    motion = MotionState(0, np.array([3.0, -1.0, 0.4]), west, np.array([0.6, 0, 0]), np.zeros(3))
+    twists = np.tile([0.6, 0.0], (len(predictor.command_stamps(0)), 1))
+    positions = predictor.predict(Observation(0), motion, twists).positions()
+    np.testing.assert_allclose(positions[0], [3.0, -1.0, 0.4], atol=1e-6)
+    np.testing.assert_allclose(positions[-1], [2.4, -1.0, 0.4], atol=0.02)
+
+
+def test_ground_does_not_act_before_it_is_touched():
+    robot = load_robot("husky")
+    above = State.at_rest(robot.ground_clearance + 0.1)
+    result = rollout(TerrainMap.flat(Grid.square(4.0)), robot, torch.zeros(1, 20, 2), above)
+    lowest = result.position[0, :-1, 2] - robot.ground_clearance
+    assert float(result.forces[0, lowest > 1e-4].abs().max()) == 0.0
+    assert float(result.forces[0, lowest < -1e-3].abs().max()) > 0.0
