@@ -20,11 +20,16 @@ class Contact:
     """
 
     directions: Tensor
-    """Unit vectors in terrain axes, ``[B, N, 3 (direction), 3 (axis)]``."""
+    """Unit vectors in terrain axes, ``[B, 3 (axis), 3 (direction), N]``."""
     force: Tensor
-    """``[B, N, 3]`` [N]."""
+    """``[B, 3 (direction), N]`` [N]."""
     gain: Tensor
-    """``[B, N, 3]`` [N s/m], never negative."""
+    """``[B, 3 (direction), N]`` [N s/m], never negative."""
+
+    @property
+    def vectors(self) -> Tensor:
+        """Whole force on each point in terrain axes, ``[B, 3, N]`` [N]."""
+        return (self.directions * self.force[:, None]).sum(2)
 
 
 def contact(
@@ -48,45 +53,47 @@ def contact(
 
     Args:
         ground: terrain under the points.
-        points: ``[B, N, 3]`` [m].
-        velocities: of the body at the points, ``[B, N, 3]`` [m/s].
-        belt_velocities: of the moving surface relative to the body, ``[B, N, 3]`` [m/s].
-        lateral: the robot's y axis, ``[B, 1, 3]``.
+        points: ``[B, 3, N]`` [m].
+        velocities: of the body at the points, ``[B, 3, N]`` [m/s].
+        belt_velocities: of the moving surface relative to the body, ``[B, 3, N]`` [m/s].
+        lateral: the robot's y axis, ``[B, 3]``.
         areas: ``[N]`` [m²].
         weights: share m g of each point in the robot's weight, ``[B, N]`` or ``[N]`` [N] (``sigmoid`` only).
-        friction_factors: longitudinal and lateral factor on the ground's friction, ``[B, 1, 2]``.
-        rolling_resistance: force against rolling as a part of the load, ``[B, 1]``.
+        friction_factors: longitudinal and lateral factor on the ground's friction, ``[B, 2]``.
+        rolling_resistance: force against rolling as a part of the load, ``[B]``.
         options: which laws.
         step_time: over which the spring follows the motion [s]; the options' time step unless given, 0 for the force
             at this very moment.
     """
-    vertical = options.normal_force == "vertical"
-    normal = torch.zeros_like(ground.normal) if vertical else ground.normal
-    if vertical:
-        normal[..., 2] = 1.0
-    depth = (ground.height - points[..., 2]) * normal[..., 2]
+    normal = ground.normal
+    if options.normal_force == "vertical":
+        normal = torch.zeros_like(normal)
+        normal[:, 2] = 1.0
+    depth = (ground.height - points[:, 2]) * normal[:, 2]
     touching = depth > 0
-    approach = -(velocities * normal).sum(-1)
+    touching_areas = areas * touching
+    lateral = lateral[..., None]
+    across = lateral - (lateral * normal).sum(1, keepdim=True) * normal
+    across = across * torch.rsqrt((across * across).sum(1, keepdim=True) + 1e-12)
+    directions = torch.stack([normal, cross(across, normal), across], dim=2)
+    moved = (directions * velocities[:, :, None]).sum(1)
+    slip = moved[:, 1:] + (directions[:, :, 1:] * belt_velocities[:, :, None]).sum(1)
+
+    # Pressing on the ground is moving against its normal.
     spring = ground.stiffness * depth
-    load = areas * (spring + ground.damping * approach).clamp_min(0.0) * touching
+    load = touching_areas * (spring - ground.damping * moved[:, 0]).clamp_min(0.0)
     # Within the step the spring follows the motion: it acts as further damping (linearly implicit Euler).
     damping = ground.damping + (options.time_step if step_time is None else step_time) * ground.stiffness
-    pressing = areas * (spring + damping * approach).clamp_min(0.0) * touching
-    normal_gain = areas * damping * (pressing > 0)
+    pressing = touching_areas * (spring - damping * moved[:, 0]).clamp_min(0.0)
+    normal_gain = touching_areas * damping * (pressing > 0)
 
-    across = lateral - (lateral * normal).sum(-1, keepdim=True) * normal
-    across = across * torch.rsqrt((across * across).sum(-1, keepdim=True) + 1e-12)
-    along = torch.linalg.cross(across, normal)
-    tangential = torch.stack([along, across], dim=2)
-    moved = (tangential * velocities[:, :, None]).sum(-1)
-    slip = moved + (tangential * belt_velocities[:, :, None]).sum(-1)
-    friction = ground.friction[..., None] * friction_factors
+    friction = ground.friction[:, None] * friction_factors[..., None]
     if options.tangential_force == "coulomb":
-        speed = torch.sqrt((slip * slip).sum(-1, keepdim=True) + options.slip_regularisation**2)
-        tangential_gain = friction * (load[..., None] / speed)
+        per_speed = load * torch.rsqrt((slip * slip).sum(1) + options.slip_regularisation**2)
+        tangential_gain = friction * per_speed[:, None]
         tangential_force = -tangential_gain * slip
     elif options.tangential_force == "sigmoid":
-        scale = friction * (weights * touching)[..., None]
+        scale = friction * (weights * touching)[:, None]
         activation = torch.sigmoid(-slip)
         tangential_force = scale * (activation - 0.5)
         tangential_gain = scale * activation * (1.0 - activation)
@@ -94,12 +101,17 @@ def contact(
         tangential_force = torch.zeros_like(slip)
         tangential_gain = tangential_force
     # What holds the body back, rather than the belt: rolling resistance and vegetation.
-    held = rolling_resistance * load / torch.sqrt(moved[..., 0] ** 2 + options.slip_regularisation**2)
-    held = torch.stack([held, torch.zeros_like(held)], dim=-1) + (areas * ground.drag * touching)[..., None]
-    tangential_force = tangential_force - held * moved
-    tangential_gain = tangential_gain + held
+    brushing = touching_areas * ground.drag
+    rolling = rolling_resistance[:, None] * load * torch.rsqrt(moved[:, 1] ** 2 + options.slip_regularisation**2)
+    held = torch.stack([rolling + brushing, brushing], dim=1)
     return Contact(
-        directions=torch.cat([normal[:, :, None], tangential], dim=2),
-        force=torch.cat([pressing[..., None], tangential_force], dim=-1),
-        gain=torch.cat([normal_gain[..., None], tangential_gain], dim=-1),
+        directions=directions,
+        force=torch.cat([pressing[:, None], tangential_force - held * moved[:, 1:]], dim=1),
+        gain=torch.cat([normal_gain[:, None], tangential_gain + held], dim=1),
     )
+
+
+def cross(first: Tensor, second: Tensor) -> Tensor:
+    """Cross product along dimension 1, component by component: many times faster here than torch's own."""
+    a, b = first.unbind(1), second.unbind(1)
+    return torch.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]], dim=1)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from monoforce_ros.physics.contact import contact
+from monoforce_ros.physics.contact import contact, cross
 from monoforce_ros.physics.lookup import TerrainLookup
 from monoforce_ros.physics.options import PhysicsOptions
 from monoforce_ros.physics.problem import Motion, Problem
@@ -72,7 +72,7 @@ class _System(nn.Module):
         self._problem = problem
         self._options = options
         self._lookup = TerrainLookup(problem.terrain, options.lookup, problem.batch_size, problem.vegetation_drag)
-        self._points = problem.points - problem.centre_of_mass[:, None]
+        self._points = problem.points.T - problem.centre_of_mass[..., None]
         hull = torch.zeros_like(problem.drive_speeds[..., :1])
         self._speeds = torch.cat([problem.drive_speeds, hull], dim=-1)
         share = problem.point_areas / problem.point_areas.sum()
@@ -89,33 +89,33 @@ class _System(nn.Module):
         problem, options = self._problem, self._options
         centre, rotation, velocity, angular_velocity = state
         turned = rotation.transpose(1, 2)
-        arms = self._points @ turned
-        points = centre[:, None] + arms
+        arms = rotation @ self._points
+        points = centre[..., None] + arms
         step = min(int(float(time.detach()) / options.time_step + 1e-9), problem.steps - 1)
-        belt = (self._speeds[:, step][:, problem.point_drives, None] * problem.point_tangents) @ turned
+        belt = rotation @ (self._speeds[:, step, problem.point_drives][:, None] * problem.point_tangents.T)
         rolling, linear_drag, quadratic_drag = problem.resistance.unbind(-1)
         touch = contact(
             self._lookup(points),
             points,
-            velocity[:, None] + torch.linalg.cross(angular_velocity[:, None], arms),
+            velocity[..., None] + cross_matrix(angular_velocity) @ arms,
             belt,
-            rotation[:, None, :, 1],
+            rotation[..., 1],
             problem.point_areas,
             self._weights,
-            problem.friction_factors[:, None],
-            rolling[:, None],
+            problem.friction_factors,
+            rolling,
             options,
             step_time=0.0,
         )
-        forces = (touch.force[..., None] * touch.directions).sum(2)
+        forces = touch.vectors
         in_body = turned @ torch.stack([velocity, angular_velocity], dim=-1)
         extra = (problem.wrench @ features(in_body, rotation)[..., None])[..., 0]
         drag = linear_drag + quadratic_drag * torch.sqrt((velocity * velocity).sum(-1) + SMALLEST_SPEED**2)
-        force = forces.sum(1) + problem.mass[:, None] * tilted_gravity(problem.gravity_tilt, options.gravity)
+        force = forces.sum(2) + problem.mass[:, None] * tilted_gravity(problem.gravity_tilt, options.gravity)
         force = force - drag[:, None] * velocity + (rotation @ extra[:, :3, None])[..., 0]
         inertia = rotation @ problem.inertia @ turned
-        torque = torch.linalg.cross(arms, forces).sum(1) + (rotation @ extra[:, 3:, None])[..., 0]
-        torque = torque - torch.linalg.cross(angular_velocity, (inertia @ angular_velocity[..., None])[..., 0])
+        torque = cross(arms, forces).sum(2) + (rotation @ extra[:, 3:, None])[..., 0]
+        torque = torque - cross(angular_velocity, (inertia @ angular_velocity[..., None])[..., 0])
         return (
             velocity,
             cross_matrix(angular_velocity) @ rotation,

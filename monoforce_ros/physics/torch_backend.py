@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from monoforce_ros.physics.contact import contact
+from monoforce_ros.physics.contact import contact, cross
 from monoforce_ros.physics.lookup import TerrainLookup
 from monoforce_ros.physics.options import PhysicsOptions
 from monoforce_ros.physics.problem import Motion, Problem
-from monoforce_ros.physics.rotation import exponential_map
+from monoforce_ros.physics.rotation import cross_matrix, exponential_map
 
 SMALLEST_SPEED = 1e-6
 """Keeps the gradient of a speed finite at rest [m/s]."""
@@ -35,8 +35,9 @@ def integrate(problem: Problem, options: PhysicsOptions, with_forces: bool) -> M
     batch, dtype, device = problem.batch_size, problem.centre.dtype, problem.centre.device
     step_time = options.time_step
     lookup = TerrainLookup(problem.terrain, options.lookup, batch, problem.vegetation_drag)
-    body_points = problem.points - problem.centre_of_mass[:, None]
-    factors = problem.friction_factors[:, None]
+    body_points = problem.points.T - problem.centre_of_mass[..., None]
+    tangents = problem.point_tangents.T
+    nothing = body_points.new_zeros(batch, 3, 3)
     share = problem.point_areas / problem.point_areas.sum()
     weights = problem.mass[:, None] * options.gravity * share
     # Drive -1, the hull, finds its zero at the end.
@@ -56,31 +57,34 @@ def integrate(problem: Problem, options: PhysicsOptions, with_forces: bool) -> M
     normal_forces, tangential_forces, forces = [], [], []
     for step in range(problem.steps):
         turned = rotation.transpose(1, 2)
-        arms = body_points @ turned
-        points = centre[:, None] + arms
-        belt = (speeds[:, step][:, problem.point_drives, None] * problem.point_tangents) @ turned
-        velocities = velocity[:, None] + torch.linalg.cross(angular_velocity[:, None], arms)
+        # Three products in one: arms to the points, their velocities by the rotation, velocities of the belts.
+        spin = cross_matrix(angular_velocity) @ rotation
+        belts = tangents * speeds[:, step, problem.point_drives][:, None]
+        frames = torch.cat(
+            [torch.cat([rotation, nothing], 2), torch.cat([spin, nothing], 2), torch.cat([nothing, rotation], 2)], 1
+        )
+        arms, spun, belt = (frames @ torch.cat([body_points, belts], 1)).split(3, dim=1)
+        points = centre[..., None] + arms
         touch = contact(
             lookup(points),
             points,
-            velocities,
+            velocity[..., None] + spun,
             belt,
-            rotation[:, None, :, 1],
+            rotation[..., 1],
             problem.point_areas,
             weights,
-            factors,
-            rolling[:, None],
+            problem.friction_factors,
+            rolling,
             options,
         )
         # Rows that turn the body's six velocities into the points' velocities along the contact directions, and by
         # their transpose forces along these into the body's force and torque.
-        jacobian = torch.cat(
-            [touch.directions, torch.linalg.cross(arms[:, :, None].expand_as(touch.directions), touch.directions)], -1
-        ).flatten(1, 2)
+        levers = cross(arms[:, :, None], touch.directions)
+        jacobian = torch.cat([touch.directions, levers], 1).flatten(2)
         force, gain = touch.force.flatten(1), touch.gain.flatten(1)
-        wrench = (force[:, None] @ jacobian)[:, 0]
+        wrench = (jacobian @ force[..., None])[..., 0]
         inertia = rotation @ problem.inertia @ turned
-        gyroscopic = torch.linalg.cross(angular_velocity, (inertia @ angular_velocity[..., None])[..., 0])
+        gyroscopic = cross(angular_velocity, (inertia @ angular_velocity[..., None])[..., 0])
         in_body = turned @ torch.stack([velocity, angular_velocity], dim=-1)
         extra = (problem.wrench @ features(in_body, rotation)[..., None])[..., 0]
         drag = linear_drag + quadratic_drag * torch.sqrt((velocity * velocity).sum(-1) + SMALLEST_SPEED**2)
@@ -91,7 +95,7 @@ def integrate(problem: Problem, options: PhysicsOptions, with_forces: bool) -> M
             ],
             dim=-1,
         )
-        yielding = (jacobian * gain[..., None]).transpose(1, 2) @ jacobian
+        yielding = (jacobian * gain[:, None]) @ jacobian.transpose(1, 2)
         system = mass_matrix(inertia) + step_time * (yielding + drag[:, None, None] * linear_part)
         change = torch.linalg.solve(system, step_time * (wrench + external))
         velocity = velocity + change[:, :3]
@@ -100,12 +104,12 @@ def integrate(problem: Problem, options: PhysicsOptions, with_forces: bool) -> M
         rotation = exponential_map(step_time * angular_velocity) @ rotation
         history.append((centre, rotation, velocity, angular_velocity))
         if with_forces:
-            acted = (force - gain * (jacobian @ change[..., None])[..., 0]).unflatten(1, (-1, 3))
-            pressing = acted[..., 0].clamp_min(0.0)
+            acted = touch.force - touch.gain * (change[:, None] @ jacobian).unflatten(2, (3, -1))[:, 0]
+            pressing = acted[:, 0].clamp_min(0.0)
             normal_forces.append(pressing)
-            tangential = (acted[..., 1:, None] * touch.directions[:, :, 1:]).sum(2)
-            tangential_forces.append(tangential)
-            forces.append(pressing[..., None] * touch.directions[:, :, 0] + tangential)
+            tangential = (touch.directions[:, :, 1:] * acted[:, None, 1:]).sum(2)
+            tangential_forces.append(tangential.transpose(1, 2))
+            forces.append((pressing[:, None] * touch.directions[:, :, 0] + tangential).transpose(1, 2))
     states = [torch.stack(entries, dim=1) for entries in zip(*history, strict=True)]
     if not normal_forces:
         return Motion(*states)

@@ -196,11 +196,7 @@ def _launch(kernels, fixed, common, inertia, states, *, state_gradients=None):
             # The adjoint reads the sums of every step; keeping them for a few trajectories at a time costs one more
             # forward launch and saves most of the memory.
             slots = max(1, steps) if backward else 1
-            scratch = _wrap(
-                (common[0].new_zeros((width, slots, 6, 3)), common[0].new_zeros((width, slots, 3, 3))),
-                (kernels.vec3, kernels.mat33),
-                gradients=backward,
-            )
+            scratch = _wrap((common[0].new_zeros((width, slots, 9, 3)),), (kernels.vec3,), gradients=backward)
             inputs = [
                 chunk, steps, int(backward), height, material, grid, options, speeds, points, areas, tangents, drives,
                 weights, mass, centre_of_mass, moments, factors, tilt, resistance, wrench,
@@ -208,7 +204,7 @@ def _launch(kernels, fixed, common, inertia, states, *, state_gradients=None):
             launch = {"dim": width, "inputs": inputs, "outputs": [*moving, *scratch], "device": device}
             wp.launch(kernels.integrate, record_tape=False, **launch)
             if backward:
-                wp.launch(kernels.integrate, record_tape=False, **launch, **_adjoint(inputs, outputs=6))
+                wp.launch(kernels.integrate, record_tape=False, **launch, **_adjoint(inputs, outputs=5))
         return [wp.to_torch(array.grad) if backward else None for array in arrays]
 
     # Compiled here: two threads must not do so at once.

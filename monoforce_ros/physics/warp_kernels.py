@@ -76,8 +76,8 @@ def kernels(double: bool) -> Kernels:
 
     @wp.func
     def corner(raw: scalar, cells: int) -> int:
-        clamped = wp.clamp(raw, scalar(0.0), scalar(cells - 1))
-        return wp.min(int(wp.floor(clamped)), cells - 2)
+        # Never negative, so that cutting off the fraction is the floor, which would be a call on plain x86-64.
+        return wp.min(int(wp.clamp(raw, scalar(0.0), scalar(cells - 1))), cells - 2)
 
     @wp.func
     def nearest(raw: scalar, cells: int) -> int:
@@ -87,6 +87,26 @@ def kernels(double: bool) -> Kernels:
     @wp.func
     def inside_axis(raw: scalar, cells: int) -> scalar:
         return wp.where(raw >= scalar(0.0) and raw <= scalar(cells - 1), scalar(1.0), scalar(0.0))
+
+    @wp.func
+    def ground_level(
+        height: wp.array3d(dtype=scalar), page: int, grid: Grid, lookup: int, raw_x: scalar, raw_y: scalar
+    ) -> scalar:
+        level = scalar(0.0)
+        if lookup == 1:
+            column = corner(raw_x, grid.columns)
+            row = corner(raw_y, grid.rows)
+            u = wp.clamp(raw_x, scalar(0.0), scalar(grid.columns - 1)) - scalar(column)
+            w = wp.clamp(raw_y, scalar(0.0), scalar(grid.rows - 1)) - scalar(row)
+            h00 = height[page, row, column]
+            h01 = height[page, row, column + 1]
+            h10 = height[page, row + 1, column]
+            h11 = height[page, row + 1, column + 1]
+            bottom = h00 + u * (h01 - h00)
+            level = bottom + w * (h10 + u * (h11 - h10) - bottom)
+        else:
+            level = height[page, nearest(raw_y, grid.rows), nearest(raw_x, grid.columns)]
+        return level
 
     @wp.func
     def touch_ground(
@@ -249,7 +269,6 @@ def kernels(double: bool) -> Kernels:
         velocity: wp.array2d(dtype=vec3),
         angular_velocity: wp.array2d(dtype=vec3),
         summed: wp.array3d(dtype=vec3),
-        coupling: wp.array2d(dtype=mat33),
     ):
         thread = wp.tid()
         b = first_trajectory + thread
@@ -269,55 +288,80 @@ def kernels(double: bool) -> Kernels:
             beside = vec3()
             turning_diagonal = vec3()
             turning_beside = vec3()
-            mixed = mat33()
+            mixed_x = vec3()
+            mixed_y = vec3()
+            mixed_z = vec3()
             for i in range(count):
                 arm = turned * (points[i] - offset)
-                # The hull has no drive; its tangents are zero.
-                drive = wp.max(drives[i], 0)
-                touch = touch_ground(
-                    height,
-                    material,
-                    page,
-                    grid,
-                    options,
-                    position,
-                    arm,
-                    turned,
-                    linear,
-                    angular,
-                    tangents[i],
-                    speeds[b, step, drive],
-                    areas[i],
-                    weight_total * share[i],
-                    factors[b],
-                    resistance[b][0],
-                )
-                if touch.active == 1:
+                raw_x = (position[0] + arm[0] - grid.origin_x) * grid.inverse_resolution
+                raw_y = (position[1] + arm[1] - grid.origin_y) * grid.inverse_resolution
+                # Most points are in the air: nothing more is computed for them.
+                if ground_level(height, page, grid, options.lookup, raw_x, raw_y) > position[2] + arm[2]:
+                    # The hull has no drive; its tangents are zero.
+                    drive = wp.max(drives[i], 0)
+                    touch = touch_ground(
+                        height,
+                        material,
+                        page,
+                        grid,
+                        options,
+                        position,
+                        arm,
+                        turned,
+                        linear,
+                        angular,
+                        tangents[i],
+                        speeds[b, step, drive],
+                        areas[i],
+                        weight_total * share[i],
+                        factors[b],
+                        resistance[b][0],
+                    )
                     acting = (
                         touch.force[0] * touch.normal + touch.force[1] * touch.along + touch.force[2] * touch.across
                     )
                     force = force + acting
                     torque = torque + wp.cross(arm, acting)
-                    yielding = (
-                        touch.gain[0] * wp.outer(touch.normal, touch.normal)
-                        + touch.gain[1] * wp.outer(touch.along, touch.along)
-                        + touch.gain[2] * wp.outer(touch.across, touch.across)
+                    normal = touch.normal
+                    along = touch.along
+                    across = touch.across
+                    stiff = touch.gain[0] * normal
+                    rolls = touch.gain[1] * along
+                    slides = touch.gain[2] * across
+                    # The symmetric gain matrix, its product with [arm]× and [arm]× from both sides, entry by entry.
+                    xx = stiff[0] * normal[0] + rolls[0] * along[0] + slides[0] * across[0]
+                    yy = stiff[1] * normal[1] + rolls[1] * along[1] + slides[1] * across[1]
+                    zz = stiff[2] * normal[2] + rolls[2] * along[2] + slides[2] * across[2]
+                    yz = stiff[1] * normal[2] + rolls[1] * along[2] + slides[1] * across[2]
+                    xz = stiff[0] * normal[2] + rolls[0] * along[2] + slides[0] * across[2]
+                    xy = stiff[0] * normal[1] + rolls[0] * along[1] + slides[0] * across[1]
+                    first = vec3(xy * arm[2] - xz * arm[1], xz * arm[0] - xx * arm[2], xx * arm[1] - xy * arm[0])
+                    second = vec3(yy * arm[2] - yz * arm[1], yz * arm[0] - xy * arm[2], xy * arm[1] - yy * arm[0])
+                    third = vec3(yz * arm[2] - zz * arm[1], zz * arm[0] - xz * arm[2], xz * arm[1] - yz * arm[0])
+                    diagonal = diagonal + vec3(xx, yy, zz)
+                    beside = beside + vec3(yz, xz, xy)
+                    mixed_x = mixed_x + first
+                    mixed_y = mixed_y + second
+                    mixed_z = mixed_z + third
+                    turning_diagonal = turning_diagonal + vec3(
+                        arm[1] * third[0] - arm[2] * second[0],
+                        arm[2] * first[1] - arm[0] * third[1],
+                        arm[0] * second[2] - arm[1] * first[2],
                     )
-                    lever = wp.skew(arm)
-                    product = yielding * lever
-                    rotary = lever * product
-                    diagonal = diagonal + vec3(yielding[0, 0], yielding[1, 1], yielding[2, 2])
-                    beside = beside + vec3(yielding[1, 2], yielding[0, 2], yielding[0, 1])
-                    turning_diagonal = turning_diagonal + vec3(rotary[0, 0], rotary[1, 1], rotary[2, 2])
-                    turning_beside = turning_beside + vec3(rotary[1, 2], rotary[0, 2], rotary[0, 1])
-                    mixed = mixed + product
+                    turning_beside = turning_beside + vec3(
+                        arm[2] * first[2] - arm[0] * third[2],
+                        arm[1] * third[2] - arm[2] * second[2],
+                        arm[1] * third[1] - arm[2] * second[1],
+                    )
             summed[thread, slot, 0] = force
             summed[thread, slot, 1] = torque
             summed[thread, slot, 2] = diagonal
             summed[thread, slot, 3] = beside
             summed[thread, slot, 4] = turning_diagonal
             summed[thread, slot, 5] = turning_beside
-            coupling[thread, slot] = mixed
+            summed[thread, slot, 6] = mixed_x
+            summed[thread, slot, 7] = mixed_y
+            summed[thread, slot, 8] = mixed_z
 
             in_body = wp.transpose(turned) * linear
             rate = (wp.transpose(turned) * angular)[2]
@@ -357,7 +401,7 @@ def kernels(double: bool) -> Kernels:
                 to[2], td[1], to[0],
                 to[1], to[0], td[2],
             )  # fmt: skip
-            side = -h * coupling[thread, slot]
+            side = -h * wp.matrix_from_rows(summed[thread, slot, 6], summed[thread, slot, 7], summed[thread, slot, 8])
             inverse = wp.inverse(upper)
             reduced = wp.transpose(side) * inverse
             right = h * total_force

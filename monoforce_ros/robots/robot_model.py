@@ -145,4 +145,6 @@ class RobotModel:
             value = getattr(self, entry.name)
             if isinstance(value, Tensor):
                 changed[entry.name] = value.to(device=device, dtype=dtype if value.is_floating_point() else None)
+        if all(value is getattr(self, name) for name, value in changed.items()):
+            return self
         return replace(self, **changed)

@@ -58,17 +58,17 @@ class TerrainMap:
             channel = getattr(self, name)
             if channel.shape != shape:
                 raise ValueError(f"terrain {name}: got shape {tuple(channel.shape)}, expected {tuple(shape)}")
-            if name != "observed" and not torch.isfinite(channel).all():
+            # One NaN or infinity makes the sum one; a sum of large finite numbers may overflow, hence the second look.
+            if name != "observed" and not torch.isfinite(channel.sum()) and not torch.isfinite(channel).all():
                 bad = int((~torch.isfinite(channel)).sum())
                 raise ValueError(
                     f"terrain {name}: {bad} of {channel.numel()} cells are not finite; fill holes by interpolation and "
                     "mark them in `observed`"
                 )
         for name in ("stiffness", "damping", "friction"):
-            if (getattr(self, name) < 0).any():
-                raise ValueError(
-                    f"terrain {name}: got a smallest value of {float(getattr(self, name).min()):g}, expected ≥ 0"
-                )
+            smallest = float(getattr(self, name).detach().amin())
+            if smallest < 0:
+                raise ValueError(f"terrain {name}: got a smallest value of {smallest:g}, expected ≥ 0")
 
     @classmethod
     def from_height(
@@ -128,4 +128,6 @@ class TerrainMap:
             value = getattr(self, entry.name)
             if isinstance(value, Tensor):
                 changed[entry.name] = value.to(device=device, dtype=dtype if value.is_floating_point() else None)
+        if all(value is getattr(self, name) for name, value in changed.items()):
+            return self
         return replace(self, **changed)
