@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import math
+import multiprocessing
+import os
 import sys
 import time
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
 from tqdm import tqdm
@@ -17,7 +21,7 @@ def build_parser() -> argparse.ArgumentParser:
     """The command line's options."""
     parser = argparse.ArgumentParser(
         prog="synthesize",
-        description="Record a rosbag2 bag from a simulated world of hills, a ramp, rocks, trees and soft tall grass.",
+        description="Record bags from simulated worlds: hills, ramp, kerbs, rocks, walls, trees, mud, soft tall grass.",
     )
     parser.add_argument("out", type=Path, metavar="OUT", help="folder of the bag")
     parser.add_argument("--seed", type=int, default=DEFAULT_SEED, help="of world, drive and noise (%(default)s)")
@@ -25,20 +29,47 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--robot", default="husky", metavar="NAME|FILE.yaml", help="(%(default)s)")
     parser.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap", help="(%(default)s)")
     parser.add_argument("--camera", default="320x240", metavar="WIDTHxHEIGHT|none", help="(%(default)s)")
+    parser.add_argument("--cameras", type=int, metavar="1-4", help="front, left, right, rear (those of the robot)")
+    parser.add_argument(
+        "--distortion", metavar="K1,K2,P1,P2,K3", help="of every camera's lens, as -0.3,0.1,0,0,0 (none)"
+    )
     parser.add_argument("--camera-rate", type=float, default=10.0, metavar="HZ", help="(%(default)s)")
     parser.add_argument("--lidar", default="16x360", metavar="RINGSxCOLUMNS|none", help="(%(default)s)")
     parser.add_argument("--lidar-rate", type=float, default=5.0, metavar="HZ", help="(%(default)s)")
     parser.add_argument(
         "--commands",
         default="random",
-        metavar="random|straight|circle|FILE.csv",
-        help="who drives; a file has the columns t,v,w in s, m/s, rad/s (%(default)s)",
+        metavar="random|steps|sweep|straight|circle|FILE.csv",
+        help="who drives: random keeps to the world's track, steps tries everything near the start; "
+        "a file has the columns t,v,w in s, m/s, rad/s (%(default)s)",
+    )
+    parser.add_argument(
+        "--odometry",
+        default="truth",
+        metavar="truth|slam|slam:METRES,DEGREES",
+        help="slam is noisy, late and drifts; its noise is 0.01 m and 0.5 degrees unless given (%(default)s)",
+    )
+    hiding = parser.add_mutually_exclusive_group()
+    hiding.add_argument(
+        "--hide",
+        action="append",
+        metavar="NAME[:VALUE|:PARAMETER=VALUE,...]",
+        help="plant a physical effect for `diagnose` to find, as payload:20; may be repeated; `--hide list` lists "
+        "them. The truth goes to OUT.hidden.json and nowhere into the bag",
+    )
+    hiding.add_argument(
+        "--hide-random", type=int, metavar="SEED", help="plant by lot: nothing, one, two, or one unknown to diagnose"
     )
     shape = parser.add_mutually_exclusive_group()
     shape.add_argument(
         "--terrain-roughness", type=float, default=1.0, metavar="FACTOR", help="on the height of hills (%(default)s)"
     )
     shape.add_argument("--flat", action="store_true", help="level ground with nothing on it")
+    shape.add_argument("--bare", action="store_true", help="hills with nothing on them")
+    parser.add_argument(
+        "--count", type=int, metavar="N", help="record N bags OUT/SEED of the seeds from --seed on, in parallel"
+    )
+    parser.add_argument("--jobs", type=int, default=2, metavar="N", help="bags recorded at a time (%(default)s)")
     parser.add_argument("--labels", action="store_true", help="write the true heights and classes to OUT.labels.npz")
     parser.add_argument("--force", action="store_true", help="replace OUT if it exists")
     parser.add_argument("--quiet", action="store_true", help="no progress and no summary")
@@ -49,51 +80,140 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
     parser = build_parser()
     options = parser.parse_args(arguments)
-    if options.out.exists() and not options.force:
-        print(f"synthesize: {options.out} exists already; choose another folder or add --force", file=sys.stderr)
+    if options.hide == ["list"]:
+        return _list_hidden()
+    outs = [options.out]
+    if options.count is not None:
+        if not 1 <= options.count <= 10_000:
+            print(f"synthesize: --count: got {options.count}, expected 1 to 10000", file=sys.stderr)
+            return 1
+        outs = [options.out / f"{options.seed + index:04d}" for index in range(options.count)]
+    existing = [out for out in outs if out.exists()]
+    if existing and not options.force:
+        print(f"synthesize: {existing[0]} exists already; choose another folder or add --force", file=sys.stderr)
         return 1
-    # Only now, so that --help and a wrong option answer at once.
-    from monoforce_ros.robots import RobotFileError
-    from monoforce_ros.synthetic.graphics import DrawingError
-    from monoforce_ros.synthetic.labels import labels_file
-    from monoforce_ros.synthetic.recording import RecordingSettings, record
+    if options.count is None:
+        return _record_one(options.out, options)
+    return _record_many(outs, options)
+
+
+def _list_hidden() -> int:
+    from monoforce_ros.synthetic.hidden import PLANTS
+
+    for name, plant in sorted(PLANTS.items()):
+        values = ", ".join(f"{p} = {v:g} ({low:g} to {high:g})" for p, (v, low, high) in plant.parameters.items())
+        print(f"{name}: {values}\n    {plant.__doc__.splitlines()[0]}")
+    return 0
+
+
+def _record_many(outs: list[Path], options: argparse.Namespace) -> int:
+    """Record a bag for each seed, several at a time in processes of their own."""
+    # Each process draws with one thread, or they would fight for the cores.
+    os.environ.setdefault("LP_NUM_THREADS", "1")
+    failed = 0
+    tasks = []
+    for index, out in enumerate(outs):
+        seeded = argparse.Namespace(**vars(options))
+        seeded.seed, seeded.quiet = options.seed + index, True
+        if options.hide_random is not None:
+            seeded.hide_random = options.hide_random + index
+        tasks.append((out, seeded))
+    context = multiprocessing.get_context("spawn")
+    with (
+        ProcessPoolExecutor(max(1, options.jobs), mp_context=context) as pool,
+        tqdm(total=len(outs), desc=options.out.name, unit="bag", disable=options.quiet) as bar,
+    ):
+        for done in as_completed([pool.submit(_record_one, *task) for task in tasks]):
+            failed += done.result() != 0
+            bar.update()
+    if failed:
+        print(f"synthesize: {failed} of {len(outs)} bags failed", file=sys.stderr)
+    return int(failed > 0)
+
+
+def _settings(options: argparse.Namespace):
+    from monoforce_ros.synthetic.hidden import draw_hidden, parse_hidden
+    from monoforce_ros.synthetic.odometry import OdometrySettings
+    from monoforce_ros.synthetic.recording import RecordingSettings
     from monoforce_ros.synthetic.sensors import CameraSettings, LidarSettings
     from monoforce_ros.synthetic.terrain_shape import TerrainSettings
 
+    camera, lidar = _size(options.camera, "--camera"), _size(options.lidar, "--lidar")
+    odometry = OdometrySettings()
+    if options.odometry != "truth":
+        name, _, noise = options.odometry.partition(":")
+        if name != "slam":
+            raise ValueError(f"--odometry: got {options.odometry!r}, expected truth, slam or slam:METRES,DEGREES")
+        odometry = OdometrySettings.slam()
+        if noise:
+            metres, degrees = _numbers(noise, 2, "--odometry slam")
+            odometry = OdometrySettings.slam(metres, math.radians(degrees))
+    hidden = None
+    if options.hide is not None:
+        hidden = tuple(parse_hidden(text) for text in options.hide)
+    elif options.hide_random is not None:
+        level = options.flat or options.bare
+        hidden = draw_hidden(options.hide_random, ("vegetation_drag",) if level else ())
+    distortion = tuple(_numbers(options.distortion, 5, "--distortion")) if options.distortion else ()
+    return RecordingSettings(
+        seed=options.seed,
+        duration=options.duration,
+        robot=options.robot,
+        commands=options.commands,
+        terrain=TerrainSettings(roughness=options.terrain_roughness, flat=options.flat, bare=options.bare),
+        camera=camera
+        and CameraSettings(width=camera[0], height=camera[1], rate=options.camera_rate, distortion=distortion),
+        cameras=options.cameras,
+        lidar=lidar and LidarSettings(rings=lidar[0], columns=lidar[1], rate=options.lidar_rate),
+        odometry=odometry,
+        hidden=hidden,
+        storage=options.storage,
+        labels=options.labels,
+        overwrite=options.force,
+    )
+
+
+def _record_one(out: Path, options: argparse.Namespace) -> int:
+    # Only now, so that --help and a wrong option answer at once.
+    from monoforce_ros.robots import RobotFileError
+    from monoforce_ros.synthetic.graphics import DrawingError
+    from monoforce_ros.synthetic.hidden import truth_file
+    from monoforce_ros.synthetic.labels import labels_file
+    from monoforce_ros.synthetic.recording import record
+
     started = time.monotonic()
     try:
-        camera, lidar = _size(options.camera, "--camera"), _size(options.lidar, "--lidar")
-        settings = RecordingSettings(
-            seed=options.seed,
-            duration=options.duration,
-            robot=options.robot,
-            commands=options.commands,
-            terrain=TerrainSettings(roughness=options.terrain_roughness, flat=options.flat),
-            camera=camera and CameraSettings(width=camera[0], height=camera[1], rate=options.camera_rate),
-            lidar=lidar and LidarSettings(rings=lidar[0], columns=lidar[1], rate=options.lidar_rate),
-            storage=options.storage,
-            labels=options.labels,
-            overwrite=options.force,
-        )
+        settings = _settings(options)
         form = "{desc}: {percentage:3.0f}%|{bar}| {n:.1f}/{total:.1f} s [{elapsed}<{remaining}]"
-        with tqdm(
-            total=options.duration, desc=options.out.name, bar_format=form, disable=options.quiet, leave=False
-        ) as bar:
-            summary = record(options.out, settings, bar.update)
+        with tqdm(total=options.duration, desc=out.name, bar_format=form, disable=options.quiet, leave=False) as bar:
+            summary = record(out, settings, bar.update)
     except (DrawingError, RobotFileError, ValueError, OSError) as error:
         print(f"synthesize: {error}", file=sys.stderr)
         return 1
     if summary.mishap is not None:
-        print(f"synthesize: {summary.mishap} after {summary.duration:.1f} s; the bag ends there", file=sys.stderr)
+        print(f"synthesize: {summary.mishap} after {summary.duration:.1f} s; {out} ends there", file=sys.stderr)
     if not options.quiet:
-        size = sum(path.stat().st_size for path in options.out.iterdir()) / 1e6
+        size = sum(path.stat().st_size for path in out.iterdir()) / 1e6
         print(
-            f"{options.out}: {summary.duration:.1f} s, {summary.distance:.1f} m driven, "
+            f"{out}: {summary.duration:.1f} s, {summary.distance:.1f} m driven, "
             f"{sum(summary.messages.values())} messages, {size:.1f} MB, in {time.monotonic() - started:.0f} s"
         )
         if options.labels:
-            print(f"{labels_file(options.out)}: true heights and classes")
+            print(f"{labels_file(out)}: true heights, classes and poses")
+        if settings.hidden is not None:
+            print(f"{truth_file(out)}: what is hidden")
     return 0
+
+
+def _numbers(text: str, count: int, option: str) -> list[float]:
+    """Comma-separated numbers."""
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != count or not all(math.isfinite(number) for number in numbers):
+        raise ValueError(f"{option}: got {text!r}, expected {count} numbers with commas between them")
+    return numbers
 
 
 def _size(text: str, option: str) -> tuple[int, int] | None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from monoforce_ros.synthetic.route import Route
 
-NAMES = ("random", "straight", "circle")
+NAMES = ("random", "steps", "sweep", "straight", "circle")
 _MAXIMUM_FILE_BYTES = 10_000_000
 
 
@@ -133,14 +133,89 @@ class WanderingDriver:
         return self._speed, self._yaw_rate
 
 
-def make_profile(name_or_file: str, route: Route, random: np.random.Generator) -> CommandProfile:
-    """The profile of a name (``random``, ``straight``, ``circle``) or of a CSV file (t,v,w).
+class TestDriver:
+    """Random steps and ramps of speed and yaw rate, standing and reversing too, that stay near the start.
+
+    What identification wants: every regime, in no order, whatever the ground.
+
+    Args:
+        fastest: largest speed [m/s].
+        random: what comes next.
+    """
+
+    __test__ = False
+    _REACH = 8.0
+    _SHARPEST_TURN = 1.3
+
+    def __init__(self, fastest: float, random: np.random.Generator):
+        self._fastest, self._random = fastest, random
+        self._from = self._to = np.zeros(2)
+        self._start, self._rise, self._end = 0.0, 0.1, 0.0
+
+    def command(self, time: float, position: np.ndarray, heading: float) -> tuple[float, float]:
+        """The command at ``time``; each call continues from the one before."""
+        if time >= self._end:
+            self._from = self._at(time)
+            self._choose(position, heading)
+            self._start, self._end = time, time + float(self._random.uniform(1.0, 3.5))
+            self._rise = float(self._random.choice([1e-3, 0.5, 1.2]))
+        return tuple(self._at(time).tolist())
+
+    def _at(self, time: float) -> np.ndarray:
+        return self._from + (self._to - self._from) * min(1.0, (time - self._start) / self._rise)
+
+    def _choose(self, position: np.ndarray, heading: float) -> None:
+        random = self._random
+        kind = random.choice(["stand", "back", "straight", "turn", "spin"], p=[0.08, 0.12, 0.25, 0.45, 0.1])
+        speed = {"stand": 0.0, "spin": 0.0, "back": -0.5 * random.uniform(0.4, 1.0)}.get(kind, random.uniform(0.3, 1.0))
+        rate = 0.0 if kind in ("stand", "straight") else random.uniform(-1.0, 1.0) * self._SHARPEST_TURN
+        if np.hypot(*position) > self._REACH and kind != "stand":
+            bearing = math.remainder(math.atan2(-position[1], -position[0]) - heading, 2 * math.pi)
+            speed = random.uniform(0.3, 0.8)
+            rate = float(np.clip(0.8 * bearing, -self._SHARPEST_TURN, self._SHARPEST_TURN))
+        self._to = np.array([speed * self._fastest, rate])
+
+
+class SweepDriver:
+    """Speed and yaw rate swing ever faster, from 0.05 Hz to 0.5 Hz and back again every minute, about a circle."""
+
+    _PERIOD = 60.0
+    _SLOW, _FAST = 0.05, 0.5
+
+    def __init__(self, fastest: float):
+        self._fastest = fastest
+
+    def command(self, time: float, position: np.ndarray, heading: float) -> tuple[float, float]:
+        """The command at ``time``."""
+        rounds, since = divmod(time, self._PERIOD)
+        growth = (self._FAST - self._SLOW) / self._PERIOD
+        forward = self._SLOW * since + 0.5 * growth * since**2
+        phase = 2 * math.pi * (forward if rounds % 2 == 0 else -forward)
+        ramp = min(1.0, time)
+        return ramp * self._fastest * (0.55 - 0.35 * math.cos(0.7 * phase)), ramp * (0.35 + 0.85 * math.sin(phase))
+
+
+def make_profile(
+    name_or_file: str, route: Route, random: np.random.Generator, maximum_speed: float = 1.0
+) -> CommandProfile:
+    """The profile of a name (``NAMES``) or of a CSV file (t,v,w).
+
+    Args:
+        name_or_file: which.
+        route: for a driver that keeps to it.
+        random: the driver's moods.
+        maximum_speed: of the robot [m/s]; nobody drives faster than 1.5 m/s for want of space.
 
     Raises:
         ValueError: there is neither such a profile nor such a file, or the file is not a table of commands.
     """
     if name_or_file == "random":
         return WanderingDriver(route, random)
+    fastest = min(maximum_speed, 1.5)
+    if name_or_file == "steps":
+        return TestDriver(fastest, random)
+    if name_or_file == "sweep":
+        return SweepDriver(fastest)
     if name_or_file == "straight":
         return SteadyCommand(0.7, 0.0)
     if name_or_file == "circle":

@@ -21,6 +21,8 @@ class GroundClass(IntEnum):
     ROCK = 2
     TREE = 3
     GRASS = 4
+    PATCH = 5
+    WALL = 6
 
 
 def world_labels(scenery: Scenery, odom_origin: np.ndarray) -> dict[str, np.ndarray]:
@@ -33,6 +35,7 @@ def world_labels(scenery: Scenery, odom_origin: np.ndarray) -> dict[str, np.ndar
     Returns:
         ``support_height``: of what bears a wheel, that is ground and rocks [m], float32;
         ``visible_height``: with the grass on top [m], float32; crowns of trees hang above both and are in neither;
+        ``friction``: factor on the friction of ordinary ground [-], float32;
         ``ground_class``: a ``GroundClass`` for each cell, uint8;
         ``resolution`` [m], ``origin`` ``[2]`` position of cell (0, 0) [m], and ``class_names``.
     """
@@ -44,6 +47,11 @@ def world_labels(scenery: Scenery, odom_origin: np.ndarray) -> dict[str, np.ndar
         classes[scenery.ramp.height_at(x, y) > 0.01] = GroundClass.RAMP
     classes[scenery.grass.canopy.heights > _GRASS_FROM] = GroundClass.GRASS
     positions = np.stack([x, y], axis=-1)
+    friction = np.ones(support.shape, np.float32)
+    for patch in scenery.patches:
+        inside = patch.contains(positions)
+        friction[inside] = patch.friction
+        classes[inside & (classes == GroundClass.GROUND)] = GroundClass.PATCH
     for rock in scenery.rocks:
         low = np.floor((rock.vertices[:, :2].min(axis=0) - ground.origin) / ground.resolution).astype(int)
         high = np.ceil((rock.vertices[:, :2].max(axis=0) - ground.origin) / ground.resolution).astype(int) + 1
@@ -54,10 +62,15 @@ def world_labels(scenery: Scenery, odom_origin: np.ndarray) -> dict[str, np.ndar
         classes[window][higher] = GroundClass.ROCK
     for tree in scenery.trees:
         classes[np.hypot(x - tree.base[0], y - tree.base[1]) < tree.trunk_radius + ground.resolution] = GroundClass.TREE
+    for wall in scenery.walls:
+        inside = wall.contains(x, y)
+        support[inside] = wall.shape.vertices[:, 2].max()
+        classes[inside] = GroundClass.WALL
     visible = np.maximum(support, ground.heights + scenery.grass.canopy.heights)
     return {
         "support_height": (support - odom_origin[2]).astype(np.float32),
         "visible_height": (visible - odom_origin[2]).astype(np.float32),
+        "friction": friction,
         "ground_class": classes,
         "resolution": np.array(ground.resolution),
         "origin": ground.origin - odom_origin[:2],

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import dataclasses
+import math
+from collections import deque
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import BagWriter, builders
 from monoforce_ros.synthetic.command_profile import CommandProfile, make_profile
+from monoforce_ros.synthetic.hidden import write_truth
 from monoforce_ros.synthetic.labels import world_labels, write_labels
+from monoforce_ros.synthetic.odometry import Odometry, OdometrySettings
+from monoforce_ros.synthetic.plants import Plant, VegetationDrag
 from monoforce_ros.synthetic.random_streams import DEFAULT_SEED, random_stream
 from monoforce_ros.synthetic.scenery import Scenery, build_scenery
 from monoforce_ros.synthetic.sensors import Camera, CameraSettings, Imu, ImuSettings, Lidar, LidarSettings, encode_jpeg
@@ -26,9 +34,12 @@ LIDAR_FRAME = "lidar"
 IMU_FRAME = "imu_link"
 CAMERA_PREFIX = "camera"
 
-_ODOMETRY_RATE = 50.0
+_WHEEL_RATE = 50.0
+# Yaw of each camera on the robot, relative to the front camera [rad].
+_SIDES = {"front": 0.0, "left": math.pi / 2, "right": -math.pi / 2, "rear": math.pi}
 _COMMAND_RATE = 20.0
 _STEPS_PER_CHECK = 50
+_LONGEST_OUTBOX = 500
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,11 +51,15 @@ class RecordingSettings:
             does not depend on which sensors record it.
         duration: [s].
         robot: name or YAML file.
-        commands: ``random``, ``straight``, ``circle`` or a CSV file with the columns t,v,w.
+        commands: ``random``, ``steps``, ``sweep``, ``straight``, ``circle`` or a CSV file with the columns t,v,w.
         terrain: the ground.
-        camera: settings of every camera of the robot, or None to record no images.
+        camera: settings of every camera, or None to record no images.
+        cameras: how many, one to four: front, left, right and rear; those that the robot's file lacks look out of the
+            front camera's place on the other sides. By default those of the robot's file.
         lidar: settings, or None to record no clouds.
         imu: settings.
+        odometry: settings.
+        hidden: physics planted for a workflow to find; the truth goes to a file beside the bag, and nowhere into it.
         storage: ``mcap`` or ``sqlite3``.
         labels: write the world's truth beside the bag.
         overwrite: replace an existing bag.
@@ -58,6 +73,9 @@ class RecordingSettings:
     camera: CameraSettings | None = field(default_factory=CameraSettings)
     lidar: LidarSettings | None = field(default_factory=LidarSettings)
     imu: ImuSettings = field(default_factory=ImuSettings)
+    cameras: int | None = None
+    odometry: OdometrySettings = field(default_factory=OdometrySettings)
+    hidden: tuple[Plant, ...] | None = None
     storage: str = "mcap"
     labels: bool = False
     overwrite: bool = False
@@ -67,6 +85,10 @@ class RecordingSettings:
             raise ValueError(f"seed: got {self.seed}, expected 0 to {2**32 - 1}")
         if not 0.1 <= self.duration <= 3600.0:
             raise ValueError(f"duration: got {self.duration}, expected 0.1 to 3600 s")
+        if self.cameras is not None and not 1 <= self.cameras <= len(_SIDES):
+            raise ValueError(f"cameras: got {self.cameras}, expected 1 to {len(_SIDES)}")
+        if (self.terrain.flat or self.terrain.bare) and any(isinstance(p, VegetationDrag) for p in self.hidden or ()):
+            raise ValueError("hidden vegetation_drag: got a world without vegetation; leave out --flat and --bare")
 
 
 @dataclass(frozen=True)
@@ -104,16 +126,21 @@ def record(out: Path, settings: RecordingSettings, progress: Callable[[float], N
         ValueError: a setting is.
     """
     robot = Vehicle.load(settings.robot)
+    if settings.camera is not None and settings.cameras is not None:
+        robot = dataclasses.replace(robot, sensors=_with_cameras(robot, settings.cameras))
     with BagWriter(out, storage=settings.storage, overwrite=settings.overwrite) as bag:
         scenery = build_scenery(settings.terrain, settings.seed)
-        profile = make_profile(settings.commands, scenery.route, random_stream(settings.seed, "commands"))
+        moods = random_stream(settings.seed, "commands")
+        profile = make_profile(settings.commands, scenery.route, moods, robot.maximum_speed)
         drive = _Drive(bag, settings, robot, scenery, profile)
         try:
             summary = drive.run(progress)
         finally:
             drive.close()
         if settings.labels:
-            write_labels(out, world_labels(scenery, drive.simulation.odom_origin))
+            write_labels(out, world_labels(scenery, drive.simulation.odom_origin) | drive.truth())
+        if settings.hidden is not None:
+            write_truth(out, settings.hidden, settings.seed)
     return summary
 
 
@@ -132,14 +159,25 @@ class _Drive:
             view = dict.fromkeys(frames, settings.camera.vertical_field_of_view)
         if settings.lidar is not None:
             lidar_pose = robot.sensor(LIDAR_FRAME, "--lidar none")
-        model = build_model(scenery, robot, settings.seed, view)
-        self.simulation = Simulation(model, scenery, robot)
+        hidden = settings.hidden or ()
+        model = build_model(scenery, robot, settings.seed, view, hidden)
+        self.simulation = Simulation(model, scenery, robot, hidden)
+        self._odometry = Odometry(settings.odometry, random_stream(settings.seed, "odometry"), hidden)
+        self._command_offset = round(1e9 * sum(plant.command_stamp_offset for plant in hidden))
+        self._pose_offset = round(1e9 * sum(plant.pose_stamp_offset for plant in hidden))
+        self._gyro_offset = np.array([0.0, 0.0, sum(plant.gyro_offset for plant in hidden)])
+        # Clouds and images are made in other threads; what follows them waits, so that the bag is in order.
+        self._workers = ThreadPoolExecutor(2, thread_name_prefix="recording")
+        self._outbox: deque[tuple[str, int, object]] = deque()
+        self._scan: Future | None = None
+        self._delayed: deque[tuple[int, str, object]] = deque()
+        self._truth: list[tuple[int, np.ndarray, np.ndarray]] = []
         self._imu = Imu(settings.imu, random_stream(settings.seed, "imu"))
         self._imu.add(self.simulation.data)
         self._tasks: list[tuple[float, Callable[[], None]]] = [
             (_COMMAND_RATE, self._write_command),
-            (_ODOMETRY_RATE, self._write_odometry),
-            (_ODOMETRY_RATE, self._write_wheels),
+            (settings.odometry.rate, self._write_odometry),
+            (_WHEEL_RATE, self._write_wheels),
             (settings.imu.rate, self._write_imu),
         ]
         if settings.lidar is not None:
@@ -155,7 +193,8 @@ class _Drive:
         return START_STAMP + round(self.simulation.time * 1e9)
 
     def close(self) -> None:
-        """Free the cameras' graphics library."""
+        """End the threads and free the cameras' graphics library."""
+        self._workers.shutdown()
         for camera in self._cameras:
             camera.close()
 
@@ -166,6 +205,7 @@ class _Drive:
         distance, last_position, reported, mishap = 0.0, np.zeros(3), 0.0, None
         self._write("/tf_static", builders.static_transforms(self._stamp, self._robot.base_frame, self._robot.sensors))
         while True:
+            self._deliver(self._stamp)
             for index, (rate, write) in enumerate(self._tasks):
                 if simulation.time * rate >= written[index] - 1e-6:
                     write()
@@ -182,43 +222,101 @@ class _Drive:
                 distance, last_position = distance + float(np.linalg.norm(position - last_position)), position
                 progress(simulation.time - reported)
                 reported = simulation.time
+        self._deliver(None)
+        self._flush(wait=True)
         progress(simulation.time - reported)
         return Summary(simulation.time, distance, mishap, self._messages)
 
-    def _write(self, topic: str, message: object) -> None:
-        self._bag.write(topic, message, self._stamp)
+    def truth(self) -> dict[str, np.ndarray]:
+        """True stamps ``[n]`` [ns], positions ``[n, 3]`` [m] and quaternions ``[n, 4]`` in the odom frame."""
+        stamps, positions, quaternions = zip(*self._truth, strict=True)
+        return {
+            "true_stamps": np.array(stamps, np.int64),
+            "true_positions": np.array(positions),
+            "true_quaternions": np.array(quaternions),
+        }
+
+    def _deliver(self, now: int | None) -> None:
+        """Write what was delayed and has arrived by ``now``, or everything."""
+        while self._delayed and (now is None or self._delayed[0][0] <= now):
+            arrival, topic, message = self._delayed.popleft()
+            self._write(topic, message, arrival)
+
+    def _write(self, topic: str, message: object, stamp: int | None = None) -> None:
+        self._outbox.append((topic, self._stamp if stamp is None else stamp, message))
         self._messages[topic] = self._messages.get(topic, 0) + 1
+        self._flush(wait=len(self._outbox) > _LONGEST_OUTBOX)
+
+    def _flush(self, *, wait: bool) -> None:
+        """Write messages in order as far as they are there, or all."""
+        while self._outbox:
+            topic, stamp, message = self._outbox[0]
+            if isinstance(message, Future):
+                if not (wait or message.done()):
+                    return
+                message = message.result()
+            self._outbox.popleft()
+            self._bag.write(topic, message, stamp)
 
     def _write_command(self) -> None:
         state = self.simulation.state()
         position = (state.position + self.simulation.odom_origin)[:2]
         forward, yaw_rate = self._profile.command(self.simulation.time, position, state.heading)
         self.simulation.drive(forward, yaw_rate)
-        self._write("/cmd_vel", builders.twist_stamped(self._stamp, self._robot.base_frame, forward, yaw_rate))
+        stamp = self._stamp + self._command_offset
+        self._write("/cmd_vel", builders.twist_stamped(stamp, self._robot.base_frame, forward, yaw_rate))
 
     def _write_odometry(self) -> None:
-        state = self.simulation.state()
+        true = self.simulation.state()
+        self._truth.append((self._stamp, true.position, true.quaternion))
+        state = self._odometry.read(true)
         motion = (state.position, state.quaternion, state.linear_velocity, state.angular_velocity)
-        self._write("/odom", builders.odometry(self._stamp, ODOM_FRAME, self._robot.base_frame, *motion))
+        stamp = self._stamp + self._pose_offset
+        message = builders.odometry(stamp, ODOM_FRAME, self._robot.base_frame, *motion)
+        self._delayed.append((self._stamp + round(1e9 * self._settings.odometry.latency), "/odom", message))
+        self._deliver(self._stamp)
 
     def _write_wheels(self) -> None:
         names = [wheel.joint for wheel in self._robot.wheels]
         self._write("/joint_states", builders.joint_state(self._stamp, names, *self.simulation.wheel_states()))
 
     def _write_imu(self) -> None:
-        self._write("/imu/data", builders.imu(self._stamp, IMU_FRAME, *self._imu.read()))
+        turning, force = self._imu.read()
+        self._write("/imu/data", builders.imu(self._stamp, IMU_FRAME, turning + self._gyro_offset, force))
 
     def _write_cloud(self) -> None:
+        # Scans follow each other: they share the lidar's memory and its noise.
+        if self._scan is not None:
+            self._scan.result()
         self.simulation.update_kinematics()
-        points = self._lidar.scan(self.simulation.data, self.simulation.world_pose())
-        self._write("/points", builders.point_cloud(self._stamp, LIDAR_FRAME, points))
+        points, stamp = self._lidar.start(self.simulation.data, self.simulation.world_pose()), self._stamp
+        self._scan = self._workers.submit(lambda: builders.point_cloud(stamp, LIDAR_FRAME, points()))
+        self._write("/points", self._scan)
 
     def _write_images(self) -> None:
         self.simulation.update_kinematics()
+        stamp = self._stamp
         for camera in self._cameras:
-            view = camera.settings
-            data = encode_jpeg(camera.capture(self.simulation.data), view.quality)
-            image = builders.compressed_image(self._stamp, camera.frame, "jpeg", data)
-            info = builders.camera_info(self._stamp, camera.frame, view.width, view.height, view.matrix, [0.0] * 5)
-            self._write(f"/{camera.frame}/image_raw/compressed", image)
-            self._write(f"/{camera.frame}/camera_info", info)
+            view, frame = camera.settings, camera.frame
+            pixels = camera.capture(self.simulation.data).copy()
+
+            def encode(pixels: np.ndarray = pixels, frame: str = frame, quality: int = view.quality) -> object:
+                return builders.compressed_image(stamp, frame, "jpeg", encode_jpeg(pixels, quality))
+
+            info = builders.camera_info(
+                stamp, frame, view.width, view.height, view.matrix, view.distortion or [0.0] * 5
+            )
+            self._write(f"/{frame}/image_raw/compressed", self._workers.submit(encode))
+            self._write(f"/{frame}/camera_info", info)
+
+
+def _with_cameras(robot: Vehicle, count: int) -> Mapping[str, np.ndarray]:
+    """The robot's sensors with this many cameras."""
+    front = robot.sensor(f"{CAMERA_PREFIX}_front", "--camera none")
+    sensors = {frame: pose for frame, pose in robot.sensors.items() if not frame.startswith(CAMERA_PREFIX)}
+    for side, yaw in list(_SIDES.items())[:count]:
+        frame = f"{CAMERA_PREFIX}_{side}"
+        turn = np.eye(4)
+        turn[:3, :3] = Rotation.from_euler("z", yaw).as_matrix()
+        sensors[frame] = robot.sensors.get(frame, turn @ front)
+    return sensors

@@ -53,7 +53,7 @@ class Route:
 
     def distance(self, positions: np.ndarray) -> np.ndarray:
         """Distance of positions ``[..., 2]`` to the route [m]."""
-        return self._tree.query(positions)[0]
+        return self._tree.query(positions, workers=-1)[0]
 
     def advance(self, station: float, position: np.ndarray, window: float = 2.0) -> float:
         """Station [m] of the point closest to ``position``, sought from ``station`` to ``window`` metres further."""

@@ -9,7 +9,7 @@ import numpy as np
 from monoforce_ros.synthetic import shapes
 from monoforce_ros.synthetic.random_streams import random_stream
 from monoforce_ros.synthetic.route import Route
-from monoforce_ros.synthetic.terrain_shape import HeightField, Ramp, TerrainSettings, build_ground
+from monoforce_ros.synthetic.terrain_shape import HeightField, Kerb, Ramp, TerrainSettings, build_ground
 from monoforce_ros.synthetic.vegetation import Grass, GrassPatch
 
 RAMP_STATION = 11.4
@@ -22,6 +22,10 @@ _GRASS_PATCHES = (
     (31.0, -0.2, 1.7, 1.7),
     (41.5, 0.3, 1.4, 1.9),
 )
+# Along the route [m], beyond what a short drive sees.
+_KERB_STATIONS = (20.5, 38.0)
+_PATCH_STATIONS = (14.5, 22.5, 27.5, 34.5)
+_WALLS = 5
 _BOULDERS, _STONES, _TREES, _RIM_TREES = 26, 46, 30, 26
 
 
@@ -37,6 +41,48 @@ class Tree:
 
 
 @dataclass(frozen=True)
+class GroundPatch:
+    """An elliptic patch of other ground.
+
+    Attributes:
+        area: its outline.
+        friction: factor on the friction of ordinary ground [-].
+        kind: ``mud`` or ``gravel``.
+    """
+
+    area: GrassPatch
+    friction: float
+    kind: str
+
+    def contains(self, positions: np.ndarray) -> np.ndarray:
+        """Whether world positions ``[..., 2]`` lie in it."""
+        return self.area.edge_distance(positions[..., 0], positions[..., 1]) > 0.0
+
+
+@dataclass(frozen=True)
+class Wall:
+    """A free-standing wall.
+
+    Attributes:
+        centre: ``[2]`` [m].
+        heading: direction along it [rad].
+        size: length, thickness and height [m].
+    """
+
+    centre: np.ndarray
+    heading: float
+    size: np.ndarray
+    shape: shapes.Shape
+
+    def contains(self, x: np.ndarray, y: np.ndarray, margin: float = 0.0) -> np.ndarray:
+        """Whether world positions lie in its footprint, grown by ``margin`` [m]."""
+        offset_x, offset_y = x - self.centre[0], y - self.centre[1]
+        cosine, sine = np.cos(self.heading), np.sin(self.heading)
+        along, across = cosine * offset_x + sine * offset_y, cosine * offset_y - sine * offset_x
+        return (np.abs(along) <= self.size[0] / 2 + margin) & (np.abs(across) <= self.size[1] / 2 + margin)
+
+
+@dataclass(frozen=True)
 class Scenery:
     """Everything in a world but the robot; positions in world coordinates [m]."""
 
@@ -46,16 +92,20 @@ class Scenery:
     rocks: tuple[shapes.Shape, ...]
     trees: tuple[Tree, ...]
     grass: Grass
+    kerbs: tuple[Kerb, ...] = ()
+    patches: tuple[GroundPatch, ...] = ()
+    walls: tuple[Wall, ...] = ()
 
 
 def build_scenery(settings: TerrainSettings, seed: int) -> Scenery:
     """Lay out a world: each kind of thing has its own random stream."""
     route = Route(random_stream(seed, "route"))
-    if settings.flat:
+    if settings.flat or settings.bare:
         ground = build_ground(settings, route, None, random_stream(seed, "ground"))
         return Scenery(ground, route, None, (), (), Grass.grow((), ground, random_stream(seed, "grass")))
     ramp = Ramp(*route.at(RAMP_STATION))
-    ground = build_ground(settings, route, ramp, random_stream(seed, "ground"))
+    kerbs = _place_kerbs(route, random_stream(seed, "kerbs"))
+    ground = build_ground(settings, route, ramp, random_stream(seed, "ground"), kerbs)
     patches = []
     for station, lateral, along, across in _GRASS_PATCHES:
         centre, heading = route.at(station, lateral)
@@ -63,7 +113,58 @@ def build_scenery(settings: TerrainSettings, seed: int) -> Scenery:
     grass = Grass.grow(tuple(patches), ground, random_stream(seed, "grass"))
     rocks = _place_rocks(ground, route, ramp, grass, random_stream(seed, "rocks"))
     trees = _place_trees(ground, route, ramp, grass, random_stream(seed, "tree places"), random_stream(seed, "foliage"))
-    return Scenery(ground, route, ramp, rocks, trees, grass)
+    other_ground = _place_patches(route, random_stream(seed, "ground patches"))
+    walls = _place_walls(ground, route, ramp, rocks, trees, random_stream(seed, "walls"))
+    return Scenery(ground, route, ramp, rocks, trees, grass, kerbs, other_ground, walls)
+
+
+def _place_kerbs(route: Route, random: np.random.Generator) -> tuple[Kerb, ...]:
+    return tuple(
+        Kerb(*route.at(station + random.uniform(-0.5, 0.5)), random.uniform(0.05, 0.085)) for station in _KERB_STATIONS
+    )
+
+
+def _place_patches(route: Route, random: np.random.Generator) -> tuple[GroundPatch, ...]:
+    patches = []
+    for station in _PATCH_STATIONS:
+        centre, heading = route.at(station + random.uniform(-0.5, 0.5), random.uniform(-0.3, 0.3))
+        area = GrassPatch(centre, heading, random.uniform(1.4, 2.0), random.uniform(1.4, 1.9))
+        kind = random.choice(("mud", "gravel"))
+        friction = random.uniform(0.25, 0.4) if kind == "mud" else random.uniform(0.55, 0.7)
+        patches.append(GroundPatch(area, float(friction), str(kind)))
+    return tuple(patches)
+
+
+def _place_walls(
+    ground: HeightField,
+    route: Route,
+    ramp: Ramp,
+    rocks: tuple[shapes.Shape, ...],
+    trees: tuple[Tree, ...],
+    random: np.random.Generator,
+) -> tuple[Wall, ...]:
+    """Walls beside the route, along it or facing it, that never stand on it nor in anything else."""
+    walls: list[Wall] = []
+    things = np.array([rock.vertices[:, :2].mean(axis=0) for rock in rocks] + [tree.base[:2] for tree in trees])
+    for _ in range(400):
+        if len(walls) == _WALLS:
+            break
+        lateral = random.choice([-1.0, 1.0]) * random.uniform(1.9, 3.2)
+        centre, heading = route.at(random.uniform(13.0, route.length - 4.0), lateral)
+        heading += random.choice([0.0, np.pi / 2]) + random.uniform(-0.2, 0.2)
+        size = np.array([random.uniform(1.6, 3.0), 0.25, random.uniform(0.7, 1.3)])
+        bottom = float(ground.height_at(centre)) - 0.3
+        shape = shapes.box(size + np.array([0.0, 0.0, 0.3]), heading).moved(np.array([*centre, bottom]))
+        wall = Wall(centre, float(heading), size, shape)
+        blocked = (
+            wall.contains(*route.points.T, margin=1.0).any()
+            or wall.contains(*things.T, margin=0.9).any()
+            or wall.contains(*ramp.centre, margin=2.5)
+            or any(np.linalg.norm(other.centre - centre) < 4.0 for other in walls)
+        )
+        if not blocked:
+            walls.append(wall)
+    return tuple(walls)
 
 
 def _place_rocks(

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -15,7 +17,7 @@ from monoforce_ros.synthetic.graphics import HOW_TO_DRAW, DrawingError, mujoco
 
 @dataclass(frozen=True, kw_only=True)
 class CameraSettings:
-    """A pinhole camera without distortion.
+    """A pinhole camera, with distortion if asked for.
 
     Attributes:
         width: [pixels].
@@ -23,7 +25,9 @@ class CameraSettings:
         field_of_view: horizontal [rad].
         rate: images per second [Hz].
         quality: of the JPEG files, 1 to 100.
+        distortion: k1, k2, p1, p2, k3 of OpenCV's plumb-bob model; empty for none.
         oversampling: pixels drawn per pixel kept, along each side; drawing costs triangles more than pixels.
+            By default two for small images.
     """
 
     width: int = 320
@@ -31,7 +35,8 @@ class CameraSettings:
     field_of_view: float = math.radians(85.0)
     rate: float = 10.0
     quality: int = 85
-    oversampling: int = 2
+    distortion: tuple[float, ...] = ()
+    oversampling: int | None = None
 
     def __post_init__(self):
         for name in ("width", "height"):
@@ -43,8 +48,14 @@ class CameraSettings:
             raise ValueError(f"camera rate: got {self.rate}, expected 0.1 to 100 Hz")
         if not 1 <= self.quality <= 100:
             raise ValueError(f"camera quality: got {self.quality}, expected 1 to 100")
+        if self.oversampling is None:
+            object.__setattr__(self, "oversampling", 2 if self.width <= 400 else 1)
         if not 1 <= self.oversampling <= 4:
             raise ValueError(f"camera oversampling: got {self.oversampling}, expected 1 to 4")
+        if len(self.distortion) not in (0, 5) or not all(abs(value) <= 1.0 for value in self.distortion):
+            raise ValueError(f"camera distortion: got {self.distortion}, expected five numbers k1, k2, p1, p2, k3")
+        if self.distortion:
+            self._check_distortion()
 
     @property
     def matrix(self) -> np.ndarray:
@@ -53,9 +64,46 @@ class CameraSettings:
         return np.array([[focal, 0, (self.width - 1) / 2], [0, focal, (self.height - 1) / 2], [0, 0, 1]])
 
     @property
+    def drawn_size(self) -> tuple[int, int]:
+        """Width and height [pixels] of the image without distortion that is drawn."""
+        reach = np.abs(self._rays()).reshape(-1, 2).max(axis=0) if self.distortion else None
+        size = np.array([self.width, self.height])
+        if reach is not None:
+            size = 2 * np.ceil(reach * self.matrix[0, 0]).astype(int) + 2
+        width, height = self.oversampling * size
+        return int(width), int(height)
+
+    @property
     def vertical_field_of_view(self) -> float:
-        """[rad]."""
-        return 2 * math.atan(self.height / 2 / self.matrix[1, 1])
+        """Of the drawn image [rad]."""
+        return 2 * math.atan(self.drawn_size[1] / self.oversampling / 2 / self.matrix[1, 1])
+
+    def drawn_pixels(self) -> np.ndarray | None:
+        """Where in the drawn image each pixel lies, ``[height, width, 2]`` float32; None without distortion."""
+        if not self.distortion:
+            return None
+        middle = (np.array(self.drawn_size) - 1) / 2
+        return (self._rays() * self.matrix[0, 0] * self.oversampling + middle).astype(np.float32)
+
+    def _rays(self) -> np.ndarray:
+        """Direction x / z, y / z of each pixel, ``[height, width, 2]``."""
+        columns, rows = np.meshgrid(np.arange(self.width, dtype=float), np.arange(self.height, dtype=float))
+        pixels = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2)
+        rays = cv2.undistortPoints(pixels, self.matrix, np.array(self.distortion))
+        return rays.reshape(self.height, self.width, 2)
+
+    def _check_distortion(self) -> None:
+        rays = self._rays()
+        back, _ = cv2.projectPoints(
+            np.concatenate([rays, np.ones_like(rays[..., :1])], axis=-1).reshape(-1, 3), np.zeros(3), np.zeros(3),
+            self.matrix, np.array(self.distortion),
+        )  # fmt: skip
+        rows, columns = np.mgrid[: self.height, : self.width]
+        error = np.abs(back.reshape(self.height, self.width, 2) - np.stack([columns, rows], axis=-1)).max()
+        if not error < 0.2 or np.abs(rays).max() > 4.0:
+            raise ValueError(
+                f"camera distortion: got {self.distortion}, which folds the image over itself; expected less of it"
+            )
 
 
 class Camera:
@@ -73,7 +121,9 @@ class Camera:
         self._groups = model.geom_group.copy()
         self._static = np.flatnonzero(model.geom_bodyid == 0)
         self._id = self._model.camera(frame).id
-        width, height = settings.oversampling * settings.width, settings.oversampling * settings.height
+        width, height = settings.drawn_size
+        self._size = width, height
+        self._pixels = settings.drawn_pixels()
         self._model.vis.global_.offwidth, self._model.vis.global_.offheight = width, height
         if not hasattr(mujoco, "GLContext"):
             raise DrawingError(f"no graphics library for camera images was found; {HOW_TO_DRAW}")
@@ -95,6 +145,8 @@ class Camera:
             flags[getattr(mujoco.mjtRndFlag, f"mjRND_{flag}")] = 0
         pixels = self._renderer.render()
         size = (self.settings.width, self.settings.height)
+        if self._pixels is not None:
+            return cv2.remap(pixels, self._pixels, None, cv2.INTER_LINEAR)
         return pixels if self.settings.oversampling == 1 else cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
 
     def close(self) -> None:
@@ -109,9 +161,7 @@ class Camera:
         along = centres @ forward
         across = np.linalg.norm(centres - along[:, None] * forward, axis=1)
         # Outside the cone around the image's corners by more than the bounding sphere's radius.
-        half_diagonal = math.atan(
-            math.tan(self.settings.field_of_view / 2) * math.hypot(1, self.settings.height / self.settings.width)
-        )
+        half_diagonal = math.atan(math.hypot(*self._size) / 2 / self.settings.oversampling / self.settings.matrix[0, 0])
         outside = across * math.cos(half_diagonal) - along * math.sin(half_diagonal) > radii
         groups = self._groups.copy()
         groups[self._static[outside]] = world.COLLISION_GROUND_GROUP
@@ -185,21 +235,53 @@ class Lidar:
         self._rays = np.stack(rays, axis=-1).reshape(-1, 3)
         self._groups = np.zeros(mujoco.mjNGROUP, np.uint8)
         self._groups[list(world.RAY_GROUPS)] = 1
+        # Casting works on scratch memory of the state, so each thread has a state of its own.
+        self._states = (mujoco.MjData(model), mujoco.MjData(model))
+        self._threads = ThreadPoolExecutor(2, thread_name_prefix="lidar")
 
     def scan(self, data: mujoco.MjData, base_pose: np.ndarray) -> np.ndarray:
         """Points ``[n, 3]`` float32 [m] in the lidar's frame, ring by ring; rays without an echo are left out.
+
+        See :meth:`start`.
+        """
+        return self.start(data, base_pose)()
+
+    def start(self, data: mujoco.MjData, base_pose: np.ndarray) -> Callable[[], np.ndarray]:
+        """Begin a scan of the present state in other threads; the result's call waits for its points.
 
         Args:
             data: the state, whose kinematics are up to date.
             base_pose: ``[4, 4]``, world ← base.
         """
         pose = base_pose @ self._pose
-        count = len(self._rays)
-        hits, ranges = np.empty(count, np.int32), np.empty(count)
-        mujoco.mj_multiRay(
-            self._model, data, pose[:3, 3].copy(), (self._rays @ pose[:3, :3].T).ravel(), self._groups, True, -1,
-            hits, ranges, None, count, self.settings.maximum_range,
-        )  # fmt: skip
+        rays = self._rays @ pose[:3, :3].T
+        count = len(rays)
+        ranges = np.empty(count)
+        for state in self._states:
+            mujoco.mj_copyData(state, self._model, data)
+
+        def cast(part: tuple[mujoco.MjData, slice]) -> None:
+            state, rows = part
+            hits, found = np.empty(rows.stop - rows.start, np.int32), np.empty(rows.stop - rows.start)
+            mujoco.mj_multiRay(
+                self._model, state, pose[:3, 3].copy(), rays[rows].ravel(), self._groups, True, -1, hits, found, None,
+                len(found), self.settings.maximum_range,
+            )  # fmt: skip
+            ranges[rows] = found
+
+        halves = (slice(0, count // 2), slice(count // 2, count))
+        casting = [self._threads.submit(cast, part) for part in zip(self._states, halves, strict=True)]
+
+        def points() -> np.ndarray:
+            for half in casting:
+                half.result()
+            return self._points(ranges)
+
+        return points
+
+    def _points(self, ranges: np.ndarray) -> np.ndarray:
+        """Points ``[n, 3]`` of the rays' ranges ``[rays]``."""
+        count = len(ranges)
         noise = self._random.normal(0.0, self.settings.range_noise, count)
         echo = (ranges >= self.settings.minimum_range) & (ranges <= self.settings.maximum_range)
         points = self._rays[echo] * (ranges + noise)[echo, None]

@@ -76,6 +76,34 @@ def rock(size: np.ndarray, random: np.random.Generator) -> Shape:
     return Shape(vertices, np.arange(len(vertices)).reshape(-1, 3), normals, coordinates)
 
 
+def box(size: np.ndarray, heading: float) -> Shape:
+    """A box that stands on the origin, its length along ``heading``; its texture repeats every metre.
+
+    Args:
+        size: length, width and height ``[3]`` [m].
+        heading: about the vertical [rad].
+    """
+    corners, faces, normals, coordinates = [], [], [], []
+    for axis in range(3):
+        for side in (-1.0, 1.0):
+            normal = side * np.eye(3)[axis]
+            first, second = np.eye(3)[(axis + 1) % 3], np.eye(3)[(axis + 2) % 3]
+            # Corners counter-clockwise seen from outside.
+            signs = [(-1, -1), (1, -1), (1, 1), (-1, 1)][:: int(side)]
+            start = 4 * len(faces) // 2
+            for u, w in signs:
+                corner = 0.5 * (normal + u * first + w * second) * size
+                corners.append(corner + np.array([0.0, 0.0, size[2] / 2]))
+                normals.append(normal)
+                # Upright on the sides: the vertical is the texture's second axis.
+                across = corner[1] if axis == 0 else corner[0]
+                coordinates.append([across, corner[1] if axis == 2 else corner[2]])
+            faces += [[start, start + 1, start + 2], [start, start + 2, start + 3]]
+    cosine, sine = math.cos(heading), math.sin(heading)
+    turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    return Shape(np.array(corners) @ turn.T, np.array(faces), np.array(normals) @ turn.T, np.array(coordinates))
+
+
 def trunk(radius: float, height: float) -> Shape:
     """A tapered stem that stands on the origin and is closed at both ends (convex)."""
     sides = 10

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import maximum_filter
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.synthetic import vehicle, world
 from monoforce_ros.synthetic.graphics import mujoco
+from monoforce_ros.synthetic.plants import Plant
 from monoforce_ros.synthetic.scenery import Scenery
 from monoforce_ros.synthetic.vehicle import Vehicle
 
@@ -55,14 +58,34 @@ class Simulation:
         model, data: MuJoCo's.
         odom_origin: ``[3]`` position of the odom frame's origin in the world [m].
         steps: of ``world.TIME_STEP`` since the robot came to rest.
+        base: the chassis' body.
+        wheel_bodies: bodies of the wheels.
+        tyres: geometries of the wheels that touch the ground.
+        tyre_friction: friction coefficient of each tyre on ordinary ground ``[wheels]``.
     """
 
-    def __init__(self, model: mujoco.MjModel, scenery: Scenery, robot: Vehicle):
+    def __init__(self, model: mujoco.MjModel, scenery: Scenery, robot: Vehicle, hidden: Sequence[Plant] = ()):
         self.model, self.data = model, mujoco.MjData(model)
-        self._scenery, self._robot = scenery, robot
-        self._base = model.body(vehicle.BODY).id
-        self._bodies = [model.body(wheel.joint).id for wheel in robot.wheels]
+        self.robot = robot
+        self._scenery, self._hidden = scenery, hidden
+        self._cell = scenery.ground.resolution
+        self.base = model.body(vehicle.BODY).id
+        self.wheel_bodies = [model.body(wheel.joint).id for wheel in robot.wheels]
+        self.tyres = [model.geom(wheel.surface).id for wheel in robot.wheels]
+        self.tyre_friction = model.geom_friction[self.tyres, 0].copy()
+        self._wanted = np.zeros(len(robot.wheels))
+        # Most steps are taken on ordinary ground: looking up one cell is all that they cost.
+        x, y = scenery.ground.grid()
+        places = np.stack([x, y], axis=-1)
+        reach = 2 * round((np.linalg.norm([w.centre[:2] for w in robot.wheels], axis=1).max() + 0.3) / self._cell) + 1
+        self._near_grass = maximum_filter(scenery.grass.canopy.heights > 0.0, reach)
+        other = np.zeros(x.shape, bool)
+        for patch in scenery.patches:
+            other |= patch.contains(places)
+        self._near_patch = maximum_filter(other, reach)
         self._radii = np.array([wheel.radius for wheel in robot.wheels])
+        # The grass is as hard on a robot of many small wheels as on one of four.
+        self._grass_share = 4.0 / len(robot.wheels)
         joints = [model.joint(wheel.joint) for wheel in robot.wheels]
         self._wheel_positions = [joint.qposadr[0] for joint in joints]
         self._wheel_velocities = [joint.dofadr[0] for joint in joints]
@@ -72,6 +95,11 @@ class Simulation:
             self.step()
         self.steps = 0
         self.odom_origin = self.data.qpos[:3].copy()
+        # Only now: the robot settles as it would with nothing hidden.
+        for plant in hidden:
+            plant.prepare(self)
+        self._on_patch = True
+        self._set_friction()
 
     @property
     def time(self) -> float:
@@ -80,11 +108,21 @@ class Simulation:
 
     def drive(self, forward: float, yaw_rate: float) -> None:
         """Command a forward speed [m/s] and a yaw rate [rad/s] from now on."""
-        self.data.ctrl[:] = self._robot.wheel_speeds(forward, yaw_rate)
+        self._wanted = self.robot.wheel_speeds(forward, yaw_rate)
 
     def step(self) -> None:
         """Advance by ``world.TIME_STEP``."""
-        self._push_wheels()
+        speeds = self._wanted
+        self.data.xfrc_applied[:] = 0.0
+        grass = self.grass_forces()
+        if grass is not None:
+            self.data.xfrc_applied[self.wheel_bodies, :3] = grass
+        if hasattr(self, "odom_origin"):
+            for plant in self._hidden:
+                speeds = plant.wheel_speeds(self.time, speeds)
+                plant.push(self)
+            self._set_friction()
+        self.data.ctrl[:] = speeds
         mujoco.mj_step(self.model, self.data)
         self.steps += 1
 
@@ -126,10 +164,41 @@ class Simulation:
             return "the robot reached the edge of the world"
         return None
 
-    def _push_wheels(self) -> None:
-        """Let the grass act on the wheels."""
-        centres = self.data.xpos[self._bodies]
-        turning = self.data.xmat[self._base].reshape(3, 3) @ self.data.qvel[3:6]
-        velocities = self.data.qvel[:3] + np.cross(turning, centres - self.data.xpos[self._base])
-        forces = self._scenery.grass.wheel_forces(self._scenery.ground, centres, self._radii, velocities)
-        self.data.xfrc_applied[self._bodies, :3] = 0.0 if forces is None else forces
+    def heading(self) -> float:
+        """Direction of the chassis' x axis in the horizontal plane [rad]."""
+        axes = self.data.xmat[self.base]
+        return math.atan2(axes[3], axes[0])
+
+    def wheel_velocities(self) -> np.ndarray:
+        """Velocity of each wheel's centre in world axes ``[wheels, 3]`` [m/s]."""
+        centres = self.data.xpos[self.wheel_bodies]
+        turning = self.data.xmat[self.base].reshape(3, 3) @ self.data.qvel[3:6]
+        return self.data.qvel[:3] + np.cross(turning, centres - self.data.xpos[self.base])
+
+    def grass_forces(self) -> np.ndarray | None:
+        """Force of the grass on each wheel ``[wheels, 3]`` [N], or None where no wheel stands in grass."""
+        if not self._is_near(self._near_grass):
+            return None
+        centres = self.data.xpos[self.wheel_bodies]
+        return self._scenery.grass.wheel_forces(
+            self._scenery.ground, centres, self._radii, self.wheel_velocities(), self._grass_share
+        )
+
+    def _is_near(self, cells: np.ndarray) -> bool:
+        origin = self._scenery.ground.origin
+        column, row = ((self.data.qpos[axis] - origin[axis]) / self._cell for axis in range(2))
+        if not (math.isfinite(row) and math.isfinite(column)):
+            return False
+        last = cells.shape[0] - 1
+        return bool(cells[min(max(int(row), 0), last), min(max(int(column), 0), last)])
+
+    def _set_friction(self) -> None:
+        """Give each tyre the friction of the ground below it."""
+        near = self._is_near(self._near_patch)
+        if not near and not self._on_patch:
+            return
+        self._on_patch = near
+        factors = np.ones(len(self.tyres))
+        for patch in self._scenery.patches:
+            factors[patch.contains(self.data.xpos[self.wheel_bodies, :2])] = patch.friction
+        self.model.geom_friction[self.tyres, 0] = self.tyre_friction * factors

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,12 +26,14 @@ class TerrainSettings:
         resolution: distance of neighbouring heights [m].
         roughness: factor on the height of the hills [-].
         flat: level ground with nothing on it: no hills, ramp, rocks, trees or grass.
+        bare: hills with nothing on them.
     """
 
     size: float = 40.0
     resolution: float = 0.1
     roughness: float = 1.0
     flat: bool = False
+    bare: bool = False
 
     def __post_init__(self):
         if not 30.0 <= self.size <= 200.0:
@@ -66,6 +69,34 @@ class Ramp:
         across = np.abs(cosine * offset_y - sine * offset_x) - self.plateau_width / 2
         rise = np.minimum(1.0 - along / self.slope_length, 1.0 - across / self.side_length)
         return self.height * np.clip(rise, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Kerb:
+    """A step up across the way, level behind its edge, that sinks back to the ground.
+
+    Attributes:
+        centre: ``[2]`` world position of the middle of the edge [m].
+        heading: direction in which it is climbed [rad].
+        height: [m].
+    """
+
+    centre: np.ndarray
+    heading: float
+    height: float
+    level_length: float = 1.2
+    fall_length: float = 1.6
+    width: float = 2.6
+    side_length: float = 0.6
+
+    def height_at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Height [m] that the kerb adds at world positions; any shape, the same for ``x`` and ``y``."""
+        offset_x, offset_y = x - self.centre[0], y - self.centre[1]
+        cosine, sine = math.cos(self.heading), math.sin(self.heading)
+        along = cosine * offset_x + sine * offset_y
+        across = np.abs(cosine * offset_y - sine * offset_x) - self.width / 2
+        fall = 1.0 - (along - self.level_length) / self.fall_length
+        return self.height * np.clip(np.minimum(fall, 1.0 - across / self.side_length), 0.0, 1.0) * (along >= 0.0)
 
 
 @dataclass(frozen=True)
@@ -130,7 +161,11 @@ class HeightField:
 
 
 def build_ground(
-    settings: TerrainSettings, route: Route, ramp: Ramp | None, random: np.random.Generator
+    settings: TerrainSettings,
+    route: Route,
+    ramp: Ramp | None,
+    random: np.random.Generator,
+    kerbs: Sequence[Kerb] = (),
 ) -> HeightField:
     """Shape the ground around a route; it is level and at height 0 where the route starts."""
     count = 2 * round(settings.size / settings.resolution / 2) + 1
@@ -155,6 +190,10 @@ def build_ground(
         # Hills under a built ramp would tilt and buckle it.
         near = gaussian_filter((added > 0.0).astype(float), 0.5 / settings.resolution)
         heights = heights * (1.0 - 0.8 * near) + gaussian_filter(added, 0.06 / settings.resolution)
+    for kerb in kerbs:
+        added = kerb.height_at(x, y)
+        near = gaussian_filter((added > 0.0).astype(float), 0.4 / settings.resolution)
+        heights = heights * (1.0 - 0.8 * near) + added
     edge = field.half_size - np.maximum(np.abs(x - field.centre[0]), np.abs(y - field.centre[1]))
     heights += 2.2 * np.clip(1.0 - edge / _RIM_WIDTH, 0.0, 1.0) ** 1.5
     return HeightField(heights, settings.resolution, origin)

@@ -17,6 +17,8 @@ _SOIL = np.array([0.46, 0.35, 0.23], np.float32)
 _DRY = np.array([0.66, 0.60, 0.36], np.float32)
 _MEADOW = np.array([0.37, 0.50, 0.19], np.float32)
 _MOSS = np.array([0.22, 0.35, 0.12], np.float32)
+_MUD = np.array([0.20, 0.15, 0.11], np.float32)
+_GRAVEL = np.array([0.55, 0.55, 0.56], np.float32)
 _SAND = np.array([0.70, 0.58, 0.42], np.float32)
 
 
@@ -57,6 +59,10 @@ def paint_ground(scenery: Scenery, random: np.random.Generator) -> tuple[np.ndar
         built = _step(scenery.ramp.height_at(x, y) + 0.03 * fine, 0.0, 0.07)
         colours = _blend(colours, _SAND, 0.9 * built)
         bare = np.maximum(bare, built)
+    for patch in scenery.patches:
+        inside = _step(patch.area.edge_distance(x, y).astype(np.float32) + 0.12 * fine, -0.05, 0.12)
+        colours = _blend(colours, _MUD if patch.kind == "mud" else _GRAVEL * (1.0 + 0.08 * fine[..., None]), inside)
+        bare = np.maximum(bare, inside)
     colours = _blend(colours, 0.75 * _MOSS, np.clip(_resized(scenery.grass.canopy.heights, count) / 0.25, 0.0, 1.0))
     colours *= ((1.0 - 0.52 * _shadows(scenery, 2 * count)[::2, ::2]) * (1.0 + 0.15 * fine))[..., None]
 
@@ -88,6 +94,17 @@ def rock_texture(random: np.random.Generator) -> np.ndarray:
     colours = np.array([0.60, 0.585, 0.56]) * (1.0 + 0.20 * grain + 0.14 * stain)[..., None]
     lichen = _step(noise(512, 10, random, 0.75), 0.55, 0.8)[..., None]
     colours += 0.45 * lichen * (np.array([0.62, 0.62, 0.42]) - colours)
+    return np.clip(255 * colours, 0, 255).astype(np.uint8)
+
+
+def wall_texture(random: np.random.Generator) -> np.ndarray:
+    """Courses of bricks, ``[512, 512, 3]`` uint8."""
+    row = np.arange(512)[:, None] // 64
+    column = (np.arange(512)[None] + 64 * (row % 2)) // 128
+    tone = random.uniform(0.75, 1.15, (8, 5))[row, column]
+    mortar = (np.arange(512)[:, None] % 64 < 7) | ((np.arange(512)[None] + 64 * (row % 2)) % 128 < 7)
+    colours = np.array([0.55, 0.29, 0.21]) * (tone * (1.0 + 0.12 * noise(512, 32, random, 0.8)))[..., None]
+    colours = np.where(mortar[..., None], np.array([0.62, 0.60, 0.56]), colours)
     return np.clip(255 * colours, 0, 255).astype(np.uint8)
 
 

@@ -114,7 +114,12 @@ class Grass:
         return self.canopy.height_at(positions)
 
     def wheel_forces(
-        self, ground: HeightField, centres: np.ndarray, radii: np.ndarray, velocities: np.ndarray
+        self,
+        ground: HeightField,
+        centres: np.ndarray,
+        radii: np.ndarray,
+        velocities: np.ndarray,
+        share: float = 1.0,
     ) -> np.ndarray | None:
         """Force of the grass on wheels.
 
@@ -123,6 +128,7 @@ class Grass:
             centres: ``[n, 3]`` world positions of the wheels' centres [m].
             radii: ``[n]`` [m].
             velocities: ``[n, 3]`` of the centres, in the world frame [m/s].
+            share: of a wheel in the forces, 1 for a robot on four.
 
         Returns:
             ``[n, 3]`` forces in the world frame [N], or None if no wheel touches grass.
@@ -140,7 +146,7 @@ class Grass:
         forces = np.zeros((len(centres), 3))
         forces[:, :2] = -(drag / np.maximum(speed, 1e-6))[:, None] * velocities[:, :2]
         forces[:, 2] = self.settings.spring * depth
-        return forces
+        return share * forces
 
 
 def short_grass(

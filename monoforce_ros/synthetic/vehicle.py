@@ -18,13 +18,17 @@ IMU_SITE = "imu"
 GROUP = 5
 """Geometry group of the robot, which its own sensors' rays pass through."""
 
-# Tyre and servo as measured to turn like the real robot and not to hop on its diagonals.
-_TYRE_STIFFNESS = 15_000.0
-_TYRE_DAMPING = 700.0
-_SERVO_GAIN = 300.0
-# Inertia of motor and gears as the wheel feels it [kg m²]; without it a standing robot trembles.
-_GEAR_INERTIA = 0.1
-_WHEEL_MASS_FRACTION = 0.03
+# Tyres and servos of a robot of this mass on four wheels, as measured to turn like the real one and not to hop on its
+# diagonals; they grow with the robot's mass and are shared by its wheels.
+_REFERENCE_MASS = 50.0
+_TYRE_STIFFNESS = 60_000.0
+_TYRE_DAMPING = 2_800.0
+_SERVO_GAIN = 1_200.0
+# Inertia of motors and gears as the wheels feel it [kg m²]; without it a standing robot trembles.
+_GEAR_INERTIA = 0.4
+_WHEELS_MASS_FRACTION = 0.12
+# Distance of the small wheels that stand for a track, in their radii: close enough to climb what a belt climbs.
+_TRACK_WHEEL_DISTANCE = 1.1
 _GRAVITY = 9.81
 
 
@@ -47,6 +51,11 @@ class Wheel:
     def joint(self) -> str:
         """Name of its joint in the model and in joint states."""
         return f"{self.name}_wheel"
+
+    @property
+    def surface(self) -> str:
+        """Name of the geometry that touches the ground."""
+        return f"{self.name}_surface"
 
 
 @dataclass(frozen=True)
@@ -72,27 +81,20 @@ class Vehicle:
 
     @classmethod
     def load(cls, name_or_file: str | Path) -> Vehicle:
-        """Read a robot by name or file; it must drive on wheels alone.
+        """Read a robot by name or file; each of its tracks becomes a row of small wheels that turn together.
 
         Raises:
-            RobotFileError: the file cannot be used, or has tracks.
+            RobotFileError: the file cannot be used, or has flippers.
         """
         robot: RobotModel = load_robot(name_or_file)
         path = robot_file(name_or_file)
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
-        if content.get("tracks") or not content.get("wheels"):
-            raise RobotFileError(f"{path}: tracks: synthetic worlds can simulate robots on wheels only")
+        if content.get("flippers"):
+            raise RobotFileError(f"{path}: flippers: synthetic worlds can simulate robots on wheels and tracks only")
         offsets = dict(zip(robot.drive_names, robot.drive_offsets.tolist(), strict=True))
-        wheels = tuple(
-            Wheel(
-                str(wheel["name"]),
-                offsets[str(wheel["drive"])],
-                np.array(wheel["centre"], float),
-                float(wheel["radius"]),
-                float(wheel["width"]),
-            )
-            for wheel in content["wheels"]
-        )
+        wheels = [_wheel(wheel, offsets) for wheel in content.get("wheels", [])]
+        for track in content.get("tracks", []):
+            wheels += _track_wheels(track, offsets)
         hull = tuple((np.array(box["centre"], float), np.array(box["size"], float)) for box in content.get("hull", []))
         return cls(
             name=robot.name,
@@ -100,7 +102,7 @@ class Vehicle:
             mass=float(robot.mass),
             centre_of_mass=robot.centre_of_mass.double().numpy(),
             inertia=robot.inertia.double().numpy(),
-            wheels=wheels,
+            wheels=tuple(wheels),
             hull=hull,
             sensors={frame: _rigid(pose.double().numpy()) for frame, pose in robot.sensors.items()},
             maximum_speed=robot.maximum_speed,
@@ -131,7 +133,7 @@ class Vehicle:
         """Add the robot to a world: at the origin, heading along x, its base frame at ``height`` [m]."""
         base = spec.worldbody.add_body(name=BODY, pos=[0.0, 0.0, height])
         base.add_freejoint()
-        wheel_mass = _WHEEL_MASS_FRACTION * self.mass
+        wheel_mass = _WHEELS_MASS_FRACTION * self.mass / len(self.wheels)
         self._set_inertia(base, wheel_mass)
         for centre, size in self.hull:
             base.add_geom(
@@ -171,24 +173,49 @@ class Vehicle:
         body.mass = mass
         body.inertia = _wheel_moments(wheel, mass)
         tyre = body.add_joint(name=f"{wheel.name}_tyre", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1])
-        tyre.stiffness = [_TYRE_STIFFNESS, 0.0, 0.0]
-        tyre.damping = [_TYRE_DAMPING, 0.0, 0.0]
+        share = self.mass / _REFERENCE_MASS / len(self.wheels)
+        stiffness = share * _TYRE_STIFFNESS
+        tyre.stiffness = [stiffness, 0.0, 0.0]
+        tyre.damping = [share * _TYRE_DAMPING, 0.0, 0.0]
         # At rest on level ground the tyre neither lifts nor lowers the base frame.
-        tyre.springref = -self.mass * _GRAVITY / len(self.wheels) / _TYRE_STIFFNESS
+        tyre.springref = -self.mass * _GRAVITY / len(self.wheels) / stiffness
         axle = body.add_joint(name=wheel.joint, type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 1, 0])
-        axle.armature = _GEAR_INERTIA
+        axle.armature = share * _GEAR_INERTIA
         lying = Rotation.from_euler("x", 90, degrees=True).as_quat(scalar_first=True)
         size = [wheel.radius, wheel.width / 2, 0.0]
+        # Its friction wins over the ground's, so that it can change with the place.
         body.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=size, quat=lying, rgba=[0.08, 0.08, 0.09, 1], **_collides()
-        )
+            name=wheel.surface, type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=size, quat=lying,
+            rgba=[0.08, 0.08, 0.09, 1], priority=1, **_collides(),
+        )  # fmt: skip
         hub = [0.5 * wheel.radius, wheel.width / 2 + 0.005, 0.0]
         body.add_geom(
             type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=hub, quat=lying, rgba=[0.45, 0.45, 0.47, 1], group=GROUP,
             contype=0, conaffinity=0,
         )  # fmt: skip
         servo = spec.add_actuator(name=wheel.joint, target=wheel.joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-        servo.set_to_velocity(kv=_SERVO_GAIN)
+        servo.set_to_velocity(kv=share * _SERVO_GAIN)
+
+
+def _wheel(entry: Mapping, offsets: Mapping[str, float]) -> Wheel:
+    drive = offsets[str(entry["drive"])]
+    return Wheel(
+        str(entry["name"]), drive, np.array(entry["centre"], float), float(entry["radius"]), float(entry["width"])
+    )
+
+
+def _track_wheels(track: Mapping, offsets: Mapping[str, float]) -> list[Wheel]:
+    """Wheels along the bottom of a track, its two rollers the first and the last of them."""
+    centre, radius, length = np.array(track["centre"], float), float(track["radius"]), float(track["length"])
+    count = max(2, 1 + round(length / (_TRACK_WHEEL_DISTANCE * radius)))
+    places = np.linspace(length / 2, -length / 2, count)
+    return [
+        Wheel(
+            f"{track['name']}_{index}", offsets[str(track["drive"])], centre + np.array([place, 0.0, 0.0]), radius,
+            float(track["width"]),
+        )
+        for index, place in enumerate(places)
+    ]  # fmt: skip
 
 
 def _collides() -> dict[str, object]:

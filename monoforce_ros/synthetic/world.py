@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.synthetic import textures, vehicle
 from monoforce_ros.synthetic.graphics import mujoco
+from monoforce_ros.synthetic.plants import Plant
 from monoforce_ros.synthetic.random_streams import random_stream
 from monoforce_ros.synthetic.scenery import Scenery
 from monoforce_ros.synthetic.shapes import Shape
@@ -35,7 +36,9 @@ _DRAWN_STEP = 2
 _TILE_SIZE = 5.0
 
 
-def build_model(scenery: Scenery, robot: Vehicle, seed: int, cameras: Mapping[str, float]) -> mujoco.MjModel:
+def build_model(
+    scenery: Scenery, robot: Vehicle, seed: int, cameras: Mapping[str, float], hidden: Sequence[Plant] = ()
+) -> mujoco.MjModel:
     """Compile a world.
 
     The ground exists three times: as a height field for contacts, as a mesh for rays (a height field casts forty times
@@ -46,6 +49,7 @@ def build_model(scenery: Scenery, robot: Vehicle, seed: int, cameras: Mapping[st
         robot: stands at the origin, heading along x.
         seed: of the colours.
         cameras: vertical field of view [rad] by sensor frame; without any, what only cameras need is left out.
+        hidden: changes the model for a workflow to find out.
     """
     spec = mujoco.MjSpec()
     spec.option.timestep = TIME_STEP
@@ -60,6 +64,8 @@ def build_model(scenery: Scenery, robot: Vehicle, seed: int, cameras: Mapping[st
         _add_light(spec)
     for index, rock in enumerate(scenery.rocks):
         _add_shape(spec, f"rock_{index}", rock, "rock", materials, SOLID_GROUP, solid=True)
+    for index, wall in enumerate(scenery.walls):
+        _add_shape(spec, f"wall_{index}", wall.shape, "wall", materials, SOLID_GROUP, solid=True)
     for index, tree in enumerate(scenery.trees):
         _add_shape(spec, f"trunk_{index}", tree.stem, "bark", materials, SOLID_GROUP, solid=True)
         _add_shape(spec, f"crown_{index}", tree.crown, tree.foliage, materials, SOLID_GROUP, solid=False)
@@ -68,6 +74,8 @@ def build_model(scenery: Scenery, robot: Vehicle, seed: int, cameras: Mapping[st
     robot.add_to(spec, robot.clearance + _SPAWN_HEIGHT)
     for frame, field_of_view in cameras.items():
         _add_camera(spec, frame, robot.sensors[frame], field_of_view)
+    for plant in hidden:
+        plant.shape(spec, robot)
     return spec.compile()
 
 
@@ -157,6 +165,7 @@ def _add_materials(spec: mujoco.MjSpec, ground: np.ndarray, seed: int) -> set[st
     images = {
         "ground": ground,
         "rock": textures.rock_texture(random_stream(seed, "rock colours")),
+        "wall": textures.wall_texture(random_stream(seed, "wall colours")),
         "bark": textures.bark_texture(random_stream(seed, "bark colours")),
         "grass": textures.grass_palette(),
         "broad": textures.leaf_palette(),

@@ -1,0 +1,109 @@
+"""Hidden: which physics is planted in a world, by name or by lot, and the file that keeps the truth."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from monoforce_ros.synthetic.plants import Plant
+from monoforce_ros.synthetic.random_streams import random_stream
+
+
+def _catalogue() -> dict[str, type[Plant]]:
+    def snake(name: str) -> str:
+        return re.sub(r"(?<!^)(?=[A-Z])", "_", name).lower()
+
+    return {snake(kind.__name__): kind for kind in Plant.__subclasses__()}
+
+
+PLANTS: dict[str, type[Plant]] = _catalogue()
+"""Everything that can be hidden, by name: that of the catalogue's effect where it has one."""
+
+# Chances of a drawn world: nothing hidden, one effect, two, one that the catalogue does not hold.
+_KINDS = (("nothing", 0.2), ("single", 0.45), ("pair", 0.2), ("outsider", 0.15))
+
+
+def parse_hidden(text: str) -> Plant:
+    """The plant of ``NAME``, ``NAME:VALUE`` or ``NAME:PARAMETER=VALUE,PARAMETER=VALUE``.
+
+    Raises:
+        ValueError: there is none of that name, no such parameter, or a value is out of range.
+    """
+    name, _, rest = text.partition(":")
+    if name not in PLANTS:
+        raise ValueError(f"--hide: got {name!r}, expected one of {', '.join(sorted(PLANTS))}")
+    kind = PLANTS[name]
+    values = {parameter: default for parameter, (default, _, _) in kind.parameters.items()}
+    for number, part in enumerate(filter(None, rest.split(","))):
+        parameter, equals, value = part.partition("=")
+        if not equals:
+            parameter, value = next(iter(values)), part
+            if number:
+                raise ValueError(f"--hide {text}: got {part!r}, expected PARAMETER=VALUE after the first comma")
+        if parameter not in values:
+            raise ValueError(f"--hide {text}: got parameter {parameter!r}, expected one of {', '.join(values)}")
+        low, high = kind.parameters[parameter][1:]
+        try:
+            values[parameter] = float(value)
+        except ValueError:
+            raise ValueError(f"--hide {text}: got {value!r}, expected a number") from None
+        if not (math.isfinite(values[parameter]) and low <= values[parameter] <= high):
+            raise ValueError(f"--hide {text}: got {parameter} = {value}, expected {low:g} to {high:g}")
+    return kind(**values)
+
+
+def draw_hidden(seed: int, without: Sequence[str] = ()) -> tuple[Plant, ...]:
+    """Hidden effects by lot: none, one, two of different names, or one that is not in the catalogue.
+
+    Values are spread over the middle of their range about the default.
+
+    Args:
+        seed: decides all.
+        without: names never drawn, such as ``vegetation_drag`` in a world without vegetation.
+    """
+    random = random_stream(seed, "hidden")
+    kind = random.choice([name for name, _ in _KINDS], p=[chance for _, chance in _KINDS])
+    count = {"nothing": 0, "pair": 2}.get(kind, 1)
+    names = [n for n, p in sorted(PLANTS.items()) if p.in_catalogue == (kind != "outsider") and n not in without]
+    drawn = []
+    for name in random.choice(names, count, replace=False):
+        values = {}
+        for parameter, (default, low, high) in PLANTS[name].parameters.items():
+            sign = random.choice([-1.0, 1.0]) if low < 0.0 < high and low == -high else 1.0
+            # Parameters that mean nothing at 1 keep their distance from it, the others from 0.
+            neutral = 1.0 if parameter in ("gain", "factor", "wheelbase_factor", "strength") else 0.0
+            value = neutral + sign * (default - neutral) * random.uniform(0.6, 1.4)
+            values[parameter] = float(min(max(value, low), high))
+        drawn.append(PLANTS[name](**values))
+    return tuple(drawn)
+
+
+def describe(hidden: Sequence[Plant]) -> list[dict]:
+    """Name, parameters and whether the catalogue holds it, of each plant."""
+    names = {kind: name for name, kind in PLANTS.items()}
+    return [
+        {
+            "name": names[type(plant)],
+            "parameters": {parameter: getattr(plant, parameter) for parameter in plant.parameters},
+            "in_catalogue": plant.in_catalogue,
+        }
+        for plant in hidden
+    ]
+
+
+def truth_file(bag: Path) -> Path:
+    """Where the truth of a bag lies: beside it, never in it."""
+    return bag.with_name(f"{bag.name}.hidden.json")
+
+
+def write_truth(bag: Path, hidden: Sequence[Plant], seed: int) -> Path:
+    """Write what is hidden in a bag beside it; returns the file, which appears only when it is complete."""
+    target = truth_file(bag)
+    unfinished = target.with_name(f".{target.name}.unfinished-{os.getpid()}")
+    unfinished.write_text(json.dumps({"hidden": describe(hidden), "seed": seed}, indent=2) + "\n", encoding="utf-8")
+    unfinished.replace(target)
+    return target
