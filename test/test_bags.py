@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from nav_msgs.msg import Odometry
 from rclpy.serialization import deserialize_message
 
@@ -66,28 +68,140 @@ def test_an_existing_bag_is_kept_unless_told_otherwise(tmp_path):
         BagWriter(tmp_path / "other", storage="csv")
 
 
+def storage_file(path):
+    return next(file for file in path.iterdir() if file.suffix in (".mcap", ".db3"))
+
+
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-@pytest.mark.parametrize("part", [0.0, 0.3, 0.9])
-def test_truncated_bags_are_refused_in_one_sentence(tmp_path, storage, part):
+def test_a_bag_of_which_nothing_is_left_is_refused_in_one_sentence(tmp_path, storage):
     path = write(tmp_path / "drive", storage)
-    file = next(f for f in path.iterdir() if f.suffix in (".mcap", ".db3"))
+    storage_file(path).write_bytes(b"")
+    with pytest.raises(BagError, match="drive.*(cannot be read|is gone|damaged)"):
+        Recording.open(path)
+
+
+@pytest.mark.parametrize("part", [0.35, 0.6, 0.9])
+def test_a_bag_that_was_cut_off_is_read_as_far_as_it_goes(tmp_path, part):
+    path = tmp_path / "drive"
+    with BagWriter(path) as bag:
+        random = np.random.default_rng(1)
+        for i in range(400):
+            at = START + i * 50_000_000
+            bag.write(
+                "/odom",
+                builders.odometry(at, "odom", "base_link", [0.05 * i, 0, 0], [0, 0, 0, 1], [1, 0, 0], [0] * 3),
+                at,
+            )
+            # Noise, which does not compress: the file has many chunks.
+            pixels = random.integers(0, 255, (120, 160, 3), np.uint8)
+            bag.write("/cam/image_raw", builders.image(at, "cam", pixels), at)
+    file = storage_file(path)
     data = file.read_bytes()
     file.write_bytes(data[: int(len(data) * part)])
-    with pytest.raises(BagError, match="drive.*(truncated|damaged)"):
-        Recording.open(path)
+    recording = Recording.open(path)
+    assert part * 400 - 40 < len(recording.motion) <= part * 400
+    assert "cut off or damaged" in recording.complaints[0]
+    assert "breaks off" in recording.complaints[1]
+    np.testing.assert_allclose(recording.motion.positions[:, 0], 0.05 * np.arange(len(recording.motion)))
+    frame = recording.images["/cam/image_raw"][10]
+    assert recording.image(frame).shape == (120, 160, 3)
 
 
-def test_missing_and_unfinished_bags_are_named(tmp_path):
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_a_bag_without_metadata_is_read_and_said(tmp_path, storage):
+    path = write(tmp_path / "drive", storage)
+    (path / "metadata.yaml").unlink()
+    recording = Recording.open(path)
+    assert "no usable index (there is no metadata.yaml)" in recording.complaints[0]
+    for recording in (recording, Recording.open(storage_file(path))):
+        assert len(recording.motion) == 20
+        assert recording.cloud(recording.clouds[7])[0][0, 0] == 8.0
+
+
+def test_a_real_ros_1_bag_without_its_index_is_read(tmp_path, real_data):
+    source = next((real_data / "husky_outdoor").glob("*.bag"))
+    cut = tmp_path / "cut.bag"
+    with source.open("rb") as stream:
+        cut.write_bytes(stream.read(source.stat().st_size // 2))
+    whole, part = Recording.open(source), Recording.open(cut)
+    assert 0.3 * len(whole.motion) < len(part.motion) < 0.7 * len(whole.motion)
+    np.testing.assert_array_equal(part.motion.positions, whole.motion.positions[: len(part.motion)])
+    assert "cut off" in part.complaints[0]
+
+
+@given(st.binary(max_size=400), st.sampled_from([b"\x89MCAP0\r\n", b"#ROSBAG V2.0\n", b"SQLite format 3\x00", b""]))
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_any_bytes_are_a_bag_or_one_clear_error(tmp_path, data, magic):
+    file = tmp_path / ("junk.db3" if magic.startswith(b"SQL") else "junk.mcap")
+    file.write_bytes(magic + data)
+    with pytest.raises(BagError, match="cannot be read"):
+        Recording.open(file)
+
+
+def test_a_size_that_the_file_cannot_hold_is_not_believed(tmp_path):
+    file = tmp_path / "huge.mcap"
+    file.write_bytes(b"\x89MCAP0\r\n" + b"\x06" + (2**62).to_bytes(8, "little") + b"short")
+    with pytest.raises(BagError, match="does not fit"):
+        Recording.open(file)
+
+
+def test_missing_bags_are_named(tmp_path):
     with pytest.raises(BagError, match="does not exist"):
         Recording.open(tmp_path / "nowhere")
-    path = write(tmp_path / "drive")
-    (path / "metadata.yaml").unlink()
-    with pytest.raises(BagError, match=r"no metadata.yaml.*ros2 bag reindex"):
-        Recording.open(path)
     junk = tmp_path / "junk.bag"
     junk.write_bytes(b"not a bag at all")
     with pytest.raises(BagError, match="cannot be read"):
         Recording.open(junk)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(BagError, match=r"holds no .mcap, .db3 or .bag file"):
+        Recording.open(tmp_path / "empty")
+
+
+def test_topics_of_unknown_types_are_no_obstacle(tmp_path):
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register(get_types_from_msg("float64 level\nstring name", "strange_msgs/msg/Battery"))
+    with Writer(tmp_path / "drive", version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        odometry = bag.add_connection("/odom", "nav_msgs/msg/Odometry", typestore=store)
+        strange = bag.add_connection("/battery", "strange_msgs/msg/Battery", typestore=store)
+        for i in range(5):
+            at = START + i * 10**8
+            message = builders.odometry(at, "odom", "base_link", [i, 0, 0], [0, 0, 0, 1], [1, 0, 0], [0] * 3)
+            bag.write(odometry, at, store.serialize_cdr(message, "nav_msgs/msg/Odometry"))
+            level = store.types["strange_msgs/msg/Battery"](level=0.5, name="b")
+            bag.write(strange, at, store.serialize_cdr(level, "strange_msgs/msg/Battery"))
+    recording = Recording.open(tmp_path / "drive")
+    assert len(recording.motion) == 5
+    with BagReader(tmp_path / "drive") as bag:
+        assert bag.topics["/battery"] == "strange_msgs/msg/Battery"
+
+
+def test_large_bags_are_read_in_little_memory(tmp_path):
+    """Half a gigabyte of images, of which a reader never holds more than a chunk."""
+    import subprocess
+    import sys
+
+    pixels = np.zeros((720, 1280, 3), np.uint8)
+    with BagWriter(tmp_path / "drive") as bag:
+        for i in range(190):
+            at = START + i * 10**8
+            bag.write("/cam/image_raw", builders.image(at, "cam", pixels), at)
+            message = builders.odometry(at, "odom", "base_link", [i, 0, 0], [0, 0, 0, 1], [1, 0, 0], [0] * 3)
+            bag.write("/odom", message, at)
+    script = (
+        "import resource, sys; from monoforce_ros.bags import Recording; import torch, cv2, scipy.interpolate\n"
+        "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
+        "recording = Recording.open(sys.argv[1])\n"
+        "print(len(recording.images['/cam/image_raw']), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script, str(tmp_path / "drive")], capture_output=True, text=True, check=True, timeout=120
+    )
+    images, grown_kilobytes = map(int, done.stdout.split())
+    assert images == 190
+    assert grown_kilobytes < 90_000
 
 
 def test_a_bag_without_odometry_says_what_it_has(tmp_path):

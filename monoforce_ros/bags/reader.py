@@ -11,6 +11,7 @@ from typing import Any
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
 
+from monoforce_ros.bags.salvage import SalvagedBag, storage_files
 from monoforce_ros.bags.types import type_store
 
 
@@ -58,12 +59,15 @@ class BagReader:
         path: a rosbag2 folder, a single ``.mcap`` or ``.db3`` file, or a ROS 1 ``.bag`` file.
 
     Raises:
-        BagError: on opening, where the bag is missing, truncated or of an unknown kind.
+        BagError: on opening, where the bag is missing, of an unknown kind, or so damaged that no message can be read.
+            A bag that was cut off is read as far as it goes, and says so in ``warnings``.
     """
 
     def __init__(self, path: str | Path):
         self.path = Path(path)
-        self._any: AnyReader
+        self._any: AnyReader | SalvagedBag
+        self.warnings: tuple[str, ...] = ()
+        """What is wrong with the bag as a whole, though it can be read in part."""
 
     @property
     def is_ros2(self) -> bool:
@@ -74,22 +78,33 @@ class BagReader:
         path = self.path
         if not path.exists():
             raise BagError(f"{path} does not exist; expected a rosbag2 folder or a ROS 1 .bag file")
-        if path.is_file() and path.suffix in (".mcap", ".db3"):
+        if path.is_file() and path.suffix in (".mcap", ".db3") and (path.parent / "metadata.yaml").is_file():
             path = path.parent
-        elif path.is_dir() and not (path / "metadata.yaml").is_file():
-            raise BagError(
-                f"{path} holds no metadata.yaml, so it is not a complete rosbag2 bag: "
-                "if the recording was cut off, rebuild the metadata with `ros2 bag reindex`"
-            )
         try:
+            if path.is_dir() and not (path / "metadata.yaml").is_file():
+                raise ValueError("there is no metadata.yaml")
             self._any = AnyReader([path], default_typestore=type_store())
             self._any.open()
         except Exception as error:  # rosbags lets errors of its parsers through; a user needs one message
-            raise BagError(
-                f"{self.path} cannot be read ({type(error).__name__}: {error}); it may be truncated or still being "
-                "written: try `ros2 bag reindex` (ROS 2) or `rosbag reindex` (ROS 1)"
-            ) from error
+            self._salvage(error)
         return self
+
+    def _salvage(self, reason: Exception) -> None:
+        """Read what can be read of a bag without an index, or say why nothing can."""
+        files = storage_files(self.path)
+        salvaged = SalvagedBag(files) if files else None
+        if salvaged is None or not salvaged.message_count:
+            where = "; ".join(salvaged.broken) if salvaged else "it holds no .mcap, .db3 or .bag file"
+            raise BagError(
+                f"{self.path} cannot be read ({type(reason).__name__}: {reason}; {where}): expected a rosbag2 folder "
+                "or a ROS 1 .bag file; is it still being written?"
+            ) from reason
+        self._any = salvaged
+        self.warnings = (
+            f"{self.path} has no usable index ({reason}): it was cut off or damaged. "
+            f"{salvaged.message_count} messages were found by reading it from its start",
+            *salvaged.broken,
+        )
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None

@@ -74,8 +74,15 @@ class Recording:
             wanted = {topic for topic in chosen.values() if topic}
             wanted.update(image_topics, bag.of_type(CAMERA_INFO), bag.of_type(TRANSFORMS))
             collected = _Collector(bag, chosen)
-            for message in bag.messages(wanted):
-                collected.take(message)
+            collected.complaints.extend(bag.warnings)
+            try:
+                for message in bag.messages(wanted):
+                    collected.take(message)
+            except BagError as error:
+                # What came before the break is a drive too.
+                if not collected.states:
+                    raise
+                collected.complaints.append(str(error))
             return collected.recording(image_topics)
 
     def cloud(self, frame: Frame) -> tuple[np.ndarray, str]:
@@ -155,6 +162,11 @@ class _Collector:
 
     def take(self, message) -> None:
         try:
+            if message.message_type in (*IMAGES, CLOUD) and self.bag.is_ros2:
+                # Their headers suffice: large messages are not unpacked until somebody asks for them.
+                stamp = decoding.stamp_of_cdr(message.data)
+                self.indexed.setdefault(message.topic, []).append(Frame(message.topic, stamp, message.received))
+                return
             decoded = message.decode()
             # A header stamp of zero means that the driver never set it.
             stamp = decoding.stamp_of(decoded) or message.received

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from typing import Any
 
 import cv2
@@ -45,6 +46,18 @@ def stamp_of(message: Any) -> int:
     """Header stamp [ns] of a message; 0 if it has no header."""
     header = getattr(message, "header", None)
     return 0 if header is None else int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
+
+
+def stamp_of_cdr(data: bytes) -> int:
+    """Header stamp [ns] of an encoded message that begins with a header, without decoding the rest.
+
+    Raises ``MessageError`` where the data are too short to hold one.
+    """
+    if len(data) < 12:
+        raise MessageError(f"message: got {len(data)} bytes, expected at least the 12 of a header's stamp")
+    order = "<" if data[1] & 1 else ">"
+    seconds, nanoseconds = struct.unpack_from(f"{order}iI", data, 4)
+    return seconds * 10**9 + nanoseconds
 
 
 def decode_image(message: Any) -> np.ndarray:

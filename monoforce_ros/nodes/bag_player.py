@@ -143,6 +143,8 @@ def main(arguments: list[str] | None = None) -> int:
             player.get_logger().info(
                 f"playing {bag.path}: {bag.duration:.1f} s, {len(player.playable)} topics, {bag.message_count} messages"
             )
+            for warning in bag.warnings:
+                player.get_logger().warning(warning)
             published = player.play()
             player.get_logger().info(f"published {published} messages")
             # Reliable messages still on their way are lost with their publisher.

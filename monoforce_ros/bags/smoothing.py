@@ -1,0 +1,159 @@
+"""Smoothing: noisy poses → poses, velocities and yaw rates that belong together, with the noise that was taken out."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.interpolate import BSpline, make_smoothing_spline
+from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation
+
+from monoforce_ros.motion import NANOSECOND, MotionTrack
+
+LARGEST_GAP = 1.0
+"""Poses further apart in time are not smoothed together [s]."""
+FASTEST = 15.0
+"""A larger speed between neighbouring poses is a jump of the localisation, not motion [m/s]."""
+SHORTEST = 8
+"""Poses that a stretch needs to be smoothed; shorter ones are left as they are."""
+
+
+@dataclass(frozen=True)
+class SmoothedMotion:
+    """Smooth motion and what was taken out of the recorded one."""
+
+    motion: MotionTrack
+    """At the recorded stamps; velocities are those of the smooth poses, in base axes."""
+    position_noise: float
+    """Standard deviation of each recorded coordinate about the smooth path [m]."""
+    rotation_noise: float
+    """Standard deviation of the recorded rotation about each axis [rad]."""
+    stretches: tuple[slice, ...]
+    """Runs of poses without a gap or a jump between them."""
+
+
+def smooth(
+    motion: MotionTrack, *, position_noise: float | None = None, rotation_noise: float | None = None
+) -> SmoothedMotion:
+    """Smooth a recorded motion.
+
+    Each coordinate and each angle becomes a cubic smoothing spline over time (Reinsch 1967); how smooth is found by
+    generalised cross-validation (Craven and Wahba 1978) unless the noise is stated. Yaw is unwrapped first, so that
+    its rate is right when the robot reverses, stands or turns on the spot, where the direction of its path is not.
+
+    Args:
+        motion: recorded poses; their velocities are not used.
+        position_noise: standard deviation of a recorded coordinate [m], if known.
+        rotation_noise: standard deviation about an axis [rad], if known.
+
+    Raises:
+        ValueError: a stated noise is negative, or a pose is not finite.
+    """
+    for name, value in (("position noise", position_noise), ("rotation noise", rotation_noise)):
+        if value is not None and not value >= 0.0:
+            raise ValueError(f"{name}: got {value}, expected 0 or more, or None to find it")
+    if not (np.isfinite(motion.positions).all() and np.isfinite(motion.quaternions).all()):
+        raise ValueError("motion: some poses are not finite; leave them out first")
+    positions, angles = motion.positions.copy(), _angles(motion.quaternions)
+    speeds, turns = np.zeros_like(positions), np.zeros_like(angles)
+    stretches = tuple(_stretches(motion))
+    lost = [0.0, 0.0]
+    used = [0, 0]
+    for stretch in stretches:
+        times = (motion.stamps[stretch] - motion.stamps[stretch.start]) * NANOSECOND
+        for kind, (values, rates, noise) in enumerate(
+            ((positions, speeds, position_noise), (angles, turns, rotation_noise))
+        ):
+            for axis in range(3):
+                taken, freedom = _fit(times, values[stretch, axis], rates[stretch, axis], noise)
+                lost[kind] += taken
+                used[kind] += freedom
+    rotations = Rotation.from_euler("ZYX", angles[:, ::-1])
+    smoothed = replace(
+        motion,
+        positions=positions,
+        quaternions=rotations.as_quat(),
+        linear_velocities=rotations.inv().apply(speeds),
+        angular_velocities=_body_rates(angles, turns),
+    )
+    found = [float(np.sqrt(lost[kind] / used[kind])) if used[kind] > 0 else 0.0 for kind in range(2)]
+    return SmoothedMotion(smoothed, found[0], found[1], stretches)
+
+
+def _angles(quaternions: np.ndarray) -> np.ndarray:
+    """Roll, pitch and unwrapped yaw ``[n, 3]`` [rad]; a ground robot stays far from a pitch of 90°."""
+    yaw, pitch, roll = Rotation.from_quat(quaternions).as_euler("ZYX").T
+    return np.stack([np.unwrap(roll), np.unwrap(pitch), np.unwrap(yaw)], axis=1)
+
+
+def _body_rates(angles: np.ndarray, rates: np.ndarray) -> np.ndarray:
+    """Angular velocity ``[n, 3]`` in base axes of roll, pitch and yaw and their rates."""
+    roll, pitch, _ = angles.T
+    roll_rate, pitch_rate, yaw_rate = rates.T
+    return np.stack(
+        [
+            roll_rate - yaw_rate * np.sin(pitch),
+            pitch_rate * np.cos(roll) + yaw_rate * np.sin(roll) * np.cos(pitch),
+            -pitch_rate * np.sin(roll) + yaw_rate * np.cos(roll) * np.cos(pitch),
+        ],
+        axis=1,
+    )
+
+
+def _stretches(motion: MotionTrack) -> list[slice]:
+    if not len(motion):
+        return []
+    steps = np.diff(motion.stamps) * NANOSECOND
+    moved = np.linalg.norm(np.diff(motion.positions, axis=0), axis=1)
+    # A jump must stand out of the noise too: at 100 Hz a centimetre of it looks fast.
+    broken = (steps > LARGEST_GAP) | ((moved > FASTEST * steps) & (moved > 0.5))
+    edges = np.r_[0, np.flatnonzero(broken) + 1, len(motion)]
+    return [slice(int(low), int(high)) for low, high in itertools.pairwise(edges)]
+
+
+def _fit(times: np.ndarray, values: np.ndarray, rates: np.ndarray, noise: float | None) -> tuple[float, float]:
+    """Replace ``values`` by a smooth curve and ``rates`` by its slope; returns squared residuals and their freedom."""
+    if len(times) < SHORTEST:
+        if len(times) > 1:
+            rates[:] = np.gradient(values, times)
+        return 0.0, 0.0
+    centred = values - values.mean()
+    if np.abs(centred).max() < 1e-12:
+        rates[:] = 0.0
+        return 0.0, 0.0
+    spline = make_smoothing_spline(times, centred) if noise is None else _with_noise(times, centred, noise)
+    residuals = centred - spline(times)
+    values[:] = values - residuals
+    rates[:] = spline.derivative()(times)
+    # The residuals of a curve that follows the noise are smaller than it, by the curve's own freedom.
+    freedom = max(len(times) - _degrees(residuals), 0.25 * len(times))
+    return float((residuals**2).sum()), freedom
+
+
+def _with_noise(times: np.ndarray, values: np.ndarray, noise: float) -> BSpline:
+    """The smoothest curve whose residuals have the stated standard deviation."""
+
+    def excess(exponent: float) -> float:
+        return float(np.std(values - make_smoothing_spline(times, values, lam=10.0**exponent)(times)) - noise)
+
+    low, high = -9.0, 4.0
+    if excess(low) >= 0.0:
+        return make_smoothing_spline(times, values, lam=10.0**low)
+    if excess(high) <= 0.0:
+        return make_smoothing_spline(times, values, lam=10.0**high)
+    return make_smoothing_spline(times, values, lam=10.0 ** brentq(excess, low, high, xtol=0.02))
+
+
+def _degrees(residuals: np.ndarray) -> float:
+    """Degrees of freedom that a smoothing spline spends, from how much its residuals correlate with their neighbours.
+
+    Pure noise about a curve that is too stiff to follow it has uncorrelated residuals; a curve that follows leaves
+    residuals that alternate. The correlation of neighbours is about minus half the share of freedom spent.
+    """
+    spread = float((residuals**2).sum())
+    if spread <= 0.0:
+        return 0.0
+    neighbours = float((residuals[1:] * residuals[:-1]).sum()) / spread
+    return float(np.clip(-2.0 * neighbours, 0.0, 0.75)) * len(residuals)

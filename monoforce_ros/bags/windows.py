@@ -1,0 +1,97 @@
+"""Windows: pieces of a drive with the commands before and in them and the motion that followed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from monoforce_ros.motion import CommandTrack, MotionState, MotionTrack, StaleDataError
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Pieces of a drive, all of one length."""
+
+    starts: tuple[MotionState, ...]
+    """Measured state at the start of each window, ``[W]``."""
+    twists: np.ndarray
+    """Commanded forward speed [m/s] and yaw rate [rad/s] at each physics step from ``history`` before the start on,
+    ``[W, history + T, 2]``."""
+    history: int
+    """Physics steps before the start."""
+    times: np.ndarray
+    """Times since the start at which motion was sampled [s], ``[K]``."""
+    positions: np.ndarray
+    """Measured positions at these times in the odometry frame [m], ``[W, K, 3]``; NaN where there was no odometry."""
+    rotations: np.ndarray
+    """Measured rotations odometry ← base, ``[W, K, 3, 3]``."""
+    velocities: np.ndarray
+    """Measured velocity in base axes [m/s], ``[W, K, 3]``."""
+    angular_velocities: np.ndarray
+    """Measured angular velocity in base axes [rad/s], ``[W, K, 3]``."""
+
+    def __len__(self) -> int:
+        return len(self.starts)
+
+
+def cut_windows(
+    motion: MotionTrack,
+    commands: CommandTrack,
+    *,
+    length: float = 5.0,
+    stride: float = 1.0,
+    history: float = 2.0,
+    time_step: float = 0.01,
+    sample_time: float = 0.1,
+    maximum_gap: float = 0.3,
+    timeout: float = np.inf,
+) -> Windows:
+    """Cut a drive into windows.
+
+    A window is left out where odometry has a gap within it: nothing is interpolated over more than ``maximum_gap``.
+
+    Args:
+        motion: measured, or smoothed.
+        commands: recorded; before the first one the robot stands.
+        length: of a window [s].
+        stride: between the starts of windows [s].
+        history: of commands before each start [s], which delays and lags of the drives need.
+        time_step: of the physics [s].
+        sample_time: between the samples of the motion [s].
+        maximum_gap: largest distance in time of a sample to the odometry around it [s].
+        timeout: age at which a command no longer holds [s].
+
+    Raises:
+        ValueError: no window is left; the message says how long the odometry is.
+    """
+    steps, before = round(length / time_step), round(history / time_step)
+    times = np.arange(round(length / sample_time) + 1) * sample_time
+    starts, sampled = [], []
+    if len(motion):
+        first, last = int(motion.stamps[0]), int(motion.stamps[-1])
+        for start in range(first, last - round(length * 1e9) + 1, round(stride * 1e9)):
+            try:
+                states = [motion.at(start + round(1e9 * time), maximum_gap=maximum_gap) for time in times]
+            except StaleDataError:
+                continue
+            starts.append(states[0])
+            sampled.append(states)
+    if not starts:
+        span = (int(motion.stamps[-1]) - int(motion.stamps[0])) * 1e-9 if len(motion) else 0.0
+        raise ValueError(
+            f"windows: got {span:.1f} s of odometry, expected at least {length:g} s without a gap of more than "
+            f"{maximum_gap:g} s"
+        )
+    offsets = np.rint(np.arange(-before, steps) * time_step * 1e9).astype(np.int64)
+    stamps = np.array([state.stamp for state in starts])[:, None] + offsets
+    return Windows(
+        starts=tuple(starts),
+        twists=commands.sample(stamps, timeout=timeout),
+        history=before,
+        times=times,
+        positions=np.array([[state.position for state in states] for states in sampled]),
+        rotations=np.array([[state.rotation for state in states] for states in sampled]),
+        velocities=np.array([[state.linear_velocity for state in states] for states in sampled]),
+        angular_velocities=np.array([[state.angular_velocity for state in states] for states in sampled]),
+    )

@@ -1,0 +1,152 @@
+"""Smoothed motion, windows and synchronised samples: what everything offline is made of."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from monoforce_ros.bags import BagWriter, Recording, builders, cut_windows, smooth, synchronise
+from monoforce_ros.motion import CommandTrack, MotionTrack
+
+START = 1_700_000_000_000_000_000
+
+
+def track(times, positions, rotations, **kinds):
+    zeros = np.zeros((len(times), 3))
+    return MotionTrack(
+        stamps=START + np.rint(np.asarray(times) * 1e9).astype(np.int64),
+        positions=np.asarray(positions, float),
+        quaternions=rotations.as_quat(),
+        linear_velocities=kinds.get("linear", zeros),
+        angular_velocities=kinds.get("angular", zeros),
+    )
+
+
+def planar(times, speed, rate):
+    """A drive on a plane at changing speed and yaw rate, finely integrated."""
+    fine = np.arange(0.0, times[-1] + 1e-9, 1e-3)
+    heading = np.concatenate([[0.0], np.cumsum(rate(fine)[:-1]) * 1e-3])
+    x = np.concatenate([[0.0], np.cumsum((speed(fine) * np.cos(heading))[:-1]) * 1e-3])
+    y = np.concatenate([[0.0], np.cumsum((speed(fine) * np.sin(heading))[:-1]) * 1e-3])
+    index = np.rint(times / 1e-3).astype(int)
+    angles = np.stack([heading[index], np.zeros(len(times)), np.zeros(len(times))], axis=1)
+    return np.stack([x[index], y[index], np.zeros(len(times))], axis=1), Rotation.from_euler("ZYX", angles)
+
+
+def noisy(positions, rotations, position_noise, rotation_noise, seed=0):
+    random = np.random.default_rng(seed)
+    turned = rotations * Rotation.from_rotvec(rotation_noise * random.standard_normal((len(positions), 3)))
+    return positions + position_noise * random.standard_normal(positions.shape), turned
+
+
+TIMES = np.arange(0.0, 40.0, 0.05)
+
+
+@pytest.mark.parametrize(("position_noise", "degrees"), [(0.01, 0.5), (0.03, 1.5)])
+def test_noise_is_found_and_taken_out(position_noise, degrees):
+    def speed(t):
+        return 0.5 + 0.4 * np.sin(0.6 * t)
+
+    def rate(t):
+        return 0.6 * np.sin(0.35 * t)
+
+    true, rotations = planar(TIMES, speed, rate)
+    positions, turned = noisy(true, rotations, position_noise, np.radians(degrees))
+    smoothed = smooth(track(TIMES, positions, turned))
+    assert smoothed.position_noise == pytest.approx(position_noise, rel=0.15)
+    assert smoothed.rotation_noise == pytest.approx(np.radians(degrees), rel=0.15)
+    inner = slice(20, -20)
+    assert (smoothed.motion.positions - true)[inner].std() < 0.35 * position_noise
+    assert (smoothed.motion.linear_velocities[:, 0] - speed(TIMES))[inner].std() < 2.0 * position_noise
+    assert (smoothed.motion.angular_velocities[:, 2] - rate(TIMES))[inner].std() < 2.0 * np.radians(degrees)
+
+
+def test_stated_noise_is_what_is_taken_out():
+    true, rotations = planar(TIMES, lambda t: 0.5 + 0 * t, lambda t: 0.3 * np.sin(0.5 * t))
+    positions, turned = noisy(true, rotations, 0.02, 0.01)
+    motion = track(TIMES, positions, turned)
+    smoothed = smooth(motion, position_noise=0.02, rotation_noise=0.01)
+    assert (smoothed.motion.positions - motion.positions).std() == pytest.approx(0.02, rel=0.05)
+    with pytest.raises(ValueError, match="position noise: got -1"):
+        smooth(motion, position_noise=-1.0)
+
+
+@pytest.mark.parametrize(
+    ("speed", "rate"), [(-0.6, 0.4), (0.0, 0.8), (0.0, 0.0), (0.5, -0.5)], ids=["reverse", "spin", "stand", "forward"]
+)
+def test_yaw_rate_is_right_whichever_way_the_robot_goes(speed, rate):
+    true, rotations = planar(TIMES, lambda t: speed + 0 * t, lambda t: rate + 0 * t)
+    positions, turned = noisy(true, rotations, 0.01, np.radians(0.5))
+    motion = smooth(track(TIMES, positions, turned)).motion
+    inner = slice(20, -20)
+    assert np.abs(motion.angular_velocities[inner, 2] - rate).max() < 0.06
+    assert np.abs(motion.linear_velocities[inner, 0] - speed).max() < 0.06
+    assert np.abs(motion.linear_velocities[inner, 1]).max() < 0.08
+
+
+def test_rates_in_base_axes_are_right_on_a_slope():
+    angles = np.stack([0.4 * TIMES, np.full(len(TIMES), 0.3), np.full(len(TIMES), -0.2)], axis=1)
+    rotations = Rotation.from_euler("ZYX", angles)
+    motion = smooth(track(TIMES, np.zeros((len(TIMES), 3)), rotations)).motion
+    expected = (rotations[:-1].inv() * rotations[1:]).as_rotvec() / 0.05
+    np.testing.assert_allclose(motion.angular_velocities[5:-5], expected[5:-4], atol=2e-3)
+
+
+def test_gaps_and_jumps_of_the_localisation_are_not_smoothed_over():
+    times = np.concatenate([np.arange(0, 10, 0.05), np.arange(15, 25, 0.05)])
+    positions = np.stack([0.5 * times, 0 * times, 0 * times], axis=1)
+    positions[300:] += 4.0
+    smoothed = smooth(track(times, positions, Rotation.identity(len(times))))
+    assert [(s.start, s.stop) for s in smoothed.stretches] == [(0, 200), (200, 300), (300, 400)]
+    np.testing.assert_allclose(smoothed.motion.positions, positions, atol=1e-6)
+    np.testing.assert_allclose(smoothed.motion.linear_velocities[:, 0], 0.5, atol=1e-6)
+
+
+def test_windows_carry_the_commands_before_them():
+    true, rotations = planar(TIMES, lambda t: 0.5 + 0 * t, lambda t: 0 * t)
+    changes = np.array([0.0, 3.9, 7.0])
+    commands = CommandTrack(
+        START + np.rint(changes * 1e9).astype(np.int64), np.array([[0.1, 0.0], [0.2, 0.3], [0.5, 0.0]])
+    )
+    windows = cut_windows(track(TIMES, true, rotations), commands, length=2.0, stride=1.0, history=1.5)
+    assert len(windows) == 38
+    assert windows.history == 150
+    assert windows.twists.shape == (38, 350, 2)
+    fifth = windows.twists[5]  # starts at 5 s: its history reaches back to 3.5 s, across the change at 3.9 s
+    assert (fifth[:40, 0] == 0.1).all()
+    assert (fifth[40:350, 0] == 0.2).all()
+    assert (windows.twists[0][:150] == 0.0).all()  # before the first command the robot stands
+    np.testing.assert_allclose(windows.positions[5, :, 0], 2.5 + 0.5 * windows.times, atol=1e-3)
+
+
+def test_windows_with_a_gap_are_left_out_and_none_at_all_is_an_error():
+    times = np.concatenate([np.arange(0, 10, 0.05), np.arange(12, 20, 0.05)])
+    motion = track(times, np.zeros((len(times), 3)), Rotation.identity(len(times)))
+    commands = CommandTrack(np.zeros(0, np.int64), np.zeros((0, 2)))
+    starts = [(s.stamp - START) * 1e-9 for s in cut_windows(motion, commands, length=3.0).starts]
+    assert starts == pytest.approx([0, 1, 2, 3, 4, 5, 6, 7, 12, 13, 14, 15, 16])
+    with pytest.raises(ValueError, match=r"got 20.0 s of odometry, expected at least 30 s"):
+        cut_windows(motion, commands, length=30.0)
+
+
+def test_samples_take_the_nearest_within_the_limit_and_nothing_beyond(tmp_path):
+    with BagWriter(tmp_path / "drive") as bag:
+        for i in range(40):
+            at = START + i * 50_000_000
+            if not 20 <= i < 32:
+                message = builders.odometry(at, "odom", "base_link", [i, 0, 0], [0, 0, 0, 1], [1, 0, 0], [0] * 3)
+                bag.write("/odom", message, at)
+        for i in range(10):
+            at = START + i * 200_000_000
+            bag.write("/left/image_raw", builders.image(at, "left", np.full((2, 2, 3), i, np.uint8)), at)
+            late = at + (30 if i < 5 else 90) * 1_000_000
+            bag.write("/right/image_raw", builders.image(late, "right", np.full((2, 2, 3), i, np.uint8)), late)
+            bag.write("/points", builders.point_cloud(at + 10_000_000, "lidar", np.ones((3, 3))), at + 10_000_000)
+    recording = Recording.open(tmp_path / "drive")
+    samples, missing = synchronise(recording, ["/left/image_raw", "/right/image_raw", "/points"])
+    assert len(samples) == 5
+    assert missing == {"/right/image_raw": 5}
+    assert samples[3].frames["/right/image_raw"].stamp - samples[3].stamp == 30_000_000
+    samples, missing = synchronise(recording, ["/left/image_raw"], limit=0.05, maximum_gap=0.1)
+    assert missing == {"odometry": 2}
+    with pytest.raises(ValueError, match="got topic /rear, expected one of"):
+        synchronise(recording, ["/rear"])
