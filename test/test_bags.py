@@ -113,9 +113,9 @@ def test_a_bag_without_metadata_is_read_and_said(tmp_path, storage):
     (path / "metadata.yaml").unlink()
     recording = Recording.open(path)
     assert "no usable index (there is no metadata.yaml)" in recording.complaints[0]
-    for recording in (recording, Recording.open(storage_file(path))):
-        assert len(recording.motion) == 20
-        assert recording.cloud(recording.clouds[7])[0][0, 0] == 8.0
+    for opened in (recording, Recording.open(storage_file(path))):
+        assert len(opened.motion) == 20
+        assert opened.cloud(opened.clouds[7])[0][0, 0] == 8.0
 
 
 def test_a_real_ros_1_bag_without_its_index_is_read(tmp_path, real_data):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -90,6 +91,26 @@ class Recording:
         message = self._read(frame)
         return decoding.decode_cloud(message), message.header.frame_id
 
+    def clouds_between(self, start: int, stop: int) -> Iterator[tuple[Frame, np.ndarray, str]]:
+        """Clouds with stamps from ``start`` to ``stop`` [ns] as :meth:`cloud` gives them, in one pass over the bag.
+
+        Clouds that cannot be decoded are left out.
+        """
+        frames = {frame.received: frame for frame in self.clouds if start <= frame.stamp <= stop}
+        if not frames:
+            return
+        topic = self.topics["cloud"]
+        with BagReader(self.path) as bag:
+            for message in bag.messages([topic], start=min(frames), stop=max(frames) + 1):
+                if message.received not in frames:
+                    continue
+                try:
+                    decoded = message.decode()
+                    points = decoding.decode_cloud(decoded)
+                except ValueError:
+                    continue
+                yield frames[message.received], points, decoded.header.frame_id
+
     def image(self, frame: Frame) -> np.ndarray:
         """RGB pixels ``[height, width, 3]`` of an image."""
         return decoding.decode_image(self._read(frame))
@@ -97,6 +118,27 @@ class Recording:
     def base_from(self, frame_id: str, base_frame: str) -> np.ndarray | None:
         """Pose ``[4, 4]`` of a sensor frame in the base frame by the bag's static transforms; None if unconnected."""
         return find_transform(self.static_transforms, base_frame, frame_id)
+
+    def sensor_pose(self, frame_id: str, base_frame: str, known: Mapping[str, object]) -> np.ndarray:
+        """Pose ``[4, 4]`` of a sensor in the base frame: from the bag's static transforms, else from ``known``.
+
+        Args:
+            frame_id: the sensor's frame.
+            base_frame: the robot's.
+            known: poses ``[4, 4]`` of a robot's sensors by frame, as its file gives them.
+
+        Raises:
+            BagError: neither knows the frame.
+        """
+        pose = self.base_from(frame_id, base_frame)
+        if pose is not None:
+            return pose
+        if frame_id in known:
+            return np.asarray(known[frame_id], np.float64)
+        raise BagError(
+            f"{self.path}: the pose of {frame_id!r} on the robot is neither in the bag's /tf_static nor in the robot "
+            f"file (known there: {sorted(known)})"
+        )
 
     def _read(self, frame: Frame):
         with BagReader(self.path) as bag:

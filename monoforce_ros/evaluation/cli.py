@@ -17,7 +17,6 @@ from monoforce_ros.evaluation.drive import (
     CONSTANT_VELOCITY,
     PHYSICS,
     EvaluationError,
-    base_from,
     evaluate_drive,
     predict_at,
 )
@@ -165,8 +164,8 @@ def camera_picture(recording: Recording, robot: RobotModel, stamp: int) -> figur
         if frame is None or abs(frame.stamp - stamp) > 200_000_000:
             continue
         try:
-            pose = base_from(recording, robot, camera.frame_id)
-        except EvaluationError:
+            pose = recording.sensor_pose(camera.frame_id, robot.base_frame, robot.sensors)
+        except BagError:
             continue
         if best is None or pose[0, 2] > best[0]:
             best = pose[0, 2], frame, camera, pose

@@ -185,7 +185,7 @@ def observe(
     if not image_topics:
         frame = min(recording.clouds, key=lambda entry: abs(entry.stamp - stamp))
         points, frame_id = recording.cloud(frame)
-        pose = base_from(recording, robot, frame_id)
+        pose = recording.sensor_pose(frame_id, robot.base_frame, robot.sensors)
         return Observation(stamp, cloud=transform_points(pose, points).astype(np.float32))
     images, cameras, poses = {}, {}, {}
     for topic in image_topics:
@@ -196,21 +196,8 @@ def observe(
             raise EvaluationError(f"{recording.path}: no CameraInfo beside {topic}")
         images[topic] = recording.image(frame)
         cameras[topic] = recording.cameras[topic]
-        poses[topic] = base_from(recording, robot, cameras[topic].frame_id)
+        poses[topic] = recording.sensor_pose(cameras[topic].frame_id, robot.base_frame, robot.sensors)
     return Observation(stamp, images=images, cameras=cameras, base_from_cameras=poses)
-
-
-def base_from(recording: Recording, robot: RobotModel, frame_id: str) -> np.ndarray:
-    """Pose ``[4, 4]`` of a sensor in the base frame: from the bag's static transforms, else from the robot file."""
-    pose = recording.base_from(frame_id, robot.base_frame)
-    if pose is not None:
-        return pose
-    if frame_id in robot.sensors:
-        return robot.sensors[frame_id].double().numpy()
-    raise EvaluationError(
-        f"the pose of {frame_id!r} on the robot is neither in the bag's /tf_static nor in the robot file "
-        f"(known there: {sorted(robot.sensors)})"
-    )
 
 
 def measured_poses(recording: Recording, motions: list[MotionState], times: np.ndarray) -> Poses:

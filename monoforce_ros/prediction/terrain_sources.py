@@ -73,7 +73,7 @@ class LidarTerrain:
         """Interpolated map; raises ``TerrainError`` where the cloud does not suffice."""
         if observation.cloud is None:
             raise ValueError("the lidar terrain source needs a point cloud, and the observation has none")
-        cloud = observation.cloud[~self._on_robot(observation.cloud)].astype(np.float64)
+        cloud = observation.cloud[~self.robot.covers(observation.cloud)].astype(np.float64)
         return terrain_from_cloud(
             transform_points(motion.terrain_from_base, cloud),
             self.grid,
@@ -81,13 +81,6 @@ class LidarTerrain:
             material=self.material,
             support=support_points(self.robot, motion, self.material.stiffness),
         )
-
-    def _on_robot(self, points: np.ndarray) -> np.ndarray:
-        """Returns from the robot's own body and from what is mounted on it or hangs over it."""
-        low, high = (bound.numpy() for bound in self.robot.bounds)
-        across = ((points[:, :2] > low[:2] - 0.1) & (points[:, :2] < high[:2] + 0.1)).all(axis=1)
-        # Returns from the ground under the body stay.
-        return across & (points[:, 2] > low[2] + 0.05)
 
 
 @dataclass(frozen=True)

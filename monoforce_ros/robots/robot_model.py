@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -88,6 +89,15 @@ class RobotModel:
     def bounds(self) -> tuple[Tensor, Tensor]:
         """Smallest and largest coordinates of the body's points [m], each ``[3]``."""
         return self.points.amin(dim=0), self.points.amax(dim=0)
+
+    def covers(self, points: np.ndarray) -> np.ndarray:
+        """Which points ``[n, 3]`` [m] (base frame) are the robot's own body, mounted on it or hang over it, ``[n]``.
+
+        Points on the ground below the body are not.
+        """
+        low, high = (bound.cpu().numpy() for bound in self.bounds)
+        across = ((points[:, :2] > low[:2] - 0.1) & (points[:, :2] < high[:2] + 0.1)).all(axis=1)
+        return across & (points[:, 2] > low[2] + 0.05)
 
     @property
     def ground_clearance(self) -> float:

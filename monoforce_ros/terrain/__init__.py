@@ -1,7 +1,19 @@
 """Terrain maps: what they hold, how they come from lidar, and how they are stored."""
 
+from monoforce_ros.terrain.accumulation import accumulate
+from monoforce_ros.terrain.files import TerrainFileError, load_terrain, save_terrain
 from monoforce_ros.terrain.grid import Grid
 from monoforce_ros.terrain.lidar import LidarSettings, terrain_from_cloud
 from monoforce_ros.terrain.terrain_map import TerrainDefaults, TerrainMap
 
-__all__ = ["Grid", "LidarSettings", "TerrainDefaults", "TerrainMap", "terrain_from_cloud"]
+__all__ = [
+    "Grid",
+    "LidarSettings",
+    "TerrainDefaults",
+    "TerrainFileError",
+    "TerrainMap",
+    "accumulate",
+    "load_terrain",
+    "save_terrain",
+    "terrain_from_cloud",
+]

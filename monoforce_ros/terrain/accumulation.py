@@ -1,0 +1,61 @@
+"""Accumulation: several lidar sweeps along a drive as one cloud in one frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from monoforce_ros.motion import transform_points
+
+VOXEL = 0.1
+"""Edge of the cubes in which a return looks for company [m]."""
+_LARGEST_INDEX = 1 << 20
+
+
+def accumulate(
+    sweeps: Iterable[tuple[np.ndarray, np.ndarray]], *, maximum_range: float = 12.0, minimum_returns: int = 3
+) -> np.ndarray:
+    """Join sweeps, each from its own pose, and leave out what is alone.
+
+    A return whose cube and the 26 around it hold fewer than ``minimum_returns`` of all sweeps together is dust, a
+    raindrop or the edge of a beam that hit two things.
+
+    Args:
+        sweeps: returns ``[n, 3]`` [m] in the base frame, without the robot's own body, and the pose ``[4, 4]`` of the
+            base frame in the frame to join them in, in which z points against gravity.
+        maximum_range: returns further from the robot are left out: errors of its attitude lift them [m].
+        minimum_returns: in a return's neighbourhood, itself included.
+
+    Returns:
+        ``[m, 3]`` [m], float64.
+    """
+    joined = []
+    for points, pose in sweeps:
+        points = np.asarray(points, np.float64)
+        points = points[np.isfinite(points).all(axis=1)]
+        points = points[np.linalg.norm(points, axis=1) < maximum_range]
+        joined.append(transform_points(np.asarray(pose, np.float64), points))
+    cloud = np.concatenate(joined) if joined else np.zeros((0, 3))
+    if not len(cloud):
+        return cloud
+    return cloud[company(cloud, VOXEL) >= minimum_returns]
+
+
+def company(points: np.ndarray, voxel: float) -> np.ndarray:
+    """How many points share the cube of each one, or touch it, itself included, ``[n]``."""
+    index = np.floor((points - points.min(axis=0)) / voxel).astype(np.int64) + 1
+    if (index >= _LARGEST_INDEX).any():
+        raise ValueError(f"points: spread over {np.ptp(points, axis=0).max():.0f} m, too far for cubes of {voxel} m")
+    keys, inverse, counts = np.unique(_key(index), return_inverse=True, return_counts=True)
+    cubes = np.stack([keys >> 40, (keys >> 20) & (_LARGEST_INDEX - 1), keys & (_LARGEST_INDEX - 1)], axis=1)
+    around = np.zeros(len(keys), np.int64)
+    for offset in np.stack(np.meshgrid(*[[-1, 0, 1]] * 3), axis=-1).reshape(-1, 3):
+        wanted = _key(cubes + offset)
+        place = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+        around += np.where(keys[place] == wanted, counts[place], 0)
+    return around[inverse]
+
+
+def _key(index: np.ndarray) -> np.ndarray:
+    return (index[:, 0] << 40) | (index[:, 1] << 20) | index[:, 2]

@@ -1,0 +1,343 @@
+"""Terrain fit: the ground that explains a driven trajectory, by gradient descent through the rollout (paper III-F)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+from torch.nn import functional
+
+from monoforce_ros.bags import Windows, cut_windows
+from monoforce_ros.motion import CommandTrack, MotionTrack, homogeneous, transform_points
+from monoforce_ros.physics import PhysicsOptions, State, rollout
+from monoforce_ros.physics.effects import drive_speeds
+from monoforce_ros.physics.rest import rest_depth
+from monoforce_ros.robots import RobotModel
+from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap
+from monoforce_ros.terrain.lidar import fill_holes
+
+_SAMPLE_TIME = 0.1
+# How far a prediction may be off before it weighs: along the ground, where slip decides, up, and in rotation.
+_ACROSS, _UP, _TURN = 0.15, 0.01, np.radians(0.7)
+_FRICTION_TRUST = 0.3
+"""Weight of the square of local changes in the logarithm of friction."""
+_BLEND = 0.6
+"""Distance from the wheels' track at which what is seen takes over from what was felt [m]."""
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """How terrain is fitted."""
+
+    chunk: float = 1.0
+    """Length of the pieces that are predicted from measured states [s]."""
+    iterations: int = 60
+    """Steps of the descent."""
+    step: float = 0.004
+    """First step in height [m]; it falls to a tenth."""
+    margin: float = 2.0
+    """Of the map around the trajectory [m]."""
+    resolution: float = 0.1
+    """[m]."""
+    smoothness: float = 0.3
+    """Weight of the fitted change's curvature."""
+    trust: float = 0.3
+    """Weight of the fitted change's square: how far the traced surface is trusted where the motion has other reasons
+    than the ground's shape, such as slipping."""
+    friction: bool = False
+    """Fit friction too."""
+    friction_step: float = 0.03
+    """First step in the logarithm of friction."""
+
+    def __post_init__(self):
+        for name, low, high in (
+            ("chunk", 0.2, 5.0),
+            ("iterations", 0, 10_000),
+            ("step", 1e-5, 0.1),
+            ("margin", 0.5, 20.0),
+            ("resolution", 0.02, 0.5),
+            ("smoothness", 0.0, 1e6),
+            ("trust", 0.0, 1e6),
+            ("friction_step", 1e-4, 1.0),
+        ):
+            if not low <= getattr(self, name) <= high:
+                raise ValueError(f"fit setting {name}: got {getattr(self, name)}, expected {low:g} to {high:g}")
+
+
+@dataclass(frozen=True)
+class TerrainFit:
+    """Fitted terrain and how well it explains the motion."""
+
+    terrain: TerrainMap
+    """``height`` is H_t*, ``geometric_height`` what was seen (or H_t* again), ``friction`` fitted if asked for."""
+    felt: np.ndarray
+    """Cells that wheels or tracks stood on, ``[rows, columns]`` bool: where H_t* is known."""
+    odometry_from_terrain: np.ndarray
+    """Pose ``[4, 4]`` of the map."""
+    losses: np.ndarray
+    """Of each step of the descent."""
+    times: np.ndarray
+    """Of the samples within a chunk [s], ``[K]``."""
+    measured: np.ndarray
+    """Positions in the map's frame [m], ``[chunks, K, 3]``."""
+    predicted: np.ndarray
+    """By the fitted terrain, ``[chunks, K, 3]``."""
+    before: np.ndarray
+    """Height error of predictions on the visible terrain at the end of each chunk [m], ``[chunks]``."""
+    after: np.ndarray
+    """The same on the fitted terrain, ``[chunks]``."""
+
+
+def trajectory_frame(motion: MotionTrack, start: int) -> np.ndarray:
+    """Pose ``[4, 4]`` odometry ← map: at the robot at ``start`` [ns], x along its heading, z against gravity."""
+    return motion.at(start).odometry_from_terrain
+
+
+def trajectory_grid(motion: MotionTrack, start: int, length: float, settings: FitSettings) -> Grid:
+    """A grid in the trajectory's frame that holds it and a margin."""
+    local = _positions(motion, start, length)[:, :2]
+    low = np.floor((local.min(axis=0) - settings.margin) / settings.resolution)
+    high = np.ceil((local.max(axis=0) + settings.margin) / settings.resolution)
+    columns, rows = (high - low + 1).astype(int)
+    origin = low * settings.resolution
+    return Grid(int(rows), int(columns), settings.resolution, (float(origin[0]), float(origin[1])))
+
+
+def fit_terrain(
+    motion: MotionTrack,
+    commands: CommandTrack,
+    robot: RobotModel,
+    *,
+    start: int,
+    length: float = 10.0,
+    visible: TerrainMap | None = None,
+    material: TerrainDefaults = TerrainDefaults(),  # noqa: B008  (frozen)
+    settings: FitSettings = FitSettings(),
+    backend: str = "auto",
+    progress: Callable[[], None] = lambda: None,
+) -> TerrainFit:
+    """Fit heights, and friction if asked for, to a driven trajectory.
+
+    The map starts as the surface that the wheels' tracks trace, joined to what is visible beside them. Chunks of the
+    trajectory are rolled out from measured states, all at once; the map moves against the gradient of how far they
+    end from what was measured. The change is smooth over neighbouring cells and touches the tracks' surroundings only.
+
+    Args:
+        motion: measured, best smoothed (:func:`monoforce_ros.bags.smooth`).
+        commands: recorded.
+        robot: what drove.
+        start: of the trajectory [ns].
+        length: of the trajectory [s].
+        visible: what was seen, on :func:`trajectory_grid`; without it only the tracks shape the map.
+        material: stiffness, damping and first friction of the ground.
+        settings: of the descent.
+        backend: of the rollout.
+        progress: called after each step of the descent.
+
+    Raises:
+        ValueError: there is no odometry for one chunk, or ``visible`` lies on another grid.
+    """
+    grid = trajectory_grid(motion, start, length, settings) if visible is None else visible.grid
+    pose = trajectory_frame(motion, start)
+    local = _within(motion, start, length)
+    windows = cut_windows(
+        local, commands, length=settings.chunk, stride=settings.chunk, sample_time=_SAMPLE_TIME, maximum_gap=0.5
+    )
+    traced, felt = _trace(local, robot, pose, grid, material.stiffness)
+    first = _first_guess(traced, felt, visible)
+    seen = first if visible is None else visible.geometric_height.numpy()
+    chunks = _Chunks(windows, robot, pose)
+    terrain = TerrainMap.from_height(
+        torch.from_numpy(first.astype(np.float32)),
+        grid,
+        geometric_height=torch.from_numpy(np.asarray(seen, np.float32)),
+        observed=torch.from_numpy(felt),
+        material=material,
+    )
+    if visible is not None:
+        terrain = replace(terrain, observed=terrain.observed | visible.observed)
+    before = chunks.roll_out(visible if visible is not None else terrain, backend)
+    terrain, losses = _descend(terrain, chunks, felt, settings, backend, progress)
+    after = chunks.roll_out(terrain, backend)
+    measured = chunks.positions.numpy()
+    return TerrainFit(
+        terrain=terrain,
+        felt=felt,
+        odometry_from_terrain=pose,
+        losses=np.array(losses),
+        times=windows.times,
+        measured=measured,
+        predicted=after[0].numpy(),
+        before=np.abs(before[0].numpy()[:, -1, 2] - measured[:, -1, 2]),
+        after=np.abs(after[0].numpy()[:, -1, 2] - measured[:, -1, 2]),
+    )
+
+
+class _Chunks:
+    """Pieces of a trajectory in the map's frame, ready to be rolled out."""
+
+    def __init__(self, windows: Windows, robot: RobotModel, pose: np.ndarray):
+        turn = pose[:3, :3].T
+
+        def tensor(values: np.ndarray) -> Tensor:
+            return torch.as_tensor(np.ascontiguousarray(values), dtype=torch.float32)
+
+        self.robot = robot
+        self.options = PhysicsOptions()
+        self.positions = tensor((windows.positions - pose[:3, 3]) @ turn.T)
+        self.rotations = tensor(turn @ windows.rotations)
+        self.index = torch.from_numpy(np.rint(windows.times / self.options.time_step).astype(np.int64))
+        rotation = (turn @ windows.rotations)[:, 0]
+        self.state = State(
+            position=self.positions[:, 0].clone(),
+            rotation=self.rotations[:, 0].clone(),
+            velocity=tensor((rotation @ windows.velocities[:, 0, :, None])[..., 0]),
+            angular_velocity=tensor((rotation @ windows.angular_velocities[:, 0, :, None])[..., 0]),
+        )
+        with torch.no_grad():
+            self.speeds = drive_speeds(robot, tensor(windows.twists), self.options.time_step, history=windows.history)
+
+    def roll_out(self, terrain: TerrainMap, backend: str) -> tuple[Tensor, Tensor]:
+        """Positions ``[chunks, K, 3]`` and rotations ``[chunks, K, 3, 3]`` at the sampled times."""
+        result = rollout(
+            terrain, self.robot, self.speeds, self.state, options=self.options, with_forces=False, backend=backend
+        )
+        return result.position[:, self.index], result.rotation[:, self.index]
+
+    def loss(self, terrain: TerrainMap, backend: str) -> Tensor:
+        """How far predictions are from what was measured, in units of what may be ignored; robust to slips."""
+        positions, rotations = self.roll_out(terrain, backend)
+        away = positions[:, 1:] - self.positions[:, 1:]
+        # Half the antisymmetric part of R_measuredᵀ R is the rotation vector between them, for small angles.
+        relative = self.rotations[:, 1:].transpose(-1, -2) @ rotations[:, 1:]
+        turns = 0.5 * torch.stack(
+            [relative[..., 2, 1] - relative[..., 1, 2], relative[..., 0, 2] - relative[..., 2, 0]], dim=-1
+        )
+        scaled = torch.cat([away[..., :2] / _ACROSS, away[..., 2:] / _UP, turns / _TURN], dim=-1)
+        per_sample = functional.huber_loss(scaled, torch.zeros_like(scaled), reduction="none", delta=3.0)
+        finite = torch.isfinite(per_sample)
+        return torch.where(finite, per_sample, 0.0).sum() / finite.sum().clamp_min(1)
+
+
+def _descend(
+    terrain: TerrainMap,
+    chunks: _Chunks,
+    felt: np.ndarray,
+    settings: FitSettings,
+    backend: str,
+    progress: Callable[[], None],
+) -> tuple[TerrainMap, list[float]]:
+    near = torch.from_numpy((distance_transform_edt(~felt) * settings.resolution < _BLEND).astype(np.float32))
+    change = torch.zeros_like(terrain.height, requires_grad=True)
+    groups = [{"params": [change], "lr": settings.step}]
+    # Friction changes as a whole, and from place to place where the motion asks for it.
+    logarithm, local = torch.zeros((), requires_grad=True), torch.zeros_like(terrain.height, requires_grad=True)
+    if settings.friction:
+        groups.append({"params": [logarithm, local], "lr": settings.friction_step})
+    optimiser = torch.optim.Adam(groups, betas=(0.8, 0.98))
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, max(1, settings.iterations), 0.1 * settings.step)
+    kernel, wide = _kernel(1.2), _kernel(4.0)
+
+    def current() -> TerrainMap:
+        changed = {"height": terrain.height + near * _spread(change, kernel)}
+        if settings.friction:
+            changed["friction"] = terrain.friction * torch.exp(logarithm + near * _spread(local, wide)).clamp(0.1, 3.0)
+        return replace(terrain, **changed)
+
+    losses: list[float] = []
+    best, least = current(), np.inf
+    for _ in range(settings.iterations):
+        optimiser.zero_grad()
+        candidate = current()
+        data = chunks.loss(candidate, backend)
+        added = candidate.height - terrain.height
+        curvature = functional.conv2d(added[None, None] / _UP, _LAPLACE)[0, 0]
+        prior = settings.smoothness * (curvature**2).sum() + settings.trust * ((added / _UP) ** 2).sum()
+        prior = prior + _FRICTION_TRUST * (local**2).sum()
+        loss = data + prior / max(1.0, float(near.sum()))
+        loss.backward()
+        losses.append(float(loss.detach()))
+        if losses[-1] < least:
+            best, least = _detached(candidate), losses[-1]
+        optimiser.step()
+        schedule.step()
+        progress()
+    return _detached(best), losses
+
+
+_LAPLACE = torch.tensor([[[[0.0, 0.25, 0.0], [0.25, -1.0, 0.25], [0.0, 0.25, 0.0]]]])
+
+
+def _kernel(deviation: float) -> Tensor:
+    reach = round(3 * deviation)
+    weights = torch.exp(-0.5 * (torch.arange(-reach, reach + 1) / deviation) ** 2)
+    return weights / weights.sum()
+
+
+def _spread(values: Tensor, kernel: Tensor) -> Tensor:
+    """A map blurred by a Gaussian: gradients of single cells move their neighbours along."""
+    reach = len(kernel) // 2
+    rows = functional.conv2d(values[None, None], kernel[None, None, None], padding=(0, reach))
+    return functional.conv2d(rows, kernel[None, None, :, None], padding=(reach, 0))[0, 0]
+
+
+def _detached(terrain: TerrainMap) -> TerrainMap:
+    return replace(terrain, height=terrain.height.detach(), friction=terrain.friction.detach())
+
+
+def _within(motion: MotionTrack, start: int, length: float) -> MotionTrack:
+    keep = (motion.stamps >= start) & (motion.stamps <= start + round(length * 1e9))
+    if keep.sum() < 2:
+        raise ValueError(f"trajectory: got {int(keep.sum())} poses in {length:g} s from {start}, expected at least 2")
+    return replace(
+        motion,
+        stamps=motion.stamps[keep],
+        positions=motion.positions[keep],
+        quaternions=motion.quaternions[keep],
+        linear_velocities=motion.linear_velocities[keep],
+        angular_velocities=motion.angular_velocities[keep],
+    )
+
+
+def _positions(motion: MotionTrack, start: int, length: float) -> np.ndarray:
+    return transform_points(np.linalg.inv(trajectory_frame(motion, start)), _within(motion, start, length).positions)
+
+
+def _trace(
+    motion: MotionTrack, robot: RobotModel, pose: np.ndarray, grid: Grid, stiffness: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Heights that the undersides of wheels and tracks pass over ``[rows, columns]`` [m], and which cells they do."""
+    underside = robot.points[robot.point_tangents[:, 0] < -0.97].double().numpy()
+    inverse = np.linalg.inv(pose)
+    rotations = Rotation.from_quat(motion.quaternions).as_matrix()
+    places = [
+        transform_points(inverse @ homogeneous(rotation, position), underside)
+        for rotation, position in zip(rotations, motion.positions, strict=True)
+    ]
+    points = np.concatenate(places)
+    rows, columns, inside = grid.cells(points[:, :2])
+    flat, heights = (rows * grid.columns + columns)[inside], points[inside, 2]
+    order = np.lexsort((heights, flat))
+    flat, heights = flat[order], heights[order]
+    starts = np.flatnonzero(np.r_[True, flat[1:] != flat[:-1]])
+    counts = np.diff(np.r_[starts, len(flat)])
+    traced = np.zeros((grid.rows, grid.columns))
+    # A wheel may hang in the air over a cell that another one stands on: the ground is where the lower ones were.
+    traced.ravel()[flat[starts]] = heights[starts + counts // 4] + rest_depth(robot, stiffness)
+    felt = np.zeros((grid.rows, grid.columns), bool)
+    felt.ravel()[flat[starts]] = True
+    return traced, felt
+
+
+def _first_guess(traced: np.ndarray, felt: np.ndarray, visible: TerrainMap | None) -> np.ndarray:
+    """The traced surface, and away from it what is visible."""
+    if visible is None:
+        return fill_holes(traced, felt)
+    away = distance_transform_edt(~felt) * visible.grid.resolution > _BLEND
+    known = felt | (away & visible.observed.numpy())
+    return fill_holes(np.where(felt, traced, visible.geometric_height.numpy()), known)
