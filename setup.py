@@ -51,6 +51,7 @@ setup(
             "bag_recorder = monoforce_ros.nodes.bag_recorder:main",
             "synthesize = monoforce_ros.synthetic.cli:main",
             "evaluate = monoforce_ros.evaluation.cli:main",
+            "convert = monoforce_ros.datasets.cli:main",
             "fit_terrain = monoforce_ros.training.fit_cli:main",
         ],
     },

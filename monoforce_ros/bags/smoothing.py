@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import BSpline, make_smoothing_spline
-from scipy.optimize import brentq
+from scipy.optimize import brentq, minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.motion import NANOSECOND, MotionTrack
@@ -16,6 +16,9 @@ LARGEST_GAP = 1.0
 """Poses further apart in time are not smoothed together [s]."""
 FASTEST = 15.0
 """A larger speed between neighbouring poses is a jump of the localisation, not motion [m/s]."""
+_PIECE, _PIECES = 400, 3
+_EXPONENTS = (-9.0, 4.0)
+"""Decimal logarithm of the weight of curvature [m² s³ or rad² s³ per squared residual] that is tried."""
 SHORTEST = 8
 """Poses that a stretch needs to be smoothed; shorter ones are left as they are."""
 
@@ -40,8 +43,9 @@ def smooth(
     """Smooth a recorded motion.
 
     Each coordinate and each angle becomes a cubic smoothing spline over time (Reinsch 1967); how smooth is found by
-    generalised cross-validation (Craven and Wahba 1978) unless the noise is stated. Yaw is unwrapped first, so that
-    its rate is right when the robot reverses, stands or turns on the spot, where the direction of its path is not.
+    cross-validation, every other pose against the curve through the rest, unless the noise is stated. Yaw is unwrapped
+    first, so that its rate is right when the robot reverses, stands or turns on the spot, where the direction of its
+    path is not.
 
     Args:
         motion: recorded poses; their velocities are not used.
@@ -123,7 +127,10 @@ def _fit(times: np.ndarray, values: np.ndarray, rates: np.ndarray, noise: float 
     if np.abs(centred).max() < 1e-12:
         rates[:] = 0.0
         return 0.0, 0.0
-    spline = make_smoothing_spline(times, centred) if noise is None else _with_noise(times, centred, noise)
+    if noise is None:
+        spline = make_smoothing_spline(times, centred, lam=_penalty(times, centred))
+    else:
+        spline = _with_noise(times, centred, noise)
     residuals = centred - spline(times)
     values[:] = values - residuals
     rates[:] = spline.derivative()(times)
@@ -132,13 +139,34 @@ def _fit(times: np.ndarray, values: np.ndarray, rates: np.ndarray, noise: float 
     return float((residuals**2).sum()), freedom
 
 
+def _penalty(times: np.ndarray, values: np.ndarray) -> float:
+    """The weight of curvature that predicts left-out poses best, from a few pieces of the stretch."""
+    count = min(_PIECES, max(1, len(times) // _PIECE))
+    starts = np.linspace(0, max(0, len(times) - _PIECE), count).astype(int)
+    pieces = [slice(start, start + _PIECE) for start in starts]
+
+    def error(exponent: float) -> float:
+        total = 0.0
+        for piece in pieces:
+            at, shown = times[piece], values[piece]
+            for kept, left in ((slice(0, None, 2), slice(1, -1, 2)), (slice(1, None, 2), slice(2, -1, 2))):
+                curve = make_smoothing_spline(at[kept], shown[kept], lam=10.0**exponent)
+                total += float(((curve(at[left]) - shown[left]) ** 2).sum())
+        return total
+
+    if len(times) < 2 * SHORTEST:
+        return 1e-3
+    found = minimize_scalar(error, bounds=_EXPONENTS, method="bounded", options={"xatol": 0.1})
+    return float(10.0**found.x)
+
+
 def _with_noise(times: np.ndarray, values: np.ndarray, noise: float) -> BSpline:
     """The smoothest curve whose residuals have the stated standard deviation."""
 
     def excess(exponent: float) -> float:
         return float(np.std(values - make_smoothing_spline(times, values, lam=10.0**exponent)(times)) - noise)
 
-    low, high = -9.0, 4.0
+    low, high = _EXPONENTS
     if excess(low) >= 0.0:
         return make_smoothing_spline(times, values, lam=10.0**low)
     if excess(high) <= 0.0:

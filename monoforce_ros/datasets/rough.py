@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from monoforce_ros.bags import BagWriter, builders
 from monoforce_ros.camera import CameraModel
+from monoforce_ros.datasets.dataset import DatasetError, odometry_message
 from monoforce_ros.motion import NANOSECOND, MotionTrack, homogeneous
 from monoforce_ros.robots import robot_file
 
@@ -25,10 +26,6 @@ BASE_FRAME = "base_link"
 MAXIMUM_POSE_GAP = 0.2
 """Largest distance in time between a cloud and a pose that may be taken for its own [s]."""
 MAXIMUM_CLOUD_BYTES = 500_000_000
-
-
-class DatasetError(ValueError):
-    """A dataset folder that lacks something or holds something unusable; the message names the file."""
 
 
 @dataclass(frozen=True)
@@ -200,7 +197,7 @@ def scene_to_bag(
     for index in range(len(motion)):
         at = int(motion.stamps[index])
         if stamp - 10**9 <= at <= stamp + seconds * 1e9:
-            messages.append((at, "/odom", _odometry(motion, index)))
+            messages.append((at, "/odom", odometry_message(motion, index)))
     for at in range(stamp - 10**9, stamp + int(seconds * 1e9), 50_000_000):
         messages.append((at, "/cmd_vel", builders.twist_stamped(at, BASE_FRAME, *twist)))
     for name, pixels in scene.images(stamp).items():
@@ -233,18 +230,6 @@ def robot_file_for(scene: RoughScene, robot: str | Path, out: str | Path) -> Pat
     out = Path(out)
     out.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
     return out
-
-
-def _odometry(motion: MotionTrack, index: int):
-    return builders.odometry(
-        int(motion.stamps[index]),
-        motion.frame_id,
-        motion.child_frame_id,
-        motion.positions[index],
-        motion.quaternions[index],
-        motion.linear_velocities[index],
-        motion.angular_velocities[index],
-    )
 
 
 def _camera_info(stamp: int, frame_id: str, camera: CameraModel):

@@ -13,6 +13,7 @@ import torch
 from monoforce_ros.bags import BagError, Recording
 from monoforce_ros.encoder import CheckpointError, load_encoder
 from monoforce_ros.evaluation import figures
+from monoforce_ros.evaluation.check import check_bag, check_text
 from monoforce_ros.evaluation.drive import (
     CONSTANT_VELOCITY,
     PHYSICS,
@@ -53,6 +54,11 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--friction", type=float, default=TerrainDefaults.friction, help="ground friction (default 0.8)"
     )
+    parser.add_argument(
+        "--check",
+        action="store_true",
+        help="only say what the bag holds, what is missing, its rates, gaps, clocks and frames; status 1 if unusable",
+    )
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     return parser
 
@@ -66,6 +72,10 @@ def main(arguments: list[str] | None = None) -> int:
     if not 0 <= options.friction <= 3:
         parser.error(f"--friction: got {options.friction}, expected 0 to 3")
     try:
+        if options.check:
+            check = check_bag(options.bag or share_directory() / "bags" / "demo", load_robot(options.robot))
+            print(check_text(check))
+            return int(not check.usable)
         run(options)
     except (BagError, CheckpointError, EffectError, EvaluationError, MessageError, RobotFileError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)

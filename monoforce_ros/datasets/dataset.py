@@ -1,0 +1,23 @@
+"""What loaders of other people's folders share."""
+
+from __future__ import annotations
+
+from monoforce_ros.bags import builders
+from monoforce_ros.motion import MotionTrack
+
+
+class DatasetError(ValueError):
+    """A dataset folder that lacks something or holds something unusable; the message names the file."""
+
+
+def odometry_message(motion: MotionTrack, index: int):
+    """``nav_msgs/Odometry`` of one state of a motion."""
+    return builders.odometry(
+        int(motion.stamps[index]),
+        motion.frame_id,
+        motion.child_frame_id,
+        motion.positions[index],
+        motion.quaternions[index],
+        motion.linear_velocities[index],
+        motion.angular_velocities[index],
+    )

@@ -1,0 +1,356 @@
+"""DRIVE: commands and measured motion of Clearpath robots (github.com/norlab-ulaval/DRIVE).
+
+Two forms are read: ``.npz`` files of 2 s windows at 20 Hz, three to a command that is held for 6 s, and continuous
+``.csv(.gz)`` logs. Their traps are met by what the data show: the gyro's sign and the delay of the lidar's poses are
+found by comparing both, poses that are only repeated until the next one comes are left out, and windows are joined by
+their order and masks.
+"""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from monoforce_ros.bags import BagWriter, builders, smooth
+from monoforce_ros.datasets.dataset import DatasetError, odometry_message
+from monoforce_ros.motion import MotionTrack
+
+WHEEL_RADIUS, TRACK_WIDTH = 0.3, 1.08
+"""Of the Warthog that recorded the data [m]."""
+BASE_FRAME = "base_link"
+START_STAMP = 1_700_000_000 * 10**9
+"""Stamp of the first sample of windows, which carry no time of their own [ns]."""
+PAUSE = 4.0
+"""Time between runs of windows in a bag [s]: longer than any gap that is interpolated over."""
+LARGEST_FILE = 1_000_000_000
+"""Bytes of unpacked data beyond which a file is not read."""
+
+_FIELDS = (
+    "cmd_left", "cmd_right", "left_wheel_vel", "right_wheel_vel", "icp_x", "icp_y", "icp_z", "icp_roll", "icp_pitch",
+    "icp_yaw", "imu_yaw_rate",
+)  # fmt: skip
+_COLUMNS = (
+    "ros_time", "meas_left_vel", "meas_right_vel", "cmd_vel_x", "cmd_vel_omega", "icp_pos_x", "icp_pos_y",
+    "icp_pos_z", "icp_quat_x", "icp_quat_y", "icp_quat_z", "icp_quat_w", "imu_z",
+)  # fmt: skip
+_LONGEST_REPEAT = 0.25
+_LAGS = np.arange(-10, 61) * 0.05
+"""Delays that are tried [s]."""
+_LONG_RUN, _TRANSIENT = 20.0, 3.0
+"""Runs shorter than this hold one command, and most of their turning changes within this time [s]."""
+_FASTEST_TURN = 2.5
+_WEAKEST = 0.5
+"""Correlation below which nothing is concluded."""
+
+
+@dataclass(frozen=True)
+class DriveRun:
+    """Samples without an interruption."""
+
+    stamps: np.ndarray
+    """``[n]`` int64 [ns], evenly spaced."""
+    twists: np.ndarray
+    """Commanded forward speed [m/s] and yaw rate [rad/s], ``[n, 2]``."""
+    wheels: np.ndarray
+    """Measured speeds of the left and right wheels [rad/s], ``[n, 2]``."""
+    positions: np.ndarray
+    """By the lidar's localisation, ``[n, 3]`` [m]."""
+    quaternions: np.ndarray
+    """``[n, 4]`` x, y, z, w."""
+    gyro: np.ndarray
+    """Yaw rate as recorded, of unknown sign, ``[n]`` [rad/s]."""
+
+
+@dataclass(frozen=True)
+class ClockFinding:
+    """What comparing the lidar's headings with the gyro shows."""
+
+    gyro_sign: int
+    """1, or -1 where the gyro is mounted upside down; 0 where the data do not tell."""
+    pose_delay: float
+    """How late the poses are against the gyro [s]; NaN where the data do not tell."""
+    correlation: float
+    """Between both yaw rates at this delay, 0 to 1."""
+
+
+@dataclass(frozen=True)
+class DriveRecording:
+    """One file of the dataset."""
+
+    path: Path
+    runs: tuple[DriveRun, ...]
+    steady: np.ndarray | None = None
+    """Of windows: which of them are steady, ``[windows]`` bool, in the order of the file."""
+
+    @classmethod
+    def open(cls, path: str | Path) -> DriveRecording:
+        """Read a file of windows or a continuous log, by its ending.
+
+        Raises:
+            DatasetError: the file is missing, too large, damaged, or of another layout.
+        """
+        path = Path(path)
+        if not path.is_file():
+            raise DatasetError(f"{path}: no such file; expected .npz windows or a .csv or .csv.gz log of DRIVE")
+        if path.suffix == ".npz":
+            return _open_windows(path)
+        if path.name.endswith((".csv", ".csv.gz")):
+            return _open_log(path)
+        raise DatasetError(f"{path}: got {path.suffix or 'no ending'}, expected .npz, .csv or .csv.gz")
+
+    def clocks(self) -> ClockFinding:
+        """Find the gyro's sign and how late the poses are, from the turns of all runs.
+
+        All delays are compared over the same samples of the poses; before and after a run the gyro is taken to go on as
+        at its ends, where commands were held. The steady part of a run tells no delay and is left out.
+        """
+        shown = [pair for pair in map(_yaw_rates, self.runs) if pair is not None]
+        products = np.zeros(len(_LAGS))
+        energies = np.zeros((2, len(_LAGS)))
+        for pose, gyro, step in shown:
+            shifts = np.rint(_LAGS / step).astype(int)
+            reach = int(np.abs(shifts).max())
+            padded = np.pad(gyro, reach, mode="edge")
+            count = len(pose) if len(pose) * step > _LONG_RUN else min(len(pose), round(_TRANSIENT / step))
+            own = pose[:count]
+            for index, shift in enumerate(shifts):
+                other = padded[reach - shift : reach - shift + count]
+                products[index] += float(own @ other)
+                energies[:, index] += float(own @ own), float(other @ other)
+        scale = np.sqrt(energies[0] * energies[1])
+        if not len(shown) or scale.max() < 0.2:
+            return ClockFinding(0, float("nan"), 0.0)
+        correlations = products / np.maximum(scale, 1e-9)
+        best = int(np.argmax(np.abs(correlations)))
+        strength = float(abs(correlations[best]))
+        if strength < _WEAKEST:
+            return ClockFinding(0, float("nan"), strength)
+        return ClockFinding(1 if correlations[best] > 0 else -1, float(_LAGS[best]), strength)
+
+
+def drive_to_bag(
+    recording: DriveRecording,
+    out: str | Path,
+    *,
+    correct_delay: bool = False,
+    storage: str = "mcap",
+    overwrite: bool = False,
+) -> list[str]:
+    """Write a recording as a bag: commands, odometry, wheel speeds and yaw rate.
+
+    Velocities of the odometry are those of its smoothed poses. Runs of windows follow each other with a pause, and
+    each starts at the origin.
+
+    Args:
+        recording: the file.
+        out: folder of the bag.
+        correct_delay: stamp the poses as early as the gyro says; else they stay as late as they were recorded.
+        storage: ``mcap`` or ``sqlite3``.
+        overwrite: replace an existing bag.
+
+    Returns:
+        remarks on what was found and changed.
+    """
+    clocks = recording.clocks()
+    remarks = []
+    if clocks.gyro_sign == 0:
+        remarks.append("whether the gyro is upside down cannot be told: it does not follow the poses' headings")
+    else:
+        remarks.append(
+            f"the poses are {clocks.pose_delay:.2f} s late against the gyro (correlation {clocks.correlation:.2f}); "
+            + ("their stamps are corrected" if correct_delay else "their stamps are left as recorded")
+        )
+        if clocks.gyro_sign < 0:
+            remarks.append("the gyro turns the other way than the poses: its sign is corrected")
+    shift = round(1e9 * clocks.pose_delay) if correct_delay and clocks.gyro_sign else 0
+    messages: list[tuple[int, str, object]] = []
+    for run in recording.runs:
+        fresh = _fresh_poses(run)
+        motion = smooth(
+            MotionTrack(
+                stamps=run.stamps[fresh] - shift,
+                positions=run.positions[fresh],
+                quaternions=run.quaternions[fresh],
+                linear_velocities=np.zeros((int(fresh.sum()), 3)),
+                angular_velocities=np.zeros((int(fresh.sum()), 3)),
+                frame_id="odom",
+                child_frame_id=BASE_FRAME,
+            )
+        ).motion
+        # Poses as they were recorded; only their velocities, which were not, come from the smooth motion.
+        motion = MotionTrack(
+            motion.stamps, run.positions[fresh], run.quaternions[fresh], motion.linear_velocities,
+            motion.angular_velocities, "odom", BASE_FRAME,
+        )  # fmt: skip
+        messages += [(int(motion.stamps[i]), "/odom", odometry_message(motion, i)) for i in range(len(motion))]
+        for index, stamp in enumerate(run.stamps.tolist()):
+            twist = builders.twist_stamped(stamp, BASE_FRAME, *run.twists[index].tolist())
+            wheels = builders.joint_state(stamp, ["left_wheel", "right_wheel"], [0.0, 0.0], run.wheels[index])
+            messages += [(stamp, "/cmd_vel", twist), (stamp, "/joint_states", wheels)]
+            if clocks.gyro_sign:
+                rate = np.array([0.0, 0.0, clocks.gyro_sign * run.gyro[index]])
+                messages.append((stamp, "/imu/data", builders.imu(stamp, "imu_link", rate, np.zeros(3))))
+    if clocks.gyro_sign:
+        remarks.append("/imu/data holds the yaw rate alone")
+    first = min(stamp for stamp, _, _ in messages)
+    about = builders.string("; ".join([f"from DRIVE {recording.path.name}", *remarks]))
+    with BagWriter(out, storage=storage, overwrite=overwrite) as bag:
+        bag.write("/about", about, first)
+        for stamp, topic, message in sorted(messages, key=lambda entry: entry[0]):
+            bag.write(topic, message, stamp)
+    return remarks
+
+
+def _fresh_poses(run: DriveRun) -> np.ndarray:
+    """Which samples hold a pose of their own, ``[n]`` bool: the log repeats a pose until the next one comes."""
+    same = (np.diff(run.positions, axis=0) == 0.0).all(axis=1) & (np.diff(run.quaternions, axis=0) == 0.0).all(axis=1)
+    fresh = np.r_[True, ~same]
+    last = 0
+    for index in range(1, len(fresh)):
+        # A robot that stands repeats its pose too: then it is said again now and then.
+        if not fresh[index] and (run.stamps[index] - run.stamps[last]) * 1e-9 >= _LONGEST_REPEAT:
+            fresh[index] = True
+        if fresh[index]:
+            last = index
+    return fresh
+
+
+def _yaw_rates(run: DriveRun) -> tuple[np.ndarray, np.ndarray, float] | None:
+    """Yaw rates by the poses and by the gyro at the same times, averaged over a third of a second, and their step [s].
+
+    Between poses of their own the headings are interpolated; what no robot turns like is a jump of the localisation.
+    """
+    if len(run.stamps) < 40:
+        return None
+    step = float(np.median(np.diff(run.stamps))) * 1e-9
+    reach = max(1, round(0.33 / step))
+    fresh = _fresh_poses(run)
+    times = (run.stamps - run.stamps[0]) * 1e-9
+    yaw = np.unwrap(Rotation.from_quat(run.quaternions[fresh]).as_euler("ZYX")[:, 0])
+    yaw = np.interp(times, times[fresh], yaw)
+    pose = np.clip((yaw[reach:] - yaw[:-reach]) / (reach * step), -_FASTEST_TURN, _FASTEST_TURN)
+    gyro = np.convolve(run.gyro, np.ones(reach) / reach, mode="valid")[: len(pose)]
+    return pose[: len(gyro)], gyro, step
+
+
+def _open_windows(path: Path) -> DriveRecording:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(entry.file_size for entry in archive.infolist())
+        if size > LARGEST_FILE:
+            raise DatasetError(f"{path}: holds {size} bytes, expected at most {LARGEST_FILE}")
+        with np.load(path, allow_pickle=False) as content:
+            names = (*_FIELDS, "steady_state_mask", "transitory_state_mask", "dt")
+            missing = sorted(set(names) - set(content.files))
+            if missing:
+                raise DatasetError(f"{path}: got no {', '.join(missing)}; expected windows of DRIVE")
+            data = {name: np.asarray(content[name], np.float64) for name in names}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        if isinstance(error, DatasetError):
+            raise
+        raise DatasetError(f"{path}: not readable: {error}") from error
+    shapes = {data[name].shape for name in _FIELDS}
+    if len(shapes) != 1 or len(next(iter(shapes))) != 2 or min(next(iter(shapes))) < 2:
+        raise DatasetError(f"{path}: got shapes {sorted(shapes)}, expected [windows, samples] for all")
+    count = next(iter(shapes))[0]
+    steady, transitory = data["steady_state_mask"] > 0.5, data["transitory_state_mask"] > 0.5
+    if steady.shape != (count,) or transitory.shape != (count,) or not 0.001 <= float(data["dt"]) <= 1.0:
+        raise DatasetError(f"{path}: its masks or its time step do not fit its {count} windows")
+    finite = np.logical_and.reduce([np.isfinite(data[name]).all(axis=1) for name in _FIELDS])
+    step = round(1e9 * float(data["dt"]))
+    runs, begin = [], START_STAMP
+    starts = [k for k in range(count) if transitory[k] or k == 0 or not (steady[k] and finite[k - 1])]
+    for start, stop in zip(starts, [*starts[1:], count], strict=True):
+        members = [k for k in range(start, stop) if finite[k]]
+        if not members:
+            continue
+        run = _join(data, members, begin, step)
+        runs.append(run)
+        begin = int(run.stamps[-1]) + round(PAUSE * 1e9)
+    if not runs:
+        raise DatasetError(f"{path}: no window holds finite numbers")
+    return DriveRecording(path, tuple(runs), steady)
+
+
+def _join(data: dict[str, np.ndarray], members: list[int], begin: int, step: int) -> DriveRun:
+    """Windows that follow each other, each zeroed at its start, as one run."""
+    positions, rotations = [], []
+    place, turn = np.zeros(3), Rotation.identity()
+    for k in members:
+        own = np.stack([data[name][k] for name in ("icp_x", "icp_y", "icp_z")], axis=1)
+        angles = np.stack([data[name][k] for name in ("icp_yaw", "icp_pitch", "icp_roll")], axis=1)
+        own_turn = Rotation.from_euler("ZYX", angles)
+        # Relative to its own first sample, which rounding leaves near zero.
+        relative = own_turn[0].inv() * own_turn
+        moved = own_turn[0].inv().apply(own - own[0])
+        positions.append(place + turn.apply(moved))
+        rotations.append((turn * relative).as_quat())
+        # On to the next window's start: one step more at the speed of the last half second.
+        reach = min(10, len(moved) - 1)
+        drift = (relative[-1 - reach].inv() * relative[-1]).as_rotvec() / reach
+        ahead = relative[-1].inv().apply(moved[-1] - moved[-1 - reach]) / reach
+        place = positions[-1][-1] + (turn * relative[-1]).apply(ahead)
+        turn = turn * relative[-1] * Rotation.from_rotvec(drift)
+
+    def joined(name: str) -> np.ndarray:
+        return np.concatenate([data[name][k] for k in members])
+
+    left, right = WHEEL_RADIUS * joined("cmd_left"), WHEEL_RADIUS * joined("cmd_right")
+    return DriveRun(
+        stamps=begin + step * np.arange(len(left), dtype=np.int64),
+        twists=np.stack([(left + right) / 2, (right - left) / TRACK_WIDTH], axis=1),
+        wheels=np.stack([joined("left_wheel_vel"), joined("right_wheel_vel")], axis=1),
+        positions=np.concatenate(positions),
+        quaternions=np.concatenate(rotations),
+        gyro=joined("imu_yaw_rate"),
+    )
+
+
+def _open_log(path: Path) -> DriveRecording:
+    unpack = gzip.open if path.suffix == ".gz" else open
+    rows: list[list[float]] = []
+    stamps: list[int] = []
+    read = 0
+    try:
+        with unpack(path, "rt", encoding="utf-8", newline="") as stream:
+            reader = csv.reader(stream)
+            names = next(reader, [])
+            missing = sorted(set(_COLUMNS) - set(names))
+            if missing:
+                raise DatasetError(f"{path}: got no column {', '.join(missing)}; expected a continuous log of DRIVE")
+            places = [names.index(name) for name in _COLUMNS]
+            for number, row in enumerate(reader, start=2):
+                read += sum(map(len, row)) + len(row)
+                if read > LARGEST_FILE:
+                    raise DatasetError(f"{path}: more than {LARGEST_FILE} bytes of text")
+                if len(row) <= max(places):
+                    raise DatasetError(f"{path}, line {number}: got {len(row)} columns, expected {len(names)}")
+                # Nanoseconds of this century do not fit into a double.
+                stamps.append(int(row[places[0]]))
+                rows.append([float(row[place]) for place in places[1:]])
+    except (OSError, EOFError, UnicodeDecodeError, csv.Error, ValueError) as error:
+        if isinstance(error, DatasetError):
+            raise
+        raise DatasetError(f"{path}: not readable: {error}") from error
+    if len(rows) < 20:
+        raise DatasetError(f"{path}: got {len(rows)} rows, expected at least 20")
+    values, times = np.array(rows), np.array(stamps, np.int64)
+    order = np.argsort(times, kind="stable")
+    times, values = times[order], values[order]
+    norms = np.linalg.norm(values[:, 7:11], axis=1)
+    keep = np.r_[True, np.diff(times) > 0] & np.isfinite(values).all(axis=1) & (np.abs(norms - 1.0) < 0.01)
+    times, values = times[keep], values[keep]
+    runs = []
+    for part in np.split(np.arange(len(times)), np.flatnonzero(np.diff(times) > 1_000_000_000) + 1):
+        if len(part) >= 20:
+            row = values[part]
+            runs.append(DriveRun(times[part], row[:, 2:4], row[:, 0:2], row[:, 4:7], row[:, 7:11], row[:, 11]))
+    if not runs:
+        raise DatasetError(f"{path}: no stretch of 20 samples without a gap")
+    return DriveRecording(path, tuple(runs))

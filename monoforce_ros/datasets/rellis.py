@@ -1,0 +1,254 @@
+"""RELLIS-3D sequences: images, Ouster clouds and lidar poses of a Warthog off road (github.com/unmannedlab/RELLIS-3D).
+
+A sequence is a folder ``00000`` to ``00004`` of ``os1_cloud_node_kitti_bin/<frame>.bin`` (float32 x, y, z, intensity),
+``pylon_camera_node/frame<frame>-<sec>_<msec>.jpg``, ``poses.txt`` (a 3 × 4 matrix map ← lidar for each frame),
+``camera_info.txt`` (fx fy cx cy) and ``transforms.yaml`` (the camera's pose in the lidar's frame). Splits are lists
+``pt_train.lst``, ``pt_val.lst`` and ``pt_test.lst`` beside the sequences. Clouds carry no time of their own: that of
+the image with their number is theirs.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import yaml
+from scipy.spatial.transform import Rotation
+
+from monoforce_ros.bags import BagWriter, builders
+from monoforce_ros.camera import CameraModel
+from monoforce_ros.datasets.dataset import DatasetError, odometry_message
+from monoforce_ros.datasets.rough import motion_from_poses
+from monoforce_ros.motion import homogeneous
+
+LIDAR_FRAME, CAMERA_FRAME, BASE_FRAME = "os1_lidar", "pylon_camera", "base_link"
+CLOUDS, IMAGES = "os1_cloud_node_kitti_bin", "pylon_camera_node"
+SPLITS = ("train", "val", "test")
+LARGEST_CLOUD = 100_000_000
+_FRAME_TIME = 100_000_000
+_IMAGE_NAME = re.compile(r"frame(\d{6})-(\d{9,10})_(\d{1,3})\.(jpg|png)")
+
+
+@dataclass(frozen=True)
+class RellisSequence:
+    """One folder of the dataset."""
+
+    path: Path
+    stamps: np.ndarray
+    """Of each frame, ``[n]`` int64 [ns]."""
+    images: dict[int, Path]
+    """Image file of each frame that has one."""
+    map_from_lidar: np.ndarray
+    """``[n, 4, 4]``."""
+    camera: CameraModel
+    lidar_from_camera: np.ndarray
+    """``[4, 4]``, the camera's frame being optical."""
+
+    @classmethod
+    def open(cls, path: str | Path) -> RellisSequence:
+        """Read a sequence's calibration, poses and file names.
+
+        Raises:
+            DatasetError: something is missing or makes no sense.
+        """
+        path = Path(path)
+        for part in (CLOUDS, IMAGES, "poses.txt", "camera_info.txt", "transforms.yaml"):
+            if not (path / part).exists():
+                raise DatasetError(f"{path} is not a RELLIS-3D sequence: {part} is missing")
+        images, times = {}, {}
+        for file in sorted((path / IMAGES).iterdir()):
+            named = _IMAGE_NAME.fullmatch(file.name)
+            if named:
+                frame = int(named[1])
+                images[frame] = file
+                times[frame] = int(named[2]) * 10**9 + int(named[3].ljust(3, "0")) * 10**6
+        if len(times) < 2:
+            raise DatasetError(
+                f"{path / IMAGES}: got {len(times)} images, expected frame000000-<sec>_<msec>.jpg and on"
+            )
+        poses = _poses(path / "poses.txt")
+        frames = np.arange(len(poses))
+        known = np.array(sorted(times))
+        stamps = np.array([times[frame] for frame in known], np.int64)
+        if (np.diff(stamps) <= 0).any():
+            raise DatasetError(f"{path / IMAGES}: the stamps of the images do not grow with their numbers")
+        first = stamps[0]
+        # Frames without an image lie between those with one, and beyond them at the lidar's rate.
+        seconds = np.interp(frames, known, (stamps - first).astype(np.float64))
+        seconds = np.where(frames < known[0], (frames - known[0]) * float(_FRAME_TIME), seconds)
+        last = float(stamps[-1] - first)
+        seconds = np.where(frames > known[-1], last + (frames - known[-1]) * float(_FRAME_TIME), seconds)
+        size = _image_size(images[int(known[0])])
+        return cls(
+            path=path,
+            stamps=first + np.rint(seconds).astype(np.int64),
+            images=images,
+            map_from_lidar=poses,
+            camera=_camera(path / "camera_info.txt", size),
+            lidar_from_camera=_camera_pose(path / "transforms.yaml"),
+        )
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    def cloud(self, frame: int) -> np.ndarray:
+        """Returns ``[n, 3]`` float32 [m] in the lidar's frame; raises ``DatasetError`` where there is no such cloud."""
+        file = self.path / CLOUDS / f"{frame:06d}.bin"
+        if not file.is_file():
+            raise DatasetError(f"{file}: no such cloud")
+        size = file.stat().st_size
+        if size % 16 or not 0 < size <= LARGEST_CLOUD:
+            raise DatasetError(f"{file}: got {size} bytes, expected a multiple of 16 up to {LARGEST_CLOUD}")
+        return np.fromfile(file, np.float32).reshape(-1, 4)[:, :3]
+
+    def image(self, frame: int) -> np.ndarray:
+        """RGB pixels ``[height, width, 3]``; raises ``DatasetError`` where there is no such image."""
+        file = self.images.get(frame)
+        pixels = None if file is None else cv2.imread(str(file), cv2.IMREAD_COLOR)
+        if pixels is None:
+            raise DatasetError(f"{self.path}: frame {frame} has no image that can be decoded")
+        return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
+
+
+def read_splits(root: str | Path) -> dict[str, list[tuple[str, int]]]:
+    """The published splits: sequence and frame of each cloud, by ``train``, ``val`` and ``test``.
+
+    Raises:
+        DatasetError: a list is missing, or a line names no cloud.
+    """
+    splits = {}
+    for name in SPLITS:
+        file = Path(root) / f"pt_{name}.lst"
+        if not file.is_file():
+            raise DatasetError(f"{file} is missing; expected pt_train.lst, pt_val.lst and pt_test.lst in {root}")
+        entries = []
+        for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), start=1):
+            if not line.strip():
+                continue
+            parts = Path(line.split()[0]).parts
+            if len(parts) < 3 or not Path(parts[-1]).stem.isdecimal():
+                raise DatasetError(f"{file}, line {number}: got {line!r}, expected 00000/{CLOUDS}/000000.bin")
+            entries.append((parts[-3], int(Path(parts[-1]).stem)))
+        splits[name] = entries
+    return splits
+
+
+def sequence_to_bag(
+    sequence: RellisSequence,
+    out: str | Path,
+    *,
+    base_from_lidar: np.ndarray,
+    frames: range | None = None,
+    storage: str = "mcap",
+    overwrite: bool = False,
+) -> list[str]:
+    """Write a sequence, or part of it, as a bag: images as they are, calibration, clouds, and odometry from its poses.
+
+    Args:
+        sequence: the folder.
+        out: folder of the bag.
+        base_from_lidar: pose ``[4, 4]`` of the lidar on the robot, as from the warthog's file: the dataset's poses are
+            the lidar's, and say nothing of the robot below it.
+        frames: which frames, all by default.
+        storage: ``mcap`` or ``sqlite3``.
+        overwrite: replace an existing bag.
+
+    Returns:
+        remarks on what in the bag is not a measurement.
+
+    Raises:
+        DatasetError: a cloud or image is damaged, or there are fewer than two frames.
+    """
+    chosen = frames or range(len(sequence))
+    chosen = range(max(chosen.start, 0), min(chosen.stop, len(sequence)))
+    if len(chosen) < 2:
+        raise DatasetError(f"{sequence.path}: got frames {frames}, expected at least two of its {len(sequence)}")
+    base_from_lidar = np.asarray(base_from_lidar, np.float64)
+    poses = sequence.map_from_lidar[chosen.start : chosen.stop] @ np.linalg.inv(base_from_lidar)
+    stamps = sequence.stamps[chosen.start : chosen.stop]
+    start = homogeneous(Rotation.from_euler("z", _heading(poses[0])).as_matrix(), poses[0, :3, 3])
+    motion = motion_from_poses(stamps, np.linalg.inv(start) @ poses)
+    remarks = [
+        "there are no commands: the sequence holds none",
+        "clouds have the stamps of the images of their number",
+        "where the lidar sits on the robot is taken from the robot's file",
+    ]
+    events: list[tuple[int, int]] = [(int(motion.stamps[i]), -1 - i) for i in range(len(motion))]
+    events += [(int(sequence.stamps[frame]), frame) for frame in chosen]
+    sensors = {LIDAR_FRAME: base_from_lidar, CAMERA_FRAME: base_from_lidar @ sequence.lidar_from_camera}
+    camera = sequence.camera
+    with BagWriter(out, storage=storage, overwrite=overwrite) as bag:
+        bag.write("/tf_static", builders.static_transforms(int(stamps[0]), BASE_FRAME, sensors), int(stamps[0]))
+        about = builders.string("; ".join([f"from RELLIS-3D {sequence.path.name}", *remarks]))
+        bag.write("/about", about, int(stamps[0]))
+        for stamp, number in sorted(events):
+            if number < 0:
+                bag.write("/odom", odometry_message(motion, -1 - number), stamp)
+                continue
+            if (sequence.path / CLOUDS / f"{number:06d}.bin").is_file():
+                bag.write("/points", builders.point_cloud(stamp, LIDAR_FRAME, sequence.cloud(number)), stamp)
+            if number in sequence.images:
+                file = sequence.images[number]
+                encoding = "png" if file.suffix == ".png" else "jpeg"
+                image = builders.compressed_image(stamp, CAMERA_FRAME, encoding, file.read_bytes())
+                info = builders.camera_info(
+                    stamp, CAMERA_FRAME, camera.width, camera.height, camera.matrix, camera.distortion
+                )
+                bag.write("/pylon_camera_node/camera_info", info, stamp)
+                bag.write("/pylon_camera_node/image_raw/compressed", image, stamp)
+    return remarks
+
+
+def _heading(pose: np.ndarray) -> float:
+    return float(np.arctan2(pose[1, 0], pose[0, 0]))
+
+
+def _poses(file: Path) -> np.ndarray:
+    try:
+        values = np.loadtxt(file, dtype=np.float64, ndmin=2)
+    except (ValueError, UnicodeDecodeError) as error:
+        raise DatasetError(f"{file}: not readable: {error}") from error
+    if values.ndim != 2 or values.shape[1] != 12 or len(values) < 2 or not np.isfinite(values).all():
+        raise DatasetError(f"{file}: got shape {values.shape}, expected at least two rows of twelve finite numbers")
+    left, scales, right = np.linalg.svd(values.reshape(-1, 3, 4)[:, :, :3])
+    if (np.abs(scales - 1.0) > 0.05).any() or (np.linalg.det(left @ right) < 0).any():
+        raise DatasetError(f"{file}: some matrices are no rotations")
+    matrices = np.tile(np.eye(4), (len(values), 1, 1))
+    matrices[:, :3, :3] = left @ right
+    matrices[:, :3, 3] = values.reshape(-1, 3, 4)[:, :, 3]
+    return matrices
+
+
+def _camera(file: Path, size: tuple[int, int]) -> CameraModel:
+    try:
+        fx, fy, cx, cy = (float(value) for value in file.read_text(encoding="utf-8").split())
+        return CameraModel(
+            width=size[0],
+            height=size[1],
+            matrix=np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
+            distortion=np.zeros(5),
+            distortion_model="plumb_bob",
+            frame_id=CAMERA_FRAME,
+        )
+    except (ValueError, UnicodeDecodeError) as error:
+        raise DatasetError(f"{file}: expected fx fy cx cy: {error}") from error
+
+
+def _image_size(file: Path) -> tuple[int, int]:
+    pixels = cv2.imread(str(file), cv2.IMREAD_COLOR)
+    if pixels is None:
+        raise DatasetError(f"{file}: cannot be decoded as an image")
+    return pixels.shape[1], pixels.shape[0]
+
+
+def _camera_pose(file: Path) -> np.ndarray:
+    try:
+        content = yaml.safe_load(file.read_text(encoding="utf-8"))
+        entry = content["os1_cloud_node-pylon_camera_node"]
+        turn = Rotation.from_quat([float(entry["q"][axis]) for axis in "xyzw"])
+        return homogeneous(turn.as_matrix(), np.array([float(entry["t"][axis]) for axis in "xyz"]))
+    except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
+        raise DatasetError(f"{file}: expected os1_cloud_node-pylon_camera_node with q and t, got {error!r}") from error

@@ -1,0 +1,255 @@
+"""Other people's folders: read with their traps, converted to bags that the rest of the package takes as they are."""
+
+import gzip
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from monoforce_ros.bags import Recording, cut_windows
+from monoforce_ros.camera import CameraModel
+from monoforce_ros.datasets import DatasetError, DriveRecording, RellisSequence, cli, drive_to_bag, read_splits
+
+LIDAR_ON_ROBOT = np.array([0.2, 0.0, 1.0])
+
+
+# ---- DRIVE
+
+
+def windows_file(path, *, delay=0.6, sign=-1.0, runs=30, seed=3):
+    """Windows as DRIVE publishes them: each run holds a command for 6 s, and poses come late and are zeroed."""
+    random = np.random.default_rng(seed)
+    step, fields = 0.05, {}
+    time = np.arange(int(runs * 6 / step)) * step
+    commands = np.repeat(random.uniform(-8, 8, (runs, 2)), 120, axis=0)
+    wheels = np.zeros_like(commands)
+    for i in range(1, len(time)):
+        wheels[i] = wheels[i - 1] + step / 0.3 * (commands[i - 1] - wheels[i - 1])
+    rate = 0.6 * 0.3 / 1.08 * (wheels[:, 1] - wheels[:, 0])
+    speed = 0.3 * wheels.mean(axis=1)
+    heading = np.cumsum(rate) * step
+    place = np.cumsum(np.stack([speed * np.cos(heading), speed * np.sin(heading)], axis=1), axis=0) * step
+    late = round(delay / step)
+    heading_seen, place_seen = np.roll(heading, late), np.roll(place, late, axis=0)
+    heading_seen[:late], place_seen[:late] = heading[0], place[0]
+
+    def cut(values):
+        return values.reshape(-1, 40).astype(np.float32)
+
+    start = np.arange(0, len(time), 40)
+    turned = Rotation.from_euler("z", -heading_seen[start]).as_matrix()[:, :2, :2]
+    relative = place_seen.reshape(-1, 40, 2) - place_seen[start][:, None]
+    local = np.einsum("wij,wkj->wki", turned, relative)
+    fields.update(
+        dt=np.float32(step), cmd_left=cut(commands[:, 0]), cmd_right=cut(commands[:, 1]),
+        left_wheel_vel=cut(wheels[:, 0]), right_wheel_vel=cut(wheels[:, 1]),
+        icp_x=local[..., 0].astype(np.float32), icp_y=local[..., 1].astype(np.float32),
+        icp_yaw=(heading_seen.reshape(-1, 40) - heading_seen[start][:, None]).astype(np.float32),
+        imu_yaw_rate=cut(sign * rate),
+        steady_state_mask=np.tile([0, 1, 1], runs).astype(np.float32),
+        transitory_state_mask=np.tile([1, 0, 0], runs).astype(np.float32),
+    )  # fmt: skip
+    for name in ("icp_z", "icp_roll", "icp_pitch"):
+        fields[name] = np.zeros((3 * runs, 40), np.float32)
+    np.savez(path, **fields)
+    return place_seen, heading_seen
+
+
+def test_windows_are_joined_and_their_traps_found_in_the_data(tmp_path):
+    place, heading = windows_file(tmp_path / "nameless.npz", delay=0.6, sign=-1.0)
+    recording = DriveRecording.open(tmp_path / "nameless.npz")
+    assert [len(run.stamps) for run in recording.runs] == [120] * 30
+    clocks = recording.clocks()
+    assert clocks.gyro_sign == -1
+    assert clocks.pose_delay == pytest.approx(0.6, abs=0.06)
+    for number in (3, 11):
+        run = recording.runs[number]
+        first = 120 * number
+        turn = Rotation.from_euler("z", heading[first]).as_matrix()[:2, :2]
+        expected = (place[first : first + 120] - place[first]) @ turn
+        # Steps between windows are extrapolated from the half second before them.
+        assert np.abs(run.positions[:, :2] - expected).max() < 0.06
+        yaw = np.unwrap(Rotation.from_quat(run.quaternions).as_euler("ZYX")[:, 0])
+        assert np.abs(yaw - (heading[first : first + 120] - heading[first])).max() < 0.06
+
+
+def test_a_converted_file_of_windows_has_windows_within_its_runs_only(tmp_path):
+    windows_file(tmp_path / "nameless.npz")
+    recording = DriveRecording.open(tmp_path / "nameless.npz")
+    remarks = drive_to_bag(recording, tmp_path / "bag", correct_delay=True)
+    assert any("0.60 s late" in remark or "0.55 s late" in remark or "0.65 s late" in remark for remark in remarks)
+    assert any("sign is corrected" in remark for remark in remarks)
+    bag = Recording.open(tmp_path / "bag")
+    windows = cut_windows(bag.motion, bag.commands, length=2.0, stride=0.5)
+    assert len(windows) > 100
+    assert np.linalg.norm(windows.positions[:, -1] - windows.positions[:, 0], axis=1).max() < 2.0 * 8 * 0.3 + 0.5
+    # Wheel commands of ±8 rad/s as speeds of the whole robot.
+    assert np.abs(bag.commands.twists[:, 0]).max() <= 8 * 0.3 + 1e-6
+
+
+@pytest.mark.parametrize(
+    ("name", "sign", "delay"),
+    [
+        ("warthog_wheels_asphalt.npz", 1, (0.5, 0.9)),
+        ("warthog_wheels_gravel_2024_8_6_11h37s32.npz", -1, (0.55, 0.9)),
+        ("warthog_wheels_sand_2024_9_25_14h13s47.npz", 1, (0.7, 1.0)),
+        ("test_warthog.npz", 1, (0.15, 0.35)),
+    ],
+)
+def test_real_recordings_show_their_clocks(real_data, name, sign, delay):
+    recording = DriveRecording.open(real_data / "drive" / name)
+    clocks = recording.clocks()
+    assert clocks.gyro_sign == sign
+    assert delay[0] <= clocks.pose_delay <= delay[1]
+    assert clocks.correlation > 0.8
+    assert all(len(run.stamps) == 120 for run in recording.runs)
+
+
+def test_the_real_continuous_log_becomes_a_bag(tmp_path, real_data):
+    file = next((real_data / "drive").glob("*continuous*.csv.gz"))
+    assert cli.main(["drive", str(file), str(tmp_path / "bag")]) == 0
+    bag = Recording.open(tmp_path / "bag")
+    assert len(bag.commands) > 7000
+    span = (bag.motion.stamps[-1] - bag.motion.stamps[0]) * 1e-9
+    assert span == pytest.approx(363, abs=3)
+    # Poses that the log only repeats are no measurements.
+    assert len(bag.motion) < 0.6 * len(bag.commands)
+    assert np.diff(bag.motion.stamps).max() * 1e-9 < 0.4
+
+
+@given(st.binary(max_size=200), st.sampled_from(["x.npz", "x.csv", "x.csv.gz", "x.txt"]))
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_any_bytes_are_refused_by_name(tmp_path, data, name):
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(DatasetError, match=name.split(".")[1]):
+        DriveRecording.open(tmp_path / name)
+
+
+def test_logs_and_windows_of_another_layout_say_what_is_missing(tmp_path):
+    np.savez(tmp_path / "other.npz", a=np.zeros(3))
+    with pytest.raises(DatasetError, match="got no cmd_left"):
+        DriveRecording.open(tmp_path / "other.npz")
+    with gzip.open(tmp_path / "log.csv.gz", "wt") as stream:
+        stream.write("time,x\n1,2\n")
+    with pytest.raises(DatasetError, match="got no column"):
+        DriveRecording.open(tmp_path / "log.csv.gz")
+
+
+# ---- RELLIS-3D
+
+
+def rellis_folder(root, sequence="00001", frames=12, missing=(4,)):
+    """A sequence of the published layout: a lidar 1 m up that drives along x and turns, a wall 6 m ahead."""
+    folder = root / sequence
+    for part in ("os1_cloud_node_kitti_bin", "pylon_camera_node"):
+        (folder / part).mkdir(parents=True)
+    rng = np.random.default_rng(2)
+    ground = np.column_stack([rng.uniform(-8, 8, (3000, 2)), np.full(3000, -1.3)])
+    poses = []
+    for frame in range(frames):
+        cloud = np.column_stack([ground, rng.uniform(0, 1, 3000)]).astype(np.float32)
+        cloud.tofile(folder / "os1_cloud_node_kitti_bin" / f"{frame:06d}.bin")
+        if frame not in missing:
+            seconds, millis = divmod(1581624652750 + 100 * frame, 1000)
+            image = np.full((30, 48, 3), 10 * frame, np.uint8)
+            cv2.imwrite(str(folder / "pylon_camera_node" / f"frame{frame:06d}-{seconds}_{millis:03d}.jpg"), image)
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_euler("z", 0.3 + 0.02 * frame).as_matrix()
+        pose[:3, 3] = [5.0 + 0.1 * frame, 2.0, 0.4]
+        poses.append(" ".join(f"{value:.9f}" for value in pose[:3].ravel()))
+    (folder / "poses.txt").write_text("\n".join(poses) + "\n")
+    (folder / "camera_info.txt").write_text("40.0 41.0 24.0 15.0\n")
+    # Optical axes: z along the lidar's x, x along its -y.
+    quaternion = Rotation.from_matrix([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]).as_quat()
+    entry = {
+        "q": dict(zip("xyzw", map(float, quaternion), strict=True)),
+        "t": {"x": 0.1, "y": 0.0, "z": -0.2},
+    }
+    (folder / "transforms.yaml").write_text(yaml.safe_dump({"os1_cloud_node-pylon_camera_node": entry}))
+    for name, numbers in (("train", range(6)), ("val", range(6, 9)), ("test", range(9, 12))):
+        lines = [
+            " ".join(
+                f"{sequence}/os1_cloud_node_{folder}/{k:06d}.{ending}"
+                for folder, ending in (("kitti_bin", "bin"), ("semantickitti_label_id", "label"))
+            )
+            for k in numbers
+        ]
+        (root / f"pt_{name}.lst").write_text("\n".join(lines) + "\n")
+    return folder
+
+
+def test_a_rellis_sequence_is_read_as_published(tmp_path):
+    sequence = RellisSequence.open(rellis_folder(tmp_path))
+    assert len(sequence) == 12
+    # The frame without an image lies between its neighbours.
+    np.testing.assert_array_equal(sequence.stamps, 1581624652750000000 + 100_000_000 * np.arange(12))
+    assert sequence.cloud(3).shape == (3000, 3)
+    assert sequence.image(5).mean() == pytest.approx(50, abs=2)
+    camera = sequence.camera
+    assert isinstance(camera, CameraModel)
+    ahead = np.linalg.inv(sequence.lidar_from_camera) @ [6.1, 0.0, -0.2, 1.0]
+    np.testing.assert_allclose(ahead[:3], [0.0, 0.0, 6.0], atol=1e-9)
+    with pytest.raises(DatasetError, match="frame 4 has no image"):
+        sequence.image(4)
+    with pytest.raises(DatasetError, match="no such cloud"):
+        sequence.cloud(99)
+
+
+def test_rellis_splits_are_the_published_lists(tmp_path):
+    rellis_folder(tmp_path)
+    splits = read_splits(tmp_path)
+    assert splits["train"][0] == ("00001", 0)
+    assert [len(splits[name]) for name in ("train", "val", "test")] == [6, 3, 3]
+    assert not {*splits["train"]} & {*splits["test"]}
+    (tmp_path / "pt_val.lst").write_text("nonsense\n")
+    with pytest.raises(DatasetError, match=r"pt_val.lst, line 1"):
+        read_splits(tmp_path)
+
+
+def test_a_rellis_bag_has_the_robot_below_its_lidar(tmp_path, capsys):
+    folder = rellis_folder(tmp_path)
+    assert cli.main(["rellis", str(folder), str(tmp_path / "bag"), "--first", "2", "--count", "8"]) == 0
+    assert "no commands" in capsys.readouterr().out
+    bag = Recording.open(tmp_path / "bag")
+    assert len(bag.clouds) == 8
+    assert [len(frames) for frames in bag.images.values()] == [7]
+    state = bag.motion.at(int(bag.motion.stamps[0]))
+    np.testing.assert_allclose(state.position, 0.0, atol=1e-9)
+    assert state.heading == pytest.approx(0.0, abs=1e-9)
+    # The warthog's lidar is 0.2 m ahead of the base frame, which turns about it.
+    assert state.linear_velocity[0] > 0.8
+    points, frame = bag.cloud(bag.clouds[0])
+    pose = bag.base_from(frame, "base_link")
+    np.testing.assert_allclose(pose[:3, 3], LIDAR_ON_ROBOT, atol=1e-6)
+    assert (points @ pose[:3, :3].T + pose[:3, 3])[:, 2].mean() == pytest.approx(-0.3, abs=1e-5)
+
+
+@pytest.mark.parametrize("broken", ["poses.txt", "camera_info.txt", "transforms.yaml"])
+def test_broken_rellis_files_are_named(tmp_path, broken):
+    folder = rellis_folder(tmp_path)
+    (folder / broken).write_text("1 2 three")
+    with pytest.raises(DatasetError, match=broken):
+        RellisSequence.open(folder)
+    (folder / broken).unlink()
+    with pytest.raises(DatasetError, match=f"{broken} is missing"):
+        RellisSequence.open(folder)
+
+
+def test_a_cloud_of_odd_size_is_refused(tmp_path):
+    folder = rellis_folder(tmp_path)
+    (folder / "os1_cloud_node_kitti_bin" / "000003.bin").write_bytes(b"odd")
+    with pytest.raises(DatasetError, match=r"000003\.bin: got 3 bytes"):
+        RellisSequence.open(folder).cloud(3)
+
+
+def test_convert_says_what_is_wrong_in_one_line(tmp_path, capsys):
+    assert cli.main(["rough", str(tmp_path), str(tmp_path / "bag")]) == 1
+    assert cli.main(["drive", str(tmp_path / "none.npz"), str(tmp_path / "bag")]) == 1
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2
+    assert "not a ROUGH scene" in lines[0]
+    assert "no such file" in lines[1]
