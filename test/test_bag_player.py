@@ -89,24 +89,44 @@ def test_a_loop_goes_on_until_interrupted(start, peer, bag):
     assert first >= 2
 
 
-@pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        (lambda path: (path / "images.mcap").write_bytes((path / "images.mcap").read_bytes()[:2000]), "truncated"),
-        (lambda path: (path / "metadata.yaml").unlink(), "no metadata.yaml"),
-        (lambda path: (path / "metadata.yaml").write_text("{"), "cannot be read"),
-    ],
-)
-def test_broken_bags_are_refused_in_one_line(start, bag, tmp_path, damage, message):
+def damaged(bag, tmp_path, damage):
     broken = tmp_path / "images"
     broken.mkdir()
     for file in bag.iterdir():
         (broken / file.name).write_bytes(file.read_bytes())
     damage(broken)
-    player = start("bag_player", broken, "--quiet", "--wait", "0")
+    return broken
+
+
+def cut(path, size):
+    file = path / "images.mcap"
+    file.write_bytes(file.read_bytes()[:size])
+
+
+def test_a_bag_of_which_nothing_is_left_is_refused_in_one_line(start, bag, tmp_path):
+    player = start("bag_player", damaged(bag, tmp_path, lambda path: cut(path, 30)), "--quiet", "--wait", "0")
     assert player.wait(30) == 1
     lines = [line for line in player.output.splitlines() if line.startswith("error:")]
-    assert len(lines) == 1 and message in lines[0] and "Traceback" not in player.output
+    assert len(lines) == 1 and "cannot be read" in lines[0] and "Traceback" not in player.output
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda path: cut(path, (path / "images.mcap").stat().st_size * 2 // 3),
+        lambda path: (path / "metadata.yaml").unlink(),
+        lambda path: (path / "metadata.yaml").write_text("{"),
+    ],
+    ids=["cut off", "no metadata", "metadata makes no sense"],
+)
+def test_what_is_left_of_a_damaged_bag_is_played_and_said(start, peer, bag, tmp_path, damage):
+    images = Listener(peer, Image, "/camera/image_raw")
+    player = start("bag_player", damaged(bag, tmp_path, damage), "--quiet", "--rate", "20", "--wait", "10")
+    assert player.wait(60) == 0
+    peer.until(lambda: len(images.messages) > 5, 5)
+    assert len(images.messages) > 5
+    images.close()
+    assert "no usable index" in player.output and "Traceback" not in player.output
 
 
 @pytest.mark.parametrize(

@@ -41,7 +41,7 @@ def windows_file(path, *, delay=0.6, sign=-1.0, runs=30, seed=3):
         return values.reshape(-1, 40).astype(np.float32)
 
     start = np.arange(0, len(time), 40)
-    turned = Rotation.from_euler("z", -heading_seen[start]).as_matrix()[:, :2, :2]
+    turned = Rotation.from_euler("z", -heading_seen[start][:, None]).as_matrix()[:, :2, :2]
     relative = place_seen.reshape(-1, 40, 2) - place_seen[start][:, None]
     local = np.einsum("wij,wkj->wki", turned, relative)
     fields.update(
