@@ -52,6 +52,7 @@ setup(
             "synthesize = monoforce_ros.synthetic.cli:main",
             "evaluate = monoforce_ros.evaluation.cli:main",
             "convert = monoforce_ros.datasets.cli:main",
+            "diagnose = monoforce_ros.discrepancy.cli:main",
             "fit_terrain = monoforce_ros.training.fit_cli:main",
         ],
     },

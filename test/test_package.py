@@ -12,7 +12,16 @@ from conftest import INSTALLED, ROOT
 from monoforce_ros.nodes.parameters import read_parameter_file
 
 SETUP = (ROOT / "setup.py").read_text()
-EXECUTABLES = ["bag_player", "bag_recorder", "convert", "evaluate", "fit_terrain", "predictor", "synthesize"]
+EXECUTABLES = [
+    "bag_player",
+    "bag_recorder",
+    "convert",
+    "diagnose",
+    "evaluate",
+    "fit_terrain",
+    "predictor",
+    "synthesize",
+]
 
 
 def test_colcon_takes_it_for_an_ament_python_package(tmp_path):

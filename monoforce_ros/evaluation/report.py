@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from monoforce_ros.evaluation.drive import DriveEvaluation
 from monoforce_ros.evaluation.metrics import Summary
 
-_STYLE = """
+PAGE_STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #1c2733; background: #f5f7f8; margin: 0; }
 main { max-width: 1120px; margin: 0 auto; padding: 32px 24px 64px; }
 h1 { font-size: 26px; margin: 0 0 4px; } h2 { font-size: 18px; margin: 36px 0 10px; }
@@ -135,7 +135,8 @@ def _page(evaluation: DriveEvaluation, settings: dict[str, object], figures: Seq
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>Evaluation of {html.escape(str(settings.get('bag', 'a drive')))}</title><style>{_STYLE}</style></head>"
+        f"<title>Evaluation of {html.escape(str(settings.get('bag', 'a drive')))}</title>"
+        f"<style>{PAGE_STYLE}</style></head>"
         "<body><main><h1>Predicted against measured motion</h1>"
         '<p class="lead">From moments along the drive the motion was predicted with the commands that followed, and '
         "compared with what the robot then did. Only the part of a trajectory that lies on the predicted map counts. "

@@ -1,0 +1,1 @@
+"""Discrepancy: finds where simulation and measurement disagree, and names the physics that is missing."""

@@ -1,0 +1,134 @@
+"""Gap: how far predictions are from the drive, how much of it is noise, and where it lives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from monoforce_ros.bags import SmoothedMotion, smooth
+from monoforce_ros.discrepancy.hypothesis import DriveData, sample_motion
+from monoforce_ros.motion import MotionTrack
+
+_NOISE_DRAWS = 4
+_SMALLEST = np.array([0.01, 0.01, np.radians(0.3)])
+"""Residuals below this mean nothing however quiet the data [m, m, rad]."""
+
+
+def noise_floor(smoothed: SmoothedMotion, data: DriveData, seed: int = 0) -> np.ndarray:
+    """Root mean square that residuals have by the noise of the poses alone, ``[K, 3]`` [m, m, rad].
+
+    The smooth motion is taken for the truth, noise of the size that was taken out is put back, and it is smoothed once
+    more: by how much the relative motion within windows then differs, a perfect model's residuals would too.
+    """
+    random = np.random.default_rng(seed)
+    motion = smoothed.motion
+    squares = np.zeros((len(data.samples), 3))
+    for _ in range(_NOISE_DRAWS):
+        noise = Rotation.from_rotvec(smoothed.rotation_noise * random.standard_normal((len(motion), 3)))
+        noisy = MotionTrack(
+            motion.stamps,
+            motion.positions + smoothed.position_noise * random.standard_normal(motion.positions.shape),
+            (Rotation.from_quat(motion.quaternions) * noise).as_quat(),
+            motion.linear_velocities,
+            motion.angular_velocities,
+            motion.frame_id,
+            motion.child_frame_id,
+        )
+        again = smooth(noisy, position_noise=smoothed.position_noise, rotation_noise=smoothed.rotation_noise).motion
+        squares += ((relative_motion(again, data) - relative_motion(motion, data)) ** 2).mean(axis=0)
+    return np.sqrt(squares / _NOISE_DRAWS)
+
+
+def relative_motion(motion: MotionTrack, data: DriveData) -> np.ndarray:
+    """Motion since the start of each window in the axes of its start, ``[W, K, 3]`` [m, m, rad]."""
+    stamps = data.starts[:, None] + np.rint(np.r_[0.0, data.samples] * 1e9).astype(np.int64)
+    positions, rotations, _, _ = sample_motion(motion, stamps)
+    headings = np.arctan2(rotations[..., 1, 0], rotations[..., 0, 0])
+    turn = Rotation.from_euler("z", headings[:, 0, None]).as_matrix()
+    moved = np.einsum("wji,wkj->wki", turn, positions[:, 1:] - positions[:, :1])
+    turned = np.angle(np.exp(1j * (headings[:, 1:] - headings[:, :1])))
+    return np.concatenate([moved[..., :2], turned[..., None]], axis=-1)
+
+
+def residual_scale(floor: np.ndarray, leftover: np.ndarray | None) -> np.ndarray:
+    """Size of a residual that means nothing, ``[K, 3]``: noise, and what disagreed on the healthy robot already."""
+    squares = floor**2 + _SMALLEST**2
+    if leftover is not None:
+        squares = squares + leftover**2
+    return np.sqrt(squares)
+
+
+@dataclass(frozen=True)
+class Regimes:
+    """Ways of driving, each a mask over windows, in plain words."""
+
+    masks: dict[str, np.ndarray]
+    """``[W]`` bool by name."""
+
+
+def find_regimes(data: DriveData) -> Regimes:
+    """What each window is an example of; a window may be one of several."""
+    count = round((data.horizon + 0.5) / 0.05)
+    stamps = data.starts[:, None] + (np.arange(count) * 50_000_000 - 500_000_000)
+    told = data.commands.sample(stamps)
+    _, rotations, linear, angular = sample_motion(data.motion, stamps)
+    speed, turning = np.abs(told[..., 0]).mean(axis=1), np.abs(told[..., 1]).mean(axis=1)
+    change = np.abs(np.diff(told[..., 0], axis=1)).sum(axis=1)
+    pitch = np.abs(rotations[..., 2, 0]).mean(axis=1)
+    fast = max(0.3, float(np.quantile(speed, 0.7)))
+    masks = {
+        "turning faster than 0.4 rad/s": turning > 0.4,
+        "driving straight": (turning < 0.1) & (speed > 0.1),
+        f"faster than {fast:.1f} m/s": speed > fast,
+        "reversing": told[..., 0].mean(axis=1) < -0.05,
+        "changing speed": change > 0.3,
+        "standing or nearly": (speed < 0.05) & (turning < 0.05),
+        "turning left": told[..., 1].mean(axis=1) > 0.2,
+        "turning right": told[..., 1].mean(axis=1) < -0.2,
+        "on slopes steeper than 5°": pitch > np.sin(np.radians(5.0)),
+        "in the first third of the drive": np.arange(len(speed)) < len(speed) / 3,
+        "in the last third of the drive": np.arange(len(speed)) >= 2 * len(speed) / 3,
+    }
+    del linear, angular
+    return Regimes({name: mask for name, mask in masks.items() if 3 <= mask.sum() < len(mask)})
+
+
+def localise(residuals: np.ndarray, floor: np.ndarray, data: DriveData, regimes: Regimes) -> list[dict]:
+    """Where the disagreement lives: shares of the squared error over its floor by axis and regime, strongest first.
+
+    Args:
+        residuals: ``[W, K, 3]``.
+        floor: ``[K, 3]``.
+        data: the drive.
+        regimes: ways of driving.
+    """
+    horizon = float(data.samples[-1])
+    names = (("error along the way", "m"), ("error across the way", "m"), ("heading error", "rad"))
+    squares = residuals[:, -1] ** 2
+    scaled = squares.mean(axis=0) / (floor[-1] ** 2 + _SMALLEST**2)
+    entries = []
+    for axis, (name, unit) in enumerate(names):
+        total = squares[:, axis].sum()
+        if total <= 0 or scaled[axis] < 2.0:
+            continue
+        for regime, mask in regimes.masks.items():
+            share, time = float(squares[mask, axis].sum() / total), float(mask.mean())
+            lift = share / max(time, 1e-9)
+            entries.append(
+                {
+                    "axis": name,
+                    "regime": regime,
+                    "share_of_error": share,
+                    "share_of_time": time,
+                    "rms": float(np.sqrt(squares[mask, axis].mean())),
+                    "bias": float(residuals[mask, -1, axis].mean()),
+                    "unit": unit,
+                    "weight": float(lift * share * min(scaled[axis], 100.0)),
+                    "text": f"{100 * share:.0f} % of the {name} at {horizon:g} s arises in {100 * time:.0f} % of the "
+                    f"time: {regime}",
+                }
+            )
+    entries = [entry for entry in entries if entry["share_of_error"] > 1.25 * entry["share_of_time"]]
+    return sorted(entries, key=lambda entry: -entry["weight"])[:8]

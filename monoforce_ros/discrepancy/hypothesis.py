@@ -1,0 +1,221 @@
+"""Hypothesis: a robot with effects, and how far its predictions are from what a drive shows.
+
+Windows start at fixed recorded times. A hypothesis predicts the motion in each from its measured start state and the
+recorded commands; what a measurement effect does to the record is undone first. Many hypotheses are rolled out at
+once: derivatives by differences cost one rollout of a larger batch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation, Slerp
+
+from monoforce_ros.motion import CommandTrack, MotionTrack
+from monoforce_ros.physics import PhysicsOptions, State, rollout
+from monoforce_ros.physics.effects import CATALOGUE, drive_speeds
+from monoforce_ros.physics.rest import rest_depth
+from monoforce_ros.robots import RobotModel
+from monoforce_ros.terrain import Grid, TerrainMap
+
+Effects = tuple[tuple[str, Mapping[str, float]], ...]
+COMPONENTS = ("along", "across", "heading")
+"""Of a residual: position in the axes of the window's start [m], heading [rad]."""
+HISTORY = 2.0
+"""Commands before a window that delays and lags may reach back to [s]."""
+_MARGIN = 1.3
+"""Kept free at both ends of the drive, so that a shifted clock still finds data [s]."""
+_LARGEST_BATCH = 1024
+
+
+@dataclass(frozen=True)
+class DriveData:
+    """What a hypothesis is held against."""
+
+    motion: MotionTrack
+    """Smoothed."""
+    commands: CommandTrack
+    starts: np.ndarray
+    """Start of each window in recorded time, ``[W]`` int64 [ns]."""
+    horizon: float
+    """Length of a window [s]."""
+    samples: np.ndarray
+    """Times in a window at which residuals are taken [s], ``[K]``."""
+    terrain: TerrainMap | None = None
+    """One map in its own frame, or None for level ground."""
+    odometry_from_terrain: np.ndarray | None = None
+
+
+def window_starts(motion: MotionTrack, stretches: Sequence[slice], horizon: float, stride: float) -> np.ndarray:
+    """Starts of windows that lie within stretches of odometry without a gap, ``[W]`` [ns]."""
+    starts = []
+    for stretch in stretches:
+        first, last = int(motion.stamps[stretch.start]), int(motion.stamps[stretch.stop - 1])
+        low, high = first + round(_MARGIN * 1e9), last - round((horizon + _MARGIN) * 1e9)
+        starts.extend(range(low, high + 1, round(stride * 1e9)))
+    return np.array(starts, np.int64)
+
+
+def sample_motion(motion: MotionTrack, stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Positions, rotation matrices, and velocities in base axes at stamps ``[...]`` within the track."""
+    shape = stamps.shape
+    origin = int(motion.stamps[0])
+    times = (motion.stamps - origin) * 1e-9
+    at = np.clip((stamps.ravel() - origin) * 1e-9, times[0], times[-1])
+
+    def blend(values: np.ndarray) -> np.ndarray:
+        return np.stack([np.interp(at, times, values[:, axis]) for axis in range(3)], axis=1).reshape(*shape, 3)
+
+    rotations = Slerp(times, Rotation.from_quat(motion.quaternions))(at).as_matrix().reshape(*shape, 3, 3)
+    return blend(motion.positions), rotations, blend(motion.linear_velocities), blend(motion.angular_velocities)
+
+
+def undo_measurement(motion: MotionTrack, commands: CommandTrack, effects: Effects) -> tuple[MotionTrack, CommandTrack]:
+    """The record without what measurement effects did to it: each is its own inverse with the opposite sign."""
+    for name, parameters in effects:
+        if CATALOGUE[name].stage == "measurement":
+            opposite = {key: -float(value) for key, value in parameters.items()}
+            motion = CATALOGUE[name].motion(motion, opposite)
+            commands = CATALOGUE[name].commands(commands, opposite)
+    return motion, commands
+
+
+class Predictions:
+    """Rolls out hypotheses over the windows of a drive.
+
+    Args:
+        robot: with the effects of its file.
+        data: the drive.
+    """
+
+    def __init__(self, robot: RobotModel, data: DriveData):
+        self.robot, self.data = robot, data
+        self.options = PhysicsOptions()
+        self._height = 0.0
+        if data.terrain is None:
+            self._terrain = TerrainMap.flat(Grid.square(2.0, 1.0))
+            self._depth = rest_depth(robot, float(self._terrain.stiffness[0, 0]))
+        else:
+            self._terrain = data.terrain
+        self._prepared: dict = {}
+        self._index = np.rint(data.samples / self.options.time_step).astype(int)
+
+    def residuals(self, hypotheses: Sequence[Effects]) -> np.ndarray:
+        """Predicted minus measured, ``[H, W, K, 3 (COMPONENTS)]``, under the robot's own effects and each of these."""
+        results: list[np.ndarray | None] = [None] * len(hypotheses)
+        # Hypotheses that differ in how the record is read have other windows; the rest share one batch.
+        groups: dict[tuple, list[int]] = {}
+        for number, effects in enumerate(hypotheses):
+            key = tuple(
+                (name, tuple(sorted(parameters.items())))
+                for name, parameters in effects
+                if CATALOGUE[name].stage == "measurement"
+            )
+            names = tuple(name for name, _ in effects)
+            groups.setdefault((key, names), []).append(number)
+        count = max(1, _LARGEST_BATCH // max(1, len(self.data.starts)))
+        for (key, _), numbers in groups.items():
+            windows = self._windows(key)
+            for first in range(0, len(numbers), count):
+                part = numbers[first : first + count]
+                for number, result in zip(part, self._roll_out(windows, [hypotheses[n] for n in part]), strict=True):
+                    results[number] = result
+        return np.stack(results)
+
+    def _windows(self, key: tuple) -> dict:
+        if key not in self._prepared:
+            if len(self._prepared) > 40:
+                self._prepared.clear()
+            motion, commands = undo_measurement(
+                self.data.motion, self.data.commands, tuple((name, dict(values)) for name, values in key)
+            )
+            self._prepared[key] = self._prepare(motion, commands)
+        return self._prepared[key]
+
+    def _prepare(self, motion: MotionTrack, commands: CommandTrack) -> dict:
+        data = self.data
+        stamps = data.starts[:, None] + np.rint(np.r_[0.0, data.samples] * 1e9).astype(np.int64)
+        positions, rotations, linear, angular = sample_motion(motion, stamps)
+        headings = np.arctan2(rotations[..., 1, 0], rotations[..., 0, 0])
+        turn = Rotation.from_euler("z", headings[:, 0, None]).as_matrix()
+        moved = np.einsum("wji,wkj->wki", turn, positions[:, 1:] - positions[:, :1])
+        turned = np.angle(np.exp(1j * (headings[:, 1:] - headings[:, :1])))
+        steps = np.arange(-round(HISTORY / self.options.time_step), self._index[-1] + 1)
+        asked = data.starts[:, None] + np.rint(steps * self.options.time_step * 1e9).astype(np.int64)
+        if data.terrain is None:
+            # On level ground every window starts at the origin, as high as its own wheels ask for.
+            frame_rotation = np.einsum("wji,wjk->wik", turn, rotations[:, 0])
+            underside = self.robot.points[self.robot.point_tangents[:, 0] < -0.97].double().numpy()
+            lowest = np.einsum("wij,nj->wni", frame_rotation, underside)[..., 2].mean(axis=1)
+            place = np.stack([0 * lowest, 0 * lowest, -lowest - self._depth], axis=1)
+            into = np.tile(np.eye(3), (len(stamps), 1, 1))
+        else:
+            pose = np.linalg.inv(data.odometry_from_terrain)
+            frame_rotation = pose[:3, :3] @ rotations[:, 0]
+            place = positions[:, 0] @ pose[:3, :3].T + pose[:3, 3]
+            heading = np.arctan2(frame_rotation[:, 1, 0], frame_rotation[:, 0, 0])
+            into = Rotation.from_euler("z", heading[:, None]).as_matrix()
+
+        def tensor(values: np.ndarray) -> torch.Tensor:
+            return torch.as_tensor(np.ascontiguousarray(values), dtype=torch.float32)
+
+        return {
+            "moved": moved,
+            "turned": turned,
+            "into": into,
+            "place": place,
+            "twists": tensor(commands.sample(asked)),
+            "history": round(HISTORY / self.options.time_step),
+            "position": tensor(place),
+            "rotation": tensor(frame_rotation),
+            "velocity": tensor(np.einsum("wij,wj->wi", frame_rotation, linear[:, 0])),
+            "angular": tensor(np.einsum("wij,wj->wi", frame_rotation, angular[:, 0])),
+        }
+
+    def _roll_out(self, windows: dict, hypotheses: list[Effects]) -> list[np.ndarray]:
+        count, width = len(hypotheses), len(self.data.starts)
+        robot = replace(self.robot, effects=self._joined(hypotheses, width))
+        with torch.no_grad():
+            speeds = drive_speeds(
+                robot,
+                windows["twists"].repeat(count, 1, 1),
+                self.options.time_step,
+                history=windows["history"],
+            )
+            state = State(
+                windows["position"].repeat(count, 1),
+                windows["rotation"].repeat(count, 1, 1),
+                windows["velocity"].repeat(count, 1),
+                windows["angular"].repeat(count, 1),
+            )
+            result = rollout(self._terrain, robot, speeds, state, options=self.options, with_forces=False)
+        positions = result.position[:, self._index].double().numpy().reshape(count, width, -1, 3)
+        rotations = result.rotation[:, self._index].double().numpy().reshape(count, width, -1, 3, 3)
+        start = windows["into"]
+        away = np.einsum("wji,hwkj->hwki", start, positions - windows["place"][None, :, None])
+        forward = np.einsum("wji,hwkj->hwki", start, rotations[..., :, 0])
+        heading = np.arctan2(forward[..., 1], forward[..., 0])
+        error = np.stack(
+            [
+                away[..., 0] - windows["moved"][..., 0],
+                away[..., 1] - windows["moved"][..., 1],
+                np.angle(np.exp(1j * (heading - windows["turned"]))),
+            ],
+            axis=-1,
+        )
+        return list(error)
+
+    def _joined(self, hypotheses: list[Effects], width: int) -> tuple:
+        """The robot's effects with each parameter as a batch: ``width`` trajectories of every hypothesis."""
+        names = [name for name, _ in hypotheses[0] if CATALOGUE[name].stage != "measurement"]
+        joined = dict(self.robot.effects)
+        for name in names:
+            values = [dict(effects)[name] for effects in hypotheses]
+            joined[name] = {
+                key: torch.tensor([float(v[key]) for v in values], dtype=torch.float32).repeat_interleave(width)
+                for key in values[0]
+            }
+        return tuple(joined.items())

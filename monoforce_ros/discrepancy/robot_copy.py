@@ -1,0 +1,64 @@
+"""Robot copy: a robot's file with what was found, where it was found, and how sure that is."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+
+import yaml
+
+from monoforce_ros.robots import robot_file
+
+
+def fingerprint(paths: Sequence[Path]) -> str:
+    """A short hash of the bags' contents."""
+    digest = hashlib.sha256()
+    for path in paths:
+        files = [path] if path.is_file() else sorted(file for file in path.iterdir() if file.is_file())
+        for file in files:
+            with file.open("rb") as stream:
+                while chunk := stream.read(1 << 20):
+                    digest.update(chunk)
+    return digest.hexdigest()[:16]
+
+
+def write_robot(
+    robot: str | Path, out: Path, effects: Sequence[dict], bags: Sequence[Path], data_fingerprint: str
+) -> Path:
+    """Write a copy of a robot's file with effects added, or with new values where it had them.
+
+    Args:
+        robot: name or file of the nominal robot.
+        out: the copy; it appears when it is complete.
+        effects: ``name`` and ``parameters`` {name: {value, low, high, unit}}.
+        bags: where they were found.
+        data_fingerprint: of these.
+    """
+    content = yaml.safe_load(robot_file(robot).read_text(encoding="utf-8"))
+    present = {entry["name"]: entry for entry in content.get("effects", [])}
+    for effect in effects:
+        present[effect["name"]] = {
+            "name": effect["name"],
+            "parameters": {
+                key: {
+                    name: (value if isinstance(value, str) else float(f"{value:.6g}")) for name, value in entry.items()
+                }
+                for key, entry in effect["parameters"].items()
+            },
+            "provenance": {
+                "found_by": "diagnose",
+                "date": datetime.now(UTC).date().isoformat(),
+                "bags": [path.name for path in bags],
+                "data": data_fingerprint,
+                "rivals": list(effect.get("rivals", [])),
+            },
+        }
+    content["effects"] = list(present.values())
+    out.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = out.with_name(f".{out.name}.unfinished-{os.getpid()}")
+    unfinished.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
+    unfinished.replace(out)
+    return out

@@ -1,0 +1,211 @@
+"""`diagnose`: what is hidden in a drive is named, sized, added to the robot's file, and makes predictions better."""
+
+import json
+import subprocess
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from monoforce_ros.bags import Recording, SmoothedMotion, smooth
+from monoforce_ros.discrepancy.diagnosis import Settings, diagnose
+from monoforce_ros.discrepancy.fit import first_values, fit_effects
+from monoforce_ros.discrepancy.gap import noise_floor
+from monoforce_ros.discrepancy.hypothesis import DriveData, Predictions, undo_measurement, window_starts
+from monoforce_ros.motion import CommandTrack, MotionTrack
+from monoforce_ros.physics import State, rollout
+from monoforce_ros.physics.effects import drive_speeds, recorded_commands, recorded_motion
+from monoforce_ros.robots import load_robot
+from monoforce_ros.synthetic.hidden import parse_hidden
+from monoforce_ros.synthetic.odometry import OdometrySettings
+from monoforce_ros.synthetic.recording import RecordingSettings, record
+from monoforce_ros.synthetic.terrain_shape import TerrainSettings
+from monoforce_ros.terrain import Grid, TerrainMap
+
+SAMPLES = np.array([0.5, 1.0, 1.5, 2.0])
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def husky():
+    return load_robot("husky")
+
+
+def own_drive(husky, effects, seconds=24.0):
+    """A drive in our own physics with effects planted, as it would be recorded."""
+    random = np.random.default_rng(4)
+    robot = replace(husky, effects=effects)
+    steps = round(seconds / 0.01)
+    told = np.repeat(random.uniform([-0.2, -0.9], [0.9, 0.9], (round(seconds / 1.5), 2)), 150, axis=0)[:steps]
+    speeds = drive_speeds(robot, torch.as_tensor(told[None], dtype=torch.float32), 0.01)
+    terrain = TerrainMap.flat(Grid.square(2.0, 1.0))
+    result = rollout(terrain, robot, speeds, State.at_rest(0.13), with_forces=False)
+    rotations = Rotation.from_matrix(result.rotation[0, ::5].double().numpy())
+    stamps = (10**9 + np.arange(len(rotations)) * 50_000_000).astype(np.int64)
+    motion = MotionTrack(
+        stamps=stamps,
+        positions=result.position[0, ::5].double().numpy(),
+        quaternions=rotations.as_quat(),
+        linear_velocities=rotations.inv().apply(result.velocity[0, ::5].double().numpy()),
+        angular_velocities=rotations.inv().apply(result.angular_velocity[0, ::5].double().numpy()),
+    )
+    commands = CommandTrack(10**9 + np.arange(steps) * 10_000_000, told)
+    return recorded_motion(motion, robot), recorded_commands(commands, robot)
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters"),
+    [
+        ("command_delay", {"delay": 0.23}),
+        ("drive_gain", {"gain": 0.87}),
+        ("drive_asymmetry", {"difference": -0.12}),
+        ("turning_scrub", {"track_width_factor": 1.3}),
+        ("sensor_lever_arm", {"x": 0.35, "y": -0.1}),
+        ("pose_clock_offset", {"offset": 0.17}),
+    ],
+)
+def test_planted_parameters_are_recovered_by_the_fit(husky, name, parameters):
+    motion, commands = own_drive(husky, ((name, parameters),))
+    starts = window_starts(motion, [slice(0, len(motion))], 2.0, 1.0)
+    predictions = Predictions(husky, DriveData(motion, commands, starts, 2.0, SAMPLES))
+    scale = np.tile([0.01, 0.01, 0.005], (4, 1))
+    before = np.abs(predictions.residuals([()])[0]).mean()
+    fit = fit_effects(predictions, first_values(name, list(parameters)), scale, np.ones(len(starts), bool))
+    for key, value in parameters.items():
+        assert dict(fit.effects)[name][key] == pytest.approx(value, rel=0.05, abs=0.012)
+    after = np.abs(predictions.residuals([fit.effects])[0]).mean()
+    assert after < 0.2 * before
+
+
+def test_hypotheses_of_a_batch_are_those_of_single_calls(husky):
+    motion, commands = own_drive(husky, ())
+    starts = window_starts(motion, [slice(0, len(motion))], 2.0, 2.0)
+    predictions = Predictions(husky, DriveData(motion, commands, starts, 2.0, SAMPLES))
+    tried = [
+        (),
+        *(((("drive_gain", {"gain": gain}),)) for gain in (0.8, 1.1)),
+        (("pose_clock_offset", {"offset": 0.1}),),
+    ]
+    together = predictions.residuals(tried)
+    for effects, expected in zip(tried, together, strict=True):
+        np.testing.assert_allclose(predictions.residuals([effects])[0], expected, atol=1e-5)
+    # Nothing is planted and nothing disagrees.
+    assert np.abs(together[0]).max() < 0.02
+
+
+def test_measurement_effects_are_undone(husky):
+    effects = (("sensor_yaw_offset", {"angle": 0.2}), ("pose_clock_offset", {"offset": 0.3}))
+    clean, commands = own_drive(husky, (), seconds=6.0)
+    recorded = recorded_motion(clean, replace(husky, effects=effects))
+    back, _ = undo_measurement(recorded, commands, effects)
+    np.testing.assert_allclose(back.stamps, clean.stamps, rtol=0, atol=100)
+    np.testing.assert_allclose(back.positions, clean.positions)
+    turned = Rotation.from_quat(back.quaternions).inv() * Rotation.from_quat(clean.quaternions)
+    assert turned.magnitude().max() < 1e-7
+
+
+def test_the_noise_floor_is_the_error_of_a_perfect_model(husky):
+    motion, commands = own_drive(husky, (), seconds=40.0)
+    random = np.random.default_rng(1)
+    noise = Rotation.from_rotvec(np.radians(0.5) * random.standard_normal((len(motion), 3)))
+    noisy = replace(
+        motion,
+        positions=motion.positions + 0.01 * random.standard_normal(motion.positions.shape),
+        quaternions=(Rotation.from_quat(motion.quaternions) * noise).as_quat(),
+    )
+    smoothed = smooth(noisy)
+    starts = window_starts(motion, smoothed.stretches, 2.0, 0.5)
+    data = DriveData(smoothed.motion, commands, starts, 2.0, SAMPLES)
+    floor = noise_floor(smoothed, data)
+    shown = np.sqrt((Predictions(husky, data).residuals([()])[0] ** 2).mean(axis=0))
+    assert (floor[-1] < 1.5 * shown[-1]).all()
+    assert (shown[-1] < 2.5 * floor[-1]).all()
+
+
+@pytest.mark.parametrize("still", [True, False])
+def test_drives_that_cannot_tell_are_said_to_be(husky, still):
+    times = np.arange(0.0, 40.0, 0.05)
+    stamps = (10**9 + np.rint(times * 1e9)).astype(np.int64)
+    positions = np.zeros((len(times), 3))
+    positions[:, 0] = 0.0 if still else 0.5 * times
+    zeros = np.zeros_like(positions)
+    motion = MotionTrack(stamps, positions, Rotation.identity(len(times)).as_quat(), zeros, zeros)
+    commands = CommandTrack(stamps, np.tile([0.0 if still else 0.5, 0.0], (len(times), 1)))
+    diagnosis = diagnose(smooth(motion), commands, husky)
+    assert diagnosis.verdict == "not_identifiable"
+    assert diagnosis.effects == ()
+    assert "drive" in diagnosis.advice[0] or "step the speed" in diagnosis.advice[0]
+
+
+@pytest.fixture(scope="module")
+def late_robot(tmp_path_factory):
+    """A MuJoCo drive of a robot that waits 0.3 s before it obeys, localised by something like SLAM."""
+    out = tmp_path_factory.mktemp("hidden") / "drive"
+    flat = TerrainSettings(flat=True)
+    hidden = (parse_hidden("command_delay:0.3"),)
+    settings = RecordingSettings(
+        duration=45.0, seed=3, terrain=flat, camera=None, lidar=None, commands="steps",
+        odometry=OdometrySettings.slam(), hidden=hidden,
+    )  # fmt: skip
+    record(out, settings)
+    return out
+
+
+def test_a_hidden_delay_is_named_added_and_closes_the_gap(late_robot, tmp_path, executables, ros_environment):
+    out = tmp_path / "report"
+    done = subprocess.run(
+        [executables / "diagnose", late_robot, "--out", out, "--effects", "1", "--quiet"],
+        env=ros_environment, capture_output=True, text=True, timeout=400, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    report = json.loads((out / "report.json").read_text())
+    assert report["verdict"] == "effect_found"
+    (effect,) = report["effects"]
+    # A late base and a late clock look the same to commands and poses; both are one class.
+    names = {effect["name"], *effect["rivals"]}
+    assert "command_delay" in names
+    (value,) = effect["parameters"].values()
+    assert value["value"] == pytest.approx(0.3, abs=0.05)
+    gap = report["gap"]["position_2s"]
+    assert gap["after"] < 0.5 * gap["before"]
+    assert gap["low"] > 0
+    page = (out / "report.html").read_text()
+    assert "What is missing" in page and "data:image/png;base64" in page and "src='http" not in page
+    # The robot file it wrote is loaded as it is, and predicts the same drive better.
+    found = load_robot(report["robot_file"])
+    assert dict(found.effects)[effect["name"]]
+    recording = Recording.open(late_robot)
+    smoothed = smooth(recording.motion)
+    starts = window_starts(smoothed.motion, smoothed.stretches, 2.0, 1.0)
+    motion, commands = undo_measurement(smoothed.motion, recording.commands, found.effects)
+    before, after = (
+        np.abs(Predictions(robot, DriveData(m, c, starts, 2.0, SAMPLES)).residuals([()])[0]).mean()
+        for robot, m, c in ((load_robot("husky"), smoothed.motion, recording.commands), (found, motion, commands))
+    )
+    assert after < 0.6 * before
+
+
+def test_without_a_disagreement_nothing_is_added(husky):
+    motion, commands = own_drive(husky, (), seconds=30.0)
+    smoothed = SmoothedMotion(motion, 0.003, 0.002, (slice(0, len(motion)),))
+    diagnosis = diagnose(smoothed, commands, husky, settings=Settings(most_effects=1))
+    assert diagnosis.verdict == "no_discrepancy"
+    assert diagnosis.effects == () and diagnosis.fitted == ()
+
+
+def test_errors_are_one_line(tmp_path, executables, ros_environment):
+    done = subprocess.run(
+        [executables / "diagnose", tmp_path / "none", "--out", tmp_path / "out"],
+        env=ros_environment, capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert done.stderr.strip().splitlines()[-1].startswith("diagnose: ")
