@@ -10,19 +10,22 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import Recording, SmoothedMotion, smooth
-from monoforce_ros.discrepancy.diagnosis import Settings, diagnose
+from monoforce_ros.discrepancy.diagnosis import Settings, commission, diagnose
 from monoforce_ros.discrepancy.fit import first_values, fit_effects
 from monoforce_ros.discrepancy.gap import noise_floor
 from monoforce_ros.discrepancy.hypothesis import DriveData, Predictions, undo_measurement, window_starts
+from monoforce_ros.discrepancy.robot_copy import read_leftover, write_robot
+from monoforce_ros.evaluation.drive import PHYSICS, evaluate_drive
 from monoforce_ros.motion import CommandTrack, MotionTrack
 from monoforce_ros.physics import State, rollout
 from monoforce_ros.physics.effects import drive_speeds, recorded_commands, recorded_motion
-from monoforce_ros.robots import load_robot
+from monoforce_ros.prediction import FlatTerrain, Predictor
+from monoforce_ros.robots import RobotFileError, load_robot
 from monoforce_ros.synthetic.hidden import parse_hidden
 from monoforce_ros.synthetic.odometry import OdometrySettings
 from monoforce_ros.synthetic.recording import RecordingSettings, record
 from monoforce_ros.synthetic.terrain_shape import TerrainSettings
-from monoforce_ros.terrain import Grid, TerrainMap
+from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap
 
 SAMPLES = np.array([0.5, 1.0, 1.5, 2.0])
 
@@ -184,14 +187,12 @@ def test_a_hidden_delay_is_named_added_and_closes_the_gap(late_robot, tmp_path, 
     found = load_robot(report["robot_file"])
     assert dict(found.effects)[effect["name"]]
     recording = Recording.open(late_robot)
-    smoothed = smooth(recording.motion)
-    starts = window_starts(smoothed.motion, smoothed.stretches, 2.0, 1.0)
-    motion, commands = undo_measurement(smoothed.motion, recording.commands, found.effects)
-    before, after = (
-        np.abs(Predictions(robot, DriveData(m, c, starts, 2.0, SAMPLES)).residuals([()])[0]).mean()
-        for robot, m, c in ((load_robot("husky"), smoothed.motion, recording.commands), (found, motion, commands))
-    )
-    assert after < 0.6 * before
+    errors = []
+    for robot in (load_robot("husky"), found):
+        predictor = Predictor(robot, FlatTerrain(robot, Grid.square(), TerrainDefaults()), horizon=2.0)
+        evaluation = evaluate_drive(recording, predictor, horizons=(1.0, 2.0), stride=1.0, progress=False)
+        errors.append(evaluation.summary(PHYSICS)[2.0][0].median)
+    assert errors[1] < 0.5 * errors[0]
 
 
 def test_without_a_disagreement_nothing_is_added(husky):
@@ -200,6 +201,34 @@ def test_without_a_disagreement_nothing_is_added(husky):
     diagnosis = diagnose(smoothed, commands, husky, settings=Settings(most_effects=1))
     assert diagnosis.verdict == "no_discrepancy"
     assert diagnosis.effects == () and diagnosis.fitted == ()
+
+
+def test_a_healthy_robot_is_commissioned_and_then_nothing_is_missing(husky, tmp_path):
+    planted = (
+        ("friction_scale", {"factor": 0.7}),
+        ("turning_scrub", {"track_width_factor": 1.2}),
+        ("actuator_lag", {"time_constant": 0.15}),
+    )
+    motion, commands = own_drive(husky, planted)
+    smoothed = SmoothedMotion(motion, 0.002, 0.001, (slice(0, len(motion)),))
+    effects, leftover = commission([(smoothed, commands)], husky)
+    found = {effect["name"]: effect["parameters"] for effect in effects}
+    assert found["turning_scrub"]["track_width_factor"]["value"] == pytest.approx(1.2, rel=0.05)
+    assert found["actuator_lag"]["time_constant"]["value"] == pytest.approx(0.15, abs=0.03)
+    assert leftover.shape == (4, 3)
+    kept = {"samples_s": [0.5, 1.0, 1.5, 2.0], "residual_rms": leftover.tolist()}
+    file = write_robot("husky", tmp_path / "husky.yaml", effects, [tmp_path], "0", kept)
+    np.testing.assert_allclose(read_leftover(file, (0.5, 1.0, 1.5, 2.0)), leftover)
+    assert read_leftover("husky", (0.5, 1.0)) is None
+    nominal = load_robot(file)
+    starts = window_starts(motion, [slice(0, len(motion))], 2.0, 1.0)
+    before, after = (
+        np.abs(Predictions(robot, DriveData(motion, commands, starts, 2.0, SAMPLES)).residuals([()])[0]).mean()
+        for robot in (husky, nominal)
+    )
+    assert after < 0.2 * before
+    with pytest.raises(RobotFileError, match="commission the robot again"):
+        read_leftover(file, (1.0, 2.0))
 
 
 def test_errors_are_one_line(tmp_path, executables, ros_environment):

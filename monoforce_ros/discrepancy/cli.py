@@ -12,9 +12,9 @@ import torch
 from tqdm import tqdm
 
 from monoforce_ros.bags import BagError, Recording, SmoothedMotion, smooth
-from monoforce_ros.discrepancy.diagnosis import Diagnosis, Settings, diagnose
+from monoforce_ros.discrepancy.diagnosis import Diagnosis, Settings, commission, diagnose
 from monoforce_ros.discrepancy.report import summary_lines, write_diagnosis
-from monoforce_ros.discrepancy.robot_copy import fingerprint, write_robot
+from monoforce_ros.discrepancy.robot_copy import fingerprint, read_leftover, write_robot
 from monoforce_ros.physics.effects import EffectError
 from monoforce_ros.robots import RobotFileError, RobotModel, load_robot, shipped_robots
 from monoforce_ros.terrain import Grid, TerrainFileError, TerrainMap, load_terrain
@@ -37,6 +37,12 @@ def build_parser() -> argparse.ArgumentParser:
         "--terrain", default="flat", metavar="flat|lidar|FILE", help="ground of the drive; a file of fit_terrain (flat)"
     )
     parser.add_argument("--out", type=Path, required=True, help="folder for the reports")
+    parser.add_argument(
+        "--commission",
+        action="store_true",
+        help="fit what every new robot needs (friction, effective track width, servo response) to drives of the "
+        "healthy robot on level ground and write OUT/ROBOT.yaml, the nominal model of later runs",
+    )
     parser.add_argument("--effects", type=int, default=2, metavar="N", help="at most (%(default)s)")
     parser.add_argument("--odometry", metavar="TOPIC", help="(found by type)")
     parser.add_argument("--commands", metavar="TOPIC", help="(found by type)")
@@ -55,11 +61,39 @@ def main(arguments: list[str] | None = None) -> int:
     torch.set_num_threads(1)
     try:
         robot = load_robot(options.robot)
+        if options.commission:
+            return _commission(robot, options)
         for bag in options.bags:
             _diagnose_bag(bag, robot, options)
     except (BagError, EffectError, RobotFileError, TerrainFileError, TerrainError, ValueError, OSError) as error:
         print(f"diagnose: {error}", file=sys.stderr)
         return 1
+    return 0
+
+
+def _commission(robot: RobotModel, options: argparse.Namespace) -> int:
+    drives = []
+    for bag in options.bags:
+        recording = Recording.open(bag, odometry=options.odometry, commands=options.commands)
+        drives.append((smooth(recording.motion), recording.commands))
+    settings = Settings()
+    effects, leftover = commission(drives, robot, settings=settings)
+    kept = {
+        "samples_s": list(settings.samples),
+        "residual_rms": [[float(f"{value:.4g}") for value in row] for row in leftover],
+    }
+    out = write_robot(
+        options.robot, options.out / f"{robot.name}.yaml", effects, options.bags, fingerprint(options.bags), kept
+    )
+    for effect in effects:
+        for key, entry in effect["parameters"].items():
+            print(f"{effect['name']}: {key} {entry['value']:.3g} {entry['unit']}")
+    along, across, heading = leftover[-1]
+    print(
+        f"left on the healthy robot after {settings.horizon:g} s: {100 * along:.1f} cm along, "
+        f"{100 * across:.1f} cm across, {np.degrees(heading):.2f}° in heading"
+    )
+    print(f"robot file: {out}")
     return 0
 
 
@@ -83,6 +117,7 @@ def _diagnose_bag(bag: Path, robot: RobotModel, options: argparse.Namespace) -> 
             robot,
             terrain=terrain,
             odometry_from_terrain=pose,
+            leftover=read_leftover(options.robot, Settings().samples),
             settings=Settings(most_effects=options.effects),
             progress=progress,
         )

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from monoforce_ros.motion import CommandTrack, MotionTrack
 from monoforce_ros.physics import PhysicsOptions, State, rollout
-from monoforce_ros.physics.effects import CATALOGUE, drive_speeds
+from monoforce_ros.physics.effects import CATALOGUE, corrected_commands, corrected_motion, drive_speeds
 from monoforce_ros.physics.rest import rest_depth
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import Grid, TerrainMap
@@ -75,12 +75,7 @@ def sample_motion(motion: MotionTrack, stamps: np.ndarray) -> tuple[np.ndarray, 
 
 def undo_measurement(motion: MotionTrack, commands: CommandTrack, effects: Effects) -> tuple[MotionTrack, CommandTrack]:
     """The record without what measurement effects did to it: each is its own inverse with the opposite sign."""
-    for name, parameters in effects:
-        if CATALOGUE[name].stage == "measurement":
-            opposite = {key: -float(value) for key, value in parameters.items()}
-            motion = CATALOGUE[name].motion(motion, opposite)
-            commands = CATALOGUE[name].commands(commands, opposite)
-    return motion, commands
+    return corrected_motion(motion, effects), corrected_commands(commands, effects)
 
 
 class Predictions:

@@ -8,9 +8,10 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
+import numpy as np
 import yaml
 
-from monoforce_ros.robots import robot_file
+from monoforce_ros.robots import RobotFileError, robot_file
 
 
 def fingerprint(paths: Sequence[Path]) -> str:
@@ -26,7 +27,12 @@ def fingerprint(paths: Sequence[Path]) -> str:
 
 
 def write_robot(
-    robot: str | Path, out: Path, effects: Sequence[dict], bags: Sequence[Path], data_fingerprint: str
+    robot: str | Path,
+    out: Path,
+    effects: Sequence[dict],
+    bags: Sequence[Path],
+    data_fingerprint: str,
+    commissioning: dict | None = None,
 ) -> Path:
     """Write a copy of a robot's file with effects added, or with new values where it had them.
 
@@ -36,6 +42,7 @@ def write_robot(
         effects: ``name`` and ``parameters`` {name: {value, low, high, unit}}.
         bags: where they were found.
         data_fingerprint: of these.
+        commissioning: what disagreed on the healthy robot, kept for later runs.
     """
     content = yaml.safe_load(robot_file(robot).read_text(encoding="utf-8"))
     present = {entry["name"]: entry for entry in content.get("effects", [])}
@@ -57,8 +64,34 @@ def write_robot(
             },
         }
     content["effects"] = list(present.values())
+    if commissioning is not None:
+        content["commissioning"] = commissioning
     out.parent.mkdir(parents=True, exist_ok=True)
     unfinished = out.with_name(f".{out.name}.unfinished-{os.getpid()}")
     unfinished.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
     unfinished.replace(out)
     return out
+
+
+def read_leftover(robot: str | Path, samples: Sequence[float]) -> np.ndarray | None:
+    """What disagreed on the healthy robot, ``[K, 3]`` [m, m, rad], by its file; None if it was never commissioned.
+
+    Raises:
+        RobotFileError: the file's entry makes no sense or is for other times.
+    """
+    path = robot_file(robot)
+    entry = yaml.safe_load(path.read_text(encoding="utf-8")).get("commissioning")
+    if entry is None:
+        return None
+    try:
+        times, rows = np.array(entry["samples_s"], float), np.array(entry["residual_rms"], float)
+    except (KeyError, TypeError, ValueError) as error:
+        raise RobotFileError(f"{path}: commissioning: expected samples_s and residual_rms, got {error!r}") from error
+    if rows.shape != (len(samples), 3) or times.shape != (len(samples),) or not np.allclose(times, samples):
+        raise RobotFileError(
+            f"{path}: commissioning: got residuals {rows.shape} at {times.tolist()} s, expected three each at "
+            f"{list(samples)} s; commission the robot again"
+        )
+    if not (np.isfinite(rows).all() and (rows >= 0).all()):
+        raise RobotFileError(f"{path}: commissioning.residual_rms: expected finite numbers of 0 or more")
+    return rows

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -13,6 +13,7 @@ from monoforce_ros.bags import Recording
 from monoforce_ros.evaluation.metrics import Poses, Summary, position_errors, rotation_errors, summarise
 from monoforce_ros.messages.decoding import MessageError
 from monoforce_ros.motion import MotionState, StaleDataError, transform_points
+from monoforce_ros.physics.effects import corrected_commands, corrected_motion
 from monoforce_ros.prediction import FlatTerrain, Observation, Prediction, Predictor
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import TerrainDefaults, TerrainMap
@@ -88,6 +89,7 @@ def evaluate_drive(
     Raises:
         EvaluationError: there is nothing to predict from, or no window with odometry after it.
     """
+    recording = corrected_recording(recording, predictor.robot)
     flat = isinstance(predictor.source, FlatTerrain)
     stamps = _window_stamps(recording, image_topics, flat, stride, min(horizons))
     count = round(max(horizons) / SAMPLE_TIME) + 1
@@ -162,11 +164,21 @@ def evaluate_drive(
 
 def predict_at(recording: Recording, predictor: Predictor, stamp: int, image_topics: Sequence[str] = ()) -> Prediction:
     """One prediction with all its forces, from the data at ``stamp`` [ns] and the commands recorded after it."""
+    recording = corrected_recording(recording, predictor.robot)
     flat = isinstance(predictor.source, FlatTerrain)
     return predictor.predict(
         observe(recording, predictor.robot, stamp, image_topics, flat),
         recording.motion.at(stamp, maximum_gap=MAXIMUM_GAP),
         recording.commands.sample(predictor.command_stamps(stamp)),
+    )
+
+
+def corrected_recording(recording: Recording, robot: RobotModel) -> Recording:
+    """The drive without what the robot's file says its clocks and sensors do to the record."""
+    return replace(
+        recording,
+        motion=corrected_motion(recording.motion, robot.effects),
+        commands=corrected_commands(recording.commands, robot.effects),
     )
 
 

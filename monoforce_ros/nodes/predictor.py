@@ -28,6 +28,7 @@ from monoforce_ros.nodes.parameters import declare_parameters, parameter_help, r
 from monoforce_ros.nodes.process import run_node
 from monoforce_ros.nodes.subscriptions import AdaptiveSubscription
 from monoforce_ros.physics import PhysicsOptions
+from monoforce_ros.physics.effects import corrected_commands, corrected_motion
 from monoforce_ros.prediction import CameraTerrain, FlatTerrain, LidarTerrain, Observation, Prediction, Predictor
 from monoforce_ros.robots import load_robot
 from monoforce_ros.shared_files import share_directory
@@ -271,10 +272,12 @@ class PredictorNode(Node):
             observation = self._observe(stamp, received)
             if observation is None:
                 return
-            motion = self.inputs.motion().at(stamp, maximum_gap=self.settings.odometry_timeout)
+            track = corrected_motion(self.inputs.motion(), self.robot.effects)
+            motion = track.at(stamp, maximum_gap=self.settings.odometry_timeout)
             # The newest command is held over the horizon, unless it is too old to count at all.
             stamps = np.minimum(self.predictor.command_stamps(stamp), stamp)
-            twists = self.inputs.commands().sample(stamps, timeout=self.settings.command_timeout)
+            commands = corrected_commands(self.inputs.commands(), self.robot.effects)
+            twists = commands.sample(stamps, timeout=self.settings.command_timeout)
             prediction = self.predictor.predict(observation, motion, twists)
             if not bool(prediction.rollout.valid.all()):
                 raise ValueError("the rollout diverged")

@@ -22,7 +22,7 @@ DEFAULT_SPACING = 0.05
 
 _TOP_KEYS = {
     "name", "description", "base_frame", "mass", "centre_of_mass", "inertia", "inertia_box", "command", "friction",
-    "wheels", "tracks", "flippers", "hull", "sensors", "effects",
+    "wheels", "tracks", "flippers", "hull", "sensors", "effects", "commissioning",
 }  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import math
 import os
@@ -9,7 +10,8 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from monoforce_ros.synthetic.plants import Plant
+from monoforce_ros.synthetic import plants
+from monoforce_ros.synthetic.plant import Plant
 from monoforce_ros.synthetic.random_streams import random_stream
 
 
@@ -17,7 +19,8 @@ def _catalogue() -> dict[str, type[Plant]]:
     def snake(name: str) -> str:
         return re.sub(r"(?<!^)(?=[A-Z])", "_", name).lower()
 
-    return {snake(kind.__name__): kind for kind in Plant.__subclasses__()}
+    kinds = [kind for _, kind in inspect.getmembers(plants, inspect.isclass) if issubclass(kind, Plant)]
+    return {snake(kind.__name__): kind for kind in kinds if kind is not Plant}
 
 
 PLANTS: dict[str, type[Plant]] = _catalogue()

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from monoforce_ros.synthetic.plants import Plant
+from monoforce_ros.synthetic.plant import Plant
 from monoforce_ros.synthetic.simulation import BaseState
 
 

@@ -8,54 +8,14 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from typing import TYPE_CHECKING, ClassVar, override
+from typing import ClassVar, override
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.synthetic.graphics import mujoco
-
-if TYPE_CHECKING:
-    from monoforce_ros.synthetic.simulation import Simulation
-    from monoforce_ros.synthetic.vehicle import Vehicle
-
-
-class Plant:
-    """Something hidden. The methods below do nothing; a plant overrides those through which it works."""
-
-    in_catalogue: ClassVar[bool] = True
-    """Whether the catalogue of effects has an effect of this name."""
-    parameters: ClassVar[dict[str, tuple[float, float, float]]]
-    """Default value, smallest and largest value of each parameter in SI units; the first is the one that
-    ``NAME:VALUE`` sets."""
-
-    def __init__(self, **values: float):
-        for name, value in values.items():
-            setattr(self, name, value)
-
-    def shape(self, spec: mujoco.MjSpec, robot: Vehicle) -> None:
-        """Change the model before it is compiled."""
-
-    def prepare(self, simulation: Simulation) -> None:
-        """Change the compiled model."""
-
-    def wheel_speeds(self, time: float, speeds: np.ndarray) -> np.ndarray:
-        """What becomes of commanded wheel speeds ``[wheels]`` [rad/s]; called at every step."""
-        return speeds
-
-    def push(self, simulation: Simulation) -> None:
-        """Add forces to ``data.xfrc_applied``, which has been cleared for this step."""
-
-    command_stamp_offset: float = 0.0
-    """Recorded minus true time of commands [s]."""
-    pose_stamp_offset: float = 0.0
-    """Recorded minus true time of poses [s]."""
-    gyro_offset: float = 0.0
-    """Added to recorded yaw rates [rad/s]."""
-
-    def sensor_pose(self) -> tuple[np.ndarray, float]:
-        """Place ``[3]`` [m] and yaw [rad], in the base frame, of what is recorded as the base frame."""
-        return np.zeros(3), 0.0
+from monoforce_ros.synthetic.plant import Plant, Subject
+from monoforce_ros.synthetic.vehicle import Vehicle
 
 
 class CommandDelay(Plant):
@@ -64,7 +24,7 @@ class CommandDelay(Plant):
     parameters: ClassVar = {"delay": (0.25, 0.05, 1.0)}
 
     @override
-    def prepare(self, simulation: Simulation) -> None:
+    def prepare(self, simulation: Subject) -> None:
         self._queue: deque[tuple[float, np.ndarray]] = deque()
         self._acting = None
 
@@ -94,7 +54,7 @@ class ActuatorSaturation(Plant):
     parameters: ClassVar = {"limit": (0.5, 0.1, 5.0)}
 
     @override
-    def prepare(self, simulation: Simulation) -> None:
+    def prepare(self, simulation: Subject) -> None:
         robot = simulation.robot
         simulation.model.actuator_forcelimited[:] = 1
         self._largest = self.limit / np.array([wheel.radius for wheel in robot.wheels])
@@ -102,7 +62,7 @@ class ActuatorSaturation(Plant):
         self.push(simulation)
 
     @override
-    def push(self, simulation: Simulation) -> None:
+    def push(self, simulation: Subject) -> None:
         share = simulation.wheel_states()[1] / self._largest
         limits = simulation.model.actuator_forcerange
         limits[:, 1] = self._stall * np.clip(1.0 - share, 0.0, 1.0)
@@ -115,7 +75,7 @@ class ActuatorDeadband(Plant):
     parameters: ClassVar = {"width": (0.1, 0.02, 0.5)}
 
     @override
-    def prepare(self, simulation: Simulation) -> None:
+    def prepare(self, simulation: Subject) -> None:
         self._radii = np.array([wheel.radius for wheel in simulation.robot.wheels])
         self._turning = np.zeros(len(self._radii), bool)
 
@@ -152,7 +112,7 @@ class FrictionScale(Plant):
     parameters: ClassVar = {"factor": (0.4, 0.1, 1.0)}
 
     @override
-    def prepare(self, simulation: Simulation) -> None:
+    def prepare(self, simulation: Subject) -> None:
         simulation.tyre_friction *= self.factor
 
 
@@ -173,7 +133,7 @@ class RollingResistance(Plant):
     parameters: ClassVar = {"coefficient": (0.15, 0.02, 0.6)}
 
     @override
-    def push(self, simulation: Simulation) -> None:
+    def push(self, simulation: Subject) -> None:
         robot, bodies = simulation.robot, simulation.wheel_bodies
         velocities = simulation.wheel_velocities()
         velocities[:, 2] = 0.0
@@ -188,7 +148,7 @@ class TerrainSoftness(Plant):
     parameters: ClassVar = {"factor": (9.0, 2.0, 50.0)}
 
     @override
-    def prepare(self, simulation: Simulation) -> None:
+    def prepare(self, simulation: Subject) -> None:
         # The stiffness of a MuJoCo contact goes with the inverse square of its time constant.
         simulation.model.geom_solref[simulation.tyres, 0] *= math.sqrt(self.factor)
 
@@ -199,7 +159,7 @@ class VegetationDrag(Plant):
     parameters: ClassVar = {"strength": (3.0, 1.0, 10.0)}
 
     @override
-    def push(self, simulation: Simulation) -> None:
+    def push(self, simulation: Subject) -> None:
         forces = simulation.grass_forces()
         if forces is not None:
             forces[:, 2] = 0.0
@@ -230,7 +190,7 @@ class ViscousDrag(Plant):
     parameters: ClassVar = {"coefficient": (150.0, 10.0, 1000.0)}
 
     @override
-    def prepare(self, simulation: Simulation) -> None:
+    def prepare(self, simulation: Subject) -> None:
         simulation.model.dof_damping[:3] = self.coefficient
 
 
@@ -240,7 +200,7 @@ class QuadraticDrag(Plant):
     parameters: ClassVar = {"coefficient": (200.0, 10.0, 1000.0)}
 
     @override
-    def push(self, simulation: Simulation) -> None:
+    def push(self, simulation: Subject) -> None:
         velocity = simulation.data.qvel[:3].copy()
         velocity[2] = 0.0
         _push_hull(simulation, -self.coefficient * np.linalg.norm(velocity) * velocity)
@@ -252,7 +212,7 @@ class GravityTilt(Plant):
     parameters: ClassVar = {"about_y": (0.08, -0.3, 0.3), "about_x": (0.0, -0.3, 0.3)}
 
     @override
-    def prepare(self, simulation: Simulation) -> None:
+    def prepare(self, simulation: Subject) -> None:
         turn = Rotation.from_rotvec([self.about_x, self.about_y, 0.0])
         simulation.model.opt.gravity[:] = turn.apply([0.0, 0.0, -9.81])
 
@@ -263,7 +223,7 @@ class ConstantForce(Plant):
     parameters: ClassVar = {"x": (-80.0, -800.0, 800.0), "y": (0.0, -800.0, 800.0)}
 
     @override
-    def push(self, simulation: Simulation) -> None:
+    def push(self, simulation: Subject) -> None:
         ripple = 1.0 + 0.1 * math.sin(2.0 * simulation.time)
         _push_hull(
             simulation, Rotation.from_euler("z", simulation.heading()).apply([self.x * ripple, self.y * ripple, 0])
@@ -276,7 +236,7 @@ class PoseClockOffset(Plant):
     parameters: ClassVar = {"offset": (0.2, -1.0, 1.0)}
 
     @override
-    def prepare(self, simulation: Simulation) -> None:
+    def prepare(self, simulation: Subject) -> None:
         self.pose_stamp_offset = self.offset
 
 
@@ -286,7 +246,7 @@ class CommandClockOffset(Plant):
     parameters: ClassVar = {"offset": (0.2, -1.0, 1.0)}
 
     @override
-    def prepare(self, simulation: Simulation) -> None:
+    def prepare(self, simulation: Subject) -> None:
         self.command_stamp_offset = self.offset
 
 
@@ -316,7 +276,7 @@ class GyroBias(Plant):
     parameters: ClassVar = {"bias": (0.05, -0.3, 0.3)}
 
     @override
-    def prepare(self, simulation: Simulation) -> None:
+    def prepare(self, simulation: Subject) -> None:
         self.gyro_offset = self.bias
 
 
@@ -338,7 +298,7 @@ class GustingWind(Plant):
     parameters: ClassVar = {"force": (200.0, 20.0, 800.0), "period": (9.0, 2.0, 60.0)}
 
     @override
-    def push(self, simulation: Simulation) -> None:
+    def push(self, simulation: Subject) -> None:
         strength = math.sin(2 * math.pi * simulation.time / self.period)
         _push_hull(simulation, self.force * strength * np.array([0.5, 0.87, 0.0]))
 
@@ -361,7 +321,7 @@ class StickyTurn(Plant):
     parameters: ClassVar = {"width": (0.4, 0.05, 1.5)}
 
     @override
-    def prepare(self, simulation: Simulation) -> None:
+    def prepare(self, simulation: Subject) -> None:
         self._side = np.sign([wheel.centre[1] for wheel in simulation.robot.wheels])
         self._arm = abs(simulation.robot.wheels[0].centre[1]) / simulation.robot.wheels[0].radius
         self._held = 0.0
@@ -381,7 +341,7 @@ class SpeedPull(Plant):
     parameters: ClassVar = {"torque": (200.0, 5.0, 600.0)}
 
     @override
-    def push(self, simulation: Simulation) -> None:
+    def push(self, simulation: Subject) -> None:
         speed = float(simulation.state().linear_velocity[0])
         simulation.data.xfrc_applied[simulation.base, 5] += self.torque * speed * abs(speed)
 
@@ -391,7 +351,7 @@ def _scale_wheels(spec: mujoco.MjSpec, robot: Vehicle, factor) -> None:
         spec.geom(wheel.surface).size[0] = wheel.radius * factor(wheel)
 
 
-def _push_hull(simulation: Simulation, force: np.ndarray) -> None:
+def _push_hull(simulation: Subject, force: np.ndarray) -> None:
     """A force in world axes [N] at the middle of the hull, by its effect at the base body's centre of mass."""
     data, base = simulation.data, simulation.base
     hull = simulation.robot.hull

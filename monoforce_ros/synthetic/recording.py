@@ -18,7 +18,8 @@ from monoforce_ros.synthetic.command_profile import CommandProfile, make_profile
 from monoforce_ros.synthetic.hidden import write_truth
 from monoforce_ros.synthetic.labels import world_labels, write_labels
 from monoforce_ros.synthetic.odometry import Odometry, OdometrySettings
-from monoforce_ros.synthetic.plants import Plant, VegetationDrag
+from monoforce_ros.synthetic.plant import Plant
+from monoforce_ros.synthetic.plants import VegetationDrag
 from monoforce_ros.synthetic.random_streams import DEFAULT_SEED, random_stream
 from monoforce_ros.synthetic.scenery import Scenery, build_scenery
 from monoforce_ros.synthetic.sensors import Camera, CameraSettings, Imu, ImuSettings, Lidar, LidarSettings, encode_jpeg

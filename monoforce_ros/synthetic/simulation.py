@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from monoforce_ros.synthetic import vehicle, world
 from monoforce_ros.synthetic.graphics import mujoco
-from monoforce_ros.synthetic.plants import Plant
+from monoforce_ros.synthetic.plant import Plant
 from monoforce_ros.synthetic.scenery import Scenery
 from monoforce_ros.synthetic.vehicle import Vehicle
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from monoforce_ros.synthetic import textures, vehicle
 from monoforce_ros.synthetic.graphics import mujoco
-from monoforce_ros.synthetic.plants import Plant
+from monoforce_ros.synthetic.plant import Plant
 from monoforce_ros.synthetic.random_streams import random_stream
 from monoforce_ros.synthetic.scenery import Scenery
 from monoforce_ros.synthetic.shapes import Shape

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import pkgutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import torch
 from torch import Tensor
@@ -120,3 +120,31 @@ def recorded_commands(commands: CommandTrack, robot: RobotModel) -> CommandTrack
         values = {key: float(value) for key, value in effect_values(name, parameters).items()}
         commands = CATALOGUE[name].commands(commands, values)
     return commands
+
+
+def corrected_motion(motion: MotionTrack, effects: Iterable[tuple[str, Mapping[str, float]]]) -> MotionTrack:
+    """Recorded motion without what measurement effects did to it: each undoes itself with the opposite sign."""
+    for name, parameters in effects:
+        if _catalogued(name).stage == "measurement":
+            motion = CATALOGUE[name].motion(motion, {key: -float(value) for key, value in _full(name, parameters)})
+    return motion
+
+
+def corrected_commands(commands: CommandTrack, effects: Iterable[tuple[str, Mapping[str, float]]]) -> CommandTrack:
+    """Recorded commands without what measurement effects did to them."""
+    for name, parameters in effects:
+        if _catalogued(name).stage == "measurement":
+            commands = CATALOGUE[name].commands(
+                commands, {key: -float(value) for key, value in _full(name, parameters)}
+            )
+    return commands
+
+
+def _catalogued(name: str) -> Effect:
+    if name not in CATALOGUE:
+        raise EffectError(f"effect {name!r} is unknown; expected one of {sorted(CATALOGUE)}")
+    return CATALOGUE[name]
+
+
+def _full(name: str, parameters: Mapping[str, float]) -> Iterable[tuple[str, float]]:
+    return [(key, float(value)) for key, value in effect_values(name, parameters).items()]
