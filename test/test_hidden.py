@@ -122,6 +122,16 @@ def test_a_payload_far_back_turns_more_easily(husky, level):
     assert steady(husky, level, (0.5, 0.5), "payload:15")[2] > 1.1 * steady(husky, level, (0.5, 0.5))[2]
 
 
+def test_soft_contacts_let_the_robot_sink(husky, level):
+    sunk = []
+    for hidden in ((), (parse_hidden("terrain_softness:20"),)):
+        simulation = Simulation(build_model(level, husky, 0, {}, hidden), level, husky, hidden)
+        for _ in range(500):
+            simulation.step()
+        sunk.append(-float(simulation.state().position[2]))
+    assert sunk[1] > sunk[0] + 0.001
+
+
 def test_outsiders_do_what_no_effect_of_the_catalogue_does(husky, level):
     fading = speeds(husky, level, (0.8, 0.0), "fading_drive:10", seconds=8.0)[:, 0]
     assert fading[-1] < 0.85 * fading[1000]
