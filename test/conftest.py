@@ -112,3 +112,14 @@ def start(executables, ros_environment, tmp_path_factory):
     for process in started:
         if process.running:
             process.stop(signal.SIGKILL)
+
+
+@pytest.fixture(scope="module")
+def one_thread():
+    """Torch on one thread, as the executables run it, for the tests of a module."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)

@@ -27,15 +27,9 @@ from monoforce_ros.synthetic.recording import RecordingSettings, record
 from monoforce_ros.synthetic.terrain_shape import TerrainSettings
 from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 SAMPLES = np.array([0.5, 1.0, 1.5, 2.0])
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")

@@ -24,13 +24,7 @@ from monoforce_ros.training import FitSettings, fit_terrain
 from monoforce_ros.training.terrain_fit import trajectory_frame, trajectory_grid
 from monoforce_ros.training.visible import visible_terrain
 
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")

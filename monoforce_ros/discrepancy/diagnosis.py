@@ -124,6 +124,7 @@ def diagnose(
     nominal = robust(np.nan_to_num(before / scale, nan=1e3))
     chosen: Effects = ()
     current = nominal
+    whole: Fit | None = None
     rounds: list[list[dict]] = []
     rivals: dict[str, list[str]] = {}
     verdict = "no_discrepancy"
@@ -145,7 +146,7 @@ def diagnose(
                 fit = fit_effects(predictions, first, scale, seen, iterations=5)
                 fits.append(fit)
                 unseen[~seen] = fit.loss[~seen]
-            gain, low, chance = _paired(current, unseen, folds, starts, random)
+            gain, low, chance = _paired(current, unseen, starts, random)
             tried.append({"name": name, "gain": gain, "low": low, "p": chance, "loss": unseen, "fits": fits})
         tried.sort(key=lambda entry: -entry["gain"])
         rounds.append(tried)
@@ -158,8 +159,8 @@ def diagnose(
             verdict = "no_improvement" if not chosen else verdict
             break
         verdict = "effect_found"
-        best = _preferred(tried, current, folds, starts, random)
-        rivals[best["name"]] = _rivals(best, tried, folds, starts, random)
+        best = _preferred(tried, current, starts, random)
+        rivals[best["name"]] = _rivals(best, tried, starts, random)
         merged = max(best["fits"], key=lambda fit: -fit.loss.mean())
         chosen = merged.effects
         whole = fit_effects(predictions, [chosen], scale, np.ones(len(starts), bool), iterations=6)
@@ -168,12 +169,10 @@ def diagnose(
     effects: tuple[dict, ...] = ()
     details: dict = {"starts": starts, "before": before, "scale": scale, "floor": floor}
     gap: dict[str, dict] = {}
-    if chosen:
-        whole = fit_effects(predictions, [chosen], scale, np.ones(len(starts), bool), iterations=6)
+    if whole is not None:
         effects = tuple(_described(whole, rivals))
         after, gap = _gap(robot, data, predictions, whole, scale, folds, random)
         details["after"] = after
-        chosen = whole.effects
         reached = [row for metric, row in gap.items() if metric.startswith("position") and row["low"] > 0]
         if not reached:
             verdict = "no_improvement"
@@ -286,7 +285,7 @@ def _blocks(starts: np.ndarray) -> np.ndarray:
 
 
 def _paired(
-    before: np.ndarray, after: np.ndarray, folds: np.ndarray, starts: np.ndarray, random: np.random.Generator
+    before: np.ndarray, after: np.ndarray, starts: np.ndarray, random: np.random.Generator
 ) -> tuple[float, float, float]:
     """Mean gain, its lower bound of 95 %, and the chance of such gains of whole blocks by Wilcoxon's test."""
     blocks = _blocks(starts)
@@ -302,29 +301,25 @@ def _paired(
     return gain, float(np.quantile(resampled, 0.05)), chance
 
 
-def _preferred(
-    tried: list[dict], current: np.ndarray, folds: np.ndarray, starts: np.ndarray, random: np.random.Generator
-) -> dict:
+def _preferred(tried: list[dict], current: np.ndarray, starts: np.ndarray, random: np.random.Generator) -> dict:
     """The best effect, or one as good that asks for fewer parameters."""
     best = tried[0]
     parameters = {name: len(keys) for name, keys in CANDIDATES}
     for entry in tried[1:6]:
-        margin, low, _ = _paired(entry["loss"], best["loss"], folds, starts, random)
+        margin, low, _ = _paired(entry["loss"], best["loss"], starts, random)
         simpler = parameters[entry["name"]] < parameters[best["name"]]
         if simpler and (low <= 0 or margin < 0.02 * current.mean()):
             best = entry
     return best
 
 
-def _rivals(
-    best: dict, tried: list[dict], folds: np.ndarray, starts: np.ndarray, random: np.random.Generator
-) -> list[str]:
+def _rivals(best: dict, tried: list[dict], starts: np.ndarray, random: np.random.Generator) -> list[str]:
     """Effects that explain the drive about as well."""
     rivals = []
     for entry in tried:
         if entry["name"] == best["name"]:
             continue
-        _, low, _ = _paired(entry["loss"], best["loss"], folds, starts, random)
+        _, low, _ = _paired(entry["loss"], best["loss"], starts, random)
         if low <= 0 or any({entry["name"], best["name"]} <= group for group in EQUIVALENT):
             rivals.append(entry["name"])
     return rivals

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -60,20 +58,12 @@ def residual_scale(floor: np.ndarray, leftover: np.ndarray | None) -> np.ndarray
     return np.sqrt(squares)
 
 
-@dataclass(frozen=True)
-class Regimes:
-    """Ways of driving, each a mask over windows, in plain words."""
-
-    masks: dict[str, np.ndarray]
-    """``[W]`` bool by name."""
-
-
-def find_regimes(data: DriveData) -> Regimes:
-    """What each window is an example of; a window may be one of several."""
+def find_regimes(data: DriveData) -> dict[str, np.ndarray]:
+    """Ways of driving in plain words, each with the mask ``[W]`` of its windows; a window may be in several."""
     count = round((data.horizon + 0.5) / 0.05)
     stamps = data.starts[:, None] + (np.arange(count) * 50_000_000 - 500_000_000)
     told = data.commands.sample(stamps)
-    _, rotations, linear, angular = sample_motion(data.motion, stamps)
+    rotations = sample_motion(data.motion, stamps)[1]
     speed, turning = np.abs(told[..., 0]).mean(axis=1), np.abs(told[..., 1]).mean(axis=1)
     change = np.abs(np.diff(told[..., 0], axis=1)).sum(axis=1)
     pitch = np.abs(rotations[..., 2, 0]).mean(axis=1)
@@ -91,18 +81,17 @@ def find_regimes(data: DriveData) -> Regimes:
         "in the first third of the drive": np.arange(len(speed)) < len(speed) / 3,
         "in the last third of the drive": np.arange(len(speed)) >= 2 * len(speed) / 3,
     }
-    del linear, angular
-    return Regimes({name: mask for name, mask in masks.items() if 3 <= mask.sum() < len(mask)})
+    return {name: mask for name, mask in masks.items() if 3 <= mask.sum() < len(mask)}
 
 
-def localise(residuals: np.ndarray, floor: np.ndarray, data: DriveData, regimes: Regimes) -> list[dict]:
+def localise(residuals: np.ndarray, floor: np.ndarray, data: DriveData, regimes: dict[str, np.ndarray]) -> list[dict]:
     """Where the disagreement lives: shares of the squared error over its floor by axis and regime, strongest first.
 
     Args:
         residuals: ``[W, K, 3]``.
         floor: ``[K, 3]``.
         data: the drive.
-        regimes: ways of driving.
+        regimes: of :func:`find_regimes`.
     """
     horizon = float(data.samples[-1])
     names = (("error along the way", "m"), ("error across the way", "m"), ("heading error", "rad"))
@@ -113,7 +102,7 @@ def localise(residuals: np.ndarray, floor: np.ndarray, data: DriveData, regimes:
         total = squares[:, axis].sum()
         if total <= 0 or scaled[axis] < 2.0:
             continue
-        for regime, mask in regimes.masks.items():
+        for regime, mask in regimes.items():
             share, time = float(squares[mask, axis].sum() / total), float(mask.mean())
             lift = share / max(time, 1e-9)
             entries.append(

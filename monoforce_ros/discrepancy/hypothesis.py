@@ -89,7 +89,6 @@ class Predictions:
     def __init__(self, robot: RobotModel, data: DriveData):
         self.robot, self.data = robot, data
         self.options = PhysicsOptions()
-        self._height = 0.0
         if data.terrain is None:
             self._terrain = TerrainMap.flat(Grid.square(2.0, 1.0))
             self._depth = rest_depth(robot, float(self._terrain.stiffness[0, 0]))
