@@ -1,8 +1,9 @@
 # make demo   play the bundled bag through the predictor and draw what it predicts
 # make test   lint and run every test
 # make bench  run the benchmarks
+# make diagnosis  measure diagnose on hidden effects and real drives (an hour), write the tables of docs/discrepancy.md
 SHELL := /bin/bash
-.PHONY: demo test bench lint environment build graphics lock clean help
+.PHONY: demo test bench diagnosis lint environment build graphics lock clean help
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -37,3 +38,11 @@ bench: build
 	@scripts/run.sh python benchmarks/rollout.py --json out/rollout.json
 	@scripts/run.sh python benchmarks/integrators.py --json out/integrators.json
 	@scripts/run.sh python benchmarks/mujoco_check.py --json out/mujoco_check.json
+
+DRIVES ?= $(or $(MONOFORCE_REAL_DATA),../shared/data)/drive
+diagnosis: build graphics
+	@.venv/bin/uv pip install --quiet --python .venv/bin/python -r benchmarks/requirements.txt
+	@mkdir -p out
+	@scripts/run.sh python benchmarks/hidden_effects.py --baselines --json out/hidden_effects.json --docs docs/discrepancy.md
+	@if [ -d "$(DRIVES)" ]; then scripts/run.sh python benchmarks/warthog_reports.py "$(DRIVES)" \
+	  --json out/warthog.json --docs docs/discrepancy.md; else echo "[diagnosis] no real drives at $(DRIVES)"; fi

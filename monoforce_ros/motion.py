@@ -126,6 +126,33 @@ class MotionTrack:
 
 
 @dataclass(frozen=True)
+class TurningTrack:
+    """Angular velocity over time as an IMU shows it, in its own axes."""
+
+    stamps: np.ndarray
+    """``[n]`` int64 [ns], ascending."""
+    rates: np.ndarray
+    """``[n, 3]`` [rad/s]."""
+    frame_id: str = "imu_link"
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+
+@dataclass(frozen=True)
+class WheelTrack:
+    """Measured turning speed of the wheels on either side over time."""
+
+    stamps: np.ndarray
+    """``[n]`` int64 [ns], ascending."""
+    speeds: np.ndarray
+    """Mean of the left and of the right wheels, ``[n, 2]`` [rad/s]."""
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+
+@dataclass(frozen=True)
 class CommandTrack:
     """Commanded forward speed and yaw rate over time; each command holds until the next."""
 

@@ -19,6 +19,7 @@ from monoforce_ros.physics.effects import (
     effect_values,
     recorded_commands,
     recorded_motion,
+    turned_effects,
 )
 from monoforce_ros.physics.effects.page import catalogue_page
 from monoforce_ros.physics.rest import rest_depth
@@ -202,6 +203,31 @@ def test_forces_and_tilted_gravity_accelerate_as_newton_says(husky):
     assert float(tilted[0]) == pytest.approx(-9.81 * math.sin(0.05), rel=0.03)
     tilted = run(having(husky, gravity_tilt={"about_x": 0.05}), (0, 0), 1.0, **free).velocity[0, -1]
     assert float(tilted[1]) == pytest.approx(9.81 * math.sin(0.05), rel=0.03)
+
+
+def test_tilted_gravity_stays_with_the_ground_when_the_robot_turns(husky):
+    """In the frame of each heading the tilt points another way; in the odometry frame it is one."""
+    robot = having(husky, gravity_tilt={"about_x": 0.02, "about_y": 0.05})
+    headings = torch.tensor([0.0, 0.5 * math.pi, 2.0], dtype=torch.float64)
+    moved = []
+    for heading in headings:
+        turned = turned_effects(robot, heading[None])
+        velocity = run(turned, (0, 0), 1.0, state=sliding(0.0), options=FRICTIONLESS).velocity[0, -1]
+        cos, sin = math.cos(heading), math.sin(heading)
+        moved.append([float(cos * velocity[0] - sin * velocity[1]), float(sin * velocity[0] + cos * velocity[1])])
+    # Small angles: the order of the two turns does not matter.
+    np.testing.assert_allclose(moved[1:], [moved[0]] * 2, atol=1e-3)
+    assert turned_effects(husky, headings) is husky
+
+
+def test_a_lag_of_its_own_for_each_trajectory_is_the_same_lag(husky):
+    twists = torch.rand(3, 150, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    constants = [0.0, 0.2, 0.7]
+    together = having(husky, actuator_lag={"time_constant": torch.tensor(constants, dtype=torch.float64)})
+    batch = drive_speeds(together, twists, 0.01)
+    for index, constant in enumerate(constants):
+        alone = having(husky, actuator_lag={"time_constant": constant})
+        torch.testing.assert_close(batch[index], drive_speeds(alone, twists[index : index + 1], 0.01)[0])
 
 
 def test_a_learned_term_contains_the_effects_it_can_spell(husky):

@@ -12,13 +12,14 @@ from scipy.spatial.transform import Rotation
 from monoforce_ros.bags.reader import BagError, BagReader
 from monoforce_ros.camera import CameraModel
 from monoforce_ros.messages import decoding
-from monoforce_ros.motion import CommandTrack, MotionTrack
+from monoforce_ros.motion import CommandTrack, MotionTrack, TurningTrack, WheelTrack
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 COMMANDS = ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist")
 CLOUD = "sensor_msgs/msg/PointCloud2"
 IMAGES = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+IMU, JOINTS = "sensor_msgs/msg/Imu", "sensor_msgs/msg/JointState"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 
 
@@ -46,9 +47,13 @@ class Recording:
     """Camera model of each image topic that has a CameraInfo beside it."""
     static_transforms: dict[tuple[str, str], np.ndarray]
     topics: dict[str, str]
-    """The topics chosen: ``odometry``, ``commands``, ``cloud``."""
+    """The topics chosen: ``odometry``, ``commands``, ``cloud``, ``imu``, ``joints``."""
     complaints: tuple[str, ...] = field(default=())
     """What was wrong with single messages; they were left out."""
+    turning: TurningTrack | None = None
+    """What the IMU shows, where there is one."""
+    wheels: WheelTrack | None = None
+    """Measured wheel speeds, where there are."""
 
     @classmethod
     def open(
@@ -68,6 +73,8 @@ class Recording:
                 "odometry": _choose(bag, odometry, (ODOMETRY,)),
                 "commands": _choose(bag, commands, COMMANDS),
                 "cloud": _choose(bag, cloud, (CLOUD,)),
+                "imu": _choose(bag, None, (IMU,)),
+                "joints": _choose(bag, None, (JOINTS,)),
             }
             if chosen["odometry"] is None:
                 raise BagError(f"{bag.path} has no {ODOMETRY} topic; it holds {sorted(set(bag.topics.values()))}")
@@ -197,6 +204,9 @@ class _Collector:
         self.states: list = []
         self.frames = ("odom", "base_link")
         self.twists: list[tuple[int, np.ndarray]] = []
+        self.turning: list[tuple[int, np.ndarray]] = []
+        self.turning_frame = ""
+        self.wheels: list[tuple[int, np.ndarray]] = []
         self.indexed: dict[str, list[Frame]] = {}
         self.cameras: dict[str, CameraModel] = {}
         self.transforms: dict[tuple[str, str], np.ndarray] = {}
@@ -217,6 +227,13 @@ class _Collector:
                 self.states.append((stamp, state))
             elif message.topic == self.chosen["commands"]:
                 self.twists.append((stamp, decoding.decode_command(decoded)))
+            elif message.topic == self.chosen["imu"]:
+                rate, self.turning_frame = decoding.decode_turning(decoded)
+                self.turning.append((stamp, rate))
+            elif message.topic == self.chosen["joints"]:
+                speeds = decoding.decode_wheels(decoded)
+                if speeds is not None:
+                    self.wheels.append((stamp, speeds))
             elif message.message_type == CAMERA_INFO:
                 if message.topic not in self.cameras:
                     self.cameras[message.topic] = decoding.decode_camera_info(decoded)
@@ -267,4 +284,21 @@ class _Collector:
             static_transforms=self.transforms,
             topics={role: topic for role, topic in self.chosen.items() if topic},
             complaints=tuple(self.complaints),
+            turning=self._turning_track(),
+            wheels=self._wheel_track(),
         )
+
+    def _wheel_track(self) -> WheelTrack | None:
+        if not self.wheels:
+            return None
+        self.wheels.sort(key=lambda entry: entry[0])
+        stamps, first = np.unique([stamp for stamp, _ in self.wheels], return_index=True)
+        return WheelTrack(stamps.astype(np.int64), np.array([self.wheels[index][1] for index in first]))
+
+    def _turning_track(self) -> TurningTrack | None:
+        if not self.turning:
+            return None
+        self.turning.sort(key=lambda entry: entry[0])
+        stamps, first = np.unique([stamp for stamp, _ in self.turning], return_index=True)
+        rates = np.array([self.turning[index][1] for index in first])
+        return TurningTrack(stamps.astype(np.int64), rates, self.turning_frame)

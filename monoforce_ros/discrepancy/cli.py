@@ -3,25 +3,27 @@
 from __future__ import annotations
 
 import argparse
+import multiprocessing
 import sys
-import time
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
 import numpy as np
 import torch
 from tqdm import tqdm
 
-from monoforce_ros.bags import BagError, Recording, SmoothedMotion, smooth
-from monoforce_ros.discrepancy.diagnosis import Diagnosis, Settings, commission, diagnose
-from monoforce_ros.discrepancy.report import summary_lines, write_diagnosis
-from monoforce_ros.discrepancy.robot_copy import fingerprint, read_leftover, write_robot
+from monoforce_ros.bags import BagError
+from monoforce_ros.discrepancy.bag_diagnosis import BagDiagnosis, Topics, diagnose_bag, read_drive
+from monoforce_ros.discrepancy.commissioning import commission
+from monoforce_ros.discrepancy.diagnosis import Settings
+from monoforce_ros.discrepancy.report import summary_lines
+from monoforce_ros.discrepancy.robot_copy import fingerprint, write_robot
 from monoforce_ros.physics.effects import EffectError
-from monoforce_ros.robots import RobotFileError, RobotModel, load_robot, shipped_robots
-from monoforce_ros.terrain import Grid, TerrainFileError, TerrainMap, load_terrain
+from monoforce_ros.robots import RobotFileError, load_robot, shipped_robots
+from monoforce_ros.terrain import TerrainFileError
 from monoforce_ros.terrain.lidar import TerrainError
-from monoforce_ros.training.visible import visible_terrain
 
-_MARGIN = 4.0
+_ERRORS = (BagError, EffectError, RobotFileError, TerrainFileError, TerrainError, ValueError, OSError)
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -41,12 +43,16 @@ def build_parser() -> argparse.ArgumentParser:
         "--commission",
         action="store_true",
         help="fit what every new robot needs (friction, effective track width, servo response) to drives of the "
-        "healthy robot on level ground and write OUT/ROBOT.yaml, the nominal model of later runs",
+        "healthy robot and write OUT/ROBOT.yaml, the nominal model of later runs",
     )
-    parser.add_argument("--effects", type=int, default=2, metavar="N", help="at most (%(default)s)")
+    parser.add_argument("--effects", type=int, default=4, metavar="N", help="at most (%(default)s)")
     parser.add_argument("--odometry", metavar="TOPIC", help="(found by type)")
     parser.add_argument("--commands", metavar="TOPIC", help="(found by type)")
     parser.add_argument("--cloud", metavar="TOPIC", help="(found by type)")
+    parser.add_argument(
+        "--held-out", nargs="+", type=Path, default=[], metavar="BAG", help="compare before and after on these too"
+    )
+    parser.add_argument("--jobs", type=int, default=2, metavar="N", help="bags diagnosed at a time (%(default)s)")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     return parser
 
@@ -55,29 +61,104 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
     parser = build_parser()
     options = parser.parse_args(arguments)
-    if not 1 <= options.effects <= 5:
-        parser.error(f"--effects: got {options.effects}, expected 1 to 5")
+    if not 1 <= options.effects <= 6:
+        parser.error(f"--effects: got {options.effects}, expected 1 to 6")
+    if options.jobs < 1:
+        parser.error(f"--jobs: got {options.jobs}, expected 1 or more")
     # Many small operations: one thread is faster than several, and does not collapse on a busy machine.
     torch.set_num_threads(1)
     try:
-        robot = load_robot(options.robot)
+        # A wrong name or file is said before a long drive is read.
+        load_robot(options.robot)
         if options.commission:
-            return _commission(robot, options)
-        for bag in options.bags:
-            _diagnose_bag(bag, robot, options)
-    except (BagError, EffectError, RobotFileError, TerrainFileError, TerrainError, ValueError, OSError) as error:
+            return _commission(options)
+        if len(options.bags) > 1:
+            return _diagnose_many(options)
+        print_finding(_with_bar(options.bags[0], options.out, options))
+    except _ERRORS as error:
         print(f"diagnose: {error}", file=sys.stderr)
         return 1
     return 0
 
 
-def _commission(robot: RobotModel, options: argparse.Namespace) -> int:
-    drives = []
-    for bag in options.bags:
-        recording = Recording.open(bag, odometry=options.odometry, commands=options.commands)
-        drives.append((smooth(recording.motion), recording.commands))
+def print_finding(found: BagDiagnosis) -> None:
+    """The outcome for people."""
+    for complaint in found.complaints[:3]:
+        print(f"diagnose: {found.bag}: {complaint}", file=sys.stderr)
+    first, *rest = summary_lines(found.diagnosis)
+    print(f"{found.bag}: {first}")
+    if found.robot_file:
+        rest.append(f"  robot file: {found.robot_file}")
+    print("\n".join([*rest, f"  report: {found.page}"]))
+
+
+def _with_bar(bag: Path, out: Path, options: argparse.Namespace) -> BagDiagnosis:
+    form = "{desc}: {percentage:3.0f}%|{bar}| [{elapsed}] {postfix}"
+    with tqdm(total=100, desc=bag.name, bar_format=form, disable=True if options.quiet else None, leave=False) as bar:
+
+        def progress(share: float, what: str) -> None:
+            bar.set_postfix_str(what, refresh=False)
+            bar.update(100 * share - bar.n)
+
+        return _run(bag, out, options, progress)
+
+
+def _run(bag: Path, out: Path, options: argparse.Namespace, progress=lambda share, what: None) -> BagDiagnosis:
+    return diagnose_bag(
+        bag,
+        options.robot,
+        out,
+        terrain=options.terrain,
+        topics=Topics(options.odometry, options.commands, options.cloud),
+        settings=Settings(most_effects=options.effects),
+        held_out=options.held_out,
+        progress=progress,
+    )
+
+
+def _run_alone(bag: Path, out: Path, options: argparse.Namespace) -> BagDiagnosis | str:
+    """In a process of its own; an error comes back as its text."""
+    torch.set_num_threads(1)
+    try:
+        return _run(bag, out, options).without_arrays()
+    except _ERRORS as error:
+        return str(error)
+
+
+def _diagnose_many(options: argparse.Namespace) -> int:
+    """Bags in parallel, each into a folder of its own; one that fails does not stop the others."""
+    names = [bag.name.removesuffix(".bag") for bag in options.bags]
+    outs = [
+        options.out / (name if names.count(name) == 1 else f"{number:02d}_{name}") for number, name in enumerate(names)
+    ]
+    failed = 0
+    context = multiprocessing.get_context("spawn")
+    jobs = min(options.jobs, len(options.bags))
+    with (
+        ProcessPoolExecutor(jobs, mp_context=context) as pool,
+        tqdm(total=len(outs), desc="diagnose", unit="bag", disable=True if options.quiet else None, leave=False) as bar,
+    ):
+        running = {pool.submit(_run_alone, bag, out, options): bag for bag, out in zip(options.bags, outs, strict=True)}
+        for done in as_completed(running):
+            found = done.result()
+            bar.clear()
+            if isinstance(found, str):
+                failed += 1
+                print(f"diagnose: {running[done]}: {found}", file=sys.stderr)
+            else:
+                print_finding(found)
+            bar.update()
+    if failed:
+        print(f"diagnose: {failed} of {len(outs)} bags failed", file=sys.stderr)
+    return int(failed > 0)
+
+
+def _commission(options: argparse.Namespace) -> int:
+    robot = load_robot(options.robot)
+    topics = Topics(options.odometry, options.commands, options.cloud)
+    drives = [read_drive(bag, robot, options.terrain, topics)[0] for bag in options.bags]
     settings = Settings()
-    effects, leftover = commission(drives, robot, settings=settings)
+    effects, leftover = commission(drives, robot, samples=settings.samples)
     kept = {
         "samples_s": list(settings.samples),
         "residual_rms": [[float(f"{value:.4g}") for value in row] for row in leftover],
@@ -95,67 +176,6 @@ def _commission(robot: RobotModel, options: argparse.Namespace) -> int:
     )
     print(f"robot file: {out}")
     return 0
-
-
-def _diagnose_bag(bag: Path, robot: RobotModel, options: argparse.Namespace) -> Diagnosis:
-    began = time.monotonic()
-    recording = Recording.open(bag, odometry=options.odometry, commands=options.commands, cloud=options.cloud)
-    for complaint in recording.complaints[:3]:
-        print(f"diagnose: {complaint}", file=sys.stderr)
-    smoothed = smooth(recording.motion)
-    terrain, pose = _terrain(recording, smoothed, robot, options.terrain)
-    form = "{desc}: {percentage:3.0f}%|{bar}| [{elapsed}<{remaining}] {postfix}"
-    with tqdm(total=100, desc=bag.name, bar_format=form, disable=True if options.quiet else None, leave=False) as bar:
-
-        def progress(share: float, what: str) -> None:
-            bar.set_postfix_str(what, refresh=False)
-            bar.update(100 * share - bar.n)
-
-        diagnosis = diagnose(
-            smoothed,
-            recording.commands,
-            robot,
-            terrain=terrain,
-            odometry_from_terrain=pose,
-            leftover=read_leftover(options.robot, Settings().samples),
-            settings=Settings(most_effects=options.effects),
-            progress=progress,
-        )
-    folder = options.out / bag.name.removesuffix(".bag") if len(options.bags) > 1 else options.out
-    data = fingerprint([bag])
-    robot_file = None
-    if diagnosis.effects:
-        robot_file = write_robot(options.robot, folder / f"{robot.name}.yaml", diagnosis.effects, [bag], data)
-    inputs = {
-        "bag": str(bag),
-        "data": data,
-        "robot": str(options.robot),
-        "terrain": options.terrain,
-        "topics": ", ".join(f"{role} {topic}" for role, topic in recording.topics.items()),
-        "noise of the poses": f"{100 * smoothed.position_noise:.1f} cm, {np.degrees(smoothed.rotation_noise):.2f}°",
-        "duration_s": round(time.monotonic() - began, 1),
-    }
-    _, page = write_diagnosis(folder, diagnosis, inputs, robot_file)
-    print("\n".join([f"{bag}: " + summary_lines(diagnosis)[0], *summary_lines(diagnosis)[1:]]))
-    if robot_file:
-        print(f"  robot file: {robot_file}")
-    print(f"  report: {page}")
-    return diagnosis
-
-
-def _terrain(
-    recording: Recording, smoothed: SmoothedMotion, robot: RobotModel, source: str
-) -> tuple[TerrainMap | None, np.ndarray | None]:
-    if source == "flat":
-        return None, None
-    if source != "lidar":
-        return load_terrain(Path(source))
-    motion = smoothed.motion
-    low, high = motion.positions.min(axis=0)[:2] - _MARGIN, motion.positions.max(axis=0)[:2] + _MARGIN
-    columns, rows = np.ceil((high - low) / 0.1).astype(int) + 1
-    grid = Grid(int(rows), int(columns), 0.1, (float(low[0]), float(low[1])))
-    start, stop = int(motion.stamps[0]), int(motion.stamps[-1])
-    return visible_terrain(recording, motion, robot, grid, np.eye(4), start=start, stop=stop), np.eye(4)
 
 
 if __name__ == "__main__":

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from monoforce_ros.discrepancy.hypothesis import Effects, Predictions
+from monoforce_ros.discrepancy.hypothesis import DriveData, Effects, Predictions
 from monoforce_ros.physics.effects import CATALOGUE
 
-_OUTLIER = 3.0
+OUTLIER = 3.0
 """Scaled residuals beyond this weigh with their size rather than their square."""
 _DAMPINGS = (1e-3, 1e-1, 3.0)
+_SHARED = 4.0
+"""Length of the blocks that say something on their own [s]."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,7 @@ class Fit:
 def robust(scaled: np.ndarray) -> np.ndarray:
     """Huber's loss of scaled residuals ``[..., W, K, 3]``, averaged over a window, ``[..., W]``."""
     size = np.abs(scaled)
-    values = np.where(size <= _OUTLIER, 0.5 * size**2, _OUTLIER * (size - 0.5 * _OUTLIER))
+    values = np.where(size <= OUTLIER, 0.5 * size**2, OUTLIER * (size - 0.5 * OUTLIER))
     return np.minimum(values, 1e6).mean(axis=(-1, -2))
 
 
@@ -56,6 +58,13 @@ def with_values(effects: Effects, values: np.ndarray) -> Effects:
     return tuple(result)
 
 
+def neutral_values(effects: Effects) -> np.ndarray:
+    """Values at which the effects do nothing, in a row."""
+    return np.array(
+        [{p.name: p for p in CATALOGUE[name].parameters}[key].neutral for name, values in effects for key in values]
+    )
+
+
 def scales(effects: Effects) -> np.ndarray:
     """How far from neutral each parameter is typically found."""
     return np.array(
@@ -63,13 +72,19 @@ def scales(effects: Effects) -> np.ndarray:
     )
 
 
+def without(effects: Effects, name: str) -> Effects:
+    """The others."""
+    return tuple(entry for entry in effects if entry[0] != name)
+
+
 def fit_effects(
     predictions: Predictions,
     starts: Sequence[Effects],
     scale: np.ndarray,
-    windows: np.ndarray,
     *,
     iterations: int = 8,
+    free: int = 0,
+    prior: float = 0.0,
 ) -> Fit:
     """Robust Levenberg-Marquardt from the best of several starts.
 
@@ -77,54 +92,93 @@ def fit_effects(
         predictions: of the drive.
         starts: the same effects with different values.
         scale: size of a residual that means nothing, ``[K, 3]``.
-        windows: which windows count, ``[W]`` bool.
         iterations: at most.
+        free: effects before this one keep their values.
+        prior: weight, beside the mean loss, of half the squared distance of each parameter from neutral in its
+            typical size; what a drive hardly tells then stays near neutral.
     """
+    neutral = neutral_values(starts[0])
+
+    def total(hypotheses: Sequence[Effects], scaled: np.ndarray) -> np.ndarray:
+        away = np.array([(flat(effects) - neutral) / scales(effects) for effects in hypotheses])
+        away = np.where(np.isfinite(away), away, 0.0)
+        return robust(np.nan_to_num(scaled, nan=1e3)).mean(axis=1) + 0.5 * prior * (away**2).sum(axis=1)
+
     tried = predictions.residuals(list(starts)) / scale
-    losses = robust(np.nan_to_num(tried, nan=1e3))[:, windows].mean(axis=1)
+    losses = total(starts, tried)
     best = int(np.argmin(losses))
     current, residual, loss = starts[best], tried[best], float(losses[best])
-    typical = scales(current)
-    values = flat(current)
+    held = sum(len(parameters) for _, parameters in current[:free])
+    typical, values = scales(current), flat(current)
     jacobian = None
-    for _ in range(iterations):
-        steps = 1e-2 * typical
-        # Away from a bound, and from neutral values beyond which an effect does not exist.
-        moved = [with_values(current, values + steps * unit) for unit in np.eye(len(values))]
-        actual = np.array([flat(m)[i] - values[i] for i, m in enumerate(moved)])
-        back = np.abs(actual) < 0.5 * steps
-        for i in np.flatnonzero(back):
-            moved[i] = with_values(current, values - steps * np.eye(len(values))[i])
-            actual[i] = flat(moved[i])[i] - values[i]
-        shifted = predictions.residuals(moved) / scale
-        actual = np.where(actual == 0.0, np.inf, actual)
-        jacobian = (shifted - residual) / actual[:, None, None, None] * typical[:, None, None, None]
-        jacobian = np.nan_to_num(jacobian[:, windows]).reshape(len(values), -1)
-        used = np.nan_to_num(residual[windows]).ravel()
-        weight = np.minimum(1.0, _OUTLIER / np.maximum(np.abs(used), 1e-9))
+    for _ in range(iterations if held < len(values) else 0):
+        jacobian = _jacobian(predictions, current, residual, scale, held)
+        used = np.nan_to_num(residual).ravel()
+        weight = np.minimum(1.0, OUTLIER / np.maximum(np.abs(used), 1e-9))
         gradient = jacobian @ (weight * used)
         curvature = (jacobian * weight) @ jacobian.T
+        if prior:
+            # The loss is a mean over residuals, the sums here are not.
+            gradient = gradient + prior * residual.size * ((values - neutral) / typical)[held:]
+            curvature = curvature + prior * residual.size * np.eye(len(curvature))
         diagonal = np.diag(np.diag(curvature) + 1e-6 * np.trace(curvature) + 1e-9)
-        candidates = [
-            with_values(current, values - typical * np.linalg.solve(curvature + damping * diagonal, gradient))
-            for damping in _DAMPINGS
-        ]
+        candidates = []
+        for damping in _DAMPINGS:
+            step = np.zeros(len(values))
+            step[held:] = typical[held:] * np.linalg.solve(curvature + damping * diagonal, gradient)
+            candidates.append(with_values(current, values - step))
         tried = predictions.residuals(candidates) / scale
-        losses = robust(np.nan_to_num(tried, nan=1e3))[:, windows].mean(axis=1)
+        losses = total(candidates, tried)
         best = int(np.argmin(losses))
-        if losses[best] >= loss * (1.0 - 1e-4):
+        if losses[best] >= loss * (1.0 - 1e-3):
             break
         current, residual, loss = candidates[best], tried[best], float(losses[best])
         values = flat(current)
-    count = max(1, int(windows.sum()))
     covariance = np.zeros((len(values), len(values)))
     if jacobian is not None and jacobian.any():
-        # Windows overlap and samples within one belong together: each window counts once.
-        information = jacobian @ jacobian.T / (jacobian.shape[1] / count)
-        spread = float(np.mean(np.minimum(np.nan_to_num(residual[windows]) ** 2, _OUTLIER**2)))
-        inverse = np.linalg.pinv(information + 1e-9 * np.eye(len(values)) * np.trace(information))
-        covariance = spread * inverse * np.outer(typical, typical)
+        covariance[held:, held:] = _covariance(jacobian, residual, typical[held:], predictions.data)
     return Fit(current, robust(np.nan_to_num(residual, nan=1e3)), covariance)
+
+
+def _jacobian(
+    predictions: Predictions, current: Effects, residual: np.ndarray, scale: np.ndarray, held: int
+) -> np.ndarray:
+    """Derivatives of the scaled residuals by each free parameter over its typical size, ``[P, W K 3]``."""
+    values, typical = flat(current), scales(current)
+    steps = 3e-2 * typical
+    units = np.eye(len(values))
+    # Away from a bound, and from neutral values beyond which an effect does not exist.
+    moved, actual = [], []
+    for i in range(held, len(values)):
+        there = with_values(current, values + steps * units[i])
+        change = flat(there)[i] - values[i]
+        if abs(change) < 0.5 * steps[i]:
+            there = with_values(current, values - steps * units[i])
+            change = flat(there)[i] - values[i]
+        moved.append(there)
+        actual.append(change if change else np.inf)
+    shifted = predictions.residuals(moved) / scale
+    factors = (typical[held:] / np.array(actual))[:, None, None, None]
+    return np.nan_to_num((shifted - residual) * factors).reshape(len(moved), -1)
+
+
+def _covariance(jacobian: np.ndarray, residual: np.ndarray, typical: np.ndarray, data: DriveData) -> np.ndarray:
+    """Of the parameters, by what each block of the drive says on its own (sandwich estimate, White 1980).
+
+    Windows of a block share motion and the model's other errors; blocks hardly do. So the spread of the blocks' pulls
+    on the parameters says how sure they are, also where the model is wrong in other ways.
+    """
+    used = np.nan_to_num(residual)
+    weight = np.minimum(1.0, OUTLIER / np.maximum(np.abs(used), 1e-9))
+    count = len(used)
+    rows = jacobian.reshape(len(jacobian), count, -1)
+    pulls = np.einsum("pwk,wk->wp", rows, (weight * used).reshape(count, -1))
+    blocks = ((data.starts - data.starts[0]) // round(_SHARED * 1e9)).astype(int)
+    sums = np.array([pulls[blocks == block].sum(axis=0) for block in np.unique(blocks)])
+    information = np.einsum("pwk,qwk->pq", rows * weight.reshape(1, count, -1), rows)
+    inverse = np.linalg.pinv(information + 1e-9 * np.eye(len(information)) * np.trace(information))
+    few = len(sums) / max(1, len(sums) - len(typical))
+    return few * inverse @ (sums.T @ sums) @ inverse * np.outer(typical, typical)
 
 
 def first_values(name: str, keys: Sequence[str]) -> list[Effects]:
@@ -151,3 +205,23 @@ def first_values(name: str, keys: Sequence[str]) -> list[Effects]:
         values[keys[0]] = float(value)
         starts.append(((name, values),))
     return starts
+
+
+def described(fit: Fit, rivals: Mapping[str, Sequence[str]]) -> list[dict]:
+    """Effects as in a report: ``name``, ``parameters`` {name: {value, low, high, unit}} with 95 %, ``rivals``."""
+    deviations = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
+    result, at = [], 0
+    for name, parameters in fit.effects:
+        known = {p.name: p for p in CATALOGUE[name].parameters}
+        listed = {}
+        for key, value in parameters.items():
+            half = 1.96 * float(deviations[at])
+            listed[key] = {
+                "value": float(value),
+                "low": float(max(value - half, known[key].low)),
+                "high": float(min(value + half, known[key].high)),
+                "unit": known[key].unit,
+            }
+            at += 1
+        result.append({"name": name, "parameters": listed, "rivals": list(rivals.get(name, []))})
+    return result

@@ -2,41 +2,86 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import SmoothedMotion, smooth
-from monoforce_ros.discrepancy.hypothesis import DriveData, sample_motion
+from monoforce_ros.discrepancy.hypothesis import DriveData, Predictions, sample_motion
 from monoforce_ros.motion import MotionTrack
+from monoforce_ros.robots import RobotModel
+from monoforce_ros.terrain import TerrainMap
 
-_NOISE_DRAWS = 4
+_NOISE_DRAWS = 3
+_KNOWN_SHAPE = 0.5
+"""Of the ground's influence on the motion: on MuJoCo's hills predictions on the true heights are off by the rest."""
 _SMALLEST = np.array([0.01, 0.01, np.radians(0.3)])
 """Residuals below this mean nothing however quiet the data [m, m, rad]."""
 
 
-def noise_floor(smoothed: SmoothedMotion, data: DriveData, seed: int = 0) -> np.ndarray:
-    """Root mean square that residuals have by the noise of the poses alone, ``[K, 3]`` [m, m, rad].
+def noisy_motions(smoothed: SmoothedMotion, seed: int = 0) -> list[MotionTrack]:
+    """The motion as it would have been found from poses with other noise of the same size.
 
     The smooth motion is taken for the truth, noise of the size that was taken out is put back, and it is smoothed once
-    more: by how much the relative motion within windows then differs, a perfect model's residuals would too.
+    more.
     """
     random = np.random.default_rng(seed)
     motion = smoothed.motion
-    squares = np.zeros((len(data.samples), 3))
+    drawn = []
     for _ in range(_NOISE_DRAWS):
         noise = Rotation.from_rotvec(smoothed.rotation_noise * random.standard_normal((len(motion), 3)))
-        noisy = MotionTrack(
-            motion.stamps,
-            motion.positions + smoothed.position_noise * random.standard_normal(motion.positions.shape),
-            (Rotation.from_quat(motion.quaternions) * noise).as_quat(),
-            motion.linear_velocities,
-            motion.angular_velocities,
-            motion.frame_id,
-            motion.child_frame_id,
+        noisy = replace(
+            motion,
+            positions=motion.positions + smoothed.position_noise * random.standard_normal(motion.positions.shape),
+            quaternions=(Rotation.from_quat(motion.quaternions) * noise).as_quat(),
         )
-        again = smooth(noisy, position_noise=smoothed.position_noise, rotation_noise=smoothed.rotation_noise).motion
-        squares += ((relative_motion(again, data) - relative_motion(motion, data)) ** 2).mean(axis=0)
-    return np.sqrt(squares / _NOISE_DRAWS)
+        again = smooth(noisy, position_noise=smoothed.position_noise, rotation_noise=smoothed.rotation_noise)
+        drawn.append(again.motion)
+    return drawn
+
+
+def noise_residuals(motion: MotionTrack, noisy: Sequence[MotionTrack], data: DriveData) -> np.ndarray:
+    """Residuals that a perfect model would have by the noise of the poses alone, ``[draws W, K, 3]``.
+
+    Args:
+        motion: smooth.
+        noisy: the same with other noise, of :func:`noisy_motions`.
+        data: windows of it.
+    """
+    own = relative_motion(motion, data)
+    return np.concatenate([relative_motion(other, data) - own for other in noisy])
+
+
+def noise_floor(motion: MotionTrack, noisy: Sequence[MotionTrack], data: DriveData) -> np.ndarray:
+    """Size of :func:`noise_residuals`, ``[K, 3]`` [m, m, rad]: two thirds are smaller, as of a standard deviation.
+
+    Robust: where a localisation jumps, smoothing other noise gives another motion altogether.
+    """
+    return np.quantile(np.abs(noise_residuals(motion, noisy, data)), 0.683, axis=0)
+
+
+def map_floor(robot: RobotModel, data: DriveData, halves: tuple[TerrainMap, TerrainMap] | None) -> np.ndarray:
+    """What residuals have by the ground's shape, however right the robot's model is, ``[K, 3]`` [m, m, rad].
+
+    Two parts: predictions on the maps of both halves of the sweeps differ by twice what the whole map's own noise does
+    to them; and what hills do to the motion, the difference to predictions on level ground, counts as known to
+    ``_KNOWN_SHAPE``, for a map has cells and tyres deform. Zero on level ground.
+    """
+    if data.terrain is None:
+        return np.zeros((len(data.samples), 3))
+
+    def spread(one: TerrainMap | None, other: TerrainMap | None) -> np.ndarray:
+        moves = [
+            np.nan_to_num(Predictions(robot, replace(data, terrain=ground)).residuals([()])[0])
+            for ground in (one, other)
+        ]
+        # Robust: a window on which one map has a step under a wheel shall not excuse all others.
+        return np.quantile(np.abs(moves[0] - moves[1]), 0.68, axis=0)
+
+    shape = (1.0 - _KNOWN_SHAPE) * spread(data.terrain, None)
+    return shape if halves is None else np.hypot(shape, 0.5 * spread(*halves))
 
 
 def relative_motion(motion: MotionTrack, data: DriveData) -> np.ndarray:

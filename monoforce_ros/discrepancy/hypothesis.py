@@ -14,9 +14,11 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation, Slerp
 
-from monoforce_ros.motion import CommandTrack, MotionTrack
+from monoforce_ros.bags import SmoothedMotion
+from monoforce_ros.motion import CommandTrack, MotionTrack, TurningTrack, WheelTrack
 from monoforce_ros.physics import PhysicsOptions, State, rollout
 from monoforce_ros.physics.effects import CATALOGUE, corrected_commands, corrected_motion, drive_speeds
+from monoforce_ros.physics.lookup import TerrainLookup
 from monoforce_ros.physics.rest import rest_depth
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import Grid, TerrainMap
@@ -27,8 +29,42 @@ COMPONENTS = ("along", "across", "heading")
 HISTORY = 2.0
 """Commands before a window that delays and lags may reach back to [s]."""
 _MARGIN = 1.3
-"""Kept free at both ends of the drive, so that a shifted clock still finds data [s]."""
+"""Kept free at both ends of a stretch, so that a shifted clock still finds data [s]."""
+_SHORT = 12.0
+"""Stretches shorter than this start with what they were recorded for, such as a step of the command [s]."""
 _LARGEST_BATCH = 1024
+_LEVEL_REACH, _HILLY_REACH = 0.1, 0.3
+"""Height over the lowest point of a robot up to which it may touch the ground [m]."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A recorded drive on its ground."""
+
+    smoothed: SmoothedMotion
+    commands: CommandTrack
+    terrain: TerrainMap | None = None
+    """One map in its own frame, or None for level ground."""
+    odometry_from_terrain: np.ndarray | None = None
+    """Pose ``[4, 4]`` of the map."""
+    halves: tuple[TerrainMap, TerrainMap] | None = None
+    """Maps that each half of the sweeps gives alone."""
+    turning: TurningTrack | None = None
+    """What an IMU shows."""
+    wheels: WheelTrack | None = None
+    """Measured wheel speeds."""
+
+    def cut(self, starts: np.ndarray, samples: np.ndarray) -> DriveData:
+        """Windows from ``starts`` [ns] to the last of ``samples`` [s]."""
+        return DriveData(
+            self.smoothed.motion,
+            self.commands,
+            starts,
+            float(samples[-1]),
+            samples,
+            self.terrain,
+            self.odometry_from_terrain,
+        )
 
 
 @dataclass(frozen=True)
@@ -54,9 +90,21 @@ def window_starts(motion: MotionTrack, stretches: Sequence[slice], horizon: floa
     starts = []
     for stretch in stretches:
         first, last = int(motion.stamps[stretch.start]), int(motion.stamps[stretch.stop - 1])
-        low, high = first + round(_MARGIN * 1e9), last - round((horizon + _MARGIN) * 1e9)
+        # Poses come late rather than early: the end of a short stretch is kept free, its start is not.
+        lead = _MARGIN if last - first > round(_SHORT * 1e9) else 0.1
+        low, high = first + round(lead * 1e9), last - round((horizon + _MARGIN) * 1e9)
         starts.extend(range(low, high + 1, round(stride * 1e9)))
     return np.array(starts, np.int64)
+
+
+def thinned(starts: np.ndarray, block: float, most: int) -> np.ndarray:
+    """At most about ``most`` of the windows of a long drive: pairs of blocks [s], evenly over all of it."""
+    if len(starts) <= most:
+        return starts
+    pairs = (starts - starts[0]) // round(2 * block * 1e9)
+    numbers = np.unique(pairs)
+    kept = numbers[:: -(-len(starts) // most)]
+    return starts[np.isin(pairs, kept)]
 
 
 def sample_motion(motion: MotionTrack, stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -73,6 +121,12 @@ def sample_motion(motion: MotionTrack, stamps: np.ndarray) -> tuple[np.ndarray, 
     return blend(motion.positions), rotations, blend(motion.linear_velocities), blend(motion.angular_velocities)
 
 
+def undone(drive: Drive, effects: Effects) -> Drive:
+    """The drive without what a robot's file says of its sensors and clocks."""
+    motion, commands = undo_measurement(drive.smoothed.motion, drive.commands, effects)
+    return replace(drive, smoothed=replace(drive.smoothed, motion=motion), commands=commands)
+
+
 def undo_measurement(motion: MotionTrack, commands: CommandTrack, effects: Effects) -> tuple[MotionTrack, CommandTrack]:
     """The record without what measurement effects did to it: each is its own inverse with the opposite sign."""
     return corrected_motion(motion, effects), corrected_commands(commands, effects)
@@ -87,13 +141,16 @@ class Predictions:
     """
 
     def __init__(self, robot: RobotModel, data: DriveData):
-        self.robot, self.data = robot, data
+        self.data = data
         self.options = PhysicsOptions()
         if data.terrain is None:
             self._terrain = TerrainMap.flat(Grid.square(2.0, 1.0))
-            self._depth = rest_depth(robot, float(self._terrain.stiffness[0, 0]))
         else:
             self._terrain = data.terrain
+        self._depth = rest_depth(robot, float(self._terrain.stiffness.median()))
+        # The upper halves of the wheels and most of the hull meet no ground: left out, rollouts are twice as fast.
+        reach = _LEVEL_REACH if data.terrain is None else _HILLY_REACH
+        self.robot = robot.with_points(robot.points[:, 2] < reach - robot.ground_clearance)
         self._prepared: dict = {}
         self._index = np.rint(data.samples / self.options.time_step).astype(int)
 
@@ -141,17 +198,16 @@ class Predictions:
         asked = data.starts[:, None] + np.rint(steps * self.options.time_step * 1e9).astype(np.int64)
         if data.terrain is None:
             # On level ground every window starts at the origin, as high as its own wheels ask for.
-            frame_rotation = np.einsum("wji,wjk->wik", turn, rotations[:, 0])
-            underside = self.robot.points[self.robot.point_tangents[:, 0] < -0.97].double().numpy()
-            lowest = np.einsum("wij,nj->wni", frame_rotation, underside)[..., 2].mean(axis=1)
+            frame_rotation = rotations[:, 0]
+            lowest = np.einsum("wij,nj->wni", frame_rotation, self._underside())[..., 2].mean(axis=1)
             place = np.stack([0 * lowest, 0 * lowest, -lowest - self._depth], axis=1)
-            into = np.tile(np.eye(3), (len(stamps), 1, 1))
         else:
             pose = np.linalg.inv(data.odometry_from_terrain)
             frame_rotation = pose[:3, :3] @ rotations[:, 0]
             place = positions[:, 0] @ pose[:3, :3].T + pose[:3, 3]
-            heading = np.arctan2(frame_rotation[:, 1, 0], frame_rotation[:, 0, 0])
-            into = Rotation.from_euler("z", heading[:, None]).as_matrix()
+            place[:, 2] += self._settling(place, frame_rotation)
+        heading = np.arctan2(frame_rotation[:, 1, 0], frame_rotation[:, 0, 0])
+        into = Rotation.from_euler("z", heading[:, None]).as_matrix()
 
         def tensor(values: np.ndarray) -> torch.Tensor:
             return torch.as_tensor(np.ascontiguousarray(values), dtype=torch.float32)
@@ -168,6 +224,23 @@ class Predictions:
             "velocity": tensor(np.einsum("wij,wj->wi", frame_rotation, linear[:, 0])),
             "angular": tensor(np.einsum("wij,wj->wi", frame_rotation, angular[:, 0])),
         }
+
+    def _settling(self, place: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+        """By how much robots at ``place`` ``[W, 3]`` are to be raised to stand on the map, ``[W]`` [m].
+
+        A map and a localisation agree about heights within centimetres; a start that deep in the ground is a jump.
+        """
+        underside = self._underside()
+        points = place[:, None] + np.einsum("wij,nj->wni", rotation, underside)
+        at = torch.as_tensor(points[..., :2], dtype=torch.float32).transpose(1, 2)
+        ground = TerrainLookup(self._terrain, "bilinear", len(points))(at).height.double().numpy()
+        gap = points[..., 2] - ground
+        # The lower half carries: on rough ground some wheels hang in the air.
+        return -np.sort(gap, axis=1)[:, : max(1, gap.shape[1] // 2)].mean(axis=1) - self._depth
+
+    def _underside(self) -> np.ndarray:
+        robot = self.robot
+        return robot.points[robot.point_tangents[:, 0] < -0.97].double().numpy()
 
     def _roll_out(self, windows: dict, hypotheses: list[Effects]) -> list[np.ndarray]:
         count, width = len(hypotheses), len(self.data.starts)

@@ -181,6 +181,34 @@ def decode_odometry(message: Any) -> tuple[MotionState, str, str]:
     return state, message.header.frame_id, message.child_frame_id
 
 
+def decode_turning(message: Any) -> tuple[np.ndarray, str]:
+    """``sensor_msgs/Imu`` → angular velocity ``[3]`` [rad/s] in its frame, and that frame's name."""
+    rate = message.angular_velocity
+    values = np.array([rate.x, rate.y, rate.z], np.float64)
+    if not np.isfinite(values).all():
+        raise MessageError(f"imu: got the angular velocity {values.tolist()}, expected finite numbers")
+    return values, message.header.frame_id
+
+
+def decode_wheels(message: Any) -> np.ndarray | None:
+    """``sensor_msgs/JointState`` → mean speed of the left and the right wheels ``[2]`` [rad/s].
+
+    Wheels are joints whose name says wheel, or track, and left or right; None where there are none on a side, or no
+    finite speeds.
+    """
+    sides: dict[str, list[float]] = {"left": [], "right": []}
+    for name, speed in zip(message.name, np.asarray(message.velocity, np.float64).tolist(), strict=False):
+        lowered = name.lower()
+        if "wheel" in lowered or "track" in lowered:
+            for side, speeds in sides.items():
+                if side in lowered:
+                    speeds.append(speed)
+    if not all(sides.values()):
+        return None
+    values = np.array([np.mean(speeds) for speeds in sides.values()])
+    return values if np.isfinite(values).all() else None
+
+
 def decode_command(message: Any) -> np.ndarray:
     """``geometry_msgs/Twist`` or ``TwistStamped`` → forward speed [m/s] and yaw rate [rad/s], ``[2]``."""
     twist = getattr(message, "twist", message)

@@ -9,7 +9,7 @@ import torch
 
 from monoforce_ros.motion import MotionState, transform_points
 from monoforce_ros.physics import PhysicsOptions, Rollout, State, rollout
-from monoforce_ros.physics.effects import drive_speeds
+from monoforce_ros.physics.effects import drive_speeds, turned_effects
 from monoforce_ros.prediction.terrain_sources import Observation, TerrainSource
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import Grid, TerrainMap
@@ -110,4 +110,7 @@ class Predictor:
                 self.options.time_step,
                 history=self.history,
             )
-            return rollout(terrain, self.robot, speeds, start_states(motions), options=self.options)
+            # Terrain frames look along the robot's heading; what holds in the odometry frame turns with them.
+            heading = torch.tensor([motion.heading for motion in motions], dtype=torch.float32)
+            robot = turned_effects(self.robot, heading)
+            return rollout(terrain, robot, speeds, start_states(motions), options=self.options)

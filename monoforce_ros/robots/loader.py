@@ -159,6 +159,7 @@ class _Reader:
             maximum_yaw_rate=self.number(
                 command.get("maximum_yaw_rate", math.inf), "command.maximum_yaw_rate", 0.01, math.inf, "rad/s"
             ),
+            wheel_radius=float(np.mean([wheel["radius"] for wheel in top["wheels"]])) if top.get("wheels") else None,
             sensors=self.sensors(top.get("sensors", {})),
             effects=self.effects(top.get("effects", [])),
             flippers=tuple(samples.flippers),

@@ -69,6 +69,8 @@ class RobotModel:
     """Largest commanded forward speed [m/s]."""
     maximum_yaw_rate: float = float("inf")
     """Largest commanded yaw rate [rad/s]."""
+    wheel_radius: float | None = None
+    """Mean radius of the wheels [m]; None for a robot without wheels."""
     sensors: Mapping[str, Tensor] = field(default_factory=dict)
     """Pose of each sensor frame in the base frame: ``[4, 4]`` homogeneous matrix, base ← sensor."""
 
@@ -98,6 +100,18 @@ class RobotModel:
         low, high = (bound.cpu().numpy() for bound in self.bounds)
         across = ((points[:, :2] > low[:2] - 0.1) & (points[:, :2] < high[:2] + 0.1)).all(axis=1)
         return across & (points[:, 2] > low[2] + 0.05)
+
+    def with_points(self, keep: Tensor) -> RobotModel:
+        """The robot with those of its points ``keep`` ``[N]`` bool alone; mass and inertia stay."""
+        flippers = None if self.point_flippers is None else self.point_flippers[keep]
+        return replace(
+            self,
+            points=self.points[keep],
+            point_areas=self.point_areas[keep],
+            point_tangents=self.point_tangents[keep],
+            point_drives=self.point_drives[keep],
+            point_flippers=flippers,
+        )
 
     @property
     def ground_clearance(self) -> float:

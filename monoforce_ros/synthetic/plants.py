@@ -97,13 +97,14 @@ class DriveGain(Plant):
 
 
 class DriveAsymmetry(Plant):
-    """Worn tyres on one side: left and right wheels of different radius."""
+    """Motor controllers that were calibrated differently: one side runs faster than told, the other slower."""
 
     parameters: ClassVar = {"difference": (0.1, -0.4, 0.4)}
 
     @override
     def shape(self, spec: mujoco.MjSpec, robot: Vehicle) -> None:
-        _scale_wheels(spec, robot, lambda wheel: 1.0 - 0.5 * self.difference * np.sign(wheel.centre[1]))
+        for servo, wheel in zip(spec.actuators, robot.wheels, strict=True):
+            servo.gainprm[0] *= 1.0 - 0.5 * self.difference * np.sign(wheel.centre[1])
 
 
 class FrictionScale(Plant):
@@ -128,18 +129,18 @@ class TurningScrub(Plant):
 
 
 class RollingResistance(Plant):
-    """A force against each wheel's motion as a part of the weight that it carries at rest."""
+    """A force at each wheel against its rolling, as a part of the weight that it carries at rest."""
 
     parameters: ClassVar = {"coefficient": (0.15, 0.02, 0.6)}
 
     @override
     def push(self, simulation: Subject) -> None:
         robot, bodies = simulation.robot, simulation.wheel_bodies
-        velocities = simulation.wheel_velocities()
-        velocities[:, 2] = 0.0
-        speed = np.linalg.norm(velocities, axis=1, keepdims=True)
+        ahead = Rotation.from_euler("z", simulation.heading()).apply([1.0, 0.0, 0.0])
+        speed = simulation.wheel_velocities() @ ahead
         load = robot.mass * 9.81 / len(robot.wheels)
-        simulation.data.xfrc_applied[bodies, :3] -= self.coefficient * load * velocities / np.maximum(speed, 0.03)
+        held = self.coefficient * load * np.clip(speed / 0.03, -1.0, 1.0)
+        simulation.data.xfrc_applied[bodies, :3] -= held[:, None] * ahead
 
 
 class TerrainSoftness(Plant):

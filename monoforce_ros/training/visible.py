@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from monoforce_ros.bags import Recording
@@ -40,21 +42,46 @@ def visible_terrain(
         TerrainError: no sweep hit the grid.
         BagError: a cloud cannot be read or the lidar's pose is unknown.
     """
+    sweeps = _placed_sweeps(recording, motion, robot, grid, odometry_from_terrain, start, stop)
+    return terrain_from_cloud(accumulate(sweeps), grid, settings=settings, material=material)
+
+
+def visible_halves(
+    recording: Recording, motion: MotionTrack, robot: RobotModel, grid: Grid
+) -> tuple[TerrainMap, tuple[TerrainMap, TerrainMap]]:
+    """A drive's map in the odometry frame, and two more from every other sweep alone.
+
+    The halves saw the same ground with noise of their own: how much they differ says how sure the map is.
+    """
+    start, stop = int(motion.stamps[0]), int(motion.stamps[-1])
+    sweeps = list(_placed_sweeps(recording, motion, robot, grid, np.eye(4), start, stop))
+    whole, even, odd = (
+        terrain_from_cloud(accumulate(part), grid) for part in (sweeps, sweeps[0::2], sweeps[1::2] or sweeps)
+    )
+    return whole, (even, odd)
+
+
+def _placed_sweeps(
+    recording: Recording,
+    motion: MotionTrack,
+    robot: RobotModel,
+    grid: Grid,
+    odometry_from_terrain: np.ndarray,
+    start: int,
+    stop: int,
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Points of each sweep that fall on the grid, in the base frame, and its pose on the map."""
     inverse = np.linalg.inv(odometry_from_terrain)
     low, high = grid.extent[0::2], grid.extent[1::2]
-
-    def sweeps():
-        for frame, points, frame_id in recording.clouds_between(start, stop):
-            try:
-                state = motion.at(frame.stamp, maximum_gap=_LARGEST_GAP)
-            except StaleDataError:
-                continue
-            pose = recording.sensor_pose(frame_id, robot.base_frame, robot.sensors)
-            points = points[np.isfinite(points).all(axis=1)] @ pose[:3, :3].T + pose[:3, 3]
-            points = points[~robot.covers(points)]
-            placed = inverse @ state.odometry_from_base
-            there = points @ placed[:3, :3].T + placed[:3, 3]
-            on_map = (there[:, 0] > low[0]) & (there[:, 0] < high[0]) & (there[:, 1] > low[1]) & (there[:, 1] < high[1])
-            yield points[on_map], placed
-
-    return terrain_from_cloud(accumulate(sweeps()), grid, settings=settings, material=material)
+    for frame, points, frame_id in recording.clouds_between(start, stop):
+        try:
+            state = motion.at(frame.stamp, maximum_gap=_LARGEST_GAP)
+        except StaleDataError:
+            continue
+        pose = recording.sensor_pose(frame_id, robot.base_frame, robot.sensors)
+        points = points[np.isfinite(points).all(axis=1)] @ pose[:3, :3].T + pose[:3, 3]
+        points = points[~robot.covers(points)]
+        placed = inverse @ state.odometry_from_base
+        there = points @ placed[:3, :3].T + placed[:3, 3]
+        on_map = (there[:, 0] > low[0]) & (there[:, 0] < high[0]) & (there[:, 1] > low[1]) & (there[:, 1] < high[1])
+        yield points[on_map], placed

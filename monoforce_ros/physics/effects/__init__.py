@@ -10,6 +10,7 @@ from monoforce_ros.physics.effects.catalogue import (
     effect_values,
     recorded_commands,
     recorded_motion,
+    turned_effects,
 )
 from monoforce_ros.physics.effects.effect import STAGES, Effect, Parameter
 
@@ -26,4 +27,5 @@ __all__ = [
     "effect_values",
     "recorded_commands",
     "recorded_motion",
+    "turned_effects",
 ]

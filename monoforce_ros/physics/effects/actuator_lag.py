@@ -25,13 +25,22 @@ class ActuatorLag(Effect):
         slow = constant > 1e-6
         safe = torch.where(slow, constant, torch.ones_like(constant))
         kept = torch.where(slow, torch.exp(-time_step / safe), torch.zeros_like(constant))
+        if constant.ndim:
+            return _step_by_step(speeds, kept[:, None])
         count = speeds.shape[1]
         steps = torch.arange(count, device=speeds.device)
         distance = (steps[:, None] - steps).to(speeds.dtype)
         # The response to all commands so far, the first of which has always held, as one matrix.
-        decay = kept[..., None, None] ** distance.clamp_min(0.0)
-        weights = torch.where(distance >= 0, (1.0 - kept[..., None, None]) * decay, torch.zeros_like(decay))
-        first = decay[..., :, :1]
-        return torch.where(
-            slow.reshape(-1, 1, 1), weights @ speeds + (first * kept[..., None, None]) * speeds[:, :1], speeds
-        )
+        decay = kept ** distance.clamp_min(0.0)
+        weights = torch.where(distance >= 0, (1.0 - kept) * decay, torch.zeros_like(decay))
+        return torch.where(slow, weights @ speeds + (decay[:, :1] * kept) * speeds[:, :1], speeds)
+
+
+def _step_by_step(speeds: Tensor, kept: Tensor) -> Tensor:
+    """The same where each trajectory has a constant of its own: a matrix for each would be large."""
+    state = speeds[:, 0]
+    result = []
+    for speed in speeds.unbind(1):
+        state = speed + kept * (state - speed)
+        result.append(state)
+    return torch.stack(result, dim=1)

@@ -6,6 +6,7 @@ import importlib
 import inspect
 import pkgutil
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -104,6 +105,12 @@ def applied_setup(terrain: TerrainMap, robot: RobotModel) -> Setup:
         values = effect_values(name, parameters, robot.points)
         setup = CATALOGUE[name].setup(setup, values)
     return setup
+
+
+def turned_effects(robot: RobotModel, heading: Tensor) -> RobotModel:
+    """The robot for rollouts in frames turned about the vertical by ``heading`` ``[B]`` [rad] from the odometry's."""
+    turned = tuple((name, CATALOGUE[name].turned(parameters, heading)) for name, parameters in robot.effects)
+    return replace(robot, effects=turned) if robot.effects else robot
 
 
 def recorded_motion(motion: MotionTrack, robot: RobotModel) -> MotionTrack:

@@ -61,6 +61,10 @@ class Effect(ABC):
         """The setup with this effect in it."""
         return setup
 
+    def turned(self, values: Mapping[str, float | Tensor], heading: Tensor) -> Mapping[str, float | Tensor]:
+        """Parameters that hold in the odometry frame, in frames turned about the vertical by ``heading`` ``[B]``."""
+        return values
+
     def motion(self, motion: MotionTrack, values: Mapping[str, float]) -> MotionTrack:
         """Motion as it is recorded under this effect."""
         return motion

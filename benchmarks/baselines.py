@@ -1,0 +1,106 @@
+"""Baselines for ``hidden_effects.py``: other ways to close a gap, on the same held-out blocks of the same drives.
+
+``refit``: the parameters that commissioning fits, fitted once more. ``network``: a small neural network that learns the
+model's error after a window from how the window begins. ``sindy``: accelerations by sparse regression (pysindy)
+instead of the physics, integrated from the start of each window.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from monoforce_ros.discrepancy.commissioning import COMMISSIONED
+from monoforce_ros.discrepancy.fit import fit_effects
+from monoforce_ros.discrepancy.gap import relative_motion
+from monoforce_ros.discrepancy.hypothesis import Drive, DriveData, Predictions, sample_motion
+from monoforce_ros.discrepancy.selection import folds_of
+from monoforce_ros.robots import RobotModel
+
+_STEP = 0.05
+_HISTORY = 0.5
+
+
+def baseline_errors(drive: Drive, data: DriveData, robot: RobotModel, scale: np.ndarray) -> dict[str, np.ndarray]:
+    """Residuals ``[W, 3]`` at the last sample of each window, of every baseline trained on the other fold."""
+    predictions = Predictions(robot, data)
+    before = predictions.residuals([()])[0][:, -1]
+    folds = folds_of(data.starts)
+    results = {name: before.copy() for name in ("refit", "network", "sindy")}
+    features = _features(data)
+    for left in np.unique(folds):
+        seen, unseen = folds != left, folds == left
+        train, test = replace(data, starts=data.starts[seen]), replace(data, starts=data.starts[unseen])
+        own = dict(robot.effects)
+        start = tuple((name, dict(own.get(name, values))) for name, values in COMMISSIONED)
+        fit = fit_effects(Predictions(robot, train), [start], scale, iterations=6)
+        results["refit"][unseen] = Predictions(robot, test).residuals([fit.effects])[0][:, -1]
+        results["network"][unseen] = before[unseen] - _network(features[seen], before[seen], features[unseen])
+        results["sindy"][unseen] = _sindy(drive, train, test)
+    return results
+
+
+def _features(data: DriveData) -> np.ndarray:
+    """Start velocity and commands around each window, ``[W, F]``."""
+    _, _, linear, angular = sample_motion(data.motion, data.starts)
+    stamps = data.starts[:, None] + (np.arange(-2, 9) * 0.25e9).astype(np.int64)
+    told = data.commands.sample(stamps).reshape(len(data.starts), -1)
+    return np.concatenate([linear[:, :2], angular[:, 2:], told], axis=1)
+
+
+def _network(features: np.ndarray, errors: np.ndarray, asked: np.ndarray) -> np.ndarray:
+    """Errors that a small network expects, ``[A, 3]``."""
+    torch.manual_seed(0)
+    mean, spread = features.mean(axis=0), features.std(axis=0) + 1e-6
+    size = errors.std(axis=0) + 1e-6
+    x = torch.as_tensor((features - mean) / spread, dtype=torch.float32)
+    y = torch.as_tensor(errors / size, dtype=torch.float32)
+    net = torch.nn.Sequential(
+        torch.nn.Linear(x.shape[1], 32), torch.nn.Tanh(), torch.nn.Linear(32, 32), torch.nn.Tanh(),
+        torch.nn.Linear(32, 3),
+    )  # fmt: skip
+    optimiser = torch.optim.AdamW(net.parameters(), lr=3e-3, weight_decay=0.1)
+    for _ in range(400):
+        optimiser.zero_grad()
+        torch.nn.functional.smooth_l1_loss(net(x), y).backward()
+        optimiser.step()
+    with torch.no_grad():
+        return net(torch.as_tensor((asked - mean) / spread, dtype=torch.float32)).numpy() * size
+
+
+def _sindy(drive: Drive, train: DriveData, test: DriveData) -> np.ndarray:
+    """Residuals of predictions by sparse regression of the accelerations, ``[W, 3]``."""
+    import pysindy
+
+    motion = drive.smoothed.motion
+
+    def pieces(data: DriveData) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        count = round(data.horizon / _STEP) + 1
+        stamps = data.starts[:, None] + (np.arange(count) * _STEP * 1e9).astype(np.int64)
+        _, _, linear, angular = sample_motion(motion, stamps)
+        states = np.stack([linear[..., 0], angular[..., 2]], axis=-1)
+        return list(states), list(data.commands.sample(stamps))
+
+    states, told = pieces(train)
+    model = pysindy.SINDy(
+        optimizer=pysindy.STLSQ(threshold=0.05, alpha=0.05),
+        feature_library=pysindy.PolynomialLibrary(degree=2),
+        differentiation_method=pysindy.SmoothedFiniteDifference(),
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        model.fit(states, t=_STEP, u=told)
+    starts, commands = pieces(test)
+    now = np.array([state[0] for state in starts])
+    commands = np.array(commands)
+    place, heading = np.zeros((len(now), 2)), np.zeros(len(now))
+    for step in range(commands.shape[1] - 1):
+        rate = np.asarray(model.predict(now, u=commands[:, step]))
+        now = np.clip(now + _STEP * rate, -5.0, 5.0)
+        heading = heading + _STEP * now[:, 1]
+        place = place + _STEP * now[:, :1] * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    predicted = np.concatenate([place, heading[:, None]], axis=1)
+    return predicted - relative_motion(motion, test)[:, -1]

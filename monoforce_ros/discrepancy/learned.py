@@ -1,0 +1,65 @@
+"""Learned: a sparse sum of named features as a body wrench, for what the catalogue does not hold.
+
+Orthogonal matching pursuit (Pati et al. 1993) on the derivatives of a drive's residuals by every term, then a fit of
+the chosen terms through the rollout.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from monoforce_ros.discrepancy.fit import OUTLIER, flat, with_values
+from monoforce_ros.discrepancy.hypothesis import Effects, Predictions
+from monoforce_ros.physics.effects import CATALOGUE
+
+LEARNED = "learned_term"
+_STEP = 0.02
+"""Force that a derivative is taken over, in parts of the robot's weight."""
+
+
+def learned_terms(predictions: Predictions, base: Effects, scale: np.ndarray, most: int) -> list[Effects]:
+    """Sums of one to ``most`` terms, each with the one more term that explains most of what is left.
+
+    Args:
+        predictions: of the drive.
+        base: effects that act beside it.
+        scale: size of a residual that means nothing, ``[K, 3]``.
+        most: terms.
+    """
+    keys = [parameter.name for parameter in CATALOGUE[LEARNED].parameters]
+    step = _STEP * 9.81 * float(predictions.robot.mass.mean())
+    trials = [(*base, (LEARNED, dict.fromkeys(keys, 0.0)))]
+    trials += [(*base, (LEARNED, {**dict.fromkeys(keys, 0.0), key: step})) for key in keys]
+    rolled = np.nan_to_num(predictions.residuals(trials) / scale, nan=1e3)
+    weight = np.sqrt(np.minimum(1.0, OUTLIER / np.maximum(np.abs(rolled[0]), 1e-9))).ravel()
+    wanted = -weight * rolled[0].ravel()
+    columns = weight * (rolled[1:] - rolled[0]).reshape(len(keys), -1)
+    lengths = np.linalg.norm(columns, axis=1)
+    # A feature that the drive hardly has would need a weight without measure.
+    lengths = np.maximum(lengths, 0.1 * lengths.max())
+    ridge = 0.03 * lengths.max()
+    chosen: list[int] = []
+    found = []
+    left = wanted
+    for _ in range(most):
+        match = np.abs(columns @ left) / np.maximum(lengths, 1e-9)
+        match[chosen] = -1.0
+        chosen.append(int(np.argmax(match)))
+        own = columns[chosen]
+        values = np.linalg.solve(own @ own.T + ridge**2 * np.eye(len(chosen)), own @ wanted)
+        left = wanted - values @ columns[chosen]
+        terms = {keys[index]: float(step * value) for index, value in zip(chosen, values, strict=True)}
+        effects = (*base, (LEARNED, terms))
+        found.append(with_values(effects, flat(effects)))
+    return found
+
+
+def formula(terms: dict[str, float]) -> str:
+    """The sum in symbols, such as ``torque_z = 12.3 vx|vx| - 4 wz``."""
+    rows: dict[str, list[str]] = {}
+    for key, value in terms.items():
+        row, feature = key.split(":")
+        shown = f"{abs(value):.3g}" + ("" if feature == "1" else f" {feature}")
+        parts = rows.setdefault(row, [])
+        parts.append((f"- {shown}" if value < 0 else f"+ {shown}") if parts else (f"-{shown}" if value < 0 else shown))
+    return "; ".join(f"{row} = {' '.join(parts)}" for row, parts in rows.items())
