@@ -30,6 +30,10 @@ def run_node(make_node: Callable[[], Node], arguments: list[str] | None = None) 
         executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
+    except Exception:
+        # A signal ends the context at once; what a callback or the executor asks of it after that fails.
+        if rclpy.ok():
+            raise
     finally:
         executor.shutdown()
         node.destroy_node()

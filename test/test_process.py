@@ -1,0 +1,35 @@
+"""How a node's process ends: whatever a signal interrupts, in order; with a fault of its own, loudly."""
+
+import subprocess
+import sys
+
+import pytest
+
+NODE = """
+import sys, rclpy
+from rclpy.node import Node
+from monoforce_ros.nodes.process import run_node
+
+class Ending(Node):
+    def __init__(self):
+        super().__init__("ending")
+        self.create_timer(0.05, self.tick)
+
+    def tick(self):
+        if {shut_down}:
+            rclpy.shutdown()
+        self.count_publishers("/anything")
+        raise ValueError("a fault of the node")
+
+sys.exit(run_node(Ending, []))
+"""
+
+
+@pytest.mark.parametrize("shut_down", [True, False])
+def test_a_callback_that_outlives_its_context_is_no_fault(shut_down, ros_environment):
+    done = subprocess.run(
+        [sys.executable, "-c", NODE.format(shut_down=shut_down)],
+        env=ros_environment, capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert (done.returncode == 0) == shut_down, done.stderr
+    assert ("a fault of the node" in done.stderr) != shut_down
