@@ -72,14 +72,15 @@ def compare(
         floor = noise_residuals(data.motion, noisy, own)
         rolled = Predictions(robot, own)
         before = rolled.residuals([()])[0][:, 0]
-        after = None
-        if parts is not None:
-            after = before.copy()
-            which = folds_of(np.r_[data.starts[0], own.starts])[1:]
-            for left, effects in enumerate(parts):
-                after[which == left] = rolled.residuals([effects])[0][which == left, 0]
+        after = None if parts is None else _unseen(rolled, data.starts[0], parts)[:, 0]
         results.append(Comparison(own.horizon, own.starts, before, after, floor[:, 0], own))
     return results
+
+
+def _unseen(rolled: Predictions, first: int, parts: Sequence[Effects]) -> np.ndarray:
+    """Residuals ``[W, K, 3]`` of each window by the effects that were found without its fold."""
+    which = folds_of(np.r_[first, rolled.data.starts])[1:]
+    return rolled.residuals(list(parts))[which, np.arange(len(which))]
 
 
 def gap_table(comparisons: Sequence[Comparison], seed: int = 0) -> dict[str, dict]:
@@ -149,12 +150,7 @@ def shown_paths(robot: RobotModel, data: DriveData, parts: Sequence[Effects] | N
     measured = relative_motion(own.motion, own)
     rolled = Predictions(robot, own)
     before = rolled.residuals([()])[0]
-    after = None
-    if parts is not None:
-        after = before.copy()
-        which = folds_of(np.r_[data.starts[0], starts])[1:]
-        for left, effects in enumerate(parts):
-            after[which == left] = rolled.residuals([effects])[0][which == left]
+    after = None if parts is None else _unseen(rolled, data.starts[0], parts)
     order = np.argsort(np.hypot(before[:, -1, 0], before[:, -1, 1]))
     picked = order[np.unique(np.linspace(0.5 * len(order), len(order) - 1, count).astype(int))]
     return [

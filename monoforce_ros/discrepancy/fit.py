@@ -13,6 +13,8 @@ from monoforce_ros.physics.effects import CATALOGUE
 OUTLIER = 3.0
 """Scaled residuals beyond this weigh with their size rather than their square."""
 _DAMPINGS = (1e-3, 1e-1, 3.0)
+_LOST = 1e3
+"""Scaled residual of a prediction that is not finite."""
 _SHARED = 4.0
 """Length of the blocks that say something on their own [s]."""
 
@@ -34,8 +36,11 @@ class Fit:
 
 
 def robust(scaled: np.ndarray) -> np.ndarray:
-    """Huber's loss of scaled residuals ``[..., W, K, 3]``, averaged over a window, ``[..., W]``."""
-    size = np.abs(scaled)
+    """Huber's loss of scaled residuals ``[..., W, K, 3]``, averaged over a window, ``[..., W]``.
+
+    A prediction that is not finite counts as one that is very wrong.
+    """
+    size = np.abs(np.nan_to_num(scaled, nan=_LOST))
     values = np.where(size <= OUTLIER, 0.5 * size**2, OUTLIER * (size - 0.5 * OUTLIER))
     return np.minimum(values, 1e6).mean(axis=(-1, -2))
 
@@ -102,7 +107,7 @@ def fit_effects(
     def total(hypotheses: Sequence[Effects], scaled: np.ndarray) -> np.ndarray:
         away = np.array([(flat(effects) - neutral) / scales(effects) for effects in hypotheses])
         away = np.where(np.isfinite(away), away, 0.0)
-        return robust(np.nan_to_num(scaled, nan=1e3)).mean(axis=1) + 0.5 * prior * (away**2).sum(axis=1)
+        return robust(scaled).mean(axis=1) + 0.5 * prior * (away**2).sum(axis=1)
 
     tried = predictions.residuals(list(starts)) / scale
     losses = total(starts, tried)
@@ -137,7 +142,7 @@ def fit_effects(
     covariance = np.zeros((len(values), len(values)))
     if jacobian is not None and jacobian.any():
         covariance[held:, held:] = _covariance(jacobian, residual, typical[held:], predictions.data)
-    return Fit(current, robust(np.nan_to_num(residual, nan=1e3)), covariance)
+    return Fit(current, robust(residual), covariance)
 
 
 def _jacobian(

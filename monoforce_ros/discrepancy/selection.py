@@ -240,7 +240,7 @@ class Search:
 
     def loss_of(self, effects: Effects) -> np.ndarray:
         """Robust loss of each window, ``[W]``."""
-        return robust(np.nan_to_num(self.predictions.residuals([effects])[0] / self.scale, nan=1e3))
+        return robust(self.predictions.residuals([effects])[0] / self.scale)
 
     def judge(self, effects: Effects, iterations: int = 4) -> Trial:
         """Fit on every fold's complement and judge on the fold."""
@@ -248,7 +248,7 @@ class Search:
         parts, losses = [], []
         for seen, other, where in self._split:
             fit = fit_effects(seen, [effects], self.scale, iterations=iterations, free=self._held(effects))
-            unseen[where] = robust(np.nan_to_num(other.residuals([fit.effects])[0] / self.scale, nan=1e3))
+            unseen[where] = robust(other.residuals([fit.effects])[0] / self.scale)
             parts.append(fit.effects)
             losses.append(float(fit.loss.mean()) + float(unseen[where].mean()))
         return Trial(parts[int(np.argmin(losses))], tuple(parts), unseen)
@@ -263,7 +263,7 @@ class Search:
     def _screened(self, base: Effects, number: str) -> tuple[float, list[tuple[str, Effects, float]]]:
         """Loss of ``base``, and every effect with a quick fit to every other window beside it, best first."""
         results = []
-        before = float(robust(np.nan_to_num(self._coarse.residuals([base])[0] / self.scale, nan=1e3)).mean())
+        before = float(robust(self._coarse.residuals([base])[0] / self.scale).mean())
         names = {name for name, _ in base}
         for name, keys in CANDIDATES:
             if name in names or name in self._taken:
