@@ -123,6 +123,10 @@ class BagPlayer(Node):
                 bar.update(elapsed - bar.n)
         return published
 
+    def linger(self) -> None:
+        """Stay a moment after the last message: its publisher's farewell overtakes it where readers are slow."""
+        self._sleep(0.5)
+
     def _sleep(self, seconds: float) -> None:
         deadline = time.monotonic() + seconds
         while self.context.ok() and (left := deadline - time.monotonic()) > 0:
@@ -147,10 +151,12 @@ def main(arguments: list[str] | None = None) -> int:
                 player.get_logger().warning(warning)
             published = player.play()
             player.get_logger().info(f"published {published} messages")
-            # Reliable messages still on their way are lost with their publisher.
+            # Messages still on their way are lost with their publisher: the reliable ones are acknowledged, the others
+            # are given time.
             for publisher in player.playable.values():
                 if player.context.ok():
                     publisher.wait_for_all_acked(rclpy.duration.Duration(seconds=1.0))
+            player.linger()
             player.destroy_node()
     except BagError as error:
         print(f"error: {error}", file=sys.stderr)
