@@ -26,6 +26,7 @@ SMALLEST_SHARE = 0.6
 LARGEST_DRIFT = 0.12
 """Of what is to explain: parameters that would have to change by more over the drive are not those of one effect."""
 _CLEARLY = 3.0 * HEALTHY_LOSS
+_WELL = 2.0 * HEALTHY_LOSS
 """Loss from which on something is missing, whether it can be named or not."""
 
 
@@ -247,8 +248,9 @@ def _verdict(search: Search, outcome: Outcome) -> tuple[str, Trial | None, tuple
             return "no_improvement", None, ("no effect predicts held-out data better",), numbers
         return *_unknown(formula_trial, nominal, "it is far larger than noise, and no effect explains it"), numbers
     why = ""
+    # A formula has more freedom than an effect with a name: what fits well keeps its name although a formula fits better.
     better, low, _ = paired(best.unseen, formula_trial.unseen, search.data.starts)
-    if low > 0 and better > 0.1 * excess:
+    if low > 0 and better > 0.1 * excess and best.loss > _WELL:
         why = f"a formula predicts held-out data better than {' and '.join(best.names)}"
     elif best.loss > _CLEARLY:
         drift, thirds = search.drifting(best)
