@@ -248,7 +248,7 @@ def _verdict(search: Search, outcome: Outcome) -> tuple[str, Trial | None, tuple
             return "no_improvement", None, ("no effect predicts held-out data better",), numbers
         return *_unknown(formula_trial, nominal, "it is far larger than noise, and no effect explains it"), numbers
     why = ""
-    # A formula has more freedom than an effect with a name: what fits well keeps its name although a formula fits better.
+    # A formula has more freedom than an effect with a name: what fits well keeps its name although one fits better.
     better, low, _ = paired(best.unseen, formula_trial.unseen, search.data.starts)
     if low > 0 and better > 0.1 * excess and best.loss > _WELL:
         why = f"a formula predicts held-out data better than {' and '.join(best.names)}"
