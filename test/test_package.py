@@ -19,6 +19,7 @@ EXECUTABLES = [
     "diagnose",
     "evaluate",
     "fit_terrain",
+    "train",
     "predictor",
     "synthesize",
 ]

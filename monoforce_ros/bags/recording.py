@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -103,20 +103,21 @@ class Recording:
 
         Clouds that cannot be decoded are left out.
         """
-        frames = {frame.received: frame for frame in self.clouds if start <= frame.stamp <= stop}
-        if not frames:
-            return
-        topic = self.topics["cloud"]
-        with BagReader(self.path) as bag:
-            for message in bag.messages([topic], start=min(frames), stop=max(frames) + 1):
-                if message.received not in frames:
-                    continue
-                try:
-                    decoded = message.decode()
-                    points = decoding.decode_cloud(decoded)
-                except ValueError:
-                    continue
-                yield frames[message.received], points, decoded.header.frame_id
+        chosen = [frame for frame in self.clouds if start <= frame.stamp <= stop]
+        for frame, message in self._decoded(chosen):
+            try:
+                points = decoding.decode_cloud(message)
+            except ValueError:
+                continue
+            yield frame, points, message.header.frame_id
+
+    def images_of(self, frames: Sequence[Frame]) -> Iterator[tuple[Frame, np.ndarray]]:
+        """Images of one topic as :meth:`image` gives them, in one pass over the bag; undecodable ones are left out."""
+        for frame, message in self._decoded(frames):
+            try:
+                yield frame, decoding.decode_image(message)
+            except ValueError:
+                continue
 
     def image(self, frame: Frame) -> np.ndarray:
         """RGB pixels ``[height, width, 3]`` of an image."""
@@ -146,6 +147,20 @@ class Recording:
             f"{self.path}: the pose of {frame_id!r} on the robot is neither in the bag's /tf_static nor in the robot "
             f"file (known there: {sorted(known)})"
         )
+
+    def _decoded(self, frames: Sequence[Frame]) -> Iterator[tuple[Frame, object]]:
+        """Messages of frames of one topic, each once, in the bag's order."""
+        wanted = {frame.received: frame for frame in frames}
+        if not wanted:
+            return
+        with BagReader(self.path) as bag:
+            for message in bag.messages([frames[0].topic], start=min(wanted), stop=max(wanted) + 1):
+                if message.received in wanted:
+                    try:
+                        decoded = message.decode()
+                    except ValueError:
+                        continue
+                    yield wanted[message.received], decoded
 
     def _read(self, frame: Frame):
         with BagReader(self.path) as bag:

@@ -6,17 +6,20 @@ from dataclasses import dataclass
 
 from monoforce_ros.terrain import Grid, TerrainDefaults
 
-BACKBONES = ("mobilenet_v3_small", "mobilenet_v3_large")
+BACKBONES = ("efficientnet_lite0",)
+
+FEATURE_STRIDE = 8
+"""Pixels of the resized image per feature that is lifted."""
 
 
 @dataclass(frozen=True)
 class EncoderConfig:
     """Everything that fixes an encoder's tensors and their meaning."""
 
-    backbone: str = "mobilenet_v3_small"
+    backbone: str = "efficientnet_lite0"
     image_width: int = 320
     image_height: int = 240
-    """Images are resized to this before the backbone."""
+    """Images are resized to this before the backbone; multiples of 16."""
     map_size: float = 12.8
     """Edge of the square map [m]."""
     resolution: float = 0.1
@@ -27,11 +30,13 @@ class EncoderConfig:
     """Depths at which a pixel's features may lie [m]; bins are spaced evenly in the logarithm."""
     image_features: int = 32
     """Channels lifted to the map."""
-    map_features: int = 48
-    """Channels of the bird's-eye-view network."""
+    map_features: int = 24
+    """Channels of the bird's-eye-view network at its finest level."""
     lowest: float = -3.0
     highest: float = 3.0
-    """Lifted points further below or above the robot are left out [m]."""
+    """Lifted points further below or above the ground under the robot are left out [m]."""
+    decreases: bool = True
+    """Whether the ground may carry lower than it looks; without it H_t = H_g, which is lift-splat-shoot alone."""
     stiffness: float = TerrainDefaults.stiffness
     damping: float = TerrainDefaults.damping
     friction: float = TerrainDefaults.friction
@@ -54,10 +59,26 @@ class EncoderConfig:
             value = getattr(self, name)
             if not isinstance(value, int | float) or isinstance(value, bool) or not low <= value <= high:
                 raise ValueError(f"encoder {name}: got {value!r}, expected {low} to {high}")
+        if not isinstance(self.decreases, bool):
+            raise ValueError(f"encoder decreases: got {self.decreases!r}, expected true or false")
+        if self.image_width % 16 or self.image_height % 16:
+            raise ValueError(
+                f"encoder image size: got {self.image_width} × {self.image_height}, expected multiples of 16"
+            )
         if self.depth_minimum >= self.depth_maximum:
             raise ValueError(
                 f"encoder depth_minimum: got {self.depth_minimum} m, expected less than {self.depth_maximum} m"
             )
+
+    @property
+    def feature_rows(self) -> int:
+        """Of the feature map that is lifted."""
+        return self.image_height // FEATURE_STRIDE
+
+    @property
+    def feature_columns(self) -> int:
+        """Of the feature map that is lifted."""
+        return self.image_width // FEATURE_STRIDE
 
     @property
     def grid(self) -> Grid:

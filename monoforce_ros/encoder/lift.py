@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from monoforce_ros.camera import CameraModel
 from monoforce_ros.encoder.config import EncoderConfig
@@ -15,49 +16,77 @@ def depth_values(config: EncoderConfig) -> np.ndarray:
     return np.geomspace(config.depth_minimum, config.depth_maximum, config.depth_bins)
 
 
-def frustum_points(camera: CameraModel, rows: int, columns: int, depths: np.ndarray) -> np.ndarray:
-    """Points that an image's feature cells may lie at, in the camera frame.
+def feature_rays(camera: CameraModel, rows: int, columns: int, image_from_view: np.ndarray | None = None) -> np.ndarray:
+    """Ray of the middle of each feature cell, distortion removed.
 
     Args:
-        camera: model of the original image; its distortion is removed here.
+        camera: model of the original image.
         rows, columns: size of the feature map that covers the whole image.
-        depths: distances along the optical axis [m], ``[bins]``.
+        image_from_view: affine map ``[2, 3]`` from what the network sees to the original image, both in 0..1; for
+            training on crops.
 
     Returns:
-        ``[bins, rows, columns, 3]`` [m].
+        ``[rows, columns, 3]`` in camera axes with z = 1; a ray times a depth is a point.
     """
-    u = (np.arange(columns) + 0.5) / columns * camera.width - 0.5
-    v = (np.arange(rows) + 0.5) / rows * camera.height - 0.5
-    rays = camera.rays(np.stack(np.meshgrid(u, v), axis=-1))
-    return depths[:, None, None, None] * rays[None]
+    x, y = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
+    if image_from_view is not None:
+        x, y = (a * x + b * y + c for a, b, c in image_from_view)
+    return camera.rays(np.stack([x * camera.width - 0.5, y * camera.height - 0.5], axis=-1))
 
 
-def map_cells(points: np.ndarray, config: EncoderConfig) -> np.ndarray:
+def lifted_points(rays: Tensor, origins: Tensor, depths: Tensor) -> Tensor:
+    """Points that feature cells may show.
+
+    Args:
+        rays: in axes of the terrain frame ``[N, rows, columns, 3]``.
+        origins: the cameras' places in it ``[N, 3]`` [m].
+        depths: ``[bins]`` [m].
+
+    Returns:
+        ``[N, bins, rows, columns, 3]`` [m].
+    """
+    return origins[:, None, None, None] + depths[:, None, None, None] * rays[:, None]
+
+
+def map_cells(points: Tensor, config: EncoderConfig) -> Tensor:
     """Flat index of the map cell of each point ``[..., 3]`` in the terrain frame; -1 outside the map or its heights."""
     grid = config.grid
-    rows, columns, inside = grid.cells(points[..., :2])
+    columns = torch.round((points[..., 0] - grid.origin[0]) / grid.resolution)
+    rows = torch.round((points[..., 1] - grid.origin[1]) / grid.resolution)
+    inside = (columns >= 0) & (columns < grid.columns) & (rows >= 0) & (rows < grid.rows)
     inside &= (points[..., 2] > config.lowest) & (points[..., 2] < config.highest)
-    return np.where(inside, rows * grid.columns + columns, -1)
+    return torch.where(inside, rows * grid.columns + columns, -1.0).long()
 
 
-def splat(depth: Tensor, features: Tensor, cells: Tensor, size: int) -> Tensor:
+def splat(depth: Tensor, features: Tensor, cells: Tensor, heights: Tensor, size: int) -> tuple[Tensor, Tensor]:
     """Sum depth-weighted features into map cells.
 
+    The products of depth and feature are never stored: points are sorted by cell, and each cell's features are summed
+    where they lie, weighted by the depth's probability.
+
     Args:
-        depth: probabilities ``[B, bins, rows, columns]``.
-        features: ``[B, C, rows, columns]``.
-        cells: flat map cells ``[B, bins, rows, columns]`` int64; -1 is left out.
-        size: number of map cells.
+        depth: probabilities ``[N, bins, rows, columns]``.
+        features: ``[N, C, rows, columns]``.
+        cells: map cells ``[N, bins, rows, columns]`` int64, counted through all maps; -1 is left out.
+        heights: of the points [m], shaped as ``cells``.
+        size: number of map cells, all maps together.
 
     Returns:
-        ``[B, C + 1, size]``: the summed features and, last, the summed probability (how much was seen there).
+        the summed features ``[size, C]``, and ``[size, 3]``: the summed probability (how much was seen there), the
+        probability times height, and times its square.
     """
-    batch, channels = features.shape[:2]
-    seen = torch.cat([features, torch.ones_like(features[:, :1])], dim=1)
-    weighted = (depth[:, :, None] * seen[:, None]).permute(0, 1, 3, 4, 2).reshape(batch, -1, channels + 1)
-    # One row more than there are cells takes what falls outside.
-    target = torch.where(cells < 0, size, cells).reshape(batch, -1)
-    target = target + (size + 1) * torch.arange(batch, device=cells.device)[:, None]
-    summed = torch.zeros(batch * (size + 1), channels + 1, dtype=weighted.dtype, device=weighted.device)
-    summed = summed.index_add(0, target.flatten(), weighted.flatten(0, 1))
-    return summed.unflatten(0, (batch, size + 1))[:, :size].transpose(1, 2)
+    count, channels, rows, columns = features.shape
+    flat = cells.flatten()
+    kept = torch.nonzero(flat >= 0)[:, 0]
+    order = kept[torch.sort(flat[kept], stable=True).indices]
+    target = flat[order]
+    # Which pixel's features a point carries: points are numbered (image, bin, row, column).
+    patch = rows * columns
+    pixel = order // (patch * depth.shape[1]) * patch + order % patch
+    table = features.permute(0, 2, 3, 1).reshape(count * patch, channels)
+    weight, height = depth.flatten()[order], heights.flatten()[order]
+    starts = torch.searchsorted(target, torch.arange(size, device=target.device))
+    summed = functional.embedding_bag(pixel, table, starts, mode="sum", per_sample_weights=weight.to(table.dtype))
+    moments = torch.stack([weight, weight * height, weight * height**2], dim=1)
+    totals = torch.zeros(size, 3, dtype=moments.dtype, device=moments.device).index_add(0, target, moments)
+    return summed, totals

@@ -5,160 +5,150 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
-from monoforce_ros.camera import CameraModel
+from monoforce_ros.encoder.backbone import COARSE_CHANNELS, FINE_CHANNELS, Backbone
+from monoforce_ros.encoder.birds_eye import BirdsEyeNetwork
 from monoforce_ros.encoder.config import EncoderConfig
-from monoforce_ros.encoder.lift import depth_values, frustum_points, map_cells, splat
-from monoforce_ros.motion import transform_points
+from monoforce_ros.encoder.lift import depth_values, lifted_points, map_cells, splat
+from monoforce_ros.encoder.view import CameraView, EncoderInput, encoder_input
 from monoforce_ros.terrain import TerrainMap
 
-# Mean and standard deviation of ImageNet's RGB pixels, which the backbones were trained with.
-_MEAN = (0.485, 0.456, 0.406)
-_DEVIATION = (0.229, 0.224, 0.225)
-_FEATURE_STRIDE = 16
+_GEOMETRY_CHANNELS = 5
+_NECK_CHANNELS = 64
+_LEVEL_GROUND_SPREAD = 0.25
+"""How far around level ground a pixel's depth is first expected, in the depth's logarithm."""
+_SEEN = 0.05
+"""Summed probability of depths from which on a cell counts as observed."""
 
 
 @dataclass(frozen=True)
-class CameraView:
-    """An image, its camera and where the camera stood."""
+class EncodedMaps:
+    """What an encoder makes of a batch; each ``[B, rows, columns]``, heights in the terrain frame [m]."""
 
-    image: np.ndarray
-    """RGB pixels ``[height, width, 3]`` uint8, as the camera delivers them."""
-    camera: CameraModel
-    terrain_from_camera: np.ndarray
-    """Pose ``[4, 4]`` of the camera in the terrain frame."""
+    geometric_height: Tensor
+    decrease: Tensor
+    """H_d ≥ 0: how far below the visible surface the ground carries."""
+    stiffness: Tensor
+    """[N/m³]."""
+    damping: Tensor
+    """[N s/m³]."""
+    friction: Tensor
+    covered: Tensor
+    """Whether the cameras look over a cell (bool)."""
+    seen: Tensor
+    """How much image evidence a cell has: summed probability of depths."""
 
-    def __post_init__(self):
-        size = (self.camera.height, self.camera.width)
-        if self.image.ndim != 3 or self.image.shape[2] != 3:
-            raise ValueError(f"image: got shape {self.image.shape}, expected [height, width, 3]")
-        if self.image.shape[:2] != size:
-            raise ValueError(
-                f"image: got {self.image.shape[1]} × {self.image.shape[0]} px, but its CameraInfo says "
-                f"{size[1]} × {size[0]} px"
-            )
+    @property
+    def height(self) -> Tensor:
+        """H_t = H_g - H_d (paper III-A)."""
+        return self.geometric_height - self.decrease
 
 
 class TerrainEncoder(nn.Module):
     """Lift-splat-shoot with heads for geometric height, its decrease and the ground's material (paper III-A).
 
-    The supporting height is H_t = H_g - H_d with H_d ≥ 0; stiffness, damping and friction are positive.
+    Beside the image each pixel's ray in the gravity-aligned terrain frame is known to the network, and the depth at
+    which it would meet level ground under the robot: intrinsics, distortion and mounting may differ from those of
+    training. Heights are counted from the ground under the wheels, so that the robot may too.
     """
 
     def __init__(self, config: EncoderConfig):
         super().__init__()
         self.config = config
-        self.backbone, channels = _backbone(config.backbone)
-        self.lift = nn.Conv2d(channels, config.depth_bins + config.image_features, kernel_size=1)
-        self.bird = _BirdsEyeNetwork(config.image_features + 1, config.map_features)
-        self.heads = nn.Conv2d(config.map_features, 6, kernel_size=1)
-        self.register_buffer("mean", torch.tensor(_MEAN).view(1, 3, 1, 1), persistent=False)
-        self.register_buffer("deviation", torch.tensor(_DEVIATION).view(1, 3, 1, 1), persistent=False)
+        self.backbone = Backbone()
+        self.neck = nn.Sequential(
+            nn.Conv2d(FINE_CHANNELS + COARSE_CHANNELS + _GEOMETRY_CHANNELS, _NECK_CHANNELS, 1, bias=False),
+            nn.BatchNorm2d(_NECK_CHANNELS),
+            nn.ReLU(inplace=True),
+            nn.Conv2d(_NECK_CHANNELS, _NECK_CHANNELS, 3, padding=1, bias=False),
+            nn.BatchNorm2d(_NECK_CHANNELS),
+            nn.ReLU(inplace=True),
+        )
+        self.lift = nn.Conv2d(_NECK_CHANNELS, config.depth_bins + config.image_features, kernel_size=1)
+        self.level_weight = nn.Parameter(torch.tensor(1.0))
+        # Features, mean height, its spread, how much was seen, the support plane and where it holds.
+        self.bird = BirdsEyeNetwork(config.image_features + 5, config.map_features)
+        self.heads = nn.Conv2d(config.map_features, 5, kernel_size=1)
+        depths = torch.from_numpy(depth_values(config)).float()
+        self.register_buffer("depths", depths, persistent=False)
 
-    def forward(self, images: Tensor, cells: Tensor, cameras: int) -> dict[str, Tensor]:
-        """Predict maps.
-
-        Args:
-            images: RGB in 0..1, ``[B · cameras, 3, image_height, image_width]``.
-            cells: map cell of each feature and depth, ``[B · cameras, bins, rows, columns]`` (:meth:`cells`).
-            cameras: how many images belong to each map.
-
-        Returns:
-            ``geometric_height``, ``decrease``, ``height`` [m], ``stiffness`` [N/m³], ``damping`` [N s/m³],
-            ``friction``, ``seen`` (how much image evidence a cell has, 0..1); each ``[B, rows, columns]``.
-        """
+    def forward(self, batch: EncoderInput) -> EncodedMaps:
+        """Predict maps from a batch."""
         config, grid = self.config, self.config.grid
-        lifted = self.lift(self.backbone((images - self.mean) / self.deviation))
-        depth = lifted[:, : config.depth_bins].softmax(dim=1)
         size = grid.rows * grid.columns
-        flat = splat(depth, lifted[:, config.depth_bins :], cells, size)
-        flat = flat.unflatten(0, (-1, cameras)).sum(1)
-        maps = flat.unflatten(2, (grid.rows, grid.columns))
-        geometric, decrease, stiffness, damping, friction, _ = self.heads(self.bird(maps)).unbind(1)
-        decrease = nn.functional.softplus(decrease - 3.0)
-        return {
-            "geometric_height": geometric,
-            "decrease": decrease,
-            "height": geometric - decrease,
-            "stiffness": config.stiffness * torch.exp(stiffness.clamp(-4.0, 4.0)),
-            "damping": config.damping * torch.exp(damping.clamp(-4.0, 4.0)),
-            "friction": config.friction * torch.exp(friction.clamp(-3.0, 1.0)),
-            "seen": maps[:, -1].clamp(max=1.0),
-        }
-
-    def cells(self, view: CameraView) -> Tensor:
-        """Map cells ``[bins, rows, columns]`` of a view's feature map at every depth."""
-        rows = -(-self.config.image_height // _FEATURE_STRIDE)
-        columns = -(-self.config.image_width // _FEATURE_STRIDE)
-        points = frustum_points(view.camera, rows, columns, depth_values(self.config))
-        return torch.from_numpy(map_cells(transform_points(view.terrain_from_camera, points), self.config))
-
-    def pixels(self, view: CameraView) -> Tensor:
-        """A view's image as the network takes it, ``[3, image_height, image_width]`` in 0..1."""
-        size = (self.config.image_width, self.config.image_height)
-        resized = cv2.resize(view.image, size, interpolation=cv2.INTER_AREA)
-        return torch.from_numpy(resized).permute(2, 0, 1).float() / 255.0
-
-    @torch.no_grad()
-    def terrain(self, views: Sequence[CameraView]) -> TerrainMap:
-        """Terrain map in the views' terrain frame; a cell counts as observed where the images carry evidence of it."""
-        self.eval()
-        device = self.mean.device
-        images = torch.stack([self.pixels(view) for view in views]).to(device)
-        cells = torch.stack([self.cells(view) for view in views]).to(device)
-        maps = {name: value[0].cpu() for name, value in self(images, cells, len(views)).items()}
-        return TerrainMap(
-            height=maps["height"],
-            geometric_height=maps["geometric_height"],
-            stiffness=maps["stiffness"],
-            damping=maps["damping"],
-            friction=maps["friction"],
-            observed=maps["seen"] > 0.05,
-            grid=self.config.grid,
+        depth, features = self._lift(batch)
+        points = lifted_points(batch.rays, batch.origins, self.depths)
+        cells = map_cells(points, config)
+        cameras = len(batch.images) // batch.maps
+        first = torch.arange(len(cells), device=cells.device).div(cameras, rounding_mode="floor") * size
+        cells = torch.where(cells < 0, cells, cells + first[:, None, None, None])
+        summed, totals = splat(depth, features, cells, points[..., 2], batch.maps * size)
+        shape = (batch.maps, grid.rows, grid.columns, -1)
+        seen = totals[:, 0]
+        mean = totals[:, 1:] / (seen + 0.05)[:, None]
+        spread = (mean[:, 1] - mean[:, 0] ** 2).clamp_min(0.0)
+        flat = [summed / (seen + 0.1)[:, None], torch.stack([mean[:, 0], spread, torch.log1p(seen)], dim=1)]
+        maps = torch.cat([part.view(shape) for part in flat], dim=-1).permute(0, 3, 1, 2)
+        maps = torch.cat([maps.to(summed.dtype), batch.support.to(summed.dtype)], dim=1)
+        if not maps.is_cuda:
+            maps = maps.contiguous(memory_format=torch.channels_last)
+        geometric, decrease, stiffness, damping, friction = self.heads(self.bird(maps)).float().unbind(1)
+        hits = torch.zeros(batch.maps * size, device=cells.device)
+        hits[cells[cells >= 0]] = 1.0
+        covered = functional.max_pool2d(hits.view(batch.maps, 1, grid.rows, grid.columns), 5, 1, 2)[:, 0] > 0
+        return EncodedMaps(
+            geometric_height=geometric + batch.ground[:, None, None],
+            decrease=functional.softplus(decrease - 3.0) if config.decreases else torch.zeros_like(decrease),
+            stiffness=config.stiffness * torch.exp(stiffness.clamp(-4.0, 4.0)),
+            damping=config.damping * torch.exp(damping.clamp(-4.0, 4.0)),
+            friction=config.friction * torch.exp(friction.clamp(-3.0, 1.0)),
+            covered=covered,
+            seen=seen.view(shape[:-1]),
         )
 
+    def _lift(self, batch: EncoderInput) -> tuple[Tensor, Tensor]:
+        """Probability of each depth ``[N, bins, rows, columns]`` and features ``[N, C, rows, columns]``."""
+        config = self.config
+        fine, coarse = self.backbone(batch.images.float() / 127.5 - 1.0)
+        coarse = functional.interpolate(coarse, size=fine.shape[-2:], mode="bilinear", align_corners=False)
+        down = batch.rays[..., 2]
+        height = batch.origins[:, 2, None, None]
+        # Depth at which the ray meets level ground; rays that do not, meet it beyond every bin.
+        level = torch.where(down < -1e-3, -height / down.clamp_max(-1e-3), 1e3).clamp(0.1, 1e3).log()
+        low, high = float(np.log(config.depth_minimum)), float(np.log(config.depth_maximum))
+        geometry = torch.stack(
+            [*batch.rays.unbind(-1), height.expand_as(down), ((level - low) / (high - low)).clamp(-0.5, 1.5)], dim=1
+        )
+        lifted = self.lift(self.neck(torch.cat([fine, coarse, geometry.to(fine.dtype)], dim=1)))
+        distance = (self.depths.log()[:, None, None] - level.clamp_max(high)[:, None]) / _LEVEL_GROUND_SPREAD
+        logits = lifted[:, : config.depth_bins].float() - self.level_weight * 0.5 * distance**2
+        return logits.softmax(dim=1), lifted[:, config.depth_bins :].float()
 
-def _backbone(name: str) -> tuple[nn.Module, int]:
-    """The first stages of an ImageNet network, down to a sixteenth of the image's size, and their channels."""
-    # torchvision takes seconds to import; a node that predicts from lidar need not wait for it.
-    import torchvision
+    @torch.no_grad()
+    def terrain(self, views: Sequence[CameraView], support: np.ndarray | None = None) -> TerrainMap:
+        """Terrain map in the views' terrain frame; a cell counts as observed where the images carry evidence of it.
 
-    network = getattr(torchvision.models, name)(weights=None).features
-    # The stages up to the last one of stride 16.
-    stages = {"mobilenet_v3_small": 9, "mobilenet_v3_large": 13}[name]
-    trunk = nn.Sequential(*list(network.children())[:stages])
-    channels = {"mobilenet_v3_small": 48, "mobilenet_v3_large": 112}[name]
-    return trunk, channels
-
-
-class _BirdsEyeNetwork(nn.Module):
-    """A small U-shaped network that spreads evidence over the map and refines it."""
-
-    def __init__(self, inputs: int, width: int):
-        super().__init__()
-        self.enter = _convolution(inputs, width)
-        self.down = nn.ModuleList(_convolution(width * 2**i, width * 2 ** (i + 1), stride=2) for i in range(3))
-        self.up = nn.ModuleList(_convolution(width * (2**i + 2 ** (i + 1)), width * 2**i) for i in reversed(range(3)))
-
-    def forward(self, maps: Tensor) -> Tensor:
-        levels = [self.enter(maps)]
-        for down in self.down:
-            levels.append(down(levels[-1]))
-        result = levels.pop()
-        for up in self.up:
-            finer = levels.pop()
-            raised = nn.functional.interpolate(result, size=finer.shape[-2:], mode="bilinear", align_corners=False)
-            result = up(torch.cat([raised, finer], dim=1))
-        return result
+        Args:
+            views: one of each camera.
+            support: points that the robot's wheels stand on ``[m, 3]`` in that frame.
+        """
+        self.eval()
+        batch = encoder_input(views, support, self.config).to(self.depths.device)
+        return terrain_maps(self(batch), self.config)[0]
 
 
-def _convolution(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
-    return nn.Sequential(
-        nn.Conv2d(inputs, outputs, kernel_size=3, stride=stride, padding=1, bias=False),
-        nn.BatchNorm2d(outputs),
-        nn.ReLU(inplace=True),
-    )
+def terrain_maps(maps: EncodedMaps, config: EncoderConfig) -> list[TerrainMap]:
+    """A batch as terrain maps on the CPU."""
+    values = {
+        name: getattr(maps, name).detach().cpu()
+        for name in ("height", "geometric_height", "stiffness", "damping", "friction")
+    }
+    observed = ((maps.seen > _SEEN) & maps.covered).detach().cpu()
+    return [
+        TerrainMap(**{name: value[i] for name, value in values.items()}, observed=observed[i], grid=config.grid)
+        for i in range(len(observed))
+    ]

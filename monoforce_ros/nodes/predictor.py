@@ -101,7 +101,7 @@ class PredictorNode(Node):
         if settings.terrain_source == "camera":
             encoder = load_encoder(settings.checkpoint)
             cuda = settings.device == "cuda" or (settings.device == "auto" and torch.cuda.is_available())
-            return CameraTerrain(encoder.to("cuda" if cuda else "cpu"))
+            return CameraTerrain(encoder.to("cuda" if cuda else "cpu"), self.robot)
         grid = Grid.square(settings.map_size, settings.map_resolution)
         material = TerrainDefaults(settings.stiffness, settings.damping, settings.friction)
         kind = LidarTerrain if settings.terrain_source == "lidar" else FlatTerrain

@@ -88,6 +88,7 @@ class CameraTerrain:
     """Terrain predicted from images by a trained encoder (paper III-A)."""
 
     encoder: TerrainEncoder
+    robot: RobotModel
 
     def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
         """Predicted map; raises ``ValueError`` where an image, calibration or camera pose is missing."""
@@ -99,4 +100,5 @@ class CameraTerrain:
             views.append(CameraView(image, observation.cameras[name], pose))
         if not views:
             raise ValueError("the camera terrain source needs at least one image, and the observation has none")
-        return self.encoder.terrain(views)
+        stiffness = self.encoder.config.stiffness
+        return self.encoder.terrain(views, support_points(self.robot, motion, stiffness))

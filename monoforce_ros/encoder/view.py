@@ -1,0 +1,122 @@
+"""CameraView and EncoderInput: images and the geometry that goes with them, ready for the network."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from monoforce_ros.camera import CameraModel
+from monoforce_ros.encoder.config import EncoderConfig
+from monoforce_ros.encoder.lift import feature_rays
+from monoforce_ros.terrain import Grid
+
+_SUPPORT_REACH = 1.0
+"""Beyond this distance from the robot's middle what its wheels stand on says nothing of the ground [m]."""
+
+
+@dataclass(frozen=True)
+class CameraView:
+    """An image, its camera and where the camera stood."""
+
+    image: np.ndarray
+    """RGB pixels ``[height, width, 3]`` uint8, as the camera delivers them."""
+    camera: CameraModel
+    terrain_from_camera: np.ndarray
+    """Pose ``[4, 4]`` of the camera in the terrain frame."""
+
+    def __post_init__(self):
+        size = (self.camera.height, self.camera.width)
+        if self.image.ndim != 3 or self.image.shape[2] != 3:
+            raise ValueError(f"image: got shape {self.image.shape}, expected [height, width, 3]")
+        if self.image.shape[:2] != size:
+            raise ValueError(
+                f"image: got {self.image.shape[1]} × {self.image.shape[0]} px, but its CameraInfo says "
+                f"{size[1]} × {size[0]} px"
+            )
+
+
+@dataclass(frozen=True)
+class EncoderInput:
+    """A batch of ``B`` maps to predict, each from the same number of cameras; heights count from ``ground``."""
+
+    images: Tensor
+    """RGB uint8 ``[B · cameras, 3, image_height, image_width]``."""
+    rays: Tensor
+    """In terrain axes, one metre along the optical axis long, ``[B · cameras, feature rows, feature columns, 3]``."""
+    origins: Tensor
+    """The cameras' places in the terrain frame, z from ``ground``, ``[B · cameras, 3]`` [m]."""
+    support: Tensor
+    """Plane under the robot's wheels from ``ground`` [m], and where it holds (0 or 1); ``[B, 2, rows, columns]``."""
+    ground: Tensor
+    """Height of the ground under the robot in its terrain frame ``[B]`` [m]."""
+
+    @property
+    def maps(self) -> int:
+        """How many maps."""
+        return len(self.ground)
+
+    def to(self, device: torch.device | str) -> EncoderInput:
+        """The same on another device."""
+        return EncoderInput(**{f.name: getattr(self, f.name).to(device, non_blocking=True) for f in fields(self)})
+
+    @classmethod
+    def stack(cls, inputs: Sequence[EncoderInput]) -> EncoderInput:
+        """A batch of inputs with the same number of cameras."""
+        return cls(**{f.name: torch.cat([getattr(entry, f.name) for entry in inputs]) for f in fields(cls)})
+
+
+def encoder_input(views: Sequence[CameraView], support: np.ndarray | None, config: EncoderConfig) -> EncoderInput:
+    """Input for one map.
+
+    Args:
+        views: one of each camera, in one terrain frame.
+        support: points that the robot's wheels stand on ``[m, 3]`` in that frame; without them the frame's origin is
+            taken for the ground's height.
+        config: of the encoder.
+    """
+    images = np.stack([network_image(view.image, config) for view in views])
+    rays = [
+        feature_rays(view.camera, config.feature_rows, config.feature_columns) @ view.terrain_from_camera[:3, :3].T
+        for view in views
+    ]
+    origins = np.stack([view.terrain_from_camera[:3, 3] for view in views])
+    return assemble(images, np.stack(rays), origins, support, config)
+
+
+def assemble(
+    images: np.ndarray, rays: np.ndarray, origins: np.ndarray, support: np.ndarray | None, config: EncoderConfig
+) -> EncoderInput:
+    """Input for one map from resized images ``[cameras, height, width, 3]``, their rays and places."""
+    ground, plane, known = support_plane(support, config.grid)
+    return EncoderInput(
+        images=torch.from_numpy(images).permute(0, 3, 1, 2).contiguous(),
+        rays=torch.as_tensor(rays, dtype=torch.float32),
+        origins=torch.as_tensor(origins - np.array([0.0, 0.0, ground]), dtype=torch.float32),
+        support=torch.as_tensor(np.stack([plane, known])[None], dtype=torch.float32),
+        ground=torch.tensor([ground], dtype=torch.float32),
+    )
+
+
+def network_image(image: np.ndarray, config: EncoderConfig) -> np.ndarray:
+    """The image in the network's size."""
+    size = (config.image_width, config.image_height)
+    if (image.shape[1], image.shape[0]) == size:
+        return np.ascontiguousarray(image)
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+
+def support_plane(support: np.ndarray | None, grid: Grid) -> tuple[float, np.ndarray, np.ndarray]:
+    """Height of the ground under the robot [m], the plane under its wheels counted from it, and where that holds."""
+    shape = (grid.rows, grid.columns)
+    if support is None or len(support) < 3:
+        return 0.0, np.zeros(shape), np.zeros(shape)
+    near = np.hypot(grid.x[None, :], grid.y[:, None]) < _SUPPORT_REACH
+    middle = support.mean(axis=0)
+    slope = np.linalg.lstsq(support[:, :2] - middle[:2], support[:, 2] - middle[2], rcond=None)[0]
+    plane = slope[0] * (grid.x[None, :] - middle[0]) + slope[1] * (grid.y[:, None] - middle[1])
+    return float(middle[2]), np.where(near, plane, 0.0), near.astype(float)

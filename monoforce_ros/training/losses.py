@@ -1,0 +1,120 @@
+"""Losses of the encoder (paper III-F): geometric, terrain and trajectory, each over what was measured alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from monoforce_ros.encoder import EncodedMaps, EncoderConfig
+from monoforce_ros.physics import PhysicsOptions, State, rollout
+from monoforce_ros.physics.effects import drive_speeds
+from monoforce_ros.robots import RobotModel
+from monoforce_ros.terrain import TerrainMap
+from monoforce_ros.training.samples import Targets
+
+HIGHEST, LOWEST = 1.0, -1.5
+"""Heights above and below the ground under the robot that are told apart [m]; a tree is a wall (paper, figure 6)."""
+_KNEE = 0.05
+"""Errors beyond it count linearly, so that few walls and trees do not outweigh the ground [m]."""
+_UNSEEN = 0.1
+"""Weight of measured cells that no camera looks at: only what surrounds them tells of them."""
+_ACROSS, _UP, _TURN = 0.15, 0.03, np.radians(2.0)
+"""How far a prediction may be off before it weighs: along the ground, where slip decides, up, and in rotation."""
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """Weights of the losses; 0 leaves one out."""
+
+    geometric: float = 1.0
+    terrain: float = 2.0
+    trajectory: float = 0.05
+    decrease: float = 0.3
+    """Of the mean square of H_d (λ_d of the paper's equation 3)."""
+
+    def __post_init__(self):
+        for name in ("geometric", "terrain", "trajectory", "decrease"):
+            if not 0.0 <= getattr(self, name) <= 1e6:
+                raise ValueError(f"loss weight {name}: got {getattr(self, name)}, expected 0 or more")
+        if self.geometric == self.terrain == self.trajectory == 0.0:
+            raise ValueError("loss weights: all are 0, expected geometric, terrain or trajectory above it")
+
+
+def geometric_loss(maps: EncodedMaps, targets: Targets, ground: Tensor) -> Tensor:
+    """Equation 4, averaged over the cells that the lidar measured; robust instead of squared."""
+    weight = targets.observed * torch.where(maps.covered, 1.0, _UNSEEN)
+    return _masked(maps.geometric_height, _limited(targets.geometric, ground), weight)
+
+
+def terrain_loss(maps: EncodedMaps, targets: Targets) -> Tensor:
+    """First part of equation 3, averaged over the cells that wheels or tracks touched; robust instead of squared."""
+    weight = targets.felt * torch.where(maps.covered, 1.0, _UNSEEN)
+    return _masked(maps.height, targets.supporting, weight)
+
+
+def decrease_loss(maps: EncodedMaps) -> Tensor:
+    """Second part of equation 3: what nobody drove over is as high as it looks."""
+    return (maps.decrease**2).mean()
+
+
+def trajectory_loss(
+    maps: EncodedMaps, targets: Targets, robot: RobotModel, config: EncoderConfig, options: PhysicsOptions
+) -> Tensor:
+    """Equation 2 over pieces of motion that start at measured states, in units of what may be ignored; robust."""
+    if not len(targets.map_of):
+        return maps.geometric_height.sum() * 0.0
+    terrain = TerrainMap(
+        **{
+            name: getattr(maps, name)[targets.map_of]
+            for name in ("height", "geometric_height", "stiffness", "damping", "friction")
+        },
+        observed=maps.covered[targets.map_of],
+        grid=config.grid,
+    )
+    steps = round(options_times(targets.positions.shape[1]) / options.time_step)
+    history = targets.twists.shape[1] - steps
+    with torch.no_grad():
+        speeds = drive_speeds(robot, targets.twists, options.time_step, history=history)
+    start = State(
+        targets.positions[:, 0].clone(), targets.rotations[:, 0].clone(), targets.velocity, targets.angular_velocity
+    )
+    result = rollout(terrain, robot, speeds, start, options=options, with_forces=False)
+    index = torch.linspace(0, steps, targets.positions.shape[1]).round().long()
+    positions, rotations = result.position[:, index[1:]], result.rotation[:, index[1:]]
+    away = positions - targets.positions[:, 1:]
+    relative = targets.rotations[:, 1:].transpose(-1, -2) @ rotations
+    # Half the antisymmetric part is the rotation vector between them, for small angles.
+    turns = 0.5 * torch.stack(
+        [relative[..., 2, 1] - relative[..., 1, 2], relative[..., 0, 2] - relative[..., 2, 0]], dim=-1
+    )
+    scaled = torch.cat([away[..., :2] / _ACROSS, away[..., 2:] / _UP, turns / _TURN], dim=-1)
+    loss = functional.huber_loss(scaled, torch.zeros_like(scaled), reduction="none", delta=2.0).mean(dim=(1, 2))
+    # What left the map rolled on ground that nobody predicted.
+    grid = config.grid
+    left, right, bottom, top = grid.extent
+    x, y = targets.positions[..., 0], targets.positions[..., 1]
+    inside = ((x > left) & (x < right) & (y > bottom) & (y < top)).all(dim=1) & torch.isfinite(loss)
+    return torch.where(inside, loss, 0.0).sum() / inside.sum().clamp_min(1)
+
+
+def options_times(samples: int) -> float:
+    """Length of a piece of motion with so many samples a tenth of a second apart [s]."""
+    return (samples - 1) * 0.1
+
+
+def _limited(heights: Tensor, ground: Tensor) -> Tensor:
+    above = heights - ground[:, None, None]
+    return ground[:, None, None] + above.clamp(LOWEST, HIGHEST)
+
+
+def _masked(predicted: Tensor, measured: Tensor, weight: Tensor) -> Tensor:
+    """Mean over weighted cells of each map, then over the maps that have any."""
+    error = functional.smooth_l1_loss(predicted, measured, reduction="none", beta=_KNEE)
+    total = weight.sum(dim=(1, 2))
+    mean = (error * weight).sum(dim=(1, 2)) / total.clamp_min(1e-6)
+    some = total > 0
+    return torch.where(some, mean, 0.0).sum() / some.sum().clamp_min(1)

@@ -1,0 +1,219 @@
+"""Samples: one image's network input and what it should have predicted, varied without breaking the calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from monoforce_ros.encoder import EncoderConfig, EncoderInput
+from monoforce_ros.encoder.lift import feature_rays
+from monoforce_ros.encoder.view import assemble
+from monoforce_ros.motion import homogeneous, transform_points
+from monoforce_ros.training.drive_samples import DriveSamples, Segment
+
+MIRROR = np.diag([1.0, -1.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Variation:
+    """A change of a sample that leaves true what the calibration says.
+
+    The whole scene is mirrored, or turned about the robot; images are cut and tilted with their rays, and recoloured.
+    """
+
+    mirrored: bool = False
+    turn: float = 0.0
+    """Of the map about the robot [rad]."""
+    zoom: float = 1.0
+    """Of the image, 1 or more."""
+    shift: tuple[float, float] = (0.0, 0.0)
+    """Of the cut within what the zoom leaves, each -1 to 1."""
+    tilt: float = 0.0
+    """Of the image about its middle [rad]."""
+    gain: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """On red, green and blue."""
+    contrast: float = 1.0
+    blur: float = 0.0
+    """Standard deviation [px]."""
+
+    @classmethod
+    def draw(cls, random: np.random.Generator) -> Variation:
+        """A random one."""
+        bright = random.uniform(0.7, 1.35)
+        return cls(
+            mirrored=bool(random.integers(2)),
+            turn=random.uniform(-0.35, 0.35),
+            zoom=random.uniform(1.0, 1.25),
+            shift=(random.uniform(-1, 1), random.uniform(-1, 1)),
+            tilt=random.uniform(-0.04, 0.04),
+            gain=tuple(bright * random.uniform(0.9, 1.1, 3)),
+            contrast=random.uniform(0.75, 1.3),
+            blur=max(0.0, random.uniform(-1.0, 0.9)),
+        )
+
+    def image_from_view(self) -> np.ndarray:
+        """Affine map ``[2, 3]`` from the varied image to the original one, both in 0..1."""
+        cosine, sine = np.cos(self.tilt), np.sin(self.tilt)
+        # A tilted cut stays within the image if it is smaller by so much.
+        inner = max(0.0, 1.0 - abs(sine) - (1.0 - cosine)) if self.tilt else 1.0
+        size = inner / self.zoom
+        free = (1.0 - size * (cosine + abs(sine))) / 2
+        middle = 0.5 + np.array(self.shift) * max(0.0, free)
+        linear = size * np.array([[cosine, -sine], [sine, cosine]]) @ np.diag([-1.0 if self.mirrored else 1.0, 1.0])
+        return np.column_stack([linear, middle - linear @ np.array([0.5, 0.5])])
+
+    def image(self, image: np.ndarray) -> np.ndarray:
+        """The varied image."""
+        if self.is_none:
+            return image
+        height, width = image.shape[:2]
+        # Pixel p lies at (p + 1/2) / size.
+        scale, half = np.array([width, height], float), 0.5
+        affine = self.image_from_view()
+        linear = affine[:, :2] * scale[:, None] / scale[None]
+        offset = scale * affine[:, 2] + linear @ np.array([half, half]) - half
+        matrix = np.column_stack([linear, offset])
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        image = cv2.warpAffine(image, matrix, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        if self.blur > 0.05:
+            image = cv2.GaussianBlur(image, (0, 0), self.blur)
+        colours = (image.astype(np.float32) - 127.5) * self.contrast + 127.5
+        return np.clip(colours * np.array(self.gain, np.float32), 0.0, 255.0).astype(np.uint8)
+
+    @property
+    def is_none(self) -> bool:
+        """Whether it changes nothing."""
+        return self == Variation()
+
+
+@dataclass(frozen=True)
+class Targets:
+    """What a batch of ``B`` maps should be, and how the robot moved on them, in the varied terrain frames."""
+
+    geometric: Tensor
+    """H_g* ``[B, rows, columns]`` [m]."""
+    observed: Tensor
+    supporting: Tensor
+    """H_t* [m]."""
+    felt: Tensor
+    map_of: Tensor
+    """Which map each of the ``W`` pieces of motion happened on."""
+    positions: Tensor
+    """``[W, K, 3]``."""
+    rotations: Tensor
+    """``[W, K, 3, 3]``."""
+    velocity: Tensor
+    """At the start, in terrain axes ``[W, 3]``."""
+    angular_velocity: Tensor
+    twists: Tensor
+    """``[W, history + T, 2]``."""
+
+    def to(self, device: torch.device | str) -> Targets:
+        """The same on another device."""
+        return Targets(**{f.name: getattr(self, f.name).to(device, non_blocking=True) for f in fields(self)})
+
+    @classmethod
+    def stack(cls, targets: Sequence[Targets]) -> Targets:
+        """Of several batches."""
+        joined = {f.name: torch.cat([getattr(t, f.name) for t in targets]) for f in fields(cls) if f.name != "map_of"}
+        starts = np.cumsum([0, *(len(t.geometric) for t in targets[:-1])])
+        map_of = torch.cat([t.map_of + int(start) for t, start in zip(targets, starts, strict=True)])
+        return cls(**joined, map_of=map_of)
+
+
+def sample(
+    drive: DriveSamples,
+    index: int,
+    config: EncoderConfig,
+    variation: Variation = Variation(),
+    *,
+    chunks: int = 4,
+    horizon: float = 5.0,
+) -> tuple[EncoderInput, Targets]:
+    """Input and targets of one sample of a drive.
+
+    Args:
+        drive: its samples.
+        index: of the sample.
+        config: of the encoder.
+        variation: of the sample.
+        chunks: pieces of motion to roll out, spread over ``horizon`` [s] after the image.
+    """
+    base = drive.odometry_from_base[index]
+    heading = np.arctan2(base[1, 0], base[0, 0]) + variation.turn
+    cosine, sine = np.cos(heading), np.sin(heading)
+    mirror = MIRROR if variation.mirrored else np.eye(3)
+    level = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    # The varied frame is left-handed where the scene is mirrored: everything that happens in it is mirrored too.
+    odometry_from_terrain = homogeneous(level @ mirror, base[:3, 3])
+    terrain_from_odometry = homogeneous(mirror @ level.T, -mirror @ level.T @ base[:3, 3])
+    affine = None if variation.is_none else variation.image_from_view()
+    rays, origins, images = [], [], []
+    for camera, pose, image in zip(
+        drive.cameras, drive.odometry_from_cameras[index], drive.images[index].numpy(), strict=True
+    ):
+        placed = terrain_from_odometry @ pose
+        rays.append(feature_rays(camera, config.feature_rows, config.feature_columns, affine) @ placed[:3, :3].T)
+        origins.append(placed[:3, 3])
+        images.append(variation.image(image))
+    support = transform_points(terrain_from_odometry, drive.support[index])
+    batch = assemble(np.stack(images), np.stack(rays), np.stack(origins), support, config)
+    maps = _maps(drive.segments[drive.segment_of[index]], odometry_from_terrain, config)
+    motion = _motion(drive, index, terrain_from_odometry, variation.mirrored, chunks, horizon)
+    return batch, Targets(**{name: torch.from_numpy(value) for name, value in (maps | motion).items()})
+
+
+def _maps(segment: Segment, odometry_from_terrain: np.ndarray, config: EncoderConfig) -> dict[str, np.ndarray]:
+    """The segment's maps, on the sample's grid."""
+    grid = config.grid
+    x, y = np.meshgrid(grid.x, grid.y)
+    centres = np.stack([x, y, np.zeros_like(x)], axis=-1)
+    turn = np.linalg.inv(segment.odometry_from_map) @ odometry_from_terrain
+    there = transform_points(turn, centres)
+    columns = ((there[..., 0] - segment.grid.origin[0]) / segment.grid.resolution).astype(np.float32)
+    rows = ((there[..., 1] - segment.grid.origin[1]) / segment.grid.resolution).astype(np.float32)
+
+    def heights(values: np.ndarray) -> np.ndarray:
+        found = cv2.remap(values, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return (found - turn[2, 3]).astype(np.float32)[None]
+
+    def mask(values: np.ndarray) -> np.ndarray:
+        known = values.astype(np.uint8)
+        found = cv2.remap(known, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+        return (found > 0)[None]
+
+    return {
+        "geometric": heights(segment.geometric),
+        "observed": mask(segment.observed),
+        "supporting": heights(segment.supporting),
+        "felt": mask(segment.felt),
+    }
+
+
+def _motion(
+    drive: DriveSamples, index: int, terrain_from_odometry: np.ndarray, mirrored: bool, count: int, horizon: float
+) -> dict[str, np.ndarray]:
+    """Pieces of motion after the image, in the varied frame."""
+    chunks = drive.chunks
+    after = (chunks.stamps - drive.stamps[index]) * 1e-9
+    usable = np.flatnonzero((after >= 0) & (after <= horizon - chunks.times[-1]))
+    if len(usable) > count:
+        usable = usable[np.linspace(0, len(usable) - 1, count).round().astype(int)]
+    turn, mirror = terrain_from_odometry[:3, :3], MIRROR if mirrored else np.eye(3)
+    rotations = turn @ chunks.rotations[usable] @ mirror
+    # An angular velocity is a pseudovector: mirrored, it turns the other way about the axes in the mirror's plane.
+    handed = -1.0 if mirrored else 1.0
+    spun = chunks.angular_velocities[usable] @ mirror * handed
+    return {
+        "map_of": np.zeros(len(usable), np.int64),
+        "positions": transform_points(terrain_from_odometry, chunks.positions[usable]).astype(np.float32),
+        "rotations": rotations.astype(np.float32),
+        "velocity": np.einsum("wij,wj->wi", rotations[:, 0], chunks.velocities[usable] @ mirror).astype(np.float32),
+        "angular_velocity": np.einsum("wij,wj->wi", rotations[:, 0], spun).astype(np.float32),
+        "twists": chunks.twists[usable] * np.array([1.0, handed], np.float32),
+    }

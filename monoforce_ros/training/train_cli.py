@@ -1,0 +1,247 @@
+"""``train``: train the terrain encoder on recorded drives."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from monoforce_ros.bags import BagError
+from monoforce_ros.encoder import CheckpointError, EncoderConfig, TerrainEncoder, load_encoder
+from monoforce_ros.encoder.backbone import WeightsError
+from monoforce_ros.robots import RobotFileError, load_robot, shipped_robots
+from monoforce_ros.training.drive_samples import DriveSamples, SamplesError, SampleSettings, drive_samples
+from monoforce_ros.training.losses import LossWeights
+from monoforce_ros.training.trainer import Process, Trainer, TrainingError, TrainingSettings, describe
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The command line's options."""
+    parser = argparse.ArgumentParser(
+        prog="train",
+        description="Train the terrain encoder on what a robot recorded: images, odometry, commands and lidar. Run "
+        "again with the same options, it goes on where it was interrupted. Under torchrun several processes share "
+        "the work.",
+    )
+    parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 folders or ROS 1 .bag files")
+    parser.add_argument("--out", type=Path, required=True, help="folder for checkpoint, logs and state")
+    parser.add_argument("--held-out", nargs="+", type=Path, default=[], metavar="BAG", help="whole drives to validate "
+                        "on (every eighth bag)")  # fmt: skip
+    parser.add_argument("--robot", default="husky", help=f"robot file or one of {', '.join(shipped_robots())}")
+    parser.add_argument("--cut", type=Path, metavar="DIR", help="folder for the drives cut into samples (OUT/samples)")
+    parser.add_argument("--images", nargs="+", default=[], metavar="TOPIC", help="cameras (all that are calibrated)")
+    parser.add_argument("--period", type=float, default=SampleSettings.period, metavar="S", help="between samples "
+                        "(%(default)s)")  # fmt: skip
+    parser.add_argument("--steps", type=int, default=TrainingSettings.steps, help="(%(default)s)")
+    parser.add_argument("--batch", type=int, default=TrainingSettings.batch, help="samples a step and process "
+                        "(%(default)s)")  # fmt: skip
+    parser.add_argument("--rate", type=float, default=TrainingSettings.rate, help="learning rate (%(default)s)")
+    parser.add_argument("--losses", nargs="+", default=["geometric", "terrain", "trajectory"],
+                        choices=("geometric", "terrain", "trajectory"),
+                        help="(all; `geometric` alone is LSS)")  # fmt: skip
+    parser.add_argument("--seed", type=int, default=TrainingSettings.seed, help="(%(default)s)")
+    parser.add_argument("--no-variation", action="store_true", help="do not mirror, turn, cut and recolour samples")
+    parser.add_argument("--size", default="320x240", metavar="WIDTHxHEIGHT", help="of images in the network "
+                        "(%(default)s)")  # fmt: skip
+    parser.add_argument("--map-size", type=float, default=EncoderConfig.map_size, metavar="M", help="(%(default)s)")
+    parser.add_argument("--resolution", type=float, default=EncoderConfig.resolution, metavar="M", help="of a cell "
+                        "(%(default)s)")  # fmt: skip
+    parser.add_argument("--start-from", type=Path, metavar="FILE.safetensors", help="an encoder to go on from")
+    parser.add_argument("--backbone-weights", choices=("imagenet", "random"), default="imagenet", help="(%(default)s)")
+    parser.add_argument("--validate-every", type=int, default=TrainingSettings.validate_every, metavar="STEPS")
+    parser.add_argument("--save-every", type=int, default=TrainingSettings.save_every, metavar="STEPS")
+    parser.add_argument("--precision", choices=("auto", "float32", "bfloat16"), default="auto")
+    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
+    parser.add_argument("--threads", type=int, default=0, help="of PyTorch (as many as cores)")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit status."""
+    parser = build_parser()
+    options = parser.parse_args(arguments)
+    process = None
+    try:
+        process = Process(options.device)
+        _train(options, process)
+    except (
+        BagError, RobotFileError, SamplesError, TrainingError, CheckpointError, WeightsError, ValueError, OSError,
+    ) as error:  # fmt: skip
+        print(f"train: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print(f"train: interrupted; the same command goes on from {options.out / 'state'}", file=sys.stderr)
+        return 130
+    finally:
+        if process is not None:
+            process.close()
+    return 0
+
+
+def _train(options: argparse.Namespace, process: Process) -> None:
+    # The same width on every computer, so that a seed means the same.
+    if options.threads:
+        torch.set_num_threads(options.threads)
+    config, settings = _config(options), _settings(options)
+    robot = load_robot(options.robot)
+    held_out = list(options.held_out)
+    bags = [bag for bag in options.bags if bag not in held_out]
+    if not held_out and len(bags) >= 4:
+        held_out = bags[7::8] or bags[-1:]
+        bags = [bag for bag in bags if bag not in held_out]
+    # One process cuts, the others read what it has written.
+    if process.first:
+        training, validation = (_cut(part, robot, config, options, what) for part, what in
+                                ((bags, "training"), (held_out, "held out")))  # fmt: skip
+    if process.count > 1:
+        torch.distributed.barrier()
+        if not process.first:
+            training, validation = (_cut(part, robot, config, options, "") for part in (bags, held_out))
+    torch.manual_seed(settings.seed)
+    encoder = _encoder(options, config)
+    trainer = Trainer(encoder, robot, training, validation, options.out, settings, process)
+    resumed = trainer.resume()
+    if process.first:
+        print(
+            f"{sum(map(len, training))} samples of {len(training)} drives, {len(validation)} drives held out, "
+            f"{sum(p.numel() for p in encoder.parameters()) / 1e6:.2f} million weights, on {process.device}"
+            + (f"; going on from step {trainer.step}" if resumed else "")
+        )
+    with _Log(options.out, settings.steps, trainer, quiet=options.quiet or not process.first) as log:
+        trainer.run(log)
+    if process.first:
+        _conclude(options.out, trainer, describe(config, settings, training))
+
+
+def _encoder(options: argparse.Namespace, config: EncoderConfig) -> TerrainEncoder:
+    if options.start_from is not None:
+        encoder = load_encoder(options.start_from)
+        before, now = asdict(encoder.config), asdict(config)
+        wrong = [name for name in now if name != "decreases" and now[name] != before[name]]
+        if wrong:
+            raise CheckpointError(
+                f"{options.start_from}: its {', '.join(wrong)} {'differ' if len(wrong) > 1 else 'differs'} from what "
+                f"the options ask for: {[before[name] for name in wrong]}, not {[now[name] for name in wrong]}"
+            )
+        fresh = TerrainEncoder(config)
+        fresh.load_state_dict(encoder.state_dict())
+        return fresh
+    encoder = TerrainEncoder(config)
+    if options.backbone_weights == "imagenet":
+        encoder.backbone.load_imagenet()
+    return encoder
+
+
+def _config(options: argparse.Namespace) -> EncoderConfig:
+    width, _, height = options.size.partition("x")
+    if not (width.isdecimal() and height.isdecimal()):
+        raise ValueError(f"--size: got {options.size!r}, expected two whole numbers as in 320x240")
+    return EncoderConfig(
+        image_width=int(width),
+        image_height=int(height),
+        map_size=options.map_size,
+        resolution=options.resolution,
+        decreases=options.losses != ["geometric"],
+    )
+
+
+def _settings(options: argparse.Namespace) -> TrainingSettings:
+    defaults = LossWeights()
+    chosen = {name: getattr(defaults, name) if name in options.losses else 0.0 for name in
+              ("geometric", "terrain", "trajectory")}  # fmt: skip
+    return TrainingSettings(
+        steps=options.steps, batch=options.batch, rate=options.rate, weights=LossWeights(**chosen), seed=options.seed,
+        vary=not options.no_variation, validate_every=options.validate_every, save_every=options.save_every,
+        precision=options.precision,
+    )  # fmt: skip
+
+
+def _cut(
+    bags: Sequence[Path], robot, config: EncoderConfig, options: argparse.Namespace, what: str
+) -> list[DriveSamples]:
+    drives = []
+    settings = SampleSettings(period=options.period)
+    bar = tqdm(bags, desc=what, unit="bag", disable=True if options.quiet or not what or not bags else None)
+    for bag in bar:
+        try:
+            drives.append(
+                drive_samples(
+                    bag, robot, config, options.cut or options.out / "samples", settings=settings,
+                    image_topics=options.images,
+                    progress=lambda step, bag=bag: bar.set_postfix_str(f"{bag.name}: {step}"),
+                )
+            )  # fmt: skip
+        except SamplesError as error:
+            # One drive that teaches nothing must not cost a night; none at all is an error.
+            print(f"train: {bag} left out: {error}", file=sys.stderr)
+    if bags and not drives:
+        raise SamplesError(f"none of {len(bags)} bags can be trained on")
+    return drives
+
+
+class _Log:
+    """Progress bar and TensorBoard's log."""
+
+    def __init__(self, out: Path, steps: int, trainer: Trainer, *, quiet: bool):
+        from torch.utils.tensorboard import SummaryWriter
+
+        self.trainer, self.validated = trainer, len(trainer.history)
+        self.writer = SummaryWriter(str(out / "log"), purge_step=trainer.step) if trainer.process.first else None
+        self.bar = tqdm(total=steps, initial=trainer.step, desc="training", unit="step",
+                        disable=True if quiet else None)  # fmt: skip
+        self.smooth: float | None = None
+
+    def __enter__(self) -> _Log:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.bar.close()
+        if self.writer is not None:
+            self.writer.close()
+
+    def __call__(self, step: int, losses: dict[str, float]) -> None:
+        total = losses["total"]
+        if np.isfinite(total):
+            self.smooth = total if self.smooth is None else 0.95 * self.smooth + 0.05 * total
+        history = self.trainer.history
+        shown = {} if self.smooth is None else {"loss": f"{self.smooth:.3f}"}
+        if history:
+            shown["held out"] = f"{100 * history[-1]['geometric']:.1f}, {100 * history[-1]['supporting']:.1f} cm"
+        self.bar.set_postfix(shown)
+        self.bar.update()
+        if self.writer is None:
+            return
+        for name, value in losses.items():
+            self.writer.add_scalar(f"loss/{name}", value, step)
+        for entry in history[self.validated :]:
+            for name in ("geometric", "supporting", "loss"):
+                self.writer.add_scalar(f"held out/{name}", entry[name], entry["step"])
+        self.validated = len(history)
+
+
+def _conclude(out: Path, trainer: Trainer, description: dict) -> None:
+    file = out / "training.json"
+    unfinished = file.with_name(f".{file.name}.unfinished")
+    unfinished.write_text(json.dumps(description | {"history": trainer.history}, indent=2, default=str), "utf-8")
+    unfinished.replace(file)
+    checkpoint = out / "encoder.safetensors"
+    line = f"{checkpoint}: {checkpoint.stat().st_size / 1e6:.1f} MB"
+    if trainer.history:
+        best = min(trainer.history, key=lambda entry: entry["loss"])
+        line += (
+            f"; on drives held out, median error {100 * best['geometric']:.1f} cm of what is seen, "
+            f"{100 * best['supporting']:.1f} cm of what carries"
+        )
+    print(line)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

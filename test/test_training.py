@@ -1,0 +1,230 @@
+"""Training: variations keep the calibration, losses count what was measured, and the installed executable trains."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from monoforce_ros.camera import CameraModel
+from monoforce_ros.encoder import EncodedMaps, EncoderConfig, load_encoder
+from monoforce_ros.encoder.lift import feature_rays
+from monoforce_ros.physics import PhysicsOptions
+from monoforce_ros.robots import load_robot
+from monoforce_ros.training.drive_samples import SamplesError, SampleSettings, drive_samples, read_samples
+from monoforce_ros.training.losses import geometric_loss, terrain_loss, trajectory_loss
+from monoforce_ros.training.samples import MIRROR, Targets, Variation, sample
+
+TINY = EncoderConfig(image_width=128, image_height=96, map_size=6.4, resolution=0.2)
+OPTIONS = ["--size", "128x96", "--map-size", "6.4", "--resolution", "0.2", "--batch", "4", "--device", "cpu",
+           "--threads", "1", "--quiet"]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def husky():
+    return load_robot("husky")
+
+
+@pytest.fixture(scope="module")
+def cut(tmp_path_factory, demo_bag, husky):
+    """Folder of the demo drive's samples, which every training below reads."""
+    folder = tmp_path_factory.mktemp("cut")
+    drive_samples(demo_bag, husky, TINY, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def drive(cut):
+    return read_samples(next(cut.glob("*.safetensors")))
+
+
+@pytest.mark.parametrize("lens", [[], [-0.22, 0.065, 0, 0, 0]])
+@pytest.mark.parametrize(
+    "variation",
+    [
+        Variation(mirrored=True),
+        Variation(zoom=1.25, shift=(0.8, -0.6)),
+        Variation(tilt=0.04, zoom=1.1, shift=(-1.0, 1.0)),
+        Variation(mirrored=True, tilt=-0.03, zoom=1.2, shift=(0.3, 0.5)),
+    ],
+)
+def test_a_varied_image_shows_a_point_where_its_ray_says(variation, lens):
+    matrix = np.array([[180.0, 0, 159.5], [0, 185.0, 121.0], [0, 0, 1]])
+    camera = CameraModel(320, 240, matrix, np.array(lens))
+    x, y = 190.0, 130.0
+    image = np.zeros((240, 320, 3), np.uint8)
+    cv2.circle(image, (int(x), int(y)), 4, (255, 255, 255), -1)
+    varied = variation.image(image)[..., 0].astype(float)
+    v, u = (np.array(np.nonzero(varied > 100)) * varied[varied > 100]).sum(1) / varied[varied > 100].sum()
+    # Rays of single pixels of the varied image: a feature map as fine as the image.
+    rays = feature_rays(camera, 240, 320, variation.image_from_view())
+    np.testing.assert_allclose(rays[round(v), round(u)], camera.rays(np.array([x, y])), atol=0.012)
+    # The whole varied image lies within the original one.
+    corners = variation.image_from_view() @ np.array([[0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 1, 1.0]]).T
+    assert corners.min() > -1e-9 and corners.max() < 1 + 1e-9
+
+
+def maps_of(targets: Targets, **changes) -> EncodedMaps:
+    """What an encoder without error would say."""
+    shape = targets.geometric
+    return EncodedMaps(
+        **{
+            "geometric_height": targets.supporting.clone(), "decrease": torch.zeros_like(shape),
+            "stiffness": torch.full_like(shape, TINY.stiffness), "damping": torch.full_like(shape, TINY.damping),
+            "friction": torch.full_like(shape, TINY.friction), "covered": torch.ones_like(shape, dtype=torch.bool),
+            "seen": torch.ones_like(shape), **changes,
+        }
+    )  # fmt: skip
+
+
+def test_a_mirrored_and_turned_sample_moves_as_the_original(drive, husky):
+    losses = []
+    for variation in (Variation(), Variation(mirrored=True), Variation(turn=0.3), Variation(mirrored=True, turn=-0.3)):
+        _, targets = sample(drive, 4, TINY, variation)
+        losses.append(float(trajectory_loss(maps_of(targets), targets, husky, TINY, PhysicsOptions())))
+        assert torch.linalg.det(targets.rotations).sub(1).abs().max() < 1e-4
+        # The wheels stand on the ground that was felt under them: the frame's origin is the robot.
+        assert float(targets.positions[0, 0, :2].norm()) < 0.5
+    assert losses[0] < 0.1
+    assert losses[1] == pytest.approx(losses[0], rel=0.02)
+    # A turned map is sampled anew, hence small differences; a wrong sign anywhere costs many times as much.
+    np.testing.assert_allclose(losses, losses[0], rtol=0.6)
+    _, targets = sample(drive, 4, TINY, Variation(mirrored=True))
+    wrong = replace(targets, twists=targets.twists * torch.tensor([1.0, -1.0]))
+    assert float(trajectory_loss(maps_of(wrong), wrong, husky, TINY, PhysicsOptions())) > 5 * losses[1]
+
+
+def test_a_mirrored_sample_mirrors_its_maps(drive):
+    (batch, plain), (other, mirrored) = (sample(drive, 3, TINY, Variation(mirrored=m)) for m in (False, True))
+    both = plain.observed & mirrored.observed.flip(1)
+    difference = (plain.geometric - mirrored.geometric.flip(1)).abs()[both]
+    assert float(difference.median()) < 1e-4
+    assert float((plain.felt ^ mirrored.felt.flip(1)).float().mean()) < 0.02
+    np.testing.assert_allclose(other.origins[0], MIRROR @ batch.origins[0].numpy(), atol=1e-5)
+    assert float(batch.ground[0]) == pytest.approx(float(other.ground[0]), abs=1e-6)
+
+
+def test_losses_are_means_over_measured_cells(drive):
+    batch, targets = sample(drive, 3, TINY)
+    off = maps_of(targets, geometric_height=targets.geometric + 0.3)
+    whole = geometric_loss(off, targets, batch.ground)
+    # A sparse mask does not shrink the loss, and what is not measured does not count.
+    sparse = targets.observed.clone()
+    sparse[:, ::3] = False
+    assert float(geometric_loss(off, replace(targets, observed=sparse), batch.ground)) == pytest.approx(
+        float(whole), rel=0.1
+    )
+    elsewhere = off.geometric_height + torch.where(targets.observed, 0.0, 5.0)
+    assert float(geometric_loss(replace(off, geometric_height=elsewhere), targets, batch.ground)) == float(whole)
+    felt = terrain_loss(maps_of(targets, decrease=torch.full_like(targets.felt.float(), 0.2)), targets)
+    assert float(felt) == pytest.approx(0.2 - 0.025, abs=1e-4)
+    nothing = replace(targets, felt=torch.zeros_like(targets.felt))
+    assert float(terrain_loss(maps_of(targets), nothing)) == 0.0
+
+
+def test_the_trajectory_loss_reaches_heights_and_material(drive, husky):
+    _, targets = sample(drive, 4, TINY)
+    heights = (targets.supporting + 0.02).requires_grad_()
+    friction = torch.full_like(heights, 0.6).requires_grad_()
+    stiffness = torch.full_like(heights, TINY.stiffness).requires_grad_()
+    maps = maps_of(targets, geometric_height=heights, friction=friction, stiffness=stiffness)
+    loss = trajectory_loss(maps, targets, husky, TINY, PhysicsOptions())
+    gradients = torch.autograd.grad(loss, (heights, friction, stiffness))
+    assert all(bool(g.isfinite().all()) and float(g.abs().sum()) > 0 for g in gradients)
+
+
+def test_samples_are_cut_once_and_damage_is_named(tmp_path, demo_bag, husky, cut, drive):
+    file = next(cut.glob("*.safetensors"))
+    before = file.stat().st_mtime_ns
+    again = drive_samples(demo_bag, husky, TINY, cut)
+    assert file.stat().st_mtime_ns == before and len(again) == len(drive)
+    assert len(list(cut.iterdir())) == 1
+    broken = tmp_path / "broken.safetensors"
+    broken.write_bytes(file.read_bytes()[:4000])
+    with pytest.raises(SamplesError, match="damaged"):
+        read_samples(broken)
+    with pytest.raises(ValueError, match="samples period: got 0"):
+        SampleSettings(period=0.0)
+
+
+def run(executables, *arguments, check=True, **environment):
+    done = subprocess.run(
+        [str(executables / "train"), *map(str, arguments)],
+        capture_output=True, text=True, timeout=300, env={**os.environ, **environment},
+    )  # fmt: skip
+    assert not check or done.returncode == 0, done.stdout + done.stderr
+    return done
+
+
+@pytest.fixture(scope="module")
+def trained(executables, demo_bag, cut, tmp_path_factory):
+    out = tmp_path_factory.mktemp("trained")
+    run(executables, demo_bag, "--out", out, "--cut", cut, "--steps", 24, "--save-every", 8, *OPTIONS)
+    return out
+
+
+def test_the_loss_falls_and_the_checkpoint_loads(trained):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(trained / "log"))
+    events.Reload()
+    for name in ("total", "geometric", "terrain"):
+        values = [event.value for event in events.Scalars(f"loss/{name}")]
+        assert len(values) == 24
+        assert np.mean(values[-6:]) < 0.8 * np.mean(values[:6]), name
+    encoder = load_encoder(trained / "encoder.safetensors")
+    assert encoder.config == TINY
+    described = json.loads((trained / "training.json").read_text())
+    assert described["settings"]["steps"] == 24 and list(described["drives"]) == ["demo"]
+
+
+def test_training_goes_on_after_a_kill_as_if_nothing_had_been(executables, demo_bag, cut, trained, tmp_path, start):
+    command = [demo_bag, "--out", tmp_path, "--cut", cut, "--steps", 24, "--save-every", 8, *OPTIONS]
+    process = start("train", *command)
+    state = tmp_path / "state" / "state.safetensors"
+    deadline = time.monotonic() + 120
+    while not state.exists() and process.running and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.stop(signal.SIGKILL)
+    done = run(executables, *command)
+    assert "going on from step" in done.stdout
+    once, twice = (load_file(str(folder / "encoder.safetensors")) for folder in (trained, tmp_path))
+    for name, value in once.items():
+        torch.testing.assert_close(twice[name], value, rtol=1e-4, atol=1e-5)
+    # Other options are not quietly mixed with what was trained.
+    refused = run(executables, *command, "--rate", "0.1", check=False)
+    assert refused.returncode == 1 and "other rate" in refused.stderr and "another --out" in refused.stderr
+    state.write_bytes(state.read_bytes()[:1000])
+    refused = run(executables, *command, check=False)
+    assert refused.returncode == 1 and "damaged" in refused.stderr and "Traceback" not in refused.stderr
+
+
+def test_two_processes_train_together(executables, demo_bag, cut, tmp_path):
+    command = [
+        sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m",
+        "monoforce_ros.training.train_cli", demo_bag, "--out", tmp_path, "--cut", cut, "--steps", "3", *OPTIONS,
+    ]  # fmt: skip
+    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert load_encoder(tmp_path / "encoder.safetensors").config == TINY
+    assert done.stdout.count("samples of 1 drives") == 1
+
+
+def test_what_cannot_be_trained_on_is_said_in_one_line(executables, tmp_path, demo_bag):
+    missing = run(executables, tmp_path / "no", "--out", tmp_path / "o", *OPTIONS, check=False)
+    assert missing.returncode == 1 and "does not exist" in missing.stderr and "Traceback" not in missing.stderr
+    wrong = run(executables, demo_bag, "--out", tmp_path / "o", "--size", "130x96", check=False)
+    assert wrong.returncode == 1 and "multiples of 16" in wrong.stderr
+    other = tmp_path / "demo"
+    shutil.copytree(demo_bag, other)
+    unknown = run(executables, other, "--out", tmp_path / "o", "--images", "/no", *OPTIONS, check=False)
+    assert unknown.returncode == 1 and "no images with a CameraInfo" in unknown.stderr
