@@ -35,7 +35,6 @@ setup(
         "safetensors",
         "torch",
         "torchdiffeq",
-        "torchvision",
         "warp-lang",
     ],
     extras_require={"test": ["pytest"]},

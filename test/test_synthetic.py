@@ -333,6 +333,8 @@ def test_the_bundled_bag_is_what_the_command_in_the_readme_records(tmp_path, dem
 def test_drawing_and_torchs_compiler_live_in_one_process():
     # Loaded the other way round, the two libraries' LLVMs crash the process.
     done = subprocess.run(
-        [sys.executable, "-c", "import monoforce_ros.synthetic.graphics, torchvision"], capture_output=True, timeout=60
+        [sys.executable, "-c", "import monoforce_ros.synthetic.graphics, torch, triton.backends"],
+        capture_output=True,
+        timeout=60,
     )
     assert done.returncode == 0, done.stderr.decode()[-500:]

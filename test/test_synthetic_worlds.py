@@ -198,3 +198,14 @@ def test_many_bags_at_once(tmp_path, executables, ros_environment):
     assert len(list((tmp_path / "set").glob("*.hidden.json"))) == 3
     ends = [Recording.open(tmp_path / "set" / bag).motion.positions[-1] for bag in bags]
     assert not np.allclose(ends[0], ends[1])
+
+
+def test_grass_grows_where_the_ground_says(tmp_path):
+    covered = {}
+    for ground in ("rigid", "mixed", "grass"):
+        world = build_scenery(TerrainSettings(ground=ground), 3)
+        covered[ground] = float((world.grass.height_at(world.route.points) > 0.1).mean())
+        assert len(world.rocks) > 50 and len(world.walls) >= 3
+    assert covered["rigid"] == 0.0 < covered["mixed"] < 0.5 * covered["grass"] and covered["grass"] > 0.4
+    with pytest.raises(ValueError, match="ground: got 'snow'"):
+        TerrainSettings(ground="snow")

@@ -67,6 +67,12 @@ def build_parser() -> argparse.ArgumentParser:
     shape.add_argument("--flat", action="store_true", help="level ground with nothing on it")
     shape.add_argument("--bare", action="store_true", help="hills with nothing on them")
     parser.add_argument(
+        "--ground",
+        choices=("mixed", "rigid", "grass"),
+        default="mixed",
+        help="some tall grass, none, or grass most of the way (%(default)s)",
+    )
+    parser.add_argument(
         "--count", type=int, metavar="N", help="record N bags OUT/SEED of the seeds from --seed on, in parallel"
     )
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="bags recorded at a time (%(default)s)")
@@ -160,7 +166,9 @@ def _settings(options: argparse.Namespace):
         duration=options.duration,
         robot=options.robot,
         commands=options.commands,
-        terrain=TerrainSettings(roughness=options.terrain_roughness, flat=options.flat, bare=options.bare),
+        terrain=TerrainSettings(
+            roughness=options.terrain_roughness, flat=options.flat, bare=options.bare, ground=options.ground
+        ),
         camera=camera
         and CameraSettings(width=camera[0], height=camera[1], rate=options.camera_rate, distortion=distortion),
         cameras=options.cameras,

@@ -22,6 +22,16 @@ _GRASS_PATCHES = (
     (31.0, -0.2, 1.7, 1.7),
     (41.5, 0.3, 1.4, 1.9),
 )
+# What a world of grass has beside them.
+_MORE_GRASS = (
+    (8.3, 0.3, 1.5, 1.7),
+    (14.6, -0.3, 1.5, 1.8),
+    (21.0, -0.2, 1.6, 1.7),
+    (24.3, -0.4, 1.5, 1.6),
+    (27.7, 0.3, 1.6, 1.8),
+    (34.4, -0.3, 1.7, 1.8),
+    (37.9, 0.2, 1.5, 1.7),
+)
 # Along the route [m], beyond what a short drive sees.
 _KERB_STATIONS = (20.5, 38.0)
 _PATCH_STATIONS = (14.5, 22.5, 27.5, 34.5)
@@ -107,7 +117,8 @@ def build_scenery(settings: TerrainSettings, seed: int) -> Scenery:
     kerbs = _place_kerbs(route, random_stream(seed, "kerbs"))
     ground = build_ground(settings, route, ramp, random_stream(seed, "ground"), kerbs)
     patches = []
-    for station, lateral, along, across in _GRASS_PATCHES:
+    grown = {"mixed": _GRASS_PATCHES, "rigid": (), "grass": (*_GRASS_PATCHES, *_MORE_GRASS)}[settings.ground]
+    for station, lateral, along, across in grown:
         centre, heading = route.at(station, lateral)
         patches.append(GrassPatch(centre, heading, along, across))
     grass = Grass.grow(tuple(patches), ground, random_stream(seed, "grass"))

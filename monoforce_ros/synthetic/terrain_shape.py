@@ -15,6 +15,7 @@ from monoforce_ros.synthetic.route import Route
 _HILLS = ((2.6, 0.13), (1.0, 0.045), (0.35, 0.010))
 _LEVEL_RADIUS = 1.0
 _RIM_WIDTH = 6.0
+GROUNDS = ("mixed", "rigid", "grass")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,6 +28,7 @@ class TerrainSettings:
         roughness: factor on the height of the hills [-].
         flat: level ground with nothing on it: no hills, ramp, rocks, trees or grass.
         bare: hills with nothing on them.
+        ground: ``mixed`` (patches of tall grass here and there), ``rigid`` (no grass) or ``grass`` (most of the way).
     """
 
     size: float = 40.0
@@ -34,8 +36,11 @@ class TerrainSettings:
     roughness: float = 1.0
     flat: bool = False
     bare: bool = False
+    ground: str = "mixed"
 
     def __post_init__(self):
+        if self.ground not in GROUNDS:
+            raise ValueError(f"ground: got {self.ground!r}, expected one of {GROUNDS}")
         if not 30.0 <= self.size <= 200.0:
             raise ValueError(f"size: got {self.size}, expected 30 to 200 m")
         if not 0.02 <= self.resolution <= 0.5:
