@@ -20,7 +20,7 @@ from monoforce_ros.encoder import EncodedMaps, EncoderConfig, load_encoder
 from monoforce_ros.encoder.lift import feature_rays
 from monoforce_ros.physics import PhysicsOptions
 from monoforce_ros.robots import load_robot
-from monoforce_ros.training.drive_samples import SamplesError, SampleSettings, drive_samples, read_samples
+from monoforce_ros.training.drive_samples import SamplesError, SampleSettings, cut_drive, read_samples
 from monoforce_ros.training.losses import geometric_loss, terrain_loss, trajectory_loss
 from monoforce_ros.training.samples import MIRROR, Targets, Variation, sample
 
@@ -38,7 +38,7 @@ def husky():
 def cut(tmp_path_factory, demo_bag, husky):
     """Folder of the demo drive's samples, which every training below reads."""
     folder = tmp_path_factory.mktemp("cut")
-    drive_samples(demo_bag, husky, TINY, folder)
+    cut_drive(demo_bag, husky, TINY, folder)
     return folder
 
 
@@ -142,11 +142,22 @@ def test_the_trajectory_loss_reaches_heights_and_material(drive, husky):
     assert all(bool(g.isfinite().all()) and float(g.abs().sum()) > 0 for g in gradients)
 
 
+def test_a_sweep_lies_where_the_map_of_many_sweeps_does(drive):
+    config = replace(TINY, sensor="lidar")
+    for variation in (Variation(), Variation(mirrored=True, turn=0.2)):
+        batch, targets = sample(drive, 4, config, variation)
+        low, _, hit = batch.sweep[0]
+        both = (hit > 0) & targets.observed[0]
+        assert int(both.sum()) > 100
+        away = (low + batch.ground[0] - targets.geometric[0])[both]
+        assert float(away.abs().median()) < 0.05
+
+
 def test_samples_are_cut_once_and_damage_is_named(tmp_path, demo_bag, husky, cut, drive):
     file = next(cut.glob("*.safetensors"))
     before = file.stat().st_mtime_ns
-    again = drive_samples(demo_bag, husky, TINY, cut)
-    assert file.stat().st_mtime_ns == before and len(again) == len(drive)
+    assert cut_drive(demo_bag, husky, TINY, cut) == file
+    assert file.stat().st_mtime_ns == before and len(read_samples(file)) == len(drive)
     assert len(list(cut.iterdir())) == 1
     broken = tmp_path / "broken.safetensors"
     broken.write_bytes(file.read_bytes()[:4000])

@@ -1,7 +1,8 @@
-"""Terrain encoder: camera images → terrain map by lift, splat, shoot (paper III-A)."""
+"""Terrain encoder: camera images → terrain map by lift, splat, shoot (paper III-A); and the lidar's network."""
 
-from monoforce_ros.encoder.checkpoint import CheckpointError, load_encoder, save_encoder
+from monoforce_ros.encoder.checkpoint import CheckpointError, Encoder, load_encoder, new_encoder, save_encoder
 from monoforce_ros.encoder.config import EncoderConfig
+from monoforce_ros.encoder.lidar_encoder import LidarEncoder
 from monoforce_ros.encoder.terrain_encoder import EncodedMaps, TerrainEncoder
 from monoforce_ros.encoder.view import CameraView, EncoderInput, encoder_input
 
@@ -9,10 +10,13 @@ __all__ = [
     "CameraView",
     "CheckpointError",
     "EncodedMaps",
+    "Encoder",
     "EncoderConfig",
     "EncoderInput",
+    "LidarEncoder",
     "TerrainEncoder",
     "encoder_input",
     "load_encoder",
+    "new_encoder",
     "save_encoder",
 ]

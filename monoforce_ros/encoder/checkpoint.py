@@ -11,7 +11,10 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from monoforce_ros.encoder.config import EncoderConfig
+from monoforce_ros.encoder.lidar_encoder import LidarEncoder
 from monoforce_ros.encoder.terrain_encoder import TerrainEncoder
+
+Encoder = TerrainEncoder | LidarEncoder
 
 MAXIMUM_BYTES = 2_000_000_000
 _HOW_TO_GET_ONE = (
@@ -24,7 +27,12 @@ class CheckpointError(ValueError):
     """A checkpoint that is missing, damaged, or of another network; predictions never run on random weights."""
 
 
-def save_encoder(encoder: TerrainEncoder, path: str | Path) -> None:
+def new_encoder(config: EncoderConfig) -> Encoder:
+    """An untrained encoder for the configuration's sensor."""
+    return TerrainEncoder(config) if config.sensor == "camera" else LidarEncoder(config)
+
+
+def save_encoder(encoder: Encoder, path: str | Path) -> None:
     """Write ``path`` (.safetensors) and its configuration (.json); both appear complete or not at all."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -36,8 +44,12 @@ def save_encoder(encoder: TerrainEncoder, path: str | Path) -> None:
     unfinished.rename(path)
 
 
-def load_encoder(path: str | Path) -> TerrainEncoder:
+def load_encoder(path: str | Path, sensor: str | None = None) -> Encoder:
     """Read an encoder.
+
+    Args:
+        path: of the weights; the configuration lies beside them.
+        sensor: that it must be for, ``camera`` or ``lidar``.
 
     Raises:
         CheckpointError: a file is missing, too large, damaged, or does not fit its configuration; the message says
@@ -56,7 +68,9 @@ def load_encoder(path: str | Path) -> TerrainEncoder:
         config = EncoderConfig(**json.loads(description.read_text(encoding="utf-8")))
     except (TypeError, ValueError) as error:
         raise CheckpointError(f"{description}: not the configuration of an encoder: {error}") from error
-    encoder = TerrainEncoder(config)
+    if sensor is not None and config.sensor != sensor:
+        raise CheckpointError(f"{path}: is an encoder for {config.sensor}, expected one for {sensor}")
+    encoder = new_encoder(config)
     try:
         weights = load_file(str(path))
         encoder.load_state_dict(weights)

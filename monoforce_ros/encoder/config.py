@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from monoforce_ros.terrain import Grid, TerrainDefaults
 
+SENSORS = ("camera", "lidar")
 BACKBONES = ("efficientnet_lite0",)
 
 FEATURE_STRIDE = 8
@@ -16,6 +17,8 @@ FEATURE_STRIDE = 8
 class EncoderConfig:
     """Everything that fixes an encoder's tensors and their meaning."""
 
+    sensor: str = "camera"
+    """``camera``, or ``lidar`` for the network that completes a sweep."""
     backbone: str = "efficientnet_lite0"
     image_width: int = 320
     image_height: int = 240
@@ -43,6 +46,8 @@ class EncoderConfig:
     """Material at which the heads start [N/m³, N s/m³, -]."""
 
     def __post_init__(self):
+        if self.sensor not in SENSORS:
+            raise ValueError(f"encoder sensor: got {self.sensor!r}, expected one of {SENSORS}")
         if self.backbone not in BACKBONES:
             raise ValueError(f"encoder backbone: got {self.backbone!r}, expected one of {BACKBONES}")
         for name, low, high in (

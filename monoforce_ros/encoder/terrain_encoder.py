@@ -96,19 +96,11 @@ class TerrainEncoder(nn.Module):
         maps = torch.cat([maps.to(summed.dtype), batch.support.to(summed.dtype)], dim=1)
         if not maps.is_cuda:
             maps = maps.contiguous(memory_format=torch.channels_last)
-        geometric, decrease, stiffness, damping, friction = self.heads(self.bird(maps)).float().unbind(1)
+        outputs = self.heads(self.bird(maps)).float()
         hits = torch.zeros(batch.maps * size, device=cells.device)
         hits[cells[cells >= 0]] = 1.0
         covered = functional.max_pool2d(hits.view(batch.maps, 1, grid.rows, grid.columns), 5, 1, 2)[:, 0] > 0
-        return EncodedMaps(
-            geometric_height=geometric + batch.ground[:, None, None],
-            decrease=functional.softplus(decrease - 3.0) if config.decreases else torch.zeros_like(decrease),
-            stiffness=config.stiffness * torch.exp(stiffness.clamp(-4.0, 4.0)),
-            damping=config.damping * torch.exp(damping.clamp(-4.0, 4.0)),
-            friction=config.friction * torch.exp(friction.clamp(-3.0, 1.0)),
-            covered=covered,
-            seen=seen.view(shape[:-1]),
-        )
+        return maps_from_heads(outputs, batch, config, covered, seen.view(shape[:-1]))
 
     def _lift(self, batch: EncoderInput) -> tuple[Tensor, Tensor]:
         """Probability of each depth ``[N, bins, rows, columns]`` and features ``[N, C, rows, columns]``."""
@@ -139,6 +131,22 @@ class TerrainEncoder(nn.Module):
         self.eval()
         batch = encoder_input(views, support, self.config).to(self.depths.device)
         return terrain_maps(self(batch), self.config)[0]
+
+
+def maps_from_heads(
+    outputs: Tensor, batch: EncoderInput, config: EncoderConfig, covered: Tensor, seen: Tensor
+) -> EncodedMaps:
+    """Heights and material from what the heads say ``[B, 5, rows, columns]``, each within its bounds."""
+    geometric, decrease, stiffness, damping, friction = outputs.unbind(1)
+    return EncodedMaps(
+        geometric_height=geometric + batch.ground[:, None, None],
+        decrease=functional.softplus(decrease - 3.0) if config.decreases else torch.zeros_like(decrease),
+        stiffness=config.stiffness * torch.exp(stiffness.clamp(-4.0, 4.0)),
+        damping=config.damping * torch.exp(damping.clamp(-4.0, 4.0)),
+        friction=config.friction * torch.exp(friction.clamp(-3.0, 1.0)),
+        covered=covered,
+        seen=seen,
+    )
 
 
 def terrain_maps(maps: EncodedMaps, config: EncoderConfig) -> list[TerrainMap]:

@@ -54,6 +54,9 @@ class EncoderInput:
     """Plane under the robot's wheels from ``ground`` [m], and where it holds (0 or 1); ``[B, 2, rows, columns]``."""
     ground: Tensor
     """Height of the ground under the robot in its terrain frame ``[B]`` [m]."""
+    sweep: Tensor
+    """What a lidar sweep hit: lowest and highest hit of each cell from ``ground`` [m], and whether there is one;
+    ``[B, 3, rows, columns]``, or ``[B, 0, rows, columns]`` without a lidar."""
 
     @property
     def maps(self) -> int:
@@ -88,18 +91,47 @@ def encoder_input(views: Sequence[CameraView], support: np.ndarray | None, confi
     return assemble(images, np.stack(rays), origins, support, config)
 
 
+def sweep_input(points: np.ndarray, support: np.ndarray | None, config: EncoderConfig) -> EncoderInput:
+    """Input for one map from a lidar sweep ``[n, 3]`` in the terrain frame [m], the robot's own body left out."""
+    none = np.zeros((0, config.image_height, config.image_width, 3), np.uint8)
+    rays = np.zeros((0, config.feature_rows, config.feature_columns, 3))
+    return assemble(none, rays, np.zeros((0, 3)), support, config, points)
+
+
 def assemble(
-    images: np.ndarray, rays: np.ndarray, origins: np.ndarray, support: np.ndarray | None, config: EncoderConfig
+    images: np.ndarray,
+    rays: np.ndarray,
+    origins: np.ndarray,
+    support: np.ndarray | None,
+    config: EncoderConfig,
+    sweep: np.ndarray | None = None,
 ) -> EncoderInput:
-    """Input for one map from resized images ``[cameras, height, width, 3]``, their rays and places."""
+    """Input for one map from resized images ``[cameras, height, width, 3]``, their rays and places, and a sweep."""
     ground, plane, known = support_plane(support, config.grid)
+    hits = np.zeros((0, *plane.shape)) if sweep is None else sweep_heights(sweep, ground, config)
     return EncoderInput(
         images=torch.from_numpy(images).permute(0, 3, 1, 2).contiguous(),
         rays=torch.as_tensor(rays, dtype=torch.float32),
         origins=torch.as_tensor(origins - np.array([0.0, 0.0, ground]), dtype=torch.float32),
         support=torch.as_tensor(np.stack([plane, known])[None], dtype=torch.float32),
         ground=torch.tensor([ground], dtype=torch.float32),
+        sweep=torch.as_tensor(hits[None], dtype=torch.float32),
     )
+
+
+def sweep_heights(points: np.ndarray, ground: float, config: EncoderConfig) -> np.ndarray:
+    """Lowest and highest hit of each cell from ``ground`` [m], 0 without one, and whether there is; ``[3, …]``."""
+    grid = config.grid
+    heights = points[:, 2] - ground
+    rows, columns, inside = grid.cells(points[:, :2])
+    inside &= (heights > config.lowest) & (heights < config.highest)
+    flat, heights = (rows * grid.columns + columns)[inside], heights[inside]
+    low, high = np.full(grid.rows * grid.columns, np.inf), np.full(grid.rows * grid.columns, -np.inf)
+    np.minimum.at(low, flat, heights)
+    np.maximum.at(high, flat, heights)
+    hit = np.isfinite(low)
+    stacked = np.stack([np.where(hit, low, 0.0), np.where(hit, high, 0.0), hit])
+    return stacked.reshape(3, grid.rows, grid.columns)
 
 
 def network_image(image: np.ndarray, config: EncoderConfig) -> np.ndarray:

@@ -93,7 +93,7 @@ def run(options: argparse.Namespace) -> None:
     recording = Recording.open(bag, odometry=options.odometry, commands=options.commands, cloud=options.cloud)
     material = TerrainDefaults(friction=options.friction)
     if options.terrain == "camera":
-        source = CameraTerrain(load_encoder(options.checkpoint), robot)
+        source = CameraTerrain(load_encoder(options.checkpoint, "camera"), robot)
     else:
         source = (LidarTerrain if options.terrain == "lidar" else FlatTerrain)(robot, Grid.square(), material)
     predictor = Predictor(robot, source, horizon=max(options.horizons), options=PhysicsOptions())

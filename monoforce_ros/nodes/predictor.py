@@ -99,7 +99,7 @@ class PredictorNode(Node):
     def _terrain_source(self) -> CameraTerrain | FlatTerrain | LidarTerrain:
         settings = self.settings
         if settings.terrain_source == "camera":
-            encoder = load_encoder(settings.checkpoint)
+            encoder = load_encoder(settings.checkpoint, "camera")
             cuda = settings.device == "cuda" or (settings.device == "auto" and torch.cuda.is_available())
             return CameraTerrain(encoder.to("cuda" if cuda else "cpu"), self.robot)
         grid = Grid.square(settings.map_size, settings.map_resolution)

@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from monoforce_ros.camera import CameraModel
-from monoforce_ros.encoder import CameraView, TerrainEncoder
+from monoforce_ros.encoder import CameraView, LidarEncoder, TerrainEncoder
 from monoforce_ros.motion import MotionState, transform_points
 from monoforce_ros.physics.rest import rest_depth
 from monoforce_ros.robots import RobotModel
@@ -81,6 +81,23 @@ class LidarTerrain:
             material=self.material,
             support=support_points(self.robot, motion, self.material.stiffness),
         )
+
+
+@dataclass(frozen=True)
+class LidarNetworkTerrain:
+    """Heights that a trained network completes from one sweep (the paper's baseline [22])."""
+
+    encoder: LidarEncoder
+    robot: RobotModel
+
+    def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
+        """Completed map; see :class:`TerrainSource`."""
+        if observation.cloud is None:
+            raise ValueError("the lidar network needs a point cloud, and the observation has none")
+        cloud = observation.cloud[~self.robot.covers(observation.cloud)].astype(np.float64)
+        cloud = cloud[np.isfinite(cloud).all(axis=1)]
+        support = support_points(self.robot, motion, self.encoder.config.stiffness)
+        return self.encoder.terrain(transform_points(motion.terrain_from_base, cloud), support)
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from monoforce_ros.bags import BagError, Recording, cut_windows, smooth
 from monoforce_ros.camera import CameraModel
 from monoforce_ros.encoder import EncoderConfig
 from monoforce_ros.encoder.view import network_image
-from monoforce_ros.motion import CommandTrack, MotionTrack, StaleDataError
+from monoforce_ros.motion import CommandTrack, MotionTrack, StaleDataError, transform_points
 from monoforce_ros.physics.effects import corrected_commands, corrected_motion
 from monoforce_ros.prediction.terrain_sources import support_points
 from monoforce_ros.robots import RobotModel
@@ -33,6 +33,7 @@ _LENGTH, _STRIDE = 10.0, 5.0
 _SEEN_BEFORE, _SEEN_AFTER = 2.0, 2.0
 _MATCH = 100_000_000
 """Images of several cameras belong together if they are no further apart [ns]."""
+_SWEEP_MATCH = 150_000_000
 CHUNK = 1.0
 """Length of the pieces of motion for the trajectory loss [s]."""
 MAXIMUM_BYTES = 20_000_000_000
@@ -108,6 +109,10 @@ class DriveSamples:
     """At each image's own time, ``[N, cameras, 4, 4]``."""
     support: np.ndarray
     """Points under the wheels in the odometry frame ``[N, m, 3]``."""
+    sweeps: np.ndarray
+    """Points of the lidar sweep nearest to each image in the odometry frame, one after another ``[p, 3]``."""
+    sweep_ends: np.ndarray
+    """Where each sample's points end in ``sweeps`` ``[N]``."""
     segment_of: np.ndarray
     segments: tuple[Segment, ...]
     chunks: Chunks
@@ -115,8 +120,13 @@ class DriveSamples:
     def __len__(self) -> int:
         return len(self.stamps)
 
+    def sweep(self, index: int) -> np.ndarray:
+        """Points ``[n, 3]`` of a sample's sweep in the odometry frame; none where there was no lidar."""
+        start = self.sweep_ends[index - 1] if index else 0
+        return self.sweeps[start : self.sweep_ends[index]]
 
-def drive_samples(
+
+def cut_drive(
     bag: Path,
     robot: RobotModel,
     config: EncoderConfig,
@@ -124,9 +134,8 @@ def drive_samples(
     *,
     settings: SampleSettings = SampleSettings(),
     image_topics: Sequence[str] = (),
-    progress: Callable[[str], None] = lambda step: None,
-) -> DriveSamples:
-    """Cut a bag into samples, or read them where that has been done with the same bag, robot and settings.
+) -> Path:
+    """Cut a bag into a file of samples, unless that has been done with the same bag, robot and settings.
 
     Raises:
         SamplesError: the drive has no images with calibration, no commands, or is too short.
@@ -135,14 +144,13 @@ def drive_samples(
     fingerprint = _fingerprint(bag, robot, config, settings, image_topics)
     file = folder / f"{bag.name.removesuffix('.bag')}-{fingerprint[:8]}.safetensors"
     if file.is_file():
-        progress("reading what was cut before")
-        return read_samples(file)
-    tensors, description = _cut(bag, robot, config, settings, image_topics, progress)
+        return file
+    tensors, description = _cut(bag, robot, config, settings, image_topics)
     folder.mkdir(parents=True, exist_ok=True)
     unfinished = file.with_name(f".{file.name}.unfinished-{os.getpid()}")
     save_file(tensors, str(unfinished), metadata={"samples": json.dumps(description)})
     unfinished.replace(file)
-    return read_samples(file)
+    return file
 
 
 def read_samples(file: Path) -> DriveSamples:
@@ -185,7 +193,10 @@ def read_samples(file: Path) -> DriveSamples:
             chunks=Chunks(**chunks, history=description["history"]),
             **{
                 name: values[name]
-                for name in ("stamps", "odometry_from_base", "odometry_from_cameras", "support", "segment_of")
+                for name in (
+                    "stamps", "odometry_from_base", "odometry_from_cameras", "support", "sweeps", "sweep_ends",
+                    "segment_of",
+                )
             },
         )  # fmt: skip
     except (SafetensorError, KeyError, TypeError, ValueError, OSError) as error:
@@ -200,9 +211,7 @@ def _cut(
     config: EncoderConfig,
     settings: SampleSettings,
     image_topics: Sequence[str],
-    progress: Callable[[str], None],
 ) -> tuple[dict[str, torch.Tensor], dict]:
-    progress("reading")
     recording = Recording.open(bag)
     topics = tuple(image_topics) or tuple(topic for topic in recording.images if topic in recording.cameras)
     unknown = [topic for topic in topics if topic not in recording.images or topic not in recording.cameras]
@@ -215,8 +224,7 @@ def _cut(
         raise SamplesError(f"{bag}: no commands (Twist or TwistStamped): the physics needs them")
     motion = smooth(corrected_motion(recording.motion, robot.effects)).motion
     commands = corrected_commands(recording.commands, robot.effects)
-    segments = _segments(recording, motion, commands, robot, settings, progress)
-    progress("reading images")
+    segments = _segments(recording, motion, commands, robot, settings)
     samples = _read_images(recording, motion, robot, config, settings, topics, [start for start, _ in segments])
     windows = cut_windows(motion, commands, length=CHUNK, stride=settings.chunk_period)
     tensors = {
@@ -254,7 +262,6 @@ def _segments(
     commands: CommandTrack,
     robot: RobotModel,
     settings: SampleSettings,
-    progress: Callable[[str], None],
 ) -> list[tuple[int, Segment]]:
     """Maps along the drive, with the start of each [ns]."""
     # The maps reach as far as any sample's own map can.
@@ -262,8 +269,7 @@ def _segments(
     first, last = int(motion.stamps[0]), int(motion.stamps[-1])
     starts = range(first, max(first + 1, last - round(1e9 * _LENGTH) + 1), round(1e9 * _STRIDE))
     segments, why = [], ""
-    for number, start in enumerate(starts):
-        progress(f"fitting terrain {number + 1} of {len(starts)}")
+    for start in starts:
         try:
             grid, pose = trajectory_grid(motion, start, _LENGTH, fitting), trajectory_frame(motion, start)
             visible = None
@@ -343,7 +349,40 @@ def _read_images(
         rows["segment_of"].append(max(i for i, start in enumerate(starts) if start <= state.stamp))
     if not rows["stamps"]:
         raise SamplesError(f"{recording.path}: no image lies within the odometry, with one second of motion after it")
-    return {name: np.array(values) for name, values in rows.items()}
+    arrays = {name: np.array(values) for name, values in rows.items()}
+    sweeps = _sweeps_near(recording, motion, robot, arrays["stamps"])
+    joined = np.concatenate(sweeps) if sweeps else np.zeros((0, 3))
+    return {
+        **arrays,
+        "sweeps": joined.astype(np.float32),
+        "sweep_ends": np.cumsum([len(points) for points in sweeps], dtype=np.int64),
+    }
+
+
+def _sweeps_near(
+    recording: Recording, motion: MotionTrack, robot: RobotModel, stamps: np.ndarray
+) -> list[np.ndarray]:
+    """Sweep nearest to each stamp, as :attr:`DriveSamples.sweeps` keeps them."""
+    clouds = np.array([frame.stamp for frame in recording.clouds], np.int64)
+    nearest: dict[int, list[int]] = {}
+    for index, stamp in enumerate(stamps):
+        if len(clouds) and np.abs(clouds - stamp).min() <= _SWEEP_MATCH:
+            nearest.setdefault(int(clouds[np.abs(clouds - stamp).argmin()]), []).append(index)
+    found = [np.zeros((0, 3))] * len(stamps)
+    first, last = (min(nearest), max(nearest)) if nearest else (0, -1)
+    for frame, points, frame_id in recording.clouds_between(first, last):
+        if frame.stamp not in nearest:
+            continue
+        try:
+            state = motion.at(frame.stamp, maximum_gap=0.3)
+        except StaleDataError:
+            continue
+        pose = recording.sensor_pose(frame_id, robot.base_frame, robot.sensors)
+        points = points[np.isfinite(points).all(axis=1)] @ pose[:3, :3].T + pose[:3, 3]
+        points = transform_points(state.odometry_from_base, points[~robot.covers(points)])
+        for index in nearest[frame.stamp]:
+            found[index] = points
+    return found
 
 
 def _fingerprint(

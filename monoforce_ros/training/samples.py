@@ -162,7 +162,8 @@ def sample(
         origins.append(placed[:3, 3])
         images.append(variation.image(image))
     support = transform_points(terrain_from_odometry, drive.support[index])
-    batch = assemble(np.stack(images), np.stack(rays), np.stack(origins), support, config)
+    sweep = transform_points(terrain_from_odometry, drive.sweep(index)) if config.sensor == "lidar" else None
+    batch = assemble(np.stack(images), np.stack(rays), np.stack(origins), support, config, sweep)
     maps = _maps(drive.segments[drive.segment_of[index]], odometry_from_terrain, config)
     motion = _motion(drive, index, terrain_from_odometry, variation.mirrored, chunks, horizon)
     return batch, Targets(**{name: torch.from_numpy(value) for name, value in (maps | motion).items()})

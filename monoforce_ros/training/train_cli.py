@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
 import sys
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 
@@ -14,10 +16,10 @@ import torch
 from tqdm import tqdm
 
 from monoforce_ros.bags import BagError
-from monoforce_ros.encoder import CheckpointError, EncoderConfig, TerrainEncoder, load_encoder
+from monoforce_ros.encoder import CheckpointError, Encoder, EncoderConfig, load_encoder, new_encoder
 from monoforce_ros.encoder.backbone import WeightsError
 from monoforce_ros.robots import RobotFileError, load_robot, shipped_robots
-from monoforce_ros.training.drive_samples import DriveSamples, SamplesError, SampleSettings, drive_samples
+from monoforce_ros.training.drive_samples import DriveSamples, SamplesError, SampleSettings, cut_drive, read_samples
 from monoforce_ros.training.losses import LossWeights
 from monoforce_ros.training.trainer import Process, Trainer, TrainingError, TrainingSettings, describe
 
@@ -36,6 +38,8 @@ def build_parser() -> argparse.ArgumentParser:
                         "on (every eighth bag)")  # fmt: skip
     parser.add_argument("--robot", default="husky", help=f"robot file or one of {', '.join(shipped_robots())}")
     parser.add_argument("--cut", type=Path, metavar="DIR", help="folder for the drives cut into samples (OUT/samples)")
+    parser.add_argument("--sensor", choices=("camera", "lidar"), default="camera", help="what the encoder sees: "
+                        "images, or a sweep that it completes (%(default)s)")  # fmt: skip
     parser.add_argument("--images", nargs="+", default=[], metavar="TOPIC", help="cameras (all that are calibrated)")
     parser.add_argument("--period", type=float, default=SampleSettings.period, metavar="S", help="between samples "
                         "(%(default)s)")  # fmt: skip
@@ -59,6 +63,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--save-every", type=int, default=TrainingSettings.save_every, metavar="STEPS")
     parser.add_argument("--precision", choices=("auto", "float32", "bfloat16"), default="auto")
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
+    parser.add_argument("--jobs", type=int, default=2, metavar="N", help="drives cut at a time (%(default)s)")
     parser.add_argument("--threads", type=int, default=0, help="of PyTorch (as many as cores)")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     return parser
@@ -121,7 +126,7 @@ def _train(options: argparse.Namespace, process: Process) -> None:
         _conclude(options.out, trainer, describe(config, settings, training))
 
 
-def _encoder(options: argparse.Namespace, config: EncoderConfig) -> TerrainEncoder:
+def _encoder(options: argparse.Namespace, config: EncoderConfig) -> Encoder:
     if options.start_from is not None:
         encoder = load_encoder(options.start_from)
         before, now = asdict(encoder.config), asdict(config)
@@ -131,11 +136,11 @@ def _encoder(options: argparse.Namespace, config: EncoderConfig) -> TerrainEncod
                 f"{options.start_from}: its {', '.join(wrong)} {'differ' if len(wrong) > 1 else 'differs'} from what "
                 f"the options ask for: {[before[name] for name in wrong]}, not {[now[name] for name in wrong]}"
             )
-        fresh = TerrainEncoder(config)
+        fresh = new_encoder(config)
         fresh.load_state_dict(encoder.state_dict())
         return fresh
-    encoder = TerrainEncoder(config)
-    if options.backbone_weights == "imagenet":
+    encoder = new_encoder(config)
+    if config.sensor == "camera" and options.backbone_weights == "imagenet":
         encoder.backbone.load_imagenet()
     return encoder
 
@@ -145,6 +150,7 @@ def _config(options: argparse.Namespace) -> EncoderConfig:
     if not (width.isdecimal() and height.isdecimal()):
         raise ValueError(f"--size: got {options.size!r}, expected two whole numbers as in 320x240")
     return EncoderConfig(
+        sensor=options.sensor,
         image_width=int(width),
         image_height=int(height),
         map_size=options.map_size,
@@ -169,22 +175,37 @@ def _cut(
 ) -> list[DriveSamples]:
     drives = []
     settings = SampleSettings(period=options.period)
+    folder = options.cut or options.out / "samples"
     bar = tqdm(bags, desc=what, unit="bag", disable=True if options.quiet or not what or not bags else None)
-    for bag in bar:
-        try:
-            drives.append(
-                drive_samples(
-                    bag, robot, config, options.cut or options.out / "samples", settings=settings,
-                    image_topics=options.images,
-                    progress=lambda step, bag=bag: bar.set_postfix_str(f"{bag.name}: {step}"),
-                )
-            )  # fmt: skip
-        except SamplesError as error:
-            # One drive that teaches nothing must not cost a night; none at all is an error.
-            print(f"train: {bag} left out: {error}", file=sys.stderr)
+    with ProcessPoolExecutor(
+        max(1, min(options.jobs, len(bags))), mp_context=multiprocessing.get_context("spawn"), initializer=_alone
+    ) as pool:
+        tasks = [(bag, robot, config, folder, settings, tuple(options.images)) for bag in bags]
+        # A single bag is cut here: another process would take longer to start.
+        cut = pool.map(_cut_one, tasks) if len(bags) > 1 and options.jobs > 1 else map(_cut_one, tasks)
+        for bag, (drive, complaint) in zip(bar, cut, strict=False):
+            if drive is not None:
+                drives.append(read_samples(drive))
+            else:
+                # One drive that teaches nothing must not cost a night; none at all is an error.
+                print(f"train: {bag} left out: {complaint}", file=sys.stderr)
     if bags and not drives:
         raise SamplesError(f"none of {len(bags)} bags can be trained on")
     return drives
+
+
+def _alone() -> None:
+    """Several processes at work have one thread each."""
+    torch.set_num_threads(1)
+
+
+def _cut_one(task: tuple) -> tuple[Path | None, str]:
+    """File of a bag's samples, or why there is none."""
+    bag, robot, config, folder, settings, topics = task
+    try:
+        return cut_drive(bag, robot, config, folder, settings=settings, image_topics=topics), ""
+    except SamplesError as error:
+        return None, str(error)
 
 
 class _Log:

@@ -17,7 +17,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from monoforce_ros.encoder import EncodedMaps, EncoderConfig, EncoderInput, TerrainEncoder, save_encoder
+from monoforce_ros.encoder import EncodedMaps, Encoder, EncoderConfig, EncoderInput, TerrainEncoder, save_encoder
 from monoforce_ros.physics import PhysicsOptions
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.training.drive_samples import DriveSamples
@@ -109,7 +109,7 @@ class Process:
 class _Losses(nn.Module):
     """Encoder and losses as one module, so that a distributed wrapper sees one forward pass."""
 
-    def __init__(self, encoder: TerrainEncoder, robot: RobotModel, weights: LossWeights):
+    def __init__(self, encoder: Encoder, robot: RobotModel, weights: LossWeights):
         super().__init__()
         self.encoder, self.weights = encoder, weights
         self.robot, self.options = robot, PhysicsOptions()
@@ -149,7 +149,7 @@ class Trainer:
 
     def __init__(
         self,
-        encoder: TerrainEncoder,
+        encoder: Encoder,
         robot: RobotModel,
         drives: Sequence[DriveSamples],
         held_out: Sequence[DriveSamples],
@@ -165,9 +165,10 @@ class Trainer:
             raise TrainingError("no samples to train on")
         losses = _Losses(self.encoder, robot, settings.weights)
         self.losses = nn.parallel.DistributedDataParallel(losses) if process.count > 1 else losses
-        pretrained = set(self.encoder.backbone.parameters())
+        backbone = list(self.encoder.backbone.parameters()) if isinstance(encoder, TerrainEncoder) else []
+        pretrained = set(backbone)
         groups = [
-            {"params": list(self.encoder.backbone.parameters()), "lr": settings.rate / 3},
+            {"params": backbone, "lr": settings.rate / 3},
             {"params": [p for p in self.encoder.parameters() if p not in pretrained], "lr": settings.rate},
         ]
         self.optimiser = torch.optim.AdamW(groups, weight_decay=1e-2)
@@ -320,7 +321,7 @@ class Trainer:
 
 
 @torch.no_grad()
-def validate(encoder: TerrainEncoder, drives: Sequence[DriveSamples], device: torch.device) -> Validation:
+def validate(encoder: Encoder, drives: Sequence[DriveSamples], device: torch.device) -> Validation:
     """Measure an encoder on whole drives, without variations."""
     encoder.eval()
     geometric, supporting, losses = [], [], []

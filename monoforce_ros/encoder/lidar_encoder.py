@@ -1,0 +1,40 @@
+"""LidarEncoder: one sparse sweep → dense map of what is visible; the learned lidar baseline (paper IV-B, [22])."""
+
+from __future__ import annotations
+
+from typing import override
+
+import numpy as np
+import torch
+from torch import nn
+
+from monoforce_ros.encoder.birds_eye import BirdsEyeNetwork
+from monoforce_ros.encoder.config import EncoderConfig
+from monoforce_ros.encoder.terrain_encoder import EncodedMaps, maps_from_heads, terrain_maps
+from monoforce_ros.encoder.view import EncoderInput, sweep_input
+from monoforce_ros.terrain import TerrainMap
+
+
+class LidarEncoder(nn.Module):
+    """Completes a sweep's heights where it hit nothing, with the network and heads of the camera's encoder."""
+
+    def __init__(self, config: EncoderConfig):
+        super().__init__()
+        self.config = config
+        # Lowest and highest hit, whether there is one, the support plane and where it holds.
+        self.bird = BirdsEyeNetwork(5, config.map_features)
+        self.heads = nn.Conv2d(config.map_features, 5, kernel_size=1)
+
+    @override
+    def forward(self, batch: EncoderInput) -> EncodedMaps:
+        """Predict maps from a batch with sweeps."""
+        outputs = self.heads(self.bird(torch.cat([batch.sweep, batch.support], dim=1))).float()
+        hit = batch.sweep[:, 2]
+        return maps_from_heads(outputs, batch, self.config, torch.ones_like(hit, dtype=torch.bool), hit)
+
+    @torch.no_grad()
+    def terrain(self, points: np.ndarray, support: np.ndarray | None = None) -> TerrainMap:
+        """Terrain map from a sweep ``[n, 3]`` in the terrain frame; cells that it hit count as observed."""
+        self.eval()
+        batch = sweep_input(points, support, self.config).to(self.heads.weight.device)
+        return terrain_maps(self(batch), self.config)[0]
