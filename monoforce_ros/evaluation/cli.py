@@ -59,14 +59,24 @@ def _parser() -> argparse.ArgumentParser:
         action="store_true",
         help="only say what the bag holds, what is missing, its rates, gaps, clocks and frames; status 1 if unusable",
     )
+    parser.add_argument(
+        "--tables",
+        action="store_true",
+        help="compare terrain sources over many drives instead; see `evaluate --tables --help`",
+    )
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     return parser
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the evaluation; see ``--help``. Returns 0, or 1 with one line that says what is wrong."""
+    given = sys.argv[1:] if arguments is None else arguments
+    if "--tables" in given:
+        from monoforce_ros.evaluation.tables_cli import main as compare
+
+        return compare(given)
     parser = _parser()
-    options = parser.parse_args(arguments)
+    options = parser.parse_args(given)
     if any(not 0.1 <= h <= 30 for h in options.horizons):
         parser.error(f"--horizons: got {options.horizons}, expected 0.1 to 30 s")
     if not 0 <= options.friction <= 3:

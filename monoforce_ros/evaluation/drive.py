@@ -74,6 +74,7 @@ def evaluate_drive(
     image_topics: Sequence[str] = (),
     horizons: Sequence[float] = (1.0, 2.0, 5.0),
     stride: float = 0.4,
+    shortest: float | None = None,
     progress: bool = True,
 ) -> DriveEvaluation:
     """Predict from moments along a drive and compare with the motion that followed.
@@ -85,13 +86,17 @@ def evaluate_drive(
         recording: the drive.
         predictor: robot, terrain source and horizon; the horizon must cover ``horizons``.
         image_topics: cameras to use with a camera terrain source; the first one sets the times.
+        horizons: at which errors are summed up [s].
+        stride: least time between windows [s].
+        shortest: odometry that a window needs after its start [s]; by default the shortest horizon.
+        progress: show a bar.
 
     Raises:
         EvaluationError: there is nothing to predict from, or no window with odometry after it.
     """
     recording = corrected_recording(recording, predictor.robot)
     flat = isinstance(predictor.source, FlatTerrain)
-    stamps = _window_stamps(recording, image_topics, flat, stride, min(horizons))
+    stamps = _window_stamps(recording, image_topics, flat, stride, shortest or min(horizons))
     count = round(max(horizons) / SAMPLE_TIME) + 1
     times = np.arange(count) * SAMPLE_TIME
     remarks: list[str] = []

@@ -1,0 +1,149 @@
+"""Tables: terrain sources compared over whole drives, as the paper's Tables I to III do (IV-B)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from monoforce_ros.bags import Recording
+from monoforce_ros.encoder import load_encoder
+from monoforce_ros.evaluation.drive import CONSTANT_VELOCITY, FLAT_PHYSICS, PHYSICS, DriveEvaluation, evaluate_drive
+from monoforce_ros.evaluation.metrics import Poses, position_errors, rotation_errors
+from monoforce_ros.prediction import CameraTerrain, LidarNetworkTerrain, LidarTerrain, Predictor
+from monoforce_ros.robots import RobotModel
+from monoforce_ros.terrain import Grid, TerrainDefaults
+
+HORIZON = 5.0
+STRIDE = 1.0
+SHORTEST = 5
+"""Compared poses that a window needs inside the map; the start is not one of them."""
+_RESAMPLES = 4000
+
+
+@dataclass(frozen=True)
+class System:
+    """A way to know the ground, and what it is called."""
+
+    key: str
+    title: str
+    input: str
+    checkpoint: Path | None = None
+
+
+@dataclass(frozen=True)
+class SequenceErrors:
+    """Mean errors over the windows of one drive."""
+
+    sequence: str
+    position: float
+    """Δx [m] (equation 5)."""
+    rotation: float
+    """ΔR [deg] (equation 6)."""
+    windows: int
+
+
+@dataclass(frozen=True)
+class Mean:
+    """A mean over drives, or a ratio of two, with its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+LIDAR = System("lidar", "lidar interpolation [19]", "point cloud")
+FLAT = System("flat", "level ground", "none")
+CONSTANT = System("constant", "constant velocity", "odometry")
+
+
+def evaluate_sequence(bag: Path, robot: RobotModel, systems: Sequence[System]) -> dict[str, SequenceErrors]:
+    """Errors of each system on one drive, from the same moments and over the same stretches.
+
+    A window counts up to where the measured robot leaves the map; windows of all systems start together.
+
+    Raises:
+        BagError, CheckpointError, EvaluationError: the bag or a checkpoint cannot be used.
+    """
+    recording = Recording.open(bag)
+    poses: dict[str, DriveEvaluation] = {}
+    for system in systems:
+        if system.key in (FLAT.key, CONSTANT.key):
+            continue
+        source = terrain_source(system, robot)
+        topics = tuple(recording.images) if isinstance(source, CameraTerrain) else ()
+        poses[system.key] = evaluate_drive(
+            recording, Predictor(robot, source, horizon=HORIZON), image_topics=topics,
+            horizons=(HORIZON,), stride=STRIDE, progress=False, shortest=1.0,
+        )  # fmt: skip
+    common = set.intersection(*(set(e.stamps.tolist()) for e in poses.values()))
+    first = next(iter(poses.values()))
+    errors = {}
+    for system in systems:
+        evaluation = poses.get(system.key, first)
+        method = {FLAT.key: FLAT_PHYSICS, CONSTANT.key: CONSTANT_VELOCITY}.get(system.key, PHYSICS)
+        chosen = np.isin(evaluation.stamps, sorted(common))
+        errors[system.key] = _sequence(bag.name, evaluation, method, chosen)
+    return errors
+
+
+def terrain_source(system: System, robot: RobotModel) -> CameraTerrain | LidarTerrain | LidarNetworkTerrain:
+    """The terrain source of a system that has one."""
+    if system.checkpoint is None:
+        return LidarTerrain(robot, Grid.square(), TerrainDefaults())
+    encoder = load_encoder(system.checkpoint)
+    if encoder.config.sensor == "lidar":
+        return LidarNetworkTerrain(encoder, robot)
+    return CameraTerrain(encoder, robot)
+
+
+def _sequence(name: str, evaluation: DriveEvaluation, method: str, chosen: np.ndarray) -> SequenceErrors:
+    measured = Poses(evaluation.measured.positions[chosen], evaluation.measured.rotations[chosen])
+    predicted = evaluation.predicted[method]
+    predicted = Poses(predicted.positions[chosen], predicted.rotations[chosen])
+    usable = np.logical_and.accumulate(_on_map(measured), axis=1)
+    position, rotation = position_errors(predicted, measured), rotation_errors(predicted, measured)
+    usable &= np.isfinite(position) & np.isfinite(rotation)
+    usable[:, 0] = False
+    counted = usable.sum(axis=1) >= SHORTEST
+
+    def mean(errors: np.ndarray) -> float:
+        inside = np.where(usable[counted], errors[counted], 0.0).sum(axis=1) / usable[counted].sum(axis=1)
+        return float(inside.mean()) if counted.any() else float("nan")
+
+    return SequenceErrors(name, mean(position), mean(rotation), int(counted.sum()))
+
+
+def _on_map(measured: Poses, half: float = 6.4) -> np.ndarray:
+    """Whether the measured robot is on the map of its window's start, ``[W, T]``."""
+    heading = np.arctan2(measured.rotations[:, 0, 1, 0], measured.rotations[:, 0, 0, 0])
+    away = measured.positions[..., :2] - measured.positions[:, :1, :2]
+    cosine, sine = np.cos(heading)[:, None], np.sin(heading)[:, None]
+    along = cosine * away[..., 0] + sine * away[..., 1]
+    across = cosine * away[..., 1] - sine * away[..., 0]
+    return (np.abs(along) < half) & (np.abs(across) < half)
+
+
+def mean_over(values: Sequence[float]) -> Mean:
+    """Mean over drives with its bootstrap interval: drives are independent, windows of one are not."""
+    array = np.array([value for value in values if np.isfinite(value)])
+    if not len(array):
+        return Mean(float("nan"), float("nan"), float("nan"))
+    means = array[_resampled(len(array))].mean(axis=1)
+    return Mean(float(array.mean()), *map(float, np.quantile(means, (0.025, 0.975))))
+
+
+def ratio_over(values: Sequence[float], others: Sequence[float]) -> Mean:
+    """Ratio of two systems' means over the same drives, resampled together."""
+    both = np.array([(a, b) for a, b in zip(values, others, strict=True) if np.isfinite(a) and np.isfinite(b)])
+    if not len(both):
+        return Mean(float("nan"), float("nan"), float("nan"))
+    means = both[_resampled(len(both))].mean(axis=1)
+    ratios = means[:, 0] / means[:, 1]
+    return Mean(float(both[:, 0].mean() / both[:, 1].mean()), *map(float, np.quantile(ratios, (0.025, 0.975))))
+
+
+def _resampled(count: int) -> np.ndarray:
+    return np.random.default_rng(0).integers(0, count, size=(_RESAMPLES, count))

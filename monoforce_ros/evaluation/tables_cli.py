@@ -1,0 +1,122 @@
+"""``evaluate --tables``: compare terrain sources over drives on rigid ground and in tall grass."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import sys
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+
+import torch
+from tqdm import tqdm
+
+from monoforce_ros.bags import BagError
+from monoforce_ros.encoder import CheckpointError
+from monoforce_ros.evaluation.drive import EvaluationError
+from monoforce_ros.evaluation.report import write_text
+from monoforce_ros.evaluation.tables import CONSTANT, FLAT, LIDAR, SequenceErrors, System, evaluate_sequence
+from monoforce_ros.evaluation.tables_report import comparison, markdown, page
+from monoforce_ros.robots import RobotFileError, load_robot, shipped_robots
+
+LEARNED = {
+    "lidar_network": ("network on a lidar sweep [22]", "point cloud"),
+    "lss": ("images → H_g, LSS [9]", "images"),
+    "monoforce": ("images → H_t, MonoForce", "images"),
+    "no_geometric": ("MonoForce without geometric loss", "images"),
+}
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The command line's options."""
+    parser = argparse.ArgumentParser(
+        prog="evaluate --tables",
+        description="Compare terrain sources over whole drives: lidar interpolation, level ground, constant velocity, "
+        "and encoders by their checkpoints. Writes tables.json, tables.html and tables.md.",
+    )
+    parser.add_argument("--tables", action="store_true", required=True, help=argparse.SUPPRESS)
+    parser.add_argument("--rigid", nargs="+", type=Path, default=[], metavar="BAG", help="drives on rigid ground, or "
+                        "folders of them")  # fmt: skip
+    parser.add_argument("--grass", nargs="+", type=Path, default=[], metavar="BAG", help="drives in tall grass")
+    for key, (title, _) in LEARNED.items():
+        parser.add_argument(f"--{key.replace('_', '-')}", type=Path, metavar="FILE.safetensors", help=title)
+    parser.add_argument("--robot", default="husky", help=f"robot file or one of {', '.join(shipped_robots())}")
+    parser.add_argument("--out", type=Path, default=Path("tables"), help="folder (%(default)s)")
+    parser.add_argument("--docs", type=Path, metavar="FILE", help="write the tables into this document too, between "
+                        "its comments `<!-- tables -->`")  # fmt: skip
+    parser.add_argument("--jobs", type=int, default=2, metavar="N", help="drives at a time (%(default)s)")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit status."""
+    parser = build_parser()
+    options = parser.parse_args(arguments)
+    if not options.rigid and not options.grass:
+        parser.error("--rigid or --grass: expected at least one drive")
+    try:
+        load_robot(options.robot)
+        systems = _systems(options)
+        grounds = {name: _bags(getattr(options, name)) for name in ("rigid", "grass") if getattr(options, name)}
+        rows = _evaluate(grounds, systems, options)
+    except (BagError, CheckpointError, EvaluationError, RobotFileError, ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    found = comparison(rows, systems)
+    text = markdown(found, systems)
+    write_text(options.out / "tables.json", json.dumps(found, indent=1, ensure_ascii=False))
+    write_text(options.out / "tables.md", text)
+    write_text(options.out / "tables.html", page(found, systems, {k: [b.name for b in v] for k, v in grounds.items()}))
+    if options.docs is not None:
+        before, _, rest = options.docs.read_text(encoding="utf-8").partition("<!-- tables -->\n")
+        _, _, after = rest.partition("<!-- end of tables -->")
+        write_text(options.docs, f"{before}<!-- tables -->\n{text}\n<!-- end of tables -->{after}")
+    print(text)
+    print(f"\n{options.out / 'tables.html'}")
+    return 0
+
+
+def _systems(options: argparse.Namespace) -> list[System]:
+    systems = [LIDAR]
+    for key, (title, sensed) in LEARNED.items():
+        checkpoint = getattr(options, key)
+        if checkpoint is not None:
+            systems.append(System(key, title, sensed, checkpoint))
+    return [*systems, FLAT, CONSTANT]
+
+
+def _bags(paths: Sequence[Path]) -> list[Path]:
+    """Bags, those in folders of bags included."""
+    found: list[Path] = []
+    for path in paths:
+        if not path.exists():
+            raise BagError(f"{path} does not exist")
+        inner = sorted(p for p in path.iterdir() if (p / "metadata.yaml").exists()) if path.is_dir() else []
+        found += [path] if (path / "metadata.yaml").exists() or not inner else inner
+    return found
+
+
+def _evaluate(
+    grounds: dict[str, list[Path]], systems: list[System], options: argparse.Namespace
+) -> dict[str, list[dict[str, SequenceErrors]]]:
+    rows: dict[str, list[dict[str, SequenceErrors]]] = {ground: [] for ground in grounds}
+    tasks = [(ground, bag) for ground, bags in grounds.items() for bag in bags]
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(max(1, options.jobs), mp_context=context) as pool:
+        running = {pool.submit(_one, bag, options.robot, systems): ground for ground, bag in tasks}
+        with tqdm(total=len(tasks), unit="drive", disable=True if options.quiet else None) as bar:
+            for done in as_completed(running):
+                rows[running[done]].append(done.result())
+                bar.update()
+    for listed in rows.values():
+        listed.sort(key=lambda row: next(iter(row.values())).sequence)
+    return rows
+
+
+def _one(bag: Path, robot: str, systems: list[System]) -> dict[str, SequenceErrors]:
+    torch.set_num_threads(1)
+    return evaluate_sequence(bag, load_robot(robot), systems)
+
