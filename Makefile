@@ -2,8 +2,10 @@
 # make test   lint and run every test
 # make bench  run the benchmarks
 # make diagnosis  measure diagnose on hidden effects and real drives (an hour), write the tables of docs/discrepancy.md
+# make checkpoint train the shipped terrain encoder on synthetic worlds, from nothing (some hours)
+# make tables     compare terrain sources on worlds that no training saw, as the paper's tables do (more hours)
 SHELL := /bin/bash
-.PHONY: demo test bench diagnosis lint environment build graphics lock clean help
+.PHONY: demo test bench diagnosis checkpoint tables lint environment build graphics lock clean help
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -46,3 +48,6 @@ diagnosis: build graphics
 	@scripts/run.sh python benchmarks/hidden_effects.py --baselines --json out/hidden_effects.json --docs docs/discrepancy.md
 	@if [ -d "$(DRIVES)" ]; then scripts/run.sh python benchmarks/warthog_reports.py "$(DRIVES)" \
 	  --json out/warthog.json --docs docs/discrepancy.md; else echo "[diagnosis] no real drives at $(DRIVES)"; fi
+
+checkpoint tables: build graphics
+	@scripts/train_encoders.sh $@

@@ -5,7 +5,7 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 PACKAGE = "monoforce_ros"
-SHARED_FOLDERS = ("config", "launch", "msg_defs", "bags")
+SHARED_FOLDERS = ("config", "launch", "msg_defs", "bags", "models")
 
 
 def shared_files() -> list[tuple[str, list[str]]]:

@@ -73,7 +73,7 @@ ros_environment() {
 
 build() {
   local stamp=install/.built started=$SECONDS
-  if [ -f "$stamp" ] && [ -z "$(find package.xml setup.py setup.cfg resource config launch msg_defs bags monoforce_ros \
+  if [ -f "$stamp" ] && [ -z "$(find package.xml setup.py setup.cfg resource config launch msg_defs bags models monoforce_ros \
     -newer "$stamp" -not -name '*.pyc' -not -name __pycache__ -print -quit)" ]; then
     say "the build is up to date"
     return

@@ -9,6 +9,7 @@ import torch
 from monoforce_ros.camera import CameraModel
 from monoforce_ros.encoder import CameraView, CheckpointError, EncoderConfig, TerrainEncoder, load_encoder, save_encoder
 from monoforce_ros.encoder.backbone import Backbone, WeightsError
+from monoforce_ros.encoder.checkpoint import shipped_checkpoint
 from monoforce_ros.encoder.lift import depth_values, feature_rays, lifted_points, map_cells, splat
 from monoforce_ros.encoder.view import EncoderInput, encoder_input, support_plane
 from monoforce_ros.motion import homogeneous, transform_points
@@ -110,9 +111,7 @@ def test_the_support_plane_holds_the_slope_under_the_wheels():
     ground, plane, known = support_plane(np.column_stack([x, y, 0.2 * x - 0.1 * y - 0.4]), SMALL.grid)
     assert ground == pytest.approx(-0.4)
     rows, columns = np.nonzero(known)
-    np.testing.assert_allclose(
-        plane[rows, columns], 0.2 * SMALL.grid.x[columns] - 0.1 * SMALL.grid.y[rows], atol=1e-9
-    )
+    np.testing.assert_allclose(plane[rows, columns], 0.2 * SMALL.grid.x[columns] - 0.1 * SMALL.grid.y[rows], atol=1e-9)
     assert not plane[known == 0].any() and support_plane(None, SMALL.grid)[0] == 0.0
 
 
@@ -173,10 +172,16 @@ def test_a_checkpoint_comes_back_as_it_was(tmp_path):
     assert sorted(p.name for p in (tmp_path / "a").iterdir()) == ["encoder.json", "encoder.safetensors"]
 
 
+def test_the_shipped_checkpoint_is_small_and_for_cameras():
+    assert shipped_checkpoint().stat().st_size < 12e6
+    encoder = load_encoder("", "camera")
+    assert encoder.config.sensor == "camera" and encoder.config.decreases
+    with pytest.raises(CheckpointError, match="is an encoder for camera, expected one for lidar"):
+        load_encoder("", "lidar")
+
+
 def test_unusable_checkpoints_are_named_and_never_replaced_by_random_weights(tmp_path):
     path = tmp_path / "encoder.safetensors"
-    with pytest.raises(CheckpointError, match="no encoder checkpoint was given"):
-        load_encoder("")
     with pytest.raises(CheckpointError, match="does not exist: a checkpoint is"):
         load_encoder(path)
     save_encoder(TerrainEncoder(SMALL), path)

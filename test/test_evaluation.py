@@ -96,7 +96,7 @@ def test_the_page_is_self_contained(report):
     ("arguments", "message"),
     [
         (["nowhere"], "does not exist"),
-        (["{bag}", "--terrain", "camera"], "no encoder checkpoint was given"),
+        (["{bag}", "--terrain", "camera", "--checkpoint", "/nowhere/encoder.safetensors"], "does not exist"),
         (["{bag}", "--robot", "huskey"], "no robot named"),
         (["{bag}", "--cloud", "/odom"], "topic /odom is nav_msgs/msg/Odometry, expected sensor_msgs"),
     ],

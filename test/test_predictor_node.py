@@ -201,7 +201,6 @@ def test_a_termination_ends_it_cleanly_too(start):
     ("parameters", "message"),
     [
         (["robot:=huskey"], "there is no robot named 'huskey'"),
-        (["terrain_source:=camera"], "no encoder checkpoint was given"),
         (["terrain_source:=camera", "checkpoint:=/nowhere/encoder.safetensors"], "encoder.safetensors does not exist"),
         (["terrain_source:=sonar"], "parameter terrain_source: got 'sonar', expected one of"),
         (["horizon:=-1.0"], "horizon"),

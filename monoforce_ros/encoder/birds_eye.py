@@ -21,12 +21,9 @@ class BirdsEyeNetwork(nn.Module):
         widths = (width, 2 * width, 3 * width, 4 * width)
         self.enter = _block(inputs, width)
         self.down = nn.ModuleList(
-            nn.Sequential(_block(fine, coarse, stride=2), _block(coarse, coarse))
-            for fine, coarse in pairwise(widths)
+            nn.Sequential(_block(fine, coarse, stride=2), _block(coarse, coarse)) for fine, coarse in pairwise(widths)
         )
-        self.up = nn.ModuleList(
-            _block(fine + coarse, fine) for coarse, fine in pairwise(reversed(widths))
-        )
+        self.up = nn.ModuleList(_block(fine + coarse, fine) for coarse, fine in pairwise(reversed(widths)))
 
     @override
     def forward(self, maps: Tensor) -> Tensor:

@@ -13,18 +13,24 @@ from safetensors.torch import load_file, save_file
 from monoforce_ros.encoder.config import EncoderConfig
 from monoforce_ros.encoder.lidar_encoder import LidarEncoder
 from monoforce_ros.encoder.terrain_encoder import TerrainEncoder
+from monoforce_ros.shared_files import share_directory
 
 Encoder = TerrainEncoder | LidarEncoder
 
 MAXIMUM_BYTES = 2_000_000_000
 _HOW_TO_GET_ONE = (
     "a checkpoint is a NAME.safetensors file with NAME.json beside it, as save_encoder writes them after training; "
-    "give its path as `checkpoint`, or use the terrain source `lidar`, which needs none"
+    "give its path as `checkpoint`, give none for the shipped one, or use the terrain source `lidar`"
 )
 
 
 class CheckpointError(ValueError):
     """A checkpoint that is missing, damaged, or of another network; predictions never run on random weights."""
+
+
+def shipped_checkpoint() -> Path:
+    """The encoder that comes with the package, trained on synthetic worlds; docs/training.md says how."""
+    return share_directory() / "models" / "terrain_encoder.safetensors"
 
 
 def new_encoder(config: EncoderConfig) -> Encoder:
@@ -48,16 +54,14 @@ def load_encoder(path: str | Path, sensor: str | None = None) -> Encoder:
     """Read an encoder.
 
     Args:
-        path: of the weights; the configuration lies beside them.
+        path: of the weights; the configuration lies beside them. Empty for the shipped encoder.
         sensor: that it must be for, ``camera`` or ``lidar``.
 
     Raises:
         CheckpointError: a file is missing, too large, damaged, or does not fit its configuration; the message says
             which and how to get a working one.
     """
-    if not str(path):
-        raise CheckpointError(f"no encoder checkpoint was given: {_HOW_TO_GET_ONE}")
-    path = Path(path).expanduser()
+    path = Path(path).expanduser() if str(path) else shipped_checkpoint()
     description = path.with_suffix(".json")
     for file in (path, description):
         if not file.is_file():

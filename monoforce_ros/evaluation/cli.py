@@ -44,7 +44,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--terrain", choices=["lidar", "camera", "flat"], default="lidar", help="terrain source (default: lidar)"
     )
-    parser.add_argument("--checkpoint", default="", help="terrain encoder weights, for --terrain camera")
+    parser.add_argument("--checkpoint", default="", help="terrain encoder weights, for --terrain camera (default: the shipped ones)")
     parser.add_argument("--images", nargs="+", default=None, metavar="TOPIC", help="image topics (default: all)")
     parser.add_argument("--odometry", default=None, metavar="TOPIC", help="odometry topic (default: found by type)")
     parser.add_argument("--commands", default=None, metavar="TOPIC", help="command topic (default: found by type)")

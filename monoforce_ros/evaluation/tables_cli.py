@@ -119,4 +119,3 @@ def _evaluate(
 def _one(bag: Path, robot: str, systems: list[System]) -> dict[str, SequenceErrors]:
     torch.set_num_threads(1)
     return evaluate_sequence(bag, load_robot(robot), systems)
-

@@ -276,9 +276,7 @@ def _segments(
             if recording.clouds:
                 seen = start - round(1e9 * _SEEN_BEFORE), start + round(1e9 * (_LENGTH + _SEEN_AFTER))
                 visible = visible_terrain(recording, motion, robot, grid, pose, start=seen[0], stop=seen[1])
-            fit = fit_terrain(
-                motion, commands, robot, start=start, length=_LENGTH, visible=visible, settings=fitting
-            )
+            fit = fit_terrain(motion, commands, robot, start=start, length=_LENGTH, visible=visible, settings=fitting)
         except (TerrainError, ValueError) as error:
             why = str(error)
             continue
@@ -359,9 +357,7 @@ def _read_images(
     }
 
 
-def _sweeps_near(
-    recording: Recording, motion: MotionTrack, robot: RobotModel, stamps: np.ndarray
-) -> list[np.ndarray]:
+def _sweeps_near(recording: Recording, motion: MotionTrack, robot: RobotModel, stamps: np.ndarray) -> list[np.ndarray]:
     """Sweep nearest to each stamp, as :attr:`DriveSamples.sweeps` keeps them."""
     clouds = np.array([frame.stamp for frame in recording.clouds], np.int64)
     nearest: dict[int, list[int]] = {}

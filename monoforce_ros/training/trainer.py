@@ -327,9 +327,7 @@ def validate(encoder: Encoder, drives: Sequence[DriveSamples], device: torch.dev
     geometric, supporting, losses = [], [], []
     for drive in drives:
         for start in range(0, len(drive), 8):
-            samples = [
-                sample(drive, i, encoder.config, chunks=1) for i in range(start, min(start + 8, len(drive)))
-            ]
+            samples = [sample(drive, i, encoder.config, chunks=1) for i in range(start, min(start + 8, len(drive)))]
             batch = EncoderInput.stack([s[0] for s in samples]).to(device)
             targets = Targets.stack([s[1] for s in samples]).to(device)
             maps: EncodedMaps = encoder(batch)

@@ -1,0 +1,55 @@
+#!/usr/bin/env bash
+# Makes the shipped terrain encoder, or all that the tables compare, from nothing: worlds, training, comparison.
+#   scripts/train_encoders.sh checkpoint | tables
+# Worlds and what has been trained are kept in out/; an interrupted run goes on where it was.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+what=${1:?checkpoint or tables}
+worlds=out/worlds
+cameras="--duration 40 --camera 320x240 --camera-rate 4 --lidar-rate 4"
+
+run() { scripts/run.sh "$@"; }
+
+# A folder of worlds that is complete is marked; one that is not is made again.
+worlds() { # name, ground, first seed, count
+  local folder=$worlds/$1
+  [ -f "$folder/.complete" ] && return
+  rm -rf "$folder"
+  run synthesize "$folder" --seed "$3" --count "$4" --ground "$2" $cameras
+  touch "$folder/.complete"
+}
+
+train() { # name, steps, options
+  local out=out/encoders/$1 steps=$2
+  shift 2
+  [ -f "$out/training.json" ] && return
+  run train "$worlds"/mixed/* "$worlds"/grass/* "$worlds"/rigid/* --held-out $held_out --cut "$worlds/cut" \
+    --out "$out" --steps "$steps" --seed 1 "$@"
+}
+
+mkdir -p "$worlds"
+worlds mixed mixed 50000 20
+worlds grass grass 51000 16
+worlds rigid rigid 52000 6
+held_out="$worlds/mixed/50018 $worlds/mixed/50019 $worlds/grass/51015 $worlds/rigid/52005"
+
+# What is seen first, then what carries: the second step starts from the first.
+train geometric 900 --losses geometric
+train monoforce 1100 --start-from out/encoders/geometric/encoder.safetensors
+mkdir -p models
+for ending in safetensors json; do
+  cp "out/encoders/monoforce/encoder.$ending" "models/.terrain_encoder.$ending"
+  mv "models/.terrain_encoder.$ending" "models/terrain_encoder.$ending"
+done
+ls -l models
+[ "$what" = tables ] || exit 0
+
+worlds test_rigid rigid 60000 8
+worlds test_grass grass 61000 8
+train lss 1100 --losses geometric --start-from out/encoders/geometric/encoder.safetensors
+train lidar_network 800 --sensor lidar --losses geometric
+train no_geometric 2000 --losses terrain trajectory
+run evaluate --tables --rigid "$worlds/test_rigid" --grass "$worlds/test_grass" --out out/tables --docs docs/training.md \
+  --monoforce out/encoders/monoforce/encoder.safetensors --lss out/encoders/lss/encoder.safetensors \
+  --lidar-network out/encoders/lidar_network/encoder.safetensors \
+  --no-geometric out/encoders/no_geometric/encoder.safetensors
