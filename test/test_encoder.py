@@ -1,13 +1,23 @@
 """The terrain encoder: geometry of the lift, checkpoints, and what it refuses."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from monoforce_ros.camera import CameraModel
-from monoforce_ros.encoder import CameraView, CheckpointError, EncoderConfig, TerrainEncoder, load_encoder, save_encoder
+from monoforce_ros.encoder import (
+    CameraView,
+    CheckpointError,
+    EncoderConfig,
+    TerrainEncoder,
+    fused,
+    load_encoder,
+    new_encoder,
+    save_encoder,
+)
 from monoforce_ros.encoder.backbone import Backbone, WeightsError
 from monoforce_ros.encoder.checkpoint import shipped_checkpoint
 from monoforce_ros.encoder.lift import depth_values, feature_rays, lifted_points, map_cells, splat
@@ -124,6 +134,24 @@ def test_a_batch_predicts_what_its_maps_do_alone():
         together = encoder(EncoderInput.stack(alone))
         for i, entry in enumerate(alone):
             torch.testing.assert_close(encoder(entry).height[0], together.height[i], atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("sensor", ["camera", "lidar"])
+def test_a_fused_encoder_predicts_the_same(sensor):
+    torch.manual_seed(0)
+    encoder = new_encoder(replace(SMALL, sensor=sensor))
+    # Norms that do something: their statistics are those of other data.
+    for module in encoder.modules():
+        if isinstance(module, torch.nn.BatchNorm2d):
+            module.running_mean.normal_(0.0, 0.1)
+            module.running_var.uniform_(0.5, 2.0)
+    quick = fused(encoder)
+    assert not any(isinstance(module, torch.nn.BatchNorm2d) for module in quick.modules())
+    image = np.random.default_rng(1).integers(0, 255, (96, 128, 3), np.uint8)
+    seen = np.random.default_rng(2).normal(size=(500, 3)) if sensor == "lidar" else [view(image)]
+    one, other = encoder.terrain(seen), quick.terrain(seen)
+    torch.testing.assert_close(one.height, other.height, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(one.friction, other.friction, atol=1e-4, rtol=1e-4)
 
 
 def test_the_backbone_takes_the_published_weights():

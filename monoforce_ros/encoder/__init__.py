@@ -2,6 +2,7 @@
 
 from monoforce_ros.encoder.checkpoint import CheckpointError, Encoder, load_encoder, new_encoder, save_encoder
 from monoforce_ros.encoder.config import EncoderConfig
+from monoforce_ros.encoder.inference import fused
 from monoforce_ros.encoder.lidar_encoder import LidarEncoder
 from monoforce_ros.encoder.terrain_encoder import EncodedMaps, TerrainEncoder
 from monoforce_ros.encoder.view import CameraView, EncoderInput, encoder_input
@@ -16,6 +17,7 @@ __all__ = [
     "LidarEncoder",
     "TerrainEncoder",
     "encoder_input",
+    "fused",
     "load_encoder",
     "new_encoder",
     "save_encoder",

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from monoforce_ros.bags import BagError, Recording
-from monoforce_ros.encoder import CheckpointError, load_encoder
+from monoforce_ros.encoder import CheckpointError, fused, load_encoder
 from monoforce_ros.evaluation import figures
 from monoforce_ros.evaluation.check import check_bag, check_text
 from monoforce_ros.evaluation.drive import (
@@ -44,7 +44,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--terrain", choices=["lidar", "camera", "flat"], default="lidar", help="terrain source (default: lidar)"
     )
-    parser.add_argument("--checkpoint", default="", help="terrain encoder weights, for --terrain camera (default: the shipped ones)")
+    parser.add_argument(
+        "--checkpoint", default="", help="terrain encoder weights, for --terrain camera (default: the shipped ones)"
+    )
     parser.add_argument("--images", nargs="+", default=None, metavar="TOPIC", help="image topics (default: all)")
     parser.add_argument("--odometry", default=None, metavar="TOPIC", help="odometry topic (default: found by type)")
     parser.add_argument("--commands", default=None, metavar="TOPIC", help="command topic (default: found by type)")
@@ -103,7 +105,7 @@ def run(options: argparse.Namespace) -> None:
     recording = Recording.open(bag, odometry=options.odometry, commands=options.commands, cloud=options.cloud)
     material = TerrainDefaults(friction=options.friction)
     if options.terrain == "camera":
-        source = CameraTerrain(load_encoder(options.checkpoint, "camera"), robot)
+        source = CameraTerrain(fused(load_encoder(options.checkpoint, "camera")), robot)
     else:
         source = (LidarTerrain if options.terrain == "lidar" else FlatTerrain)(robot, Grid.square(), material)
     predictor = Predictor(robot, source, horizon=max(options.horizons), options=PhysicsOptions())

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from monoforce_ros.bags import Recording
-from monoforce_ros.encoder import load_encoder
+from monoforce_ros.encoder import fused, load_encoder
 from monoforce_ros.evaluation.drive import CONSTANT_VELOCITY, FLAT_PHYSICS, PHYSICS, DriveEvaluation, evaluate_drive
 from monoforce_ros.evaluation.metrics import Poses, position_errors, rotation_errors
 from monoforce_ros.prediction import CameraTerrain, LidarNetworkTerrain, LidarTerrain, Predictor
@@ -93,7 +93,7 @@ def terrain_source(system: System, robot: RobotModel) -> CameraTerrain | LidarTe
     """The terrain source of a system that has one."""
     if system.checkpoint is None:
         return LidarTerrain(robot, Grid.square(), TerrainDefaults())
-    encoder = load_encoder(system.checkpoint)
+    encoder = fused(load_encoder(system.checkpoint))
     if encoder.config.sensor == "lidar":
         return LidarNetworkTerrain(encoder, robot)
     return CameraTerrain(encoder, robot)

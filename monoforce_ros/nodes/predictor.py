@@ -17,7 +17,7 @@ from visualization_msgs.msg import MarkerArray
 
 from monoforce_ros.bags.recording import camera_info_topic
 from monoforce_ros.camera import CameraModel
-from monoforce_ros.encoder import load_encoder
+from monoforce_ros.encoder import fused, load_encoder
 from monoforce_ros.messages import decoding
 from monoforce_ros.messages import prediction as encoders
 from monoforce_ros.motion import NANOSECOND, transform_points
@@ -99,7 +99,7 @@ class PredictorNode(Node):
     def _terrain_source(self) -> CameraTerrain | FlatTerrain | LidarTerrain:
         settings = self.settings
         if settings.terrain_source == "camera":
-            encoder = load_encoder(settings.checkpoint, "camera")
+            encoder = fused(load_encoder(settings.checkpoint, "camera"))
             cuda = settings.device == "cuda" or (settings.device == "auto" and torch.cuda.is_available())
             return CameraTerrain(encoder.to("cuda" if cuda else "cpu"), self.robot)
         grid = Grid.square(settings.map_size, settings.map_resolution)
