@@ -40,6 +40,7 @@ bench: build
 	@scripts/run.sh python benchmarks/rollout.py --json out/rollout.json
 	@scripts/run.sh python benchmarks/integrators.py --json out/integrators.json
 	@scripts/run.sh python benchmarks/mujoco_check.py --json out/mujoco_check.json
+	@scripts/run.sh python benchmarks/encoder.py --json out/encoder.json
 
 DRIVES ?= $(or $(MONOFORCE_REAL_DATA),../shared/data)/drive
 diagnosis: build graphics

@@ -1,0 +1,114 @@
+"""Speed of the terrain encoder: images to terrain, one and four cameras, and where the time goes.
+
+    scripts/run.sh python benchmarks/encoder.py [--json FILE] [--threads 2] [--quick]
+
+The plain encoder and the one with folded norms run side by side; every figure is the median of several runs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from monoforce_ros.camera import CameraModel
+from monoforce_ros.encoder import CameraView, EncoderConfig, TerrainEncoder, encoder_input, fused
+from monoforce_ros.encoder.lift import lifted_points, map_cells, splat
+from monoforce_ros.encoder.terrain_encoder import terrain_maps
+from monoforce_ros.evaluation.report import write_text
+from monoforce_ros.motion import homogeneous
+
+FORWARD = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
+SUPPORT = np.array([[0.3, 0.3, -0.1], [0.3, -0.3, -0.1], [-0.3, 0.3, -0.1], [-0.3, -0.3, -0.1]])
+
+
+def views(count: int, width: int = 320, height: int = 240) -> list[CameraView]:
+    """Cameras on all sides of a robot, that look a little downwards."""
+    random = np.random.default_rng(0)
+    matrix = np.array([[0.6 * width, 0, width / 2 - 0.5], [0, 0.6 * width, height / 2 - 0.5], [0, 0, 1]])
+    camera = CameraModel(width, height, matrix, np.array([-0.2, 0.05, 0.0, 0.0, 0.0]))
+    down = np.array([[np.cos(0.3), 0, np.sin(0.3)], [0, 1, 0], [-np.sin(0.3), 0, np.cos(0.3)]])
+    found = []
+    for side in range(count):
+        angle = side * np.pi / 2
+        turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+        image = random.integers(0, 255, (height, width, 3), np.uint8)
+        found.append(CameraView(image, camera, homogeneous(turn @ down @ FORWARD, turn @ np.array([0.3, 0.0, 0.4]))))
+    return found
+
+
+def timed(work: Callable[[], object], repeats: int) -> float:
+    """Median duration [ms]."""
+    work()
+    durations = []
+    for _ in range(repeats):
+        began = time.perf_counter()
+        work()
+        durations.append(time.perf_counter() - began)
+    return 1e3 * statistics.median(durations)
+
+
+def stages(encoder: TerrainEncoder, seen: list[CameraView], repeats: int) -> dict[str, float]:
+    """Durations of the parts [ms]."""
+    config = encoder.config
+    size = config.grid.rows * config.grid.columns
+    batch = encoder_input(seen, SUPPORT, config)
+    with torch.no_grad():
+        depth, features = encoder._lift(batch)
+        points = lifted_points(batch.rays, batch.origins, encoder.depths)
+        cells = map_cells(points, config)
+        maps = torch.zeros(1, config.image_features + 5, config.grid.rows, config.grid.columns)
+        maps = maps.contiguous(memory_format=torch.channels_last)
+        encoded = encoder(batch)
+        return {
+            "geometry and resizing": timed(lambda: encoder_input(seen, SUPPORT, config), repeats),
+            "backbone": timed(lambda: encoder.backbone(batch.images.float() / 127.5 - 1.0), repeats),
+            "backbone, neck and depths": timed(lambda: encoder._lift(batch), repeats),
+            "points and cells": timed(
+                lambda: map_cells(lifted_points(batch.rays, batch.origins, encoder.depths), config), repeats
+            ),
+            "splat": timed(lambda: splat(depth, features, cells, points[..., 2], size), repeats),
+            "bird's-eye-view network": timed(lambda: encoder.heads(encoder.bird(maps)), repeats),
+            "terrain map": timed(lambda: terrain_maps(encoded, config), repeats),
+        }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--threads", type=int, default=2, help="of PyTorch (%(default)s)")
+    parser.add_argument("--quick", action="store_true", help="few runs, for a test")
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    torch.manual_seed(0)
+    repeats = 3 if options.quick else 30
+    plain = TerrainEncoder(EncoderConfig()).eval()
+    quick = fused(plain)
+    figures: dict = {"threads": options.threads, "processor": platform.processor(), "torch": torch.__version__}
+    for count in (1, 4):
+        seen = views(count)
+        before, after = (timed(lambda e=e: e.terrain(seen, SUPPORT), repeats) for e in (plain, quick))  # noqa: B023
+        parts = stages(quick, seen, repeats)
+        figures[f"{count} cameras"] = {
+            "plain_ms": before,
+            "fused_ms": after,
+            "ratio": before / after,
+            "stages_ms": parts,
+        }
+        print(f"{count} camera(s) 320 × 240, {options.threads} threads: {after:.1f} ms ({before:.1f} ms without folded "
+              f"norms, {before / after:.2f} ×)")  # fmt: skip
+        for name, duration in parts.items():
+            print(f"    {name:28s} {duration:7.1f} ms  {100 * duration / after:4.0f} %")
+    if options.json:
+        write_text(options.json, json.dumps(figures, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

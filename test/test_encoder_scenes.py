@@ -1,0 +1,59 @@
+"""The encoder on real cameras: what the lidar hit lands in its cell, and images can say what the lidar saw."""
+
+import sys
+
+import numpy as np
+import pytest
+import torch
+from conftest import ROOT
+
+from monoforce_ros.datasets.rough import LIDAR_FRAME, RoughScene
+from monoforce_ros.encoder import EncoderConfig
+from monoforce_ros.encoder.lift import feature_rays, map_cells
+from monoforce_ros.motion import transform_points
+
+sys.path.insert(0, str(ROOT / "benchmarks"))
+
+CONFIG = EncoderConfig()
+
+
+@pytest.mark.parametrize("name", ["husky_robingas", "tradr_robingas", "tradr_rough"])
+def test_lidar_points_lifted_through_their_pixels_land_in_their_cells(real_data, name):
+    scene = RoughScene.open(real_data / "rough" / name)
+    stamp = int(scene.cloud_stamps[0])
+    cloud = transform_points(scene.base_from_sensors[LIDAR_FRAME], scene.cloud(stamp))
+    cloud = cloud[np.isfinite(cloud).all(axis=1) & (np.abs(cloud[:, :2]) < 6.0).all(axis=1)]
+    cloud = cloud[np.abs(cloud[:, 2]) < 2.0]
+    portrait = distorted = 0
+    for camera_name in scene.images(stamp):
+        camera, pose = scene.cameras[camera_name], scene.base_from_sensors[camera_name]
+        portrait += camera.height > camera.width
+        distorted += camera.is_distorted
+        in_camera = transform_points(np.linalg.inv(pose), cloud)
+        pixels, visible = camera.project(in_camera)
+        if visible.sum() < 200:  # A camera that looks up sees nothing near the robot.
+            continue
+        points, seen, depth = cloud[visible], pixels[visible], in_camera[visible, 2:3]
+        lifted = transform_points(pose, camera.rays(seen) * depth)
+        assert np.median(np.linalg.norm(lifted - points, axis=1)) < 1e-3
+        cells = [map_cells(torch.from_numpy(p), CONFIG).numpy() for p in (points, lifted)]
+        assert (cells[0] == cells[1]).mean() > 0.98
+        # The ray of the feature that covers the pixel passes by within the feature's own width.
+        rays = feature_rays(camera, CONFIG.feature_rows, CONFIG.feature_columns)
+        column = ((seen[:, 0] + 0.5) / camera.width * CONFIG.feature_columns).astype(int)
+        row = ((seen[:, 1] + 0.5) / camera.height * CONFIG.feature_rows).astype(int)
+        away = np.abs(rays[row, column] - camera.rays(seen))[:, :2]
+        width = np.abs(np.diff(rays[..., 0], axis=1)).max(), np.abs(np.diff(rays[..., 1], axis=0)).max()
+        assert (away <= 0.6 * np.array(width)).mean() > 0.99
+    assert distorted >= 3 and (name != "tradr_robingas" or portrait >= 1)
+
+
+def test_images_alone_can_say_what_the_lidar_saw(real_data, one_thread):
+    from overfit_scenes import overfit, read_scene
+
+    config = EncoderConfig(image_width=160, image_height=128, resolution=0.2, depth_bins=32)
+    scene = read_scene(real_data / "rough" / "husky_robingas", config)
+    _, first = overfit([scene], config, 1, quiet=True)
+    _, errors = overfit([scene], config, 40, quiet=True)
+    # benchmarks/overfit_scenes.py goes on to the last centimetres.
+    assert errors[0] < 0.08 < first[0]
