@@ -34,8 +34,8 @@ worlds rigid rigid 52000 6
 held_out="$worlds/mixed/50018 $worlds/mixed/50019 $worlds/grass/51015 $worlds/rigid/52005"
 
 # What is seen first, then what carries: the second step starts from the first.
-train geometric 900 --losses geometric
-train monoforce 1100 --start-from out/encoders/geometric/encoder.safetensors
+train geometric 700 --losses geometric
+train monoforce 800 --start-from out/encoders/geometric/encoder.safetensors
 mkdir -p models
 for ending in safetensors json; do
   cp "out/encoders/monoforce/encoder.$ending" "models/.terrain_encoder.$ending"
@@ -46,9 +46,9 @@ ls -l models
 
 worlds test_rigid rigid 60000 8
 worlds test_grass grass 61000 8
-train lss 1100 --losses geometric --start-from out/encoders/geometric/encoder.safetensors
-train lidar_network 800 --sensor lidar --losses geometric
-train no_geometric 2000 --losses terrain trajectory
+train lss 800 --losses geometric --start-from out/encoders/geometric/encoder.safetensors
+train lidar_network 500 --sensor lidar --losses geometric
+train no_geometric 1500 --losses terrain trajectory
 run evaluate --tables --rigid "$worlds/test_rigid" --grass "$worlds/test_grass" --out out/tables --docs docs/training.md \
   --monoforce out/encoders/monoforce/encoder.safetensors --lss out/encoders/lss/encoder.safetensors \
   --lidar-network out/encoders/lidar_network/encoder.safetensors \

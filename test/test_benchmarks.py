@@ -46,3 +46,19 @@ def test_the_rollout_benchmark_writes_its_figures(tmp_path):
     assert {row["backend"] for row in content["rows"]} == {"warp"}
     assert content["kept_for_backward_b64_bytes"] > 0
     assert len(content["effects"]) == 2
+
+
+def test_the_encoder_benchmark_writes_its_figures(tmp_path):
+    out = tmp_path / "encoder.json"
+    done = subprocess.run(
+        [sys.executable, "benchmarks/encoder.py", "--quick", "--threads", "1", "--json", str(out)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    figures = json.loads(out.read_text())
+    for count in (1, 4):
+        row = figures[f"{count} cameras"]
+        assert row["fused_ms"] > 0 and row["ratio"] > 0 and all(v > 0 for v in row["stages_ms"].values())

@@ -218,6 +218,8 @@ class _Log:
         self.writer = SummaryWriter(str(out / "log"), purge_step=trainer.step) if trainer.process.first else None
         self.bar = tqdm(total=steps, initial=trainer.step, desc="training", unit="step",
                         disable=True if quiet else None)  # fmt: skip
+        # Without a terminal a bar shows nothing: a night's log gets twenty lines instead.
+        self.steps, self.lines = steps, 0 if quiet or sys.stderr.isatty() else max(1, steps // 20)
         self.smooth: float | None = None
 
     def __enter__(self) -> _Log:
@@ -238,6 +240,9 @@ class _Log:
             shown["held out"] = f"{100 * history[-1]['geometric']:.1f}, {100 * history[-1]['supporting']:.1f} cm"
         self.bar.set_postfix(shown)
         self.bar.update()
+        if self.lines and (step % self.lines == 0 or step == self.steps):
+            said = ", ".join(f"{name} {value}" for name, value in shown.items())
+            print(f"step {step} of {self.steps}: {said}", flush=True)
         if self.writer is None:
             return
         for name, value in losses.items():

@@ -1,0 +1,106 @@
+"""Tables of terrain sources: what is averaged over what, and the installed executable on a real bag."""
+
+import json
+import subprocess
+
+import numpy as np
+import pytest
+import torch
+
+from monoforce_ros.encoder import EncoderConfig, new_encoder, save_encoder
+from monoforce_ros.evaluation.drive import PHYSICS, DriveEvaluation
+from monoforce_ros.evaluation.metrics import Poses
+from monoforce_ros.evaluation.tables import FLAT, LIDAR, _sequence, evaluate_sequence, mean_over, ratio_over
+from monoforce_ros.robots import load_robot
+
+
+def straight(away: float, speed: float = 2.0, windows: int = 2) -> DriveEvaluation:
+    """Windows of 5 s straight ahead, predicted ``away`` metres to the side."""
+    times = np.arange(51) * 0.1
+    measured = np.zeros((windows, 51, 3))
+    measured[..., 0] = speed * times
+    level = np.broadcast_to(np.eye(3), (windows, 51, 3, 3)).copy()
+    predicted = measured + np.array([0.0, away, 0.0])
+    return DriveEvaluation(
+        times=times,
+        stamps=np.arange(windows),
+        measured=Poses(measured, level),
+        predicted={PHYSICS: Poses(predicted, level)},
+        inside=np.ones((windows, 51), bool),
+        horizons=(5.0,),
+    )
+
+
+def test_errors_count_as_long_as_the_measured_robot_is_on_the_map():
+    # At 2 m/s the map's edge, 6.4 m away, is reached after 3.2 s; what comes after does not count.
+    evaluation = straight(0.3)
+    evaluation.predicted[PHYSICS].positions[:, 33:, 1] += 100.0
+    errors = _sequence("drive", evaluation, PHYSICS, np.array([True, True]))
+    assert errors.position == pytest.approx(0.3) and errors.rotation == pytest.approx(0.0) and errors.windows == 2
+    # The start is the same for all and does not dilute the mean; a window left out does not count.
+    evaluation.predicted[PHYSICS].positions[1] += 50.0
+    assert _sequence("drive", evaluation, PHYSICS, np.array([True, False])).position == pytest.approx(0.3)
+    # A robot that leaves at once leaves nothing to compare.
+    assert np.isnan(_sequence("drive", straight(0.3, speed=40.0), PHYSICS, np.array([True, True])).position)
+
+
+def test_means_and_ratios_are_over_drives():
+    mean = mean_over([1.0, 2.0, 3.0, float("nan")])
+    assert mean.value == 2.0 and 1.0 <= mean.low < 2.0 < mean.high <= 3.0
+    # Drives differ by more than the systems do: resampled together, the ratio is still sure.
+    ratio = ratio_over([0.5, 5.0, 50.0], [1.0, 10.0, 100.0])
+    assert ratio.value == ratio.low == ratio.high == 0.5
+    assert np.isnan(mean_over([]).value) and np.isnan(ratio_over([], []).value)
+
+
+@pytest.fixture(scope="module")
+def checkpoints(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("checkpoints")
+    torch.manual_seed(0)
+    for sensor in ("camera", "lidar"):
+        config = EncoderConfig(sensor=sensor, image_width=128, image_height=96, resolution=0.2)
+        save_encoder(new_encoder(config), folder / f"{sensor}.safetensors")
+    return folder
+
+
+def test_the_executable_compares_and_shows(executables, demo_bag, checkpoints, tmp_path):
+    docs = tmp_path / "page.md"
+    docs.write_text("before\n<!-- tables -->\nold\n<!-- end of tables -->\nafter\n")
+    done = subprocess.run(
+        [
+            executables / "evaluate", "--tables", "--grass", demo_bag, "--lss", checkpoints / "camera.safetensors",
+            "--lidar-network", checkpoints / "lidar.safetensors", "--out", tmp_path / "out", "--docs", docs,
+            "--jobs", "1", "--quiet",
+        ],
+        capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = json.loads((tmp_path / "out" / "tables.json").read_text())["grass"]
+    assert found["drives"] == 1 and found["windows"] >= 5
+    assert set(found["systems"]) == {"lidar", "lss", "lidar_network", "flat", "constant"}
+    # The same numbers as by hand, and none is a copy of another.
+    by_hand = evaluate_sequence(demo_bag, load_robot("husky"), [LIDAR, FLAT])
+    for key in ("lidar", "flat"):
+        value = found["systems"][key]["position"]["value"]
+        assert value == pytest.approx(by_hand[key].position, rel=0.05)
+    values = [entry["position"]["value"] for entry in found["systems"].values()]
+    assert len({round(v, 9) for v in values}) == 5 and all(np.isfinite(values))
+    page = (tmp_path / "out" / "tables.html").read_text()
+    assert "data:image/png;base64" in page and "LSS [9]" in page and "http" not in page.split("</style>")[1]
+    text = docs.read_text()
+    assert text.startswith("before\n<!-- tables -->") and "old" not in text and text.endswith("tables -->\nafter\n")
+    assert "| images | images → H_g, LSS [9] |" in text
+
+
+def test_what_cannot_be_compared_is_said_in_one_line(executables, demo_bag, tmp_path):
+    def run(*arguments):
+        return subprocess.run(
+            [executables / "evaluate", "--tables", *arguments, "--out", tmp_path],
+            capture_output=True, text=True, timeout=120,
+        )  # fmt: skip
+
+    missing = run("--rigid", tmp_path / "no")
+    assert missing.returncode == 1 and "does not exist" in missing.stderr and "Traceback" not in missing.stderr
+    assert run().returncode == 2
+    wrong = run("--rigid", demo_bag, "--lss", tmp_path / "no.safetensors")
+    assert wrong.returncode == 1 and "no.safetensors does not exist" in wrong.stderr
