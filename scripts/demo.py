@@ -59,12 +59,13 @@ def stop(process: subprocess.Popen) -> int:
         return process.wait()
 
 
-def play(bag: Path, out: Path, robot: str) -> None:
+def play(bag: Path, out: Path, robot: str, terrain: str) -> None:
     """Run player and predictor, record what the predictor publishes."""
     logs = {name: out / f"{name}.log" for name in ("predictor", "bag_recorder")}
     topics = [*(f"/predicted/{name}" for name in OUTPUTS), "/diagnostics"]
-    say("starting the predictor and a recorder")
-    predictor = start("predictor", "--ros-args", "-p", f"robot:={robot}", log=logs["predictor"])
+    say(f"starting the predictor, terrain from {terrain}, and a recorder")
+    parameters = ["-p", f"robot:={robot}", "-p", f"terrain_source:={terrain}"]
+    predictor = start("predictor", "--ros-args", *parameters, log=logs["predictor"])
     recorder = start("bag_recorder", str(out / "outputs"), "--overwrite", "--topics", *topics, log=logs["bag_recorder"])
     try:
         wait_for(logs["predictor"], "predicting", predictor, 90)
@@ -121,6 +122,12 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("out/demo"), help="folder for what it makes")
     parser.add_argument("--bag", type=Path, default=share_directory() / "bags" / "demo", help="bag to play")
     parser.add_argument("--robot", default="husky", help="robot name or file")
+    parser.add_argument(
+        "--terrain",
+        choices=("camera", "lidar", "flat"),
+        default="camera",
+        help="where terrain comes from (%(default)s)",
+    )
     parser.add_argument("--moment", type=float, default=1.2, help="time in the bag to draw [s]")
     options = parser.parse_args()
     began = time.monotonic()
@@ -129,10 +136,11 @@ def main() -> None:
     os.environ.setdefault("ROS_DOMAIN_ID", str(os.getpid() % 100))
     shutil.rmtree(options.out, ignore_errors=True)
     options.out.mkdir(parents=True)
-    play(options.bag, options.out, options.robot)
+    play(options.bag, options.out, options.robot, options.terrain)
     draw(options.bag, options.out, options.robot, options.moment)
     say("evaluating predictions along the bag against the measured motion")
-    status = evaluate([str(options.bag), "--robot", options.robot, "--out", str(options.out / "evaluation")])
+    arguments = [str(options.bag), "--robot", options.robot, "--terrain", options.terrain]
+    status = evaluate([*arguments, "--out", str(options.out / "evaluation")])
     if status:
         sys.exit(status)
     say(f"done after {time.monotonic() - began:.0f} s; open")

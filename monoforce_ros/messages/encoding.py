@@ -107,3 +107,30 @@ def marker_array(stamp: int, frame_id: str, markers: Sequence[ListMarker]) -> by
         writer.fields("I", 0)  # mesh_file: data
         writer.fields("B", 0)  # mesh_use_embedded_materials
     return writer.bytes()
+
+
+def occupancy_grid(
+    stamp: int, frame_id: str, resolution: float, origin: tuple[float, float, float], data: np.ndarray
+) -> bytes:
+    """``nav_msgs/OccupancyGrid`` of int8 costs ``[rows, columns]``; ``origin`` is the corner of its first cell [m]."""
+    rows, columns = data.shape
+    writer = CdrWriter()
+    writer.header(stamp, frame_id)
+    writer.fields("iI", stamp // 10**9, stamp % 10**9)
+    writer.fields("fII", resolution, columns, rows)
+    writer.fields("ddddddd", *origin, 0.0, 0.0, 0.0, 1.0)
+    writer.sequence(np.asarray(data, np.int8).reshape(-1), 1)
+    return writer.bytes()
+
+
+def float_table(rows: str, columns: Sequence[str], values: np.ndarray) -> bytes:
+    """``std_msgs/Float32MultiArray`` of values ``[n, columns]``; the layout names rows and columns."""
+    count, width = values.shape
+    writer = CdrWriter()
+    writer.fields("I", 2)
+    for label, size, stride in ((rows, count, count * width), (",".join(columns), width, width)):
+        writer.string(label)
+        writer.fields("II", size, stride)
+    writer.fields("I", 0)
+    writer.sequence(np.asarray(values, "<f4").reshape(-1), 4)
+    return writer.bytes()

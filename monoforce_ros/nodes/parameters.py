@@ -9,7 +9,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import yaml
-from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.node import Node
 
@@ -56,7 +56,9 @@ def declare_parameters(node: Node, entries: list[ParameterEntry]) -> SimpleNames
             additional_constraints=entry.range_text if entry.choices else "",
             read_only=True,
         )
-        if entry.minimum is not None:
+        if entry.type == "integer":
+            descriptor.integer_range = [IntegerRange(from_value=entry.minimum, to_value=entry.maximum, step=1)]
+        elif entry.minimum is not None:
             descriptor.floating_point_range = [
                 FloatingPointRange(from_value=entry.minimum, to_value=entry.maximum, step=0.0)
             ]

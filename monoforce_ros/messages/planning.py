@@ -1,0 +1,80 @@
+"""Assessed candidates → the messages that planners and people read: markers, a table of costs, best path, occupancy."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from matplotlib import colormaps
+from scipy.spatial.transform import Rotation
+
+from monoforce_ros.messages import encoding
+from monoforce_ros.motion import MotionState, transform_points
+from monoforce_ros.physics import Rollout
+from monoforce_ros.planning import Assessment, Occupancy
+
+COLUMNS = ("speed", "yaw_rate", "cost", "feasible")
+"""What stands before the terms in a table of costs."""
+_SHOWN = 0.1
+"""Time between the points of a drawn path [s]."""
+_REFUSED = (0.45, 0.45, 0.45, 0.35)
+
+
+def candidate_markers(motion: MotionState, rollout: Rollout, assessment: Assessment, frame_id: str) -> bytes:
+    """``visualization_msgs/MarkerArray``: paths from green (cheapest) to red, grey where not feasible, the best thick.
+
+    Namespaces ``candidates`` and ``best_candidate``.
+    """
+    times = rollout.times
+    stride = max(1, round(_SHOWN / float(times[1] - times[0])))
+    positions = rollout.position[:, ::stride].double().cpu().numpy()
+    usable = rollout.valid.cpu().numpy()
+    paths = transform_points(motion.odometry_from_terrain, positions)
+    lines = np.stack([paths[:, :-1], paths[:, 1:]], axis=2).reshape(len(paths), -1, 3)
+    cost, feasible = assessment.cost.cpu().numpy(), assessment.feasible.cpu().numpy()
+    low, high = (cost[feasible].min(), cost[feasible].max()) if feasible.any() else (0.0, 1.0)
+    shade = np.clip((np.nan_to_num(cost, posinf=high) - low) / max(high - low, 1e-6), 0.0, 1.0)
+    colours = colormaps["RdYlGn_r"](shade).astype(np.float32)
+    colours[~feasible] = _REFUSED
+    each = np.repeat(colours[usable], lines.shape[1], axis=0)
+    best = assessment.best
+    chosen = lines[best] if best is not None else np.zeros((0, 3))
+    return encoding.marker_array(
+        motion.stamp,
+        frame_id,
+        [
+            encoding.ListMarker("candidates", "lines", lines[usable].reshape(-1, 3), each, 0.015),
+            encoding.ListMarker("best_candidate", "lines", chosen, np.array([0.1, 0.9, 0.3, 1.0]), 0.06),
+        ],
+    )
+
+
+def candidate_costs(fan: np.ndarray, assessment: Assessment) -> bytes:
+    """``std_msgs/Float32MultiArray``: a row for each candidate; the second dimension's label names the columns."""
+    names = list(assessment.terms)
+    columns = [
+        torch.from_numpy(fan[:, 0]), torch.from_numpy(fan[:, 1]), assessment.cost, assessment.feasible,
+        *(assessment.terms[name] for name in names),
+    ]  # fmt: skip
+    values = torch.stack([column.float().cpu() for column in columns], dim=1).numpy()
+    return encoding.float_table("candidate", [*COLUMNS, *names], values)
+
+
+def best_path(motion: MotionState, rollout: Rollout, best: int, frame_id: str, time_step: float) -> bytes:
+    """``nav_msgs/Path`` of the best candidate, as far as the map reaches."""
+    times = rollout.times.double().numpy()
+    stride = max(1, round(time_step / (times[1] - times[0])))
+    outside = np.flatnonzero(~rollout.inside[best].numpy())
+    end = int(outside[0]) if len(outside) else len(times)
+    chosen = np.arange(0, max(1, end), stride)
+    pose = motion.odometry_from_terrain
+    return encoding.path(
+        frame_id,
+        motion.stamp + np.rint(times[chosen] * 1e9).astype(np.int64),
+        transform_points(pose, rollout.position[best].double().numpy()[chosen]),
+        Rotation.from_matrix(pose[:3, :3] @ rollout.rotation[best].double().numpy()[chosen]).as_quat(),
+    )
+
+
+def occupancy_grid(stamp: int, found: Occupancy, frame_id: str) -> bytes:
+    """``nav_msgs/OccupancyGrid``, axes along those of the frame."""
+    return encoding.occupancy_grid(stamp, frame_id, found.resolution, (*found.origin, found.height), found.data)

@@ -1,0 +1,151 @@
+"""Candidates, their costs and where a robot can drive: terms that say what they are called after."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from monoforce_ros.physics import PhysicsOptions, State, rollout
+from monoforce_ros.physics.rest import rest_depth
+from monoforce_ros.planning import CandidateSettings, CostWeights, Limits, assess, fan_of_arcs, occupancy
+from monoforce_ros.planning.candidates import held
+from monoforce_ros.robots import load_robot
+from monoforce_ros.terrain import Grid, TerrainMap
+
+GRID = Grid.square(12.8, 0.1)
+X, Y = np.meshgrid(GRID.x, GRID.y)
+STEPS = 300
+
+
+@pytest.fixture(scope="module")
+def husky():
+    return load_robot("husky")
+
+
+def terrain_of(height: np.ndarray, **changes) -> TerrainMap:
+    return replace(TerrainMap.from_height(torch.from_numpy(height.astype(np.float32)), GRID), **changes)
+
+
+def assessed(husky, terrain, fan, **how):
+    """Costs of commands held for 3 s from standing on the middle of a map."""
+    fan = np.atleast_2d(np.array(fan, float))
+    twists = torch.from_numpy(held(fan, np.zeros((0, 2)), STEPS)).float()
+    low = float(husky.points[:, 2].min())
+    middle = GRID.rows // 2
+    height = float(terrain.height[middle, middle]) - low - float(rest_depth(husky, float(terrain.stiffness.mean())))
+    state = State.at_rest(height, batch=len(fan))
+    result = rollout(terrain, husky, husky.drive_speeds(twists), state, options=PhysicsOptions())
+    return assess(result, terrain, husky, twists, **how), result
+
+
+def test_a_fan_holds_every_speed_from_right_to_left_and_a_stop():
+    fan = fan_of_arcs(CandidateSettings(count=11, speeds=(0.5, 1.0), yaw_rate=0.6))
+    assert fan.shape == (11, 2) and fan[-1].tolist() == [0.0, 0.0]
+    for speed in (0.5, 1.0):
+        rates = fan[fan[:, 0] == speed, 1]
+        assert rates.tolist() == pytest.approx([-0.6, -0.3, 0.0, 0.3, 0.6])
+    assert fan_of_arcs(CandidateSettings(count=1, speeds=(0.5,))).tolist() == [[0.5, 0.0]]
+    twists = held(fan, np.full((20, 2), 0.3), 50)
+    assert twists.shape == (11, 70, 2) and (twists[:, :20] == 0.3).all() and (twists[3, 20:] == fan[3]).all()
+    for wrong in ({"count": 0}, {"speeds": ()}, {"speeds": (float("nan"),)}, {"yaw_rate": -1.0}):
+        with pytest.raises(ValueError, match="got"):
+            CandidateSettings(**wrong)
+
+
+def test_level_ground_is_feasible_and_standing_costs_least(husky):
+    found, _ = assessed(husky, terrain_of(np.zeros_like(X)), [[0.5, 0.0], [0.5, 0.5], [0.0, 0.0]])
+    assert bool(found.feasible.all()) and found.best == 2 and found.why_not(0) == ""
+    assert all(float(value.max()) < 0.6 for value in found.terms.values())
+    assert float(found.terms["collision"].max()) < 0.05
+
+
+def test_a_side_slope_rolls_unloads_one_side_and_forbids_what_is_too_steep(husky):
+    gentle, _ = assessed(husky, terrain_of(0.2 * Y), [[0.5, 0.0]])
+    # It starts level, drops onto the slope and rolls somewhat beyond it.
+    assert 1.0 < float(gentle.terms["roll"][0]) / (np.arctan(0.2) / Limits().roll) < 1.5
+    assert 0.1 < float(gentle.terms["wheel_load"][0]) < 1.0 and bool(gentle.feasible[0])
+    steep, _ = assessed(husky, terrain_of(0.8 * Y), [[0.5, 0.0]])
+    assert not bool(steep.feasible[0]) and "roll" in steep.why_not(0) and "times its limit" in steep.why_not(0)
+    assert steep.best is None
+    uphill, _ = assessed(husky, terrain_of(0.2 * X), [[0.5, 0.0]])
+    assert float(uphill.terms["pitch"][0]) > 3 * float(uphill.terms["roll"][0])
+
+
+def test_a_wall_is_a_collision_and_the_way_past_it_is_not(husky):
+    wall = np.where((X > 1.2) & (X < 1.6) & (np.abs(Y) < 0.8), 1.0, 0.0)
+    found, result = assessed(husky, terrain_of(wall), [[0.8, 0.0], [0.8, 0.9], [-0.5, 0.0]])
+    assert float(result.position[0, -1, 0]) < 1.2
+    assert float(found.terms["collision"][0]) > 1.0 and "collision" in found.why_not(0)
+    assert float(found.terms["slip"][0]) > 2 * float(found.terms["slip"][2])
+    assert float(found.terms["collision"][2]) < 0.1 and bool(found.feasible[2]) and found.best == 2
+    # The cost says the same as the flag.
+    assert float(found.cost[0]) > float(found.cost[2])
+
+
+def test_rough_ground_varies_the_load_and_slippery_ground_slips(husky):
+    smooth, _ = assessed(husky, terrain_of(np.zeros_like(X)), [[0.8, 0.0]])
+    rough, _ = assessed(husky, terrain_of(0.05 * np.sin(9 * X) * np.cos(7 * Y)), [[0.8, 0.0]])
+    assert float(rough.terms["force_variation"][0]) > 3 * float(smooth.terms["force_variation"][0])
+    climb = terrain_of(0.25 * X)
+    slippery, _ = assessed(husky, replace(climb, friction=torch.full_like(climb.height, 0.22)), [[0.8, 0.0]])
+    firm, _ = assessed(husky, climb, [[0.8, 0.0]])
+    assert float(slippery.terms["slip"][0]) > 1.0 > float(firm.terms["slip"][0])
+    level, _ = assessed(husky, terrain_of(np.zeros_like(X)), [[0.8, 0.0]])
+    assert float(firm.terms["effort"][0]) > 3 * float(level.terms["effort"][0])
+
+
+def test_what_nothing_measured_costs(husky):
+    ahead = torch.from_numpy(X < 1.2)
+    found, _ = assessed(husky, terrain_of(np.zeros_like(X), observed=ahead), [[0.9, 0.0], [-0.9, 0.0], [0.0, 0.0]])
+    assert float(found.terms["unobserved"][0]) > 0.5 and float(found.terms["unobserved"][1]) == 0.0
+    assert float(found.terms["unobserved"][2]) == 0.0
+
+
+def test_weights_and_limits_do_what_they_say(husky):
+    terrain = terrain_of(0.2 * Y)
+    found, result = assessed(husky, terrain, [[0.5, 0.0]])
+    weights = CostWeights(**dict.fromkeys(found.terms, 0.0) | {"roll": 2.0})
+    alone, _ = assessed(husky, terrain, [[0.5, 0.0]], weights=weights)
+    assert float(alone.cost[0]) == pytest.approx(2 * float(found.terms["roll"][0]), rel=1e-5)
+    strict, _ = assessed(husky, terrain, [[0.5, 0.0]], limits=Limits(roll=0.1))
+    assert not bool(strict.feasible[0]) and strict.why_not(0).startswith("roll")
+    with pytest.raises(ValueError, match="has no forces"):
+        assess(replace(result, forces=None), terrain, husky, torch.zeros(1, STEPS, 2))
+    with pytest.raises(ValueError, match="limit of roll: got 0"):
+        Limits(roll=0.0)
+    with pytest.raises(ValueError, match="cost weight slip: got -1"):
+        CostWeights(slip=-1.0)
+
+
+def test_a_diverged_candidate_is_never_chosen(husky):
+    terrain = terrain_of(np.zeros_like(X))
+    _, result = assessed(husky, terrain, [[0.5, 0.0], [0.4, 0.0]])
+    lost = result.position.clone()
+    lost[0] = torch.nan
+    broken = replace(result, valid=torch.tensor([False, True]), position=lost)
+    found = assess(broken, terrain, husky, torch.full((2, STEPS, 2), 0.4))
+    assert found.best == 1 and not bool(found.feasible[0]) and found.why_not(0) == "the rollout diverged"
+
+
+@pytest.mark.parametrize("heading", [0.0, 0.7, -2.0])
+def test_occupancy_lies_where_the_terrain_does_whichever_way_the_robot_looks(heading):
+    wall = np.where((X > 2.0) & (X < 2.6) & (np.abs(Y - 1.0) < 0.5), 1.0, 0.1 * X)
+    terrain = terrain_of(wall, observed=torch.from_numpy(Y > -3.0))
+    pose = np.eye(4)
+    pose[:2, :2] = [[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]]
+    pose[:3, 3] = [10.0, -4.0, 0.3]
+    found = occupancy(terrain, pose, slope_limit=0.5, step_limit=0.15)
+
+    def at(x: float, y: float) -> int:
+        place = pose[:2, :2] @ [x, y] + pose[:2, 3]
+        column, row = ((place - np.array(found.origin)) / found.resolution).astype(int)
+        return int(found.data[row, column])
+
+    assert at(2.0, 1.0) == at(2.6, 1.0) == 100
+    assert at(0.0, -4.0) == -1
+    # A tenth of a slope is a fifth of the limit.
+    assert at(-3.0, 2.0) == pytest.approx(100 * np.arctan(0.1) / 0.5, abs=3)
+    assert found.data.dtype == np.int8 and found.data.min() == -1 and found.data.max() == 100
+    with pytest.raises(ValueError, match="occupancy limits"):
+        occupancy(terrain, pose, slope_limit=0.0, step_limit=0.1)
