@@ -99,7 +99,7 @@ def test_the_readme_lists_every_parameter_as_the_file_has_it():
     assert not missing, "put these rows into README.md:\n" + "\n".join(parameter_table())
 
 
-@pytest.mark.parametrize("document", ["README.md", "docs/architecture.md", "docs/physics.md"])
+@pytest.mark.parametrize("document", ["README.md", "docs/architecture.md", "docs/physics.md", "docs/training.md"])
 def test_documents_point_to_files_that_exist(document):
     text = (ROOT / document).read_text()
     for target in re.findall(r"\]\(([^)#]+)\)", text):
