@@ -211,3 +211,26 @@ def test_a_node_that_cannot_work_says_why_and_does_not_start(start, parameters, 
     process = start("predictor", "--ros-args", *arguments)
     assert process.wait() == 1
     assert message in process.output and "Traceback" not in process.output
+
+
+def test_the_live_gap_is_small_where_predictions_hold_and_says_what_to_do_where_not(peer, start):
+    predictor = start("predictor", "--ros-args", "-p", "data_timeout:=1.0", "-r", "__node:=watcher")
+    predictor.wait_for("predicting 5 s ahead for husky")
+
+    def gap() -> tuple[int, str, dict]:
+        for array in reversed(peer.received["/diagnostics"]):
+            for status in array.status:
+                if status.name == "watcher: live gap":
+                    values = {entry.key: entry.value for entry in status.values}
+                    return int.from_bytes(status.level, "little"), status.message, values
+        return -1, "", {}
+
+    peer.clear()
+    peer.drive(7.5, speed=0.0)
+    assert peer.until(lambda: gap()[0] == OK, 5.0), (gap(), predictor.output[-2000:])
+    assert float(gap()[2]["median error at 5 s [m]"]) < 0.05
+    # The robot does not move although it is told to: it stands in front of a kerb that nobody models.
+    peer.drive(14.0, speed=0.5)
+    assert peer.until(lambda: gap()[0] == WARN, 5.0), (gap(), predictor.output[-2000:])
+    assert "off after 2 s" in gap()[1] and "run `diagnose`" in gap()[1]
+    predictor.stop()

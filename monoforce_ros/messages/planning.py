@@ -11,6 +11,7 @@ from monoforce_ros.messages import encoding
 from monoforce_ros.motion import MotionState, transform_points
 from monoforce_ros.physics import Rollout
 from monoforce_ros.planning import Assessment, Occupancy
+from monoforce_ros.prediction.live_gap import HORIZONS, GapSummary
 
 COLUMNS = ("speed", "yaw_rate", "cost", "feasible")
 """What stands before the terms in a table of costs."""
@@ -73,6 +74,14 @@ def best_path(motion: MotionState, rollout: Rollout, best: int, frame_id: str, t
         transform_points(pose, rollout.position[best].double().numpy()[chosen]),
         Rotation.from_matrix(pose[:3, :3] @ rollout.rotation[best].double().numpy()[chosen]).as_quat(),
     )
+
+
+def live_gap(found: GapSummary) -> bytes:
+    """``std_msgs/Float32MultiArray``: a row for each horizon; the second dimension's label names the columns."""
+    columns = ("horizon", "median_position_error", "median_heading_error", "noise_floor", "count")
+    count = np.full(len(HORIZONS), found.count)
+    values = np.column_stack([HORIZONS, found.position, found.heading, found.floor, count])
+    return encoding.float_table("horizon", columns, values)
 
 
 def occupancy_grid(stamp: int, found: Occupancy, frame_id: str) -> bytes:

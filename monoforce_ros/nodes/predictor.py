@@ -22,7 +22,7 @@ from monoforce_ros.encoder import fused, load_encoder
 from monoforce_ros.messages import decoding
 from monoforce_ros.messages import planning as plan_messages
 from monoforce_ros.messages import prediction as encoders
-from monoforce_ros.motion import NANOSECOND, transform_points
+from monoforce_ros.motion import NANOSECOND, CommandTrack, MotionTrack, transform_points
 from monoforce_ros.nodes.frames import SensorFrames
 from monoforce_ros.nodes.health import ERROR, OK, STALE, WARN, Health
 from monoforce_ros.nodes.inputs import Inputs, Received
@@ -35,6 +35,7 @@ from monoforce_ros.planning import CandidateSettings, CostWeights, Limits, asses
 from monoforce_ros.planning.candidates import held
 from monoforce_ros.planning.costs import TERMS
 from monoforce_ros.prediction import CameraTerrain, FlatTerrain, LidarTerrain, Observation, Prediction, Predictor
+from monoforce_ros.prediction.live_gap import HORIZONS, LiveGap
 from monoforce_ros.robots import load_robot
 from monoforce_ros.shared_files import share_directory
 from monoforce_ros.terrain import Grid, TerrainDefaults
@@ -63,8 +64,9 @@ class PredictorNode(Node):
             "preparing the physics; the first time on a machine its kernels are compiled, about 10 s"
         )
         self.predictor.warm_up()
+        self.gap = LiveGap(self.predictor)
         self.sensor_topics = self._sensor_topics()
-        self.health = Health(self, ["odometry", "commands", *self.sensor_topics, "prediction"])
+        self.health = Health(self, ["odometry", "commands", *self.sensor_topics, "prediction", "live gap"])
         self.inputs = Inputs(
             list(self.sensor_topics.values()),
             slop=settings.camera_slop,
@@ -89,6 +91,7 @@ class PredictorNode(Node):
             "path": self.create_publisher(Path, "predicted/path", newest),
             "contact_forces": self.create_publisher(MarkerArray, "predicted/contact_forces", newest),
         }
+        self._outputs["live_gap"] = self.create_publisher(Float32MultiArray, "predicted/live_gap", newest)
         if settings.candidates:
             self._outputs |= {
                 "candidates": self.create_publisher(MarkerArray, "predicted/candidates", newest),
@@ -222,6 +225,7 @@ class PredictorNode(Node):
             self.cameras[part] = error
 
     def _on_time_jump(self, topic: str, seconds: float) -> None:
+        self.gap.clear()
         self.health.report(
             "prediction",
             WARN,
@@ -307,6 +311,8 @@ class PredictorNode(Node):
             if not bool(prediction.rollout.valid.all()):
                 raise ValueError("the rollout diverged")
             self._publish(prediction)
+            self.gap.remember(prediction)
+            self._compare(track, commands)
             if len(self.fan):
                 self._publish_candidates(prediction, twists[: self.predictor.history])
         except Exception as error:  # the node must outlive whatever its input brings about
@@ -373,6 +379,31 @@ class PredictorNode(Node):
             return
         for name, data in messages.items():
             self._outputs[name].publish(data)
+
+    def _compare(self, motion: MotionTrack, commands: CommandTrack) -> None:
+        """Compare an earlier prediction with what the robot did, and say how large the gap is by now."""
+        if self.gap.compare(motion, commands) is None:
+            return
+        found = self.gap.summary()
+        figures = {"compared predictions": str(found.count)}
+        for i, horizon in enumerate(HORIZONS):
+            if np.isfinite(found.position[i]):
+                figures[f"median error at {horizon:g} s [m]"] = f"{found.position[i]:.3f}"
+                figures[f"of which noise at {horizon:g} s [m]"] = f"{found.floor[i]:.3f}"
+                figures[f"median heading error at {horizon:g} s [deg]"] = f"{np.degrees(found.heading[i]):.1f}"
+        where = f", most when {found.worst}" if found.worst else ""
+        if found.excessive:
+            message = (
+                f"predictions are {found.position[1]:.2f} m off after 2 s{where}; record a bag and run `diagnose` to "
+                "see what the model is missing"
+            )
+            self.health.report("live gap", WARN, message, reason="excessive")
+        else:
+            size = f"{found.position[1]:.2f} m off after 2 s" if np.isfinite(found.position[1]) else "not known at 2 s"
+            self.health.report("live gap", OK, f"predictions are {size}{where}", reason="ok")
+        self.health.report_values("live gap", figures)
+        if self.context.ok():
+            self._outputs["live_gap"].publish(plan_messages.live_gap(found))
 
     def _publish_candidates(self, prediction: Prediction, before: np.ndarray) -> None:
         """Roll out every candidate on the prediction's map and publish what each costs."""
