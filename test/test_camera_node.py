@@ -114,6 +114,30 @@ def test_a_camera_that_is_not_calibrated(peer, predictor):
     healthy(peer, predictor)
 
 
+def test_images_without_a_pixel(peer, predictor):
+    def empty(stamp):
+        message = picture(stamp)
+        message.height = message.width = message.step = 0
+        message.data = np.zeros(0, np.uint8)
+        return message
+
+    nothing_new(peer, predictor, "image size: got 0", image=empty)
+    healthy(peer, predictor)
+
+
+def test_a_calibration_that_changes_counts_from_then_on(peer, predictor):
+    healthy(peer, predictor)
+    before = np.frombuffer(bytes(peer.received["/predicted/terrain"][-1].data), "<f4").reshape(-1, 8)
+    narrow = MATRIX * np.array([[3, 1, 1], [1, 3, 1], [1, 1, 1]])
+    peer.clear()
+    look(peer, 2.0, info=lambda stamp: information(stamp, matrix=narrow))
+    assert peer.until(lambda: len(peer.received["/predicted/terrain"]) > 3)
+    after = np.frombuffer(bytes(peer.received["/predicted/terrain"][-1].data), "<f4").reshape(-1, 8)
+    # A longer lens sees less.
+    assert after[:, 7].sum() < 0.6 * before[:, 7].sum()
+    healthy(peer, predictor)
+
+
 def test_a_camera_that_dies_and_comes_back(peer, predictor):
     nothing_new(peer, predictor, f"publisher(s) on {IMAGE} send nothing", image=lambda stamp: None)
     healthy(peer, predictor)

@@ -152,7 +152,8 @@ def storage_files(path: Path) -> list[Path]:
     if path.is_file():
         return [path]
     found = [file for file in path.iterdir() if file.suffix in (".mcap", ".db3", ".bag", ".active")]
-    return sorted(file for file in found if not file.name.startswith("."))
+    # Hidden files are somebody's scraps, except in a hidden folder: an unfinished bag of a writer that was killed.
+    return sorted(file for file in found if path.name.startswith(".") or not file.name.startswith("."))
 
 
 def _starts_with(file: Path, magic: bytes) -> bool:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import shutil
+import sqlite3
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.rosbag2.storage_mcap import McapWriter
 
 from monoforce_ros.bags.types import type_store
 
@@ -32,25 +34,28 @@ class BagWriter:
     """Write a rosbag2 bag: ``with BagWriter(path) as bag: bag.write("/odom", message, stamp)``.
 
     The bag is written beside its target and renamed when the block ends without an error, so that a half-written
-    bag never stands under the final name. After an error the unfinished bag is removed.
+    bag never stands under the final name. After an error the unfinished bag is removed, unless ``keep`` is set: what
+    cannot be made again, such as a recording, is then finished as it is, or left where it lies if even that fails.
 
     Args:
         path: folder of the bag; must not exist unless ``overwrite``.
         storage: ``mcap`` or ``sqlite3``.
         overwrite: replace an existing bag once the new one is complete.
+        keep: after an error keep what was written.
 
     Raises:
         ValueError: the storage is unknown.
         FileExistsError: the target exists and ``overwrite`` is off.
     """
 
-    def __init__(self, path: str | Path, *, storage: str = "mcap", overwrite: bool = False):
+    def __init__(self, path: str | Path, *, storage: str = "mcap", overwrite: bool = False, keep: bool = False):
         if storage not in _STORAGES:
             raise ValueError(f"storage: got {storage!r}, expected one of {sorted(_STORAGES)}")
         self.path = Path(path)
         if self.path.exists() and not overwrite:
             raise FileExistsError(f"{self.path} exists already: remove it, choose another name or allow overwriting")
         self._unfinished = self.path.with_name(f".{self.path.name}.unfinished-{os.getpid()}")
+        self._keep = keep
         self._writer = Writer(self._unfinished, version=9, storage_plugin=_STORAGES[storage])
         if storage == "mcap":
             # Chunks are compressed inside the file, as ros2 bag's own mcap presets do.
@@ -67,11 +72,21 @@ class BagWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        if kind is not None:
+        if kind is not None and not self._keep:
             if self._writer.storage:
                 self._writer.storage.abort()
             shutil.rmtree(self._unfinished, ignore_errors=True)
             return
+        try:
+            self._finish()
+        except (OSError, sqlite3.Error) as failure:
+            if not self._keep:
+                raise
+            raise OSError(
+                f"{failure}; what was written up to then lies in {self._unfinished} and can be read as it is"
+            ) from failure
+
+    def _finish(self) -> None:
         self._writer.close()
         if self.path.exists():
             shutil.rmtree(self.path)
@@ -94,6 +109,22 @@ class BagWriter:
             )
             self._connections[topic] = connection
         self._writer.write(connection, stamp, data)
+
+    def flush(self) -> None:
+        """Bring to the disk what was written so far: a process that is killed then loses nothing of it."""
+        storage = self._writer.storage
+        if isinstance(storage, McapWriter):
+            if storage.chunk.msgs:
+                storage.close_chunk()
+            storage.bio.flush()
+        elif storage is not None:
+            storage.conn.commit()
+
+    @staticmethod
+    def unfinished(path: str | Path) -> list[Path]:
+        """Folders of bags for ``path`` whose writers were killed; :class:`BagReader` reads them as they are."""
+        path = Path(path)
+        return sorted(path.parent.glob(f".{path.name}.unfinished-*"))
 
     def _name_storage_file(self) -> None:
         """Name the storage file after the bag, not after the temporary folder it was written in."""

@@ -37,6 +37,7 @@ class BagRecorder(Node):
         self._subscribed: set[str] = set()
         self.recorded = 0
         self._timer = self.create_timer(0.2, self._look)
+        self._flusher = self.create_timer(1.0, bag.flush)
         self._look()
 
     def _look(self) -> None:
@@ -78,8 +79,10 @@ def main(arguments: list[str] | None = None) -> int:
     given = sys.argv if arguments is None else ["bag_recorder", *arguments]
     options = _arguments(remove_ros_args(given)[1:])
     rclpy.init(args=given)
+    for left in BagWriter.unfinished(options.out):
+        print(f"an earlier recording was killed and lies in {left}: it can be read as it is", file=sys.stderr)
     try:
-        with BagWriter(options.out, storage=options.storage, overwrite=options.overwrite) as bag:
+        with BagWriter(options.out, storage=options.storage, overwrite=options.overwrite, keep=True) as bag:
             recorder = BagRecorder(bag, options.topics)
             try:
                 rclpy.spin(recorder)

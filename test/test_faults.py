@@ -1,0 +1,109 @@
+"""Faults that strike a process from outside: killed, the disk full, files cut in half, two of the same name."""
+
+import os
+import signal
+import subprocess
+import time
+
+import pytest
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from std_msgs.msg import String
+
+from monoforce_ros.bags import BagReader, builders
+from monoforce_ros.encoder.checkpoint import shipped_checkpoint
+from monoforce_ros.shared_files import share_directory
+
+START = 1_700_000_000_000_000_000
+
+
+def speak(peer, recorder, count: int) -> None:
+    """Publish commands until the recorder hears them, and then so many more."""
+    sent = 0
+
+    def publish():
+        nonlocal sent
+        peer.publish("/cmd_vel", builders.twist_stamped(START + sent, "base_link", 0.1, 0.0))
+        sent += 1
+        peer.spin(0.05)
+
+    deadline = time.monotonic() + 30
+    while "recording /cmd_vel" not in recorder.output:
+        assert recorder.running and time.monotonic() < deadline, recorder.output
+        publish()
+    for _ in range(count):
+        publish()
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_a_recording_that_is_killed_is_not_lost(start, peer, tmp_path, storage):
+    recorder = start("bag_recorder", tmp_path / "out", "--topics", "/cmd_vel", "--storage", storage)
+    speak(peer, recorder, 60)
+    recorder.stop(signal.SIGKILL)
+    (left,) = tmp_path.glob(".out.unfinished-*")
+    with BagReader(left) as bag:
+        # What came in the last second may still have been on its way to the disk.
+        assert len(list(bag.messages(["/cmd_vel"]))) >= 30
+        assert bag.warnings
+    again = start("bag_recorder", tmp_path / "out", "--topics", "/cmd_vel")
+    again.wait_for(f"an earlier recording was killed and lies in {left}")
+    again.stop()
+
+
+def test_a_recorder_whose_disk_is_full_keeps_what_it_has_and_says_where(executables, ros_environment, peer, tmp_path):
+    # A limit on the size of files stands for the end of the disk: the same error from the same call.
+    log = tmp_path / "log"
+    with log.open("w") as output:
+        recorder = subprocess.Popen(
+            ["bash", "-c", f"ulimit -f 1500; exec {executables / 'bag_recorder'} {tmp_path / 'out'} --topics /noise"],
+            stdout=output, stderr=subprocess.STDOUT, env=ros_environment,
+        )  # fmt: skip
+    publisher = peer.node.create_publisher(
+        String, "/noise", QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+    )
+    deadline = time.monotonic() + 60
+    while recorder.poll() is None and time.monotonic() < deadline:
+        # Noise does not compress.
+        publisher.publish(String(data=os.urandom(4000).hex()))
+        peer.spin(0.02)
+    assert recorder.wait(timeout=10) == 1
+    text = log.read_text()
+    (left,) = tmp_path.glob(".out.unfinished-*")
+    assert "too large" in text and f"lies in {left} and can be read as it is" in text and "Traceback" not in text
+    with BagReader(left) as bag:
+        assert len(list(bag.messages(["/noise"]))) >= 2
+
+
+def test_a_node_refuses_a_checkpoint_cut_in_half(start, tmp_path):
+    whole = shipped_checkpoint()
+    broken = tmp_path / "encoder.safetensors"
+    broken.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    broken.with_suffix(".json").write_bytes(whole.with_suffix(".json").read_bytes())
+    node = start("predictor", "--ros-args", "-p", "terrain_source:=camera", "-p", f"checkpoint:={broken}")
+    assert node.wait(60) == 1
+    assert f"{broken}: damaged" in node.output and "Traceback" not in node.output
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [("mass:", "mas:", "mas"), ("mass: 50", "mass: 50 kg", "50 kg"), ("mass: 50", "mass: -50", "mass")],
+)
+def test_a_node_refuses_a_robot_file_with_a_wrong_key_or_unit(start, tmp_path, old, new, said):
+    text = (share_directory() / "config" / "robots" / "husky.yaml").read_text()
+    assert old in text
+    file = tmp_path / "robot.yaml"
+    file.write_text(text.replace(old, new, 1))
+    node = start("predictor", "--ros-args", "-p", f"robot:={file}")
+    assert node.wait(60) == 1
+    assert said in node.output and str(file) in node.output and "Traceback" not in node.output
+
+
+def test_two_nodes_of_one_name_both_predict(start, peer):
+    nodes = [start("predictor", "--ros-args", "-p", "terrain_source:=flat") for _ in range(2)]
+    for node in nodes:
+        node.wait_for("predicting 5 s ahead for husky")
+    peer.clear()
+    peer.drive(3.0)
+    assert peer.until(lambda: len(peer.received["/predicted/path"]) > 10)
+    peer.drive(0.5)
+    for node in nodes:
+        assert node.stop() == 0, node.output
