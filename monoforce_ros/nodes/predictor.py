@@ -9,21 +9,21 @@ import time
 import numpy as np
 import torch
 from geometry_msgs.msg import Twist, TwistStamped
-from nav_msgs.msg import GridCells, OccupancyGrid, Odometry, Path
+from nav_msgs.msg import GridCells, Odometry, Path
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
-from std_msgs.msg import Float32MultiArray
 from visualization_msgs.msg import MarkerArray
 
 from monoforce_ros.bags.recording import camera_info_topic
 from monoforce_ros.camera import CameraModel
 from monoforce_ros.encoder import fused, load_encoder
 from monoforce_ros.messages import decoding
-from monoforce_ros.messages import planning as plan_messages
 from monoforce_ros.messages import prediction as encoders
-from monoforce_ros.motion import NANOSECOND, CommandTrack, MotionTrack, transform_points
+from monoforce_ros.motion import NANOSECOND, transform_points
+from monoforce_ros.nodes.candidate_output import CandidateOutput
 from monoforce_ros.nodes.frames import SensorFrames
+from monoforce_ros.nodes.gap_output import GapOutput
 from monoforce_ros.nodes.health import ERROR, OK, STALE, WARN, Health
 from monoforce_ros.nodes.inputs import Inputs, Received
 from monoforce_ros.nodes.parameters import declare_parameters, parameter_help, read_parameter_file
@@ -31,11 +31,7 @@ from monoforce_ros.nodes.process import run_node
 from monoforce_ros.nodes.subscriptions import AdaptiveSubscription
 from monoforce_ros.physics import PhysicsOptions
 from monoforce_ros.physics.effects import corrected_commands, corrected_motion
-from monoforce_ros.planning import CandidateSettings, CostWeights, Limits, assess, fan_of_arcs, occupancy
-from monoforce_ros.planning.candidates import held
-from monoforce_ros.planning.costs import TERMS
 from monoforce_ros.prediction import CameraTerrain, FlatTerrain, LidarTerrain, Observation, Prediction, Predictor
-from monoforce_ros.prediction.live_gap import HORIZONS, LiveGap
 from monoforce_ros.robots import load_robot
 from monoforce_ros.shared_files import share_directory
 from monoforce_ros.terrain import Grid, TerrainDefaults
@@ -64,7 +60,6 @@ class PredictorNode(Node):
             "preparing the physics; the first time on a machine its kernels are compiled, about 10 s"
         )
         self.predictor.warm_up()
-        self.gap = LiveGap(self.predictor)
         self.sensor_topics = self._sensor_topics()
         self.health = Health(self, ["odometry", "commands", *self.sensor_topics, "prediction", "live gap"])
         self.inputs = Inputs(
@@ -77,12 +72,10 @@ class PredictorNode(Node):
         self._arrivals: dict[str, float] = {}
         self._started = time.monotonic()
         self._predictions = 0
-        self._feasible = 0
         self._last_prediction = self._started
         self._durations: list[float] = []
-        self.fan = self._candidates()
-        self.weights = CostWeights(**{name: getattr(settings, f"weight_{name}") for name in TERMS})
-        self.limits = Limits(**{name: getattr(settings, f"limit_{name}") for name in TERMS})
+        self.gap = GapOutput(self, self.predictor, self.health)
+        self.candidates = CandidateOutput(self, self.predictor, settings) if settings.candidates else None
         self._subscribe()
         newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST)
         self._outputs = {
@@ -91,14 +84,6 @@ class PredictorNode(Node):
             "path": self.create_publisher(Path, "predicted/path", newest),
             "contact_forces": self.create_publisher(MarkerArray, "predicted/contact_forces", newest),
         }
-        self._outputs["live_gap"] = self.create_publisher(Float32MultiArray, "predicted/live_gap", newest)
-        if settings.candidates:
-            self._outputs |= {
-                "candidates": self.create_publisher(MarkerArray, "predicted/candidates", newest),
-                "candidate_costs": self.create_publisher(Float32MultiArray, "predicted/candidate_costs", newest),
-                "best_path": self.create_publisher(Path, "predicted/best_path", newest),
-                "occupancy": self.create_publisher(OccupancyGrid, "predicted/occupancy", newest),
-            }
         self._watch = self.create_timer(0.5, self._watch_inputs)
         self._running = True
         self._worker = threading.Thread(target=self._work, name="prediction", daemon=True)
@@ -125,15 +110,6 @@ class PredictorNode(Node):
         material = TerrainDefaults(settings.stiffness, settings.damping, settings.friction)
         kind = LidarTerrain if settings.terrain_source == "lidar" else FlatTerrain
         return kind(self.robot, grid, material)
-
-    def _candidates(self) -> np.ndarray:
-        """Commands to compare ``[N, 2]``; none where none are asked for."""
-        settings = self.settings
-        if not settings.candidates:
-            return np.zeros((0, 2))
-        return fan_of_arcs(
-            CandidateSettings(settings.candidates, tuple(settings.candidate_speeds), settings.candidate_yaw_rate)
-        )
 
     def _sensor_topics(self) -> dict[str, str]:
         """Part name → resolved topic of every sensor that the terrain source uses."""
@@ -260,7 +236,8 @@ class PredictorNode(Node):
             "predictions": str(self._predictions),
             "dropped inputs": str(self.inputs.dropped),
             "median duration [ms]": f"{1e3 * recent[len(recent) // 2]:.0f}",
-        } | ({"feasible candidates": f"{self._feasible} of {len(self.fan)}"} if len(self.fan) else {})
+            **(self.candidates.figures if self.candidates is not None else {}),
+        }
 
     # The worker: one prediction after the other, always from the newest data.
 
@@ -311,10 +288,10 @@ class PredictorNode(Node):
             if not bool(prediction.rollout.valid.all()):
                 raise ValueError("the rollout diverged")
             self._publish(prediction)
-            self.gap.remember(prediction)
-            self._compare(track, commands)
-            if len(self.fan):
-                self._publish_candidates(prediction, twists[: self.predictor.history])
+            frame_id = self.inputs.frame_id or "odom"
+            self.gap.update(prediction, track, commands)
+            if self.candidates is not None:
+                self.candidates.publish(prediction, twists[: self.predictor.history], frame_id)
         except Exception as error:  # the node must outlive whatever its input brings about
             # Errors that say what is wrong with the input are ValueErrors; others need their kind to be understood.
             text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
@@ -375,59 +352,6 @@ class PredictorNode(Node):
             "contact_forces": encoders.contact_forces(prediction, self.robot, frame_id),
             "path": encoders.path(prediction, frame_id, self.settings.path_time_step),
         }
-        if not self.context.ok():
-            return
-        for name, data in messages.items():
-            self._outputs[name].publish(data)
-
-    def _compare(self, motion: MotionTrack, commands: CommandTrack) -> None:
-        """Compare an earlier prediction with what the robot did, and say how large the gap is by now."""
-        if self.gap.compare(motion, commands) is None:
-            return
-        found = self.gap.summary()
-        figures = {"compared predictions": str(found.count)}
-        for i, horizon in enumerate(HORIZONS):
-            if np.isfinite(found.position[i]):
-                figures[f"median error at {horizon:g} s [m]"] = f"{found.position[i]:.3f}"
-                figures[f"of which noise at {horizon:g} s [m]"] = f"{found.floor[i]:.3f}"
-                figures[f"median heading error at {horizon:g} s [deg]"] = f"{np.degrees(found.heading[i]):.1f}"
-        where = f", most when {found.worst}" if found.worst else ""
-        if found.excessive:
-            message = (
-                f"predictions are {found.position[1]:.2f} m off after 2 s{where}; record a bag and run `diagnose` to "
-                "see what the model is missing"
-            )
-            self.health.report("live gap", WARN, message, reason="excessive")
-        else:
-            size = f"{found.position[1]:.2f} m off after 2 s" if np.isfinite(found.position[1]) else "not known at 2 s"
-            self.health.report("live gap", OK, f"predictions are {size}{where}", reason="ok")
-        self.health.report_values("live gap", figures)
-        if self.context.ok():
-            self._outputs["live_gap"].publish(plan_messages.live_gap(found))
-
-    def _publish_candidates(self, prediction: Prediction, before: np.ndarray) -> None:
-        """Roll out every candidate on the prediction's map and publish what each costs."""
-        frame_id, motion, settings = self.inputs.frame_id or "odom", prediction.motion, self.settings
-        twists = held(self.fan, before, self.predictor.steps)
-        rolled = self.predictor.roll_out(prediction.terrain, [motion] * len(self.fan), twists)
-        asked = torch.from_numpy(twists[:, self.predictor.history :]).float()
-        found = assess(rolled, prediction.terrain, self.robot, asked, weights=self.weights, limits=self.limits)
-        grid = occupancy(
-            prediction.terrain,
-            motion.odometry_from_terrain,
-            slope_limit=settings.slope_limit,
-            step_limit=settings.step_limit,
-        )
-        messages = {
-            "candidates": plan_messages.candidate_markers(motion, rolled, found, frame_id),
-            "candidate_costs": plan_messages.candidate_costs(self.fan, found),
-            "occupancy": plan_messages.occupancy_grid(motion.stamp, grid, frame_id),
-        }
-        if found.best is not None:
-            messages["best_path"] = plan_messages.best_path(
-                motion, rolled, found.best, frame_id, settings.path_time_step
-            )
-        self._feasible = int(found.feasible.sum())
         if not self.context.ok():
             return
         for name, data in messages.items():
