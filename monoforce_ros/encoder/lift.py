@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -28,10 +30,26 @@ def feature_rays(camera: CameraModel, rows: int, columns: int, image_from_view: 
     Returns:
         ``[rows, columns, 3]`` in camera axes with z = 1; a ray times a depth is a point.
     """
+    if image_from_view is None:
+        matrix, distortion = (np.asarray(v, np.float64) for v in (camera.matrix, camera.distortion))
+        intrinsics = (matrix.tobytes(), distortion.tobytes(), camera.distortion_model)
+        return _whole_image_rays(camera.width, camera.height, *intrinsics, rows, columns)
     x, y = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
-    if image_from_view is not None:
-        x, y = (a * x + b * y + c for a, b, c in image_from_view)
+    x, y = (a * x + b * y + c for a, b, c in image_from_view)
     return camera.rays(np.stack([x * camera.width - 0.5, y * camera.height - 0.5], axis=-1))
+
+
+@lru_cache(maxsize=64)
+def _whole_image_rays(
+    width: int, height: int, matrix: bytes, distortion: bytes, model: str, rows: int, columns: int
+) -> np.ndarray:
+    """Rays of a camera that stays the same from image to image: removing distortion takes a millisecond."""
+    camera = CameraModel(width, height, np.frombuffer(matrix).reshape(3, 3), np.frombuffer(distortion), model)
+    u = (np.arange(columns) + 0.5) / columns * width - 0.5
+    v = (np.arange(rows) + 0.5) / rows * height - 0.5
+    rays = camera.rays(np.stack(np.meshgrid(u, v), axis=-1))
+    rays.flags.writeable = False
+    return rays
 
 
 def lifted_points(rays: Tensor, origins: Tensor, depths: Tensor) -> Tensor:
