@@ -46,6 +46,7 @@ setup(
     entry_points={
         "console_scripts": [
             "predictor = monoforce_ros.nodes.predictor:main",
+            "path_selector = monoforce_ros.nodes.path_selector:main",
             "bag_player = monoforce_ros.nodes.bag_player:main",
             "bag_recorder = monoforce_ros.nodes.bag_recorder:main",
             "synthesize = monoforce_ros.synthetic.cli:main",

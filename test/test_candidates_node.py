@@ -11,7 +11,7 @@ from monoforce_ros.messages.message_types import message_class
 
 TOPICS = {
     "/predicted/candidates": "visualization_msgs/msg/MarkerArray",
-    "/predicted/candidate_costs": "std_msgs/msg/Float32MultiArray",
+    "/predicted/candidate_costs": "sensor_msgs/msg/PointCloud2",
     "/predicted/best_path": "nav_msgs/msg/Path",
     "/predicted/occupancy": "nav_msgs/msg/OccupancyGrid",
 }
@@ -55,9 +55,8 @@ def walled(stamp: int):
 
 
 def table(message) -> tuple[list[str], np.ndarray]:
-    rows, columns = message.layout.dim
-    assert rows.label == "candidate" and rows.stride == rows.size * columns.size and columns.stride == columns.size
-    return columns.label.split(","), np.array(message.data).reshape(rows.size, columns.size)
+    names = [field.name for field in message.fields]
+    return names, np.frombuffer(bytes(message.data), "<f4").reshape(message.width, len(names))
 
 
 def feed(peer, heard, cloud=None) -> None:
@@ -73,14 +72,19 @@ def feed(peer, heard, cloud=None) -> None:
 def test_every_candidate_has_its_path_and_its_costs(peer, predictor, heard):
     feed(peer, heard)
     names, values = table(heard["/predicted/candidate_costs"][-1])
-    assert names[:4] == ["speed", "yaw_rate", "cost", "feasible"] and "collision" in names
-    assert len(values) == COUNT and (values[:-1, 0] == np.float32(0.8)).all() and (values[-1, :2] == 0).all()
+    assert names[:8] == ["x", "y", "z", "heading", "speed", "yaw_rate", "cost", "feasible"] and "collision" in names
+    column = {name: values[:, i] for i, name in enumerate(names)}
+    assert len(values) == COUNT and (column["speed"][:-1] == np.float32(0.8)).all()
+    assert column["speed"][-1] == column["yaw_rate"][-1] == 0.0
+    # The robot stands at (1, 2): arcs to the right end there, to the left there, and stopping ends where it is.
+    assert column["y"][0] < 1.5 and column["y"][COUNT - 2] > 2.5 and column["heading"][0] < -0.5
+    assert abs(column["x"][-1] - 1.0) < 0.02 and abs(column["y"][-1] - 2.0) < 0.02
     # On level ground everything can be driven; the terms add up to the cost by their weights.
-    assert values[:, 3].all()
+    assert column["feasible"].all()
     weights = {"roll": 1.0, "pitch": 1.0, "force_variation": 0.5, "wheel_load": 1.0, "slip": 1.0, "effort": 0.0,
                "unobserved": 1.0, "collision": 3.0}  # fmt: skip
     total = sum(weight * values[:, names.index(name)] for name, weight in weights.items())
-    np.testing.assert_allclose(values[:, 2], total, rtol=1e-4)
+    np.testing.assert_allclose(column["cost"], total, rtol=1e-4)
     markers = {m.ns: m for m in heard["/predicted/candidates"][-1].markers}
     assert set(markers) == {"candidates", "best_candidate"}
     assert len(markers["candidates"].points) == COUNT * 30 * 2
@@ -95,8 +99,8 @@ def test_every_candidate_has_its_path_and_its_costs(peer, predictor, heard):
 def test_a_wall_is_not_driven_into(peer, predictor, heard):
     feed(peer, heard, walled)
     names, values = table(heard["/predicted/candidate_costs"][-1])
-    feasible, collision = values[:, 3] > 0, values[:, names.index("collision")]
-    straight = int(np.abs(values[:-1, 1]).argmin())
+    feasible, collision = values[:, names.index("feasible")] > 0, values[:, names.index("collision")]
+    straight = int(np.abs(values[:-1, names.index("yaw_rate")]).argmin())
     assert not feasible[straight] and collision[straight] > 1.0
     assert feasible[0] and feasible[COUNT - 2], "the outermost arcs pass the wall"
     ends = [message.poses[-1].pose.position for message in heard["/predicted/best_path"]]

@@ -20,6 +20,7 @@ EXECUTABLES = [
     "evaluate",
     "fit_terrain",
     "train",
+    "path_selector",
     "predictor",
     "synthesize",
 ]

@@ -8,7 +8,16 @@ import torch
 
 from monoforce_ros.physics import PhysicsOptions, State, rollout
 from monoforce_ros.physics.rest import rest_depth
-from monoforce_ros.planning import CandidateSettings, CostWeights, Limits, assess, fan_of_arcs, occupancy
+from monoforce_ros.planning import (
+    CandidateSettings,
+    ChoiceWeights,
+    CostWeights,
+    Limits,
+    assess,
+    choose,
+    fan_of_arcs,
+    occupancy,
+)
 from monoforce_ros.planning.candidates import held
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainMap
@@ -149,3 +158,24 @@ def test_occupancy_lies_where_the_terrain_does_whichever_way_the_robot_looks(hea
     assert found.data.dtype == np.int8 and found.data.min() == -1 and found.data.max() == 100
     with pytest.raises(ValueError, match="occupancy limits"):
         occupancy(terrain, pose, slope_limit=0.0, step_limit=0.1)
+
+
+def test_the_choice_weighs_cost_against_the_way_left():
+    candidates = {
+        "x": np.array([3.0, 2.5, 0.0, 3.0]), "y": np.array([0.0, 1.5, 0.0, -1.0]),
+        "heading": np.array([0.0, 0.6, 0.0, -0.4]), "speed": np.array([0.8, 0.8, 0.0, 0.8]),
+        "yaw_rate": np.array([0.0, 0.5, 0.0, -0.4]), "cost": np.array([0.5, 0.4, 0.1, 0.5]), "feasible": np.ones(4),
+    }  # fmt: skip
+    robot = np.zeros(2)
+    assert choose(candidates, robot, np.array([8.0, 0.0])) == 0
+    assert choose(candidates, robot, np.array([5.0, 6.0])) == 1
+    # Where the robot is already, standing is best; what is not feasible is never chosen, however near it ends.
+    assert choose(candidates, robot, np.array([0.1, 0.0])) == 2
+    barred = candidates | {"feasible": np.array([0.0, 1.0, 1.0, 1.0])}
+    assert choose(barred, robot, np.array([8.0, 0.0])) in (1, 3)
+    costly = candidates | {"cost": np.array([5.0, 5.0, 0.1, 5.0])}
+    assert choose(costly, robot, np.array([8.0, 0.0]), ChoiceWeights(cost=10.0)) == 2
+    assert choose(candidates | {"feasible": np.zeros(4)}, robot, np.array([8.0, 0.0])) is None
+    assert choose(candidates | {"cost": np.full(4, np.inf)}, robot, np.array([8.0, 0.0])) is None
+    with pytest.raises(ValueError, match="fields \\['cost'\\] are missing"):
+        choose({k: v for k, v in candidates.items() if k != "cost"}, robot, np.zeros(2))

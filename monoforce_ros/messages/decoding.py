@@ -127,14 +127,30 @@ def decode_cloud(message: Any) -> np.ndarray:
     Empty returns (NaN, infinity, or all zeros) are left out. Raises ``MessageError`` where fields or sizes are wrong
     or where not a single return remains.
     """
+    missing = [name for name in "xyz" if name not in {field.name for field in message.fields}]
+    if missing:
+        raise MessageError(
+            f"point cloud fields: got {sorted(field.name for field in message.fields)}, expected x, y and z"
+        )
+    columns = decode_fields(message, tuple("xyz"))
+    points = np.stack([column.astype(np.float32) for column in columns.values()], axis=1)
+    with np.errstate(invalid="ignore", over="ignore"):
+        kept = np.isfinite(points).all(axis=1) & (np.abs(points) < 1e4).all(axis=1) & (points != 0.0).any(axis=1)
+    if not kept.any():
+        raise MessageError(f"point cloud: none of its {len(points)} points is a finite return")
+    return points[kept]
+
+
+def decode_fields(message: Any, names: tuple[str, ...] | None = None) -> dict[str, np.ndarray]:
+    """Fields of a ``sensor_msgs/PointCloud2`` by name, each ``[points]``; all of them, or those that are named.
+
+    Raises ``MessageError`` where sizes are wrong or a field is not of floating point numbers.
+    """
     count = int(message.width) * int(message.height)
     if count < 1 or count > MAXIMUM_CLOUD_POINTS:
         raise MessageError(f"point cloud size: got {count} points, expected 1 to {MAXIMUM_CLOUD_POINTS}")
     point_step, row_step = int(message.point_step), int(message.row_step)
     by_name = {field.name: field for field in message.fields}
-    missing = [name for name in "xyz" if name not in by_name]
-    if missing:
-        raise MessageError(f"point cloud fields: got {sorted(by_name)}, expected x, y and z")
     data = np.frombuffer(message.data, np.uint8)
     width, height = int(message.width), int(message.height)
     if point_step < 1 or row_step < width * point_step or data.size < row_step * height:
@@ -145,8 +161,8 @@ def decode_cloud(message: Any) -> np.ndarray:
     rows = data[: row_step * height].reshape(height, row_step)[:, : width * point_step]
     records = np.ascontiguousarray(rows).reshape(count, point_step)
     order = ">" if message.is_bigendian else "<"
-    columns = []
-    for name in "xyz":
+    columns = {}
+    for name in names if names is not None else by_name:
         field = by_name[name]
         kind = _POINT_DTYPES.get(int(field.datatype))
         if kind not in ("f4", "f8"):
@@ -155,13 +171,8 @@ def decode_cloud(message: Any) -> np.ndarray:
         end = int(field.offset) + dtype.itemsize
         if end > point_step:
             raise MessageError(f"point cloud field {name}: ends at byte {end} of a point of {point_step} bytes")
-        columns.append(np.ascontiguousarray(records[:, int(field.offset) : end]).view(dtype)[:, 0])
-    points = np.stack([column.astype(np.float32) for column in columns], axis=1)
-    with np.errstate(invalid="ignore", over="ignore"):
-        kept = np.isfinite(points).all(axis=1) & (np.abs(points) < 1e4).all(axis=1) & (points != 0.0).any(axis=1)
-    if not kept.any():
-        raise MessageError(f"point cloud: none of its {count} points is a finite return")
-    return points[kept]
+        columns[name] = np.ascontiguousarray(records[:, int(field.offset) : end]).view(dtype)[:, 0]
+    return columns
 
 
 def decode_odometry(message: Any) -> tuple[MotionState, str, str]:

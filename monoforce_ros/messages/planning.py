@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 from matplotlib import colormaps
 from scipy.spatial.transform import Rotation
 
@@ -13,8 +12,6 @@ from monoforce_ros.physics import Rollout
 from monoforce_ros.planning import Assessment, Occupancy
 from monoforce_ros.prediction.live_gap import HORIZONS, GapSummary
 
-COLUMNS = ("speed", "yaw_rate", "cost", "feasible")
-"""What stands before the terms in a table of costs."""
 _SHOWN = 0.1
 """Time between the points of a drawn path [s]."""
 _REFUSED = (0.45, 0.45, 0.45, 0.35)
@@ -49,15 +46,27 @@ def candidate_markers(motion: MotionState, rollout: Rollout, assessment: Assessm
     )
 
 
-def candidate_costs(fan: np.ndarray, assessment: Assessment) -> bytes:
-    """``std_msgs/Float32MultiArray``: a row for each candidate; the second dimension's label names the columns."""
-    names = list(assessment.terms)
-    columns = [
-        torch.from_numpy(fan[:, 0]), torch.from_numpy(fan[:, 1]), assessment.cost, assessment.feasible,
-        *(assessment.terms[name] for name in names),
-    ]  # fmt: skip
-    values = torch.stack([column.float().cpu() for column in columns], dim=1).numpy()
-    return encoding.float_table("candidate", [*COLUMNS, *names], values)
+def candidate_costs(
+    motion: MotionState, rollout: Rollout, fan: np.ndarray, assessment: Assessment, frame_id: str
+) -> bytes:
+    """``sensor_msgs/PointCloud2``: a point where each candidate ends, with its command, cost and every term as fields.
+
+    A message with stamp and frame that every ROS has, that planners read by field names and RViz colours by cost.
+    """
+    end = transform_points(motion.odometry_from_terrain, rollout.position[:, -1].double().cpu().numpy())
+    turned = motion.odometry_from_terrain[:3, :3] @ rollout.rotation[:, -1].double().cpu().numpy()
+    channels = {
+        "x": end[:, 0],
+        "y": end[:, 1],
+        "z": end[:, 2],
+        "heading": np.arctan2(turned[:, 1, 0], turned[:, 0, 0]),
+        "speed": fan[:, 0],
+        "yaw_rate": fan[:, 1],
+        "cost": assessment.cost.cpu().numpy(),
+        "feasible": assessment.feasible.cpu().numpy().astype(np.float32),
+    }
+    channels |= {name: value.cpu().numpy() for name, value in assessment.terms.items()}
+    return encoding.point_cloud(motion.stamp, frame_id, channels)
 
 
 def best_path(motion: MotionState, rollout: Rollout, best: int, frame_id: str, time_step: float) -> bytes:

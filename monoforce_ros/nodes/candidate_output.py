@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from nav_msgs.msg import OccupancyGrid, Path
 from rclpy.node import Node
-from std_msgs.msg import Float32MultiArray
+from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import MarkerArray
 
 from monoforce_ros.messages import planning as messages
@@ -35,7 +35,7 @@ class CandidateOutput:
         self._feasible = 0
         self._publishers = {
             "candidates": node.create_publisher(MarkerArray, "predicted/candidates", 1),
-            "candidate_costs": node.create_publisher(Float32MultiArray, "predicted/candidate_costs", 1),
+            "candidate_costs": node.create_publisher(PointCloud2, "predicted/candidate_costs", 1),
             "best_path": node.create_publisher(Path, "predicted/best_path", 1),
             "occupancy": node.create_publisher(OccupancyGrid, "predicted/occupancy", 1),
         }
@@ -63,7 +63,7 @@ class CandidateOutput:
         )
         data = {
             "candidates": messages.candidate_markers(motion, rolled, found, frame_id),
-            "candidate_costs": messages.candidate_costs(self._fan, found),
+            "candidate_costs": messages.candidate_costs(motion, rolled, self._fan, found, frame_id),
             "occupancy": messages.occupancy_grid(motion.stamp, grid, frame_id),
         }
         if found.best is not None:

@@ -1,0 +1,126 @@
+"""path_selector: drives the robot to a goal by the predictor's candidates; an example of their use."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped, TwistStamped
+from nav_msgs.msg import Odometry
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import PointCloud2
+
+from monoforce_ros.messages import decoding
+from monoforce_ros.motion import NANOSECOND, MotionState
+from monoforce_ros.nodes.health import ERROR, OK, WARN, Health
+from monoforce_ros.nodes.parameters import declare_parameters, parameter_help, read_parameter_file
+from monoforce_ros.nodes.process import run_node
+from monoforce_ros.planning.choice import ChoiceWeights, choose
+from monoforce_ros.shared_files import share_directory
+
+PARAMETER_FILE = share_directory() / "config" / "path_selector.yaml"
+PART = "choice"
+
+
+class PathSelectorNode(Node):
+    """Tells the robot the best candidate's command; stops it where there is none that can be relied on."""
+
+    def __init__(self):
+        super().__init__("path_selector")
+        self.settings = settings = declare_parameters(self, read_parameter_file(PARAMETER_FILE))
+        self.weights = ChoiceWeights(settings.weight_cost, settings.weight_distance, settings.weight_heading)
+        self.health = Health(self, [PART])
+        self._goal: tuple[np.ndarray, str] | None = None
+        self._motion: MotionState | None = None
+        self._candidates: tuple[int, str, dict[str, np.ndarray]] | None = None
+        self._moving = False
+        self._commands = self.create_publisher(TwistStamped, settings.command_topic, 10)
+        newest = QoSProfile(depth=1)
+        self._inputs = (
+            self.create_subscription(PoseStamped, settings.goal_topic, self._on_goal, newest),
+            self.create_subscription(Odometry, settings.odometry_topic, self._on_odometry, newest),
+            self.create_subscription(PointCloud2, settings.candidate_topic, self._on_candidates, newest),
+        )
+        self._clock_tick = self.create_timer(1.0 / settings.rate, self._tell)
+        self.get_logger().info(f"waiting for a goal on {self.resolve_topic_name(settings.goal_topic)}")
+
+    def _on_goal(self, message: PoseStamped) -> None:
+        place = np.array([message.pose.position.x, message.pose.position.y])
+        if not np.isfinite(place).all():
+            self.health.report(
+                PART, ERROR, f"the goal is at {place.tolist()}: not finite, not driven to", reason="goal"
+            )
+            return
+        self._goal = place, message.header.frame_id
+        self.get_logger().info(f"driving to ({place[0]:.2f}, {place[1]:.2f})")
+
+    def _on_odometry(self, message: Odometry) -> None:
+        try:
+            self._motion = decoding.decode_odometry(message)[0]
+        except decoding.MessageError as error:
+            self.health.report(PART, ERROR, f"odometry: {error}", reason="odometry")
+
+    def _on_candidates(self, message: PointCloud2) -> None:
+        try:
+            fields = decoding.decode_fields(message)
+        except decoding.MessageError as error:
+            self.health.report(PART, ERROR, f"candidates: {error}", reason="candidates")
+            return
+        self._candidates = decoding.stamp_of(message), message.header.frame_id, fields
+
+    def _tell(self) -> None:
+        command = self._command()
+        # A robot that nobody sent anywhere is left alone; one that was moving is told to stop until it is.
+        if command is None and not self._moving:
+            return
+        speed, rate = command or (0.0, 0.0)
+        self._moving = command is not None or self._goal is not None
+        message = TwistStamped()
+        message.header.stamp = self.get_clock().now().to_msg()
+        message.header.frame_id = "base_link"
+        message.twist.linear.x, message.twist.angular.z = speed, rate
+        self._commands.publish(message)
+
+    def _command(self) -> tuple[float, float] | None:
+        """Speed [m/s] and yaw rate [rad/s] to tell; None to stop."""
+        if self._goal is None or self._motion is None:
+            return None
+        goal, goal_frame = self._goal
+        left = float(np.linalg.norm(goal - self._motion.position[:2]))
+        if left < self.settings.goal_tolerance:
+            self._goal = None
+            self.health.report(PART, OK, f"the goal is reached, {left:.2f} m away", reason="reached")
+            return None
+        if self._candidates is None:
+            return self._stopped("no candidates yet: does the predictor run with `candidates`?", "none")
+        stamp, frame, fields = self._candidates
+        if goal_frame.lstrip("/") not in ("", frame.lstrip("/")):
+            return self._stopped(f"the goal is in frame {goal_frame!r}, candidates are in {frame!r}", "frame")
+        age = (self._motion.stamp - stamp) * NANOSECOND
+        if abs(age) > self.settings.timeout:
+            return self._stopped(f"candidates are {age:.2f} s old, at most {self.settings.timeout:g} s count", "late")
+        try:
+            best = choose(fields, self._motion.position[:2], goal, self.weights)
+        except ValueError as error:
+            return self._stopped(str(error), "fields")
+        if best is None:
+            return self._stopped("no candidate is feasible", "infeasible")
+        self.health.report(PART, OK, "driving to the goal", reason="driving", distance_left_m=f"{left:.2f}")
+        return float(fields["speed"][best]), float(fields["yaw_rate"][best])
+
+    def _stopped(self, why: str, reason: str) -> None:
+        self.health.report(PART, WARN, f"stopped: {why}", reason=reason)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the node; ``--help`` lists its parameters, which config/path_selector.yaml defines."""
+    given = sys.argv[1:] if arguments is None else arguments
+    if {"-h", "--help"} & set(given):
+        print(parameter_help("path_selector", read_parameter_file(PARAMETER_FILE)))
+        return 0
+    return run_node(PathSelectorNode, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
