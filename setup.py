@@ -47,6 +47,7 @@ setup(
         "console_scripts": [
             "predictor = monoforce_ros.nodes.predictor:main",
             "path_selector = monoforce_ros.nodes.path_selector:main",
+            "simulator = monoforce_ros.nodes.simulator:main",
             "bag_player = monoforce_ros.nodes.bag_player:main",
             "bag_recorder = monoforce_ros.nodes.bag_recorder:main",
             "synthesize = monoforce_ros.synthetic.cli:main",

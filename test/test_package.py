@@ -21,6 +21,7 @@ EXECUTABLES = [
     "fit_terrain",
     "train",
     "path_selector",
+    "simulator",
     "predictor",
     "synthesize",
 ]

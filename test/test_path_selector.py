@@ -1,4 +1,4 @@
-"""The path selector with the real predictor: to the goal, around a wall, and standing where it cannot rely on anything."""
+"""The path selector with the real predictor: to the goal, around a wall, and standing where nothing is to be trusted."""
 
 import math
 

@@ -1,0 +1,175 @@
+"""simulator: a MuJoCo robot in the loop; takes commands and publishes what its sensors say, in real time."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+
+import rclpy
+from geometry_msgs.msg import Twist, TwistStamped
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.utilities import remove_ros_args
+
+from monoforce_ros.bags.types import type_store
+from monoforce_ros.messages import decoding
+from monoforce_ros.messages.message_types import message_class
+from monoforce_ros.nodes.subscriptions import AdaptiveSubscription
+from monoforce_ros.synthetic.live import LiveSettings, LiveWorld
+
+_ODOMETRY_RATE = 50.0
+_TICK = 0.01
+_TIMEOUT = 0.5
+"""Age at which a command no longer counts and the robot stops, as real bases do [s]."""
+_LATE = 0.5
+"""How far the simulation may fall behind before it gives the time up [s]."""
+
+
+def _arguments(arguments: list[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="simulator",
+        description="Drive a simulated robot through ROS: cmd_vel in, odom and points, and images, out.",
+    )
+    parser.add_argument("--seed", type=int, default=12, help="of the world (%(default)s)")
+    parser.add_argument("--robot", default="husky", metavar="NAME|FILE.yaml", help="(%(default)s)")
+    parser.add_argument("--ground", choices=("mixed", "rigid", "grass"), default="mixed", help="(%(default)s)")
+    parser.add_argument("--flat", action="store_true", help="level ground with nothing on it")
+    parser.add_argument("--lidar-rate", type=float, default=5.0, metavar="HZ", help="0 for none (%(default)s)")
+    parser.add_argument("--camera-rate", type=float, default=0.0, metavar="HZ", help="0 for none (%(default)s)")
+    parser.add_argument("--duration", type=float, default=float("inf"), metavar="S", help="to simulate (until stopped)")
+    options = parser.parse_args(arguments)
+    for name in ("lidar_rate", "camera_rate"):
+        if not 0.0 <= getattr(options, name) <= 50.0:
+            parser.error(f"--{name.replace('_', '-')}: got {getattr(options, name)}, expected 0 to 50 Hz")
+    return options
+
+
+class SimulatorNode(Node):
+    """Publishes a live world's sensors and obeys the newest command."""
+
+    def __init__(self, world: LiveWorld, options: argparse.Namespace):
+        super().__init__("simulator")
+        self._world = world
+        self._options = options
+        self._outputs: dict[str, Publisher] = {}
+        self._commanded = float("-inf")
+        self._subscription = AdaptiveSubscription(
+            self,
+            "cmd_vel",
+            {"geometry_msgs/msg/TwistStamped": TwistStamped, "geometry_msgs/msg/Twist": Twist},
+            self._on_command,
+            depth=5,
+        )
+        self._next = dict.fromkeys(("odometry", "cloud", "images"), 0.0)
+
+    def _on_command(self, message: Twist | TwistStamped) -> None:
+        try:
+            speed, rate = decoding.decode_command(message)
+        except decoding.MessageError as error:
+            self.get_logger().warning(f"cmd_vel: {error}", throttle_duration_sec=2.0)
+            return
+        self._commanded = self._world.time
+        self._world.simulation.drive(float(speed), float(rate))
+
+    def advance(self, until: float, stamp_of: float) -> None:
+        """Simulate up to a time, publishing what is due.
+
+        Args:
+            until: simulated time [s].
+            stamp_of: time of the node's clock at simulated time zero [s].
+        """
+        world = self._world
+        if world.time - self._commanded > _TIMEOUT:
+            world.simulation.drive(0.0, 0.0)
+        world.advance(until)
+        stamp = round((stamp_of + world.time) * 1e9)
+        if self._due("cloud", self._options.lidar_rate):
+            self._publish("points", world.cloud(stamp))
+        if self._due("images", self._options.camera_rate):
+            for frame, image, info in world.images(stamp):
+                self._publish(f"{frame}/camera_info", info)
+                self._publish(f"{frame}/image_raw/compressed", image)
+        if self._due("odometry", _ODOMETRY_RATE):
+            self._publish("odom", world.odometry(stamp))
+
+    def _due(self, name: str, rate: float) -> bool:
+        if not rate or self._world.time < self._next[name] - 1e-6:
+            return False
+        self._next[name] = max(self._next[name] + 1.0 / rate, self._world.time)
+        return True
+
+    def _publish(self, topic: str, message: object | None) -> None:
+        if message is None or not self.context.ok():
+            return
+        kind = message.__msgtype__
+        if topic not in self._outputs:
+            self._outputs[topic] = self.create_publisher(message_class(kind), topic, 5)
+        self._outputs[topic].publish(bytes(type_store().serialize_cdr(message, kind)))
+
+
+def _settings(options: argparse.Namespace) -> LiveSettings:
+    from monoforce_ros.synthetic.sensors import CameraSettings, LidarSettings
+    from monoforce_ros.synthetic.terrain_shape import TerrainSettings
+
+    return LiveSettings(
+        seed=options.seed,
+        robot=options.robot,
+        terrain=TerrainSettings(flat=options.flat, ground=options.ground),
+        camera=CameraSettings() if options.camera_rate else None,
+        lidar=LidarSettings() if options.lidar_rate else None,
+    )
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the simulator; see ``--help``."""
+    given = sys.argv if arguments is None else ["simulator", *arguments]
+    options = _arguments(remove_ros_args(given)[1:])
+    try:
+        world = LiveWorld(_settings(options))
+    except (ValueError, OSError, RuntimeError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    rclpy.init(args=given)
+    node = SimulatorNode(world, options)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    node.get_logger().info(f"simulating {world.robot.name} in world {options.seed}")
+    try:
+        _run(node, executor, world, options.duration)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except Exception:
+        # A signal ends the context at once; what is asked of it after that fails.
+        if rclpy.ok():
+            raise
+    finally:
+        world.close()
+        executor.shutdown()
+        node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+def _run(node: SimulatorNode, executor: SingleThreadedExecutor, world: LiveWorld, duration: float) -> None:
+    """Keep the simulated time at the heels of the real one."""
+    began = time.monotonic()
+    origin = node.get_clock().now().nanoseconds * 1e-9
+    while rclpy.ok() and world.time < duration:
+        now = time.monotonic() - began
+        if now - world.time > _LATE:
+            # Too slow a computer: the world falls behind instead of jumping, and its stamps with it.
+            node.get_logger().warning("the simulation is slower than real time", throttle_duration_sec=5.0)
+            began += now - world.time - _TICK
+            origin += now - world.time - _TICK
+        if (mishap := world.simulation.mishap()) is not None:
+            node.get_logger().error(f"the robot has come to grief: {mishap}")
+            return
+        if now > world.time:
+            node.advance(world.time + _TICK, origin)
+        executor.spin_once(timeout_sec=max(0.0, world.time - (time.monotonic() - began)))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
