@@ -79,6 +79,9 @@ def test_every_candidate_has_its_path_and_its_costs(peer, predictor, heard):
     # The robot stands at (1, 2): arcs to the right end there, to the left there, and stopping ends where it is.
     assert column["y"][0] < 1.5 and column["y"][COUNT - 2] > 2.5 and column["heading"][0] < -0.5
     assert abs(column["x"][-1] - 1.0) < 0.02 and abs(column["y"][-1] - 2.0) < 0.02
+    np.testing.assert_allclose(
+        column["x_50"][COUNT // 2 - 1], 1.0 + 0.5 * (column["x"][COUNT // 2 - 1] - 1.0), atol=0.15
+    )
     # On level ground everything can be driven; the terms add up to the cost by their weights.
     assert column["feasible"].all()
     weights = {"roll": 1.0, "pitch": 1.0, "force_variation": 0.5, "wheel_load": 1.0, "slip": 1.0, "effort": 0.0,

@@ -1,4 +1,4 @@
-"""The path selector with the real predictor: to the goal, around a wall, and standing where nothing is to be trusted."""
+"""The path selector with the real predictor: to the goal, around a wall, and standing where it must."""
 
 import math
 

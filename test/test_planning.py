@@ -166,11 +166,15 @@ def test_the_choice_weighs_cost_against_the_way_left():
         "heading": np.array([0.0, 0.6, 0.0, -0.4]), "speed": np.array([0.8, 0.8, 0.0, 0.8]),
         "yaw_rate": np.array([0.0, 0.5, 0.0, -0.4]), "cost": np.array([0.5, 0.4, 0.1, 0.5]), "feasible": np.ones(4),
     }  # fmt: skip
+    for share in (25, 50, 75):
+        candidates |= {f"{axis}_{share}": candidates[axis] * share / 100 for axis in "xy"}
     robot = np.zeros(2)
     assert choose(candidates, robot, np.array([8.0, 0.0])) == 0
     assert choose(candidates, robot, np.array([5.0, 6.0])) == 1
     # Where the robot is already, standing is best; what is not feasible is never chosen, however near it ends.
-    assert choose(candidates, robot, np.array([0.1, 0.0])) == 2
+    assert choose(candidates, robot, np.array([0.0, 0.0])) == 2
+    # A goal nearer than any candidate ends is passed, not stopped before.
+    assert choose(candidates, robot, np.array([1.2, 0.0])) == 0
     barred = candidates | {"feasible": np.array([0.0, 1.0, 1.0, 1.0])}
     assert choose(barred, robot, np.array([8.0, 0.0])) in (1, 3)
     costly = candidates | {"cost": np.array([5.0, 5.0, 0.1, 5.0])}

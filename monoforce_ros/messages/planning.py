@@ -10,6 +10,7 @@ from monoforce_ros.messages import encoding
 from monoforce_ros.motion import MotionState, transform_points
 from monoforce_ros.physics import Rollout
 from monoforce_ros.planning import Assessment, Occupancy
+from monoforce_ros.planning.choice import WAYPOINTS
 from monoforce_ros.prediction.live_gap import HORIZONS, GapSummary
 
 _SHOWN = 0.1
@@ -51,6 +52,7 @@ def candidate_costs(
 ) -> bytes:
     """``sensor_msgs/PointCloud2``: a point where each candidate ends, with its command, cost and every term as fields.
 
+    ``x_25``, ``y_25`` and so on are where it is after that share of the horizon, in per cent.
     A message with stamp and frame that every ROS has, that planners read by field names and RViz colours by cost.
     """
     end = transform_points(motion.odometry_from_terrain, rollout.position[:, -1].double().cpu().numpy())
@@ -65,6 +67,10 @@ def candidate_costs(
         "cost": assessment.cost.cpu().numpy(),
         "feasible": assessment.feasible.cpu().numpy().astype(np.float32),
     }
+    for share in WAYPOINTS:
+        step = round(share / 100 * (rollout.position.shape[1] - 1))
+        place = transform_points(motion.odometry_from_terrain, rollout.position[:, step].double().cpu().numpy())
+        channels |= {f"x_{share}": place[:, 0], f"y_{share}": place[:, 1]}
     channels |= {name: value.cpu().numpy() for name, value in assessment.terms.items()}
     return encoding.point_cloud(motion.stamp, frame_id, channels)
 

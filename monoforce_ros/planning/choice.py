@@ -7,7 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-FIELDS = ("x", "y", "heading", "speed", "yaw_rate", "cost", "feasible")
+WAYPOINTS = (25, 50, 75)
+"""Shares of the horizon at which a candidate's place is known beside its end [%]."""
+FIELDS = (
+    *("x", "y", "heading", "speed", "yaw_rate", "cost", "feasible"),
+    *(f"{axis}_{share}" for share in WAYPOINTS for axis in "xy"),
+)
 """What must be known of each candidate."""
 
 
@@ -17,7 +22,7 @@ class ChoiceWeights:
 
     cost: float = 1.0
     distance: float = 3.0
-    """Of the distance left to the goal, over how far any candidate comes."""
+    """Of how near to the goal a candidate comes, over how far any comes."""
     heading: float = 1.0
     """Of the angle between the last heading and the goal, over half a turn."""
 
@@ -45,11 +50,24 @@ def choose(
     if not feasible.any():
         return None
     end = np.column_stack([candidates["x"], candidates["y"]])
-    left = np.linalg.norm(goal - end, axis=1)
+    way = [np.broadcast_to(robot, end.shape)]
+    way += [np.column_stack([candidates[f"x_{share}"], candidates[f"y_{share}"]]) for share in WAYPOINTS]
+    nearest, at_end = _nearest(np.stack([*way, end], axis=1), goal)
     reach = max(float(np.linalg.norm(end - robot, axis=1).max()), 0.1)
     towards = np.arctan2(goal[1] - end[:, 1], goal[0] - end[:, 0])
     off = np.abs((candidates["heading"] - towards + np.pi) % (2.0 * np.pi) - np.pi) / np.pi
-    # A candidate that comes to the goal itself may look anywhere.
-    off = np.where(left < 0.3, 0.0, off)
-    score = weights.cost * candidates["cost"] + weights.distance * left / reach + weights.heading * off
+    # A candidate that passes the goal may look anywhere.
+    off = np.where(at_end, off, 0.0)
+    score = weights.cost * candidates["cost"] + weights.distance * nearest / reach + weights.heading * off
     return int(np.where(feasible, score, np.inf).argmin())
+
+
+def _nearest(ways: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Least distance of each polyline ``[N, K, 2]`` to the goal [m], and whether that is at its end; each ``[N]``."""
+    start, step = ways[:, :-1], np.diff(ways, axis=1)
+    length = np.maximum((step**2).sum(axis=2), 1e-12)
+    along = np.clip(((goal - start) * step).sum(axis=2) / length, 0.0, 1.0)
+    away = np.linalg.norm(start + along[..., None] * step - goal, axis=2)
+    nearest = away.min(axis=1)
+    end = np.linalg.norm(ways[:, -1] - goal, axis=1)
+    return nearest, end <= nearest + 1e-6
