@@ -46,6 +46,8 @@ def save_encoder(encoder: Encoder, path: str | Path) -> None:
     save_file({name: value.contiguous() for name, value in encoder.state_dict().items()}, str(unfinished))
     description = unfinished.with_suffix(".json.part")
     description.write_text(json.dumps(asdict(encoder.config), indent=2), encoding="utf-8")
+    # safetensors writes for its owner alone; a checkpoint is to be read by whoever runs the node.
+    unfinished.chmod(0o644)
     description.rename(path.with_suffix(".json"))
     unfinished.rename(path)
 
