@@ -36,7 +36,8 @@ environment() {
     say "the environment is up to date"
     return
   fi
-  if ! is_python_312 "$venv/bin/python"; then
+  # Made anew for another lock: packages that share folders, as those of ROS do, do not survive the removal of one.
+  if [ -f "$venv/.locked" ] || ! is_python_312 "$venv/bin/python"; then
     if ! python=$(find_python); then
       cat >&2 <<'TEXT'
 [set-up] No working Python 3.12 with the venv module was found.
