@@ -8,6 +8,7 @@ from monoforce_ros.motion import MotionState
 from monoforce_ros.physics import State, rollout
 from monoforce_ros.prediction import FlatTerrain, Observation, Predictor
 from monoforce_ros.prediction.predictor import start_states
+from monoforce_ros.prediction.terrain_sources import laid_under
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap
 
@@ -42,3 +43,19 @@ def test_ground_does_not_act_before_it_is_touched():
     lowest = result.position[0, :-1, 2] - robot.ground_clearance
     assert float(result.forces[0, lowest > 1e-4].abs().max()) == 0.0
     assert float(result.forces[0, lowest < -1e-3].abs().max()) > 0.0
+
+
+def test_a_predicted_map_is_laid_under_the_wheels_and_left_alone_elsewhere():
+    grid = Grid.square(6.4, 0.1)
+    x, _ = np.meshgrid(grid.x, grid.y)
+    terrain = TerrainMap.from_height(torch.from_numpy((0.3 + 0.1 * x).astype(np.float32)), grid)
+    wheels = np.array([[0.3, 0.3, -0.05], [0.3, -0.3, -0.05], [-0.3, 0.3, -0.1], [-0.3, -0.3, -0.1]])
+    laid = laid_under(terrain, wheels)
+    rows, columns, _ = grid.cells(wheels[:, :2])
+    np.testing.assert_allclose(laid.height.numpy()[rows, columns], wheels[:, 2], atol=0.02)
+    far = np.hypot(x, x.T) > 1.2
+    np.testing.assert_array_equal(laid.height.numpy()[far], terrain.height.numpy()[far])
+    assert torch.equal(laid.geometric_height, terrain.geometric_height)
+    # No step at the border of what was moved.
+    assert float(np.abs(np.diff(laid.height.numpy(), axis=1)).max()) < 0.15
+    assert laid_under(terrain, wheels + np.array([50.0, 0.0, 0.0])) is terrain

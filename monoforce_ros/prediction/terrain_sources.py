@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
+import torch
 
 from monoforce_ros.camera import CameraModel
 from monoforce_ros.encoder import CameraView, LidarEncoder, TerrainEncoder
@@ -14,6 +15,9 @@ from monoforce_ros.motion import MotionState, transform_points
 from monoforce_ros.physics.rest import rest_depth
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import Grid, LidarSettings, TerrainDefaults, TerrainMap, terrain_from_cloud
+
+_LAID_FROM, _LAID_TO = 0.15, 0.7
+"""Distances from the wheels up to which a map is shifted to where the robot stands, and beyond which not [m]."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,26 @@ def support_points(robot: RobotModel, motion: MotionState, stiffness: float) -> 
     points = transform_points(motion.terrain_from_base, lowest.astype(np.float64))
     points[:, 2] += rest_depth(robot, stiffness)
     return points
+
+
+def laid_under(terrain: TerrainMap, support: np.ndarray) -> TerrainMap:
+    """A predicted map that meets the ground under the robot's wheels, which is known better than any image tells.
+
+    Heights that carry are shifted to the points ``[m, 3]`` where the robot stands, less so with the distance from them;
+    what is visible stays. A robot that starts below a predicted surface would be thrown off it.
+    """
+    grid = terrain.grid
+    rows, columns, inside = grid.cells(support[:, :2])
+    if not inside.any():
+        return terrain
+    points = support[inside]
+    short = points[:, 2] - terrain.height.numpy()[rows[inside], columns[inside]]
+    x, y = np.meshgrid(grid.x, grid.y)
+    away = np.hypot(x[..., None] - points[:, 0], y[..., None] - points[:, 1])
+    nearness = 1.0 / (away + 0.05) ** 2
+    shift = (nearness * short).sum(axis=-1) / nearness.sum(axis=-1)
+    share = np.clip((_LAID_TO - away.min(axis=-1)) / (_LAID_TO - _LAID_FROM), 0.0, 1.0)
+    return replace(terrain, height=terrain.height + torch.from_numpy((shift * share).astype(np.float32)))
 
 
 @dataclass(frozen=True)
@@ -97,7 +121,7 @@ class LidarNetworkTerrain:
         cloud = observation.cloud[~self.robot.covers(observation.cloud)].astype(np.float64)
         cloud = cloud[np.isfinite(cloud).all(axis=1)]
         support = support_points(self.robot, motion, self.encoder.config.stiffness)
-        return self.encoder.terrain(transform_points(motion.terrain_from_base, cloud), support)
+        return laid_under(self.encoder.terrain(transform_points(motion.terrain_from_base, cloud), support), support)
 
 
 @dataclass(frozen=True)
@@ -117,5 +141,5 @@ class CameraTerrain:
             views.append(CameraView(image, observation.cameras[name], pose))
         if not views:
             raise ValueError("the camera terrain source needs at least one image, and the observation has none")
-        stiffness = self.encoder.config.stiffness
-        return self.encoder.terrain(views, support_points(self.robot, motion, stiffness))
+        support = support_points(self.robot, motion, self.encoder.config.stiffness)
+        return laid_under(self.encoder.terrain(views, support), support)
