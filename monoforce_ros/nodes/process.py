@@ -10,8 +10,17 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 
 
-def run_node(make_node: Callable[[], Node], arguments: list[str] | None = None) -> int:
+def run_node(
+    make_node: Callable[[], Node],
+    arguments: list[str] | None = None,
+    work: Callable[[Node, SingleThreadedExecutor], None] = lambda node, executor: executor.spin(),
+) -> int:
     """Spin a node until SIGINT or SIGTERM.
+
+    Args:
+        make_node: makes it, once ROS is there.
+        arguments: of the command line.
+        work: spins it, where it has more to do than to wait for callbacks.
 
     Returns:
         exit status: 0 after an ordinary end, 1 where the node could not start (its ``ValueError`` or ``OSError`` is
@@ -27,7 +36,7 @@ def run_node(make_node: Callable[[], Node], arguments: list[str] | None = None) 
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     try:
-        executor.spin()
+        work(node, executor)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except Exception:

@@ -8,7 +8,7 @@ import time
 
 import rclpy
 from geometry_msgs.msg import Twist, TwistStamped
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.utilities import remove_ros_args
@@ -16,6 +16,7 @@ from rclpy.utilities import remove_ros_args
 from monoforce_ros.bags.types import type_store
 from monoforce_ros.messages import decoding
 from monoforce_ros.messages.message_types import message_class
+from monoforce_ros.nodes.process import run_node
 from monoforce_ros.nodes.subscriptions import AdaptiveSubscription
 from monoforce_ros.synthetic.live import LiveSettings, LiveWorld
 
@@ -131,25 +132,16 @@ def main(arguments: list[str] | None = None) -> int:
     except (ValueError, OSError, RuntimeError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
-    rclpy.init(args=given)
-    node = SimulatorNode(world, options)
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
-    node.get_logger().info(f"simulating {world.robot.name} in world {options.seed}")
+
+    def make_node() -> SimulatorNode:
+        node = SimulatorNode(world, options)
+        node.get_logger().info(f"simulating {world.robot.name} in world {options.seed}")
+        return node
+
     try:
-        _run(node, executor, world, options.duration)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    except Exception:
-        # A signal ends the context at once; what is asked of it after that fails.
-        if rclpy.ok():
-            raise
+        return run_node(make_node, given, lambda node, executor: _run(node, executor, world, options.duration))
     finally:
         world.close()
-        executor.shutdown()
-        node.destroy_node()
-        rclpy.try_shutdown()
-    return 0
 
 
 def _run(node: SimulatorNode, executor: SingleThreadedExecutor, world: LiveWorld, duration: float) -> None:

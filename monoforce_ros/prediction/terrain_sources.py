@@ -62,12 +62,18 @@ def laid_under(terrain: TerrainMap, support: np.ndarray) -> TerrainMap:
         return terrain
     points = support[inside]
     short = points[:, 2] - terrain.height.numpy()[rows[inside], columns[inside]]
-    x, y = np.meshgrid(grid.x, grid.y)
+    # Nothing moves beyond this window; most of the map need not be looked at.
+    (left, bottom), (right, top) = points[:, :2].min(axis=0) - _LAID_TO, points[:, :2].max(axis=0) + _LAID_TO
+    across = slice(*np.searchsorted(grid.x, (left, right)))
+    up = slice(*np.searchsorted(grid.y, (bottom, top)))
+    x, y = np.meshgrid(grid.x[across], grid.y[up])
     away = np.hypot(x[..., None] - points[:, 0], y[..., None] - points[:, 1])
     nearness = 1.0 / (away + 0.05) ** 2
     shift = (nearness * short).sum(axis=-1) / nearness.sum(axis=-1)
     share = np.clip((_LAID_TO - away.min(axis=-1)) / (_LAID_TO - _LAID_FROM), 0.0, 1.0)
-    return replace(terrain, height=terrain.height + torch.from_numpy((shift * share).astype(np.float32)))
+    height = terrain.height.clone()
+    height[up, across] += torch.from_numpy((shift * share).astype(np.float32))
+    return replace(terrain, height=height)
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from monoforce_ros.physics import PhysicsOptions, State, rollout
 from monoforce_ros.physics.effects import drive_speeds
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import TerrainMap
+from monoforce_ros.training.drive_samples import CHUNK
 from monoforce_ros.training.samples import Targets
 
 HIGHEST, LOWEST = 1.0, -1.5
@@ -75,7 +76,7 @@ def trajectory_loss(
         observed=maps.covered[targets.map_of],
         grid=config.grid,
     )
-    steps = round(options_times(targets.positions.shape[1]) / options.time_step)
+    steps = round(CHUNK / options.time_step)
     history = targets.twists.shape[1] - steps
     with torch.no_grad():
         speeds = drive_speeds(robot, targets.twists, options.time_step, history=history)
@@ -99,11 +100,6 @@ def trajectory_loss(
     x, y = targets.positions[..., 0], targets.positions[..., 1]
     inside = ((x > left) & (x < right) & (y > bottom) & (y < top)).all(dim=1) & torch.isfinite(loss)
     return torch.where(inside, loss, 0.0).sum() / inside.sum().clamp_min(1)
-
-
-def options_times(samples: int) -> float:
-    """Length of a piece of motion with so many samples a tenth of a second apart [s]."""
-    return (samples - 1) * 0.1
 
 
 def _limited(heights: Tensor, ground: Tensor) -> Tensor:

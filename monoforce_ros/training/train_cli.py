@@ -18,6 +18,7 @@ from tqdm import tqdm
 from monoforce_ros.bags import BagError
 from monoforce_ros.encoder import CheckpointError, Encoder, EncoderConfig, load_encoder, new_encoder
 from monoforce_ros.encoder.backbone import WeightsError
+from monoforce_ros.evaluation.report import write_text
 from monoforce_ros.robots import RobotFileError, load_robot, shipped_robots
 from monoforce_ros.training.drive_samples import DriveSamples, SamplesError, SampleSettings, cut_drive, read_samples
 from monoforce_ros.training.losses import LossWeights
@@ -254,10 +255,8 @@ class _Log:
 
 
 def _conclude(out: Path, trainer: Trainer, description: dict) -> None:
-    file = out / "training.json"
-    unfinished = file.with_name(f".{file.name}.unfinished")
-    unfinished.write_text(json.dumps(description | {"history": trainer.history}, indent=2, default=str), "utf-8")
-    unfinished.replace(file)
+    content = json.dumps(description | {"history": trainer.history}, indent=2, default=str)
+    write_text(out / "training.json", content)
     checkpoint = out / "encoder.safetensors"
     line = f"{checkpoint}: {checkpoint.stat().st_size / 1e6:.1f} MB"
     if trainer.history:
