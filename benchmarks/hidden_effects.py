@@ -86,8 +86,8 @@ def with_baselines(result: dict, bag: Path, robot: Path, row: Path) -> dict:
     from monoforce_ros.discrepancy.bag_diagnosis import read_drive
     from monoforce_ros.discrepancy.gap import noise_floor, noisy_motions, residual_scale
     from monoforce_ros.discrepancy.hypothesis import window_starts
-    from monoforce_ros.discrepancy.robot_copy import read_leftover
     from monoforce_ros.robots import load_robot
+    from monoforce_ros.robots.robot_copy import read_leftover
 
     model = load_robot(robot)
     drive, _ = read_drive(bag, model, "lidar" if result["ground"] == "hills" else "flat")

@@ -24,7 +24,6 @@ from monoforce_ros.discrepancy.hypothesis import (
     undo_measurement,
     window_starts,
 )
-from monoforce_ros.discrepancy.robot_copy import read_leftover, write_robot
 from monoforce_ros.discrepancy.wheels import compare_with_wheels
 from monoforce_ros.evaluation.drive import PHYSICS, evaluate_drive
 from monoforce_ros.messages import decoding
@@ -33,6 +32,7 @@ from monoforce_ros.physics import State, rollout
 from monoforce_ros.physics.effects import drive_speeds, recorded_commands, recorded_motion
 from monoforce_ros.prediction import FlatTerrain, Predictor
 from monoforce_ros.robots import RobotFileError, load_robot
+from monoforce_ros.robots.robot_copy import read_leftover, write_robot
 from monoforce_ros.synthetic.hidden import parse_hidden
 from monoforce_ros.synthetic.odometry import OdometrySettings
 from monoforce_ros.synthetic.recording import RecordingSettings, record

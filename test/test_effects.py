@@ -62,7 +62,7 @@ def test_neutral_values_change_nothing_bit_for_bit(husky, name, backend):
 
 STRONG = {
     "rolling_resistance": {"coefficient": 0.1},
-    "vegetation_drag": {"coefficient": 3e4},
+    "vegetation_drag": {"coefficient": 3e4, "yield_speed": 0.4},
     "viscous_drag": {"coefficient": 40.0},
     "quadratic_drag": {"coefficient": 30.0},
     "gravity_tilt": {"about_x": 0.1, "about_y": -0.07},
@@ -269,6 +269,13 @@ def test_soft_ground_and_grass_and_ice(husky):
     bare = run(having(husky, vegetation_drag={"coefficient": 2e4}), (0, 0), 1.0, state=sliding(1.0),
                options=FRICTIONLESS)  # fmt: skip
     assert float(slowed.velocity[0, -1, 0]) < 0.6 and float(bare.velocity[0, -1, 0]) == pytest.approx(1.0, abs=1e-3)
+    # Without stems that bend the speed decays by a factor; with them by the same factor towards -v_y.
+    decayed, bent = (
+        float(run(having(husky, vegetation_drag={"coefficient": 2e3, "yield_speed": speed}), (0, 0), 0.5, terrain=grass,
+                  state=sliding(1.0), options=FRICTIONLESS).velocity[0, -1, 0])
+        for speed in (0.0, 0.2)
+    )  # fmt: skip
+    assert 0.1 < decayed < 0.9 and bent == pytest.approx(1.2 * decayed - 0.2, abs=0.005)
     ice = run(having(husky, friction_scale={"factor": 0.1}), (1.0, 0.0), 0.6)
     assert float(ice.velocity[0, -1, 0]) == pytest.approx(0.1 * 0.8 * 9.81 * 0.6, rel=0.1)
 

@@ -15,8 +15,8 @@ from monoforce_ros.discrepancy.diagnosis import Diagnosis, Settings, diagnose
 from monoforce_ros.discrepancy.gap import noisy_motions
 from monoforce_ros.discrepancy.hypothesis import Drive, Effects, undone, window_starts
 from monoforce_ros.discrepancy.report import write_diagnosis
-from monoforce_ros.discrepancy.robot_copy import fingerprint, read_leftover, write_robot
 from monoforce_ros.robots import RobotModel, load_robot
+from monoforce_ros.robots.robot_copy import fingerprint, read_leftover, write_robot
 from monoforce_ros.terrain import Grid, load_terrain
 from monoforce_ros.training.visible import visible_halves
 

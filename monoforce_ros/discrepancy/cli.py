@@ -17,9 +17,9 @@ from monoforce_ros.discrepancy.bag_diagnosis import BagDiagnosis, Topics, diagno
 from monoforce_ros.discrepancy.commissioning import commission
 from monoforce_ros.discrepancy.diagnosis import Settings
 from monoforce_ros.discrepancy.report import summary_lines
-from monoforce_ros.discrepancy.robot_copy import fingerprint, write_robot
 from monoforce_ros.physics.effects import EffectError
 from monoforce_ros.robots import RobotFileError, load_robot, shipped_robots
+from monoforce_ros.robots.robot_copy import fingerprint, write_robot
 from monoforce_ros.terrain import TerrainFileError
 from monoforce_ros.terrain.lidar import TerrainError
 

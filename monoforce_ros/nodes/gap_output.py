@@ -43,11 +43,10 @@ class GapOutput:
                 f"predictions are {found.position[1]:.2f} m off after 2 s{where}; record a bag and run `diagnose` to "
                 "see what the model is missing"
             )
-            self._health.report(PART, WARN, message, reason="excessive")
+            self._health.report(PART, WARN, message, reason="excessive", **_figures(found))
         else:
             size = f"{found.position[1]:.2f} m off after 2 s" if np.isfinite(found.position[1]) else "not known at 2 s"
-            self._health.report(PART, OK, f"predictions are {size}{where}", reason="ok")
-        self._health.report_values(PART, _figures(found))
+            self._health.report(PART, OK, f"predictions are {size}{where}", reason="ok", **_figures(found))
         if self._node.context.ok():
             self._publisher.publish(messages.live_gap(found))
 

@@ -42,6 +42,7 @@ def contact(
     weights: Tensor,
     friction_factors: Tensor,
     rolling_resistance: Tensor,
+    yield_speed: Tensor,
     options: PhysicsOptions,
     step_time: float | None = None,
 ) -> Contact:
@@ -61,6 +62,7 @@ def contact(
         weights: share m g of each point in the robot's weight, ``[B, N]`` or ``[N]`` [N] (``sigmoid`` only).
         friction_factors: longitudinal and lateral factor on the ground's friction, ``[B, 2]``.
         rolling_resistance: force against rolling as a part of the load, ``[B]``.
+        yield_speed: at which vegetation holds as much by being bent as by being moved, ``[B]`` [m/s].
         options: which laws.
         step_time: over which the spring follows the motion [s]; the options' time step unless given, 0 for the force
             at this very moment.
@@ -101,7 +103,9 @@ def contact(
         tangential_force = torch.zeros_like(slip)
         tangential_gain = tangential_force
     # What holds the body back, rather than the belt: rolling resistance and vegetation.
-    brushing = touching_areas * ground.drag
+    along, across = moved[:, 1], moved[:, 2]
+    pace = torch.rsqrt(along * along + across * across + options.slip_regularisation**2)
+    brushing = touching_areas * ground.drag * (1.0 + yield_speed[:, None] * pace)
     rolling = rolling_resistance[:, None] * load * torch.rsqrt(moved[:, 1] ** 2 + options.slip_regularisation**2)
     held = torch.stack([rolling + brushing, brushing], dim=1)
     return Contact(

@@ -93,7 +93,7 @@ class _System(nn.Module):
         points = centre[..., None] + arms
         step = min(int(float(time.detach()) / options.time_step + 1e-9), problem.steps - 1)
         belt = rotation @ (self._speeds[:, step, problem.point_drives][:, None] * problem.point_tangents.T)
-        rolling, linear_drag, quadratic_drag = problem.resistance.unbind(-1)
+        rolling, linear_drag, quadratic_drag, yield_speed = problem.resistance.unbind(-1)
         touch = contact(
             self._lookup(points),
             points,
@@ -104,6 +104,7 @@ class _System(nn.Module):
             self._weights,
             problem.friction_factors,
             rolling,
+            yield_speed,
             options,
             step_time=0.0,
         )

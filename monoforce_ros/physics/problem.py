@@ -49,7 +49,7 @@ class Problem:
     gravity_tilt: Tensor
     """Tilt of gravity about x and y [rad], ``[B, 2]``."""
     resistance: Tensor
-    """Rolling resistance [-], linear [N s/m] and quadratic drag [N s²/m²], ``[B, 3]``."""
+    """Rolling resistance [-], linear [N s/m], quadratic drag [N s²/m²], yield speed of vegetation [m/s], ``[B, 4]``."""
     vegetation_drag: Tensor
     """Drag map [N s/m³]: force against motion per area of a touching point; like the terrain, ``[(B,) rows, cols]``."""
     wrench: Tensor
@@ -77,7 +77,7 @@ class Problem:
             )
         centre_of_mass = robot.centre_of_mass.expand(batch, 3)
         offset = (rotation @ centre_of_mass[..., None])[..., 0]
-        resistance = (loads.rolling_resistance, loads.linear_drag, loads.quadratic_drag)
+        resistance = (loads.rolling_resistance, loads.linear_drag, loads.quadratic_drag, loads.vegetation_yield)
         vegetation = (terrain.geometric_height - terrain.height).clamp_min(0.0)
         if loads.vegetation_drag.ndim and vegetation.ndim == 2:
             vegetation = vegetation.expand(batch, -1, -1)

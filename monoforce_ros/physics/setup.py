@@ -29,6 +29,8 @@ class Loads:
     """Force against the centre of mass's velocity times speed [N s²/m²]."""
     vegetation_drag: Tensor
     """Force against motion per area of a touching point and height of vegetation over the ground [N s/m⁴]."""
+    vegetation_yield: Tensor
+    """Speed at which vegetation holds as much by being bent, whatever the speed, as by being moved [m/s]."""
     wrench: Tensor
     """Body-frame force [N] and torque [N m] per feature of ``FEATURES``, ``[6, F]`` or ``[B, 6, F]``."""
 
@@ -36,7 +38,7 @@ class Loads:
     def none(cls, like: Tensor) -> Loads:
         """No extra load, in the precision and on the device of ``like``."""
         zero = torch.zeros((), dtype=like.dtype, device=like.device)
-        return cls(zero.expand(2), zero, zero, zero, zero, zero.expand(6, len(FEATURES)))
+        return cls(zero.expand(2), zero, zero, zero, zero, zero, zero.expand(6, len(FEATURES)))
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ def integrate(problem: Problem, options: PhysicsOptions, with_forces: bool) -> M
     # Drive -1, the hull, finds its zero at the end.
     speeds = torch.cat([problem.drive_speeds, torch.zeros_like(problem.drive_speeds[..., :1])], dim=-1)
     weight = problem.mass[:, None] * tilted_gravity(problem.gravity_tilt, options.gravity)
-    rolling, linear_drag, quadratic_drag = problem.resistance.unbind(-1)
+    rolling, linear_drag, quadratic_drag, yield_speed = problem.resistance.unbind(-1)
     translation = problem.mass[:, None, None] * torch.eye(3, dtype=dtype, device=device)
     zero = torch.zeros_like(translation)
     linear_part = torch.diag(torch.tensor([1.0, 1.0, 1.0, 0.0, 0.0, 0.0], dtype=dtype, device=device))
@@ -75,6 +75,7 @@ def integrate(problem: Problem, options: PhysicsOptions, with_forces: bool) -> M
             weights,
             problem.friction_factors,
             rolling,
+            yield_speed,
             options,
         )
         # Rows that turn the body's six velocities into the points' velocities along the contact directions, and by

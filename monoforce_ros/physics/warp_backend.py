@@ -94,8 +94,8 @@ def _kernels(tensor: Tensor) -> warp_kernels.Kernels:
 
 def _types(kernels: warp_kernels.Kernels) -> tuple:
     """Warp element types of the tensors in ``common``, in their order."""
-    s, v2, v3 = kernels.scalar, kernels.vec2, kernels.vec3
-    return (s, kernels.vec4, s, v3, s, v3, s, s, v3, v2, v2, v3, kernels.wrench)
+    s, v2, v3, v4 = kernels.scalar, kernels.vec2, kernels.vec3, kernels.vec4
+    return (s, v4, s, v3, s, v3, s, s, v3, v2, v2, v4, kernels.wrench)
 
 
 def _wrap(tensors, types, *, gradients: bool) -> list[wp.array]:

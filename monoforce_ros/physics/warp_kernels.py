@@ -126,6 +126,7 @@ def kernels(double: bool) -> Kernels:
         weight: scalar,
         factors: vec2,
         rolling: scalar,
+        yielding: scalar,
     ) -> Touch:
         touch = Touch()
         point = position + arm
@@ -216,7 +217,8 @@ def kernels(double: bool) -> Kernels:
                 gain_along = friction_along * weight * active_along * (scalar(1.0) - active_along)
                 gain_across = friction_across * weight * active_across * (scalar(1.0) - active_across)
             # What holds the body back, rather than the belt: rolling resistance and vegetation.
-            held_across = area * stuff[3]
+            moved = wp.sqrt(moved_along * moved_along + moved_across * moved_across + options.slip_square)
+            held_across = area * stuff[3] * (scalar(1.0) + yielding / moved)
             held_along = rolling * load / wp.sqrt(moved_along * moved_along + options.slip_square) + held_across
             force_along = force_along - held_along * moved_along
             force_across = force_across - held_across * moved_across
@@ -262,7 +264,7 @@ def kernels(double: bool) -> Kernels:
         inertia: wp.array(dtype=mat33),
         factors: wp.array(dtype=vec2),
         tilt: wp.array(dtype=vec2),
-        resistance: wp.array(dtype=vec3),
+        resistance: wp.array(dtype=vec4),
         wrench: wp.array(dtype=wrench_matrix),
         centre: wp.array2d(dtype=vec3),
         rotation: wp.array2d(dtype=mat33),
@@ -316,6 +318,7 @@ def kernels(double: bool) -> Kernels:
                         weight_total * share[i],
                         factors[b],
                         resistance[b][0],
+                        resistance[b][3],
                     )
                     acting = (
                         touch.force[0] * touch.normal + touch.force[1] * touch.along + touch.force[2] * touch.across
@@ -430,7 +433,7 @@ def kernels(double: bool) -> Kernels:
         centre_of_mass: wp.array(dtype=vec3),
         factors: wp.array(dtype=vec2),
         tilt: wp.array(dtype=vec2),
-        resistance: wp.array(dtype=vec3),
+        resistance: wp.array(dtype=vec4),
         wrench: wp.array(dtype=wrench_matrix),
         centre: wp.array2d(dtype=vec3),
         rotation: wp.array2d(dtype=mat33),
@@ -462,6 +465,7 @@ def kernels(double: bool) -> Kernels:
             mass[b] * options.gravity * share[i],
             factors[b],
             resistance[b][0],
+            resistance[b][3],
         )
         if touch.active == 1:
             # The forces that acted over the step: what the point's change of velocity left of them.

@@ -35,6 +35,8 @@ _MORE_GRASS = (
 # Along the route [m], beyond what a short drive sees.
 _KERB_STATIONS = (20.5, 38.0)
 _PATCH_STATIONS = (14.5, 22.5, 27.5, 34.5)
+_HIDING = 0.1
+"""Height of grass through which the ground is not seen [m]."""
 _WALLS = 5
 _BOULDERS, _STONES, _TREES, _RIM_TREES = 26, 46, 30, 26
 
@@ -124,7 +126,7 @@ def build_scenery(settings: TerrainSettings, seed: int) -> Scenery:
     grass = Grass.grow(tuple(patches), ground, random_stream(seed, "grass"))
     rocks = _place_rocks(ground, route, ramp, grass, random_stream(seed, "rocks"))
     trees = _place_trees(ground, route, ramp, grass, random_stream(seed, "tree places"), random_stream(seed, "foliage"))
-    other_ground = _place_patches(route, random_stream(seed, "ground patches"))
+    other_ground = _place_patches(route, grass, random_stream(seed, "ground patches"))
     walls = _place_walls(ground, route, ramp, rocks, trees, random_stream(seed, "walls"))
     return Scenery(ground, route, ramp, rocks, trees, grass, kerbs, other_ground, walls)
 
@@ -135,14 +137,19 @@ def _place_kerbs(route: Route, random: np.random.Generator) -> tuple[Kerb, ...]:
     )
 
 
-def _place_patches(route: Route, random: np.random.Generator) -> tuple[GroundPatch, ...]:
+def _place_patches(route: Route, grass: Grass, random: np.random.Generator) -> tuple[GroundPatch, ...]:
+    """Patches that can be seen: mud under tall grass would hold a robot for the rest of its drive, unforeseeably."""
     patches = []
     for station in _PATCH_STATIONS:
         centre, heading = route.at(station + random.uniform(-0.5, 0.5), random.uniform(-0.3, 0.3))
         area = GrassPatch(centre, heading, random.uniform(1.4, 2.0), random.uniform(1.4, 1.9))
         kind = random.choice(("mud", "gravel"))
         friction = random.uniform(0.25, 0.4) if kind == "mud" else random.uniform(0.55, 0.7)
-        patches.append(GroundPatch(area, float(friction), str(kind)))
+        patch = GroundPatch(area, float(friction), str(kind))
+        x, y = grass.canopy.grid()
+        hidden = patch.contains(np.stack([x, y], axis=-1)) & (grass.canopy.heights > _HIDING)
+        if not hidden.any():
+            patches.append(patch)
     return tuple(patches)
 
 

@@ -23,8 +23,9 @@ _KNEE = 0.05
 """Errors beyond it count linearly, so that few walls and trees do not outweigh the ground [m]."""
 _UNSEEN = 0.1
 """Weight of measured cells that no camera looks at: only what surrounds them tells of them."""
-_ACROSS, _UP, _TURN = 0.15, 0.03, np.radians(2.0)
-"""How far a prediction may be off before it weighs: along the ground, where slip decides, up, and in rotation."""
+_ACROSS, _UP, _TURN, _HEADING = 0.15, 0.03, np.radians(2.0), np.radians(4.0)
+"""How far a prediction may be off before it weighs: along the ground, where slip decides, up, in roll and pitch, and in
+heading, which slip decides too."""
 
 
 @dataclass(frozen=True)
@@ -90,9 +91,15 @@ def trajectory_loss(
     relative = targets.rotations[:, 1:].transpose(-1, -2) @ rotations
     # Half the antisymmetric part is the rotation vector between them, for small angles.
     turns = 0.5 * torch.stack(
-        [relative[..., 2, 1] - relative[..., 1, 2], relative[..., 0, 2] - relative[..., 2, 0]], dim=-1
+        [
+            relative[..., 2, 1] - relative[..., 1, 2],
+            relative[..., 0, 2] - relative[..., 2, 0],
+            relative[..., 1, 0] - relative[..., 0, 1],
+        ],
+        dim=-1,
     )
-    scaled = torch.cat([away[..., :2] / _ACROSS, away[..., 2:] / _UP, turns / _TURN], dim=-1)
+    parts = [away[..., :2] / _ACROSS, away[..., 2:] / _UP, turns[..., :2] / _TURN, turns[..., 2:] / _HEADING]
+    scaled = torch.cat(parts, dim=-1)
     loss = functional.huber_loss(scaled, torch.zeros_like(scaled), reduction="none", delta=2.0).mean(dim=(1, 2))
     # What left the map rolled on ground that nobody predicted.
     grid = config.grid

@@ -169,6 +169,20 @@ def sample(
     return batch, Targets(**{name: torch.from_numpy(value) for name, value in (maps | motion).items()})
 
 
+def targets(
+    drive: DriveSamples, index: int, config: EncoderConfig, *, chunks: int = 4, horizon: float = 5.0
+) -> Targets:
+    """Targets of one sample as they are, without its images; see :func:`sample`."""
+    base = drive.odometry_from_base[index]
+    heading = np.arctan2(base[1, 0], base[0, 0])
+    cosine, sine = np.cos(heading), np.sin(heading)
+    level = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    pose = homogeneous(level, base[:3, 3])
+    maps = _maps(drive.segments[drive.segment_of[index]], pose, config)
+    motion = _motion(drive, index, np.linalg.inv(pose), False, chunks, horizon)
+    return Targets(**{name: torch.from_numpy(value) for name, value in (maps | motion).items()})
+
+
 def _maps(segment: Segment, odometry_from_terrain: np.ndarray, config: EncoderConfig) -> dict[str, np.ndarray]:
     """The segment's maps, on the sample's grid."""
     grid = config.grid

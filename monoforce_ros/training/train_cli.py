@@ -19,10 +19,12 @@ from monoforce_ros.bags import BagError
 from monoforce_ros.encoder import CheckpointError, Encoder, EncoderConfig, load_encoder, new_encoder
 from monoforce_ros.encoder.backbone import WeightsError
 from monoforce_ros.evaluation.report import write_text
-from monoforce_ros.robots import RobotFileError, load_robot, shipped_robots
+from monoforce_ros.robots import RobotFileError, RobotModel, load_robot, shipped_robots
+from monoforce_ros.robots.robot_copy import fingerprint, write_robot
 from monoforce_ros.training.drive_samples import DriveSamples, SamplesError, SampleSettings, cut_drive, read_samples
 from monoforce_ros.training.losses import LossWeights
 from monoforce_ros.training.trainer import Process, Trainer, TrainingError, TrainingSettings, describe
+from monoforce_ros.training.vegetation_fit import EFFECT, fit_vegetation
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -34,11 +36,12 @@ def build_parser() -> argparse.ArgumentParser:
         "the work.",
     )
     parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 folders or ROS 1 .bag files")
-    parser.add_argument("--out", type=Path, required=True, help="folder for checkpoint, logs and state")
+    parser.add_argument("--out", type=Path, help="folder for checkpoint, logs and state")
     parser.add_argument("--held-out", nargs="+", type=Path, default=[], metavar="BAG", help="whole drives to validate "
                         "on (every eighth bag)")  # fmt: skip
     parser.add_argument("--robot", default="husky", help=f"robot file or one of {', '.join(shipped_robots())}")
     parser.add_argument("--cut", type=Path, metavar="DIR", help="folder for the drives cut into samples (OUT/samples)")
+    parser.add_argument("--cut-only", action="store_true", help="cut the drives into samples and stop")
     parser.add_argument("--sensor", choices=("camera", "lidar"), default="camera", help="what the encoder sees: "
                         "images, or a sweep that it completes (%(default)s)")  # fmt: skip
     parser.add_argument("--images", nargs="+", default=[], metavar="TOPIC", help="cameras (all that are calibrated)")
@@ -51,6 +54,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--losses", nargs="+", default=["geometric", "terrain", "trajectory"],
                         choices=("geometric", "terrain", "trajectory"),
                         help="(all; `geometric` alone is LSS)")  # fmt: skip
+    parser.add_argument("--no-vegetation", action="store_true", help="do not fit how hard vegetation holds the robot")
     parser.add_argument("--seed", type=int, default=TrainingSettings.seed, help="(%(default)s)")
     parser.add_argument("--no-variation", action="store_true", help="do not mirror, turn, cut and recolour samples")
     parser.add_argument("--size", default="320x240", metavar="WIDTHxHEIGHT", help="of images in the network "
@@ -74,6 +78,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
     parser = build_parser()
     options = parser.parse_args(arguments)
+    if options.cut_only and options.cut is None:
+        parser.error("--cut-only: expected the folder for the samples with --cut")
+    if options.out is None and not options.cut_only:
+        parser.error("the following arguments are required: --out")
     process = None
     try:
         process = Process(options.device)
@@ -107,10 +115,13 @@ def _train(options: argparse.Namespace, process: Process) -> None:
     if process.first:
         training, validation = (_cut(part, robot, config, options, what) for part, what in
                                 ((bags, "training"), (held_out, "held out")))  # fmt: skip
+    if options.cut_only:
+        return
     if process.count > 1:
         torch.distributed.barrier()
         if not process.first:
             training, validation = (_cut(part, robot, config, options, "") for part in (bags, held_out))
+    robot = _with_vegetation(robot, training, config, settings, options, process)
     torch.manual_seed(settings.seed)
     encoder = _encoder(options, config)
     trainer = Trainer(encoder, robot, training, validation, options.out, settings, process)
@@ -125,6 +136,37 @@ def _train(options: argparse.Namespace, process: Process) -> None:
         trainer.run(log)
     if process.first:
         _conclude(options.out, trainer, describe(config, settings, training))
+
+
+def _with_vegetation(
+    robot: RobotModel,
+    training: Sequence[DriveSamples],
+    config: EncoderConfig,
+    settings: TrainingSettings,
+    options: argparse.Namespace,
+    process: Process,
+) -> RobotModel:
+    """The robot with the drag of vegetation in it, where the motion is a target and its file does not say already.
+
+    OUT/robot.yaml is that robot's file; once there it is kept, so that an interrupted training goes on with it.
+    """
+    known = any(name == EFFECT for name, _ in robot.effects)
+    if known or options.no_vegetation or not settings.weights.trajectory:
+        return robot
+    file = options.out / "robot.yaml"
+    if process.first and not file.is_file():
+        found = fit_vegetation(training, robot, config)
+        bags = [bag for bag in options.bags if bag not in options.held_out]
+        write_robot(options.robot, file, [found.effect] if found else [], bags, fingerprint(bags), found_by="train")
+        if found:
+            print(
+                f"{file}: vegetation holds the robot: {found.coefficient:.3g} N s/m⁴, as much by bending as at "
+                f"{found.yield_speed:.2g} m/s; loss of {found.pieces} pieces of motion through it {found.before:.2f} → "
+                f"{found.after:.2f}"
+            )
+    if process.count > 1:
+        torch.distributed.barrier()
+    return load_robot(file)
 
 
 def _encoder(options: argparse.Namespace, config: EncoderConfig) -> Encoder:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from monoforce_ros.robots import RobotFileError, robot_file
+from monoforce_ros.robots.loader import RobotFileError, robot_file
 
 
 def fingerprint(paths: Sequence[Path]) -> str:
@@ -33,6 +33,7 @@ def write_robot(
     bags: Sequence[Path],
     data_fingerprint: str,
     commissioning: dict | None = None,
+    found_by: str = "diagnose",
 ) -> Path:
     """Write a copy of a robot's file with effects added, or with new values where it had them.
 
@@ -43,6 +44,7 @@ def write_robot(
         bags: where they were found.
         data_fingerprint: of these.
         commissioning: what disagreed on the healthy robot, kept for later runs.
+        found_by: what found the effects.
     """
     content = yaml.safe_load(robot_file(robot).read_text(encoding="utf-8"))
     present = {entry["name"]: entry for entry in content.get("effects", [])}
@@ -56,7 +58,7 @@ def write_robot(
                 for key, entry in effect["parameters"].items()
             },
             "provenance": {
-                "found_by": "diagnose",
+                "found_by": found_by,
                 "date": datetime.now(UTC).date().isoformat(),
                 "bags": [path.name for path in bags],
                 "data": data_fingerprint,
