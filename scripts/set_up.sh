@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Makes .venv with the locked packages and builds the package with colcon.
 # Finished work is stamped, so a second call only checks the stamps.
-#   scripts/set_up.sh environment | build | graphics
+#   scripts/set_up.sh environment | build | interfaces | graphics
 set -euo pipefail
 cd "$(dirname "$0")/.."
 root=$PWD
@@ -90,6 +90,39 @@ build() {
   say "built into install/ after $((SECONDS - started)) s"
 }
 
+# The typed messages for planners, beside monoforce_ros in install/. They take a C++ compiler; all else works without.
+interfaces() {
+  local stamp=install/.interfaces source=msg_defs/monoforce_msgs started=$SECONDS headers arrays
+  if [ -f "$stamp" ] && [ -z "$(find "$source" -type f -newer "$stamp" -print -quit)" ]; then
+    say "the message package is up to date"
+    return
+  fi
+  if ! command -v c++ >/dev/null; then
+    say "no C++ compiler: monoforce_msgs is not built, its tests will be skipped (sudo apt install g++)"
+    return
+  fi
+  ros_environment
+  # The wheels' exported targets name folders of the machine on which they were made.
+  headers=$("$venv/bin/python" -c 'import sysconfig; print(sysconfig.get_paths()["include"])')
+  arrays=$("$venv/bin/python" -c 'import numpy; print(numpy.get_include())')
+  if [ ! -f "$headers/Python.h" ]; then
+    say "no headers of Python in $headers: monoforce_msgs is not built, its tests will be skipped (sudo apt install python3-dev)"
+    return
+  fi
+  { grep -rlZ '"/opt/python/' "$venv"/share/*/cmake || true; } | xargs -0r sed -i \
+    -e "s#/opt/python/[^;\"]*/include/python3[.0-9]*#$headers#g" -e "s#/opt/python/[^;\"]*/numpy/[^;\"]*include#$arrays#g"
+  say "building monoforce_msgs"
+  mkdir -p out
+  if ! colcon --log-base log build --base-paths "$source" --build-base build --install-base install \
+    --event-handlers console_cohesion- --cmake-args -G Ninja -DBUILD_TESTING=OFF -DCMAKE_BUILD_TYPE=Release \
+    -DPython3_EXECUTABLE="$venv/bin/python" >out/interfaces.log 2>&1; then
+    cat out/interfaces.log >&2
+    exit 1
+  fi
+  touch "$stamp"
+  say "monoforce_msgs built after $((SECONDS - started)) s"
+}
+
 # Only drawing camera images of synthetic worlds needs a GL library; everything else runs without.
 graphics() {
   if ldconfig -p 2>/dev/null | grep -q 'libOSMesa\.so'; then
@@ -104,9 +137,9 @@ graphics() {
 }
 
 case "${1:-}" in
-  environment | build | graphics) "$1" ;;
+  environment | build | interfaces | graphics) "$1" ;;
   *)
-    echo "usage: scripts/set_up.sh environment|build|graphics" >&2
+    echo "usage: scripts/set_up.sh environment|build|interfaces|graphics" >&2
     exit 2
     ;;
 esac

@@ -18,7 +18,7 @@ from monoforce_ros.planning import (
     fan_of_arcs,
     occupancy,
 )
-from monoforce_ros.planning.candidates import held
+from monoforce_ros.planning.candidates import over_horizon
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainMap
 
@@ -39,7 +39,7 @@ def terrain_of(height: np.ndarray, **changes) -> TerrainMap:
 def assessed(husky, terrain, fan, **how):
     """Costs of commands held for 3 s from standing on the middle of a map."""
     fan = np.atleast_2d(np.array(fan, float))
-    twists = torch.from_numpy(held(fan, np.zeros((0, 2)), STEPS)).float()
+    twists = torch.from_numpy(over_horizon(fan[:, None], np.zeros((0, 2)), STEPS)).float()
     low = float(husky.points[:, 2].min())
     middle = GRID.rows // 2
     height = float(terrain.height[middle, middle]) - low - float(rest_depth(husky, float(terrain.stiffness.mean())))
@@ -55,7 +55,7 @@ def test_a_fan_holds_every_speed_from_right_to_left_and_a_stop():
         rates = fan[fan[:, 0] == speed, 1]
         assert rates.tolist() == pytest.approx([-0.6, -0.3, 0.0, 0.3, 0.6])
     assert fan_of_arcs(CandidateSettings(count=1, speeds=(0.5,))).tolist() == [[0.5, 0.0]]
-    twists = held(fan, np.full((20, 2), 0.3), 50)
+    twists = over_horizon(fan[:, None], np.full((20, 2), 0.3), 50)
     assert twists.shape == (11, 70, 2) and (twists[:, :20] == 0.3).all() and (twists[3, 20:] == fan[3]).all()
     for wrong in ({"count": 0}, {"speeds": ()}, {"speeds": (float("nan"),)}, {"yaw_rate": -1.0}):
         with pytest.raises(ValueError, match="got"):

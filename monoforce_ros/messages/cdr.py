@@ -6,6 +6,7 @@ Large arrays are spliced in as blocks, so a grid of 16 384 cells costs microseco
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -38,6 +39,12 @@ class CdrWriter:
         data = text.encode() + b"\x00"
         self.fields("I", len(data))
         self._buffer += data
+
+    def strings(self, texts: Sequence[str]) -> None:
+        """A sequence of strings."""
+        self.fields("I", len(texts))
+        for text in texts:
+            self.string(text)
 
     def header(self, stamp: int, frame_id: str) -> None:
         """``std_msgs/Header`` with a stamp in [ns]."""

@@ -14,6 +14,10 @@ from monoforce_ros.motion import MotionState
 
 MAXIMUM_IMAGE_PIXELS = 64_000_000
 MAXIMUM_CLOUD_POINTS = 8_000_000
+MAXIMUM_COMMANDS = 1000
+"""Of one candidate."""
+MAXIMUM_SPEED = 100.0
+"""Larger commands are no robot's [m/s, rad/s]."""
 
 _POINT_DTYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 # encoding → (dtype, channels, OpenCV's conversion to RGB); Bayer names in ROS give the first two pixels of the first
@@ -227,6 +231,29 @@ def decode_command(message: Any) -> np.ndarray:
     if not np.isfinite(command).all():
         raise MessageError(f"command: got forward speed {command[0]}, yaw rate {command[1]}; expected finite numbers")
     return command
+
+
+def decode_sequences(message: Any, most: int) -> np.ndarray:
+    """``std_msgs/Float32MultiArray`` with dimensions candidates, commands and 2 → forward speeds [m/s] and yaw rates
+    [rad/s] ``[N, K, 2]``.
+
+    Raises:
+        MessageError: other dimensions, numbers that are not finite or not a robot's, or more than ``most`` candidates.
+    """
+    sizes = tuple(int(dimension.size) for dimension in message.layout.dim)
+    if len(sizes) != 3 or sizes[2] != 2 or sizes[0] < 1 or not 1 <= sizes[1] <= MAXIMUM_COMMANDS:
+        raise MessageError(
+            f"candidate commands have dimensions {list(sizes)}, expected [candidates, commands of each (1 to "
+            f"{MAXIMUM_COMMANDS}), 2 (forward speed, yaw rate)]"
+        )
+    if sizes[0] > most:
+        raise MessageError(f"{sizes[0]} candidates, at most {most} are rolled out")
+    values, offset = np.asarray(message.data, np.float32), int(message.layout.data_offset)
+    if len(values) - offset != sizes[0] * sizes[1] * 2:
+        raise MessageError(f"{len(values)} numbers after an offset of {offset}, expected {sizes[0] * sizes[1] * 2}")
+    if not np.isfinite(values).all() or np.abs(values).max() > MAXIMUM_SPEED:
+        raise MessageError(f"candidate commands are not all finite and below {MAXIMUM_SPEED:g} m/s or rad/s")
+    return values[offset:].reshape(sizes).astype(np.float64)
 
 
 def decode_transforms(message: Any) -> dict[tuple[str, str], np.ndarray]:

@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 from matplotlib import colormaps
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.messages import encoding
+from monoforce_ros.messages.cdr import CdrWriter
+from monoforce_ros.messages.prediction import usable_steps
 from monoforce_ros.motion import MotionState, transform_points
 from monoforce_ros.physics import Rollout
 from monoforce_ros.planning import Assessment, Occupancy
 from monoforce_ros.planning.choice import WAYPOINTS
+from monoforce_ros.prediction import Prediction
 from monoforce_ros.prediction.live_gap import HORIZONS, GapSummary
+from monoforce_ros.prediction.uncertainty import Spread
+from monoforce_ros.robots import RobotModel
 
 _SHOWN = 0.1
 """Time between the points of a drawn path [s]."""
+_CIRCLES = 0.5
+"""Time between the circles that are drawn about a path [s]."""
 _REFUSED = (0.45, 0.45, 0.45, 0.35)
 
 
@@ -73,6 +81,108 @@ def candidate_costs(
         channels |= {f"x_{share}": place[:, 0], f"y_{share}": place[:, 1]}
     channels |= {name: value.cpu().numpy() for name, value in assessment.terms.items()}
     return encoding.point_cloud(motion.stamp, frame_id, channels)
+
+
+def candidate_rollouts(
+    motion: MotionState,
+    rollout: Rollout,
+    robot: RobotModel,
+    sequences: np.ndarray,
+    assessment: Assessment,
+    frame_id: str,
+    time_step: float,
+) -> bytes:
+    """``monoforce_msgs/Candidates``: everything that is known of all candidates, sampled every ``time_step`` [s].
+
+    Args:
+        motion: start of all.
+        rollout: with forces, ``[N]``.
+        robot: what rolled.
+        sequences: commands of equal shares of the horizon ``[N, K, 2]``.
+        assessment: of the rollouts.
+        frame_id: of the odometry.
+        time_step: between samples [s].
+    """
+    times = rollout.times.double().cpu().numpy()
+    stride = max(1, round(time_step / (times[1] - times[0])))
+    chosen = np.arange(0, len(times), stride)
+    count, horizon = len(rollout.position), len(times) - 1
+    pose = motion.odometry_from_terrain
+    turn = pose[:3, :3]
+    rotation = turn @ rollout.rotation[:, chosen].double().cpu().numpy()
+    finite = np.isfinite(rotation).all(axis=(-1, -2))
+    quaternion = np.full((*rotation.shape[:2], 4), np.nan)
+    quaternion[finite] = Rotation.from_matrix(rotation[finite]).as_quat()
+    states = np.concatenate(
+        [transform_points(pose, rollout.position[:, chosen].double().cpu().numpy()), quaternion], axis=-1
+    )
+    linear, angular = (
+        value[:, chosen].double().cpu().numpy() @ turn.T for value in (rollout.velocity, rollout.angular_velocity)
+    )
+    share = np.minimum(chosen, horizon - 1) * sequences.shape[1] // horizon
+    forces = _averaged(rollout.forces.sum(dim=2), chosen) @ turn.T
+    drives = [torch.flatten((robot.point_drives == k).nonzero()) for k in (*range(robot.number_of_drives), -1)]
+    loads = torch.stack([rollout.normal_forces[:, :, points].sum(dim=2) for points in drives], dim=-1)
+    best = assessment.best
+    writer = CdrWriter()
+    writer.header(motion.stamp, frame_id)
+    writer.string(robot.name)
+    writer.fields("I", count)
+    for values in (
+        times[chosen], sequences[:, share], states, np.concatenate([linear, angular], axis=-1), forces,
+    ):  # fmt: skip
+        writer.sequence(np.asarray(values, "<f4").reshape(-1), 4)
+    writer.strings((*robot.drive_names, "hull"))
+    writer.sequence(np.asarray(_averaged(loads, chosen), "<f4").reshape(-1), 4)
+    writer.sequence(rollout.inside[:, chosen].cpu().numpy().astype(np.uint8).reshape(-1), 1)
+    writer.strings(tuple(assessment.terms))
+    terms = torch.stack(list(assessment.terms.values()), dim=-1)
+    writer.sequence(np.asarray(terms.cpu().numpy(), "<f4").reshape(-1), 4)
+    writer.sequence(np.asarray(assessment.cost.cpu().numpy(), "<f4"), 4)
+    writer.sequence(assessment.feasible.cpu().numpy().astype(np.uint8), 1)
+    writer.fields("i", -1 if best is None else best)
+    return writer.bytes()
+
+
+def _averaged(values: torch.Tensor, chosen: np.ndarray) -> np.ndarray:
+    """Means of per-step values ``[N, T, ...]`` over the steps before each chosen one; the first has none and is 0."""
+    summed = torch.cat([torch.zeros_like(values[:, :1]), values.cumsum(dim=1)], dim=1)[:, chosen].cpu().double().numpy()
+    steps = np.diff(chosen, prepend=chosen[0])
+    mean = np.diff(summed, axis=1, prepend=summed[:, :1])
+    return mean / np.maximum(steps, 1).reshape(1, -1, *[1] * (mean.ndim - 2))
+
+
+def spread_table(prediction: Prediction, found: Spread, frame_id: str, time_step: float) -> bytes:
+    """``sensor_msgs/PointCloud2``: poses of the path with how far each may be off, one field each.
+
+    ``time`` [s], standard deviations ``along``, ``across``, ``up`` [m] and ``heading`` [rad], and ``radius_90`` [m].
+    """
+    chosen = _path_steps(prediction, time_step)
+    positions = prediction.positions()[chosen]
+    channels = {"x": positions[:, 0], "y": positions[:, 1], "z": positions[:, 2]}
+    channels["time"] = prediction.rollout.times.double().numpy()[chosen]
+    channels |= {name: getattr(found, name)[chosen] for name in ("along", "across", "up", "heading")}
+    channels["radius_90"] = found.radius[chosen]
+    return encoding.point_cloud(prediction.stamp, frame_id, channels)
+
+
+def spread_band(prediction: Prediction, found: Spread, frame_id: str, time_step: float) -> bytes:
+    """``visualization_msgs/MarkerArray``: circles about the path's poses that hold 90 % of what may happen."""
+    chosen = _path_steps(prediction, max(time_step, _CIRCLES))[1:]
+    angle = np.linspace(0.0, 2.0 * np.pi, 25)
+    circle = np.stack([np.cos(angle), np.sin(angle), np.zeros(25)], axis=1)
+    rings = prediction.positions()[chosen][:, None] + found.radius[chosen][:, None, None] * circle
+    lines = np.stack([rings[:, :-1], rings[:, 1:]], axis=2).reshape(-1, 3)
+    colour = np.array([0.2, 0.5, 1.0, 0.6])
+    return encoding.marker_array(
+        prediction.stamp, frame_id, [encoding.ListMarker("spread_90", "lines", lines, colour, 0.02)]
+    )
+
+
+def _path_steps(prediction: Prediction, time_step: float) -> np.ndarray:
+    """Steps every ``time_step`` [s] as far as the map reaches."""
+    times = prediction.rollout.times.double().numpy()
+    return np.arange(0, max(1, usable_steps(prediction)), max(1, round(time_step / (times[1] - times[0]))))
 
 
 def best_path(motion: MotionState, rollout: Rollout, best: int, frame_id: str, time_step: float) -> bytes:

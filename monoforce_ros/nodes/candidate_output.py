@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,41 +10,75 @@ import torch
 from nav_msgs.msg import OccupancyGrid, Path
 from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Float32MultiArray
 from visualization_msgs.msg import MarkerArray
 
+from monoforce_ros.messages import decoding
 from monoforce_ros.messages import planning as messages
-from monoforce_ros.planning import CandidateSettings, CostWeights, Limits, assess, fan_of_arcs, occupancy
-from monoforce_ros.planning.candidates import held
+from monoforce_ros.messages.message_types import message_class
+from monoforce_ros.nodes.health import ERROR, OK, WARN, Health
+from monoforce_ros.planning import CandidateSettings, CostWeights, Limits, assess, fan_of_arcs, occupancy, refine
+from monoforce_ros.planning.candidates import over_horizon
 from monoforce_ros.planning.costs import TERMS
 from monoforce_ros.prediction import Prediction, Predictor
 
+PART = "candidates"
+TYPED = "monoforce_msgs/msg/Candidates"
+MOST = 512
+
 
 class CandidateOutput:
-    """Compares a fan of commands with each prediction.
+    """Compares commands with each prediction: a fan of arcs, or what a planner asks for.
 
     Raises:
         ValueError: a setting is out of its range.
     """
 
-    def __init__(self, node: Node, predictor: Predictor, settings: SimpleNamespace):
-        self._node, self._predictor, self._settings = node, predictor, settings
-        self._fan = fan_of_arcs(
-            CandidateSettings(settings.candidates, tuple(settings.candidate_speeds), settings.candidate_yaw_rate)
-        )
-        self._weights = CostWeights(**{name: getattr(settings, f"weight_{name}") for name in TERMS})
-        self._limits = Limits(**{name: getattr(settings, f"limit_{name}") for name in TERMS})
-        self._feasible = 0
+    def __init__(self, node: Node, predictor: Predictor, settings: SimpleNamespace, health: Health):
+        self._node, self._predictor, self._settings, self._health = node, predictor, settings, health
+        self._fan = np.zeros((0, 1, 2))
+        if settings.candidates:
+            fan = CandidateSettings(settings.candidates, tuple(settings.candidate_speeds), settings.candidate_yaw_rate)
+            self._fan = fan_of_arcs(fan)[:, None]
+        self._asked: tuple[float, np.ndarray] | None = None
+        self._round_seconds = 0.0
+        self.apply(settings)
+        self._figures: dict[str, str] = {}
         self._publishers = {
             "candidates": node.create_publisher(MarkerArray, "predicted/candidates", 1),
             "candidate_costs": node.create_publisher(PointCloud2, "predicted/candidate_costs", 1),
             "best_path": node.create_publisher(Path, "predicted/best_path", 1),
             "occupancy": node.create_publisher(OccupancyGrid, "predicted/occupancy", 1),
         }
+        # Where the message package is built, planners get everything in one typed message.
+        if typed := message_class(TYPED):
+            self._publishers["candidate_rollouts"] = node.create_publisher(typed, "predicted/candidate_rollouts", 1)
+        self._subscription = None
+        if settings.candidate_topic:
+            self._subscription = node.create_subscription(
+                Float32MultiArray, settings.candidate_topic, self._on_sequences, 1
+            )
+
+    def apply(self, settings: SimpleNamespace) -> None:
+        """Take weights, limits and thresholds from settings that may have changed while the node runs.
+
+        Raises:
+            ValueError: one is out of its range.
+        """
+        weights = CostWeights(**{name: getattr(settings, f"weight_{name}") for name in TERMS})
+        limits = Limits(**{name: getattr(settings, f"limit_{name}") for name in TERMS})
+        self._weights, self._limits, self._settings = weights, limits, settings
+
+    def _on_sequences(self, message: Float32MultiArray) -> None:
+        try:
+            self._asked = time.monotonic(), decoding.decode_sequences(message, MOST)
+        except decoding.MessageError as error:
+            self._health.report(PART, ERROR, f"{self._settings.candidate_topic}: {error}", reason="unusable")
 
     @property
     def figures(self) -> dict[str, str]:
         """For the diagnostics."""
-        return {"feasible candidates": f"{self._feasible} of {len(self._fan)}"}
+        return self._figures
 
     def publish(self, prediction: Prediction, before: np.ndarray, frame_id: str) -> None:
         """Roll out every candidate on the prediction's map and publish what each costs.
@@ -53,22 +88,69 @@ class CandidateOutput:
             before: commands that led to now ``[history, 2]``.
             frame_id: of the odometry.
         """
-        motion, terrain, settings = prediction.motion, prediction.terrain, self._settings
-        twists = held(self._fan, before, self._predictor.steps)
-        rolled = self._predictor.roll_out(terrain, [motion] * len(self._fan), twists)
-        asked = torch.from_numpy(twists[:, self._predictor.history :]).float()
-        found = assess(rolled, terrain, self._predictor.robot, asked, weights=self._weights, limits=self._limits)
+        sequences = self._sequences()
+        if not len(sequences):
+            return
+        motion, terrain, settings, steps = prediction.motion, prediction.terrain, self._settings, self._predictor.steps
+        rolled, found = self._assess(prediction, over_horizon(sequences, before, steps))
+        if settings.refine_seconds and found.best is not None:
+            refined = self._refined(prediction, before, sequences[found.best])
+            again, assessed = self._assess(prediction, over_horizon(refined, before, steps))
+            sequences = np.concatenate([over_horizon(sequences, np.zeros((0, 2)), steps), refined])
+            rolled, found = rolled.joined(again), found.joined(assessed)
         grid = occupancy(
             terrain, motion.odometry_from_terrain, slope_limit=settings.slope_limit, step_limit=settings.step_limit
         )
         data = {
             "candidates": messages.candidate_markers(motion, rolled, found, frame_id),
-            "candidate_costs": messages.candidate_costs(motion, rolled, self._fan, found, frame_id),
+            "candidate_costs": messages.candidate_costs(motion, rolled, sequences[:, 0], found, frame_id),
             "occupancy": messages.occupancy_grid(motion.stamp, grid, frame_id),
         }
         if found.best is not None:
             data["best_path"] = messages.best_path(motion, rolled, found.best, frame_id, settings.path_time_step)
-        self._feasible = int(found.feasible.sum())
+        if "candidate_rollouts" in self._publishers:
+            data["candidate_rollouts"] = messages.candidate_rollouts(
+                motion, rolled, self._predictor.robot, sequences, found, frame_id, settings.path_time_step
+            )
+        self._figures["feasible candidates"] = f"{int(found.feasible.sum())} of {len(sequences)}"
         if self._node.context.ok():
             for name, message in data.items():
                 self._publishers[name].publish(message)
+
+    def _sequences(self) -> np.ndarray:
+        """Commands to compare ``[N, K, 2]``: the planner's while they are fresh, else the fan."""
+        settings = self._settings
+        if not settings.candidate_topic:
+            return self._fan
+        age = np.inf if self._asked is None else time.monotonic() - self._asked[0]
+        if age <= settings.data_timeout:
+            self._health.report(PART, OK, f"comparing what {settings.candidate_topic} asks for", reason="planner")
+            return self._asked[1]
+        said = "nothing has come yet" if self._asked is None else f"nothing for {age:.1f} s"
+        instead = f"the fan of {len(self._fan)} arcs is compared" if len(self._fan) else "nothing is compared"
+        self._health.report(PART, WARN, f"{settings.candidate_topic}: {said}; {instead}", reason="silent")
+        return self._fan
+
+    def _assess(self, prediction: Prediction, twists: np.ndarray):
+        rolled = self._predictor.roll_out(prediction.terrain, [prediction.motion] * len(twists), twists)
+        asked = torch.from_numpy(twists[:, self._predictor.history :]).float()
+        robot = self._predictor.robot
+        found = assess(rolled, prediction.terrain, robot, asked, weights=self._weights, limits=self._limits)
+        return rolled, found
+
+    def _refined(self, prediction: Prediction, before: np.ndarray, best: np.ndarray) -> np.ndarray:
+        """The best candidate's commands of every step, improved ``[1, T, 2]``."""
+        budget = self._settings.refine_seconds
+        found = refine(
+            self._predictor, prediction, before, best, weights=self._weights, limits=self._limits,
+            seconds=budget, round_seconds=self._round_seconds,
+        )  # fmt: skip
+        # A slow first round (kernels are loaded) must not end refinement for good.
+        self._round_seconds = found.round_seconds if found.rounds else 0.9 * self._round_seconds
+        if found.rounds:
+            self._figures["refined cost"] = f"{found.cost_before:.3f} to {found.cost:.3f} in {found.rounds} rounds"
+        else:
+            self._figures["refined cost"] = (
+                f"not refined: a round takes {1e3 * self._round_seconds:.0f} ms, refine_seconds is {budget:g}"
+            )
+        return found.sequence[None]

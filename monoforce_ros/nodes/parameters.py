@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import yaml
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 
 
 @dataclass(frozen=True)
@@ -26,6 +28,8 @@ class ParameterEntry:
     maximum: float | None = None
     unit: str = ""
     choices: tuple[str, ...] = ()
+    dynamic: bool = False
+    """Whether it may be changed while the node runs."""
 
     @property
     def range_text(self) -> str:
@@ -54,7 +58,7 @@ def declare_parameters(node: Node, entries: list[ParameterEntry]) -> SimpleNames
         descriptor = ParameterDescriptor(
             description=f"{entry.description}{f' [{entry.unit}]' if entry.unit else ''}",
             additional_constraints=entry.range_text if entry.choices else "",
-            read_only=True,
+            read_only=not entry.dynamic,
         )
         if entry.type == "integer":
             descriptor.integer_range = [IntegerRange(from_value=entry.minimum, to_value=entry.maximum, step=1)]
@@ -71,6 +75,35 @@ def declare_parameters(node: Node, entries: list[ParameterEntry]) -> SimpleNames
             raise ValueError(f"parameter {entry.name}: got {value!r}, expected one of {list(entry.choices)}")
         setattr(values, entry.name, value)
     return values
+
+
+def follow_changes(node: Node, entries: list[ParameterEntry], change: Callable[[SimpleNamespace], None]) -> None:
+    """Have changes of dynamic parameters checked together, and taken over only if all of them fit.
+
+    Args:
+        node: whose ``settings`` hold the values that :func:`declare_parameters` returned.
+        entries: of the parameters.
+        change: takes all values with the changes in them; raises ``ValueError`` where they do not fit.
+    """
+    known = {entry.name: entry for entry in entries}
+
+    def on_change(parameters: list[Parameter]) -> SetParametersResult:
+        changed = SimpleNamespace(**vars(node.settings))
+        for parameter in parameters:
+            entry = known.get(parameter.name)
+            if entry is None:
+                continue
+            if entry.choices and parameter.value not in entry.choices:
+                reason = f"{entry.name}: got {parameter.value!r}, expected one of {list(entry.choices)}"
+                return SetParametersResult(successful=False, reason=reason)
+            setattr(changed, parameter.name, parameter.value)
+        try:
+            change(changed)
+        except ValueError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    node.add_on_set_parameters_callback(on_change)
 
 
 def parameter_help(executable: str, entries: list[ParameterEntry]) -> str:

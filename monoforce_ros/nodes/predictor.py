@@ -5,12 +5,12 @@ from __future__ import annotations
 import sys
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import torch
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import GridCells, Odometry, Path
-from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from visualization_msgs.msg import MarkerArray
@@ -26,8 +26,10 @@ from monoforce_ros.nodes.frames import SensorFrames
 from monoforce_ros.nodes.gap_output import GapOutput
 from monoforce_ros.nodes.health import ERROR, OK, STALE, WARN, Health
 from monoforce_ros.nodes.inputs import Inputs, Received
-from monoforce_ros.nodes.parameters import declare_parameters, parameter_help, read_parameter_file
+from monoforce_ros.nodes.managed import ManagedNode
+from monoforce_ros.nodes.parameters import declare_parameters, follow_changes, parameter_help, read_parameter_file
 from monoforce_ros.nodes.process import run_node
+from monoforce_ros.nodes.spread_output import SpreadOutput
 from monoforce_ros.nodes.subscriptions import AdaptiveSubscription
 from monoforce_ros.physics import PhysicsOptions
 from monoforce_ros.physics.effects import corrected_commands, corrected_motion
@@ -39,12 +41,23 @@ from monoforce_ros.terrain import Grid, TerrainDefaults
 PARAMETER_FILE = share_directory() / "config" / "predictor.yaml"
 
 
-class PredictorNode(Node):
+class PredictorNode(ManagedNode):
     """Predicts from the newest data, in a thread of its own, so that callbacks never wait for physics."""
 
     def __init__(self):
         super().__init__("predictor")
-        self.settings = declare_parameters(self, read_parameter_file(PARAMETER_FILE))
+        entries = read_parameter_file(PARAMETER_FILE)
+        self.settings = declare_parameters(self, entries)
+        self.candidates: CandidateOutput | None = None
+        self.spread: SpreadOutput | None = None
+        follow_changes(self, entries, self._change_settings)
+        if self.settings.autostart:
+            self.autostart()
+        else:
+            self.get_logger().info("waiting to be configured")
+
+    def set_up(self) -> None:
+        """Load robot and encoder, subscribe to inputs, advertise outputs."""
         settings = self.settings
         # One thread: on a small computer PyTorch's pool costs more than it brings at these sizes.
         torch.set_num_threads(1)
@@ -75,30 +88,48 @@ class PredictorNode(Node):
         self._last_prediction = self._started
         self._durations: list[float] = []
         self.gap = GapOutput(self, self.predictor, self.health)
-        self.candidates = CandidateOutput(self, self.predictor, settings) if settings.candidates else None
+        wanted = settings.candidates or settings.candidate_topic
+        self.candidates = CandidateOutput(self, self.predictor, settings, self.health) if wanted else None
+        self.spread = SpreadOutput(self, self.predictor, settings) if settings.ensemble else None
         self._subscribe()
-        newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST)
+        offered = {"reliable": ReliabilityPolicy.RELIABLE, "best_effort": ReliabilityPolicy.BEST_EFFORT}
+        newest = QoSProfile(depth=1, reliability=offered[settings.output_qos], history=HistoryPolicy.KEEP_LAST)
         self._outputs = {
             "height_map": self.create_publisher(GridCells, "predicted/height_map", newest),
             "terrain": self.create_publisher(PointCloud2, "predicted/terrain", newest),
             "path": self.create_publisher(Path, "predicted/path", newest),
             "contact_forces": self.create_publisher(MarkerArray, "predicted/contact_forces", newest),
         }
+
+    def begin(self) -> None:
+        """Predict from now on."""
+        self._started = self._last_prediction = time.monotonic()
         self._watch = self.create_timer(0.5, self._watch_inputs)
         self._running = True
         self._worker = threading.Thread(target=self._work, name="prediction", daemon=True)
         self._worker.start()
+        settings = self.settings
         self.get_logger().info(
             f"predicting {settings.horizon:g} s ahead for {self.robot.name} with terrain from {settings.terrain_source}"
         )
 
-    def destroy_node(self) -> None:
-        """Stop predicting, then end the node."""
+    def pause(self) -> None:
+        """Stop predicting."""
         self._running = False
+        self.destroy_timer(self._watch)
         with self.inputs.changed:
             self.inputs.changed.notify_all()
         self._worker.join(timeout=10.0)
-        super().destroy_node()
+        if self.context.ok():
+            self.health.report("prediction", STALE, "deactivated: nothing is predicted", reason="deactivated")
+
+    def _change_settings(self, changed: SimpleNamespace) -> None:
+        """Take changed parameters as a whole; raises ``ValueError`` where they do not fit."""
+        if self.candidates is not None:
+            self.candidates.apply(changed)
+        if self.spread is not None:
+            self.spread.apply(changed)
+        self.settings = changed
 
     def _terrain_source(self) -> CameraTerrain | FlatTerrain | LidarTerrain:
         settings = self.settings
@@ -290,6 +321,8 @@ class PredictorNode(Node):
             self._publish(prediction)
             frame_id = self.inputs.frame_id or "odom"
             self.gap.update(prediction, track, commands)
+            if self.spread is not None:
+                self.spread.publish(prediction, twists, frame_id)
             if self.candidates is not None:
                 self.candidates.publish(prediction, twists[: self.predictor.history], frame_id)
         except Exception as error:  # the node must outlive whatever its input brings about

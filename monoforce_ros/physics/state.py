@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
@@ -75,3 +75,14 @@ class Rollout:
     """Part of the contact force along the ground on each body point [N], ``[B, T, N, 3]`` in terrain axes."""
     forces: Tensor | None = None
     """Whole contact force on each body point during each step [N], ``[B, T, N, 3]`` in terrain axes."""
+
+    def joined(self, other: Rollout) -> Rollout:
+        """These trajectories and others of the same times after them; forces only where both have them."""
+        parts = {}
+        for entry in fields(self):
+            mine, theirs = getattr(self, entry.name), getattr(other, entry.name)
+            if entry.name == "times":
+                parts[entry.name] = mine
+            else:
+                parts[entry.name] = None if mine is None or theirs is None else torch.cat([mine, theirs])
+        return Rollout(**parts)

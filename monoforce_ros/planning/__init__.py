@@ -4,6 +4,7 @@ from monoforce_ros.planning.candidates import CandidateSettings, fan_of_arcs
 from monoforce_ros.planning.choice import ChoiceWeights, choose
 from monoforce_ros.planning.costs import Assessment, CostWeights, Limits, assess
 from monoforce_ros.planning.occupancy import Occupancy, occupancy
+from monoforce_ros.planning.refine import Refinement, refine
 
 __all__ = [
     "Assessment",
@@ -12,8 +13,10 @@ __all__ = [
     "CostWeights",
     "Limits",
     "Occupancy",
+    "Refinement",
     "assess",
     "choose",
     "fan_of_arcs",
     "occupancy",
+    "refine",
 ]

@@ -45,16 +45,17 @@ def fan_of_arcs(settings: CandidateSettings) -> np.ndarray:
     return np.array(fan)
 
 
-def held(fan: np.ndarray, before: np.ndarray, steps: int) -> np.ndarray:
-    """Commands of candidates ``[N, 2]`` over a horizon, after the commands that led to now.
+def over_horizon(sequences: np.ndarray, before: np.ndarray, steps: int) -> np.ndarray:
+    """Commands of candidates over a horizon, after the commands that led to now.
 
     Args:
-        fan: what each candidate holds.
+        sequences: commands that each candidate holds one after another, for equal shares of the horizon ``[N, K, 2]``.
         before: commands of the steps before now ``[history, 2]``.
         steps: of the horizon.
 
     Returns:
         ``[N, history + steps, 2]``.
     """
-    led = np.broadcast_to(before, (len(fan), *before.shape))
-    return np.concatenate([led, np.repeat(fan[:, None], steps, axis=1)], axis=1)
+    led = np.broadcast_to(before, (len(sequences), *before.shape))
+    share = np.arange(steps) * sequences.shape[1] // steps
+    return np.concatenate([led, sequences[:, share]], axis=1)

@@ -86,6 +86,11 @@ class Assessment:
             return None
         return int(torch.where(self.feasible, self.cost, torch.inf).argmin())
 
+    def joined(self, other: Assessment) -> Assessment:
+        """These candidates and others after them."""
+        terms = {name: torch.cat([value, other.terms[name]]) for name, value in self.terms.items()}
+        return Assessment(terms, torch.cat([self.cost, other.cost]), torch.cat([self.feasible, other.feasible]))
+
     def why_not(self, index: int) -> str:
         """What keeps a candidate from being feasible, in words; empty where nothing does."""
         if not bool(torch.isfinite(self.cost[index])):

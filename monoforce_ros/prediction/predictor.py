@@ -104,13 +104,14 @@ class Predictor:
     def roll_out(self, terrain: TerrainMap, motions: list[MotionState], twists: np.ndarray) -> Rollout:
         """Roll out motions ``[B]`` under twists ``[B, history + T, 2]`` on one map or a batch of maps."""
         with torch.no_grad():
-            speeds = drive_speeds(
-                self.robot,
-                torch.as_tensor(twists, dtype=torch.float32),
-                self.options.time_step,
-                history=self.history,
-            )
-            # Terrain frames look along the robot's heading; what holds in the odometry frame turns with them.
-            heading = torch.tensor([motion.heading for motion in motions], dtype=torch.float32)
-            robot = turned_effects(self.robot, heading)
-            return rollout(terrain, robot, speeds, start_states(motions), options=self.options)
+            given = torch.as_tensor(twists, dtype=torch.float32)
+            return self.differentiable_roll_out(terrain, motions, given, start_states(motions), self.robot)
+
+    def differentiable_roll_out(
+        self, terrain: TerrainMap, motions: list[MotionState], twists: torch.Tensor, start: State, robot: RobotModel
+    ) -> Rollout:
+        """As :meth:`roll_out`, with gradients, from other start states and with another variant of the robot."""
+        speeds = drive_speeds(robot, twists, self.options.time_step, history=self.history)
+        # Terrain frames look along the robot's heading; what holds in the odometry frame turns with them.
+        heading = torch.tensor([motion.heading for motion in motions], dtype=torch.float32)
+        return rollout(terrain, turned_effects(robot, heading), speeds, start, options=self.options)

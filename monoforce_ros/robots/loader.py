@@ -20,6 +20,7 @@ MAXIMUM_FILE_BYTES = 1_000_000
 DEFAULT_SPACING = 0.05
 """Largest distance of neighbouring samples along a belt [m]; across it, rows are twice as far apart at the most."""
 
+_VALUE_KEYS = {"value", "low", "high", "unit"}
 _TOP_KEYS = {
     "name", "description", "base_frame", "mass", "centre_of_mass", "inertia", "inertia_box", "command", "friction",
     "wheels", "tracks", "flippers", "hull", "sensors", "effects", "commissioning",
@@ -162,6 +163,7 @@ class _Reader:
             wheel_radius=float(np.mean([wheel["radius"] for wheel in top["wheels"]])) if top.get("wheels") else None,
             sensors=self.sensors(top.get("sensors", {})),
             effects=self.effects(top.get("effects", [])),
+            effect_intervals=self.intervals(top.get("effects", [])),
             flippers=tuple(samples.flippers),
             flipper_angles=tensor(samples.angles),
             point_flippers=torch.as_tensor(np.concatenate(samples.arms), dtype=torch.int64),
@@ -179,9 +181,27 @@ class _Reader:
             for key, value in effect["parameters"].items():
                 place = f"{where}.parameters.{key}"
                 if isinstance(value, Mapping):
-                    value = self.mapping(value, place, {"value", "low", "high", "unit"}, ["value"])["value"]
+                    value = self.mapping(value, place, _VALUE_KEYS, ["value"])["value"]
                 values[str(key)] = self.number(value, place, -math.inf, math.inf, "")
             listed.append((str(effect["name"]), values))
+        return tuple(listed)
+
+    def intervals(self, content: Any) -> tuple[tuple[str, dict[str, tuple[float, float]]], ...]:
+        """Of parameters that have one; :meth:`effects` has checked the entries."""
+        listed = []
+        for index, effect in enumerate(self.items(content, "effects")):
+            known = {}
+            for key, value in effect["parameters"].items():
+                if not isinstance(value, Mapping) or not {"low", "high"} <= set(value):
+                    continue
+                place = f"effects[{index}].parameters.{key}"
+                low = self.number(value["low"], f"{place}.low", -math.inf, math.inf, "")
+                high = self.number(value["high"], f"{place}.high", -math.inf, math.inf, "")
+                if low > high:
+                    raise self.fail(place, f"low {low:g} above high {high:g}", "low ≤ high")
+                known[str(key)] = (low, high)
+            if known:
+                listed.append((str(effect["name"]), known))
         return tuple(listed)
 
     def inertia(self, top: Mapping[str, Any], mass: float) -> np.ndarray:

@@ -1,0 +1,104 @@
+"""How often what happened lies within the predicted 90 % band: drives → coverage at 1, 2 and 5 s.
+
+    scripts/run.sh python benchmarks/uncertainty.py BAG... [--terrain lidar|camera|flat] [--json FILE]
+
+Each drive is predicted every second under the commands that were really given. A band that is right holds 90 % of the
+outcomes; the factor that would make it so on these drives is printed beside (`ensemble_scale` of the predictor).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from monoforce_ros.bags import Recording
+from monoforce_ros.encoder import fused, load_encoder
+from monoforce_ros.evaluation.drive import corrected_recording, observe
+from monoforce_ros.evaluation.report import write_text
+from monoforce_ros.motion import StaleDataError
+from monoforce_ros.prediction import CameraTerrain, FlatTerrain, LidarTerrain, Prediction, Predictor
+from monoforce_ros.prediction.uncertainty import COVERAGE, EnsembleSettings, spread
+from monoforce_ros.robots import load_robot
+from monoforce_ros.terrain import Grid, TerrainDefaults
+
+HORIZONS = (1.0, 2.0, 5.0)
+
+
+def drive_ratios(bag: Path, predictor: Predictor, settings: EnsembleSettings) -> tuple[np.ndarray, np.ndarray]:
+    """Error over band radius, and the radius [m], of each window at each horizon ``[W, 3]``; NaN off the map."""
+    recording = corrected_recording(Recording.open(bag), predictor.robot)
+    flat, camera = isinstance(predictor.source, FlatTerrain), isinstance(predictor.source, CameraTerrain)
+    topics = tuple(recording.images) if camera else ()
+    first, last = int(recording.motion.stamps[0]), int(recording.motion.stamps[-1])
+    ratios, radii = [], []
+    for stamp in range(first + 10**9, last - round(1e9 * HORIZONS[0]), 10**9):
+        try:
+            motion = recording.motion.at(stamp, maximum_gap=0.3)
+            terrain = predictor.source.terrain(observe(recording, predictor.robot, stamp, topics, flat), motion)
+        except ValueError:
+            continue
+        twists = recording.commands.sample(predictor.command_stamps(stamp))
+        prediction = Prediction(motion, terrain, predictor.roll_out(terrain, [motion], twists[None]))
+        found = spread(predictor, prediction, twists, settings)
+        places, inside = prediction.positions(), prediction.rollout.inside[0].numpy()
+        row, sizes = [], []
+        for horizon in HORIZONS:
+            step = round(horizon / predictor.options.time_step)
+            try:
+                state = recording.motion.at(stamp + round(1e9 * horizon), maximum_gap=0.3)
+                off = float(np.hypot(*(places[step, :2] - state.position[:2])))
+            except StaleDataError:
+                off = np.nan
+            row.append(off / max(found.radius[step], 1e-6) if inside[: step + 1].all() else np.nan)
+            sizes.append(found.radius[step])
+        ratios.append(row)
+        radii.append(sizes)
+    return np.array(ratios).reshape(-1, len(HORIZONS)), np.array(radii).reshape(-1, len(HORIZONS))
+
+
+def main() -> None:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("bags", nargs="+", type=Path)
+    parser.add_argument("--robot", default="husky")
+    parser.add_argument("--terrain", choices=("lidar", "camera", "flat"), default="lidar")
+    parser.add_argument("--checkpoint", default="", help="terrain encoder (the shipped one)")
+    parser.add_argument("--members", type=int, default=EnsembleSettings.members)
+    parser.add_argument("--scale", type=float, default=EnsembleSettings.scale)
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    robot = load_robot(options.robot)
+    if options.terrain == "camera":
+        source = CameraTerrain(fused(load_encoder(options.checkpoint, "camera")), robot)
+    else:
+        kind = LidarTerrain if options.terrain == "lidar" else FlatTerrain
+        source = kind(robot, Grid.square(), TerrainDefaults())
+    predictor = Predictor(robot, source)
+    settings = EnsembleSettings(members=options.members, scale=options.scale)
+    rows, sizes = zip(
+        *(drive_ratios(bag, predictor, settings) for bag in tqdm(options.bags, unit="drive")), strict=True
+    )
+    ratios, radii = np.concatenate(rows), np.concatenate(sizes)
+    result = {"drives": len(rows), "windows": len(ratios), "members": options.members, "scale": options.scale}
+    print(f"{len(rows)} drives, {len(ratios)} windows, {options.members} members, scale {options.scale:g}")
+    for i, horizon in enumerate(HORIZONS):
+        known = ratios[np.isfinite(ratios[:, i]), i]
+        inside, factor = float(np.mean(known <= 1.0)), float(np.quantile(known, COVERAGE))
+        radius = float(np.median(radii[:, i]))
+        result[f"{horizon:g} s"] = {"windows": len(known), "inside": inside, "median_radius": radius, "factor": factor}
+        print(
+            f"  {horizon:g} s: {100 * inside:.0f} % of {len(known)} inside (asked {100 * COVERAGE:.0f}), median radius "
+            f"{radius:.2f} m, factor for {100 * COVERAGE:.0f} % {factor:.2f}"
+        )
+    if options.json:
+        write_text(options.json, json.dumps(result, indent=1))
+
+
+if __name__ == "__main__":
+    main()
