@@ -82,8 +82,8 @@ def test_the_band_holds_what_its_own_variations_bring_about(predictor):
     other = spread(predictor, prediction, twists, replace(settings, seed=5))
     assert other.radius[-1] == pytest.approx(found.radius[-1], rel=0.5)
     at = prediction.positions()[400]
-    near = MotionState(0, at + [0.9 * found.radius[400], 0, 0], np.eye(3), np.zeros(3), np.zeros(3))
-    far = replace(near, position=at + [0, 1.1 * found.radius[400], 0])
+    near = MotionState(0, at + np.array([0.9 * found.radius[400], 0, 0]), np.eye(3), np.zeros(3), np.zeros(3))
+    far = replace(near, position=at + np.array([0, 1.1 * found.radius[400], 0]))
     assert covered(found, prediction, 400, near) and not covered(found, prediction, 400, far)
 
 
@@ -125,7 +125,7 @@ def test_refinement_keeps_to_its_budget_and_leaves_what_is_not_feasible(predicto
 
 
 def test_rollouts_are_joined_in_order(predictor):
-    prediction, twists = predicted(predictor)
+    prediction, _ = predicted(predictor)
     other, _ = predicted(predictor, command=(0.3, -0.5))
     both = prediction.rollout.joined(other.rollout)
     assert both.position.shape[0] == 2 and torch.equal(both.position[1], other.rollout.position[0])

@@ -34,8 +34,8 @@ class EnsembleSettings:
     gain: float = 0.03
     """Of the drives' gain, each side on its own: what a model of the drives leaves out."""
     drift: float = 0.08
-    """Of the position along and across, per metre driven [-]: what maps and physics get wrong beside all this; measured on
-    synthetic drives with a lidar (benchmarks/uncertainty.py)."""
+    """Of the position along and across, per metre driven [-]: what maps and physics get wrong beside all this; measured
+    on synthetic drives with a lidar (benchmarks/uncertainty.py)."""
     scale: float = 1.0
     """On the whole band; set so that it holds :data:`COVERAGE` of what happened."""
     seed: int = 0
