@@ -1,11 +1,12 @@
 # make demo   play the bundled bag through the predictor and draw what it predicts
 # make test   lint and run every test
+# make interfaces build monoforce_msgs, the typed message for planners, into install/ (takes a C++ compiler)
 # make bench  run the benchmarks
 # make diagnosis  measure diagnose on hidden effects and real drives (an hour), write the tables of docs/discrepancy.md
 # make checkpoint train the shipped terrain encoder on synthetic worlds, from nothing (some hours)
 # make tables     compare terrain sources on worlds that no training saw, as the paper's tables do (more hours)
 SHELL := /bin/bash
-.PHONY: demo test bench diagnosis checkpoint tables lint environment build graphics lock clean help
+.PHONY: demo test interfaces bench diagnosis checkpoint tables lint environment build graphics lock clean help
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -16,6 +17,9 @@ environment:
 build: environment
 	@scripts/set_up.sh build
 
+interfaces: environment
+	@scripts/set_up.sh interfaces
+
 graphics:
 	@scripts/set_up.sh graphics
 
@@ -25,7 +29,7 @@ demo: build
 lint: environment
 	@scripts/run.sh ruff check --quiet . && scripts/run.sh ruff format --check --quiet . && echo "[lint] clean"
 
-test: build graphics lint
+test: build interfaces graphics lint
 	@scripts/run.sh python -m pytest $(PYTEST_ARGUMENTS)
 
 # Pin anew after a change of requirements.in.
@@ -35,7 +39,7 @@ lock: environment
 clean:
 	rm -rf build install log out
 
-bench: build
+bench: build interfaces
 	@mkdir -p out
 	@scripts/run.sh python benchmarks/rollout.py --json out/rollout.json
 	@scripts/run.sh python benchmarks/integrators.py --json out/integrators.json

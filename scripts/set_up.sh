@@ -81,6 +81,8 @@ build() {
   fi
   ros_environment
   say "building with colcon"
+  # What is no longer in the source must not stay installed.
+  rm -rf build/monoforce_ros install/monoforce_ros
   mkdir -p out
   if ! colcon --log-base log build --event-handlers console_cohesion- >out/colcon_build.log 2>&1; then
     cat out/colcon_build.log >&2

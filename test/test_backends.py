@@ -136,3 +136,26 @@ def test_a_planted_control_is_recovered_from_its_trajectory():
 
     optimiser.step(loss)
     np.testing.assert_allclose(guess.detach().numpy(), truth[:, 0].numpy(), atol=0.02)
+
+
+@pytest.mark.parametrize("backend", ["torch", "warp"])
+def test_forces_of_every_fifth_step_are_those_of_all(backend):
+    husky = load_robot("husky")
+    grid = Grid.square(6.4, 0.1)
+    x, y = np.meshgrid(grid.x, grid.y)
+    heights = torch.from_numpy(0.05 * np.sin(2 * x) * np.cos(3 * y)).requires_grad_()
+    terrain = TerrainMap.from_height(heights, grid)
+    speeds = torch.full((20, 43, 2), 0.5, dtype=torch.float64)
+    speeds[:, :, ::2] += torch.linspace(-0.3, 0.3, 20, dtype=torch.float64)[:, None, None]
+    state = State.at_rest(0.2, batch=20, dtype=torch.float64)
+    whole = rollout(terrain, husky, speeds, state, backend=backend)
+    some = rollout(terrain, husky, speeds, state, backend=backend, force_every=5)
+    assert some.force_every == 5 and some.forces.shape[:2] == (20, 9)
+    for name in ("forces", "normal_forces", "tangential_forces"):
+        torch.testing.assert_close(getattr(some, name), getattr(whole, name)[:, ::5])
+    (gradient,) = torch.autograd.grad((some.forces**2).sum(), heights)
+    heights.grad = None
+    (expected,) = torch.autograd.grad((whole.forces[:, ::5] ** 2).sum(), heights)
+    torch.testing.assert_close(gradient, expected, rtol=1e-9, atol=1e-9)
+    with pytest.raises(ValueError, match="every 0 steps"):
+        rollout(terrain, husky, speeds, state, backend=backend, force_every=0)

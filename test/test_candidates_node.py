@@ -125,3 +125,79 @@ def test_the_occupancy_grid_shows_the_wall_where_it_is(peer, predictor, heard):
     assert at(3.05, 2.0) == 100
     assert 0 <= at(1.0 + 1.2, 2.0) < 50 and 0 <= at(1.0, 2.0 + 2.0) < 50
     assert data.min() == -1
+
+
+def test_what_a_planner_asks_for_is_compared_and_refined(peer, start):
+    """Sequences of two commands over a topic; with the best refined as one more; everything in one typed message."""
+    typed = message_class("monoforce_msgs/msg/Candidates")
+    process = start(
+        "predictor", "--ros-args", "-r", "__node:=asked", "-p", "candidate_topic:=planned", "-p", "horizon:=2.0",
+        "-p", "refine_seconds:=0.8", "-p", "rate:=1.0", "-p", "ensemble:=8",
+        "-r", "predicted/candidate_costs:=asked_costs", "-r", "predicted/candidate_rollouts:=asked_rollouts",
+    )  # fmt: skip
+    process.wait_for("predicting 2 s ahead for husky")
+    costs, rollouts, spreads = [], [], []
+    cloud = message_class("sensor_msgs/msg/PointCloud2")
+    peer.node.create_subscription(cloud, "/asked_costs", costs.append, QoSProfile(depth=10))
+    peer.node.create_subscription(cloud, "/predicted/path_spread", spreads.append, QoSProfile(depth=10))
+    if typed is not None:
+        peer.node.create_subscription(typed, "/asked_rollouts", rollouts.append, QoSProfile(depth=10))
+    sequences = np.array([[[0.6, 0.3], [0.6, -0.3]], [[0.4, 0.0], [0.8, 0.0]], [[0.0, 0.0], [0.0, 0.0]]])
+    array = message_class("std_msgs/msg/Float32MultiArray")()
+    dimension = message_class("std_msgs/msg/MultiArrayDimension")
+    array.layout.dim = [dimension(label=label, size=size) for label, size in zip("nkc", sequences.shape, strict=True)]
+    array.data = sequences.ravel().tolist()
+    planner = peer.node.create_publisher(type(array), "/planned", 1)
+
+    def feed(message) -> None:
+        for _ in range(10):
+            planner.publish(message)
+            peer.drive(0.5)
+            if costs and spreads and (rollouts or typed is None):
+                return
+        pytest.fail(process.output[-2000:])
+
+    feed(array)
+    names, values = table(costs[-1])
+    assert len(values) == 4, "three candidates and the refined one"
+    np.testing.assert_allclose(values[:3, names.index("speed")], sequences[:, 0, 0], atol=1e-6)
+    feasible = values[:3, names.index("feasible")] > 0
+    best = values[:3, names.index("cost")][feasible].min()
+    assert values[3, names.index("cost")] <= best + 1e-3
+    names, values = table(spreads[-1])
+    assert {"time", "along", "across", "heading", "radius_90"} <= set(names) and len(values) > 10
+    radius = values[:, names.index("radius_90")]
+    assert radius[0] < 1e-3 and np.isfinite(radius).all()
+    # Wrong dimensions are refused in words, and what was asked before goes on until it is old.
+    wrong = type(array)()
+    wrong.layout.dim = [dimension(label="n", size=3)]
+    wrong.data = [0.0] * 3
+    peer.clear()
+    planner.publish(wrong)
+    said = lambda: [s.message for a in peer.received["/diagnostics"] for s in a.status if s.name == "asked: candidates"]  # noqa: E731
+    assert peer.until(lambda: any("dimensions [3]" in text for text in said()), 10.0), said()
+    costs.clear()
+    peer.drive(5.0)
+    assert any("nothing for" in text for text in said()), said()
+    assert process.stop() == 0
+    if typed is None:
+        pytest.skip("monoforce_msgs is not built: its message was not looked at")
+    message = rollouts[-1]
+    count, samples = message.count, len(message.times)
+    assert count == 4 and samples == 21 and message.robot == "husky" and message.header.frame_id == "odom"
+    states = np.array(message.states).reshape(count, samples, 7)
+    commands = np.array(message.commands).reshape(count, samples, 2)
+    np.testing.assert_allclose(states[:, 0, :3], [[1.0, 2.0, 0.3]] * 4, atol=1e-3)
+    np.testing.assert_allclose(np.linalg.norm(states[..., 3:], axis=-1), 1.0, atol=1e-5)
+    np.testing.assert_allclose(commands[0, [0, 9, 11, 20]], sequences[0][[0, 0, 1, 1]], atol=1e-6)
+    # The robot's weight rests on its drives, in every candidate and at every time after the start.
+    loads = np.array(message.loads).reshape(count, samples, len(message.drives))
+    forces = np.array(message.forces).reshape(count, samples, 3)
+    assert list(message.drives)[-1] == "hull"
+    np.testing.assert_allclose(forces[2, 5:, 2], 50 * 9.81, rtol=0.05)
+    np.testing.assert_allclose(loads[2, 5:].sum(axis=1), 50 * 9.81, rtol=0.05)
+    velocities = np.array(message.velocities).reshape(count, samples, 6)
+    np.testing.assert_allclose(velocities[1, 9, 0], 0.4, atol=0.05)
+    terms = np.array(message.terms).reshape(count, len(message.term_names))
+    assert "roll" in message.term_names and np.isfinite(terms).all() and len(message.costs) == count
+    assert message.best == int(np.argmin(np.where(message.feasible, message.costs, np.inf)))

@@ -89,9 +89,11 @@ def parameter_table() -> list[str]:
     for entry in read_parameter_file(ROOT / "config" / "predictor.yaml"):
         unit = f" {entry.unit}" if entry.unit else ""
         default = ", ".join(map(str, entry.default)) if isinstance(entry.default, list) else entry.default
+        default = str(default).lower() if isinstance(default, bool) else default
         shown = f"`{default}`{unit}" if default not in ("", None) else "–"
         choices = entry.range_text.replace("|", "\\|")
-        rows.append(f"| `{entry.name}` | {shown} | {choices}{unit if choices else ''} | {entry.description} |")
+        live = " ↻" if entry.dynamic else ""
+        rows.append(f"| `{entry.name}`{live} | {shown} | {choices}{unit if choices else ''} | {entry.description} |")
     return rows
 
 

@@ -236,7 +236,9 @@ def test_the_live_gap_is_small_where_predictions_hold_and_says_what_to_do_where_
     )
     assert "compared predictions" in {entry.key for entry in first.values}, "a state was published without its figures"
     # A busy machine may leave a hole in the odometry where the first comparisons look.
-    peer.drive(2.0, speed=0.0, until=lambda: "median error at 5 s [m]" in gap()[2])
+    for _ in range(4):
+        if "median error at 5 s [m]" not in gap()[2]:
+            peer.drive(1.0, speed=0.0)
     assert float(gap()[2]["median error at 5 s [m]"]) < 0.05
     # The robot does not move although it is told to: it stands in front of a kerb that nobody models.
     peer.drive(14.0, speed=0.5)

@@ -9,6 +9,7 @@ import torch
 from monoforce_ros.motion import MotionState
 from monoforce_ros.planning import CostWeights, Limits, assess, refine
 from monoforce_ros.planning.candidates import over_horizon
+from monoforce_ros.planning.costs import FORCE_EVERY
 from monoforce_ros.prediction import Prediction, Predictor
 from monoforce_ros.prediction.uncertainty import EnsembleSettings, covered, spread
 from monoforce_ros.robots import load_robot
@@ -103,10 +104,15 @@ def test_refinement_costs_less_and_ends_where_it_did(predictor):
     ends = []
     for sequence, cost in ((best, found.cost_before), (found.sequence, found.cost)):
         twists = over_horizon(sequence[None], before, predictor.steps)
-        rolled = predictor.roll_out(prediction.terrain, [STILL], twists)
         asked = torch.from_numpy(twists[:, predictor.history :]).float()
-        assessed = assess(rolled, prediction.terrain, predictor.robot, asked)
-        assert float(assessed.cost[0]) == pytest.approx(cost, rel=1e-3) and bool(assessed.feasible[0])
+        costs = []
+        for every in (FORCE_EVERY, 1):
+            rolled = predictor.roll_out(prediction.terrain, [STILL], twists, force_every=every)
+            assessed = assess(rolled, prediction.terrain, predictor.robot, asked)
+            assert bool(assessed.feasible[0])
+            costs.append(float(assessed.cost[0]))
+        # Every fifth step's forces cost what those of all steps do.
+        assert costs[0] == pytest.approx(cost, rel=1e-3) and costs[1] == pytest.approx(cost, rel=0.1)
         ends.append(rolled.position[0, -1].numpy())
     assert np.linalg.norm(ends[1] - ends[0]) < 0.35 * np.linalg.norm(ends[0])
     assert np.abs(found.sequence[:, 0]).max() <= predictor.robot.maximum_speed

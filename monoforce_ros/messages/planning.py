@@ -120,7 +120,7 @@ def candidate_rollouts(
         value[:, chosen].double().cpu().numpy() @ turn.T for value in (rollout.velocity, rollout.angular_velocity)
     )
     share = np.minimum(chosen, horizon - 1) * sequences.shape[1] // horizon
-    forces = _averaged(rollout.forces.sum(dim=2), chosen) @ turn.T
+    forces = _averaged(rollout.forces.sum(dim=2), chosen, rollout.force_every) @ turn.T
     drives = [torch.flatten((robot.point_drives == k).nonzero()) for k in (*range(robot.number_of_drives), -1)]
     loads = torch.stack([rollout.normal_forces[:, :, points].sum(dim=2) for points in drives], dim=-1)
     best = assessment.best
@@ -133,7 +133,7 @@ def candidate_rollouts(
     ):  # fmt: skip
         writer.sequence(np.asarray(values, "<f4").reshape(-1), 4)
     writer.strings((*robot.drive_names, "hull"))
-    writer.sequence(np.asarray(_averaged(loads, chosen), "<f4").reshape(-1), 4)
+    writer.sequence(np.asarray(_averaged(loads, chosen, rollout.force_every), "<f4").reshape(-1), 4)
     writer.sequence(rollout.inside[:, chosen].cpu().numpy().astype(np.uint8).reshape(-1), 1)
     writer.strings(tuple(assessment.terms))
     terms = torch.stack(list(assessment.terms.values()), dim=-1)
@@ -144,12 +144,18 @@ def candidate_rollouts(
     return writer.bytes()
 
 
-def _averaged(values: torch.Tensor, chosen: np.ndarray) -> np.ndarray:
-    """Means of per-step values ``[N, T, ...]`` over the steps before each chosen one; the first has none and is 0."""
-    summed = torch.cat([torch.zeros_like(values[:, :1]), values.cumsum(dim=1)], dim=1)[:, chosen].cpu().double().numpy()
-    steps = np.diff(chosen, prepend=chosen[0])
-    mean = np.diff(summed, axis=1, prepend=summed[:, :1])
-    return mean / np.maximum(steps, 1).reshape(1, -1, *[1] * (mean.ndim - 2))
+def _averaged(values: torch.Tensor, chosen: np.ndarray, every: int) -> np.ndarray:
+    """Means of values of every so many steps ``[N, T / every, ...]`` from each chosen step to the next one.
+
+    The first is that of the start; a sample between which and the one before nothing was computed repeats it.
+    """
+    summed = torch.cat([torch.zeros_like(values[:, :1]), values.cumsum(dim=1)], dim=1).cpu().double().numpy()
+    ends = np.minimum(-(-chosen // every), values.shape[1])
+    starts = np.concatenate([[0], ends[:-1]])
+    ends = np.maximum(ends, 1)
+    starts = np.minimum(starts, ends - 1)
+    count = (ends - starts).reshape(1, -1, *[1] * (summed.ndim - 2))
+    return (summed[:, ends] - summed[:, starts]) / count
 
 
 def spread_table(prediction: Prediction, found: Spread, frame_id: str, time_step: float) -> bytes:

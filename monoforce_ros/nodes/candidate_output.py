@@ -19,7 +19,7 @@ from monoforce_ros.messages.message_types import message_class
 from monoforce_ros.nodes.health import ERROR, OK, WARN, Health
 from monoforce_ros.planning import CandidateSettings, CostWeights, Limits, assess, fan_of_arcs, occupancy, refine
 from monoforce_ros.planning.candidates import over_horizon
-from monoforce_ros.planning.costs import TERMS
+from monoforce_ros.planning.costs import FORCE_EVERY, TERMS
 from monoforce_ros.prediction import Prediction, Predictor
 
 PART = "candidates"
@@ -132,7 +132,8 @@ class CandidateOutput:
         return self._fan
 
     def _assess(self, prediction: Prediction, twists: np.ndarray):
-        rolled = self._predictor.roll_out(prediction.terrain, [prediction.motion] * len(twists), twists)
+        motions = [prediction.motion] * len(twists)
+        rolled = self._predictor.roll_out(prediction.terrain, motions, twists, force_every=FORCE_EVERY)
         asked = torch.from_numpy(twists[:, self._predictor.history :]).float()
         robot = self._predictor.robot
         found = assess(rolled, prediction.terrain, robot, asked, weights=self._weights, limits=self._limits)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -24,6 +26,7 @@ def rollout(
     *,
     options: PhysicsOptions = PhysicsOptions(),  # noqa: B008  (frozen)
     with_forces: bool = True,
+    force_every: int = 1,
     backend: str = "auto",
     ode: OdeOptions | None = None,
 ) -> Rollout:
@@ -42,6 +45,8 @@ def rollout(
         drive_speeds: surface speed of each drive during each step [m/s], ``[B, T, D]``.
         state: start states, ``[B]``.
         with_forces: whether to return per-point forces (memory grows with B · T · N).
+        force_every: of so many steps the first one's forces are returned; where many candidates are compared, all of
+            them would cost more than the motion.
         ode: integrate by a solver of torchdiffeq instead, as the paper's Neural-ODE variant does; without forces.
         backend: ``warp`` (compiled kernels), ``torch`` (the reference), or ``auto``: Warp where it is installed.
 
@@ -49,6 +54,8 @@ def rollout(
         ValueError: shapes that do not fit together, or a backend that is not there.
     """
     batch = state.position.shape[0]
+    if force_every < 1:
+        raise ValueError(f"forces of every {force_every} steps: expected 1 or more")
     if drive_speeds.ndim != 3 or drive_speeds.shape[0] != batch or drive_speeds.shape[2] != robot.number_of_drives:
         raise ValueError(
             f"drive speeds: got shape {tuple(drive_speeds.shape)}, expected [{batch}, T, {robot.number_of_drives}] "
@@ -60,8 +67,8 @@ def rollout(
     if ode is not None:
         motion = neural_ode.integrate(problem, options, ode)
     else:
-        motion = _backend(backend).integrate(problem, options, with_forces)
-    return _result(problem, motion, finite, options)
+        motion = _backend(backend).integrate(problem, options, with_forces, force_every)
+    return replace(_result(problem, motion, finite, options), force_every=force_every)
 
 
 def _backend(name: str):

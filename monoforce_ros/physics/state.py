@@ -75,13 +75,15 @@ class Rollout:
     """Part of the contact force along the ground on each body point [N], ``[B, T, N, 3]`` in terrain axes."""
     forces: Tensor | None = None
     """Whole contact force on each body point during each step [N], ``[B, T, N, 3]`` in terrain axes."""
+    force_every: int = 1
+    """Forces are those of the first of so many steps; above, ``T`` is then that much smaller."""
 
     def joined(self, other: Rollout) -> Rollout:
         """These trajectories and others of the same times after them; forces only where both have them."""
         parts = {}
         for entry in fields(self):
             mine, theirs = getattr(self, entry.name), getattr(other, entry.name)
-            if entry.name == "times":
+            if entry.name in ("times", "force_every"):
                 parts[entry.name] = mine
             else:
                 parts[entry.name] = None if mine is None or theirs is None else torch.cat([mine, theirs])

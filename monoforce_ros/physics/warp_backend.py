@@ -28,7 +28,7 @@ _threads: ThreadPoolExecutor | None = None
 wp.init()
 
 
-def integrate(problem: Problem, options: PhysicsOptions, with_forces: bool) -> Motion:
+def integrate(problem: Problem, options: PhysicsOptions, with_forces: bool, force_every: int = 1) -> Motion:
     """Integrate with Warp; see :func:`monoforce_ros.physics.rollout`."""
     terrain = problem.terrain
     height = terrain.height if terrain.height.ndim == 3 else terrain.height[None]
@@ -60,7 +60,7 @@ def integrate(problem: Problem, options: PhysicsOptions, with_forces: bool) -> M
     states = _Integrate.apply(fixed, *common, problem.inertia, *start)
     if not with_forces or not problem.steps:
         return Motion(*states)
-    return Motion(*states, *_Forces.apply(fixed, *common, *states))
+    return Motion(*states, *_Forces.apply(fixed, force_every, *common, *states))
 
 
 class _Fixed:
@@ -142,17 +142,17 @@ class _Integrate(torch.autograd.Function):
 
 class _Forces(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, fixed, *tensors):
+    def forward(ctx, fixed, every, *tensors):
         kernels = _kernels(tensors[0])
         inputs = _contiguous(tensors)
-        batch, steps = inputs[2].shape[:2]
+        batch, steps = inputs[2].shape[0], -(-inputs[2].shape[1] // every)
         count = inputs[3].shape[0]
         normal = inputs[0].new_zeros((batch, steps, count))
         tangential = inputs[0].new_zeros((batch, steps, count, 3))
         whole = torch.zeros_like(tangential)
-        _launch_forces(kernels, fixed, inputs, (normal, tangential, whole))
+        _launch_forces(kernels, fixed, every, inputs, (normal, tangential, whole))
         if any(ctx.needs_input_grad):
-            ctx.fixed = fixed
+            ctx.fixed, ctx.every = fixed, every
             ctx.save_for_backward(*inputs, normal, tangential, whole)
         return normal, tangential, whole
 
@@ -163,11 +163,12 @@ class _Forces(torch.autograd.Function):
         given = _launch_forces(
             kernels,
             ctx.fixed,
+            ctx.every,
             inputs,
             (normal, tangential, whole),
             output_gradients=[gradient.contiguous() for gradient in output_gradients],
         )
-        return (None, *given)
+        return (None, None, *given)
 
 
 def _launch(kernels, fixed, common, inertia, states, *, state_gradients=None):
@@ -215,36 +216,46 @@ def _launch(kernels, fixed, common, inertia, states, *, state_gradients=None):
     return [torch.stack(entries).sum(0) if len(entries) > 1 else entries[0] for entries in zip(*parts, strict=True)]
 
 
-def _launch_forces(kernels, fixed, inputs, outputs, *, output_gradients=None):
+def _launch_forces(kernels, fixed, every, inputs, outputs, *, output_gradients=None):
+    """Launch the forces of every so many steps, or their adjoint; then return the inputs' gradients."""
     backward = output_gradients is not None
     grid, options = fixed.structs(kernels)
     state_types = (kernels.vec3, kernels.mat33, kernels.vec3, kernels.vec3)
-    arrays = _wrap(inputs, (*_types(kernels), *state_types), gradients=backward)
-    (
-        height, material, speeds, points, areas, tangents, weights, mass, centre_of_mass, factors, tilt, resistance,
-        wrench, *moving,
-    ) = arrays  # fmt: skip
-    gradients = output_gradients or (None, None, None)
-    results = [
-        wp.from_torch(t, dtype=kind, requires_grad=backward, grad=g)
-        for t, kind, g in zip(outputs, (kernels.scalar, kernels.vec3, kernels.vec3), gradients, strict=True)
-    ]
+    device = str(inputs[0].device)
     drives = wp.from_torch(fixed.drives, dtype=wp.int32)
-    before = [
-        height, material, grid, options, speeds, points, areas, tangents, drives, weights, mass, centre_of_mass,
-        factors, tilt, resistance, wrench, *moving,
-    ]  # fmt: skip
-    extra = _adjoint(before, outputs=3) if backward else {}
-    wp.launch(
-        kernels.forces,
-        dim=tuple(outputs[0].shape),
-        inputs=before,
-        outputs=results,
-        device=str(inputs[0].device),
-        record_tape=False,
-        **extra,
-    )
-    return [wp.to_torch(array.grad) for array in arrays] if backward else []
+
+    def work(part: tuple[int, int]) -> list[Tensor]:
+        first, count = part
+        arrays = _wrap(inputs, (*_types(kernels), *state_types), gradients=backward)
+        (
+            height, material, speeds, points, areas, tangents, weights, mass, centre_of_mass, factors, tilt, resistance,
+            wrench, *moving,
+        ) = arrays  # fmt: skip
+        gradients = output_gradients or (None, None, None)
+        results = [
+            wp.from_torch(t, dtype=kind, requires_grad=backward, grad=g)
+            for t, kind, g in zip(outputs, (kernels.scalar, kernels.vec3, kernels.vec3), gradients, strict=True)
+        ]
+        before = [
+            first, every, height, material, grid, options, speeds, points, areas, tangents, drives, weights, mass,
+            centre_of_mass, factors, tilt, resistance, wrench, *moving,
+        ]  # fmt: skip
+        extra = _adjoint(before, outputs=3) if backward else {}
+        wp.launch(
+            kernels.forces,
+            dim=(count, *outputs[0].shape[1:]),
+            inputs=before,
+            outputs=results,
+            device=device,
+            record_tape=False,
+            **extra,
+        )
+        return [wp.to_torch(array.grad) for array in arrays] if backward else []
+
+    parts = list(_in_parallel(work, _shares(outputs[0].shape[0], inputs[0].device)))
+    if not backward:
+        return []
+    return [torch.stack(entries).sum(0) if len(entries) > 1 else entries[0] for entries in zip(*parts, strict=True)]
 
 
 def _adjoint(inputs: list, outputs: int) -> dict:

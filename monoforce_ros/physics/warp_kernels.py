@@ -419,6 +419,8 @@ def kernels(double: bool) -> Kernels:
 
     @wp.kernel(module="unique")
     def forces(
+        first_trajectory: int,
+        every: int,
         height: wp.array3d(dtype=scalar),
         material: wp.array3d(dtype=vec4),
         grid: Grid,
@@ -443,7 +445,9 @@ def kernels(double: bool) -> Kernels:
         tangential_forces: wp.array3d(dtype=vec3),
         whole_forces: wp.array3d(dtype=vec3),
     ):
-        b, step, i = wp.tid()
+        part, slot, i = wp.tid()
+        b = first_trajectory + part
+        step = slot * every
         page = wp.min(b, height.shape[0] - 1)
         turned = rotation[b, step]
         arm = turned * (points[i] - centre_of_mass[b])
@@ -475,10 +479,10 @@ def kernels(double: bool) -> Kernels:
             pressing = wp.max(touch.force[0] - touch.gain[0] * wp.dot(touch.normal, change), scalar(0.0))
             rolling = touch.force[1] - touch.gain[1] * wp.dot(touch.along, change)
             sliding = touch.force[2] - touch.gain[2] * wp.dot(touch.across, change)
-            normal_forces[b, step, i] = pressing
+            normal_forces[b, slot, i] = pressing
             tangential = rolling * touch.along + sliding * touch.across
-            tangential_forces[b, step, i] = tangential
-            whole_forces[b, step, i] = pressing * touch.normal + tangential
+            tangential_forces[b, slot, i] = tangential
+            whole_forces[b, slot, i] = pressing * touch.normal + tangential
 
     # Structs are reached through the kernels' signatures by the caller.
     integrate.grid_type, integrate.options_type = Grid, Options

@@ -15,6 +15,8 @@ from monoforce_ros.terrain import TerrainMap
 _GRAVITY = 9.81
 _STEEP = 0.5
 """A contact whose normal has a smaller vertical part pushes rather than carries: it is steeper than 60°."""
+FORCE_EVERY = 5
+"""Steps of which one's forces decide: enough for what is averaged below, at a fifth of the work."""
 _SMOOTHED = 0.2
 """Forces of single steps are averaged over this time [s]: a tyre's bounce is not a lost wheel."""
 
@@ -121,12 +123,11 @@ def assess(
     """
     if rollout.forces is None or rollout.tangential_forces is None:
         raise ValueError("costs: the rollout has no forces; roll out with `with_forces=True`")
-    if twists.shape[:2] != rollout.forces.shape[:2]:
-        raise ValueError(
-            f"costs: got twists {tuple(twists.shape)}, expected {(*rollout.forces.shape[:2], 2)} for the rollout"
-        )
+    expected = (rollout.position.shape[0], rollout.position.shape[1] - 1, 2)
+    if tuple(twists.shape) != expected:
+        raise ValueError(f"costs: got twists {tuple(twists.shape)}, expected {expected} for the rollout")
     weight = robot.mass * _GRAVITY
-    step = float(rollout.times[1] - rollout.times[0])
+    step = rollout.force_every * float(rollout.times[1] - rollout.times[0])
     rotation = rollout.rotation[:, 1:]
     roll = torch.atan2(rotation[..., 2, 1], rotation[..., 2, 2]).abs().amax(dim=1)
     pitch = torch.asin(rotation[..., 2, 0].clamp(-1.0, 1.0)).abs().amax(dim=1)
@@ -177,9 +178,10 @@ def _slip(rollout: Rollout, robot: RobotModel, twists: Tensor) -> Tensor:
 def _effort(rollout: Rollout, robot: RobotModel, twists: Tensor) -> Tensor:
     """Mean power that the drives bring to the ground [W] ``[N]``."""
     driven = robot.point_drives >= 0
-    along = rollout.rotation[:, 1:, None, :, 0]
+    along = rollout.rotation[:, 1 :: rollout.force_every, None, :, 0]
     traction = (rollout.tangential_forces[:, :, driven] * along).sum(-1)
     lateral = robot.drive_offsets[robot.point_drives[driven]]
+    twists = twists[:, :: rollout.force_every]
     speed = twists[..., :1] - lateral * twists[..., 1:]
     return (traction * speed).sum(dim=2).abs().mean(dim=1)
 

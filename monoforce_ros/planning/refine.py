@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from monoforce_ros.planning.candidates import over_horizon
-from monoforce_ros.planning.costs import Assessment, CostWeights, Limits, assess
+from monoforce_ros.planning.costs import FORCE_EVERY, Assessment, CostWeights, Limits, assess
 from monoforce_ros.prediction import Prediction, Predictor
 from monoforce_ros.prediction.predictor import start_states
 
@@ -85,7 +85,9 @@ def refine(
         asked = commands(change)
         twists = torch.cat([led.expand(len(change), -1, -1), asked], dim=1)
         motions = [prediction.motion] * len(change)
-        rolled = predictor.differentiable_roll_out(prediction.terrain, motions, twists, start_states(motions), robot)
+        rolled = predictor.differentiable_roll_out(
+            prediction.terrain, motions, twists, start_states(motions), robot, force_every=FORCE_EVERY
+        )
         found = assess(rolled, prediction.terrain, robot, asked, weights=weights, limits=limits)
         return rolled.position[:, -1], found, asked
 

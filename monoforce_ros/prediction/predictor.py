@@ -101,17 +101,31 @@ class Predictor:
         terrain = self.source.terrain(observation, motion)
         return Prediction(motion, terrain, self.roll_out(terrain, [motion], twists[None]))
 
-    def roll_out(self, terrain: TerrainMap, motions: list[MotionState], twists: np.ndarray) -> Rollout:
+    def roll_out(
+        self, terrain: TerrainMap, motions: list[MotionState], twists: np.ndarray, *, force_every: int = 1
+    ) -> Rollout:
         """Roll out motions ``[B]`` under twists ``[B, history + T, 2]`` on one map or a batch of maps."""
         with torch.no_grad():
             given = torch.as_tensor(twists, dtype=torch.float32)
-            return self.differentiable_roll_out(terrain, motions, given, start_states(motions), self.robot)
+            start = start_states(motions)
+            return self.differentiable_roll_out(terrain, motions, given, start, self.robot, force_every=force_every)
 
     def differentiable_roll_out(
-        self, terrain: TerrainMap, motions: list[MotionState], twists: torch.Tensor, start: State, robot: RobotModel
+        self,
+        terrain: TerrainMap,
+        motions: list[MotionState],
+        twists: torch.Tensor,
+        start: State,
+        robot: RobotModel,
+        *,
+        with_forces: bool = True,
+        force_every: int = 1,
     ) -> Rollout:
         """As :meth:`roll_out`, with gradients, from other start states and with another variant of the robot."""
         speeds = drive_speeds(robot, twists, self.options.time_step, history=self.history)
         # Terrain frames look along the robot's heading; what holds in the odometry frame turns with them.
         heading = torch.tensor([motion.heading for motion in motions], dtype=torch.float32)
-        return rollout(terrain, turned_effects(robot, heading), speeds, start, options=self.options)
+        return rollout(
+            terrain, turned_effects(robot, heading), speeds, start, options=self.options, with_forces=with_forces,
+            force_every=force_every,
+        )  # fmt: skip

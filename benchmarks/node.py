@@ -1,0 +1,324 @@
+"""From sensor to published path, between real processes: latency, rate, CPU and memory of the installed predictor.
+
+    scripts/run.sh python benchmarks/node.py [--seconds 20] [--only NAME ...] [--json FILE] [--docs FILE]
+
+A process like a robot's drivers publishes raw images or clouds at 10 Hz, odometry at 50 Hz and commands at 20 Hz, all
+stamped with the time at which they are published; latency is the time from a stamp until the path that carries it
+arrives back. `overload` sends images at ten times the rate: latency must not grow, and what is dropped is counted.
+`--endurance MINUTES` plays on instead and says how memory and threads develop.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import yaml
+
+from monoforce_ros.bags import Recording, builders
+from monoforce_ros.bags.types import type_store
+from monoforce_ros.evaluation.report import write_text
+from monoforce_ros.messages.message_types import message_class
+from monoforce_ros.robots import robot_file
+
+ROOT = Path(__file__).resolve().parent.parent
+ENVIRONMENT = {"ROS_DOMAIN_ID": "87", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+PROFILE = ROOT / "config" / "fastdds_large_messages.xml"
+_TICK = os.sysconf("SC_CLK_TCK")
+_SIDES = ("front", "left", "right", "rear")
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is sent and how the predictor is set."""
+
+    name: str
+    title: str
+    cameras: int = 0
+    clouds: bool = False
+    rate: float = 10.0
+    parameters: tuple[str, ...] = ()
+
+
+CASES = (
+    Case("lidar", "lidar", clouds=True),
+    Case("lidar_candidates", "lidar, 64 candidates", clouds=True, parameters=("candidates:=64",)),
+    Case("camera", "1 camera 640 × 480", cameras=1),
+    Case("camera_candidates", "1 camera, 64 candidates", cameras=1, parameters=("candidates:=64",)),
+    Case("camera_all", "1 camera, 64 candidates, ensemble of 24", cameras=1,
+         parameters=("candidates:=64", "ensemble:=24")),
+    Case("four_cameras", "4 cameras 640 × 480", cameras=4),
+    Case("overload", "1 camera at 100 Hz", cameras=1, rate=100.0),
+)  # fmt: skip
+
+
+def four_camera_robot(folder: Path) -> Path:
+    """The Husky with a camera on each side."""
+    content = yaml.safe_load(robot_file("husky").read_text(encoding="utf-8"))
+    for index, side in enumerate(_SIDES):
+        turn = (0.0, np.pi / 2, -np.pi / 2, np.pi)[index]
+        content["sensors"][f"camera_{side}"] = {
+            "translation": [float(0.3 * np.cos(turn)), float(0.3 * np.sin(turn)), 0.55],
+            "rotation": [-1.8208, 0.0, float(turn - np.pi / 2)],
+        }
+    file = folder / "husky_four_cameras.yaml"
+    file.write_text(yaml.safe_dump(content), encoding="utf-8")
+    return file
+
+
+class Source:
+    """Publishes what a robot's drivers would and hears the path; one thread, one process."""
+
+    def __init__(self, case: Case, robot_frames: list[str]):
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.qos import QoSProfile
+
+        # Large messages want the segment of the process that publishes them to be large.
+        os.environ |= ENVIRONMENT | {"FASTRTPS_DEFAULT_PROFILES_FILE": str(PROFILE)}
+        self.case, self.frames = case, robot_frames
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context)
+        self.node = rclpy.create_node("drivers", context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        newest = QoSProfile(depth=10)
+        self.latencies: list[float] = []
+        self.arrivals: list[float] = []
+        self.dropped = 0
+        self.said: dict[str, str] = {}
+        self.node.create_subscription(
+            message_class("nav_msgs/msg/Path"), "predicted/path", self._on_path, newest, raw=True
+        )
+        self.node.create_subscription(
+            message_class("diagnostic_msgs/msg/DiagnosticArray"), "/diagnostics", self._on_diagnostics, newest
+        )
+        self._publishers = {}
+        recording = Recording.open(ROOT / "bags" / "demo")
+        topic = next(iter(recording.images))
+        image = cv2.resize(recording.image(recording.images[topic][20]), (640, 480))
+        camera = recording.cameras[topic]
+        scale = 640 / camera.width
+        matrix = camera.matrix * np.array([[scale], [scale], [1.0]])
+        # An encoded image differs from the next in its stamp alone.
+        self.images = [self._encode(builders.image(1, frame, image)) for frame in robot_frames]
+        self.infos = [
+            builders.camera_info(1, frame, 640, 480, matrix, camera.distortion, camera.distortion_model)
+            for frame in robot_frames
+        ]
+        points, frame = recording.cloud(recording.clouds[10])
+        self.cloud = self._encode(builders.point_cloud(1, frame, points.astype(np.float32)))
+
+    @staticmethod
+    def _encode(message) -> bytearray:
+        return bytearray(type_store().serialize_cdr(message, message.__msgtype__))
+
+    def _publish(self, topic: str, kind: str, data: bytes) -> None:
+        from rclpy.qos import QoSProfile
+
+        if topic not in self._publishers:
+            self._publishers[topic] = self.node.create_publisher(message_class(kind), topic, QoSProfile(depth=2))
+        self._publishers[topic].publish(bytes(data))
+
+    def _stamped(self, data: bytearray, stamp: int) -> bytes:
+        data[4:12] = np.array([stamp // 10**9, stamp % 10**9], "<u4").tobytes()
+        return data
+
+    def _on_path(self, data: bytes) -> None:
+        now = time.time_ns()
+        seconds, nanoseconds = np.frombuffer(data[4:12], "<u4")
+        self.latencies.append((now - (int(seconds) * 10**9 + int(nanoseconds))) * 1e-6)
+        self.arrivals.append(time.monotonic())
+
+    def _on_diagnostics(self, message) -> None:
+        for status in message.status:
+            self.said[status.name] = status.message
+            for entry in status.values:
+                if entry.key == "dropped inputs":
+                    self.dropped = int(entry.value)
+
+    def run(self, seconds: float) -> int:
+        """Publish for a while; returns how many images or clouds were sent."""
+        begin, sent, small = time.monotonic(), 0, 0
+        while (now := time.monotonic() - begin) < seconds:
+            if now * 50 >= small:
+                stamp = time.time_ns()
+                pose = [0.3 * now % 2, 0.0, 0.1323]
+                odometry = builders.odometry(stamp, "odom", "base_link", pose, [0, 0, 0, 1], [0.3, 0, 0], [0, 0, 0])
+                self._publish("odom", "nav_msgs/msg/Odometry", self._encode(odometry))
+                if small % 5 < 2:
+                    command = builders.twist_stamped(stamp, "base_link", 0.5, 0.1)
+                    self._publish("cmd_vel", "geometry_msgs/msg/TwistStamped", self._encode(command))
+                if small % 50 == 0:
+                    for frame, info in zip(self.frames, self.infos, strict=True):
+                        self._publish(f"{frame}/camera_info", "sensor_msgs/msg/CameraInfo", self._encode(info))
+                small += 1
+            if now * self.case.rate >= sent:
+                stamp = time.time_ns()
+                for frame, image in zip(self.frames, self.images, strict=True):
+                    self._publish(f"{frame}/image_raw", "sensor_msgs/msg/Image", self._stamped(image, stamp))
+                if self.case.clouds:
+                    self._publish("points", "sensor_msgs/msg/PointCloud2", self._stamped(self.cloud, stamp))
+                sent += 1
+            self.executor.spin_once(timeout_sec=0.002)
+        return sent
+
+    def close(self) -> None:
+        """End the node."""
+        import rclpy
+
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self.context)
+
+
+class Predictor:
+    """The installed executable."""
+
+    def __init__(self, case: Case, folder: Path, frames: list[str]):
+        executable = ROOT / "install" / "monoforce_ros" / "lib" / "monoforce_ros" / "predictor"
+        source = "camera" if case.cameras else "lidar"
+        listed = ",".join(f"{frame}/image_raw" for frame in frames) or "none"
+        parameters = [
+            f"terrain_source:={source}",
+            f"robot:={four_camera_robot(folder)}",
+            f"image_topics:=[{listed}]",
+            *case.parameters,
+        ]
+        command = [str(executable), "--ros-args", *(word for p in parameters for word in ("-p", p))]
+        log = folder / f"{case.name}.log"
+        with log.open("w") as output:
+            environment = os.environ | ENVIRONMENT
+            self.process = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, env=environment)
+        deadline = time.monotonic() + 90
+        while "predicting" not in log.read_text():
+            if self.process.poll() is not None or time.monotonic() > deadline:
+                sys.exit(f"the predictor did not start:\n{log.read_text()}")
+            time.sleep(0.1)
+
+    def cpu_seconds(self) -> float:
+        """Used so far."""
+        fields = Path(f"/proc/{self.process.pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / _TICK
+
+    def state(self) -> tuple[float, int]:
+        """Resident memory [MB] and number of threads."""
+        values = dict(line.split(":", 1) for line in Path(f"/proc/{self.process.pid}/status").read_text().splitlines())
+        return int(values["VmRSS"].split()[0]) / 1024, int(values["Threads"])
+
+    def stop(self) -> int:
+        """End it; its exit status."""
+        self.process.send_signal(signal.SIGINT)
+        return self.process.wait(timeout=30)
+
+
+def measure(case: Case, seconds: float, folder: Path) -> dict:
+    """Run one case."""
+    frames = [f"camera_{side}" for side in _SIDES[: case.cameras]]
+    predictor = Predictor(case, folder, frames)
+    source = Source(case, frames)
+    source.run(4.0)
+    if not source.latencies:
+        sys.exit(f"{case.name}: no path came: {source.said}")
+    source.latencies.clear()
+    source.arrivals.clear()
+    dropped, cpu, began = source.dropped, predictor.cpu_seconds(), time.monotonic()
+    sent = source.run(seconds)
+    lasted = time.monotonic() - began
+    used = (predictor.cpu_seconds() - cpu) / lasted
+    memory, threads = predictor.state()
+    source.executor.spin_once(timeout_sec=1.2)
+    values = np.array(source.latencies)
+    gaps = np.diff(source.arrivals)
+    row = {
+        "case": case.name, "title": case.title, "sent_hz": sent / lasted, "paths": len(values),
+        "rate_hz": len(values) / lasted, "longest_gap_s": float(gaps.max()) if len(gaps) else None,
+        **{f"p{q}_ms": float(np.percentile(values, q)) for q in (50, 95, 99)},
+        "cpu_cores": used, "memory_mb": memory, "threads": threads, "dropped": source.dropped - dropped,
+    }  # fmt: skip
+    source.close()
+    row["exit_status"] = predictor.stop()
+    return row
+
+
+def endure(case: Case, minutes: float, folder: Path) -> dict:
+    """Run one case for long; memory and threads every tenth of the time."""
+    frames = [f"camera_{side}" for side in _SIDES[: case.cameras]]
+    predictor = Predictor(case, folder, frames)
+    source = Source(case, frames)
+    source.run(10.0)
+    samples = []
+    for part in range(10):
+        count = len(source.latencies)
+        source.run(6.0 * minutes)
+        memory, threads = predictor.state()
+        values = np.array(source.latencies[count:])
+        samples.append({
+            "minute": (part + 1) * minutes / 10, "memory_mb": memory, "threads": threads, "paths": len(values),
+            "p95_ms": float(np.percentile(values, 95)) if len(values) else None,
+        })  # fmt: skip
+        print(f"  {samples[-1]['minute']:.1f} min: {memory:.0f} MB, {threads} threads, {len(values)} paths, "
+              f"p95 {samples[-1]['p95_ms']:.0f} ms", flush=True)  # fmt: skip
+    source.close()
+    return {"case": case.name, "minutes": minutes, "samples": samples, "exit_status": predictor.stop()}
+
+
+def table(rows: list[dict]) -> str:
+    """As Markdown."""
+    lines = [
+        "| input | sent | paths | p50 | p95 | p99 | CPU | memory | dropped |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    lines += [
+        f"| {row['title']} | {row['sent_hz']:.0f} Hz | {row['rate_hz']:.1f} Hz | {row['p50_ms']:.0f} ms | "
+        f"{row['p95_ms']:.0f} ms | {row['p99_ms']:.0f} ms | {100 * row['cpu_cores']:.0f} % | "
+        f"{row['memory_mb']:.0f} MB | {row['dropped']} |"
+        for row in rows
+    ]
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=20.0, help="of each case (%(default)s)")
+    parser.add_argument("--only", nargs="+", choices=[case.name for case in CASES], metavar="NAME")
+    parser.add_argument("--endurance", type=float, metavar="MINUTES", help="one case (camera) for so long instead")
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--docs", type=Path, help="write the table between this document's `<!-- latency -->` marks")
+    options = parser.parse_args()
+    cases = [case for case in CASES if not options.only or case.name in options.only]
+    with tempfile.TemporaryDirectory() as folder:
+        if options.endurance:
+            case = cases[0] if options.only else next(c for c in CASES if c.name == "camera_candidates")
+            result = {"endurance": endure(case, options.endurance, Path(folder))}
+        else:
+            rows = []
+            for case in cases:
+                rows.append(measure(case, options.seconds, Path(folder)))
+                row = rows[-1]
+                print(f"{case.title}: {row['rate_hz']:.1f} Hz, p50 {row['p50_ms']:.0f}, p95 {row['p95_ms']:.0f}, p99 "
+                      f"{row['p99_ms']:.0f} ms, {100 * row['cpu_cores']:.0f} % CPU, {row['memory_mb']:.0f} MB, "
+                      f"{row['dropped']} dropped", flush=True)  # fmt: skip
+            result = {"machine": platform.processor() or platform.machine(), "cores": os.cpu_count(), "rows": rows}
+            if options.docs:
+                before, _, rest = options.docs.read_text(encoding="utf-8").partition("<!-- latency -->")
+                after = rest.partition("<!-- end of latency -->")[2]
+                write_text(options.docs, f"{before}<!-- latency -->\n{table(rows)}\n<!-- end of latency -->{after}")
+    if options.json:
+        write_text(options.json, json.dumps(result, indent=1))
+
+
+if __name__ == "__main__":
+    main()

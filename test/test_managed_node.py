@@ -1,0 +1,158 @@
+"""The predictor under a manager: states, parameters that change while it runs, and two robots side by side."""
+
+import pytest
+from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rcl_interfaces.srv import DescribeParameters, SetParametersAtomically
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
+
+from monoforce_ros.bags import builders
+from monoforce_ros.messages.message_types import message_class
+
+PATHS = "nav_msgs/msg/Path"
+
+
+def call(peer, kind, service: str, request):
+    client = peer.node.create_client(kind, service)
+    assert client.wait_for_service(timeout_sec=10.0), f"nobody offers {service}"
+    future = client.call_async(request)
+    assert peer.until(future.done, 20.0), f"{service} does not answer"
+    peer.node.destroy_client(client)
+    return future.result()
+
+
+def change(peer, node: str, transition: int) -> bool:
+    return call(
+        peer, ChangeState, f"{node}/change_state", ChangeState.Request(transition=Transition(id=transition))
+    ).success
+
+
+def state(peer, node: str) -> int:
+    return call(peer, GetState, f"{node}/get_state", GetState.Request()).current_state.id
+
+
+def test_a_manager_configures_activates_pauses_and_takes_down(peer, start):
+    process = start("predictor", "--ros-args", "-p", "autostart:=false", "-r", "__node:=managed")
+    process.wait_for("waiting to be configured")
+    assert state(peer, "/managed") == State.PRIMARY_STATE_UNCONFIGURED
+    peer.clear()
+    peer.drive(1.0)
+    assert not peer.received["/predicted/path"]
+    assert change(peer, "/managed", Transition.TRANSITION_CONFIGURE)
+    assert state(peer, "/managed") == State.PRIMARY_STATE_INACTIVE
+    peer.drive(1.5)
+    assert not peer.received["/predicted/path"], "an inactive node predicts"
+    assert change(peer, "/managed", Transition.TRANSITION_ACTIVATE)
+    for _ in range(6):
+        peer.drive(1.0)
+        if peer.received["/predicted/path"]:
+            break
+    assert peer.received["/predicted/path"]
+    assert change(peer, "/managed", Transition.TRANSITION_DEACTIVATE)
+    peer.drive(0.5)
+    peer.clear()
+    peer.drive(1.5)
+    assert not peer.received["/predicted/path"]
+    assert change(peer, "/managed", Transition.TRANSITION_CLEANUP)
+    # A second life is like the first.
+    assert change(peer, "/managed", Transition.TRANSITION_CONFIGURE)
+    assert change(peer, "/managed", Transition.TRANSITION_ACTIVATE)
+    for _ in range(6):
+        peer.drive(1.0)
+        if peer.received["/predicted/path"]:
+            break
+    assert peer.received["/predicted/path"], process.output[-2000:]
+    assert process.stop() == 0
+
+
+def test_a_node_that_cannot_be_configured_stays_and_says_why(peer, start):
+    process = start(
+        "predictor", "--ros-args", "-p", "autostart:=false", "-p", "robot:=no_such_robot", "-r", "__node:=wrong"
+    )
+    process.wait_for("waiting to be configured")
+    assert not change(peer, "/wrong", Transition.TRANSITION_CONFIGURE)
+    process.wait_for("no_such_robot")
+    assert state(peer, "/wrong") == State.PRIMARY_STATE_UNCONFIGURED and process.running
+    assert process.stop() == 0
+
+
+@pytest.fixture(scope="module")
+def tunable(start):
+    process = start("predictor", "--ros-args", "-r", "__node:=tunable", "-p", "candidates:=5", "-p", "horizon:=2.0")
+    process.wait_for("predicting 2 s ahead")
+    return process
+
+
+def set_parameters(peer, node: str, **values):
+    request = SetParametersAtomically.Request()
+    request.parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+    return call(peer, SetParametersAtomically, f"{node}/set_parameters_atomically", request).result
+
+
+def test_parameters_change_while_it_runs_all_or_none(peer, tunable):
+    assert set_parameters(peer, "/tunable", weight_roll=2.5, rate=5.0).successful
+    # A value out of its range keeps the others from being taken over too.
+    refused = set_parameters(peer, "/tunable", weight_roll=7.0, limit_roll=-1.0)
+    assert not refused.successful and refused.reason
+    fixed = set_parameters(peer, "/tunable", robot="marv")
+    assert not fixed.successful and "read-only" in fixed.reason.lower()
+    from rcl_interfaces.srv import GetParameters
+
+    request = GetParameters.Request(names=["weight_roll", "rate"])
+    values = call(peer, GetParameters, "/tunable/get_parameters", request).values
+    assert [v.double_value for v in values] == [2.5, 5.0]
+    assert tunable.running
+
+
+def test_every_parameter_is_described_with_its_range(peer, tunable):
+    request = DescribeParameters.Request(names=["rate", "weight_roll", "robot"])
+    rate, weight, robot = call(peer, DescribeParameters, "/tunable/describe_parameters", request).descriptors
+    assert "Largest rate" in rate.description and rate.floating_point_range[0].to_value == 100.0
+    assert not rate.read_only and not weight.read_only and robot.read_only
+
+
+def test_a_changed_rate_is_kept_to(peer, tunable):
+    assert set_parameters(peer, "/tunable", rate=2.0).successful
+    peer.drive(1.0)
+    peer.clear()
+    peer.drive(4.0)
+    assert 4 <= len(peer.received["/predicted/path"]) <= 11
+    tunable.stop()
+
+
+def test_two_robots_in_namespaces_do_not_hear_each_other(peer, start):
+    processes = [
+        start("predictor", "--ros-args", "-r", f"__ns:=/{name}", "-p", "robot:=husky", "-p", "terrain_source:=flat")
+        for name in ("left", "right")
+    ]
+    for process in processes:
+        process.wait_for("predicting 5 s ahead for husky")
+    paths: dict[str, list] = {"left": [], "right": []}
+    for name, received in paths.items():
+        peer.node.create_subscription(
+            message_class(PATHS), f"/{name}/predicted/path", received.append, QoSProfile(depth=10)
+        )
+
+    def feed(name: str, x: float) -> None:
+        for _ in range(40):
+            peer.now += 50_000_000
+            pose = [x, 0.0, 0.1323]
+            peer.publish(
+                f"/{name}/odom", builders.odometry(peer.now, "odom", "base_link", pose, [0, 0, 0, 1], [0] * 3, [0] * 3)
+            )
+            peer.publish(f"/{name}/cmd_vel", builders.twist_stamped(peer.now, "base_link", 0.5, 0.0))
+            peer.spin(0.05)
+
+    for _ in range(5):
+        feed("left", 10.0)
+        if paths["left"]:
+            break
+    assert paths["left"] and not paths["right"]
+    for _ in range(5):
+        feed("right", 20.0)
+        if paths["right"]:
+            break
+    assert abs(paths["left"][-1].poses[0].pose.position.x - 10.0) < 0.1
+    assert abs(paths["right"][-1].poses[0].pose.position.x - 20.0) < 0.1
+    assert all(process.stop() == 0 for process in processes)
