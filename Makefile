@@ -9,7 +9,7 @@ SHELL := /bin/bash
 .PHONY: demo test interfaces bench diagnosis checkpoint tables lint environment build graphics lock clean help
 
 help:
-	@sed -n 's/^# //p' Makefile
+	@sed -n 's/^# make/make/p' Makefile
 
 environment:
 	@scripts/set_up.sh environment
@@ -29,8 +29,13 @@ demo: build
 lint: environment
 	@scripts/run.sh ruff check --quiet . && scripts/run.sh ruff format --check --quiet . && echo "[lint] clean"
 
+# Tests that compute share the cores; those of nodes run one after another: their timing wants the machine.
+TEST_PROCESSES ?= 2
 test: build interfaces graphics lint
-	@scripts/run.sh python -m pytest $(PYTEST_ARGUMENTS)
+	@failed=0; \
+	scripts/run.sh python -m pytest -m "not robot" -n $(TEST_PROCESSES) --dist loadfile $(PYTEST_ARGUMENTS) || failed=1; \
+	scripts/run.sh python -m pytest -m robot $(PYTEST_ARGUMENTS) || failed=1; \
+	exit $$failed
 
 # Pin anew after a change of requirements.in.
 lock: environment

@@ -16,6 +16,13 @@ INSTALLED = ROOT / "install" / "monoforce_ros"
 torch.set_num_threads(1)
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests that start nodes run by themselves, the others beside each other (see the Makefile)."""
+    for item in items:
+        if {"start", "peer"} & set(getattr(item, "fixturenames", ())):
+            item.add_marker(pytest.mark.robot)
+
+
 @pytest.fixture(scope="session")
 def real_data() -> Path:
     """Folder of real recordings; tests that need it are skipped where it is absent."""
