@@ -19,6 +19,7 @@ from monoforce_ros.messages.message_types import message_class
 from monoforce_ros.nodes.process import run_node
 from monoforce_ros.nodes.subscriptions import AdaptiveSubscription
 from monoforce_ros.synthetic.live import LiveSettings, LiveWorld
+from monoforce_ros.synthetic.terrain_shape import GROUNDS
 
 _ODOMETRY_RATE = 50.0
 _TICK = 0.01
@@ -35,8 +36,10 @@ def _arguments(arguments: list[str]) -> argparse.Namespace:
     )
     parser.add_argument("--seed", type=int, default=12, help="of the world (%(default)s)")
     parser.add_argument("--robot", default="husky", metavar="NAME|FILE.yaml", help="(%(default)s)")
-    parser.add_argument("--ground", choices=("mixed", "rigid", "grass"), default="mixed", help="(%(default)s)")
+    parser.add_argument("--ground", choices=GROUNDS, default="mixed", help="(%(default)s)")
     parser.add_argument("--flat", action="store_true", help="level ground with nothing on it")
+    parser.add_argument("--course", action="store_true", help="a test track: a wall in the way, behind "
+                        "it a band of tall grass")  # fmt: skip
     parser.add_argument("--lidar-rate", type=float, default=5.0, metavar="HZ", help="0 for none (%(default)s)")
     parser.add_argument("--camera-rate", type=float, default=0.0, metavar="HZ", help="0 for none (%(default)s)")
     parser.add_argument("--duration", type=float, default=float("inf"), metavar="S", help="to simulate (until stopped)")
@@ -111,6 +114,7 @@ class SimulatorNode(Node):
 
 
 def _settings(options: argparse.Namespace) -> LiveSettings:
+    from monoforce_ros.synthetic.course import CourseSettings
     from monoforce_ros.synthetic.sensors import CameraSettings, LidarSettings
     from monoforce_ros.synthetic.terrain_shape import TerrainSettings
 
@@ -118,6 +122,7 @@ def _settings(options: argparse.Namespace) -> LiveSettings:
         seed=options.seed,
         robot=options.robot,
         terrain=TerrainSettings(flat=options.flat, ground=options.ground),
+        course=CourseSettings.draw(options.seed) if options.course else None,
         camera=CameraSettings() if options.camera_rate else None,
         lidar=LidarSettings() if options.lidar_rate else None,
     )

@@ -15,6 +15,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from monoforce_ros.synthetic.random_streams import DEFAULT_SEED
+from monoforce_ros.synthetic.terrain_shape import GROUNDS
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -39,7 +40,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--commands",
         default="random",
-        metavar="random|steps|sweep|straight|circle|FILE.csv",
+        metavar="random|steps|sweep|straight|circle|spin|FILE.csv",
         help="who drives: random keeps to the world's track, steps tries everything near the start; "
         "a file has the columns t,v,w in s, m/s, rad/s (%(default)s)",
     )
@@ -68,9 +69,9 @@ def build_parser() -> argparse.ArgumentParser:
     shape.add_argument("--bare", action="store_true", help="hills with nothing on them")
     parser.add_argument(
         "--ground",
-        choices=("mixed", "rigid", "grass"),
+        choices=GROUNDS,
         default="mixed",
-        help="some tall grass, none, or grass most of the way (%(default)s)",
+        help="some tall grass, none, grass most of the way, or walls and grass around the start (%(default)s)",
     )
     parser.add_argument(
         "--count", type=int, metavar="N", help="record N bags OUT/SEED of the seeds from --seed on, in parallel"

@@ -11,7 +11,7 @@ import numpy as np
 
 from monoforce_ros.synthetic.route import Route
 
-NAMES = ("random", "steps", "sweep", "straight", "circle")
+NAMES = ("random", "steps", "sweep", "straight", "circle", "spin")
 _MAXIMUM_FILE_BYTES = 10_000_000
 
 
@@ -218,6 +218,8 @@ def make_profile(
         return SweepDriver(fastest)
     if name_or_file == "straight":
         return SteadyCommand(0.7, 0.0)
+    if name_or_file == "spin":
+        return SteadyCommand(0.0, 1.2)
     if name_or_file == "circle":
         return SteadyCommand(0.6, 0.5)
     return CommandTable.read(Path(name_or_file).expanduser())

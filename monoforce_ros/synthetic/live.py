@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from monoforce_ros.bags import builders
+from monoforce_ros.synthetic.course import CourseSettings, build_course
 from monoforce_ros.synthetic.odometry import Odometry, OdometrySettings
 from monoforce_ros.synthetic.random_streams import DEFAULT_SEED, random_stream
 from monoforce_ros.synthetic.recording import CAMERA_PREFIX, LIDAR_FRAME, ODOM_FRAME
@@ -26,6 +27,8 @@ class LiveSettings:
     seed: int = DEFAULT_SEED
     robot: str = "husky"
     terrain: TerrainSettings = field(default_factory=TerrainSettings)
+    course: CourseSettings | None = None
+    """A test track in place of the terrain's world."""
     camera: CameraSettings | None = None
     """None draws no images."""
     lidar: LidarSettings | None = field(default_factory=LidarSettings)
@@ -43,7 +46,10 @@ class LiveWorld:
     def __init__(self, settings: LiveSettings):
         self.settings = settings
         self.robot = Vehicle.load(settings.robot)
-        scenery = build_scenery(settings.terrain, settings.seed)
+        if settings.course is not None:
+            scenery = build_course(settings.course, settings.seed)
+        else:
+            scenery = build_scenery(settings.terrain, settings.seed)
         frames = [frame for frame in self.robot.sensors if frame.startswith(CAMERA_PREFIX)] if settings.camera else []
         view = {frame: settings.camera.vertical_field_of_view for frame in frames} if settings.camera else {}
         model = build_model(scenery, self.robot, settings.seed, view, ())

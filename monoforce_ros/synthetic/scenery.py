@@ -35,6 +35,7 @@ _MORE_GRASS = (
 # Along the route [m], beyond what a short drive sees.
 _KERB_STATIONS = (20.5, 38.0)
 _PATCH_STATIONS = (14.5, 22.5, 27.5, 34.5)
+_YARD_SECTORS = 6
 _HIDING = 0.1
 """Height of grass through which the ground is not seen [m]."""
 _WALLS = 5
@@ -115,6 +116,8 @@ def build_scenery(settings: TerrainSettings, seed: int) -> Scenery:
     if settings.flat or settings.bare:
         ground = build_ground(settings, route, None, random_stream(seed, "ground"))
         return Scenery(ground, route, None, (), (), Grass.grow((), ground, random_stream(seed, "grass")))
+    if settings.ground == "yard":
+        return _build_yard(settings, route, seed)
     ramp = Ramp(*route.at(RAMP_STATION))
     kerbs = _place_kerbs(route, random_stream(seed, "kerbs"))
     ground = build_ground(settings, route, ramp, random_stream(seed, "ground"), kerbs)
@@ -129,6 +132,34 @@ def build_scenery(settings: TerrainSettings, seed: int) -> Scenery:
     other_ground = _place_patches(route, grass, random_stream(seed, "ground patches"))
     walls = _place_walls(ground, route, ramp, rocks, trees, random_stream(seed, "walls"))
     return Scenery(ground, route, ramp, rocks, trees, grass, kerbs, other_ground, walls)
+
+
+def _build_yard(settings: TerrainSettings, route: Route, seed: int) -> Scenery:
+    """Walls and tall grass all around the start, near and far: what a robot that turns on the spot has before it."""
+    random = random_stream(seed, "yard")
+    ground = build_ground(settings, route, None, random_stream(seed, "ground"))
+    walls, patches = [], []
+    for sector in range(_YARD_SECTORS):
+        bearing = 2.0 * np.pi * (sector + random.uniform(0.2, 0.8)) / _YARD_SECTORS
+        there = np.array([np.cos(bearing), np.sin(bearing)])
+        kind = random.choice(["wall", "grass", "nothing"], p=[0.5, 0.3, 0.2])
+        if kind == "wall":
+            size = np.array([random.uniform(1.2, 3.6), 0.25, random.uniform(0.5, 1.3)])
+            facing = bearing + np.pi / 2 + random.uniform(-0.6, 0.6)
+            walls.append(standing_wall(ground, random.uniform(1.5, 4.5) * there, facing, size))
+        elif kind == "grass":
+            length, width = random.uniform(0.8, 1.6), random.uniform(1.0, 2.2)
+            centre = (length + random.uniform(0.8, 3.5)) * there
+            patches.append(GrassPatch(centre, bearing, length, width))
+    grass = Grass.grow(tuple(patches), ground, random_stream(seed, "grass"))
+    return Scenery(ground, route, None, (), (), grass, walls=tuple(walls))
+
+
+def standing_wall(ground: HeightField, centre: np.ndarray, heading: float, size: np.ndarray) -> Wall:
+    """A wall of a length, thickness and height [m] that reaches into the ground."""
+    bottom = float(ground.height_at(centre)) - 0.3
+    shape = shapes.box(size + np.array([0.0, 0.0, 0.3]), heading).moved(np.array([*centre, bottom]))
+    return Wall(centre, float(heading), size, shape)
 
 
 def _place_kerbs(route: Route, random: np.random.Generator) -> tuple[Kerb, ...]:
@@ -171,9 +202,7 @@ def _place_walls(
         centre, heading = route.at(random.uniform(13.0, route.length - 4.0), lateral)
         heading += random.choice([0.0, np.pi / 2]) + random.uniform(-0.2, 0.2)
         size = np.array([random.uniform(1.6, 3.0), 0.25, random.uniform(0.7, 1.3)])
-        bottom = float(ground.height_at(centre)) - 0.3
-        shape = shapes.box(size + np.array([0.0, 0.0, 0.3]), heading).moved(np.array([*centre, bottom]))
-        wall = Wall(centre, float(heading), size, shape)
+        wall = standing_wall(ground, centre, heading, size)
         blocked = (
             wall.contains(*route.points.T, margin=1.0).any()
             or wall.contains(*things.T, margin=0.9).any()

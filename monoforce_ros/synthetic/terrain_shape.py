@@ -15,7 +15,7 @@ from monoforce_ros.synthetic.route import Route
 _HILLS = ((2.6, 0.13), (1.0, 0.045), (0.35, 0.010))
 _LEVEL_RADIUS = 1.0
 _RIM_WIDTH = 6.0
-GROUNDS = ("mixed", "rigid", "grass")
+GROUNDS = ("mixed", "rigid", "grass", "yard")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,7 +28,8 @@ class TerrainSettings:
         roughness: factor on the height of the hills [-].
         flat: level ground with nothing on it: no hills, ramp, rocks, trees or grass.
         bare: hills with nothing on them.
-        ground: ``mixed`` (patches of tall grass here and there), ``rigid`` (no grass) or ``grass`` (most of the way).
+        ground: ``mixed`` (patches of tall grass here and there), ``rigid`` (no grass), ``grass`` (most of the way),
+            or ``yard`` (hills with walls and grass around the start).
     """
 
     size: float = 40.0

@@ -1,0 +1,169 @@
+"""A wall ahead (the paper's Figure 9): which terrain encoders predict the crash, and what happens in the simulator.
+
+    scripts/run.sh python benchmarks/wall.py --monoforce FILE [--no-geometric FILE] [--lss FILE] [--count 12]
+        [--json FILE] [--png FILE] [--docs FILE]
+
+A robot stands before a wall, sees it once, and is told to drive straight on for five seconds. The simulator drives and
+is stopped; each encoder's prediction from that one image drives on its map. Whether a wall stands there at all is drawn
+by lot, so that an encoder that always predicts a crash is found out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from tqdm import tqdm
+
+from monoforce_ros.encoder import fused, load_encoder
+from monoforce_ros.evaluation.report import write_text
+from monoforce_ros.messages import decoding
+from monoforce_ros.prediction import CameraTerrain, LidarTerrain, Observation, Prediction, Predictor
+from monoforce_ros.robots import load_robot
+from monoforce_ros.synthetic.course import CourseSettings
+from monoforce_ros.synthetic.live import LiveSettings, LiveWorld
+from monoforce_ros.synthetic.random_streams import random_stream
+from monoforce_ros.synthetic.sensors import CameraSettings
+from monoforce_ros.terrain import Grid, TerrainDefaults
+
+SPEED, HORIZON = 0.8, 5.0
+STOPPED = 0.7
+"""A robot that gets less far than this share of the way it was told to go has run into something."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What the robot saw, and how far it then came."""
+
+    observation: Observation
+    start: object
+    wall: float | None
+    image: np.ndarray
+    driven: float
+
+
+def scene(seed: int) -> Scene:
+    """Drive one course in the simulator."""
+    random = random_stream(seed, "wall ahead")
+    wall = float(random.uniform(2.0, 3.2)) if random.random() < 0.6 else None
+    course = replace(
+        CourseSettings.draw(seed), wall=wall, grass=None, wall_width=4.0, roughness=float(random.uniform(0.1, 0.5))
+    )
+    world = LiveWorld(LiveSettings(seed=seed, course=course, camera=CameraSettings()))
+    try:
+        stamp = 10**9
+        state, _, _ = decoding.decode_odometry(world.odometry(stamp))
+        cloud = decoding.decode_cloud(world.cloud(stamp))
+        frame, message, info = next(iter(world.images(stamp)))
+        image, camera = decoding.decode_image(message), decoding.decode_camera_info(info)
+        robot = load_robot("husky")
+        lidar = robot.sensors["lidar"].double().numpy()
+        observation = Observation(
+            stamp, cloud=(cloud @ lidar[:3, :3].T + lidar[:3, 3]).astype(np.float32), images={frame: image},
+            cameras={frame: camera}, base_from_cameras={frame: robot.sensors[frame].double().numpy()},
+        )  # fmt: skip
+        world.simulation.drive(SPEED, 0.0)
+        world.advance(world.time + HORIZON)
+        end, _, _ = decoding.decode_odometry(world.odometry(stamp))
+    finally:
+        world.close()
+    return Scene(observation, state, wall, image, float(np.linalg.norm(end.position[:2] - state.position[:2])))
+
+
+def predicted(predictor: Predictor, found: Scene) -> tuple[float, Prediction]:
+    """How far a prediction drives [m]."""
+    twists = np.zeros((predictor.history + predictor.steps, 2))
+    twists[predictor.history :, 0] = SPEED
+    prediction = predictor.predict(found.observation, found.start, twists)
+    places = prediction.positions()
+    return float(np.linalg.norm(places[-1, :2] - places[0, :2])), prediction
+
+
+def draw(scenes: list[Scene], maps: dict[str, Prediction], titles: dict[str, str]) -> Figure:
+    """The nearest wall: the image, and each map's heights along the way with where the robot ends."""
+    figure = Figure(figsize=(11, 3.6), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=[1, 1.7])
+    shown = next(s for s in scenes if s.wall is not None)
+    left.imshow(shown.image)
+    left.set_axis_off()
+    left.set_title("what the robot sees")
+    for (key, prediction), colour in zip(maps.items(), ("#1b7f5c", "#c4531d", "#5b4bb7", "#888888"), strict=False):
+        grid, height = prediction.terrain.grid, prediction.terrain.height.numpy()
+        row = int(np.argmin(np.abs(np.asarray(grid.y))))
+        ahead = np.asarray(grid.x) > -0.5
+        right.plot(np.asarray(grid.x)[ahead], height[row, ahead], color=colour, label=titles[key])
+        local = prediction.rollout.position[0].numpy()
+        right.plot(*local[-1, [0, 2]], "o", color=colour, markersize=9)
+    right.axvline(shown.wall, color="black", linestyle="--", linewidth=1, label="the wall")
+    right.plot(shown.driven, 0.0, "kx", markersize=10, label="where the simulator ends")
+    right.set(xlabel="ahead [m]", ylabel="height that carries [m]", xlim=(-0.5, 5.0))
+    right.set_title("predicted ground; dots: where the predicted robot is after 5 s")
+    right.legend(fontsize=8, loc="upper left")
+    return figure
+
+
+def main() -> None:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    titles = {
+        "monoforce": "MonoForce", "no_geometric": "without geometric loss", "lss": "LSS (H_g alone)",
+        "lidar": "lidar interpolation",
+    }  # fmt: skip
+    for key in ("monoforce", "no_geometric", "lss"):
+        parser.add_argument(f"--{key.replace('_', '-')}", type=Path, metavar="FILE.safetensors")
+    parser.add_argument("--robot", default="husky", help="name or file (%(default)s)")
+    parser.add_argument("--count", type=int, default=24, help="scenes (%(default)s)")
+    parser.add_argument("--seed", type=int, default=70000)
+    for name in ("json", "png", "docs"):
+        parser.add_argument(f"--{name}", type=Path)
+    options = parser.parse_args()
+    torch.set_num_threads(2)
+    robot = load_robot(options.robot)
+    sources = {
+        key: CameraTerrain(fused(load_encoder(getattr(options, key))), robot)
+        for key in ("monoforce", "no_geometric", "lss")
+        if getattr(options, key)
+    }
+    sources["lidar"] = LidarTerrain(robot, Grid.square(), TerrainDefaults())
+    predictors = {key: Predictor(robot, source, horizon=HORIZON) for key, source in sources.items()}
+    scenes = [scene(options.seed + i) for i in tqdm(range(options.count), desc="scenes")]
+    truth = np.array([s.driven < STOPPED * SPEED * HORIZON for s in scenes])
+    rows, shown = [], {}
+    for key, predictor in predictors.items():
+        driven = np.array([predicted(predictor, s)[0] for s in scenes])
+        crash = driven < STOPPED * SPEED * HORIZON
+        ends = np.array([s.driven for s in scenes])
+        rows.append({
+            "system": titles[key], "walls": int(truth.sum()), "crashes_predicted": int((crash & truth).sum()),
+            "open": int((~truth).sum()), "false_crashes": int((crash & ~truth).sum()),
+            "stop_error_m": float(np.median(np.abs(driven - ends)[truth])) if truth.any() else None,
+        })  # fmt: skip
+        first = next((s for s in scenes if s.wall is not None), None)
+        if first is not None:
+            shown[key] = predicted(predictor, first)[1]
+    lines = ["| terrain | crashes predicted | false crashes | where it stops, median error |", "|---|---|---|---|"]
+    lines += [
+        f"| {r['system']} | {r['crashes_predicted']} of {r['walls']} | {r['false_crashes']} of {r['open']} | "
+        f"{r['stop_error_m']:.2f} m |"
+        for r in rows
+    ]
+    print("\n".join(lines))
+    if options.json:
+        write_text(options.json, json.dumps({"scenes": options.count, "rows": rows}, indent=1))
+    if options.png and shown:
+        options.png.parent.mkdir(parents=True, exist_ok=True)
+        draw(scenes, shown, titles).savefig(options.png, dpi=130)
+    if options.docs:
+        before, _, rest = options.docs.read_text(encoding="utf-8").partition("<!-- wall -->")
+        after = rest.partition("<!-- end of wall -->")[2]
+        table = "\n".join(lines)
+        write_text(options.docs, f"{before}<!-- wall -->\n{table}\n<!-- end of wall -->{after}")
+
+
+if __name__ == "__main__":
+    main()
