@@ -5,7 +5,7 @@
 A process like a robot's drivers publishes raw images or clouds at 10 Hz, odometry at 50 Hz and commands at 20 Hz, all
 stamped with the time at which they are published; latency is the time from a stamp until the path that carries it
 arrives back. `overload` sends images at ten times the rate: latency must not grow, and what is dropped is counted.
-`--endurance MINUTES` plays on instead and says how memory and threads develop.
+`--endurance MINUTES` plays the demo bag in a loop at twice its speed instead and says how memory and threads develop.
 """
 
 from __future__ import annotations
@@ -189,13 +189,9 @@ class Predictor:
     def __init__(self, case: Case, folder: Path, frames: list[str]):
         executable = ROOT / "install" / "monoforce_ros" / "lib" / "monoforce_ros" / "predictor"
         source = "camera" if case.cameras else "lidar"
-        listed = ",".join(f"{frame}/image_raw" for frame in frames) or "none"
-        parameters = [
-            f"terrain_source:={source}",
-            f"robot:={four_camera_robot(folder)}",
-            f"image_topics:=[{listed}]",
-            *case.parameters,
-        ]
+        parameters = [f"terrain_source:={source}", f"robot:={four_camera_robot(folder)}", *case.parameters]
+        if frames:
+            parameters.append(f"image_topics:=[{','.join(f'{frame}/image_raw' for frame in frames)}]")
         command = [str(executable), "--ros-args", *(word for p in parameters for word in ("-p", p))]
         log = folder / f"{case.name}.log"
         with log.open("w") as output:
@@ -252,26 +248,78 @@ def measure(case: Case, seconds: float, folder: Path) -> dict:
     return row
 
 
+class Listener:
+    """Counts paths."""
+
+    def __init__(self):
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.qos import QoSProfile
+
+        os.environ |= ENVIRONMENT
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context)
+        self.node = rclpy.create_node("listener", context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.count = 0
+        path = message_class("nav_msgs/msg/Path")
+        self.node.create_subscription(path, "predicted/path", self._on_path, QoSProfile(depth=10), raw=True)
+
+    def _on_path(self, _: bytes) -> None:
+        self.count += 1
+
+    def run(self, seconds: float) -> int:
+        """Listen for a while; returns how many paths came."""
+        before, end = self.count, time.monotonic() + seconds
+        while time.monotonic() < end:
+            self.executor.spin_once(timeout_sec=0.2)
+        return self.count - before
+
+    def close(self) -> None:
+        """End the node."""
+        import rclpy
+
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self.context)
+
+
 def endure(case: Case, minutes: float, folder: Path) -> dict:
-    """Run one case for long; memory and threads every tenth of the time."""
-    frames = [f"camera_{side}" for side in _SIDES[: case.cameras]]
-    predictor = Predictor(case, folder, frames)
-    source = Source(case, frames)
-    source.run(10.0)
+    """Play the demo bag in a loop at twice its speed; memory and threads at each tenth of the time."""
+    predictor = Predictor(case, folder, [])
+    player = ROOT / "install" / "monoforce_ros" / "lib" / "monoforce_ros" / "bag_player"
+    bag = subprocess.Popen(
+        [str(player), str(ROOT / "bags" / "demo"), "--loop", "--rate", "2"],
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=os.environ | ENVIRONMENT,
+    )  # fmt: skip
+    listener = Listener()
     samples = []
-    for part in range(10):
-        count = len(source.latencies)
-        source.run(6.0 * minutes)
-        memory, threads = predictor.state()
-        values = np.array(source.latencies[count:])
-        samples.append({
-            "minute": (part + 1) * minutes / 10, "memory_mb": memory, "threads": threads, "paths": len(values),
-            "p95_ms": float(np.percentile(values, 95)) if len(values) else None,
-        })  # fmt: skip
-        print(f"  {samples[-1]['minute']:.1f} min: {memory:.0f} MB, {threads} threads, {len(values)} paths, "
-              f"p95 {samples[-1]['p95_ms']:.0f} ms", flush=True)  # fmt: skip
-    source.close()
-    return {"case": case.name, "minutes": minutes, "samples": samples, "exit_status": predictor.stop()}
+    try:
+        # Libraries, kernels and caches of the first seconds are no leak.
+        listener.run(12.0)
+        for part in range(10):
+            paths = listener.run(6.0 * minutes)
+            memory, threads = predictor.state()
+            samples.append(
+                {"minute": (part + 1) * minutes / 10, "memory_mb": memory, "threads": threads, "paths": paths}
+            )
+            print(f"  {samples[-1]['minute']:.1f} min: {memory:.0f} MB, {threads} threads, {paths} paths", flush=True)
+    finally:
+        listener.close()
+        bag.send_signal(signal.SIGINT)
+        player_status = bag.wait(timeout=30)
+        status = predictor.stop()
+    return {"case": case.name, "minutes": minutes, "samples": samples, "exit_status": [status, player_status]}
+
+
+def endurance_table(found: dict) -> str:
+    """As Markdown."""
+    lines = ["| minute | memory | threads | paths |", "|---|---|---|---|"]
+    lines += [
+        f"| {s['minute']:.1f} | {s['memory_mb']:.0f} MB | {s['threads']} | {s['paths']} |" for s in found["samples"]
+    ]
+    return "\n".join(lines)
 
 
 def table(rows: list[dict]) -> str:
@@ -289,20 +337,32 @@ def table(rows: list[dict]) -> str:
     return "\n".join(lines)
 
 
+def into_document(document: Path, name: str, text: str) -> None:
+    """Put a table between a document's marks."""
+    before, _, rest = document.read_text(encoding="utf-8").partition(f"<!-- {name} -->")
+    after = rest.partition(f"<!-- end of {name} -->")[2]
+    write_text(document, f"{before}<!-- {name} -->\n{text}\n<!-- end of {name} -->{after}")
+
+
 def main() -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=20.0, help="of each case (%(default)s)")
     parser.add_argument("--only", nargs="+", choices=[case.name for case in CASES], metavar="NAME")
-    parser.add_argument("--endurance", type=float, metavar="MINUTES", help="one case (camera) for so long instead")
+    parser.add_argument(
+        "--endurance", type=float, metavar="MINUTES", help="the bag in a loop at 2x for so long instead"
+    )
     parser.add_argument("--json", type=Path)
     parser.add_argument("--docs", type=Path, help="write the table between this document's `<!-- latency -->` marks")
     options = parser.parse_args()
     cases = [case for case in CASES if not options.only or case.name in options.only]
     with tempfile.TemporaryDirectory() as folder:
         if options.endurance:
-            case = cases[0] if options.only else next(c for c in CASES if c.name == "camera_candidates")
-            result = {"endurance": endure(case, options.endurance, Path(folder))}
+            case = Case("endurance", "", cameras=1, parameters=("candidates:=8", "ensemble:=8"))
+            found = endure(case, options.endurance, Path(folder))
+            result = {"endurance": found}
+            if options.docs:
+                into_document(options.docs, "endurance", endurance_table(found))
         else:
             rows = []
             for case in cases:
@@ -313,9 +373,7 @@ def main() -> None:
                       f"{row['dropped']} dropped", flush=True)  # fmt: skip
             result = {"machine": platform.processor() or platform.machine(), "cores": os.cpu_count(), "rows": rows}
             if options.docs:
-                before, _, rest = options.docs.read_text(encoding="utf-8").partition("<!-- latency -->")
-                after = rest.partition("<!-- end of latency -->")[2]
-                write_text(options.docs, f"{before}<!-- latency -->\n{table(rows)}\n<!-- end of latency -->{after}")
+                into_document(options.docs, "latency", table(rows))
     if options.json:
         write_text(options.json, json.dumps(result, indent=1))
 

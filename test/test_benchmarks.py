@@ -62,3 +62,36 @@ def test_the_encoder_benchmark_writes_its_figures(tmp_path):
     for count in (1, 4):
         row = figures[f"{count} cameras"]
         assert row["fused_ms"] > 0 and row["ratio"] > 0 and all(v > 0 for v in row["stages_ms"].values())
+
+
+def test_a_minute_of_a_bag_in_a_loop_leaves_memory_and_threads_as_they_were(start, tmp_path):
+    """Half an hour of it is a benchmark; `start` has the node's tests run by themselves."""
+    out = tmp_path / "node.json"
+    done = subprocess.run(
+        [sys.executable, "benchmarks/node.py", "--endurance", "1", "--json", str(out)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=200,
+    )
+    assert done.returncode == 0, done.stderr
+    found = json.loads(out.read_text())["endurance"]
+    samples = found["samples"]
+    assert found["exit_status"] == [0, 0]
+    assert all(sample["paths"] > 0 for sample in samples)
+    assert samples[-1]["threads"] <= samples[0]["threads"]
+    assert samples[-1]["memory_mb"] < 1.08 * samples[0]["memory_mb"]
+
+
+def test_latency_is_measured_between_processes(start, tmp_path):
+    out = tmp_path / "node.json"
+    done = subprocess.run(
+        [sys.executable, "benchmarks/node.py", "--only", "lidar", "--seconds", "3", "--json", str(out)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    (row,) = json.loads(out.read_text())["rows"]
+    assert row["paths"] >= 5 and 0 < row["p50_ms"] <= row["p95_ms"] <= row["p99_ms"] and row["exit_status"] == 0

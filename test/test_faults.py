@@ -7,6 +7,7 @@ import time
 
 import pytest
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
 from std_msgs.msg import String
 
 from monoforce_ros.bags import BagReader, builders
@@ -71,6 +72,43 @@ def test_a_recorder_whose_disk_is_full_keeps_what_it_has_and_says_where(executab
     assert "too large" in text and f"lies in {left} and can be read as it is" in text and "Traceback" not in text
     with BagReader(left) as bag:
         assert len(list(bag.messages(["/noise"]))) >= 2
+
+
+def test_a_report_that_the_disk_does_not_hold_leaves_the_old_one(executables, demo_bag, tmp_path):
+    (tmp_path / "report.html").write_text("the old one")
+    command = f"ulimit -f 60; exec {executables / 'evaluate'} {demo_bag} --terrain flat --out {tmp_path} --stride 2"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 1, done.stderr
+    assert "too large" in done.stderr and "Traceback" not in done.stderr
+    assert (tmp_path / "report.html").read_text() == "the old one"
+    assert not list(tmp_path.glob(".*unfinished*"))
+
+
+def test_simulated_time_that_starts_over_is_said_and_lived_with(start, peer):
+    """`use_sim_time` with a /clock that goes back, as a looping bag brings it."""
+    node = start("predictor", "--ros-args", "-p", "use_sim_time:=true", "-r", "__node:=dreaming")
+    node.wait_for("predicting 5 s ahead for husky")
+    clock = peer.node.create_publisher(Clock, "/clock", 10)
+
+    def drive(seconds: float) -> None:
+        for _ in range(round(2 * seconds)):
+            message = Clock()
+            message.clock.sec, message.clock.nanosec = divmod(peer.now, 10**9)
+            clock.publish(message)
+            peer.drive(0.5)
+
+    before = peer.now
+    peer.clear()
+    drive(2.5)
+    first = len(peer.received["/predicted/path"])
+    assert first
+    peer.now = before - 100 * 10**9
+    peer.clear()
+    drive(4.0)
+    assert peer.received["/predicted/path"]
+    stamps = [m.header.stamp.sec for m in peer.received["/predicted/path"]]
+    assert all(stamp < before // 10**9 for stamp in stamps[-3:])
+    assert "time went back" in node.output and node.stop() == 0
 
 
 def test_a_node_refuses_a_checkpoint_cut_in_half(start, tmp_path):
