@@ -25,7 +25,7 @@ from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
 
-from monoforce_ros.evaluation.report import write_text
+from monoforce_ros.evaluation.report import write_between, write_text
 from monoforce_ros.synthetic.course import CourseSettings
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -156,8 +156,12 @@ def main() -> None:
             with tempfile.TemporaryDirectory() as folder:
                 rows.append(drive(seed, source, options.robot, options.checkpoint, options.seconds, Path(folder)))
             row = rows[-1]
-            print(f"{source} {seed}: {'reached' if row['reached'] else 'not reached'} after {row['seconds']:.0f} s, "
-                  f"{row['left_m']:.1f} m left, {'touched' if row['wall_touched'] else 'clear of'} the wall", flush=True)  # fmt: skip
+            end = "reached" if row["reached"] else "not reached"
+            wall = "touched" if row["wall_touched"] else "clear of"
+            print(
+                f"{source} {seed}: {end} after {row['seconds']:.0f} s, {row['left_m']:.1f} m left, {wall} the wall",
+                flush=True,
+            )
     lines = ["| terrain from | goal reached | wall touched | came through the grass | median time |", "|---" * 5 + "|"]
     for source in options.source:
         mine = [row for row in rows if row["source"] == source]
@@ -172,9 +176,7 @@ def main() -> None:
     if options.json:
         write_text(options.json, json.dumps({"rows": rows}, indent=1))
     if options.docs:
-        before, _, rest = options.docs.read_text(encoding="utf-8").partition("<!-- closed loop -->")
-        after = rest.partition("<!-- end of closed loop -->")[2]
-        write_text(options.docs, f"{before}<!-- closed loop -->\n{text}\n<!-- end of closed loop -->{after}")
+        write_between(options.docs, "closed loop", text)
 
 
 if __name__ == "__main__":

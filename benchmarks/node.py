@@ -28,7 +28,7 @@ import yaml
 
 from monoforce_ros.bags import Recording, builders
 from monoforce_ros.bags.types import type_store
-from monoforce_ros.evaluation.report import write_text
+from monoforce_ros.evaluation.report import write_between, write_text
 from monoforce_ros.messages.message_types import message_class
 from monoforce_ros.robots import robot_file
 
@@ -337,13 +337,6 @@ def table(rows: list[dict]) -> str:
     return "\n".join(lines)
 
 
-def into_document(document: Path, name: str, text: str) -> None:
-    """Put a table between a document's marks."""
-    before, _, rest = document.read_text(encoding="utf-8").partition(f"<!-- {name} -->")
-    after = rest.partition(f"<!-- end of {name} -->")[2]
-    write_text(document, f"{before}<!-- {name} -->\n{text}\n<!-- end of {name} -->{after}")
-
-
 def main() -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -362,7 +355,7 @@ def main() -> None:
             found = endure(case, options.endurance, Path(folder))
             result = {"endurance": found}
             if options.docs:
-                into_document(options.docs, "endurance", endurance_table(found))
+                write_between(options.docs, "endurance", endurance_table(found))
         else:
             rows = []
             for case in cases:
@@ -373,7 +366,7 @@ def main() -> None:
                       f"{row['dropped']} dropped", flush=True)  # fmt: skip
             result = {"machine": platform.processor() or platform.machine(), "cores": os.cpu_count(), "rows": rows}
             if options.docs:
-                into_document(options.docs, "latency", table(rows))
+                write_between(options.docs, "latency", table(rows))
     if options.json:
         write_text(options.json, json.dumps(result, indent=1))
 

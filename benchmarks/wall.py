@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from monoforce_ros.encoder import fused, load_encoder
-from monoforce_ros.evaluation.report import write_text
+from monoforce_ros.evaluation.report import write_between, write_text
 from monoforce_ros.messages import decoding
 from monoforce_ros.prediction import CameraTerrain, LidarTerrain, Observation, Prediction, Predictor
 from monoforce_ros.robots import load_robot
@@ -159,10 +159,7 @@ def main() -> None:
         options.png.parent.mkdir(parents=True, exist_ok=True)
         draw(scenes, shown, titles).savefig(options.png, dpi=130)
     if options.docs:
-        before, _, rest = options.docs.read_text(encoding="utf-8").partition("<!-- wall -->")
-        after = rest.partition("<!-- end of wall -->")[2]
-        table = "\n".join(lines)
-        write_text(options.docs, f"{before}<!-- wall -->\n{table}\n<!-- end of wall -->{after}")
+        write_between(options.docs, "wall", "\n".join(lines))
 
 
 if __name__ == "__main__":

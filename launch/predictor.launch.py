@@ -1,34 +1,57 @@
-"""Start the predictor: ``ros2 launch monoforce_ros predictor.launch.py robot:=husky terrain_source:=lidar``."""
+"""Start the predictor, and what drives by it.
 
-from launch.actions import DeclareLaunchArgument
+``ros2 launch monoforce_ros predictor.launch.py robot:=husky terrain_source:=lidar candidates:=32 path_selector:=true``
+"""
+
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from launch import LaunchDescription
+from launch import LaunchContext, LaunchDescription
 
+# Name of an argument: default, type of the predictor's parameter of that name (None for what is none), meaning.
 ARGUMENTS = {
-    "robot": ("husky", "robot model, a shipped name or a file"),
-    "terrain_source": ("lidar", "lidar, camera or flat"),
-    "checkpoint": ("", "terrain encoder weights, for terrain_source:=camera"),
-    "namespace": ("", "namespace of the node and its topics"),
+    "robot": ("husky", str, "robot model, a shipped name or a file"),
+    "terrain_source": ("lidar", str, "lidar, camera or flat"),
+    "checkpoint": ("", str, "terrain encoder weights, for terrain_source:=camera"),
+    "cloud_topic": ("points", str, "sensor_msgs/PointCloud2, for terrain_source:=lidar"),
+    "odometry_topic": ("odom", str, "nav_msgs/Odometry"),
+    "command_topic": ("cmd_vel", str, "geometry_msgs/TwistStamped or Twist"),
+    "candidates": ("0", int, "number of candidate commands; 0 compares none"),
+    "ensemble": ("0", int, "members of the ensemble that tells how sure a prediction is; 0 tells nothing"),
+    "autostart": ("true", bool, "false leaves configuring and activating to a lifecycle manager"),
+    "use_sim_time": ("false", bool, "take the time from /clock"),
+    "params_file": ("", None, "YAML file with further parameters, which go before the arguments"),
+    "namespace": ("", None, "namespace of the nodes and their topics, for several robots"),
+    "path_selector": ("false", None, "also start path_selector, which drives to goal_pose by the candidates"),
 }
 
 
+def _typed(text: str, kind: type) -> str | int | bool:
+    if kind is bool:
+        if text.lower() not in ("true", "false"):
+            raise ValueError(f"got {text!r}, expected true or false")
+        return text.lower() == "true"
+    return kind(text)
+
+
+def _nodes(context: LaunchContext) -> list[Node]:
+    """The nodes for the arguments as they were given."""
+    given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
+    parameters = {name: _typed(given[name], kind) for name, (_, kind, _) in ARGUMENTS.items() if kind is not None}
+    common = {"package": "monoforce_ros", "namespace": given["namespace"], "output": "screen"}
+    files = [given["params_file"]] if given["params_file"] else []
+    nodes = [Node(executable="predictor", name="predictor", parameters=[parameters, *files], **common)]
+    if _typed(given["path_selector"], bool):
+        shared = {name: parameters[name] for name in ("use_sim_time", "odometry_topic", "command_topic")}
+        nodes.append(Node(executable="path_selector", name="path_selector", parameters=[shared, *files], **common))
+    return nodes
+
+
 def generate_launch_description() -> LaunchDescription:
-    """One predictor with its most used parameters as launch arguments."""
-    parameters = {name: LaunchConfiguration(name) for name in ARGUMENTS if name != "namespace"}
-    return LaunchDescription(
-        [
-            *(
-                DeclareLaunchArgument(name, default_value=default, description=meaning)
-                for name, (default, meaning) in ARGUMENTS.items()
-            ),
-            Node(
-                package="monoforce_ros",
-                executable="predictor",
-                namespace=LaunchConfiguration("namespace"),
-                parameters=[parameters],
-                output="screen",
-            ),
-        ]
-    )
+    """The predictor with its most used parameters as arguments, and path_selector where it is asked for."""
+    declared = [
+        DeclareLaunchArgument(name, default_value=default, description=meaning)
+        for name, (default, _, meaning) in ARGUMENTS.items()
+    ]
+    return LaunchDescription([*declared, OpaqueFunction(function=_nodes)])

@@ -52,7 +52,9 @@ if [ "$what" = tables ]; then
   worlds test_grass grass 61000 8
   others() {
     train no_geometric 800 --losses terrain trajectory &&
-      train lidar_network 400 --sensor lidar --losses geometric
+      train lidar_network 400 --sensor lidar --losses geometric &&
+      until [ -f out/encoders/geometric/training.json ]; do sleep 5; done &&
+      train lss 600 --losses geometric --start-from out/encoders/geometric/encoder.safetensors
   }
   beside out/encoders/others.log others &
   other=$!
@@ -69,7 +71,6 @@ mv models/.husky_in_grass.yaml models/husky_in_grass.yaml
 ls -l models
 [ "$what" = tables ] || exit 0
 
-train lss 600 --losses geometric --start-from out/encoders/geometric/encoder.safetensors
 wait "$other"
 run evaluate --tables --rigid "$worlds/test_rigid" --grass "$worlds/test_grass" --out out/tables --docs docs/training.md \
   --robot out/encoders/monoforce/robot.yaml \

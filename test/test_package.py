@@ -1,5 +1,6 @@
 """The package as ROS tooling sees it, and the documents that are made from its files."""
 
+import ast
 import re
 import subprocess
 import sys
@@ -148,3 +149,21 @@ def test_the_set_up_says_what_to_install_where_there_is_no_python(tmp_path):
     )
     assert ended.returncode == 1
     assert "No working Python 3.12" in ended.stderr and "apt install python3.12" in ended.stderr
+
+
+def test_launch_arguments_are_parameters_with_their_defaults():
+    """ROS's launch is not on PyPI: the file is read here, not run."""
+    tree = ast.parse((ROOT / "launch" / "predictor.launch.py").read_text())
+    (table,) = [n.value for n in tree.body if isinstance(n, ast.Assign) and n.targets[0].id == "ARGUMENTS"]
+    known = {entry.name: entry for entry in read_parameter_file(ROOT / "config" / "predictor.yaml")}
+    kinds = {"str": "string", "int": "integer", "bool": "bool"}
+    seen = set()
+    for key, value in zip(table.keys, table.values, strict=True):
+        default, kind, meaning = value.elts
+        if isinstance(kind, ast.Constant) or key.value == "use_sim_time":
+            continue
+        entry = known[key.value]
+        seen.add(key.value)
+        assert kinds[kind.id] == entry.type and default.value == str(entry.default).replace("True", "true")
+        assert len(meaning.value) > 5
+    assert {"robot", "terrain_source", "candidates", "autostart"} <= seen

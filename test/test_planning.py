@@ -17,6 +17,7 @@ from monoforce_ros.planning import (
     choose,
     fan_of_arcs,
     occupancy,
+    way_to_goal,
 )
 from monoforce_ros.planning.candidates import over_horizon
 from monoforce_ros.robots import load_robot
@@ -183,3 +184,43 @@ def test_the_choice_weighs_cost_against_the_way_left():
     assert choose(candidates | {"cost": np.full(4, np.inf)}, robot, np.array([8.0, 0.0])) is None
     with pytest.raises(ValueError, match="fields \\['cost'\\] are missing"):
         choose({k: v for k, v in candidates.items() if k != "cost"}, robot, np.zeros(2))
+
+
+def test_the_way_to_a_goal_leads_around_a_wall():
+    data = np.zeros((100, 100), np.int8)
+    # Cells of 0.1 m from (-5, -5): a wall at x = 1 from y = -3 to the upper border.
+    data[20:, 60:63] = 100
+    goal = np.array([3.0, 1.0])
+    ways = way_to_goal(data, 0.1, np.array([-5.0, -5.0]), goal, radius=0.3)
+    behind, before = float(ways.at(np.array([2.0, 1.0]))), float(ways.at(np.array([0.0, 1.0])))
+    assert behind == pytest.approx(1.0, abs=0.2)
+    # Around the wall's lower end, not through it.
+    around = np.hypot(1.0, 4.3) + np.hypot(2.0, 4.3)
+    assert before == pytest.approx(around, rel=0.15)
+    free = way_to_goal(np.zeros_like(data), 0.1, np.array([-5.0, -5.0]), goal, radius=0.3)
+    assert float(free.at(np.array([0.0, 1.0]))) == pytest.approx(3.0, abs=0.2)
+    # A goal beyond the map, and a place off it.
+    far = way_to_goal(np.zeros_like(data), 0.1, np.array([-5.0, -5.0]), np.array([9.0, 0.0]), radius=0.3)
+    assert float(far.at(np.array([0.0, 0.0]))) == pytest.approx(9.0, abs=0.4)
+    assert float(far.at(np.array([8.0, 0.0]))) == pytest.approx(1.0)
+    # A robot that stands too near to the wall still finds away from it.
+    assert np.isfinite(ways.length).all()
+    assert float(ways.at(np.array([0.85, 0.0]))) > float(ways.at(np.array([0.5, 0.0])))
+    with pytest.raises(ValueError, match="costmap"):
+        way_to_goal(np.zeros((0, 4)), 0.1, np.zeros(2), goal, radius=0.3)
+
+
+def test_the_choice_goes_around_what_lies_between():
+    """Straight on ends nearer to the goal, but before a wall; to the right leads around it."""
+    data = np.zeros((100, 100), np.int8)
+    data[30:, 70:73] = 100
+    goal = np.array([4.0, 0.0])
+    ways = way_to_goal(data, 0.1, np.array([-5.0, -5.0]), goal, radius=0.3)
+    ends = {"x": [1.2, 0.9], "y": [0.0, -0.9], "heading": [0.0, -0.8], "speed": [0.5, 0.5], "yaw_rate": [0.0, -0.5],
+            "cost": [0.2, 0.2], "feasible": [1.0, 1.0]}  # fmt: skip
+    for share in (25, 50, 75):
+        ends |= {f"{axis}_{share}": [share / 100 * v for v in ends[axis]] for axis in "xy"}
+    candidates = {name: np.array(values) for name, values in ends.items()}
+    weights = ChoiceWeights(heading=0.0)
+    assert choose(candidates, np.zeros(2), goal, weights) == 0
+    assert choose(candidates, np.zeros(2), goal, weights, ways) == 1

@@ -95,6 +95,20 @@ def write_text(path: Path, text: str) -> None:
         raise
 
 
+def write_between(document: Path, name: str, text: str) -> None:
+    """Put a text into a document, between its comments ``<!-- NAME -->`` and ``<!-- end of NAME -->``.
+
+    Raises:
+        ValueError: the document has no such comments.
+    """
+    content = document.read_text(encoding="utf-8")
+    begin, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
+    if begin not in content or end not in content:
+        raise ValueError(f"{document}: no {begin} and {end} to write between")
+    before, _, rest = content.partition(begin)
+    write_text(document, f"{before}{begin}\n{text.strip()}\n{end}{rest.partition(end)[2]}")
+
+
 def figure_png(figure: Figure) -> bytes:
     """A figure as PNG."""
     buffer = io.BytesIO()

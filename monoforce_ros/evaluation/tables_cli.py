@@ -16,7 +16,7 @@ from tqdm import tqdm
 from monoforce_ros.bags import BagError
 from monoforce_ros.encoder import CheckpointError
 from monoforce_ros.evaluation.drive import EvaluationError
-from monoforce_ros.evaluation.report import write_text
+from monoforce_ros.evaluation.report import write_between, write_text
 from monoforce_ros.evaluation.tables import CONSTANT, FLAT, LIDAR, SequenceErrors, System, evaluate_sequence
 from monoforce_ros.evaluation.tables_report import comparison, markdown, page
 from monoforce_ros.robots import RobotFileError, load_robot, shipped_robots
@@ -71,9 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     write_text(options.out / "tables.md", text)
     write_text(options.out / "tables.html", page(found, systems, {k: [b.name for b in v] for k, v in grounds.items()}))
     if options.docs is not None:
-        before, _, rest = options.docs.read_text(encoding="utf-8").partition("<!-- tables -->\n")
-        _, _, after = rest.partition("<!-- end of tables -->")
-        write_text(options.docs, f"{before}<!-- tables -->\n{text}\n<!-- end of tables -->{after}")
+        write_between(options.docs, "tables", text)
     print(text)
     print(f"\n{options.out / 'tables.html'}")
     return 0

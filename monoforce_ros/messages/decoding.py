@@ -256,6 +256,26 @@ def decode_sequences(message: Any, most: int) -> np.ndarray:
     return values[offset:].reshape(sizes).astype(np.float64)
 
 
+def decode_occupancy(message: Any) -> tuple[np.ndarray, float, np.ndarray]:
+    """``nav_msgs/OccupancyGrid`` → costs ``[rows, columns]`` int8, edge of a cell [m], corner of the first ``[2]`` [m].
+
+    Raises:
+        MessageError: sizes do not fit, or the grid is turned, which costmaps are not.
+    """
+    info = message.info
+    rows, columns = int(info.height), int(info.width)
+    data = np.asarray(message.data, np.int8)
+    if not 1 <= rows * columns <= MAXIMUM_IMAGE_PIXELS or data.size != rows * columns:
+        raise MessageError(f"occupancy grid: got {data.size} cells, expected {rows} rows of {columns}")
+    corner = np.array([info.origin.position.x, info.origin.position.y], float)
+    resolution = float(info.resolution)
+    if not (np.isfinite(corner).all() and 1e-3 <= resolution <= 100.0):
+        raise MessageError(f"occupancy grid: cells of {resolution} m from {corner.tolist()}, expected finite numbers")
+    if abs(float(info.origin.orientation.w)) < 0.9999:
+        raise MessageError("occupancy grid: it is turned, expected axes along those of its frame")
+    return data.reshape(rows, columns), resolution, corner
+
+
 def decode_transforms(message: Any) -> dict[tuple[str, str], np.ndarray]:
     """``tf2_msgs/TFMessage`` → ``{(parent, child): [4, 4] parent ← child}``."""
     transforms = {}

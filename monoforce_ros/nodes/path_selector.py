@@ -6,7 +6,7 @@ import sys
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped, TwistStamped
-from nav_msgs.msg import Odometry
+from nav_msgs.msg import OccupancyGrid, Odometry
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import PointCloud2
@@ -17,6 +17,7 @@ from monoforce_ros.nodes.health import ERROR, OK, WARN, Health
 from monoforce_ros.nodes.parameters import declare_parameters, parameter_help, read_parameter_file
 from monoforce_ros.nodes.process import run_node
 from monoforce_ros.planning.choice import ChoiceWeights, choose
+from monoforce_ros.planning.way_to_goal import WayToGoal, way_to_goal
 from monoforce_ros.shared_files import share_directory
 
 PARAMETER_FILE = share_directory() / "config" / "path_selector.yaml"
@@ -35,12 +36,15 @@ class PathSelectorNode(Node):
         self._motion: MotionState | None = None
         self._candidates: tuple[int, str, dict[str, np.ndarray]] | None = None
         self._moving = False
+        self._map: tuple[np.ndarray, float, np.ndarray] | None = None
+        self._ways: WayToGoal | None = None
         self._commands = self.create_publisher(TwistStamped, settings.command_topic, 10)
         newest = QoSProfile(depth=1)
         self._inputs = (
             self.create_subscription(PoseStamped, settings.goal_topic, self._on_goal, newest),
             self.create_subscription(Odometry, settings.odometry_topic, self._on_odometry, newest),
             self.create_subscription(PointCloud2, settings.candidate_topic, self._on_candidates, newest),
+            self.create_subscription(OccupancyGrid, settings.occupancy_topic, self._on_occupancy, newest),
         )
         self._clock_tick = self.create_timer(1.0 / settings.rate, self._tell)
         self.get_logger().info(f"waiting for a goal on {self.resolve_topic_name(settings.goal_topic)}")
@@ -52,7 +56,7 @@ class PathSelectorNode(Node):
                 PART, ERROR, f"the goal is at {place.tolist()}: not finite, not driven to", reason="goal"
             )
             return
-        self._goal = place, message.header.frame_id
+        self._goal, self._ways = (place, message.header.frame_id), None
         self.get_logger().info(f"driving to ({place[0]:.2f}, {place[1]:.2f})")
 
     def _on_odometry(self, message: Odometry) -> None:
@@ -68,6 +72,12 @@ class PathSelectorNode(Node):
             self.health.report(PART, ERROR, f"candidates: {error}", reason="candidates")
             return
         self._candidates = decoding.stamp_of(message), message.header.frame_id, fields
+
+    def _on_occupancy(self, message: OccupancyGrid) -> None:
+        try:
+            self._map, self._ways = decoding.decode_occupancy(message), None
+        except decoding.MessageError as error:
+            self.health.report(PART, ERROR, str(error), reason="occupancy")
 
     def _tell(self) -> None:
         command = self._command()
@@ -101,7 +111,9 @@ class PathSelectorNode(Node):
         if abs(age) > self.settings.timeout:
             return self._stopped(f"candidates are {age:.2f} s old, at most {self.settings.timeout:g} s count", "late")
         try:
-            best = choose(fields, self._motion.position[:2], goal, self.weights)
+            if self._ways is None and self._map is not None:
+                self._ways = way_to_goal(*self._map, goal, radius=self.settings.robot_radius)
+            best = choose(fields, self._motion.position[:2], goal, self.weights, self._ways)
         except ValueError as error:
             return self._stopped(str(error), "fields")
         if best is None:

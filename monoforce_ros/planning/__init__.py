@@ -5,6 +5,7 @@ from monoforce_ros.planning.choice import ChoiceWeights, choose
 from monoforce_ros.planning.costs import Assessment, CostWeights, Limits, assess
 from monoforce_ros.planning.occupancy import Occupancy, occupancy
 from monoforce_ros.planning.refine import Refinement, refine
+from monoforce_ros.planning.way_to_goal import WayToGoal, way_to_goal
 
 __all__ = [
     "Assessment",
@@ -14,9 +15,11 @@ __all__ = [
     "Limits",
     "Occupancy",
     "Refinement",
+    "WayToGoal",
     "assess",
     "choose",
     "fan_of_arcs",
     "occupancy",
     "refine",
+    "way_to_goal",
 ]

@@ -7,8 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from monoforce_ros.planning.way_to_goal import WayToGoal
+
 WAYPOINTS = (25, 50, 75)
 """Shares of the horizon at which a candidate's place is known beside its end [%]."""
+_LOOK = 0.5
+"""Length of a look ahead [m]."""
 FIELDS = (
     *("x", "y", "heading", "speed", "yaw_rate", "cost", "feasible"),
     *(f"{axis}_{share}" for share in WAYPOINTS for axis in "xy"),
@@ -32,6 +36,7 @@ def choose(
     robot: np.ndarray,
     goal: np.ndarray,
     weights: ChoiceWeights = ChoiceWeights(),
+    ways: WayToGoal | None = None,
 ) -> int | None:
     """Index of the best feasible candidate; None where there is none.
 
@@ -39,6 +44,8 @@ def choose(
         candidates: :data:`FIELDS`, each ``[N]``; places and headings in the odometry frame.
         robot: where the robot is ``[2]`` [m].
         goal: where it shall go ``[2]`` [m].
+        weights: of cost, distance and heading.
+        ways: to the goal around obstacles; without them distances are straight.
 
     Raises:
         ValueError: a field is missing.
@@ -53,9 +60,17 @@ def choose(
     way = [np.broadcast_to(robot, end.shape)]
     way += [np.column_stack([candidates[f"x_{share}"], candidates[f"y_{share}"]]) for share in WAYPOINTS]
     nearest, at_end = _nearest(np.stack([*way, end], axis=1), goal)
+    if ways is not None:
+        # How far it still is from the best place on the way; a candidate that reaches the goal itself keeps its own.
+        left = np.stack([ways.at(place) for place in way[1:]] + [ways.at(end)], axis=1)
+        nearest, at_end = np.minimum(left.min(axis=1), np.where(nearest < _LOOK, nearest, np.inf)), nearest >= _LOOK
     reach = max(float(np.linalg.norm(end - robot, axis=1).max()), 0.1)
     towards = np.arctan2(goal[1] - end[:, 1], goal[0] - end[:, 0])
     off = np.abs((candidates["heading"] - towards + np.pi) % (2.0 * np.pi) - np.pi) / np.pi
+    if ways is not None:
+        # Where the way is not straight, looking along it counts: by how much half a metre ahead would shorten it.
+        ahead = end + _LOOK * np.column_stack([np.cos(candidates["heading"]), np.sin(candidates["heading"])])
+        off = np.clip(0.5 * (1.0 - (ways.at(end) - ways.at(ahead)) / _LOOK), 0.0, 1.0)
     # A candidate that passes the goal may look anywhere.
     off = np.where(at_end, off, 0.0)
     score = weights.cost * candidates["cost"] + weights.distance * nearest / reach + weights.heading * off

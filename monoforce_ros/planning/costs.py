@@ -57,7 +57,7 @@ class Limits:
     effort: float = 0.6
     """Mean power at the ground over weight times 1 m/s."""
     unobserved: float = 0.8
-    """Share of the way over cells that nothing has measured, or off the map."""
+    """Share of the way over ground that nothing has measured nearby, or off the map."""
     collision: float = 0.25
     """Push of steep contacts over the robot's weight."""
 
@@ -192,7 +192,8 @@ def _unobserved(rollout: Rollout, terrain: TerrainMap) -> Tensor:
     place = rollout.position.detach()[..., :2]
     column = ((place[..., 0] - grid.origin[0]) / grid.resolution).round().clamp(0, grid.columns - 1).nan_to_num(0.0)
     row = ((place[..., 1] - grid.origin[1]) / grid.resolution).round().clamp(0, grid.rows - 1).nan_to_num(0.0)
-    known = terrain.observed[row.long(), column.long()] & rollout.inside
+    nearby = torch.from_numpy(terrain.measured_nearby()).to(place.device)
+    known = nearby[row.long(), column.long()] & rollout.inside
     away = (place - place[:, :1]).norm(dim=-1)
     # Where the robot stands nothing sees the ground, and it is known to carry.
     moved = away > 1.0

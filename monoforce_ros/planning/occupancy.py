@@ -53,7 +53,7 @@ def occupancy(
     step = np.maximum(0.0, span - 2.0 * grid.resolution * np.tan(np.minimum(slope, 1.4)))
     share = np.maximum(slope / slope_limit, step / step_limit)
     cost = np.where(share >= 1.0, LETHAL, np.minimum(LETHAL - 1, np.rint(100.0 * share))).astype(np.int8)
-    cost = np.where(terrain.observed.cpu().numpy(), cost, UNKNOWN).astype(np.int8)
+    cost = np.where(terrain.measured_nearby(), cost, UNKNOWN).astype(np.int8)
     return _aligned(cost, terrain, odometry_from_terrain)
 
 

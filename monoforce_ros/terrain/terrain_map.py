@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
+import numpy as np
 import torch
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from monoforce_ros.terrain.grid import Grid
@@ -115,6 +117,16 @@ class TerrainMap:
             raise ValueError("terrain maps on different grids cannot be stacked")
         channels = {name: torch.stack([getattr(m, name) for m in maps]) for name in (*CHANNELS, "observed")}
         return cls(**channels, grid=maps[0].grid)
+
+    def measured_nearby(self, reach: float = 0.3) -> np.ndarray:
+        """Whether a cell was measured or lies within ``reach`` [m] of one that was, of one map ``[rows, columns]`` bool.
+
+        Between a lidar's rings heights are interpolated, and as good as measured.
+        """
+        observed = self.observed.cpu().numpy()
+        if not observed.any():
+            return observed
+        return distance_transform_edt(~observed) * self.grid.resolution <= reach
 
     @property
     def batch_size(self) -> int | None:
