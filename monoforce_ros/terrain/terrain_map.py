@@ -119,7 +119,7 @@ class TerrainMap:
         return cls(**channels, grid=maps[0].grid)
 
     def measured_nearby(self, reach: float = 0.3) -> np.ndarray:
-        """Whether a cell was measured or lies within ``reach`` [m] of one that was, of one map ``[rows, columns]`` bool.
+        """Whether a cell of one map was measured or is within ``reach`` [m] of one that was, ``[rows, columns]`` bool.
 
         Between a lidar's rings heights are interpolated, and as good as measured.
         """
