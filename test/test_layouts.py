@@ -32,7 +32,8 @@ def test_rviz_shows_every_output_with_its_type():
     outputs = published()
     assert shown == {topic: outputs[topic] for topic in shown}
     # Tables of numbers are not for a 3D view.
-    assert set(outputs) - set(shown) == {"/predicted/candidate_costs", "/predicted/live_gap", "/diagnostics"}
+    tables = {"candidate_costs", "candidate_rollouts", "path_spread", "live_gap"}
+    assert set(outputs) - set(shown) == {"/diagnostics", *(f"/predicted/{name}" for name in tables)}
 
 
 def test_foxglove_shows_topics_that_exist():
