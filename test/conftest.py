@@ -91,6 +91,8 @@ def ros_environment() -> dict[str, str]:
     environment = dict(os.environ)
     environment["ROS_DOMAIN_ID"] = str((os.getpid() * 7 + next(_domains)) % 100 + 1)
     environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    # A crash says where.
+    environment["PYTHONFAULTHANDLER"] = "1"
     return environment
 
 

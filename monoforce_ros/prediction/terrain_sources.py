@@ -53,8 +53,9 @@ def support_points(robot: RobotModel, motion: MotionState, stiffness: float) -> 
 def laid_under(terrain: TerrainMap, support: np.ndarray) -> TerrainMap:
     """A predicted map that meets the ground under the robot's wheels, which is known better than any image tells.
 
-    Heights that carry are shifted to the points ``[m, 3]`` where the robot stands, less so with the distance from them;
-    what is visible stays. A robot that starts below a predicted surface would be thrown off it.
+    Heights are shifted to where those that carry meet the points ``[m, 3]`` on which the robot stands, less so with the
+    distance from them. What stands above the ground is shifted along: its height is what vegetation holds the robot by.
+    A robot that starts below a predicted surface would be thrown off it.
     """
     grid = terrain.grid
     rows, columns, inside = grid.cells(support[:, :2])
@@ -72,8 +73,11 @@ def laid_under(terrain: TerrainMap, support: np.ndarray) -> TerrainMap:
     shift = (nearness * short).sum(axis=-1) / nearness.sum(axis=-1)
     share = np.clip((_LAID_TO - away.min(axis=-1)) / (_LAID_TO - _LAID_FROM), 0.0, 1.0)
     height = terrain.height.clone()
-    height[up, across] += torch.from_numpy((shift * share).astype(np.float32))
-    return replace(terrain, height=height)
+    moved = torch.from_numpy((shift * share).astype(np.float32))
+    height[up, across] += moved
+    visible = terrain.geometric_height.clone()
+    visible[up, across] += moved
+    return replace(terrain, height=height, geometric_height=visible)
 
 
 @dataclass(frozen=True)
