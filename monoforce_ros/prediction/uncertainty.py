@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from monoforce_ros.motion import MotionState
 from monoforce_ros.physics.state import State
 from monoforce_ros.prediction.predictor import Prediction, Predictor, start_states
 from monoforce_ros.robots import RobotModel
@@ -167,9 +166,3 @@ def _varied_robot(robot: RobotModel, drawn: torch.Tensor, settings: EnsembleSett
     sides = torch.as_tensor(uneven["difference"], dtype=torch.float32) + settings.gain * drawn[:, 7]
     uneven["difference"] = sides.clamp(-1.0, 1.0)
     return replace(robot, effects=tuple(effects.items()))
-
-
-def covered(spread_of: Spread, prediction: Prediction, step: int, state: MotionState) -> bool:
-    """Whether where the robot was at a step lies within the band."""
-    away = prediction.positions()[step, :2] - state.position[:2]
-    return bool(np.hypot(*away) <= spread_of.radius[step])

@@ -144,14 +144,7 @@ def sample(
         variation: of the sample.
         chunks: pieces of motion to roll out, spread over ``horizon`` [s] after the image.
     """
-    base = drive.odometry_from_base[index]
-    heading = np.arctan2(base[1, 0], base[0, 0]) + variation.turn
-    cosine, sine = np.cos(heading), np.sin(heading)
-    mirror = MIRROR if variation.mirrored else np.eye(3)
-    level = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-    # The varied frame is left-handed where the scene is mirrored: everything that happens in it is mirrored too.
-    odometry_from_terrain = homogeneous(level @ mirror, base[:3, 3])
-    terrain_from_odometry = homogeneous(mirror @ level.T, -mirror @ level.T @ base[:3, 3])
+    terrain_from_odometry = np.linalg.inv(_odometry_from_terrain(drive, index, variation))
     affine = None if variation.is_none else variation.image_from_view()
     rays, origins, images = [], [], []
     for camera, pose, image in zip(
@@ -164,23 +157,36 @@ def sample(
     support = transform_points(terrain_from_odometry, drive.support[index])
     sweep = transform_points(terrain_from_odometry, drive.sweep(index)) if config.sensor == "lidar" else None
     batch = assemble(np.stack(images), np.stack(rays), np.stack(origins), support, config, sweep)
-    maps = _maps(drive.segments[drive.segment_of[index]], odometry_from_terrain, config)
-    motion = _motion(drive, index, terrain_from_odometry, variation.mirrored, chunks, horizon)
-    return batch, Targets(**{name: torch.from_numpy(value) for name, value in (maps | motion).items()})
+    return batch, targets(drive, index, config, variation, chunks=chunks, horizon=horizon)
 
 
 def targets(
-    drive: DriveSamples, index: int, config: EncoderConfig, *, chunks: int = 4, horizon: float = 5.0
+    drive: DriveSamples,
+    index: int,
+    config: EncoderConfig,
+    variation: Variation = Variation(),
+    *,
+    chunks: int = 4,
+    horizon: float = 5.0,
 ) -> Targets:
-    """Targets of one sample as they are, without its images; see :func:`sample`."""
-    base = drive.odometry_from_base[index]
-    heading = np.arctan2(base[1, 0], base[0, 0])
-    cosine, sine = np.cos(heading), np.sin(heading)
-    level = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-    pose = homogeneous(level, base[:3, 3])
+    """Targets of one sample, without its images; see :func:`sample`."""
+    pose = _odometry_from_terrain(drive, index, variation)
     maps = _maps(drive.segments[drive.segment_of[index]], pose, config)
-    motion = _motion(drive, index, np.linalg.inv(pose), False, chunks, horizon)
+    motion = _motion(drive, index, np.linalg.inv(pose), variation.mirrored, chunks, horizon)
     return Targets(**{name: torch.from_numpy(value) for name, value in (maps | motion).items()})
+
+
+def _odometry_from_terrain(drive: DriveSamples, index: int, variation: Variation) -> np.ndarray:
+    """Pose of a sample's varied terrain frame ``[4, 4]``.
+
+    It is left-handed where the scene is mirrored: everything that happens in it is mirrored too.
+    """
+    base = drive.odometry_from_base[index]
+    heading = np.arctan2(base[1, 0], base[0, 0]) + variation.turn
+    cosine, sine = np.cos(heading), np.sin(heading)
+    mirror = MIRROR if variation.mirrored else np.eye(3)
+    level = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    return homogeneous(level @ mirror, base[:3, 3])
 
 
 def _maps(segment: Segment, odometry_from_terrain: np.ndarray, config: EncoderConfig) -> dict[str, np.ndarray]:
