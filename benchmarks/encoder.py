@@ -64,18 +64,20 @@ def stages(encoder: TerrainEncoder, seen: list[CameraView], repeats: int) -> dic
         depth, features = encoder._lift(batch)
         points = lifted_points(batch.rays, batch.origins, encoder.depths)
         cells = map_cells(points, config)
+        kind = encoder.lift.weight.dtype
+        images = (batch.images.float() / 127.5 - 1.0).to(kind)
         maps = torch.zeros(1, config.image_features + 5, config.grid.rows, config.grid.columns)
         maps = maps.contiguous(memory_format=torch.channels_last)
         encoded = encoder(batch)
         return {
             "geometry and resizing": timed(lambda: encoder_input(seen, SUPPORT, config), repeats),
-            "backbone": timed(lambda: encoder.backbone(batch.images.float() / 127.5 - 1.0), repeats),
+            "backbone": timed(lambda: encoder.backbone(images), repeats),
             "backbone, neck and depths": timed(lambda: encoder._lift(batch), repeats),
             "points and cells": timed(
                 lambda: map_cells(lifted_points(batch.rays, batch.origins, encoder.depths), config), repeats
             ),
             "splat": timed(lambda: splat(depth, features, cells, points[..., 2], size), repeats),
-            "bird's-eye-view network": timed(lambda: encoder.heads(encoder.bird(maps)), repeats),
+            "bird's-eye-view network": timed(lambda: encoder.heads(encoder.bird(maps.to(kind)).float()), repeats),
             "terrain map": timed(lambda: terrain_maps(encoded, config), repeats),
         }
 

@@ -96,6 +96,7 @@ class Source:
         newest = QoSProfile(depth=10)
         self.latencies: list[float] = []
         self.arrivals: list[float] = []
+        self.compared: list[float] = []
         self.dropped = 0
         self.said: dict[str, str] = {}
         self.node.create_subscription(
@@ -103,6 +104,9 @@ class Source:
         )
         self.node.create_subscription(
             message_class("diagnostic_msgs/msg/DiagnosticArray"), "/diagnostics", self._on_diagnostics, newest
+        )
+        self.node.create_subscription(
+            message_class("sensor_msgs/msg/PointCloud2"), "predicted/candidate_costs", self._on_costs, newest, raw=True
         )
         self._publishers = {}
         recording = Recording.open(ROOT / "bags" / "demo")
@@ -136,10 +140,17 @@ class Source:
         return data
 
     def _on_path(self, data: bytes) -> None:
-        now = time.time_ns()
-        seconds, nanoseconds = np.frombuffer(data[4:12], "<u4")
-        self.latencies.append((now - (int(seconds) * 10**9 + int(nanoseconds))) * 1e-6)
+        self.latencies.append(self._age(data))
         self.arrivals.append(time.monotonic())
+
+    def _on_costs(self, data: bytes) -> None:
+        self.compared.append(self._age(data))
+
+    @staticmethod
+    def _age(data: bytes) -> float:
+        """Time since the stamp of an encoded message [ms]."""
+        seconds, nanoseconds = np.frombuffer(data[4:12], "<u4")
+        return (time.time_ns() - (int(seconds) * 10**9 + int(nanoseconds))) * 1e-6
 
     def _on_diagnostics(self, message) -> None:
         for status in message.status:
@@ -229,6 +240,7 @@ def measure(case: Case, seconds: float, folder: Path) -> dict:
         sys.exit(f"{case.name}: no path came: {source.said}")
     source.latencies.clear()
     source.arrivals.clear()
+    source.compared.clear()
     dropped, cpu, began = source.dropped, predictor.cpu_seconds(), time.monotonic()
     sent = source.run(seconds)
     lasted = time.monotonic() - began
@@ -241,6 +253,8 @@ def measure(case: Case, seconds: float, folder: Path) -> dict:
         "case": case.name, "title": case.title, "sent_hz": sent / lasted, "paths": len(values),
         "rate_hz": len(values) / lasted, "longest_gap_s": float(gaps.max()) if len(gaps) else None,
         **{f"p{q}_ms": float(np.percentile(values, q)) for q in (50, 95, 99)},
+        "candidates_hz": len(source.compared) / lasted,
+        "candidates_p95_ms": float(np.percentile(source.compared, 95)) if source.compared else None,
         "cpu_cores": used, "memory_mb": memory, "threads": threads, "dropped": source.dropped - dropped,
     }  # fmt: skip
     source.close()
@@ -322,15 +336,20 @@ def endurance_table(found: dict) -> str:
     return "\n".join(lines)
 
 
+def _candidates(row: dict) -> str:
+    """Rate and latency of the candidates' costs."""
+    return f"{row['candidates_hz']:.1f} Hz, {row['candidates_p95_ms']:.0f} ms" if row["candidates_p95_ms"] else "–"
+
+
 def table(rows: list[dict]) -> str:
     """As Markdown."""
     lines = [
-        "| input | sent | paths | p50 | p95 | p99 | CPU | memory | dropped |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "| input | sent | paths | p50 | p95 | p99 | candidates, p95 | CPU | memory | dropped |",
+        "|---|---|---|---|---|---|---|---|---|---|",
     ]
     lines += [
         f"| {row['title']} | {row['sent_hz']:.0f} Hz | {row['rate_hz']:.1f} Hz | {row['p50_ms']:.0f} ms | "
-        f"{row['p95_ms']:.0f} ms | {row['p99_ms']:.0f} ms | {100 * row['cpu_cores']:.0f} % | "
+        f"{row['p95_ms']:.0f} ms | {row['p99_ms']:.0f} ms | {_candidates(row)} | {100 * row['cpu_cores']:.0f} % | "
         f"{row['memory_mb']:.0f} MB | {row['dropped']} |"
         for row in rows
     ]
@@ -361,9 +380,12 @@ def main() -> None:
             for case in cases:
                 rows.append(measure(case, options.seconds, Path(folder)))
                 row = rows[-1]
-                print(f"{case.title}: {row['rate_hz']:.1f} Hz, p50 {row['p50_ms']:.0f}, p95 {row['p95_ms']:.0f}, p99 "
-                      f"{row['p99_ms']:.0f} ms, {100 * row['cpu_cores']:.0f} % CPU, {row['memory_mb']:.0f} MB, "
-                      f"{row['dropped']} dropped", flush=True)  # fmt: skip
+                print(
+                    f"{case.title}: {row['rate_hz']:.1f} Hz, p50 {row['p50_ms']:.0f}, p95 {row['p95_ms']:.0f}, p99 "
+                    f"{row['p99_ms']:.0f} ms, candidates {_candidates(row)}, {100 * row['cpu_cores']:.0f} % CPU, "
+                    f"{row['memory_mb']:.0f} MB, {row['dropped']} dropped",
+                    flush=True,
+                )
             result = {"machine": platform.processor() or platform.machine(), "cores": os.cpu_count(), "rows": rows}
             if options.docs:
                 write_between(options.docs, "latency", table(rows))

@@ -17,14 +17,12 @@ import torch
 from tqdm import tqdm
 
 from monoforce_ros.bags import Recording
-from monoforce_ros.encoder import fused, load_encoder
 from monoforce_ros.evaluation.drive import corrected_recording, observe
 from monoforce_ros.evaluation.report import write_text
 from monoforce_ros.motion import StaleDataError
-from monoforce_ros.prediction import CameraTerrain, FlatTerrain, LidarTerrain, Prediction, Predictor
+from monoforce_ros.prediction import SOURCES, Prediction, Predictor, choose_terrain_source
 from monoforce_ros.prediction.uncertainty import COVERAGE, EnsembleSettings, spread
 from monoforce_ros.robots import load_robot
-from monoforce_ros.terrain import Grid, TerrainDefaults
 
 HORIZONS = (1.0, 2.0, 5.0)
 
@@ -32,14 +30,14 @@ HORIZONS = (1.0, 2.0, 5.0)
 def drive_ratios(bag: Path, predictor: Predictor, settings: EnsembleSettings) -> tuple[np.ndarray, np.ndarray]:
     """Error over band radius, and the radius [m], of each window at each horizon ``[W, 3]``; NaN off the map."""
     recording = corrected_recording(Recording.open(bag), predictor.robot)
-    flat, camera = isinstance(predictor.source, FlatTerrain), isinstance(predictor.source, CameraTerrain)
-    topics = tuple(recording.images) if camera else ()
+    sensors = predictor.source.sensors
+    topics = tuple(recording.images) if "camera" in sensors else ()
     first, last = int(recording.motion.stamps[0]), int(recording.motion.stamps[-1])
     ratios, radii = [], []
     for stamp in range(first + 10**9, last - round(1e9 * HORIZONS[0]), 10**9):
         try:
             motion = recording.motion.at(stamp, maximum_gap=0.3)
-            terrain = predictor.source.terrain(observe(recording, predictor.robot, stamp, topics, flat), motion)
+            terrain = predictor.source.terrain(observe(recording, predictor.robot, stamp, sensors, topics), motion)
         except ValueError:
             continue
         twists = recording.commands.sample(predictor.command_stamps(stamp))
@@ -66,7 +64,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("bags", nargs="+", type=Path)
     parser.add_argument("--robot", default="husky")
-    parser.add_argument("--terrain", choices=("lidar", "camera", "flat"), default="lidar")
+    parser.add_argument("--terrain", choices=SOURCES, default="lidar")
     parser.add_argument("--checkpoint", default="", help="terrain encoder (the shipped one)")
     parser.add_argument("--members", type=int, default=EnsembleSettings.members)
     parser.add_argument("--scale", type=float, default=EnsembleSettings.scale)
@@ -74,12 +72,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     robot = load_robot(options.robot)
-    if options.terrain == "camera":
-        source = CameraTerrain(fused(load_encoder(options.checkpoint, "camera")), robot)
-    else:
-        kind = LidarTerrain if options.terrain == "lidar" else FlatTerrain
-        source = kind(robot, Grid.square(), TerrainDefaults())
-    predictor = Predictor(robot, source)
+    predictor = Predictor(robot, choose_terrain_source(options.terrain, robot, checkpoint=options.checkpoint))
     settings = EnsembleSettings(members=options.members, scale=options.scale)
     rows, sizes = zip(
         *(drive_ratios(bag, predictor, settings) for bag in tqdm(options.bags, unit="drive")), strict=True

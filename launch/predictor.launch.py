@@ -12,9 +12,9 @@ from launch import LaunchContext, LaunchDescription
 # Name of an argument: default, type of the predictor's parameter of that name (None for what is none), meaning.
 ARGUMENTS = {
     "robot": ("husky", str, "robot model, a shipped name or a file"),
-    "terrain_source": ("lidar", str, "lidar, camera or flat"),
-    "checkpoint": ("", str, "terrain encoder weights, for terrain_source:=camera"),
-    "cloud_topic": ("points", str, "sensor_msgs/PointCloud2, for terrain_source:=lidar"),
+    "terrain_source": ("lidar", str, "lidar, camera, lidar_camera or flat"),
+    "checkpoint": ("", str, "terrain encoder weights, for terrain sources with a camera"),
+    "cloud_topic": ("points", str, "sensor_msgs/PointCloud2, for terrain sources with a lidar"),
     "odometry_topic": ("odom", str, "nav_msgs/Odometry"),
     "command_topic": ("cmd_vel", str, "geometry_msgs/TwistStamped or Twist"),
     "candidates": ("0", int, "number of candidate commands; 0 compares none"),

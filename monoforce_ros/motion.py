@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
@@ -33,6 +33,15 @@ class MotionState:
     def heading(self) -> float:
         """Angle of the base's x axis about the vertical [rad]."""
         return float(np.arctan2(self.rotation[1, 0], self.rotation[0, 0]))
+
+    def onwards(self, seconds: float) -> MotionState:
+        """The state after ``seconds`` > 0 of the same velocities in base axes, with its own stamp; else itself."""
+        if seconds <= 0.0:
+            return self
+        turn = Rotation.from_rotvec(self.angular_velocity * seconds).as_matrix()
+        half = Rotation.from_rotvec(self.angular_velocity * (0.5 * seconds)).as_matrix()
+        position = self.position + self.rotation @ half @ self.linear_velocity * seconds
+        return replace(self, position=position, rotation=self.rotation @ turn)
 
     @property
     def odometry_from_base(self) -> np.ndarray:
@@ -73,6 +82,8 @@ class MotionTrack:
     def at(self, stamp: int, *, maximum_gap: float = 0.5) -> MotionState:
         """The motion at a time, interpolated between the measurements around it.
 
+        After the last measurement the robot is taken to go on as it did: sensors are often a little ahead of odometry.
+
         Args:
             stamp: time [ns].
             maximum_gap: largest distance in time [s] to the measurements used; beyond it nothing is invented.
@@ -85,10 +96,10 @@ class MotionTrack:
         after = int(np.searchsorted(self.stamps, stamp))
         before = max(after - 1, 0)
         after = min(after, len(self) - 1)
-        if after == before:  # before the first or after the last measurement: hold it
+        if after == before:  # before the first or after the last measurement
             gap = abs(int(self.stamps[after]) - stamp) * NANOSECOND
             self._refuse_gap(gap, maximum_gap)
-            return self._state(after, stamp)
+            return self._state(after, stamp).onwards((stamp - int(self.stamps[after])) * NANOSECOND)
         span = int(self.stamps[after] - self.stamps[before])
         gaps = (stamp - int(self.stamps[before])) * NANOSECOND, (int(self.stamps[after]) - stamp) * NANOSECOND
         if min(gaps) > maximum_gap:
@@ -107,6 +118,15 @@ class MotionTrack:
             rotation=Slerp([0.0, 1.0], pair)(fraction).as_matrix(),
             linear_velocity=blend(self.linear_velocities),
             angular_velocity=blend(self.angular_velocities),
+        )
+
+    def base_between(self, start: int, end: int, *, maximum_gap: float = 0.5) -> np.ndarray:
+        """Pose ``[4, 4]`` of the base frame of time ``start`` [ns] in that of ``end``; errors as in :meth:`at`."""
+        if start == end:
+            return np.eye(4)
+        before, after = (self.at(stamp, maximum_gap=maximum_gap) for stamp in (start, end))
+        return np.linalg.inv(homogeneous(after.rotation, after.position)) @ homogeneous(
+            before.rotation, before.position
         )
 
     def _refuse_gap(self, gap: float, maximum_gap: float) -> None:
@@ -181,6 +201,27 @@ class CommandTrack:
         held = self.twists[np.maximum(index, 0)]
         age = (stamps - self.stamps[np.maximum(index, 0)]) * NANOSECOND
         return np.where(((index >= 0) & (age <= timeout))[..., None], held, 0.0)
+
+
+def quaternions(rotations: np.ndarray) -> np.ndarray:
+    """Quaternions ``[..., 4]`` (x, y, z, w) of rotations ``[..., 3, 3]``, w or the largest part positive.
+
+    The matrices are taken as rotations (Shepperd 1978); SciPy makes each of them orthogonal first, which takes longer
+    than all else that is done with a few thousand predicted poses.
+    """
+    diagonal = np.einsum("...ii->...i", rotations)
+    trace = diagonal.sum(axis=-1, keepdims=True)
+    squares = np.concatenate([1.0 - trace + 2.0 * diagonal, 1.0 + trace], axis=-1)
+    largest = squares.argmax(axis=-1)
+    off = rotations - np.swapaxes(rotations, -1, -2)
+    beside = rotations + np.swapaxes(rotations, -1, -2)
+    # Four times the products of all pairs of parts: row k holds those with part k.
+    products = np.empty((*rotations.shape[:-2], 4, 4))
+    products[..., :3, :3] = beside
+    products[..., 3, :3] = products[..., :3, 3] = np.stack([off[..., 2, 1], off[..., 0, 2], off[..., 1, 0]], axis=-1)
+    np.einsum("...ii->...i", products)[...] = squares
+    found = np.take_along_axis(products, largest[..., None, None], axis=-2)[..., 0, :]
+    return found / np.linalg.norm(found, axis=-1, keepdims=True)
 
 
 def homogeneous(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ from monoforce_ros.bags import Recording
 from monoforce_ros.evaluation.drive import observe
 from monoforce_ros.planning import CandidateSettings, assess, fan_of_arcs, occupancy, refine
 from monoforce_ros.planning.candidates import over_horizon
-from monoforce_ros.planning.costs import FORCE_EVERY
+from monoforce_ros.planning.costs import force_every
 from monoforce_ros.prediction import LidarTerrain, Prediction, Predictor
 from monoforce_ros.prediction.uncertainty import EnsembleSettings, spread
 from monoforce_ros.robots import load_robot
@@ -33,11 +33,12 @@ def draw(recording: Recording, seconds: float) -> Figure:
     stamp = int(recording.motion.stamps[0] + 1e9 * seconds)
     frame = min(recording.clouds, key=lambda entry: abs(entry.stamp - stamp))
     motion = recording.motion.at(frame.stamp)
-    terrain = predictor.source.terrain(observe(recording, robot, frame.stamp, (), False), motion)
+    terrain = predictor.source.terrain(observe(recording, robot, frame.stamp, predictor.source.sensors), motion)
     before = recording.commands.sample(predictor.command_stamps(frame.stamp))[: predictor.history]
     fan = fan_of_arcs(CandidateSettings(41, (0.4, 0.8), 0.9))[:, None]
     twists = over_horizon(fan, before, predictor.steps)
-    rolled = predictor.roll_out(terrain, [motion] * len(fan), twists, force_every=FORCE_EVERY)
+    every = force_every(predictor.options.time_step)
+    rolled = predictor.roll_out(terrain, [motion] * len(fan), twists, with_contact=True, force_every=every)
     found = assess(rolled, terrain, robot, torch.from_numpy(twists[:, predictor.history :]).float())
     # The figure shows the cheapest of those that go somewhere.
     moving = torch.from_numpy(np.abs(fan[:, 0, 0]) > 0.6) & found.feasible

@@ -59,7 +59,8 @@ TEXT
   say "fetching uv $uv_version, the installer"
   "$venv/bin/python" -m pip install --quiet --disable-pip-version-check "uv==$uv_version"
   say "installing $(grep -c '^[a-z0-9].*==' requirements.lock) locked packages (several GB, most of it torch's CUDA libraries)"
-  "$venv/bin/uv" pip sync --quiet --python "$venv/bin/python" requirements.lock
+  # Compiled here once: where Python may not write bytecode every start of a node would compile all of torch.
+  "$venv/bin/uv" pip sync --quiet --compile-bytecode --python "$venv/bin/python" requirements.lock
   printf '%s' "$lock_hash" >"$venv/.locked"
   say "environment ready after $((SECONDS - started)) s"
 }
@@ -88,6 +89,7 @@ build() {
     cat out/colcon_build.log >&2
     exit 1
   fi
+  "$venv/bin/python" -m compileall -q install/monoforce_ros/lib
   touch "$stamp"
   say "built into install/ after $((SECONDS - started)) s"
 }

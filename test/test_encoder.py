@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from monoforce_ros.bags import Recording
 from monoforce_ros.camera import CameraModel
 from monoforce_ros.encoder import (
     CameraView,
@@ -152,6 +153,24 @@ def test_a_fused_encoder_predicts_the_same(sensor):
     one, other = encoder.terrain(seen), quick.terrain(seen)
     torch.testing.assert_close(one.height, other.height, atol=1e-4, rtol=1e-4)
     torch.testing.assert_close(one.friction, other.friction, atol=1e-4, rtol=1e-4)
+
+
+def test_half_precision_differs_by_millimetres(demo_bag):
+    recording = Recording.open(demo_bag)
+    topic = next(iter(recording.images))
+    shipped = load_encoder("", "camera")
+    exact, quick = fused(shipped), fused(shipped, "bfloat16")
+    assert quick.lift.weight.dtype == torch.bfloat16 and quick.heads.weight.dtype == torch.float32
+    for frame in recording.images[topic][::20]:
+        seen = [
+            CameraView(recording.image(frame), recording.cameras[topic], homogeneous(FORWARD, np.array([0.3, 0, 0.4])))
+        ]
+        one, other = exact.terrain(seen), quick.terrain(seen)
+        away = (one.height - other.height).abs()[one.observed]
+        assert float(away.median()) < 0.003 and float(away.quantile(0.95)) < 0.015
+        assert float((one.friction / other.friction).log().abs().median()) < 0.02
+    with pytest.raises(ValueError, match="encoder precision: got 'float8'"):
+        fused(shipped, "float8")
 
 
 def test_the_backbone_takes_the_published_weights():

@@ -6,6 +6,7 @@ import numpy as np
 
 from monoforce_ros.motion import MotionState
 from monoforce_ros.nodes.inputs import Inputs
+from monoforce_ros.nodes.pace import Pace
 
 SECOND = 10**9
 
@@ -42,6 +43,42 @@ def test_cameras_are_used_together_when_their_stamps_agree():
     kept.add_sensor("a", int(1.21 * SECOND), 3)
     taken = kept.take(odometry_timeout=1.0, wait=0.01)
     assert {name: entry.message for name, entry in taken.items()} == {"a": 3, "b": 2}
+
+
+def test_cameras_that_are_triggered_together_are_not_mixed_with_their_last_images():
+    kept = Inputs(["a", "b", "c"], slop=0.1, patience=5.0, on_time_jump=lambda *_: None)
+    moved(kept, 9 * SECOND)
+    taken = []
+    for frame in range(6):
+        for name in "abc":
+            kept.add_sensor(name, frame * SECOND // 10, frame)
+            if found := kept.take(odometry_timeout=1.0, wait=0.005):
+                taken.append({entry.message for entry in found.values()})
+    # Until a sensor has sent twice its rate is not known.
+    assert taken[-4:] == [{2}, {3}, {4}, {5}]
+
+
+def test_inputs_are_left_out_rather_than_kept_waiting():
+    def used(interval, rate, jitter):
+        times = np.arange(400) * interval + np.random.default_rng(0).uniform(-jitter, jitter, 400)
+        pace = Pace()
+        return np.array([pace.due(now, rate) for now in times]), times
+
+    assert used(0.1, 10.0, 0.01)[0].mean() > 0.99
+    for interval in (0.01, 0.0333, 0.09):
+        kept, times = used(interval, 10.0, 0.2 * interval)
+        span = times[kept]
+        assert 0.45 * min(10.0, 1 / interval) < (len(span) - 1) / (span[-1] - span[0]) < 10.3
+        assert np.diff(span).min() > 0.05
+    assert used(1.0, 10.0, 0.1)[0].all()
+
+
+def test_flat_ground_is_predicted_from_each_new_odometry_once():
+    kept, _ = inputs([])
+    assert kept.take_motion(0, wait=0.01) is None
+    moved(kept, 3 * SECOND)
+    assert kept.take_motion(0, wait=0.01)["odometry"].stamp == 3 * SECOND
+    assert kept.take_motion(3 * SECOND, wait=0.01) is None
 
 
 def test_a_camera_that_never_starts_or_dies_holds_up_the_others_for_a_while_only():

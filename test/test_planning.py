@@ -45,7 +45,7 @@ def assessed(husky, terrain, fan, **how):
     middle = GRID.rows // 2
     height = float(terrain.height[middle, middle]) - low - float(rest_depth(husky, float(terrain.stiffness.mean())))
     state = State.at_rest(height, batch=len(fan))
-    result = rollout(terrain, husky, husky.drive_speeds(twists), state, options=PhysicsOptions())
+    result = rollout(terrain, husky, husky.drive_speeds(twists), state, options=PhysicsOptions(), with_contact=True)
     return assess(result, terrain, husky, twists, **how), result
 
 
@@ -120,8 +120,8 @@ def test_weights_and_limits_do_what_they_say(husky):
     assert float(alone.cost[0]) == pytest.approx(2 * float(found.terms["roll"][0]), rel=1e-5)
     strict, _ = assessed(husky, terrain, [[0.5, 0.0]], limits=Limits(roll=0.1))
     assert not bool(strict.feasible[0]) and strict.why_not(0).startswith("roll")
-    with pytest.raises(ValueError, match="has no forces"):
-        assess(replace(result, forces=None), terrain, husky, torch.zeros(1, STEPS, 2))
+    with pytest.raises(ValueError, match="has no contact forces"):
+        assess(replace(result, contact=None), terrain, husky, torch.zeros(1, STEPS, 2))
     with pytest.raises(ValueError, match="limit of roll: got 0"):
         Limits(roll=0.0)
     with pytest.raises(ValueError, match="cost weight slip: got -1"):

@@ -1,6 +1,7 @@
 """From measured motion to the state that a prediction starts from."""
 
 import numpy as np
+import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
@@ -8,7 +9,7 @@ from monoforce_ros.motion import MotionState
 from monoforce_ros.physics import State, rollout
 from monoforce_ros.prediction import FlatTerrain, Observation, Predictor
 from monoforce_ros.prediction.predictor import start_states
-from monoforce_ros.prediction.terrain_sources import laid_under
+from monoforce_ros.prediction.terrain_sources import choose_terrain_source, laid_under, lowered
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap
 
@@ -60,3 +61,35 @@ def test_a_predicted_map_is_laid_under_the_wheels_and_left_alone_elsewhere():
     # No step at the border of what was moved.
     assert float(np.abs(np.diff(laid.height.numpy(), axis=1)).max()) < 0.15
     assert laid_under(terrain, wheels + np.array([50.0, 0.0, 0.0])) is terrain
+
+
+def test_a_lidars_surfaces_are_lowered_by_what_gives_way_and_walls_stand():
+    grid = Grid.square(6.4, 0.1)
+    x, y = np.meshgrid(grid.x, grid.y)
+    grass, wall, hidden = (x > 1) & (x < 2), (x > 2.5) & (y > 0), (x < -2)
+    measured = np.where(wall, 1.5, np.where(grass, 0.45, 0.1))
+
+    def of(values):
+        return torch.from_numpy(np.asarray(values, np.float32) + np.zeros_like(x, dtype=np.float32))
+
+    swept = TerrainMap.from_height(of(measured), grid, observed=torch.from_numpy(~hidden))
+    # The encoder has missed the wall, is 4 cm off on the ground and unsure whether that gives.
+    decrease = np.where(grass, 0.5, 0.03)
+    seen = TerrainMap.from_height(of(0.06), grid, geometric_height=of(0.06 + decrease))
+    both = lowered(swept, seen)
+    height = both.height.numpy()
+    np.testing.assert_allclose(height[grass], 0.06, atol=1e-6)
+    np.testing.assert_allclose(height[wall], 1.5, atol=1e-6)
+    firm = ~grass & ~wall & (x > -1.6)
+    np.testing.assert_allclose(height[firm], 0.1, atol=1e-6)
+    np.testing.assert_allclose(height[x < -2.4], 0.06, atol=1e-6)
+    np.testing.assert_allclose((both.geometric_height - both.height).numpy()[grass], 0.5, atol=1e-6)
+    assert float((both.geometric_height - both.height).numpy()[firm].max()) == 0.0
+    # A surface is never lowered by more than it is said to give, though the encoder sees the ground far below.
+    deep = lowered(swept, TerrainMap.from_height(of(-1.0), grid, geometric_height=of(-1.0 + decrease)))
+    np.testing.assert_allclose(deep.height.numpy()[grass], 0.45 - 0.5, atol=1e-6)
+
+
+def test_an_unknown_terrain_source_is_refused():
+    with pytest.raises(ValueError, match="terrain source: got 'sonar', expected one of"):
+        choose_terrain_source("sonar", load_robot("husky"))

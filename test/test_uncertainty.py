@@ -9,7 +9,7 @@ import torch
 from monoforce_ros.motion import MotionState
 from monoforce_ros.planning import CostWeights, Limits, assess, refine
 from monoforce_ros.planning.candidates import over_horizon
-from monoforce_ros.planning.costs import FORCE_EVERY
+from monoforce_ros.planning.costs import force_every
 from monoforce_ros.prediction import Prediction, Predictor
 from monoforce_ros.prediction.uncertainty import EnsembleSettings, spread
 from monoforce_ros.robots import load_robot
@@ -105,8 +105,10 @@ def test_refinement_costs_less_and_ends_where_it_did(predictor):
         twists = over_horizon(sequence[None], before, predictor.steps)
         asked = torch.from_numpy(twists[:, predictor.history :]).float()
         costs = []
-        for every in (FORCE_EVERY, 1):
-            rolled = predictor.roll_out(prediction.terrain, [STILL], twists, force_every=every)
+        for every in (force_every(predictor.options.time_step), 1):
+            rolled = predictor.roll_out(
+                prediction.terrain, [STILL], twists, with_forces=False, with_contact=True, force_every=every
+            )
             assessed = assess(rolled, prediction.terrain, predictor.robot, asked)
             assert bool(assessed.feasible[0])
             costs.append(float(assessed.cost[0]))

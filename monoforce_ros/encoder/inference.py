@@ -1,19 +1,36 @@
-"""Inference: an encoder with its batch norms folded into the convolutions, laid out for the processor."""
+"""Inference: an encoder made fast for prediction: norms and borders folded into convolutions, half precision."""
 
 from __future__ import annotations
 
 import copy
+from functools import cache
 from itertools import pairwise
+from pathlib import Path
 
 import torch
-from torch import nn
-from torch.nn.utils.fusion import fuse_conv_bn_eval
+from torch import Tensor, nn
+from torch.nn import functional
+from torch.nn.utils import fuse_conv_bn_eval
 
 from monoforce_ros.encoder.checkpoint import Encoder
 
+PRECISIONS = ("auto", "float32", "bfloat16")
 
-def fused(encoder: Encoder) -> Encoder:
-    """A copy that predicts the same, faster; it cannot be trained nor saved any more."""
+
+def fused(encoder: Encoder, precision: str = "float32") -> Encoder:
+    """A copy that predicts the same, faster; it cannot be trained nor saved any more.
+
+    Args:
+        encoder: as loaded.
+        precision: of the convolutions: ``float32``; ``bfloat16``, about twice as fast on processors that multiply it,
+            with heights within a few millimetres; ``auto`` takes it where the processor does. Heads, depths and the
+            splat stay float32.
+
+    Raises:
+        ValueError: there is no such precision.
+    """
+    if precision not in PRECISIONS:
+        raise ValueError(f"encoder precision: got {precision!r}, expected one of {PRECISIONS}")
     encoder = copy.deepcopy(encoder).eval()
     for parent in list(encoder.modules()):
         names = [name for name, _ in parent.named_children()]
@@ -22,5 +39,38 @@ def fused(encoder: Encoder) -> Encoder:
             if isinstance(convolution, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d):
                 setattr(parent, first, fuse_conv_bn_eval(convolution, norm))
                 setattr(parent, second, nn.Identity())
+        if getattr(parent, "beyond", 0):
+            parent.conv = _with_border(parent.conv)
+            parent.beyond = 0
     encoder.requires_grad_(False)
+    if precision == "bfloat16" or (precision == "auto" and multiplies_bfloat16()):
+        for name, part in encoder.named_children():
+            if name != "heads":
+                part.to(torch.bfloat16)
     return encoder.to(memory_format=torch.channels_last)
+
+
+def _with_border(convolution: nn.Conv2d) -> nn.Conv2d:
+    """A convolution of stride 2 that pads all sides alike, in place of one that expects a border on two of them.
+
+    A row and a column of zeros before the weights shift it by one pixel; a padded copy of the image is not needed.
+    """
+    kernel = convolution.kernel_size[0]
+    shifted = nn.Conv2d(
+        convolution.in_channels, convolution.out_channels, kernel + 1, convolution.stride, padding=kernel // 2,
+        groups=convolution.groups,
+    )  # fmt: skip
+    weight: Tensor = functional.pad(convolution.weight.detach(), (1, 0, 1, 0))
+    shifted.weight, shifted.bias = nn.Parameter(weight), convolution.bias
+    return shifted
+
+
+@cache
+def multiplies_bfloat16() -> bool:
+    """Whether the processor has instructions for products of bfloat16 (AVX-512 BF16, AMX, Arm BF16)."""
+    try:
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return False
+    flags = next((line for line in text.splitlines() if line.lower().startswith(("flags", "features"))), "")
+    return bool({"avx512_bf16", "amx_bf16", "bf16"} & set(flags.split()))

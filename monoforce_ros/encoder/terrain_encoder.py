@@ -94,9 +94,10 @@ class TerrainEncoder(nn.Module):
         flat = [summed / (seen + 0.1)[:, None], torch.stack([mean[:, 0], spread, torch.log1p(seen)], dim=1)]
         maps = torch.cat([part.view(shape) for part in flat], dim=-1).permute(0, 3, 1, 2)
         maps = torch.cat([maps.to(summed.dtype), batch.support.to(summed.dtype)], dim=1)
+        maps = maps.to(self.lift.weight.dtype)
         if not maps.is_cuda:
             maps = maps.contiguous(memory_format=torch.channels_last)
-        outputs = self.heads(self.bird(maps)).float()
+        outputs = self.heads(self.bird(maps).to(self.heads.weight.dtype)).float()
         hits = torch.zeros(batch.maps * size, device=cells.device)
         hits[cells[cells >= 0]] = 1.0
         covered = functional.max_pool2d(hits.view(batch.maps, 1, grid.rows, grid.columns), 5, 1, 2)[:, 0] > 0
@@ -105,7 +106,7 @@ class TerrainEncoder(nn.Module):
     def _lift(self, batch: EncoderInput) -> tuple[Tensor, Tensor]:
         """Probability of each depth ``[N, bins, rows, columns]`` and features ``[N, C, rows, columns]``."""
         config = self.config
-        fine, coarse = self.backbone(batch.images.float() / 127.5 - 1.0)
+        fine, coarse = self.backbone((batch.images.float() / 127.5 - 1.0).to(self.lift.weight.dtype))
         coarse = functional.interpolate(coarse, size=fine.shape[-2:], mode="bilinear", align_corners=False)
         down = batch.rays[..., 2]
         height = batch.origins[:, 2, None, None]

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from monoforce_ros.bags import BagError, Recording
-from monoforce_ros.encoder import CheckpointError, fused, load_encoder
+from monoforce_ros.encoder import CheckpointError
 from monoforce_ros.evaluation import figures
 from monoforce_ros.evaluation.check import check_bag, check_text
 from monoforce_ros.evaluation.drive import (
@@ -26,10 +26,10 @@ from monoforce_ros.evaluation.view import PredictionView
 from monoforce_ros.messages.decoding import MessageError
 from monoforce_ros.physics import PhysicsOptions
 from monoforce_ros.physics.effects import EffectError
-from monoforce_ros.prediction import CameraTerrain, FlatTerrain, LidarTerrain, Predictor
+from monoforce_ros.prediction import SOURCES, Predictor, choose_terrain_source
 from monoforce_ros.robots import RobotFileError, RobotModel, load_robot, shipped_robots
 from monoforce_ros.shared_files import share_directory
-from monoforce_ros.terrain import Grid, TerrainDefaults
+from monoforce_ros.terrain import TerrainDefaults
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -41,9 +41,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("bag", nargs="?", help="rosbag2 folder or ROS 1 .bag file (default: the demo bag)")
     parser.add_argument("--robot", default="husky", help=f"robot file or one of {', '.join(shipped_robots())}")
     parser.add_argument("--out", default="evaluation", help="folder for the report (default: evaluation)")
-    parser.add_argument(
-        "--terrain", choices=["lidar", "camera", "flat"], default="lidar", help="terrain source (default: lidar)"
-    )
+    parser.add_argument("--terrain", choices=SOURCES, default="lidar", help="terrain source (default: lidar)")
     parser.add_argument(
         "--checkpoint", default="", help="terrain encoder weights, for --terrain camera (default: the shipped ones)"
     )
@@ -104,12 +102,9 @@ def run(options: argparse.Namespace) -> None:
     robot = load_robot(options.robot)
     recording = Recording.open(bag, odometry=options.odometry, commands=options.commands, cloud=options.cloud)
     material = TerrainDefaults(friction=options.friction)
-    if options.terrain == "camera":
-        source = CameraTerrain(fused(load_encoder(options.checkpoint, "camera")), robot)
-    else:
-        source = (LidarTerrain if options.terrain == "lidar" else FlatTerrain)(robot, Grid.square(), material)
+    source = choose_terrain_source(options.terrain, robot, material=material, checkpoint=options.checkpoint)
     predictor = Predictor(robot, source, horizon=max(options.horizons), options=PhysicsOptions())
-    topics = tuple(options.images or recording.images) if options.terrain == "camera" else ()
+    topics = tuple(options.images or recording.images) if "camera" in source.sensors else ()
     evaluation = evaluate_drive(
         recording,
         predictor,

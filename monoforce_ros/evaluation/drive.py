@@ -22,6 +22,8 @@ SAMPLE_TIME = 0.1
 """Time between the poses that are compared [s]."""
 PHYSICS, FLAT_PHYSICS, CONSTANT_VELOCITY = "physics", "physics, flat ground", "constant velocity, flat ground"
 BATCH = 16
+_TOGETHER = 100_000_000
+"""Largest difference between the stamps of what is used together [ns]."""
 MAXIMUM_GAP = 0.3
 """Largest distance in time between a compared pose and the odometry around it [s]."""
 
@@ -95,8 +97,8 @@ def evaluate_drive(
         EvaluationError: there is nothing to predict from, or no window with odometry after it.
     """
     recording = corrected_recording(recording, predictor.robot)
-    flat = isinstance(predictor.source, FlatTerrain)
-    stamps = _window_stamps(recording, image_topics, flat, stride, shortest or min(horizons))
+    sensors = predictor.source.sensors
+    stamps = _window_stamps(recording, sensors, image_topics, stride, shortest or min(horizons))
     count = round(max(horizons) / SAMPLE_TIME) + 1
     times = np.arange(count) * SAMPLE_TIME
     remarks: list[str] = []
@@ -104,12 +106,12 @@ def evaluate_drive(
     terrains: list[TerrainMap] = []
     collected: dict[str, list[Poses]] = {PHYSICS: [], FLAT_PHYSICS: [], CONSTANT_VELOCITY: []}
     inside: list[np.ndarray] = []
-    level = FlatTerrain(predictor.robot, predictor_grid(predictor), TerrainDefaults())
+    level = FlatTerrain(predictor.robot, predictor.source.grid, TerrainDefaults())
 
     def finish_batch(batch: list[MotionState], maps: list[TerrainMap]) -> None:
         twists = np.stack([recording.commands.sample(predictor.command_stamps(m.stamp)) for m in batch])
         for method, batch_maps in ((PHYSICS, maps), (FLAT_PHYSICS, [level.terrain(Observation(0), m) for m in batch])):
-            if method == FLAT_PHYSICS and flat:
+            if method == FLAT_PHYSICS and not sensors:
                 continue
             result = predictor.roll_out(TerrainMap.stack(batch_maps), batch, twists)
             index = np.rint(times / predictor.options.time_step).astype(int)
@@ -127,7 +129,7 @@ def evaluate_drive(
     for stamp in bar:
         try:
             motion = recording.motion.at(int(stamp), maximum_gap=MAXIMUM_GAP)
-            observation = observe(recording, predictor.robot, int(stamp), image_topics, flat)
+            observation = observe(recording, predictor.robot, int(stamp), sensors, image_topics)
             pending_maps.append(predictor.source.terrain(observation, motion))
         except (StaleDataError, MessageError, ValueError) as error:
             remarks.append(f"window at {(stamp - recording.motion.stamps[0]) * 1e-9:.1f} s left out: {error}")
@@ -170,9 +172,8 @@ def evaluate_drive(
 def predict_at(recording: Recording, predictor: Predictor, stamp: int, image_topics: Sequence[str] = ()) -> Prediction:
     """One prediction with all its forces, from the data at ``stamp`` [ns] and the commands recorded after it."""
     recording = corrected_recording(recording, predictor.robot)
-    flat = isinstance(predictor.source, FlatTerrain)
     return predictor.predict(
-        observe(recording, predictor.robot, stamp, image_topics, flat),
+        observe(recording, predictor.robot, stamp, predictor.source.sensors, image_topics),
         recording.motion.at(stamp, maximum_gap=MAXIMUM_GAP),
         recording.commands.sample(predictor.command_stamps(stamp)),
     )
@@ -187,34 +188,35 @@ def corrected_recording(recording: Recording, robot: RobotModel) -> Recording:
     )
 
 
-def predictor_grid(predictor: Predictor):
-    """The grid of a predictor's maps."""
-    source = predictor.source
-    return source.encoder.config.grid if hasattr(source, "encoder") else source.grid
-
-
 def observe(
-    recording: Recording, robot: RobotModel, stamp: int, image_topics: Sequence[str], flat: bool
+    recording: Recording, robot: RobotModel, stamp: int, sensors: Sequence[str], image_topics: Sequence[str] = ()
 ) -> Observation:
-    """The cloud or the images at a stamp; images of further cameras are the nearest within 0.1 s."""
-    if flat:
-        return Observation(stamp)
-    if not image_topics:
-        frame = min(recording.clouds, key=lambda entry: abs(entry.stamp - stamp))
-        points, frame_id = recording.cloud(frame)
-        pose = recording.sensor_pose(frame_id, robot.base_frame, robot.sensors)
-        return Observation(stamp, cloud=transform_points(pose, points).astype(np.float32))
-    images, cameras, poses = {}, {}, {}
-    for topic in image_topics:
+    """What sensors (``lidar``, ``camera``) saw nearest to a stamp [ns], seen from where the robot was then.
+
+    With cameras and a lidar, or several cameras, what is further away than 0.1 s is left out.
+    """
+    cloud, images, cameras, poses = None, {}, {}, {}
+    if "lidar" in sensors:
+        frame = min(recording.clouds, key=lambda entry: abs(entry.stamp - stamp), default=None)
+        if frame is not None and ("camera" not in sensors or abs(frame.stamp - stamp) <= _TOGETHER):
+            points, frame_id = recording.cloud(frame)
+            pose = recording.sensor_pose(frame_id, robot.base_frame, robot.sensors)
+            cloud = transform_points(_moved(recording, frame.stamp, stamp) @ pose, points).astype(np.float32)
+    for topic in image_topics if "camera" in sensors else ():
         frame = min(recording.images[topic], key=lambda entry: abs(entry.stamp - stamp), default=None)
-        if frame is None or abs(frame.stamp - stamp) > 100_000_000:
+        if frame is None or abs(frame.stamp - stamp) > _TOGETHER:
             continue
         if topic not in recording.cameras:
             raise EvaluationError(f"{recording.path}: no CameraInfo beside {topic}")
         images[topic] = recording.image(frame)
         cameras[topic] = recording.cameras[topic]
-        poses[topic] = recording.sensor_pose(cameras[topic].frame_id, robot.base_frame, robot.sensors)
-    return Observation(stamp, images=images, cameras=cameras, base_from_cameras=poses)
+        pose = recording.sensor_pose(cameras[topic].frame_id, robot.base_frame, robot.sensors)
+        poses[topic] = _moved(recording, frame.stamp, stamp) @ pose
+    return Observation(stamp, cloud, images, cameras, poses)
+
+
+def _moved(recording: Recording, start: int, end: int) -> np.ndarray:
+    return recording.motion.base_between(start, end, maximum_gap=MAXIMUM_GAP)
 
 
 def measured_poses(recording: Recording, motions: list[MotionState], times: np.ndarray) -> Poses:
@@ -253,21 +255,22 @@ def constant_velocity(motion: MotionState, times: np.ndarray) -> Poses:
 
 
 def _window_stamps(
-    recording: Recording, image_topics: Sequence[str], flat: bool, stride: float, shortest: float
+    recording: Recording, sensors: Sequence[str], image_topics: Sequence[str], stride: float, shortest: float
 ) -> np.ndarray:
-    if flat:
+    if not sensors:
         candidates = recording.motion.stamps
-    elif image_topics:
+    elif "camera" in sensors and image_topics:
         unknown = [topic for topic in image_topics if topic not in recording.images]
         if unknown:
             raise EvaluationError(f"{recording.path}: no images on {unknown}; there are {sorted(recording.images)}")
         candidates = np.array([frame.stamp for frame in recording.images[image_topics[0]]], np.int64)
     else:
-        candidates = np.array([frame.stamp for frame in recording.clouds], np.int64)
+        frames = () if "camera" in sensors else recording.clouds
+        candidates = np.array([frame.stamp for frame in frames], np.int64)
     if not len(candidates):
+        missing = "images" if "camera" in sensors else "point clouds"
         raise EvaluationError(
-            f"{recording.path}: no {'images' if image_topics else 'point clouds'} to predict from; with `--terrain "
-            "flat` odometry and commands suffice"
+            f"{recording.path}: no {missing} to predict from; with `--terrain flat` odometry and commands suffice"
         )
     if not len(recording.commands):
         raise EvaluationError(f"{recording.path}: no commands (Twist or TwistStamped): the prediction needs them")

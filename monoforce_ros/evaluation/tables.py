@@ -12,9 +12,9 @@ from monoforce_ros.bags import Recording
 from monoforce_ros.encoder import fused, load_encoder
 from monoforce_ros.evaluation.drive import CONSTANT_VELOCITY, FLAT_PHYSICS, PHYSICS, DriveEvaluation, evaluate_drive
 from monoforce_ros.evaluation.metrics import Poses, position_errors, rotation_errors
-from monoforce_ros.prediction import CameraTerrain, LidarNetworkTerrain, LidarTerrain, Predictor
+from monoforce_ros.prediction import CameraTerrain, LidarNetworkTerrain, Predictor, choose_terrain_source
+from monoforce_ros.prediction.terrain_sources import TerrainSource
 from monoforce_ros.robots import RobotModel
-from monoforce_ros.terrain import Grid, TerrainDefaults
 
 HORIZON = 5.0
 STRIDE = 1.0
@@ -31,6 +31,8 @@ class System:
     title: str
     input: str
     checkpoint: Path | None = None
+    with_lidar: bool = False
+    """Whether the encoder of images lowers a lidar's surfaces, rather than to predict heights itself."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,7 @@ def evaluate_sequence(bag: Path, robot: RobotModel, systems: Sequence[System]) -
         if system.key in (FLAT.key, CONSTANT.key):
             continue
         source = terrain_source(system, robot)
-        topics = tuple(recording.images) if isinstance(source, CameraTerrain) else ()
+        topics = tuple(recording.images) if "camera" in source.sensors else ()
         poses[system.key] = evaluate_drive(
             recording, Predictor(robot, source, horizon=HORIZON), image_topics=topics,
             horizons=(HORIZON,), stride=STRIDE, progress=False, shortest=1.0,
@@ -89,10 +91,12 @@ def evaluate_sequence(bag: Path, robot: RobotModel, systems: Sequence[System]) -
     return errors
 
 
-def terrain_source(system: System, robot: RobotModel) -> CameraTerrain | LidarTerrain | LidarNetworkTerrain:
+def terrain_source(system: System, robot: RobotModel) -> TerrainSource:
     """The terrain source of a system that has one."""
     if system.checkpoint is None:
-        return LidarTerrain(robot, Grid.square(), TerrainDefaults())
+        return choose_terrain_source("lidar", robot)
+    if system.with_lidar:
+        return choose_terrain_source("lidar_camera", robot, checkpoint=system.checkpoint)
     encoder = fused(load_encoder(system.checkpoint))
     if encoder.config.sensor == "lidar":
         return LidarNetworkTerrain(encoder, robot)

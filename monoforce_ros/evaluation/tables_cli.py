@@ -83,6 +83,16 @@ def _systems(options: argparse.Namespace) -> list[System]:
         checkpoint = getattr(options, key)
         if checkpoint is not None:
             systems.append(System(key, title, sensed, checkpoint))
+        if key == "monoforce" and checkpoint is not None:
+            systems.append(
+                System(
+                    "monoforce_lidar",
+                    "lidar lowered by images → H_d",
+                    "images, point cloud",
+                    checkpoint,
+                    with_lidar=True,
+                )
+            )
     return [*systems, FLAT, CONSTANT]
 
 

@@ -16,9 +16,11 @@ from monoforce_ros.evaluation.tables import SequenceErrors, System, mean_over, r
 
 GROUNDS = {"rigid": "Rigid ground (as the paper's Table I)", "grass": "Tall grass (as the paper's Table II)"}
 METRICS = {"position": ("Δx", "m", 3), "rotation": ("ΔR", "deg", 2)}
-RATIOS = (("monoforce", "lss"), ("monoforce", "lidar"), ("monoforce", "no_geometric"), ("lss", "lidar"))
+RATIOS = (("monoforce", "lss"), ("monoforce", "lidar"), ("monoforce", "no_geometric"), ("lss", "lidar"),
+          ("monoforce_lidar", "lidar"), ("monoforce_lidar", "monoforce"))  # fmt: skip
 _COLOURS = {"lidar": "#9b59b6", "lidar_network": "#c39bd3", "lss": "#e08214", "monoforce": "#0b84a5",
-            "no_geometric": "#7fb8c9", "flat": "#8a8f98", "constant": "#c4c8ce"}  # fmt: skip
+            "monoforce_lidar": "#2a9d5c", "no_geometric": "#7fb8c9",
+            "flat": "#8a8f98", "constant": "#c4c8ce"}  # fmt: skip
 
 
 def comparison(rows: Mapping[str, Sequence[Mapping[str, SequenceErrors]]], systems: Sequence[System]) -> dict:

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 import torch
 from matplotlib import colormaps
-from scipy.spatial.transform import Rotation
 
 from monoforce_ros.messages import encoding
 from monoforce_ros.messages.cdr import CdrWriter
 from monoforce_ros.messages.prediction import usable_steps
-from monoforce_ros.motion import MotionState, transform_points
+from monoforce_ros.motion import MotionState, quaternions, transform_points
 from monoforce_ros.physics import Rollout
 from monoforce_ros.planning import Assessment, Occupancy
 from monoforce_ros.planning.choice import WAYPOINTS
@@ -96,7 +95,7 @@ def candidate_rollouts(
 
     Args:
         motion: start of all.
-        rollout: with forces, ``[N]``.
+        rollout: with the sums of its contact forces, ``[N]``.
         robot: what rolled.
         sequences: commands of equal shares of the horizon ``[N, K, 2]``.
         assessment: of the rollouts.
@@ -110,19 +109,14 @@ def candidate_rollouts(
     pose = motion.odometry_from_terrain
     turn = pose[:3, :3]
     rotation = turn @ rollout.rotation[:, chosen].double().cpu().numpy()
-    finite = np.isfinite(rotation).all(axis=(-1, -2))
-    quaternion = np.full((*rotation.shape[:2], 4), np.nan)
-    quaternion[finite] = Rotation.from_matrix(rotation[finite]).as_quat()
-    states = np.concatenate(
-        [transform_points(pose, rollout.position[:, chosen].double().cpu().numpy()), quaternion], axis=-1
-    )
+    places = transform_points(pose, rollout.position[:, chosen].double().cpu().numpy())
+    states = np.concatenate([places, quaternions(rotation)], axis=-1)
     linear, angular = (
         value[:, chosen].double().cpu().numpy() @ turn.T for value in (rollout.velocity, rollout.angular_velocity)
     )
     share = np.minimum(chosen, horizon - 1) * sequences.shape[1] // horizon
-    forces = _averaged(rollout.forces.sum(dim=2), chosen, rollout.force_every) @ turn.T
-    drives = [torch.flatten((robot.point_drives == k).nonzero()) for k in (*range(robot.number_of_drives), -1)]
-    loads = torch.stack([rollout.normal_forces[:, :, points].sum(dim=2) for points in drives], dim=-1)
+    forces = _averaged(rollout.contact.force, chosen, rollout.force_every) @ turn.T
+    loads = rollout.contact.load
     best = assessment.best
     writer = CdrWriter()
     writer.header(motion.stamp, frame_id)
@@ -203,7 +197,7 @@ def best_path(motion: MotionState, rollout: Rollout, best: int, frame_id: str, t
         frame_id,
         motion.stamp + np.rint(times[chosen] * 1e9).astype(np.int64),
         transform_points(pose, rollout.position[best].double().numpy()[chosen]),
-        Rotation.from_matrix(pose[:3, :3] @ rollout.rotation[best].double().numpy()[chosen]).as_quat(),
+        quaternions(pose[:3, :3] @ rollout.rotation[best].double().numpy()[chosen]),
     )
 
 

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib import colormaps
-from scipy.spatial.transform import Rotation
 
 from monoforce_ros.messages import encoding
-from monoforce_ros.motion import transform_points
+from monoforce_ros.motion import quaternions, transform_points
 from monoforce_ros.prediction import Prediction
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import TerrainMap
@@ -66,7 +65,7 @@ def path(prediction: Prediction, frame_id: str, time_step: float) -> bytes:
         frame_id,
         prediction.stamp + np.rint(times[chosen] * 1e9).astype(np.int64),
         prediction.positions()[chosen],
-        Rotation.from_matrix(prediction.rotations()[chosen]).as_quat(),
+        quaternions(prediction.rotations()[chosen]),
     )
 
 
@@ -80,10 +79,11 @@ def force_steps(prediction: Prediction) -> np.ndarray:
 def contact_points(prediction: Prediction, robot: RobotModel, step: int) -> tuple[np.ndarray, np.ndarray]:
     """Points ``[k, 3]`` [m] that carry load during a step, and the forces on them ``[k, 3]`` [N], odometry frame."""
     result, transform = prediction.rollout, prediction.motion.odometry_from_terrain
-    loaded = (result.normal_forces[0, step] > 1.0).numpy()
+    slot = step // result.force_every
+    loaded = (result.normal_forces[0, slot] > 1.0).numpy()
     body = robot.points.double().numpy()[loaded]
     points = body @ result.rotation[0, step].double().numpy().T + result.position[0, step].double().numpy()
-    forces = result.forces[0, step].double().numpy()[loaded]
+    forces = result.forces[0, slot].double().numpy()[loaded]
     return transform_points(transform, points), forces @ transform[:3, :3].T
 
 

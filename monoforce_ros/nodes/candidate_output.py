@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,11 +17,13 @@ from visualization_msgs.msg import MarkerArray
 from monoforce_ros.messages import decoding
 from monoforce_ros.messages import planning as messages
 from monoforce_ros.messages.message_types import message_class
+from monoforce_ros.motion import CommandTrack
 from monoforce_ros.nodes.health import ERROR, OK, WARN, Health
 from monoforce_ros.planning import CandidateSettings, CostWeights, Limits, assess, fan_of_arcs, occupancy, refine
 from monoforce_ros.planning.candidates import over_horizon
-from monoforce_ros.planning.costs import FORCE_EVERY, TERMS
+from monoforce_ros.planning.costs import TERMS, force_every
 from monoforce_ros.prediction import Prediction, Predictor
+from monoforce_ros.robots import load_robot
 
 PART = "candidates"
 TYPED = "monoforce_msgs/msg/Candidates"
@@ -35,7 +38,12 @@ class CandidateOutput:
     """
 
     def __init__(self, node: Node, predictor: Predictor, settings: SimpleNamespace, health: Health):
-        self._node, self._predictor, self._settings, self._health = node, predictor, settings, health
+        self._node, self._settings, self._health = node, settings, health
+        # Coarser steps and samples than those of the one prediction that is looked at: candidates are many.
+        options = replace(predictor.options, time_step=settings.candidate_time_step)
+        robot = load_robot(settings.robot, spacing=settings.candidate_spacing)
+        self._predictor = Predictor(robot, predictor.source, horizon=settings.horizon, options=options)
+        self._force_every = force_every(options.time_step)
         self._fan = np.zeros((0, 1, 2))
         if settings.candidates:
             fan = CandidateSettings(settings.candidates, tuple(settings.candidate_speeds), settings.candidate_yaw_rate)
@@ -80,17 +88,19 @@ class CandidateOutput:
         """For the diagnostics."""
         return self._figures
 
-    def publish(self, prediction: Prediction, before: np.ndarray, frame_id: str) -> None:
+    def publish(self, prediction: Prediction, commands: CommandTrack, frame_id: str) -> None:
         """Roll out every candidate on the prediction's map and publish what each costs.
 
         Args:
             prediction: whose map and start state all share.
-            before: commands that led to now ``[history, 2]``.
+            commands: that led to now.
             frame_id: of the odometry.
         """
         sequences = self._sequences()
         if not len(sequences):
             return
+        stamps = self._predictor.command_stamps(prediction.stamp)[: self._predictor.history]
+        before = commands.sample(stamps, timeout=self._settings.command_timeout)
         motion, terrain, settings, steps = prediction.motion, prediction.terrain, self._settings, self._predictor.steps
         rolled, found = self._assess(prediction, over_horizon(sequences, before, steps))
         if settings.refine_seconds and found.best is not None:
@@ -133,7 +143,9 @@ class CandidateOutput:
 
     def _assess(self, prediction: Prediction, twists: np.ndarray):
         motions = [prediction.motion] * len(twists)
-        rolled = self._predictor.roll_out(prediction.terrain, motions, twists, force_every=FORCE_EVERY)
+        rolled = self._predictor.roll_out(
+            prediction.terrain, motions, twists, with_forces=False, with_contact=True, force_every=self._force_every
+        )
         asked = torch.from_numpy(twists[:, self._predictor.history :]).float()
         robot = self._predictor.robot
         found = assess(rolled, prediction.terrain, robot, asked, weights=self._weights, limits=self._limits)

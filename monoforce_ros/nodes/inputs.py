@@ -10,14 +10,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from monoforce_ros.motion import NANOSECOND, CommandTrack, MotionState, MotionTrack
+from monoforce_ros.motion import NANOSECOND, CommandTrack, MotionState, MotionTrack, quaternions
 
 MEMORY = 10_000_000_000
 """How long motion and commands are remembered [ns]."""
 JUMP = 1_000_000_000
 """A stamp this much older than the one before it on the same topic means that time was set back [ns]."""
+
+AHEAD = 30_000_000
+"""By how much sensor data may be newer than the odometry that they are used with [ns]."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,7 @@ class Inputs:
         self._states: deque[MotionState] = deque()
         self._commands: deque[tuple[int, np.ndarray]] = deque()
         self._newest: dict[str, Received] = {}
+        self._intervals: dict[str, int] = {}
         self._pending: dict[str, Received] = {}
         self._first_sensor = 0.0
 
@@ -99,6 +102,8 @@ class Inputs:
                 self.dropped += 1
                 return
             now = time.monotonic()
+            if topic in self._newest:
+                self._intervals[topic] = stamp - self._newest[topic].stamp
             self._newest[topic] = Received(message, stamp, now)
             live = [
                 entry for entry in self._newest.values() if now - entry.arrival <= self._patience
@@ -106,16 +111,25 @@ class Inputs:
             self._first_sensor = self._first_sensor or now
             if len(self._newest) < len(self._sensors) and now - self._first_sensor < self._patience:
                 return  # the others may still be starting
-            if max(e.stamp for e in live) - min(e.stamp for e in live) > self._slop:
+            if max(e.stamp for e in live) - min(e.stamp for e in live) > self._largest_spread():
                 return
             self.dropped += bool(self._pending)
             self._pending = {name: entry for name, entry in self._newest.items() if entry in live}
             self.changed.notify_all()
 
+    def _largest_spread(self) -> int:
+        """Difference of stamps [ns] up to which messages make a set.
+
+        What is more than half the slowest sensor's interval behind the others belongs to the set before: of cameras
+        that are triggered together one must not be used with the others' last images.
+        """
+        return min([self._slop, *([max(self._intervals.values()) // 2] if self._intervals else [])])
+
     def take(self, *, odometry_timeout: float, wait: float) -> dict[str, Received] | None:
         """The newest complete set of sensor messages once odometry has caught up with it, else None after ``wait`` [s].
 
-        Odometry that stays behind for ``odometry_timeout`` [s] is not waited for any longer.
+        For the last :data:`AHEAD` the motion goes on as it did (:meth:`MotionTrack.at`), which beats waiting. Odometry
+        that stays behind for ``odometry_timeout`` [s] is not waited for any longer.
         """
         deadline = time.monotonic() + wait
         with self.changed:
@@ -124,7 +138,7 @@ class Inputs:
                 if self._pending:
                     stamp = max(entry.stamp for entry in self._pending.values())
                     arrival = max(entry.arrival for entry in self._pending.values())
-                    caught_up = bool(self._states) and self._states[-1].stamp >= stamp
+                    caught_up = bool(self._states) and self._states[-1].stamp >= stamp - AHEAD
                     if caught_up or now - arrival >= odometry_timeout:
                         taken, self._pending = self._pending, {}
                         return taken
@@ -135,6 +149,25 @@ class Inputs:
                     return None
                 self.changed.wait(max(0.0, limit - now) + 1e-3)
 
+    def take_motion(self, last: int, *, wait: float) -> dict[str, Received] | None:
+        """The newest odometry as what to predict from, if it is not the one of stamp ``last`` [ns]; else None.
+
+        Waits up to ``wait`` [s] for it.
+        """
+        deadline = time.monotonic() + wait
+        with self.changed:
+            while not self._states or self._states[-1].stamp == last:
+                remaining = deadline - time.monotonic()
+                if remaining <= 0:
+                    return None
+                self.changed.wait(remaining)
+            return {"odometry": Received(None, self._states[-1].stamp, time.monotonic())}
+
+    def drop(self, received: dict[str, Received]) -> None:
+        """Count what was taken and is not used."""
+        with self.changed:
+            self.dropped += received.keys() != {"odometry"}
+
     def motion(self) -> MotionTrack:
         """The remembered motion."""
         with self.changed:
@@ -143,9 +176,7 @@ class Inputs:
         return MotionTrack(
             stamps=np.array([s.stamp for s in states], np.int64),
             positions=np.array([s.position for s in states]).reshape(-1, 3),
-            quaternions=(
-                Rotation.from_matrix(np.array([s.rotation for s in states])).as_quat() if states else np.zeros((0, 4))
-            ),
+            quaternions=quaternions(np.array([s.rotation for s in states]).reshape(-1, 3, 3)),
             linear_velocities=np.array([s.linear_velocity for s in states]).reshape(-1, 3),
             angular_velocities=np.array([s.angular_velocity for s in states]).reshape(-1, 3),
             frame_id=frames[0],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
 import time
@@ -17,23 +18,25 @@ from visualization_msgs.msg import MarkerArray
 
 from monoforce_ros.bags.recording import camera_info_topic
 from monoforce_ros.camera import CameraModel
-from monoforce_ros.encoder import fused, load_encoder
 from monoforce_ros.messages import decoding
 from monoforce_ros.messages import prediction as encoders
-from monoforce_ros.motion import NANOSECOND, transform_points
+from monoforce_ros.motion import NANOSECOND, CommandTrack, MotionTrack, transform_points
+from monoforce_ros.nodes.beside import Beside
 from monoforce_ros.nodes.candidate_output import CandidateOutput
 from monoforce_ros.nodes.frames import SensorFrames
 from monoforce_ros.nodes.gap_output import GapOutput
 from monoforce_ros.nodes.health import ERROR, OK, STALE, WARN, Health
 from monoforce_ros.nodes.inputs import Inputs, Received
 from monoforce_ros.nodes.managed import ManagedNode
+from monoforce_ros.nodes.pace import Pace
 from monoforce_ros.nodes.parameters import declare_parameters, follow_changes, parameter_help, read_parameter_file
 from monoforce_ros.nodes.process import run_node
 from monoforce_ros.nodes.spread_output import SpreadOutput
 from monoforce_ros.nodes.subscriptions import AdaptiveSubscription
 from monoforce_ros.physics import PhysicsOptions
 from monoforce_ros.physics.effects import corrected_commands, corrected_motion
-from monoforce_ros.prediction import CameraTerrain, FlatTerrain, LidarTerrain, Observation, Prediction, Predictor
+from monoforce_ros.prediction import Observation, Prediction, Predictor, choose_terrain_source
+from monoforce_ros.prediction.terrain_sources import TerrainSource
 from monoforce_ros.robots import load_robot
 from monoforce_ros.shared_files import share_directory
 from monoforce_ros.terrain import Grid, TerrainDefaults
@@ -50,6 +53,7 @@ class PredictorNode(ManagedNode):
         self.settings = declare_parameters(self, entries)
         self.candidates: CandidateOutput | None = None
         self.spread: SpreadOutput | None = None
+        self._beside: Beside | None = None
         follow_changes(self, entries, self._change_settings)
         if self.settings.autostart:
             self.autostart()
@@ -69,6 +73,7 @@ class PredictorNode(ManagedNode):
             horizon=settings.horizon,
             options=PhysicsOptions(time_step=settings.time_step),
         )
+        self._force_every = max(1, round(encoders.FORCE_INTERVAL / settings.time_step))
         self.get_logger().info(
             "preparing the physics; the first time on a machine its kernels are compiled, about 10 s"
         )
@@ -106,6 +111,8 @@ class PredictorNode(ManagedNode):
         self._started = self._last_prediction = time.monotonic()
         self._watch = self.create_timer(0.5, self._watch_inputs)
         self._running = True
+        compares = self.candidates is not None or self.spread is not None
+        self._beside = Beside("comparison", self._compare) if compares else None
         self._worker = threading.Thread(target=self._work, name="prediction", daemon=True)
         self._worker.start()
         settings = self.settings
@@ -120,6 +127,8 @@ class PredictorNode(ManagedNode):
         with self.inputs.changed:
             self.inputs.changed.notify_all()
         self._worker.join(timeout=10.0)
+        if self._beside is not None:
+            self._beside.stop()
         if self.context.ok():
             self.health.report("prediction", STALE, "deactivated: nothing is predicted", reason="deactivated")
 
@@ -131,25 +140,29 @@ class PredictorNode(ManagedNode):
             self.spread.apply(changed)
         self.settings = changed
 
-    def _terrain_source(self) -> CameraTerrain | FlatTerrain | LidarTerrain:
+    def _terrain_source(self) -> TerrainSource:
         settings = self.settings
-        if settings.terrain_source == "camera":
-            encoder = fused(load_encoder(settings.checkpoint, "camera"))
-            cuda = settings.device == "cuda" or (settings.device == "auto" and torch.cuda.is_available())
-            return CameraTerrain(encoder.to("cuda" if cuda else "cpu"), self.robot)
-        grid = Grid.square(settings.map_size, settings.map_resolution)
-        material = TerrainDefaults(settings.stiffness, settings.damping, settings.friction)
-        kind = LidarTerrain if settings.terrain_source == "lidar" else FlatTerrain
-        return kind(self.robot, grid, material)
+        cuda = settings.device == "cuda" or (settings.device == "auto" and torch.cuda.is_available())
+        return choose_terrain_source(
+            settings.terrain_source,
+            self.robot,
+            grid=Grid.square(settings.map_size, settings.map_resolution),
+            material=TerrainDefaults(settings.stiffness, settings.damping, settings.friction),
+            checkpoint=settings.checkpoint,
+            device="cuda" if cuda else "cpu",
+            precision=settings.encoder_precision,
+            threads=min(settings.encoder_threads, os.cpu_count() or 1),
+        )
 
     def _sensor_topics(self) -> dict[str, str]:
         """Part name → resolved topic of every sensor that the terrain source uses."""
-        settings = self.settings
-        if settings.terrain_source == "lidar":
-            return {"lidar": self.resolve_topic_name(settings.cloud_topic)}
-        if settings.terrain_source == "camera":
-            return {f"camera {topic}": self.resolve_topic_name(topic) for topic in settings.image_topics if topic}
-        return {}
+        settings, sensors = self.settings, self.predictor.source.sensors
+        topics = {}
+        if "lidar" in sensors:
+            topics["lidar"] = self.resolve_topic_name(settings.cloud_topic)
+        if "camera" in sensors:
+            topics |= {f"camera {topic}": self.resolve_topic_name(topic) for topic in settings.image_topics if topic}
+        return topics
 
     def _subscribe(self) -> None:
         settings = self.settings
@@ -170,13 +183,15 @@ class PredictorNode(ManagedNode):
         }
         images = {"sensor_msgs/msg/CompressedImage": CompressedImage, "sensor_msgs/msg/Image": Image}
         info_topics = [*settings.camera_info_topics, *[""] * len(self.sensor_topics)]
-        for index, (part, topic) in enumerate(self.sensor_topics.items()):
+        index = 0
+        for part, topic in self.sensor_topics.items():
             types = {"sensor_msgs/msg/PointCloud2": PointCloud2} if part == "lidar" else images
             self._subscriptions_by_part[part] = AdaptiveSubscription(
                 self, topic, types, lambda message, part=part: self._on_sensor(part, message), **large
             )
             if part != "lidar":
                 info = info_topics[index] or camera_info_topic(topic)
+                index += 1
                 self._subscriptions_by_part[f"{part} info"] = AdaptiveSubscription(
                     self,
                     info,
@@ -273,58 +288,47 @@ class PredictorNode(ManagedNode):
     # The worker: one prediction after the other, always from the newest data.
 
     def _work(self) -> None:
-        settings = self.settings
-        if not self.sensor_topics:
-            self._work_without_sensors()
-            return
-        while self._running:
-            received = self.inputs.take(odometry_timeout=settings.odometry_timeout, wait=0.5)
-            if received is None or not self._running:
-                continue
-            started = time.monotonic()
-            self._predict(received)
-            self._pause(started)
-
-    def _work_without_sensors(self) -> None:
-        """Flat ground needs no sensor: predict from each new odometry."""
+        pace = Pace()
         last = 0
         while self._running:
-            started = time.monotonic()
-            motion = self.inputs.motion()
-            if len(motion) and motion.stamps[-1] != last:
-                last = int(motion.stamps[-1])
-                self._predict({"odometry": Received(None, last, started)})
-            self._pause(started)
-
-    def _pause(self, started: float) -> None:
-        remaining = started + 1.0 / self.settings.rate - time.monotonic()
-        while remaining > 0 and self._running:
-            time.sleep(min(remaining, 0.05))
-            remaining = started + 1.0 / self.settings.rate - time.monotonic()
+            if self.sensor_topics:
+                received = self.inputs.take(odometry_timeout=self.settings.odometry_timeout, wait=0.5)
+            else:
+                # Flat ground needs no sensor: predict from each new odometry.
+                received = self.inputs.take_motion(last, wait=0.5)
+            if received is None or not self._running:
+                continue
+            if not pace.due(time.monotonic(), self.settings.rate):
+                self.inputs.drop(received)
+                continue
+            last = max(entry.stamp for entry in received.values())
+            self._predict(received)
 
     def _predict(self, received: dict[str, Received]) -> None:
         started = time.monotonic()
         stamp = max(entry.stamp for entry in received.values())
         try:
-            observation = self._observe(stamp, received)
+            track = corrected_motion(self.inputs.motion(), self.robot.effects)
+            observation = self._observe(stamp, received, track)
             if observation is None:
                 return
-            track = corrected_motion(self.inputs.motion(), self.robot.effects)
             motion = track.at(stamp, maximum_gap=self.settings.odometry_timeout)
             # The newest command is held over the horizon, unless it is too old to count at all.
             stamps = np.minimum(self.predictor.command_stamps(stamp), stamp)
             commands = corrected_commands(self.inputs.commands(), self.robot.effects)
             twists = commands.sample(stamps, timeout=self.settings.command_timeout)
-            prediction = self.predictor.predict(observation, motion, twists)
+            prediction = self.predictor.predict(observation, motion, twists, force_every=self._force_every)
             if not bool(prediction.rollout.valid.all()):
                 raise ValueError("the rollout diverged")
-            self._publish(prediction)
             frame_id = self.inputs.frame_id or "odom"
+            # What is steered by comes first, what is looked at last.
+            self._publish("path", encoders.path(prediction, frame_id, self.settings.path_time_step))
+            if self._beside is not None:
+                self._beside.give((prediction, commands, twists, frame_id))
+            self._publish("height_map", encoders.height_map(prediction, frame_id))
+            self._publish("terrain", encoders.terrain_cloud(prediction, frame_id))
+            self._publish("contact_forces", encoders.contact_forces(prediction, self.robot, frame_id))
             self.gap.update(prediction, track, commands)
-            if self.spread is not None:
-                self.spread.publish(prediction, twists, frame_id)
-            if self.candidates is not None:
-                self.candidates.publish(prediction, twists[: self.predictor.history], frame_id)
         except Exception as error:  # the node must outlive whatever its input brings about
             # Errors that say what is wrong with the input are ValueErrors; others need their kind to be understood.
             text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
@@ -335,14 +339,33 @@ class PredictorNode(ManagedNode):
         self._durations = [*self._durations[-199:], time.monotonic() - started]
         self.health.report("prediction", OK, "predicting", latency_ms=f"{1e3 * self._durations[-1]:.0f}")
 
-    def _observe(self, stamp: int, received: dict[str, Received]) -> Observation | None:
-        """Decode sensor messages; a fault is reported on its part, and None returned where nothing usable remains."""
+    def _compare(self, job: tuple[Prediction, CommandTrack, np.ndarray, str]) -> None:
+        """Candidates and spread of a prediction, while the next one is made."""
+        prediction, commands, twists, frame_id = job
+        try:
+            if self.candidates is not None:
+                self.candidates.publish(prediction, commands, frame_id)
+            if self.spread is not None:
+                self.spread.publish(prediction, twists, frame_id)
+        except Exception as error:  # the node must outlive whatever its input brings about
+            text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+            self.health.report("comparison", ERROR, f"nothing published: {text}", reason=type(error).__name__)
+            return
+        self.health.report("comparison", OK, "candidates and spread are up to date", left_out=self._beside.dropped)
+
+    def _observe(self, stamp: int, received: dict[str, Received], track: MotionTrack) -> Observation | None:
+        """Decode sensor messages; a fault is reported on its part, and None returned where nothing usable remains.
+
+        What was seen before ``stamp`` is given as seen from where the robot is at ``stamp``.
+        """
         cloud, images, cameras, poses = None, {}, {}, {}
         for part, entry in received.items():
             if part == "odometry":
                 continue
             try:
                 pose_of = self.frames.base_from(entry.message.header.frame_id)
+                limit = self.settings.odometry_timeout
+                pose_of = track.base_between(entry.stamp, stamp, maximum_gap=limit) @ pose_of
                 if part == "lidar":
                     cloud = transform_points(pose_of, decoding.decode_cloud(entry.message))
                 else:
@@ -377,17 +400,8 @@ class PredictorNode(ManagedNode):
             )
         return image, camera
 
-    def _publish(self, prediction: Prediction) -> None:
-        frame_id = self.inputs.frame_id or "odom"
-        messages = {
-            "height_map": encoders.height_map(prediction, frame_id),
-            "terrain": encoders.terrain_cloud(prediction, frame_id),
-            "contact_forces": encoders.contact_forces(prediction, self.robot, frame_id),
-            "path": encoders.path(prediction, frame_id, self.settings.path_time_step),
-        }
-        if not self.context.ok():
-            return
-        for name, data in messages.items():
+    def _publish(self, name: str, data: bytes) -> None:
+        if self.context.ok():
             self._outputs[name].publish(data)
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from monoforce_ros.physics.contact_summary import ContactSummary
 from monoforce_ros.physics.effects.catalogue import applied_setup
 from monoforce_ros.physics.effects.effect import per_trajectory
 from monoforce_ros.physics.state import State
@@ -133,3 +134,5 @@ class Motion:
     """``[B, T, N, 3]``."""
     forces: Tensor | None = None
     """``[B, T, N, 3]``."""
+    contact: ContactSummary | None = None
+    """Where the backend summed the forces itself."""

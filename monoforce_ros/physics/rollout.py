@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import torch
 from torch import Tensor
 
 from monoforce_ros.physics import neural_ode, torch_backend
+from monoforce_ros.physics.contact_summary import ContactSummary
 from monoforce_ros.physics.neural_ode import OdeOptions
 from monoforce_ros.physics.options import PhysicsOptions
 from monoforce_ros.physics.problem import Motion, Problem
@@ -26,6 +27,7 @@ def rollout(
     *,
     options: PhysicsOptions = PhysicsOptions(),  # noqa: B008  (frozen)
     with_forces: bool = True,
+    with_contact: bool = False,
     force_every: int = 1,
     backend: str = "auto",
     ode: OdeOptions | None = None,
@@ -45,6 +47,7 @@ def rollout(
         drive_speeds: surface speed of each drive during each step [m/s], ``[B, T, D]``.
         state: start states, ``[B]``.
         with_forces: whether to return per-point forces (memory grows with B · T · N).
+        with_contact: whether to return their sums over the body, which without gradients cost little.
         force_every: of so many steps the first one's forces are returned; where many candidates are compared, all of
             them would cost more than the motion.
         ode: integrate by a solver of torchdiffeq instead, as the paper's Neural-ODE variant does; without forces.
@@ -67,8 +70,17 @@ def rollout(
     if ode is not None:
         motion = neural_ode.integrate(problem, options, ode)
     else:
-        motion = _backend(backend).integrate(problem, options, with_forces, force_every)
-    return replace(_result(problem, motion, finite, options), force_every=force_every)
+        motion = _backend(backend).integrate(problem, options, with_forces, with_contact, force_every)
+    result = replace(_result(problem, motion, finite, options), force_every=force_every)
+    if not with_contact or not problem.steps or result.contact is not None or result.forces is None:
+        return result
+    contact = ContactSummary.of_points(
+        robot.to(result.position.dtype, result.position.device), result.rotation[:, :-1:force_every],
+        result.normal_forces, result.tangential_forces, result.forces,
+    )  # fmt: skip
+    if with_forces:
+        return replace(result, contact=contact)
+    return replace(result, contact=contact, normal_forces=None, tangential_forces=None, forces=None)
 
 
 def _backend(name: str):
@@ -111,4 +123,6 @@ def _result(problem: Problem, motion: Motion, finite: Tensor, options: PhysicsOp
         normal_forces=mark(motion.normal_forces),
         tangential_forces=mark(motion.tangential_forces),
         forces=mark(motion.forces),
+        contact=motion.contact
+        and ContactSummary(*(mark(getattr(motion.contact, f.name)) for f in fields(motion.contact))),
     )

@@ -7,6 +7,8 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from monoforce_ros.physics.contact_summary import ContactSummary
+
 
 @dataclass(frozen=True)
 class State:
@@ -75,8 +77,10 @@ class Rollout:
     """Part of the contact force along the ground on each body point [N], ``[B, T, N, 3]`` in terrain axes."""
     forces: Tensor | None = None
     """Whole contact force on each body point during each step [N], ``[B, T, N, 3]`` in terrain axes."""
+    contact: ContactSummary | None = None
+    """The forces summed over the body's points, ``[B, T, …]``."""
     force_every: int = 1
-    """Forces are those of the first of so many steps; above, ``T`` is then that much smaller."""
+    """Forces and their sums are those of the first of so many steps; above, ``T`` is then that much smaller."""
 
     def joined(self, other: Rollout) -> Rollout:
         """These trajectories and others of the same times after them; forces only where both have them."""
@@ -85,6 +89,8 @@ class Rollout:
             mine, theirs = getattr(self, entry.name), getattr(other, entry.name)
             if entry.name in ("times", "force_every"):
                 parts[entry.name] = mine
+            elif isinstance(mine, ContactSummary):
+                parts[entry.name] = None if theirs is None else mine.joined(theirs)
             else:
                 parts[entry.name] = None if mine is None or theirs is None else torch.cat([mine, theirs])
         return Rollout(**parts)

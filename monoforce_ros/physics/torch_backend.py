@@ -30,7 +30,9 @@ def features(in_body: Tensor, rotation: Tensor) -> Tensor:
     return torch.stack([*listed, rotation[:, 2, 0], rotation[:, 2, 1]], dim=-1)
 
 
-def integrate(problem: Problem, options: PhysicsOptions, with_forces: bool, force_every: int = 1) -> Motion:
+def integrate(
+    problem: Problem, options: PhysicsOptions, with_forces: bool, with_contact: bool = False, force_every: int = 1
+) -> Motion:
     """Integrate with autograd recording each step; see :func:`monoforce_ros.physics.rollout`."""
     batch, dtype, device = problem.batch_size, problem.centre.dtype, problem.centre.device
     step_time = options.time_step
@@ -104,7 +106,7 @@ def integrate(problem: Problem, options: PhysicsOptions, with_forces: bool, forc
         centre = centre + step_time * velocity
         rotation = exponential_map(step_time * angular_velocity) @ rotation
         history.append((centre, rotation, velocity, angular_velocity))
-        if with_forces and step % force_every == 0:
+        if (with_forces or with_contact) and step % force_every == 0:
             acted = touch.force - touch.gain * (change[:, None] @ jacobian).unflatten(2, (3, -1))[:, 0]
             pressing = acted[:, 0].clamp_min(0.0)
             normal_forces.append(pressing)

@@ -10,6 +10,8 @@ import warp as wp
 from torch import Tensor
 
 from monoforce_ros.physics import warp_kernels
+from monoforce_ros.physics.clusters import PointClusters, point_clusters
+from monoforce_ros.physics.contact_summary import STEEP, ContactSummary
 from monoforce_ros.physics.options import PhysicsOptions
 from monoforce_ros.physics.problem import Motion, Problem
 from monoforce_ros.terrain import Grid
@@ -28,7 +30,9 @@ _threads: ThreadPoolExecutor | None = None
 wp.init()
 
 
-def integrate(problem: Problem, options: PhysicsOptions, with_forces: bool, force_every: int = 1) -> Motion:
+def integrate(
+    problem: Problem, options: PhysicsOptions, with_forces: bool, with_contact: bool = False, force_every: int = 1
+) -> Motion:
     """Integrate with Warp; see :func:`monoforce_ros.physics.rollout`."""
     terrain = problem.terrain
     height = terrain.height if terrain.height.ndim == 3 else terrain.height[None]
@@ -40,36 +44,47 @@ def integrate(problem: Problem, options: PhysicsOptions, with_forces: bool, forc
     height, material = height.expand(pages, -1, -1), material.expand(pages, -1, -1, -1)
     share = problem.point_areas / problem.point_areas.sum()
     drives = problem.point_drives.to(torch.int32)
-    fixed = _Fixed(options, terrain.grid, drives)
-    common = (
-        height,
-        material,
-        problem.drive_speeds,
-        problem.points,
-        problem.point_areas,
-        problem.point_tangents,
-        share,
-        problem.mass,
-        problem.centre_of_mass,
-        problem.friction_factors,
-        problem.gravity_tilt,
-        problem.resistance,
-        problem.wrench,
-    )
+    sampled = (problem.points, problem.point_areas, problem.point_tangents, share)
+
+    def common(body: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+        return (
+            height,
+            material,
+            problem.drive_speeds,
+            *body,
+            problem.mass,
+            problem.centre_of_mass,
+            problem.friction_factors,
+            problem.gravity_tilt,
+            problem.resistance,
+            problem.wrench,
+        )
+
     start = (problem.centre, problem.rotation, problem.velocity, problem.angular_velocity)
-    states = _Integrate.apply(fixed, *common, problem.inertia, *start)
-    if not with_forces or not problem.steps:
+    clusters = point_clusters(problem.points)
+    fixed = _Fixed(options, terrain.grid, drives[clusters.order], clusters)
+    # Points of a cluster lie side by side.
+    ordered = common(tuple(t[clusters.order] for t in sampled))
+    states = _Integrate.apply(fixed, *ordered, problem.inertia, *start)
+    if not problem.steps or not (with_forces or with_contact):
         return Motion(*states)
-    return Motion(*states, *_Forces.apply(fixed, force_every, *common, *states))
+    with_gradient = torch.is_grad_enabled() and any(t.requires_grad for t in (*ordered, *states))
+    if with_contact and not with_forces and not with_gradient:
+        sums = _launch_summary(fixed, force_every, _contiguous(ordered), states)
+        return Motion(*states, contact=ContactSummary.split(sums, problem.drive_speeds.shape[2]))
+    fixed = _Fixed(options, terrain.grid, drives, clusters)
+    return Motion(*states, *_Forces.apply(fixed, force_every, *common(sampled), *states))
 
 
 class _Fixed:
     """What a launch needs besides tensors that carry gradients."""
 
-    def __init__(self, options: PhysicsOptions, grid: Grid, drives: Tensor):
+    def __init__(self, options: PhysicsOptions, grid: Grid, drives: Tensor, clusters: PointClusters):
         self.options = options
         self.grid = grid
         self.drives = drives.contiguous()
+        self.clusters = clusters
+        self._ceiling: Tensor | None = None
 
     def structs(self, kernels: warp_kernels.Kernels):
         grid = kernels.integrate.grid_type()
@@ -84,6 +99,14 @@ class _Fixed:
         options.normal = int(self.options.normal_force == "normal")
         options.tangential = _TANGENTIAL[self.options.tangential_force]
         return grid, options
+
+    def broad_phase(self, kernels: warp_kernels.Kernels, height: Tensor) -> tuple[wp.array, tuple[wp.array, ...]]:
+        """The highest ground near each node, and the clusters of points that it is compared with."""
+        found = self.clusters
+        listed = ((found.centres, kernels.vec3), (found.radii, kernels.scalar), (found.edges, wp.int32))
+        if self._ceiling is None:
+            self._ceiling = found.ceiling(height, self.grid.resolution).contiguous()
+        return wp.from_torch(self._ceiling, dtype=kernels.scalar), tuple(wp.from_torch(t, dtype=k) for t, k in listed)
 
 
 def _kernels(tensor: Tensor) -> warp_kernels.Kernels:
@@ -180,6 +203,7 @@ def _launch(kernels, fixed, common, inertia, states, *, state_gradients=None):
     types = (*_types(kernels), kernels.mat33)
     state_types = (kernels.vec3, kernels.mat33, kernels.vec3, kernels.vec3)
     drives = wp.from_torch(fixed.drives, dtype=wp.int32)
+    ceiling, clusters = fixed.broad_phase(kernels, common[0])
 
     def work(part: tuple[int, int]) -> list[Tensor | None]:
         first, count = part
@@ -199,8 +223,8 @@ def _launch(kernels, fixed, common, inertia, states, *, state_gradients=None):
             slots = max(1, steps) if backward else 1
             scratch = _wrap((common[0].new_zeros((width, slots, 9, 3)),), (kernels.vec3,), gradients=backward)
             inputs = [
-                chunk, steps, int(backward), height, material, grid, options, speeds, points, areas, tangents, drives,
-                weights, mass, centre_of_mass, moments, factors, tilt, resistance, wrench,
+                chunk, steps, int(backward), height, ceiling, material, grid, options, speeds, *clusters, points, areas,
+                tangents, drives, weights, mass, centre_of_mass, moments, factors, tilt, resistance, wrench,
             ]  # fmt: skip
             launch = {"dim": width, "inputs": inputs, "outputs": [*moving, *scratch], "device": device}
             wp.launch(kernels.integrate, record_tape=False, **launch)
@@ -256,6 +280,37 @@ def _launch_forces(kernels, fixed, every, inputs, outputs, *, output_gradients=N
     if not backward:
         return []
     return [torch.stack(entries).sum(0) if len(entries) > 1 else entries[0] for entries in zip(*parts, strict=True)]
+
+
+def _launch_summary(fixed, every, common, states) -> Tensor:
+    """Launch the sums of the forces of every so many steps, ``[B, S, 2 D + 8]``."""
+    kernels = _kernels(common[0])
+    grid, options = fixed.structs(kernels)
+    batch, steps, drives = common[2].shape
+    state_types = (kernels.vec3, kernels.mat33, kernels.vec3, kernels.vec3)
+    sums = common[0].new_zeros((batch, -(-steps // every), 2 * drives + 8))
+    ceiling, clusters = fixed.broad_phase(kernels, common[0])
+    (
+        height, material, speeds, points, areas, tangents, weights, mass, centre_of_mass, factors, tilt, resistance,
+        wrench, *moving,
+    ) = _wrap((*common, *_contiguous(states)), (*_types(kernels), *state_types), gradients=False)  # fmt: skip
+    result, moved = wp.from_torch(sums, dtype=kernels.scalar), wp.from_torch(fixed.drives, dtype=wp.int32)
+
+    def work(part: tuple[int, int]) -> None:
+        first, count = part
+        inputs = [
+            first, every, kernels.scalar(STEEP), height, ceiling, material, grid, options, speeds, *clusters, points,
+            areas, tangents, moved, weights, mass, centre_of_mass, factors, tilt, resistance, wrench, *moving,
+        ]  # fmt: skip
+        device = str(common[0].device)
+        wp.launch(
+            kernels.summarise, dim=(count, sums.shape[1]), inputs=inputs, outputs=[result], device=device,
+            record_tape=False,
+        )  # fmt: skip
+
+    kernels.summarise.module.load(wp.get_device(str(common[0].device)))
+    list(_in_parallel(work, _shares(batch, common[0].device)))
+    return sums
 
 
 def _adjoint(inputs: list, outputs: int) -> dict:

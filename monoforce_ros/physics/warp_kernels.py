@@ -35,6 +35,7 @@ class Kernels:
     wrench: Any
     integrate: Any
     forces: Any
+    summarise: Any
 
 
 @cache
@@ -83,6 +84,17 @@ def kernels(double: bool) -> Kernels:
     def nearest(raw: scalar, cells: int) -> int:
         # rint rounds halves to even, as torch does.
         return int(wp.rint(wp.clamp(raw, scalar(0.0), scalar(cells - 1))))
+
+    @wp.func
+    def nearby(raw: scalar, cells: int) -> int:
+        # Which way halves are rounded is all the same here, and rint would be a call.
+        return int(wp.clamp(raw, scalar(0.0), scalar(cells - 1)) + scalar(0.5))
+
+    @wp.func
+    def may_touch(ceiling: wp.array3d(dtype=scalar), page: int, grid: Grid, middle: vec3, radius: scalar) -> bool:
+        row = nearby((middle[1] - grid.origin_y) * grid.inverse_resolution, grid.rows)
+        column = nearby((middle[0] - grid.origin_x) * grid.inverse_resolution, grid.columns)
+        return ceiling[page, row, column] > middle[2] - radius
 
     @wp.func
     def inside_axis(raw: scalar, cells: int) -> scalar:
@@ -233,6 +245,16 @@ def kernels(double: bool) -> Kernels:
         return touch
 
     @wp.func
+    def over_the_step(touch: Touch, arm: vec3, change: vec3, turning_change: vec3) -> vec3:
+        # The forces that acted over the step: what the point's change of velocity left of them.
+        moved = change + wp.cross(turning_change, arm)
+        return vec3(
+            wp.max(touch.force[0] - touch.gain[0] * wp.dot(touch.normal, moved), scalar(0.0)),
+            touch.force[1] - touch.gain[1] * wp.dot(touch.along, moved),
+            touch.force[2] - touch.gain[2] * wp.dot(touch.across, moved),
+        )
+
+    @wp.func
     def exponential(turn: vec3) -> mat33:
         square = wp.dot(turn, turn)
         first = scalar(1.0) - square / scalar(6.0)
@@ -250,10 +272,14 @@ def kernels(double: bool) -> Kernels:
         steps: int,
         keep: int,
         height: wp.array3d(dtype=scalar),
+        ceiling: wp.array3d(dtype=scalar),
         material: wp.array3d(dtype=vec4),
         grid: Grid,
         options: Options,
         speeds: wp.array3d(dtype=scalar),
+        cluster_centres: wp.array(dtype=vec3),
+        cluster_radii: wp.array(dtype=scalar),
+        cluster_edges: wp.array(dtype=wp.int32),
         points: wp.array(dtype=vec3),
         areas: wp.array(dtype=scalar),
         tangents: wp.array(dtype=vec3),
@@ -277,7 +303,7 @@ def kernels(double: bool) -> Kernels:
         page = wp.min(b, height.shape[0] - 1)
         weight_total = mass[b] * options.gravity
         offset = centre_of_mass[b]
-        count = points.shape[0]
+        count = cluster_radii.shape[0]
         for step in range(steps):
             slot = step * keep
             position = centre[b, step]
@@ -293,69 +319,81 @@ def kernels(double: bool) -> Kernels:
             mixed_x = vec3()
             mixed_y = vec3()
             mixed_z = vec3()
-            for i in range(count):
-                arm = turned * (points[i] - offset)
-                raw_x = (position[0] + arm[0] - grid.origin_x) * grid.inverse_resolution
-                raw_y = (position[1] + arm[1] - grid.origin_y) * grid.inverse_resolution
-                # Most points are in the air: nothing more is computed for them.
-                if ground_level(height, page, grid, options.lookup, raw_x, raw_y) > position[2] + arm[2]:
-                    # The hull has no drive; its tangents are zero.
-                    drive = wp.max(drives[i], 0)
-                    touch = touch_ground(
-                        height,
-                        material,
-                        page,
-                        grid,
-                        options,
-                        position,
-                        arm,
-                        turned,
-                        linear,
-                        angular,
-                        tangents[i],
-                        speeds[b, step, drive],
-                        areas[i],
-                        weight_total * share[i],
-                        factors[b],
-                        resistance[b][0],
-                        resistance[b][3],
-                    )
-                    acting = (
-                        touch.force[0] * touch.normal + touch.force[1] * touch.along + touch.force[2] * touch.across
-                    )
-                    force = force + acting
-                    torque = torque + wp.cross(arm, acting)
-                    normal = touch.normal
-                    along = touch.along
-                    across = touch.across
-                    stiff = touch.gain[0] * normal
-                    rolls = touch.gain[1] * along
-                    slides = touch.gain[2] * across
-                    # The symmetric gain matrix, its product with [arm]× and [arm]× from both sides, entry by entry.
-                    xx = stiff[0] * normal[0] + rolls[0] * along[0] + slides[0] * across[0]
-                    yy = stiff[1] * normal[1] + rolls[1] * along[1] + slides[1] * across[1]
-                    zz = stiff[2] * normal[2] + rolls[2] * along[2] + slides[2] * across[2]
-                    yz = stiff[1] * normal[2] + rolls[1] * along[2] + slides[1] * across[2]
-                    xz = stiff[0] * normal[2] + rolls[0] * along[2] + slides[0] * across[2]
-                    xy = stiff[0] * normal[1] + rolls[0] * along[1] + slides[0] * across[1]
-                    first = vec3(xy * arm[2] - xz * arm[1], xz * arm[0] - xx * arm[2], xx * arm[1] - xy * arm[0])
-                    second = vec3(yy * arm[2] - yz * arm[1], yz * arm[0] - xy * arm[2], xy * arm[1] - yy * arm[0])
-                    third = vec3(yz * arm[2] - zz * arm[1], zz * arm[0] - xz * arm[2], xz * arm[1] - yz * arm[0])
-                    diagonal = diagonal + vec3(xx, yy, zz)
-                    beside = beside + vec3(yz, xz, xy)
-                    mixed_x = mixed_x + first
-                    mixed_y = mixed_y + second
-                    mixed_z = mixed_z + third
-                    turning_diagonal = turning_diagonal + vec3(
-                        arm[1] * third[0] - arm[2] * second[0],
-                        arm[2] * first[1] - arm[0] * third[1],
-                        arm[0] * second[2] - arm[1] * first[2],
-                    )
-                    turning_beside = turning_beside + vec3(
-                        arm[2] * first[2] - arm[0] * third[2],
-                        arm[1] * third[2] - arm[2] * second[2],
-                        arm[1] * third[1] - arm[2] * second[1],
-                    )
+            for cluster in range(count):
+                # Most clusters are higher than any ground below them: nothing is computed for their points.
+                middle = position + turned * (cluster_centres[cluster] - offset)
+                if may_touch(ceiling, page, grid, middle, cluster_radii[cluster]):
+                    for i in range(cluster_edges[cluster], cluster_edges[cluster + 1]):
+                        arm = turned * (points[i] - offset)
+                        raw_x = (position[0] + arm[0] - grid.origin_x) * grid.inverse_resolution
+                        raw_y = (position[1] + arm[1] - grid.origin_y) * grid.inverse_resolution
+                        # Of the rest most points are in the air.
+                        if ground_level(height, page, grid, options.lookup, raw_x, raw_y) > position[2] + arm[2]:
+                            # The hull has no drive; its tangents are zero.
+                            drive = wp.max(drives[i], 0)
+                            touch = touch_ground(
+                                height,
+                                material,
+                                page,
+                                grid,
+                                options,
+                                position,
+                                arm,
+                                turned,
+                                linear,
+                                angular,
+                                tangents[i],
+                                speeds[b, step, drive],
+                                areas[i],
+                                weight_total * share[i],
+                                factors[b],
+                                resistance[b][0],
+                                resistance[b][3],
+                            )
+                            acting = (
+                                touch.force[0] * touch.normal
+                                + touch.force[1] * touch.along
+                                + touch.force[2] * touch.across
+                            )
+                            force = force + acting
+                            torque = torque + wp.cross(arm, acting)
+                            normal = touch.normal
+                            along = touch.along
+                            across = touch.across
+                            stiff = touch.gain[0] * normal
+                            rolls = touch.gain[1] * along
+                            slides = touch.gain[2] * across
+                            # The symmetric gain matrix, it times [arm]×, and [arm]× on both sides, entry by entry.
+                            xx = stiff[0] * normal[0] + rolls[0] * along[0] + slides[0] * across[0]
+                            yy = stiff[1] * normal[1] + rolls[1] * along[1] + slides[1] * across[1]
+                            zz = stiff[2] * normal[2] + rolls[2] * along[2] + slides[2] * across[2]
+                            yz = stiff[1] * normal[2] + rolls[1] * along[2] + slides[1] * across[2]
+                            xz = stiff[0] * normal[2] + rolls[0] * along[2] + slides[0] * across[2]
+                            xy = stiff[0] * normal[1] + rolls[0] * along[1] + slides[0] * across[1]
+                            first = vec3(
+                                xy * arm[2] - xz * arm[1], xz * arm[0] - xx * arm[2], xx * arm[1] - xy * arm[0]
+                            )
+                            second = vec3(
+                                yy * arm[2] - yz * arm[1], yz * arm[0] - xy * arm[2], xy * arm[1] - yy * arm[0]
+                            )
+                            third = vec3(
+                                yz * arm[2] - zz * arm[1], zz * arm[0] - xz * arm[2], xz * arm[1] - yz * arm[0]
+                            )
+                            diagonal = diagonal + vec3(xx, yy, zz)
+                            beside = beside + vec3(yz, xz, xy)
+                            mixed_x = mixed_x + first
+                            mixed_y = mixed_y + second
+                            mixed_z = mixed_z + third
+                            turning_diagonal = turning_diagonal + vec3(
+                                arm[1] * third[0] - arm[2] * second[0],
+                                arm[2] * first[1] - arm[0] * third[1],
+                                arm[0] * second[2] - arm[1] * first[2],
+                            )
+                            turning_beside = turning_beside + vec3(
+                                arm[2] * first[2] - arm[0] * third[2],
+                                arm[1] * third[2] - arm[2] * second[2],
+                                arm[1] * third[1] - arm[2] * second[1],
+                            )
             summed[thread, slot, 0] = force
             summed[thread, slot, 1] = torque
             summed[thread, slot, 2] = diagonal
@@ -472,18 +510,111 @@ def kernels(double: bool) -> Kernels:
             resistance[b][3],
         )
         if touch.active == 1:
-            # The forces that acted over the step: what the point's change of velocity left of them.
-            change = (velocity[b, step + 1] - velocity[b, step]) + wp.cross(
-                angular_velocity[b, step + 1] - angular_velocity[b, step], arm
+            acted = over_the_step(
+                touch,
+                arm,
+                velocity[b, step + 1] - velocity[b, step],
+                angular_velocity[b, step + 1] - angular_velocity[b, step],
             )
-            pressing = wp.max(touch.force[0] - touch.gain[0] * wp.dot(touch.normal, change), scalar(0.0))
-            rolling = touch.force[1] - touch.gain[1] * wp.dot(touch.along, change)
-            sliding = touch.force[2] - touch.gain[2] * wp.dot(touch.across, change)
-            normal_forces[b, slot, i] = pressing
-            tangential = rolling * touch.along + sliding * touch.across
+            normal_forces[b, slot, i] = acted[0]
+            tangential = acted[1] * touch.along + acted[2] * touch.across
             tangential_forces[b, slot, i] = tangential
-            whole_forces[b, slot, i] = pressing * touch.normal + tangential
+            whole_forces[b, slot, i] = acted[0] * touch.normal + tangential
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def summarise(
+        first_trajectory: int,
+        every: int,
+        steep: scalar,
+        height: wp.array3d(dtype=scalar),
+        ceiling: wp.array3d(dtype=scalar),
+        material: wp.array3d(dtype=vec4),
+        grid: Grid,
+        options: Options,
+        speeds: wp.array3d(dtype=scalar),
+        cluster_centres: wp.array(dtype=vec3),
+        cluster_radii: wp.array(dtype=scalar),
+        cluster_edges: wp.array(dtype=wp.int32),
+        points: wp.array(dtype=vec3),
+        areas: wp.array(dtype=scalar),
+        tangents: wp.array(dtype=vec3),
+        drives: wp.array(dtype=wp.int32),
+        share: wp.array(dtype=scalar),
+        mass: wp.array(dtype=scalar),
+        centre_of_mass: wp.array(dtype=vec3),
+        factors: wp.array(dtype=vec2),
+        tilt: wp.array(dtype=vec2),
+        resistance: wp.array(dtype=vec4),
+        wrench: wp.array(dtype=wrench_matrix),
+        centre: wp.array2d(dtype=vec3),
+        rotation: wp.array2d(dtype=mat33),
+        velocity: wp.array2d(dtype=vec3),
+        angular_velocity: wp.array2d(dtype=vec3),
+        sums: wp.array3d(dtype=scalar),
+    ):
+        part, slot = wp.tid()
+        b = first_trajectory + part
+        step = slot * every
+        page = wp.min(b, height.shape[0] - 1)
+        turned = rotation[b, step]
+        position = centre[b, step]
+        offset = centre_of_mass[b]
+        ahead = vec3(turned[0, 0], turned[1, 0], turned[2, 0])
+        change = velocity[b, step + 1] - velocity[b, step]
+        turning_change = angular_velocity[b, step + 1] - angular_velocity[b, step]
+        number = speeds.shape[2]
+        left = scalar(0.0)
+        right = scalar(0.0)
+        push = vec3()
+        whole = vec3()
+        for cluster in range(cluster_radii.shape[0]):
+            middle = position + turned * (cluster_centres[cluster] - offset)
+            if may_touch(ceiling, page, grid, middle, cluster_radii[cluster]):
+                for i in range(cluster_edges[cluster], cluster_edges[cluster + 1]):
+                    arm = turned * (points[i] - offset)
+                    touch = touch_ground(
+                        height,
+                        material,
+                        page,
+                        grid,
+                        options,
+                        position,
+                        arm,
+                        turned,
+                        velocity[b, step],
+                        angular_velocity[b, step],
+                        tangents[i],
+                        speeds[b, step, wp.max(drives[i], 0)],
+                        areas[i],
+                        mass[b] * options.gravity * share[i],
+                        factors[b],
+                        resistance[b][0],
+                        resistance[b][3],
+                    )
+                    if touch.active == 1:
+                        acted = over_the_step(touch, arm, change, turning_change)
+                        tangential = acted[1] * touch.along + acted[2] * touch.across
+                        whole = whole + acted[0] * touch.normal + tangential
+                        if touch.normal[2] < steep:
+                            push = push + acted[0] * touch.normal
+                        if points[i][1] > scalar(0.0):
+                            left = left + acted[0]
+                        if points[i][1] < scalar(0.0):
+                            right = right + acted[0]
+                        drive = wp.where(drives[i] >= 0, drives[i], number)
+                        sums[b, slot, drive] = sums[b, slot, drive] + acted[0]
+                        if drives[i] >= 0:
+                            place = number + 1 + drive
+                            sums[b, slot, place] = sums[b, slot, place] + wp.dot(tangential, ahead)
+        after = 2 * number + 1
+        sums[b, slot, after] = left
+        sums[b, slot, after + 1] = right
+        sums[b, slot, after + 2] = push[0]
+        sums[b, slot, after + 3] = push[1]
+        sums[b, slot, after + 4] = whole[0]
+        sums[b, slot, after + 5] = whole[1]
+        sums[b, slot, after + 6] = whole[2]
 
     # Structs are reached through the kernels' signatures by the caller.
     integrate.grid_type, integrate.options_type = Grid, Options
-    return Kernels(scalar, vec2, vec3, vec4, mat33, wrench_matrix, integrate, forces)
+    return Kernels(scalar, vec2, vec3, vec4, mat33, wrench_matrix, integrate, forces, summarise)

@@ -13,10 +13,8 @@ from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import TerrainMap
 
 _GRAVITY = 9.81
-_STEEP = 0.5
-"""A contact whose normal has a smaller vertical part pushes rather than carries: it is steeper than 60°."""
-FORCE_EVERY = 5
-"""Steps of which one's forces decide: enough for what is averaged below, at a fifth of the work."""
+_FORCE_INTERVAL = 0.06
+"""Time between the steps whose forces decide [s]: enough for what is averaged below."""
 _SMOOTHED = 0.2
 """Forces of single steps are averaged over this time [s]: a tyre's bounce is not a lost wheel."""
 
@@ -70,6 +68,11 @@ class Limits:
 TERMS = tuple(entry.name for entry in fields(CostWeights))
 
 
+def force_every(time_step: float) -> int:
+    """Steps of ``time_step`` [s] of which one's forces are needed to assess a rollout."""
+    return max(1, round(_FORCE_INTERVAL / time_step))
+
+
 @dataclass(frozen=True)
 class Assessment:
     """What each of ``N`` candidates costs."""
@@ -113,16 +116,16 @@ def assess(
     """Terms, cost and feasibility of rolled out candidates. Differentiable in the rollout.
 
     Args:
-        rollout: with its forces, ``[N]``.
+        rollout: with the sums of its contact forces, ``[N]``.
         terrain: the map that all rolled on.
         robot: what rolled.
         twists: commanded forward speed [m/s] and yaw rate [rad/s] of each step ``[N, T, 2]``.
 
     Raises:
-        ValueError: the rollout has no forces, or shapes do not fit.
+        ValueError: the rollout has no sums of forces, or shapes do not fit.
     """
-    if rollout.forces is None or rollout.tangential_forces is None:
-        raise ValueError("costs: the rollout has no forces; roll out with `with_forces=True`")
+    if rollout.contact is None:
+        raise ValueError("costs: the rollout has no contact forces; roll out with `with_contact=True`")
     expected = (rollout.position.shape[0], rollout.position.shape[1] - 1, 2)
     if tuple(twists.shape) != expected:
         raise ValueError(f"costs: got twists {tuple(twists.shape)}, expected {expected} for the rollout")
@@ -131,13 +134,12 @@ def assess(
     rotation = rollout.rotation[:, 1:]
     roll = torch.atan2(rotation[..., 2, 1], rotation[..., 2, 2]).abs().amax(dim=1)
     pitch = torch.asin(rotation[..., 2, 0].clamp(-1.0, 1.0)).abs().amax(dim=1)
-    pressed = rollout.normal_forces
-    load = _smoothed(pressed.sum(dim=2), step)
+    load = _smoothed(rollout.contact.load.sum(dim=2), step)
     raw = {
         "roll": roll,
         "pitch": pitch,
         "force_variation": load.std(dim=1) / weight,
-        "wheel_load": _unloaded(pressed, robot, step),
+        "wheel_load": _unloaded(rollout, step),
         "slip": _slip(rollout, robot, twists),
         "effort": _effort(rollout, robot, twists) / weight,
         "unobserved": _unobserved(rollout, terrain),
@@ -156,10 +158,9 @@ def _smoothed(values: Tensor, step: float) -> Tensor:
     return functional.avg_pool1d(values[:, None], width, stride=1)[:, 0]
 
 
-def _unloaded(pressed: Tensor, robot: RobotModel, step: float) -> Tensor:
+def _unloaded(rollout: Rollout, step: float) -> Tensor:
     """Of half the load, the largest share that either side loses ``[N]``."""
-    left = _smoothed(pressed[:, :, robot.points[:, 1] > 0].sum(dim=2), step)
-    right = _smoothed(pressed[:, :, robot.points[:, 1] < 0].sum(dim=2), step)
+    left, right = (_smoothed(side, step) for side in rollout.contact.sides.unbind(-1))
     lighter = torch.minimum(left, right) / (left + right).clamp_min(1e-6)
     return 1.0 - 2.0 * lighter.amin(dim=1)
 
@@ -177,13 +178,9 @@ def _slip(rollout: Rollout, robot: RobotModel, twists: Tensor) -> Tensor:
 
 def _effort(rollout: Rollout, robot: RobotModel, twists: Tensor) -> Tensor:
     """Mean power that the drives bring to the ground [W] ``[N]``."""
-    driven = robot.point_drives >= 0
-    along = rollout.rotation[:, 1 :: rollout.force_every, None, :, 0]
-    traction = (rollout.tangential_forces[:, :, driven] * along).sum(-1)
-    lateral = robot.drive_offsets[robot.point_drives[driven]]
     twists = twists[:, :: rollout.force_every]
-    speed = twists[..., :1] - lateral * twists[..., 1:]
-    return (traction * speed).sum(dim=2).abs().mean(dim=1)
+    speed = twists[..., :1] - robot.drive_offsets.to(twists) * twists[..., 1:]
+    return (rollout.contact.traction * speed).sum(dim=2).abs().mean(dim=1)
 
 
 def _unobserved(rollout: Rollout, terrain: TerrainMap) -> Tensor:
@@ -202,8 +199,4 @@ def _unobserved(rollout: Rollout, terrain: TerrainMap) -> Tensor:
 
 def _push(rollout: Rollout, step: float) -> Tensor:
     """Largest horizontal push of steep contacts [N] ``[N]``."""
-    normal = rollout.forces - rollout.tangential_forces
-    size = rollout.normal_forces.clamp_min(1e-6)
-    steep = (normal[..., 2] / size) < _STEEP
-    pushed = torch.where(steep[..., None], normal[..., :2], 0.0).sum(dim=2).norm(dim=-1)
-    return _smoothed(pushed, step).amax(dim=1)
+    return _smoothed(rollout.contact.push.norm(dim=-1), step).amax(dim=1)

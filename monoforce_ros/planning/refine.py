@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from monoforce_ros.planning.candidates import over_horizon
-from monoforce_ros.planning.costs import FORCE_EVERY, Assessment, CostWeights, Limits, assess
+from monoforce_ros.planning.costs import Assessment, CostWeights, Limits, assess, force_every
 from monoforce_ros.prediction import Prediction, Predictor
 from monoforce_ros.prediction.predictor import start_states
 
@@ -68,6 +68,7 @@ def refine(
     """
     started = time.monotonic()
     steps, robot = predictor.steps, predictor.robot
+    every = force_every(predictor.options.time_step)
     base = torch.from_numpy(over_horizon(sequence[None], np.zeros((0, 2)), steps)[0]).float()
     led = torch.from_numpy(np.ascontiguousarray(before)).float()
     bound = torch.tensor([robot.maximum_speed, robot.maximum_yaw_rate]).clamp(max=1e3)
@@ -86,8 +87,9 @@ def refine(
         twists = torch.cat([led.expand(len(change), -1, -1), asked], dim=1)
         motions = [prediction.motion] * len(change)
         rolled = predictor.differentiable_roll_out(
-            prediction.terrain, motions, twists, start_states(motions), robot, force_every=FORCE_EVERY
-        )
+            prediction.terrain, motions, twists, start_states(motions), robot, with_forces=False,
+            with_contact=True, force_every=every,
+        )  # fmt: skip
         found = assess(rolled, prediction.terrain, robot, asked, weights=weights, limits=limits)
         return rolled.position[:, -1], found, asked
 

@@ -45,7 +45,9 @@ def start_states(motions: list[MotionState], dtype: torch.dtype = torch.float32)
     def tensor(values: list[np.ndarray]) -> torch.Tensor:
         return torch.as_tensor(np.array(values), dtype=dtype)
 
-    rotations = [motion.terrain_from_base[:3, :3] for motion in motions]
+    # Candidates all start from one motion.
+    known = {id(motion): motion.terrain_from_base[:3, :3] for motion in {id(m): m for m in motions}.values()}
+    rotations = [known[id(motion)] for motion in motions]
     return State(
         position=tensor([np.zeros(3)] * len(motions)),
         rotation=tensor(rotations),
@@ -90,25 +92,38 @@ class Predictor:
         steps = np.arange(-self.history, self.steps)
         return stamp + np.rint(steps * self.options.time_step * 1e9).astype(np.int64)
 
-    def predict(self, observation: Observation, motion: MotionState, twists: np.ndarray) -> Prediction:
+    def predict(
+        self, observation: Observation, motion: MotionState, twists: np.ndarray, *, force_every: int = 1
+    ) -> Prediction:
         """Predict from one observation.
 
         Args:
             observation: what the sensors saw.
             motion: the robot's state at that time.
             twists: commanded forward speed [m/s] and yaw rate [rad/s] at ``command_stamps``, ``[history + T, 2]``.
+            force_every: of so many steps the forces of the first one are computed.
         """
         terrain = self.source.terrain(observation, motion)
-        return Prediction(motion, terrain, self.roll_out(terrain, [motion], twists[None]))
+        return Prediction(motion, terrain, self.roll_out(terrain, [motion], twists[None], force_every=force_every))
 
     def roll_out(
-        self, terrain: TerrainMap, motions: list[MotionState], twists: np.ndarray, *, force_every: int = 1
+        self,
+        terrain: TerrainMap,
+        motions: list[MotionState],
+        twists: np.ndarray,
+        *,
+        with_forces: bool = True,
+        with_contact: bool = False,
+        force_every: int = 1,
     ) -> Rollout:
         """Roll out motions ``[B]`` under twists ``[B, history + T, 2]`` on one map or a batch of maps."""
         with torch.no_grad():
             given = torch.as_tensor(twists, dtype=torch.float32)
             start = start_states(motions)
-            return self.differentiable_roll_out(terrain, motions, given, start, self.robot, force_every=force_every)
+            return self.differentiable_roll_out(
+                terrain, motions, given, start, self.robot,
+                with_forces=with_forces, with_contact=with_contact, force_every=force_every,
+            )  # fmt: skip
 
     def differentiable_roll_out(
         self,
@@ -119,6 +134,7 @@ class Predictor:
         robot: RobotModel,
         *,
         with_forces: bool = True,
+        with_contact: bool = False,
         force_every: int = 1,
     ) -> Rollout:
         """As :meth:`roll_out`, with gradients, from other start states and with another variant of the robot."""
@@ -127,5 +143,5 @@ class Predictor:
         heading = torch.tensor([motion.heading for motion in motions], dtype=torch.float32)
         return rollout(
             terrain, turned_effects(robot, heading), speeds, start, options=self.options, with_forces=with_forces,
-            force_every=force_every,
+            with_contact=with_contact, force_every=force_every,
         )  # fmt: skip

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from pathlib import Path
+from typing import ClassVar, Protocol
 
 import numpy as np
 import torch
 
 from monoforce_ros.camera import CameraModel
-from monoforce_ros.encoder import CameraView, LidarEncoder, TerrainEncoder
+from monoforce_ros.encoder import CameraView, LidarEncoder, TerrainEncoder, fused, load_encoder
 from monoforce_ros.motion import MotionState, transform_points
 from monoforce_ros.physics.rest import rest_depth
 from monoforce_ros.robots import RobotModel
@@ -18,6 +19,9 @@ from monoforce_ros.terrain import Grid, LidarSettings, TerrainDefaults, TerrainM
 
 _LAID_FROM, _LAID_TO = 0.15, 0.7
 """Distances from the wheels up to which a map is shifted to where the robot stands, and beyond which not [m]."""
+
+_GIVES_FROM, _GIVES_WHOLLY = 0.05, 0.15
+"""Decrease below which a surface that a lidar measured is taken as firm, and from which on as said [m]."""
 
 
 @dataclass(frozen=True)
@@ -35,8 +39,17 @@ class Observation:
     """Pose ``[4, 4]`` of each camera in the base frame."""
 
 
+SOURCES = ("lidar", "camera", "lidar_camera", "flat")
+"""Terrain sources that users choose from by name."""
+
+
 class TerrainSource(Protocol):
     """Makes a map of the ground around the robot."""
+
+    sensors: ClassVar[tuple[str, ...]]
+    """What an observation must hold: ``lidar``, ``camera``, both or nothing."""
+    grid: Grid
+    """Where the maps' cells lie."""
 
     def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
         """Map in the terrain frame (origin at the robot, x along its heading, z up)."""
@@ -80,6 +93,24 @@ def laid_under(terrain: TerrainMap, support: np.ndarray) -> TerrainMap:
     return replace(terrain, height=height, geometric_height=visible)
 
 
+def lowered(swept: TerrainMap, seen: TerrainMap) -> TerrainMap:
+    """A lidar's surfaces, lowered where an encoder says that they give way.
+
+    What no return came near to is the encoder's alone, for behind the first stems a lidar sees nothing.
+
+    Args:
+        swept: from a lidar.
+        seen: from an encoder, on the same grid.
+    """
+    decrease = (seen.geometric_height - seen.height).clamp_min(0.0)
+    decrease = decrease * ((decrease - _GIVES_FROM) / (_GIVES_WHOLLY - _GIVES_FROM)).clamp(0.0, 1.0)
+    # Never below where the encoder says that the ground carries, nor further down than it says that this gives.
+    height = swept.height - torch.minimum((swept.height - seen.height).clamp_min(0.0), decrease)
+    elsewhere = ~torch.from_numpy(swept.measured_nearby()) & seen.observed
+    height = torch.where(elsewhere, seen.height, height)
+    return replace(seen, height=height, geometric_height=height + decrease, observed=swept.observed | seen.observed)
+
+
 @dataclass(frozen=True)
 class FlatTerrain:
     """Level ground at the height of the wheels; the terrain source that needs no sensor."""
@@ -87,6 +118,7 @@ class FlatTerrain:
     robot: RobotModel
     grid: Grid
     material: TerrainDefaults
+    sensors: ClassVar[tuple[str, ...]] = ()
 
     def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
         """Level map; see :class:`TerrainSource`."""
@@ -102,6 +134,7 @@ class LidarTerrain:
     grid: Grid
     material: TerrainDefaults
     settings: LidarSettings = field(default_factory=LidarSettings)
+    sensors: ClassVar[tuple[str, ...]] = ("lidar",)
 
     def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
         """Interpolated map; raises ``TerrainError`` where the cloud does not suffice."""
@@ -123,6 +156,12 @@ class LidarNetworkTerrain:
 
     encoder: LidarEncoder
     robot: RobotModel
+    sensors: ClassVar[tuple[str, ...]] = ("lidar",)
+
+    @property
+    def grid(self) -> Grid:
+        """The encoder's."""
+        return self.encoder.config.grid
 
     def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
         """Completed map; see :class:`TerrainSource`."""
@@ -140,6 +179,14 @@ class CameraTerrain:
 
     encoder: TerrainEncoder
     robot: RobotModel
+    threads: int | None = None
+    """For the encoder alone: the physics' many small operations are fastest on one."""
+    sensors: ClassVar[tuple[str, ...]] = ("camera",)
+
+    @property
+    def grid(self) -> Grid:
+        """The encoder's."""
+        return self.encoder.config.grid
 
     def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
         """Predicted map; raises ``ValueError`` where an image, calibration or camera pose is missing."""
@@ -152,4 +199,76 @@ class CameraTerrain:
         if not views:
             raise ValueError("the camera terrain source needs at least one image, and the observation has none")
         support = support_points(self.robot, motion, self.encoder.config.stiffness)
-        return laid_under(self.encoder.terrain(views, support), support)
+        before = torch.get_num_threads()
+        torch.set_num_threads(self.threads or before)
+        try:
+            found = self.encoder.terrain(views, support)
+        finally:
+            torch.set_num_threads(before)
+        return laid_under(found, support)
+
+
+@dataclass(frozen=True)
+class LidarCameraTerrain:
+    """Surfaces where a lidar hit them, lowered by how far the encoder says that they give way (H_d); on one grid.
+
+    A lidar knows where a wall is and takes grass for one; an encoder knows grass, and heights less well.
+    """
+
+    lidar: LidarTerrain
+    camera: CameraTerrain
+    sensors: ClassVar[tuple[str, ...]] = ("lidar", "camera")
+
+    @property
+    def grid(self) -> Grid:
+        """The encoder's."""
+        return self.camera.grid
+
+    def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
+        """Map of both, or of the one that there is; raises ``ValueError`` where neither suffices."""
+        if observation.cloud is None:
+            return self.camera.terrain(observation, motion)
+        if not observation.images:
+            return self.lidar.terrain(observation, motion)
+        return lowered(self.lidar.terrain(observation, motion), self.camera.terrain(observation, motion))
+
+
+def choose_terrain_source(
+    kind: str,
+    robot: RobotModel,
+    *,
+    grid: Grid | None = None,
+    material: TerrainDefaults = TerrainDefaults(),  # noqa: B008  (frozen)
+    checkpoint: str | Path = "",
+    device: str = "cpu",
+    precision: str = "float32",
+    threads: int | None = None,
+) -> TerrainSource:
+    """A terrain source by its name, one of :data:`SOURCES`.
+
+    Args:
+        kind: its name.
+        robot: that stands on the ground.
+        grid: of the maps; with an encoder, its own.
+        material: of ground of which the source does not predict it.
+        checkpoint: of the encoder; empty for the shipped one.
+        device: on which the encoder runs.
+        precision: of the encoder, see :func:`monoforce_ros.encoder.fused`.
+        threads: that the encoder may use on the CPU; by default as many as PyTorch is set to.
+
+    Raises:
+        ValueError: there is no such source or precision.
+        CheckpointError: the encoder cannot be loaded.
+    """
+    if kind not in SOURCES:
+        raise ValueError(f"terrain source: got {kind!r}, expected one of {SOURCES}")
+    grid = grid or Grid.square()
+    if kind == "flat":
+        return FlatTerrain(robot, grid, material)
+    if kind == "lidar":
+        return LidarTerrain(robot, grid, material)
+    encoder = load_encoder(checkpoint, "camera")
+    # What is gained by folding and by half precision is gained on the CPU.
+    encoder = fused(encoder, precision) if device == "cpu" else fused(encoder).to(device)
+    camera = CameraTerrain(encoder, robot, threads)
+    return camera if kind == "camera" else LidarCameraTerrain(LidarTerrain(robot, camera.grid, material), camera)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
+import cv2
 import numpy as np
 import torch
-from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from monoforce_ros.terrain.grid import Grid
@@ -126,7 +126,8 @@ class TerrainMap:
         observed = self.observed.cpu().numpy()
         if not observed.any():
             return observed
-        return distance_transform_edt(~observed) * self.grid.resolution <= reach
+        away = cv2.distanceTransform((~observed).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        return away * self.grid.resolution <= reach + 1e-6
 
     @property
     def batch_size(self) -> int | None:
