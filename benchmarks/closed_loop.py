@@ -1,10 +1,10 @@
 """Simulator, predictor and path_selector drive to a goal around a wall and through tall grass, seed after seed.
 
-    scripts/run.sh python benchmarks/closed_loop.py [--count 10] [--source lidar camera] [--json FILE] [--docs FILE]
+    scripts/run.sh python benchmarks/closed_loop.py [--count 10] [--source NAME ...] [--json FILE] [--docs FILE]
 
 Three processes that talk through ROS in real time. A drive succeeds if the robot stands within half a metre of the goal
-in the time given and has not run into the wall. `lidar` takes grass for what it looks like; `camera` runs the terrain
-encoder.
+in the time given and has not run into the wall. `lidar` takes grass for what it looks like, `camera` runs the terrain
+encoder, `lidar_camera` lowers what the lidar measures by what the encoder says.
 """
 
 from __future__ import annotations
@@ -97,12 +97,12 @@ def drive(seed: int, source: str, robot: str, checkpoint: str, seconds: float, f
     """One drive."""
     course = CourseSettings.draw(seed)
     goal = np.array([course.grass + course.grass_depth + BEHIND, 0.0])
-    sensors = ["--camera-rate", "5", "--lidar-rate", "0"] if source == "camera" else ["--lidar-rate", "5"]
+    sensors = ["--camera-rate", "5" if "camera" in source else "0", "--lidar-rate", "5" if "lidar" in source else "0"]
     processes = [started("simulator", folder, "--course", "--seed", str(seed), *sensors)]
     wait_for(folder / "simulator.log", "simulating")
     parameters = [f"terrain_source:={source}", "candidates:=31", "horizon:=4.0", "rate:=5.0", f"robot:={robot}",
                   "candidate_yaw_rate:=1.0"]  # fmt: skip
-    parameters += [f"checkpoint:={checkpoint}"] if source == "camera" and checkpoint else []
+    parameters += [f"checkpoint:={checkpoint}"] if checkpoint else []
     words = [word for parameter in parameters for word in ("-p", parameter)]
     processes.append(started("predictor", folder, "--ros-args", *words))
     wait_for(folder / "predictor.log", "predicting")
@@ -143,7 +143,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=10, help="seeds (%(default)s)")
     parser.add_argument("--seed", type=int, default=80000, help="the first (%(default)s)")
-    parser.add_argument("--source", nargs="+", choices=("lidar", "camera"), default=["lidar", "camera"])
+    parser.add_argument("--source", nargs="+", choices=("lidar", "camera", "lidar_camera"),
+                        default=["lidar", "camera", "lidar_camera"])  # fmt: skip
     parser.add_argument("--robot", default="husky", help="name or file (%(default)s)")
     parser.add_argument("--checkpoint", default="", help="terrain encoder (the shipped one)")
     parser.add_argument("--seconds", type=float, default=75.0, help="for each drive (%(default)s)")

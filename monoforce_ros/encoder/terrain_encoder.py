@@ -21,6 +21,9 @@ _GEOMETRY_CHANNELS = 5
 _NECK_CHANNELS = 64
 _LEVEL_GROUND_SPREAD = 0.25
 """How far around level ground a pixel's depth is first expected, in the depth's logarithm."""
+_BEND = 20.0
+"""How sharply H_d bends towards 0 [1/m]: it starts at 3 cm, where its gradient is half of what it can be. Far out on
+the bend, where nothing gives way, nothing is learnt either."""
 _SEEN = 0.05
 """Summed probability of depths from which on a cell counts as observed."""
 
@@ -141,7 +144,7 @@ def maps_from_heads(
     geometric, decrease, stiffness, damping, friction = outputs.unbind(1)
     return EncodedMaps(
         geometric_height=geometric + batch.ground[:, None, None],
-        decrease=functional.softplus(decrease - 3.0) if config.decreases else torch.zeros_like(decrease),
+        decrease=functional.softplus(decrease, beta=_BEND) if config.decreases else torch.zeros_like(decrease),
         stiffness=config.stiffness * torch.exp(stiffness.clamp(-4.0, 4.0)),
         damping=config.damping * torch.exp(damping.clamp(-4.0, 4.0)),
         friction=config.friction * torch.exp(friction.clamp(-3.0, 1.0)),

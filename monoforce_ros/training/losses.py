@@ -21,6 +21,9 @@ HIGHEST, LOWEST = 1.0, -1.5
 """Heights above and below the ground under the robot that are told apart [m]; a tree is a wall (paper, figure 6)."""
 _KNEE = 0.05
 """Errors beyond it count linearly, so that few walls and trees do not outweigh the ground [m]."""
+_STANDING, _STANDING_WEIGHT, _AROUND = 0.3, 3.0, 12
+"""Height over the mean of so many cells to all sides from which on a cell stands out [m], and by how much more it then
+counts."""
 _UNSEEN = 0.1
 """Weight of measured cells that no camera looks at: only what surrounds them tells of them."""
 _ACROSS, _UP, _TURN, _HEADING = 0.15, 0.03, np.radians(2.0), np.radians(4.0)
@@ -47,9 +50,15 @@ class LossWeights:
 
 
 def geometric_loss(maps: EncodedMaps, targets: Targets, ground: Tensor) -> Tensor:
-    """Equation 4, averaged over the cells that the lidar measured; robust instead of squared."""
-    weight = targets.observed * torch.where(maps.covered, 1.0, _UNSEEN)
-    return _masked(maps.geometric_height, _limited(targets.geometric, ground), weight)
+    """Equation 4, averaged over the cells that the lidar measured; robust instead of squared.
+
+    What stands out of its surroundings counts more: walls, trunks and the edges of grass are few, and an error that
+    counts linearly is least where they are left out.
+    """
+    measured = _limited(targets.geometric, ground)
+    standing = (_prominence(measured, targets.observed) / _STANDING).clamp(0.0, 1.0)
+    weight = targets.observed * torch.where(maps.covered, 1.0, _UNSEEN) * (1.0 + _STANDING_WEIGHT * standing)
+    return _masked(maps.geometric_height, measured, weight)
 
 
 def terrain_loss(maps: EncodedMaps, targets: Targets) -> Tensor:
@@ -112,6 +121,16 @@ def trajectory_loss(
 def _limited(heights: Tensor, ground: Tensor) -> Tensor:
     above = heights - ground[:, None, None]
     return ground[:, None, None] + above.clamp(LOWEST, HIGHEST)
+
+
+def _prominence(heights: Tensor, known: Tensor) -> Tensor:
+    """Height of cells over the mean of the known ones around them [m]; all ``[B, rows, columns]``."""
+    mask = known.to(heights.dtype)
+    around = 2 * _AROUND + 1
+    summed, count = (
+        functional.avg_pool2d(values[:, None], around, 1, _AROUND)[:, 0] for values in (heights * mask, mask)
+    )
+    return heights - summed / count.clamp_min(1e-6)
 
 
 def _masked(predicted: Tensor, measured: Tensor, weight: Tensor) -> Tensor:
