@@ -19,11 +19,10 @@ import time
 from pathlib import Path
 
 import numpy as np
-import rclpy
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
+from ros_peer import Peer
 
 from monoforce_ros.evaluation.report import write_between, write_text
 from monoforce_ros.synthetic.course import CourseSettings
@@ -55,16 +54,11 @@ def wait_for(log: Path, text: str, seconds: float = 90.0) -> None:
         time.sleep(0.1)
 
 
-class Watcher:
+class Watcher(Peer):
     """Knows where the robot is and sends it off."""
 
     def __init__(self):
-        os.environ |= ENVIRONMENT
-        self.context = rclpy.Context()
-        rclpy.init(context=self.context)
-        self.node = rclpy.create_node("watcher", context=self.context)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
+        super().__init__("watcher", ENVIRONMENT)
         self.way: list[np.ndarray] = []
         self.node.create_subscription(Odometry, "odom", self._on_odometry, QoSProfile(depth=20))
         self.goals = self.node.create_publisher(PoseStamped, "goal_pose", 1)
@@ -73,24 +67,12 @@ class Watcher:
         place = message.pose.pose.position
         self.way.append(np.array([place.x, place.y]))
 
-    def spin(self, seconds: float) -> None:
-        """Listen."""
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            self.executor.spin_once(timeout_sec=0.1)
-
     def send(self, goal: np.ndarray) -> None:
         """Send the robot to a place."""
         message = PoseStamped()
         message.header.frame_id = "odom"
         message.pose.position.x, message.pose.position.y = map(float, goal)
         self.goals.publish(message)
-
-    def close(self) -> None:
-        """End the node."""
-        self.executor.shutdown()
-        self.node.destroy_node()
-        rclpy.shutdown(context=self.context)
 
 
 def drive(seed: int, source: str, robot: str, checkpoint: str, seconds: float, folder: Path) -> dict:

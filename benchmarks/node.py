@@ -19,12 +19,14 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import yaml
+from rclpy.qos import QoSProfile
+from ros_peer import Peer
 
 from monoforce_ros.bags import Recording, builders
 from monoforce_ros.bags.types import type_store
@@ -77,22 +79,13 @@ def four_camera_robot(folder: Path) -> Path:
     return file
 
 
-class Source:
+class Source(Peer):
     """Publishes what a robot's drivers would and hears the path; one thread, one process."""
 
     def __init__(self, case: Case, robot_frames: list[str]):
-        import rclpy
-        from rclpy.executors import SingleThreadedExecutor
-        from rclpy.qos import QoSProfile
-
         # Large messages want the segment of the process that publishes them to be large.
-        os.environ |= ENVIRONMENT | {"FASTRTPS_DEFAULT_PROFILES_FILE": str(PROFILE)}
+        super().__init__("drivers", ENVIRONMENT | {"FASTRTPS_DEFAULT_PROFILES_FILE": str(PROFILE)})
         self.case, self.frames = case, robot_frames
-        self.context = rclpy.Context()
-        rclpy.init(context=self.context)
-        self.node = rclpy.create_node("drivers", context=self.context)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
         newest = QoSProfile(depth=10)
         self.latencies: list[float] = []
         self.arrivals: list[float] = []
@@ -129,8 +122,6 @@ class Source:
         return bytearray(type_store().serialize_cdr(message, message.__msgtype__))
 
     def _publish(self, topic: str, kind: str, data: bytes) -> None:
-        from rclpy.qos import QoSProfile
-
         if topic not in self._publishers:
             self._publishers[topic] = self.node.create_publisher(message_class(kind), topic, QoSProfile(depth=2))
         self._publishers[topic].publish(bytes(data))
@@ -182,16 +173,8 @@ class Source:
                 if self.case.clouds:
                     self._publish("points", "sensor_msgs/msg/PointCloud2", self._stamped(self.cloud, stamp))
                 sent += 1
-            self.executor.spin_once(timeout_sec=0.002)
+            self.spin_once(0.002)
         return sent
-
-    def close(self) -> None:
-        """End the node."""
-        import rclpy
-
-        self.executor.shutdown()
-        self.node.destroy_node()
-        rclpy.shutdown(context=self.context)
 
 
 class Predictor:
@@ -246,7 +229,7 @@ def measure(case: Case, seconds: float, folder: Path) -> dict:
     lasted = time.monotonic() - began
     used = (predictor.cpu_seconds() - cpu) / lasted
     memory, threads = predictor.state()
-    source.executor.spin_once(timeout_sec=1.2)
+    source.spin_once(1.2)
     values = np.array(source.latencies)
     gaps = np.diff(source.arrivals)
     row = {
@@ -262,20 +245,11 @@ def measure(case: Case, seconds: float, folder: Path) -> dict:
     return row
 
 
-class Listener:
+class Listener(Peer):
     """Counts paths."""
 
     def __init__(self):
-        import rclpy
-        from rclpy.executors import SingleThreadedExecutor
-        from rclpy.qos import QoSProfile
-
-        os.environ |= ENVIRONMENT
-        self.context = rclpy.Context()
-        rclpy.init(context=self.context)
-        self.node = rclpy.create_node("listener", context=self.context)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
+        super().__init__("listener", ENVIRONMENT)
         self.count = 0
         path = message_class("nav_msgs/msg/Path")
         self.node.create_subscription(path, "predicted/path", self._on_path, QoSProfile(depth=10), raw=True)
@@ -285,18 +259,9 @@ class Listener:
 
     def run(self, seconds: float) -> int:
         """Listen for a while; returns how many paths came."""
-        before, end = self.count, time.monotonic() + seconds
-        while time.monotonic() < end:
-            self.executor.spin_once(timeout_sec=0.2)
+        before = self.count
+        self.spin(seconds)
         return self.count - before
-
-    def close(self) -> None:
-        """End the node."""
-        import rclpy
-
-        self.executor.shutdown()
-        self.node.destroy_node()
-        rclpy.shutdown(context=self.context)
 
 
 def endure(case: Case, minutes: float, folder: Path) -> dict:
@@ -362,7 +327,11 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=20.0, help="of each case (%(default)s)")
     parser.add_argument("--only", nargs="+", choices=[case.name for case in CASES], metavar="NAME")
     parser.add_argument(
-        "--endurance", type=float, metavar="MINUTES", help="the bag in a loop at 2x for so long instead"
+        "--endurance",
+        type=float,
+        metavar="MINUTES",
+        help="the bag in a loop at 2x for so long instead, with 8 candidates and an ensemble "
+        "of 8; from the sensor of the first case of --only, by default one camera",
     )
     parser.add_argument("--json", type=Path)
     parser.add_argument("--docs", type=Path, help="write the table between this document's `<!-- latency -->` marks")
@@ -370,7 +339,8 @@ def main() -> None:
     cases = [case for case in CASES if not options.only or case.name in options.only]
     with tempfile.TemporaryDirectory() as folder:
         if options.endurance:
-            case = Case("endurance", "", cameras=1, parameters=("candidates:=8", "ensemble:=8"))
+            source = cases[0] if options.only else CASES[2]
+            case = replace(source, name="endurance", parameters=("candidates:=8", "ensemble:=8"))
             found = endure(case, options.endurance, Path(folder))
             result = {"endurance": found}
             if options.docs:
