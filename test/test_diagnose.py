@@ -13,7 +13,7 @@ from monoforce_ros.bags import Recording, SmoothedMotion, builders, smooth
 from monoforce_ros.discrepancy.bag_diagnosis import diagnose_bag
 from monoforce_ros.discrepancy.clocks import compare_with_gyro
 from monoforce_ros.discrepancy.commissioning import commission
-from monoforce_ros.discrepancy.diagnosis import Settings, diagnose
+from monoforce_ros.discrepancy.diagnosis import Settings, _same, diagnose
 from monoforce_ros.discrepancy.fit import first_values, fit_effects
 from monoforce_ros.discrepancy.gap import map_floor, noise_floor, noisy_motions
 from monoforce_ros.discrepancy.hypothesis import (
@@ -24,6 +24,7 @@ from monoforce_ros.discrepancy.hypothesis import (
     undo_measurement,
     window_starts,
 )
+from monoforce_ros.discrepancy.selection import Search, Trial
 from monoforce_ros.discrepancy.wheels import compare_with_wheels
 from monoforce_ros.evaluation.drive import PHYSICS, evaluate_drive
 from monoforce_ros.messages import decoding
@@ -93,6 +94,34 @@ def test_planted_parameters_are_recovered_by_the_fit(husky, name, parameters):
         assert dict(fit.effects)[name][key] == pytest.approx(value, rel=0.05, abs=0.012)
     after = np.abs(predictions.residuals([fit.effects])[0]).mean()
     assert after < 0.2 * before
+
+
+def test_what_matters_most_is_named_first(husky):
+    planted = (("drive_asymmetry", {"difference": 0.01}), ("drive_gain", {"gain": 0.8}))
+    motion, commands = own_drive(husky, planted)
+    starts = window_starts(motion, [slice(0, len(motion))], 2.0, 1.0)
+    search = Search(husky, DriveData(motion, commands, starts, 2.0, SAMPLES), np.tile([0.01, 0.01, 0.005], (4, 1)))
+    fit = search.refit(planted)
+    assert search.ranked(fit) == [1, 0]
+    alone = replace(fit, effects=fit.effects[:1])
+    assert search.ranked(alone) == [0]
+
+
+def test_a_formula_that_is_an_effect_and_a_small_rest_keeps_the_effects_name():
+    def trial(effects, loss):
+        return Trial(effects, (effects, effects), np.full(4, loss))
+
+    nominal, drag = trial((), 4.0), (("viscous_drag", {"coefficient": 150.0}),)
+    as_formula = (("learned_term", {"force_x:vx": -170.0, "torque_z:vx": 20.0}),)
+    assert _same(trial(drag, 1.2), trial(as_formula, 0.6), nominal)
+    # The formula explains far more, is of something else, or its largest term is.
+    assert not _same(trial(drag, 3.0), trial(as_formula, 0.6), nominal)
+    assert not _same(trial((("payload", {"mass": 9.0}),), 1.2), trial(as_formula, 0.6), nominal)
+    turned = (("learned_term", {"force_x:vx": -20.0, "torque_z:vx": 170.0}),)
+    assert not _same(trial(drag, 1.2), trial(turned, 0.6), nominal)
+    push = (("constant_force", {"x": 0.0, "y": 150.0}),)
+    constant = (("learned_term", {"force_y:1": 147.0, "torque_z:wz": 10.8, "force_x:wz": 55.9}),)
+    assert _same(trial(push, 1.5), trial(constant, 0.6), nominal)
 
 
 def test_hypotheses_of_a_batch_are_those_of_single_calls(husky):

@@ -25,6 +25,14 @@ SMALLEST_SHARE = 0.6
 """Of what is to explain: effects that explain less are not what is missing."""
 LARGEST_DRIFT = 0.12
 """Of what is to explain: parameters that would have to change by more over the drive are not those of one effect."""
+_DRAGS = frozenset({"viscous_drag", "quadratic_drag"})
+_ACTS_AS = {
+    "force_x:1": frozenset({"constant_force"}), "force_y:1": frozenset({"constant_force"}), "force_x:vx": _DRAGS,
+    "force_x:vx|vx|": _DRAGS,
+}  # fmt: skip
+"""Terms of a formula that an effect of the catalogue consists of; at about one speed the drags are alike."""
+_TYPICAL = {"vx": 0.5, "vx|vx|": 0.3, "wz": 0.5, "wz|wz|": 0.3}
+"""How large features of the motion are on a drive, to compare what terms amount to."""
 _CLEARLY = 3.0 * HEALTHY_LOSS
 _WELL = 2.0 * HEALTHY_LOSS
 """Loss from which on something is missing, whether it can be named or not."""
@@ -139,7 +147,9 @@ def diagnose(
     if shown is not None:
         whole = search.refit(shown.effects)
         fitted, parts = whole.effects, shown.parts
-        effects = tuple(_measured(entry, gyro, wheels) for entry in described(whole, outcome.rivals))
+        listed = [_measured(entry, gyro, wheels) for entry in described(whole, outcome.rivals)]
+        # What matters most is named first, whatever was found first.
+        effects = tuple(listed[i] for i in search.ranked(whole))
     compared = compare(robot, data, smoothed, parts, noisy)
     gap = gap_table(compared, settings.seed)
     reached = [row for metric, row in gap.items() if row["low"] > 0 and metric.endswith(("_1s", "_2s"))]
@@ -250,14 +260,14 @@ def _verdict(search: Search, outcome: Outcome) -> tuple[str, Trial | None, tuple
     why = ""
     # A formula has more freedom than an effect with a name: what fits well keeps its name although one fits better.
     better, low, _ = paired(best.unseen, formula_trial.unseen, search.data.starts)
-    if low > 0 and better > 0.1 * excess and best.loss > _WELL:
+    if low > 0 and better > 0.1 * excess and best.loss > _WELL and not _same(best, formula_trial, nominal):
         why = f"a formula predicts held-out data better than {' and '.join(best.names)}"
     elif best.loss > _CLEARLY:
         drift, thirds = search.drifting(best)
         numbers["share_by_drift"] = drift / excess
         if drift > LARGEST_DRIFT * excess:
             why = f"{_changing(thirds, len(search.known))} over the drive, as no single value can"
-        elif share < SMALLEST_SHARE and not search.known:
+        elif share < SMALLEST_SHARE and not search.known and not _same(best, formula_trial, nominal):
             # What the gyro and the wheels show is so, however much else there is.
             why = f"no more than {100 * share:.0f} % of it is explained by {' and '.join(best.names)}"
     if why:
@@ -265,6 +275,20 @@ def _verdict(search: Search, outcome: Outcome) -> tuple[str, Trial | None, tuple
         measured = best if search.known and best.effects[: len(search.known)] == search.known else None
         return *_unknown(formula_trial, nominal, why, measured), numbers
     return "effect_found", best, remarks, numbers
+
+
+def _same(best: Trial, formula_trial: Trial, nominal: Trial) -> bool:
+    """Whether a formula is an effect of the catalogue and some small rest.
+
+    Its largest term is then the force by which that effect acts, and the effect explains most of what it does.
+    """
+    terms = dict(formula_trial.effects).get(LEARNED)
+    if not terms:
+        return False
+    largest = max(terms, key=lambda key: abs(terms[key]) * _TYPICAL.get(key.split(":")[1], 1.0))
+    if not _ACTS_AS.get(largest, frozenset()) & set(best.names):
+        return False
+    return nominal.loss - best.loss > SMALLEST_SHARE * (nominal.loss - formula_trial.loss)
 
 
 def _unknown(

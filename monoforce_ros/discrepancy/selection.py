@@ -257,6 +257,14 @@ class Search:
         """Fit to the whole drive."""
         return fit_effects(self.predictions, [effects], self.scale, iterations=6, free=self._held(effects))
 
+    def ranked(self, fit: Fit) -> list[int]:
+        """Indices of a fit's effects, that first without which most would be unexplained again."""
+        if len(fit.effects) < 2:
+            return list(range(len(fit.effects)))
+        others = [fit.effects[:i] + fit.effects[i + 1 :] for i in range(len(fit.effects))]
+        losses = [float(self.loss_of(effects).mean()) for effects in others]
+        return sorted(range(len(losses)), key=lambda i: -losses[i])
+
     def _held(self, effects: Effects) -> int:
         return len(self.known) if effects[: len(self.known)] == self.known else 0
 
