@@ -1,5 +1,6 @@
 """What the tests share: where real recordings lie, and running installed executables as processes of their own."""
 
+import itertools
 import os
 import signal
 import subprocess
@@ -19,7 +20,7 @@ torch.set_num_threads(1)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Tests that start nodes run by themselves, the others beside each other (see the Makefile)."""
     for item in items:
-        if {"start", "peer"} & set(getattr(item, "fixturenames", ())):
+        if {"start", "peer"} & set(getattr(item, "fixturenames", ())) and not item.get_closest_marker("unhurried"):
             item.add_marker(pytest.mark.robot)
 
 
@@ -82,14 +83,15 @@ class Process:
             pytest.fail(f"the process did not end on signal {how}; it printed:\n{self.output}")
 
 
-_domains = iter(range(10_000))
+_WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw2").removeprefix("gw"))
+_domains = itertools.cycle(range(1 + 25 * _WORKER, 26 + 25 * _WORKER))
 
 
 @pytest.fixture(scope="module")
 def ros_environment() -> dict[str, str]:
     """Environment with a ROS domain of its own, so that tests and robots do not hear each other."""
     environment = dict(os.environ)
-    environment["ROS_DOMAIN_ID"] = str((os.getpid() * 7 + next(_domains)) % 100 + 1)
+    environment["ROS_DOMAIN_ID"] = str(next(_domains))
     environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     # A crash says where.
     environment["PYTHONFAULTHANDLER"] = "1"

@@ -64,8 +64,8 @@ def test_the_encoder_benchmark_writes_its_figures(tmp_path):
         assert row["fused_ms"] > 0 and row["ratio"] > 0 and all(v > 0 for v in row["stages_ms"].values())
 
 
-def test_a_minute_of_a_bag_in_a_loop_leaves_memory_and_threads_as_they_were(start, tmp_path):
-    """Half an hour of it is a benchmark; `start` has the node's tests run by themselves."""
+def test_a_minute_of_a_bag_in_a_loop_leaves_memory_and_threads_as_they_were(tmp_path):
+    """Half an hour of it is a benchmark."""
     out = tmp_path / "node.json"
     done = subprocess.run(
         [sys.executable, "benchmarks/node.py", "--endurance", "1", "--json", str(out)],
@@ -83,7 +83,8 @@ def test_a_minute_of_a_bag_in_a_loop_leaves_memory_and_threads_as_they_were(star
     assert samples[-1]["memory_mb"] < 1.08 * samples[0]["memory_mb"]
 
 
-def test_latency_is_measured_between_processes(start, tmp_path):
+@pytest.mark.robot
+def test_latency_is_measured_between_processes(tmp_path):
     out = tmp_path / "node.json"
     done = subprocess.run(
         [sys.executable, "benchmarks/node.py", "--only", "lidar", "--seconds", "3", "--json", str(out)],

@@ -403,6 +403,7 @@ def test_what_the_catalogue_does_not_hold_is_said_to_be_unknown(pulled_robot, la
     assert json.loads((out / "01_drive" / "report.json").read_text())["verdict"] == "effect_found"
 
 
+@pytest.mark.unhurried
 def test_the_node_predicts_better_with_the_written_file(tmp_path, start, peer):
     """A robot with small wheels is diagnosed; the file that comes of it in a running node, against the nominal one."""
     bag = tmp_path / "drive"

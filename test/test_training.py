@@ -198,6 +198,7 @@ def test_the_loss_falls_and_the_checkpoint_loads(trained):
     assert described["settings"]["steps"] == 24 and list(described["drives"]) == ["demo"]
 
 
+@pytest.mark.unhurried
 def test_training_goes_on_after_a_kill_as_if_nothing_had_been(executables, demo_bag, cut, trained, tmp_path, start):
     command = [demo_bag, "--out", tmp_path, "--cut", cut, "--steps", 24, "--save-every", 8, *OPTIONS]
     process = start("train", *command)
