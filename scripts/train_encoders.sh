@@ -60,7 +60,7 @@ if [ "$what" = tables ]; then
   other=$!
 fi
 # What is seen first, then what carries: the second step starts from the first.
-train geometric 600 --losses geometric
+train geometric 800 --losses geometric
 train monoforce 600 --start-from out/encoders/geometric/encoder.safetensors
 for ending in safetensors json; do
   cp "out/encoders/monoforce/encoder.$ending" "models/.terrain_encoder.$ending"

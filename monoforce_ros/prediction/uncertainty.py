@@ -35,6 +35,8 @@ class EnsembleSettings:
     drift: float = 0.08
     """Of the position along and across, per metre driven [-]: what maps and physics get wrong beside all this; measured
     on synthetic drives with a lidar (benchmarks/uncertainty.py)."""
+    position: float = 0.02
+    """Of the start's position [m]: odometry jumps about by that much."""
     scale: float = 1.0
     """On the whole band; set so that it holds :data:`COVERAGE` of what happened."""
     seed: int = 0
@@ -49,6 +51,7 @@ class EnsembleSettings:
             ("heading", 1.0),
             ("gain", 1.0),
             ("drift", 1.0),
+            ("position", 1.0),
         ):
             if not 0.0 <= getattr(self, name) <= high:
                 raise ValueError(f"ensemble {name}: got {getattr(self, name)}, expected 0 to {high:g}")
@@ -114,14 +117,14 @@ def spread(predictor: Predictor, prediction: Prediction, twists: np.ndarray, set
     turn = np.arctan2(rotation[..., 1, 0], rotation[..., 0, 0]) - heading
     turn = (turn + np.pi) % (2.0 * np.pi) - np.pi
     driven = np.linalg.norm(np.diff(nominal[:, :2], axis=0, prepend=nominal[:1, :2]), axis=1).cumsum()
-    drift = settings.drift * driven
+    drift = np.hypot(settings.drift * driven, settings.position)
     radius = np.hypot(np.quantile(np.hypot(along, across), COVERAGE, axis=0), _RAYLEIGH * drift)
 
     def deviation(values: np.ndarray, beside: np.ndarray | float = 0.0) -> np.ndarray:
         return settings.scale * np.sqrt((values**2).mean(axis=0) + np.square(beside))
 
     return Spread(
-        deviation(along, drift), deviation(across, drift), deviation(away[..., 2]), deviation(turn),
+        deviation(along, drift), deviation(across, drift), deviation(away[..., 2], settings.position), deviation(turn),
         settings.scale * radius, int(finite.sum()),
     )  # fmt: skip
 
