@@ -298,6 +298,7 @@ def endurance_table(found: dict) -> str:
     lines += [
         f"| {s['minute']:.1f} | {s['memory_mb']:.0f} MB | {s['threads']} | {s['paths']} |" for s in found["samples"]
     ]
+    lines += ["", f"Predictor and player ended with {' and '.join(map(str, found['exit_status']))}."]
     return "\n".join(lines)
 
 
