@@ -21,7 +21,7 @@ from monoforce_ros.encoder.lift import feature_rays
 from monoforce_ros.physics import PhysicsOptions
 from monoforce_ros.robots import load_robot
 from monoforce_ros.training.drive_samples import SamplesError, SampleSettings, cut_drive, read_samples
-from monoforce_ros.training.losses import geometric_loss, terrain_loss, trajectory_loss
+from monoforce_ros.training.losses import geometric_loss, measured_decrease_loss, terrain_loss, trajectory_loss
 from monoforce_ros.training.samples import MIRROR, Targets, Variation, sample
 
 TINY = EncoderConfig(image_width=128, image_height=96, map_size=6.4, resolution=0.2)
@@ -129,6 +129,39 @@ def test_losses_are_means_over_measured_cells(drive):
     assert float(felt) == pytest.approx(0.2 - 0.025, abs=1e-4)
     nothing = replace(targets, felt=torch.zeros_like(targets.felt))
     assert float(terrain_loss(maps_of(targets), nothing)) == 0.0
+
+
+def test_what_stands_out_counts_more(drive):
+    batch, targets = sample(drive, 3, TINY)
+    measured = targets.geometric.clone()
+    rows, columns = measured.shape[1:]
+    wall = torch.zeros_like(targets.observed)
+    wall[:, rows // 2, columns // 2 - 3 : columns // 2 + 3] = True
+    measured = torch.where(wall, batch.ground[:, None, None] + 0.9, batch.ground[:, None, None])
+    targets = replace(targets, geometric=measured, observed=torch.ones_like(targets.observed))
+
+    def loss_of(where):
+        return float(geometric_loss(maps_of(targets, geometric_height=measured + 0.3 * where), targets, batch.ground))
+
+    level = torch.zeros_like(wall)
+    level[:, 2, 2:8] = True
+    assert loss_of(wall) == pytest.approx(4 * loss_of(level), rel=1e-3)
+
+
+def test_the_decrease_is_learnt_where_both_surfaces_are_known(drive):
+    _, targets = sample(drive, 3, TINY)
+    observed = torch.zeros_like(targets.observed)
+    observed[:, :, observed.shape[2] // 2 :] = True
+    targets = replace(targets, geometric=targets.supporting + 0.4, observed=observed)
+    said = torch.full_like(targets.supporting, 0.1).requires_grad_()
+    loss = measured_decrease_loss(maps_of(targets, decrease=said), targets)
+    assert float(loss) == pytest.approx(0.3 - 0.025, abs=1e-4)
+    (gradient,) = torch.autograd.grad(loss, said)
+    known = targets.felt & observed
+    assert bool(known.any()) and bool((gradient[known] < 0).all()) and float(gradient[~known].abs().max()) == 0.0
+    # What is not known of both does not count; a surface never gives way upwards.
+    higher = replace(targets, geometric=targets.supporting - 0.4)
+    assert float(measured_decrease_loss(maps_of(targets, decrease=said * 0.0), higher)) == 0.0
 
 
 def test_the_trajectory_loss_reaches_heights_and_material(drive, husky):

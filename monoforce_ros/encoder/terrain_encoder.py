@@ -21,9 +21,9 @@ _GEOMETRY_CHANNELS = 5
 _NECK_CHANNELS = 64
 _LEVEL_GROUND_SPREAD = 0.25
 """How far around level ground a pixel's depth is first expected, in the depth's logarithm."""
-_BEND = 20.0
-"""How sharply H_d bends towards 0 [1/m]: it starts at 3 cm, where its gradient is half of what it can be. Far out on
-the bend, where nothing gives way, nothing is learnt either."""
+_BEND = 5.0
+"""How sharply H_d bends towards 0 [1/m]. Far out on the bend, where nothing gives way, nothing is learnt either: the
+start must not lie there, nor what is firm push all of the map there before grass is told from it."""
 _SEEN = 0.05
 """Summed probability of depths from which on a cell counts as observed."""
 

@@ -40,9 +40,11 @@ class LossWeights:
     trajectory: float = 0.05
     decrease: float = 0.3
     """Of the mean square of H_d (λ_d of the paper's equation 3)."""
+    measured_decrease: float = 2.0
+    """Of H_d where it was measured; together with the geometric and the terrain loss alone."""
 
     def __post_init__(self):
-        for name in ("geometric", "terrain", "trajectory", "decrease"):
+        for name in ("geometric", "terrain", "trajectory", "decrease", "measured_decrease"):
             if not 0.0 <= getattr(self, name) <= 1e6:
                 raise ValueError(f"loss weight {name}: got {getattr(self, name)}, expected 0 or more")
         if self.geometric == self.terrain == self.trajectory == 0.0:
@@ -70,6 +72,18 @@ def terrain_loss(maps: EncodedMaps, targets: Targets) -> Tensor:
 def decrease_loss(maps: EncodedMaps) -> Tensor:
     """Second part of equation 3: what nobody drove over is as high as it looks."""
     return (maps.decrease**2).mean()
+
+
+def measured_decrease_loss(maps: EncodedMaps, targets: Targets) -> Tensor:
+    """H_d where both surfaces are known: where wheels or tracks touched what the lidar measured; robust.
+
+    Heights tell of it by their difference alone, and an encoder that is not yet sure what is grass finds it easier to
+    see lower.
+    """
+    measured = (targets.geometric - targets.supporting).clamp(0.0, HIGHEST)
+    known = targets.felt & targets.observed
+    weight = known * torch.where(maps.covered, 1.0, _UNSEEN)
+    return _masked(maps.decrease, torch.where(known, measured, 0.0), weight)
 
 
 def trajectory_loss(
