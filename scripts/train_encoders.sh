@@ -54,14 +54,14 @@ if [ "$what" = tables ]; then
     train no_geometric 800 --losses terrain trajectory &&
       train lidar_network 400 --sensor lidar --losses geometric &&
       until [ -f out/encoders/geometric/training.json ]; do sleep 5; done &&
-      train lss 600 --losses geometric --start-from out/encoders/geometric/encoder.safetensors
+      train lss 400 --losses geometric --start-from out/encoders/geometric/encoder.safetensors
   }
   beside out/encoders/others.log others &
   other=$!
 fi
 # What is seen first, then what carries: the second step starts from the first.
 train geometric 800 --losses geometric
-train monoforce 600 --start-from out/encoders/geometric/encoder.safetensors
+train monoforce 400 --start-from out/encoders/geometric/encoder.safetensors
 for ending in safetensors json; do
   cp "out/encoders/monoforce/encoder.$ending" "models/.terrain_encoder.$ending"
   mv "models/.terrain_encoder.$ending" "models/terrain_encoder.$ending"

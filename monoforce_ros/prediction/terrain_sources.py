@@ -20,8 +20,9 @@ from monoforce_ros.terrain import Grid, LidarSettings, TerrainDefaults, TerrainM
 _LAID_FROM, _LAID_TO = 0.15, 0.7
 """Distances from the wheels up to which a map is shifted to where the robot stands, and beyond which not [m]."""
 
-_GIVES_FROM, _GIVES_WHOLLY = 0.05, 0.15
-"""Decrease below which a surface that a lidar measured is taken as firm, and from which on as said [m]."""
+_GIVES_FROM, _GIVES_WHOLLY, _UNSURE = 0.02, 0.06, 0.25
+"""Decrease below which a surface that a lidar measured is taken as firm, and from which on as giving way [m]; how much
+higher than the encoder says such a surface may be."""
 
 
 @dataclass(frozen=True)
@@ -94,21 +95,20 @@ def laid_under(terrain: TerrainMap, support: np.ndarray) -> TerrainMap:
 
 
 def lowered(swept: TerrainMap, seen: TerrainMap) -> TerrainMap:
-    """A lidar's surfaces, lowered where an encoder says that they give way.
-
-    What no return came near to is the encoder's alone, for behind the first stems a lidar sees nothing.
+    """A lidar's surfaces, lowered to where an encoder says that the ground carries where it says that they give way.
 
     Args:
         swept: from a lidar.
         seen: from an encoder, on the same grid.
     """
     decrease = (seen.geometric_height - seen.height).clamp_min(0.0)
-    decrease = decrease * ((decrease - _GIVES_FROM) / (_GIVES_WHOLLY - _GIVES_FROM)).clamp(0.0, 1.0)
-    # Never below where the encoder says that the ground carries, nor further down than it says that this gives.
-    height = swept.height - torch.minimum((swept.height - seen.height).clamp_min(0.0), decrease)
-    elsewhere = ~torch.from_numpy(swept.measured_nearby()) & seen.observed
-    height = torch.where(elsewhere, seen.height, height)
-    return replace(seen, height=height, geometric_height=height + decrease, observed=swept.observed | seen.observed)
+    gives = ((decrease - _GIVES_FROM) / (_GIVES_WHOLLY - _GIVES_FROM)).clamp(0.0, 1.0)
+    # A surface far above what the encoder explains is another one, which it has not seen.
+    above = (swept.height - seen.height).clamp_min(0.0)
+    height = swept.height - gives * torch.minimum(above, decrease + _UNSURE)
+    return replace(
+        seen, height=height, geometric_height=height + gives * decrease, observed=swept.observed | seen.observed
+    )
 
 
 @dataclass(frozen=True)
