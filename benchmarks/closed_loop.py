@@ -82,8 +82,8 @@ def drive(seed: int, source: str, robot: str, checkpoint: str, seconds: float, f
     sensors = ["--camera-rate", "5" if "camera" in source else "0", "--lidar-rate", "5" if "lidar" in source else "0"]
     processes = [started("simulator", folder, "--course", "--seed", str(seed), *sensors)]
     wait_for(folder / "simulator.log", "simulating")
-    parameters = [f"terrain_source:={source}", "candidates:=31", "horizon:=4.0", "rate:=5.0", f"robot:={robot}",
-                  "candidate_yaw_rate:=1.0"]  # fmt: skip
+    parameters = [f"terrain_source:={source}", "candidates:=46", "horizon:=4.0", "rate:=5.0", f"robot:={robot}",
+                  "candidate_yaw_rate:=1.0", "candidate_speeds:=[0.0,0.4,0.8]"]  # fmt: skip
     parameters += [f"checkpoint:={checkpoint}"] if checkpoint else []
     words = [word for parameter in parameters for word in ("-p", parameter)]
     processes.append(started("predictor", folder, "--ros-args", *words))
