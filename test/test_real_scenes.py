@@ -88,7 +88,8 @@ def test_the_path_starts_at_the_robot_and_keeps_to_the_ground(played):
     motion = recording.motion.at(recording.clouds[0].stamp)
     path = outputs["path"][0]
     poses = np.array([[p.pose.position.x, p.pose.position.y, p.pose.position.z] for p in path.poses])
-    np.testing.assert_allclose(poses[0], motion.position, atol=1e-6)
+    # Where the cloud overtook its odometry, the motion was carried on for at most 30 ms, as it went.
+    np.testing.assert_allclose(poses[0], motion.position, atol=2e-3)
     terrain = outputs["terrain"][0]
     names = [entry.name for entry in terrain.fields]
     cells = np.frombuffer(bytes(terrain.data), "<f4").reshape(-1, len(names)).astype(float)
