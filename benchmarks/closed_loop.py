@@ -25,15 +25,16 @@ from rclpy.qos import QoSProfile
 from ros_peer import Peer
 
 from monoforce_ros.evaluation.report import write_between, write_text
-from monoforce_ros.synthetic.course import CourseSettings
+from monoforce_ros.robots import load_robot
+from monoforce_ros.synthetic.course import WALL_THICKNESS, CourseSettings
 
 ROOT = Path(__file__).resolve().parent.parent
 ENVIRONMENT = {"ROS_DOMAIN_ID": "88", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 TOLERANCE = 0.5
 BEHIND = 2.0
 """Of the goal behind the grass [m]."""
-_ROBOT = 0.55
-"""Nearer to a wall than this the robot's middle is in it [m]: half its length, and some."""
+_TOUCHED = 0.03
+"""A robot nearer to the wall than this has touched it, as far as its odometry can tell [m]."""
 
 
 def started(name: str, folder: Path, *arguments: str) -> subprocess.Popen:
@@ -60,12 +61,13 @@ class Watcher(Peer):
     def __init__(self):
         super().__init__("watcher", ENVIRONMENT)
         self.way: list[np.ndarray] = []
+        """x, y [m] and heading [rad]."""
         self.node.create_subscription(Odometry, "odom", self._on_odometry, QoSProfile(depth=20))
         self.goals = self.node.create_publisher(PoseStamped, "goal_pose", 1)
 
     def _on_odometry(self, message: Odometry) -> None:
-        place = message.pose.pose.position
-        self.way.append(np.array([place.x, place.y]))
+        place, turn = message.pose.pose.position, message.pose.pose.orientation
+        self.way.append(np.array([place.x, place.y, 2.0 * np.arctan2(turn.z, turn.w)]))
 
     def send(self, goal: np.ndarray) -> None:
         """Send the robot to a place."""
@@ -73,6 +75,18 @@ class Watcher(Peer):
         message.header.frame_id = "odom"
         message.pose.position.x, message.pose.position.y = map(float, goal)
         self.goals.publish(message)
+
+
+def room_to_wall(way: np.ndarray, course: CourseSettings, bounds: tuple) -> float:
+    """Least distance between the robot's outline and the wall over a way ``[n, 3]`` [m]."""
+    (rear, right), (front, left) = (bound.numpy()[:2] for bound in bounds)
+    along, aside = (v.ravel() for v in np.meshgrid(np.linspace(rear, front, 21), np.linspace(right, left, 15)))
+    cosine, sine = np.cos(way[:, 2:]), np.sin(way[:, 2:])
+    x = way[:, :1] + along * cosine - aside * sine
+    y = way[:, 1:2] + along * sine + aside * cosine
+    ahead = np.maximum(0.0, np.abs(x - course.wall - WALL_THICKNESS / 2) - WALL_THICKNESS / 2)
+    beside = np.maximum(0.0, np.abs(y - course.wall_side) - course.wall_width / 2)
+    return float(np.hypot(ahead, beside).min())
 
 
 def drive(seed: int, source: str, robot: str, checkpoint: str, seconds: float, folder: Path) -> dict:
@@ -102,7 +116,7 @@ def drive(seed: int, source: str, robot: str, checkpoint: str, seconds: float, f
         left = np.inf
         while time.monotonic() - began < seconds and left > TOLERANCE:
             watcher.spin(0.2)
-            left = float(np.linalg.norm(watcher.way[-1] - goal))
+            left = float(np.linalg.norm(watcher.way[-1][:2] - goal))
         took = time.monotonic() - began
     finally:
         way = np.array(watcher.way)
@@ -110,12 +124,11 @@ def drive(seed: int, source: str, robot: str, checkpoint: str, seconds: float, f
         for process in reversed(processes):
             process.send_signal(signal.SIGINT)
             process.wait(timeout=30)
-    across = np.abs(way[:, 1] - course.wall_side) < course.wall_width / 2
-    along = course.wall - way[:, 0]
-    touched = bool((across & (along < _ROBOT) & (along > -_ROBOT)).any())
+    room = room_to_wall(way, course, load_robot(robot).bounds)
     return {
-        "way": np.round(way[:: max(1, len(way) // 60)], 2).tolist(),
-        "seed": seed, "source": source, "reached": left <= TOLERANCE, "wall_touched": touched, "left_m": left,
+        "way": np.round(way[:: max(1, len(way) // 60), :2], 2).tolist(),
+        "seed": seed, "source": source, "reached": left <= TOLERANCE, "left_m": left,
+        "wall_touched": room < _TOUCHED, "room_to_wall_m": room,
         "seconds": took, "furthest_m": float(way[:, 0].max()), "grass_from_m": course.grass,
         "through_grass": bool(way[:, 0].max() > course.grass + course.grass_depth),
     }  # fmt: skip
@@ -146,13 +159,15 @@ def main() -> None:
                 f"{source} {seed}: {end} after {row['seconds']:.0f} s, {row['left_m']:.1f} m left, {wall} the wall",
                 flush=True,
             )
-    lines = ["| terrain from | goal reached | wall touched | came through the grass | median time |", "|---" * 5 + "|"]
+    heads = ("terrain from", "goal reached", "wall touched", "came through the grass", "least room to the wall", "time")
+    lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     for source in options.source:
         mine = [row for row in rows if row["source"] == source]
         times = [row["seconds"] for row in mine if row["reached"]]
         lines.append(
             f"| {source} | {sum(r['reached'] and not r['wall_touched'] for r in mine)} of {len(mine)} | "
             f"{sum(r['wall_touched'] for r in mine)} | {sum(r['through_grass'] for r in mine)} | "
+            f"{min(r['room_to_wall_m'] for r in mine):.2f} m | "
             f"{f'{np.median(times):.0f} s' if times else '–'} |"
         )
     text = "\n".join(lines)

@@ -9,7 +9,7 @@ from monoforce_ros.motion import MotionState
 from monoforce_ros.physics import State, rollout
 from monoforce_ros.prediction import FlatTerrain, Observation, Predictor
 from monoforce_ros.prediction.predictor import start_states
-from monoforce_ros.prediction.terrain_sources import choose_terrain_source, laid_under, lowered
+from monoforce_ros.prediction.terrain_sources import choose_terrain_source, clear_of, laid_under, lowered
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap
 
@@ -44,6 +44,47 @@ def test_ground_does_not_act_before_it_is_touched():
     lowest = result.position[0, :-1, 2] - robot.ground_clearance
     assert float(result.forces[0, lowest > 1e-4].abs().max()) == 0.0
     assert float(result.forces[0, lowest < -1e-3].abs().max()) > 0.0
+
+
+def swept(wall, beyond=8.0):
+    """Lidar returns of level ground outside a ring around the robot, and of a wall across at x = ``wall``."""
+    random = np.random.default_rng(0)
+    radius, angle = random.uniform(1.4, beyond, 12000), random.uniform(-np.pi, np.pi, 12000)
+    ground = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(12000, -0.131)], axis=1)
+    ground = ground[ground[:, 0] < wall]
+    front = np.stack([np.full(4000, wall), random.uniform(-1.5, 1.5, 4000), random.uniform(-0.1, 0.8, 4000)], axis=1)
+    return np.concatenate([ground, front])
+
+
+def test_a_wall_just_ahead_does_not_reach_into_the_robot_that_stands_before_it():
+    """A lidar sees no ground near the robot; filled in from the wall's height, it would push the robot away."""
+    robot = load_robot("husky")
+    still = MotionState(0, np.zeros(3), Rotation.from_euler("z", 0.7).as_matrix(), np.zeros(3), np.zeros(3))
+    predictor = Predictor(robot, choose_terrain_source("lidar", robot), horizon=1.0)
+    twists = np.zeros((len(predictor.command_stamps(0)), 2))
+    prediction = predictor.predict(Observation(0, swept(0.62)), still, twists)
+    way = np.linalg.norm(prediction.positions() - prediction.positions()[0], axis=1)
+    assert way.max() < 0.03
+    assert prediction.terrain.height.max() > 0.5, "the wall itself stays"
+    # Driving on, it runs into it.
+    onwards = predictor.predict(Observation(0, swept(0.62)), still, twists + np.array([0.5, 0.0]))
+    assert np.linalg.norm(onwards.positions()[-1] - onwards.positions()[0]) < 0.25
+
+
+def test_only_what_reaches_into_the_hull_is_lowered():
+    robot, grid = load_robot("husky"), Grid.square(6.4, 0.1)
+    tilted = MotionState(0, np.zeros(3), Rotation.from_euler("yx", [0.2, 0.1]).as_matrix(), np.zeros(3), np.zeros(3))
+    x, y = np.meshgrid(grid.x, grid.y)
+    high = TerrainMap.from_height(torch.ones(grid.rows, grid.columns), grid)
+    cleared = clear_of(high, robot, tilted).height.numpy()
+    hull = tilted.rotation @ [0.3, 0.1, 0.0]
+    row, column, _ = grid.cells(hull[None, :2])
+    assert cleared[row[0], column[0]] == pytest.approx(hull[2], abs=0.03)
+    assert (cleared[(np.abs(x) > 0.65) | (np.abs(y) > 0.5)] == 1.0).all()
+    low = TerrainMap.from_height(torch.full((grid.rows, grid.columns), -0.5), grid)
+    assert clear_of(low, robot, tilted) is low
+    on_its_side = MotionState(0, np.zeros(3), Rotation.from_euler("x", np.pi / 2).as_matrix(), *np.zeros((2, 3)))
+    assert clear_of(high, robot, on_its_side) is high
 
 
 def test_a_predicted_map_is_laid_under_the_wheels_and_left_alone_elsewhere():

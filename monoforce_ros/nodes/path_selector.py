@@ -30,7 +30,9 @@ class PathSelectorNode(Node):
     def __init__(self):
         super().__init__("path_selector")
         self.settings = settings = declare_parameters(self, read_parameter_file(PARAMETER_FILE))
-        self.weights = ChoiceWeights(settings.weight_cost, settings.weight_distance, settings.weight_heading)
+        self.weights = ChoiceWeights(
+            settings.weight_cost, settings.weight_distance, settings.weight_heading, settings.weight_clearance
+        )
         self.health = Health(self, [PART])
         self._goal: tuple[np.ndarray, str] | None = None
         self._motion: MotionState | None = None

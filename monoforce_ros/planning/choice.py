@@ -29,6 +29,8 @@ class ChoiceWeights:
     """Of how near to the goal a candidate comes, over how far any comes."""
     heading: float = 1.0
     """Of the angle between the last heading and the goal, over half a turn."""
+    clearance: float = 1.0
+    """Of how near to what is lethal a candidate comes, 0 to 1, on the average of the places where it is looked at."""
 
 
 def choose(
@@ -44,7 +46,7 @@ def choose(
         candidates: :data:`FIELDS`, each ``[N]``; places and headings in the odometry frame.
         robot: where the robot is ``[2]`` [m].
         goal: where it shall go ``[2]`` [m].
-        weights: of cost, distance and heading.
+        weights: of cost, distance, heading and clearance.
         ways: to the goal around obstacles; without them distances are straight.
 
     Raises:
@@ -73,7 +75,9 @@ def choose(
         off = np.clip(0.5 * (1.0 - (ways.at(end) - ways.at(ahead)) / _LOOK), 0.0, 1.0)
     # A candidate that passes the goal may look anywhere.
     off = np.where(at_end, off, 0.0)
+    close = 0.0 if ways is None else np.mean([ways.near(place) for place in (*way[1:], end)], axis=0)
     score = weights.cost * candidates["cost"] + weights.distance * nearest / reach + weights.heading * off
+    score = score + weights.clearance * close
     return int(np.where(feasible, score, np.inf).argmin())
 
 

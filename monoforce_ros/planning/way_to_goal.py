@@ -18,6 +18,9 @@ _LETHAL_COST, _COSTLY, _UNKNOWN_COST = 30.0, 2.0, 1.5
 
 Lethal is costly rather than impossible: a robot that stands too near to a wall must find away from it.
 """
+_BESIDE, _BESIDE_COST = 0.6, 3.0
+"""Next to what is lethal a metre counts this much more [m], less and less up to this distance from there [m]: a robot
+that has to leave its way must have the room."""
 _STEPS = ((0, 1), (1, 0), (1, 1), (1, -1))
 
 
@@ -32,18 +35,32 @@ class WayToGoal:
     """``[rows, columns]`` [m]."""
     goal: np.ndarray
     """``[2]`` [m]."""
+    nearness: np.ndarray
+    """To what is lethal, 1 from the robot's radius on and 0 where there is room enough ``[rows, columns]``."""
 
     def at(self, places: np.ndarray) -> np.ndarray:
         """From places ``[..., 2]`` [m]; as the crow flies where they are off the map."""
-        cells = np.floor((places - self.origin) / self.resolution).astype(int)
-        rows, columns = self.length.shape
-        inside = (cells[..., 0] >= 0) & (cells[..., 0] < columns) & (cells[..., 1] >= 0) & (cells[..., 1] < rows)
+        cells, inside = self._cells(places)
         # Within a cell the straight distance to the goal tells two places apart.
         centre = (cells + 0.5) * self.resolution + self.origin
         straight = np.linalg.norm(places - self.goal, axis=-1)
         within = straight - np.linalg.norm(centre - self.goal, axis=-1)
-        column, row = np.clip(cells[..., 0], 0, columns - 1), np.clip(cells[..., 1], 0, rows - 1)
-        return np.where(inside, self.length[row, column] + within, straight)
+        return np.where(inside, self._values(self.length, cells) + within, straight)
+
+    def near(self, places: np.ndarray) -> np.ndarray:
+        """How near to what is lethal places ``[..., 2]`` [m] are, 0 to 1; 0 off the map."""
+        cells, inside = self._cells(places)
+        return np.where(inside, self._values(self.nearness, cells), 0.0)
+
+    def _cells(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Column and row of the cell of each place ``[..., 2]``, and whether it is on the map."""
+        cells = np.floor((places - self.origin) / self.resolution).astype(int)
+        rows, columns = self.length.shape
+        return cells, ((cells >= 0) & (cells < [columns, rows])).all(axis=-1)
+
+    def _values(self, of: np.ndarray, cells: np.ndarray) -> np.ndarray:
+        rows, columns = of.shape
+        return of[np.clip(cells[..., 1], 0, rows - 1), np.clip(cells[..., 0], 0, columns - 1)]
 
 
 def way_to_goal(
@@ -66,12 +83,15 @@ def way_to_goal(
     if data.size == 0 or data.ndim != 2:
         raise ValueError(f"costmap: got shape {data.shape}, expected rows and columns")
     lethal = data >= LETHAL
-    near = distance_transform_edt(~lethal) * resolution < radius if lethal.any() else lethal
+    away = distance_transform_edt(~lethal) * resolution if lethal.any() else np.full(data.shape, np.inf)
+    near = away < radius
     factor = 1.0 + (_COSTLY - 1.0) * np.clip(data, 0, LETHAL) / LETHAL
     factor = np.where(data == UNKNOWN, _UNKNOWN_COST, factor)
+    nearness = np.clip(1.0 - (away - radius) / _BESIDE, 0.0, 1.0)
+    factor = factor + _BESIDE_COST * nearness
     factor = np.where(near, _LETHAL_COST, factor)
     each = max(1, round(_CELL / resolution))
-    factor, size = _coarser(factor, each), each * resolution
+    factor, nearness, size = _coarser(factor, each), _coarser(nearness, each), each * resolution
     rows, columns = factor.shape
     index = np.arange(rows * columns).reshape(rows, columns)
     starts, ends, costs = [], [], []
@@ -83,22 +103,22 @@ def way_to_goal(
         costs.append((np.hypot(down, right) * size * 0.5 * (factor[here] + factor[there])).ravel())
     # The goal is one more node: beside its own cell, or straight beyond the border.
     x, y = np.meshgrid(origin[0] + (np.arange(columns) + 0.5) * size, origin[1] + (np.arange(rows) + 0.5) * size)
-    away = np.hypot(x - goal[0], y - goal[1])
+    straight = np.hypot(x - goal[0], y - goal[1])
     border = np.zeros((rows, columns), bool)
     inside = (origin[0] <= goal[0] < origin[0] + columns * size) and (origin[1] <= goal[1] < origin[1] + rows * size)
     if inside:
-        border.ravel()[away.argmin()] = True
+        border.ravel()[straight.argmin()] = True
     else:
         border[[0, -1]] = border[:, [0, -1]] = True
     last = rows * columns
     starts.append(index[border])
     ends.append(np.full(border.sum(), last))
-    costs.append(np.maximum(away[border], 1e-6))
+    costs.append(np.maximum(straight[border], 1e-6))
     graph = coo_matrix(
         (np.concatenate(costs), (np.concatenate(starts), np.concatenate(ends))), shape=(last + 1, last + 1)
     ).tocsr()
     length = dijkstra(graph, directed=False, indices=last)[:last].reshape(rows, columns)
-    return WayToGoal(size, np.asarray(origin, float), length, np.asarray(goal, float))
+    return WayToGoal(size, np.asarray(origin, float), length, np.asarray(goal, float), nearness)
 
 
 def _coarser(values: np.ndarray, each: int) -> np.ndarray:

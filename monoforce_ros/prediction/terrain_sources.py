@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ClassVar, Protocol
 
+import cv2
 import numpy as np
 import torch
 
@@ -19,6 +20,9 @@ from monoforce_ros.terrain import Grid, LidarSettings, TerrainDefaults, TerrainM
 
 _LAID_FROM, _LAID_TO = 0.15, 0.7
 """Distances from the wheels up to which a map is shifted to where the robot stands, and beyond which not [m]."""
+
+_ALLOWED = 0.03
+"""How far ground may reach above the lowest point of a wheel or track within a cell [m]."""
 
 _GIVES_FROM, _GIVES_WHOLLY, _UNSURE = 0.02, 0.06, 0.25
 """Decrease below which a surface that a lidar measured is taken as firm, and from which on as giving way [m]; how much
@@ -94,6 +98,34 @@ def laid_under(terrain: TerrainMap, support: np.ndarray) -> TerrainMap:
     return replace(terrain, height=height, geometric_height=visible)
 
 
+def clear_of(terrain: TerrainMap, robot: RobotModel, motion: MotionState) -> TerrainMap:
+    """A map of which nothing reaches into the robot that stands on it.
+
+    No sensor sees the ground below a robot; what is filled in there from a wall nearby would push it from the start.
+    Cells below it are lowered to its lower side; so are those next to it of which nothing was measured.
+    """
+    grid, pose = terrain.grid, motion.terrain_from_base
+    (rear, right), (front, left) = (bound.cpu().double().numpy()[:2] for bound in robot.bounds)
+    hull = robot.points[robot.point_drives < 0]
+    belly = float(hull[:, 2].min()) if len(hull) else 0.0
+    if abs(np.linalg.det(pose[:2, :2])) < 0.1:  # it lies on its side
+        return terrain
+    # Where each cell's vertical meets the plane of the hull's lower side, in the robot's axes.
+    cells = np.stack(np.meshgrid(grid.x, grid.y), axis=-1) - pose[:2, 2] * belly
+    along, aside = np.moveaxis(cells @ np.linalg.inv(pose[:2, :2]).T, -1, 0)
+    inside = (along > rear) & (along < front) & (aside > right) & (aside < left)
+    limit = np.where(inside, pose[2, 0] * along + pose[2, 1] * aside + pose[2, 2] * belly, np.inf)
+    # Wheels and tracks reach lower; between their points and the cells' centres the ground may slope.
+    points = transform_points(pose, robot.points.cpu().double().numpy())
+    rows, columns, on_grid = grid.cells(points[:, :2])
+    np.minimum.at(limit, (rows[on_grid], columns[on_grid]), points[on_grid, 2] + _ALLOWED)
+    beside = cv2.erode(limit.astype(np.float32), np.ones((3, 3), np.uint8), borderValue=np.inf)
+    limit = torch.from_numpy(np.where(terrain.observed.numpy(), limit, beside)).to(terrain.height)
+    if not bool((terrain.height > limit).any()):
+        return terrain
+    return replace(terrain, height=torch.minimum(terrain.height, limit))
+
+
 def lowered(swept: TerrainMap, seen: TerrainMap) -> TerrainMap:
     """A lidar's surfaces, lowered to where an encoder says that the ground carries where it says that they give way.
 
@@ -141,13 +173,14 @@ class LidarTerrain:
         if observation.cloud is None:
             raise ValueError("the lidar terrain source needs a point cloud, and the observation has none")
         cloud = observation.cloud[~self.robot.covers(observation.cloud)].astype(np.float64)
-        return terrain_from_cloud(
+        found = terrain_from_cloud(
             transform_points(motion.terrain_from_base, cloud),
             self.grid,
             settings=self.settings,
             material=self.material,
             support=support_points(self.robot, motion, self.material.stiffness),
         )
+        return clear_of(found, self.robot, motion)
 
 
 @dataclass(frozen=True)
@@ -170,7 +203,8 @@ class LidarNetworkTerrain:
         cloud = observation.cloud[~self.robot.covers(observation.cloud)].astype(np.float64)
         cloud = cloud[np.isfinite(cloud).all(axis=1)]
         support = support_points(self.robot, motion, self.encoder.config.stiffness)
-        return laid_under(self.encoder.terrain(transform_points(motion.terrain_from_base, cloud), support), support)
+        found = self.encoder.terrain(transform_points(motion.terrain_from_base, cloud), support)
+        return clear_of(laid_under(found, support), self.robot, motion)
 
 
 @dataclass(frozen=True)
@@ -205,7 +239,7 @@ class CameraTerrain:
             found = self.encoder.terrain(views, support)
         finally:
             torch.set_num_threads(before)
-        return laid_under(found, support)
+        return clear_of(laid_under(found, support), self.robot, motion)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,9 @@ from monoforce_ros.synthetic.scenery import Scenery, Wall, standing_wall
 from monoforce_ros.synthetic.terrain_shape import HeightField, TerrainSettings, build_ground
 from monoforce_ros.synthetic.vegetation import Grass, GrassPatch
 
-_WALL_HEIGHT, _WALL_THICKNESS = 0.9, 0.25
+_WALL_HEIGHT = 0.9
+WALL_THICKNESS = 0.25
+"""Of the wall across the way [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,6 +72,6 @@ def build_course(settings: CourseSettings, seed: int) -> Scenery:
 
 
 def _wall(settings: CourseSettings, ground: HeightField) -> Wall:
-    centre = np.array([settings.wall + _WALL_THICKNESS / 2, settings.wall_side])
-    size = np.array([settings.wall_width, _WALL_THICKNESS, _WALL_HEIGHT])
+    centre = np.array([settings.wall + WALL_THICKNESS / 2, settings.wall_side])
+    size = np.array([settings.wall_width, WALL_THICKNESS, _WALL_HEIGHT])
     return standing_wall(ground, centre, np.pi / 2, size)
