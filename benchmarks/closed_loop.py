@@ -1,6 +1,7 @@
 """Simulator, predictor and path_selector drive to a goal around a wall and through tall grass, seed after seed.
 
     scripts/run.sh python benchmarks/closed_loop.py [--count 10] [--source NAME ...] [--json FILE] [--docs FILE]
+                                                    [--png FILE]
 
 Three processes that talk through ROS in real time. A drive succeeds if the robot stands within half a metre of the goal
 in the time given and has not run into the wall. `lidar` takes grass for what it looks like, `camera` runs the terrain
@@ -20,6 +21,8 @@ from pathlib import Path
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 from nav_msgs.msg import Odometry
 from rclpy.qos import QoSProfile
 from ros_peer import Peer
@@ -134,6 +137,26 @@ def drive(seed: int, source: str, robot: str, checkpoint: str, seconds: float, f
     }  # fmt: skip
 
 
+def drawn(rows: list[dict], sources: list[str]) -> Figure:
+    """The ways of all drives, a panel for each source; walls and grass of all seeds lie over each other."""
+    figure = Figure(figsize=(5.2 * len(sources), 4.0), layout="constrained", dpi=110)
+    panels = figure.subplots(1, len(sources), squeeze=False)
+    for panel, source in zip(panels[0], sources, strict=True):
+        mine = [row for row in rows if row["source"] == source]
+        for row in mine:
+            course = CourseSettings.draw(row["seed"])
+            panel.axvspan(course.grass, course.grass + course.grass_depth, color="#6aa84f", alpha=0.5 / len(mine), lw=0)
+            corner = (course.wall, course.wall_side - course.wall_width / 2)
+            panel.add_patch(Rectangle(corner, WALL_THICKNESS, course.wall_width, color="#444444", alpha=0.25, lw=0))
+            fine = row["reached"] and not row["wall_touched"]
+            panel.plot(*np.array(row["way"]).T, color="#1f77b4" if fine else "#d62728", lw=1.2)
+            panel.plot(*row["way"][-1], "o" if fine else "x", color="#1f77b4" if fine else "#d62728", ms=5)
+        reached = sum(row["reached"] and not row["wall_touched"] for row in mine)
+        panel.set(title=f"{source}: {reached} of {len(mine)} reach the goal", aspect="equal", xlim=(-0.8, 10.5))
+        panel.set(ylim=(-3.6, 3.6), xlabel="x [m]", ylabel="y [m]")
+    return figure
+
+
 def main() -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -146,6 +169,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=75.0, help="for each drive (%(default)s)")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--docs", type=Path, help="write the table between this document's marks")
+    parser.add_argument("--png", type=Path, help="draw the ways")
     options = parser.parse_args()
     rows = []
     for source in options.source:
@@ -174,6 +198,9 @@ def main() -> None:
     print(text)
     if options.json:
         write_text(options.json, json.dumps({"rows": rows}, indent=1))
+    if options.png:
+        options.png.parent.mkdir(parents=True, exist_ok=True)
+        drawn(rows, options.source).savefig(options.png)
     if options.docs:
         write_between(options.docs, "closed loop", text)
 

@@ -10,17 +10,15 @@ from monoforce_ros.physics import PhysicsOptions, State, rollout
 from monoforce_ros.physics.rest import rest_depth
 from monoforce_ros.planning import (
     CandidateSettings,
-    ChoiceWeights,
     CostWeights,
     Limits,
     assess,
-    choose,
     fan_of_arcs,
     occupancy,
-    way_to_goal,
 )
 from monoforce_ros.planning.candidates import over_horizon
 from monoforce_ros.robots import load_robot
+from monoforce_ros.steering import ChoiceWeights, choose, way_to_goal
 from monoforce_ros.terrain import Grid, TerrainMap
 
 GRID = Grid.square(12.8, 0.1)

@@ -33,3 +33,12 @@ def test_a_callback_that_outlives_its_context_is_no_fault(shut_down, ros_environ
     )  # fmt: skip
     assert (done.returncode == 0) == shut_down, done.stderr
     assert ("a fault of the node" in done.stderr) != shut_down
+
+
+def test_choosing_among_candidates_needs_no_physics_engine():
+    """On the robot's own small computer a second process of half a gigabyte is felt."""
+    loaded = (
+        "import sys, monoforce_ros.nodes.path_selector; print(sorted({'torch', 'warp', 'mujoco'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", loaded], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.strip() == "[]"

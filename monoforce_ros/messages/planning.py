@@ -12,11 +12,11 @@ from monoforce_ros.messages.prediction import usable_steps
 from monoforce_ros.motion import MotionState, quaternions, transform_points
 from monoforce_ros.physics import Rollout
 from monoforce_ros.planning import Assessment, Occupancy
-from monoforce_ros.planning.choice import WAYPOINTS
 from monoforce_ros.prediction import Prediction
 from monoforce_ros.prediction.live_gap import HORIZONS, GapSummary
 from monoforce_ros.prediction.uncertainty import Spread
 from monoforce_ros.robots import RobotModel
+from monoforce_ros.steering.choice import WAYPOINTS
 
 _SHOWN = 0.1
 """Time between the points of a drawn path [s]."""

@@ -16,9 +16,8 @@ from monoforce_ros.motion import NANOSECOND, MotionState
 from monoforce_ros.nodes.health import ERROR, OK, WARN, Health
 from monoforce_ros.nodes.parameters import declare_parameters, parameter_help, read_parameter_file
 from monoforce_ros.nodes.process import run_node
-from monoforce_ros.planning.choice import ChoiceWeights, choose
-from monoforce_ros.planning.way_to_goal import WayToGoal, way_to_goal
 from monoforce_ros.shared_files import share_directory
+from monoforce_ros.steering import ChoiceWeights, WayToGoal, choose, way_to_goal
 
 PARAMETER_FILE = share_directory() / "config" / "path_selector.yaml"
 PART = "choice"

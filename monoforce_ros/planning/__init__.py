@@ -1,25 +1,19 @@
 """What a planner needs: candidate commands, what each would cost the robot, and where it can drive at all."""
 
 from monoforce_ros.planning.candidates import CandidateSettings, fan_of_arcs
-from monoforce_ros.planning.choice import ChoiceWeights, choose
 from monoforce_ros.planning.costs import Assessment, CostWeights, Limits, assess
 from monoforce_ros.planning.occupancy import Occupancy, occupancy
 from monoforce_ros.planning.refine import Refinement, refine
-from monoforce_ros.planning.way_to_goal import WayToGoal, way_to_goal
 
 __all__ = [
     "Assessment",
     "CandidateSettings",
-    "ChoiceWeights",
     "CostWeights",
     "Limits",
     "Occupancy",
     "Refinement",
-    "WayToGoal",
     "assess",
-    "choose",
     "fan_of_arcs",
     "occupancy",
     "refine",
-    "way_to_goal",
 ]

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter
 
+from monoforce_ros.steering.way_to_goal import LETHAL, UNKNOWN
 from monoforce_ros.terrain import TerrainMap
 
-UNKNOWN, LETHAL = -1, 100
 _SLOPE_BASE = 0.5
 """Length over which a slope counts as one [m]."""
 

@@ -9,8 +9,8 @@ from scipy.ndimage import distance_transform_edt
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from monoforce_ros.planning.occupancy import LETHAL, UNKNOWN
-
+UNKNOWN, LETHAL = -1, 100
+"""What costmaps call a cell that nothing measured, and one that nobody must enter."""
 _CELL = 0.2
 """Edge of the cells on which the way is sought [m]; finer ones cost time and find the same way."""
 _LETHAL_COST, _COSTLY, _UNKNOWN_COST = 30.0, 2.0, 1.5

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from monoforce_ros.planning.way_to_goal import WayToGoal
+from monoforce_ros.steering.way_to_goal import WayToGoal
 
 WAYPOINTS = (25, 50, 75)
 """Shares of the horizon at which a candidate's place is known beside its end [%]."""
