@@ -8,8 +8,9 @@ from scipy.spatial.transform import Rotation
 from monoforce_ros.motion import MotionState
 from monoforce_ros.physics import State, rollout
 from monoforce_ros.prediction import FlatTerrain, Observation, Predictor
+from monoforce_ros.prediction.footing import clear_of, laid_under
 from monoforce_ros.prediction.predictor import start_states
-from monoforce_ros.prediction.terrain_sources import choose_terrain_source, clear_of, laid_under, lowered
+from monoforce_ros.prediction.terrain_sources import choose_terrain_source, lowered
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap
 

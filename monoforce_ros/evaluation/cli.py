@@ -45,6 +45,13 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--checkpoint", default="", help="terrain encoder weights, for --terrain camera (default: the shipped ones)"
     )
+    parser.add_argument(
+        "--memory",
+        type=float,
+        default=10.0,
+        metavar="S",
+        help="for so long what cameras saw is remembered (default 10)",
+    )
     parser.add_argument("--images", nargs="+", default=None, metavar="TOPIC", help="image topics (default: all)")
     parser.add_argument("--odometry", default=None, metavar="TOPIC", help="odometry topic (default: found by type)")
     parser.add_argument("--commands", default=None, metavar="TOPIC", help="command topic (default: found by type)")
@@ -81,6 +88,8 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error(f"--horizons: got {options.horizons}, expected 0.1 to 30 s")
     if not 0 <= options.friction <= 3:
         parser.error(f"--friction: got {options.friction}, expected 0 to 3")
+    if not 0 <= options.memory <= 600:
+        parser.error(f"--memory: got {options.memory}, expected 0 to 600 s")
     try:
         if options.check:
             check = check_bag(options.bag or share_directory() / "bags" / "demo", load_robot(options.robot))
@@ -102,7 +111,9 @@ def run(options: argparse.Namespace) -> None:
     robot = load_robot(options.robot)
     recording = Recording.open(bag, odometry=options.odometry, commands=options.commands, cloud=options.cloud)
     material = TerrainDefaults(friction=options.friction)
-    source = choose_terrain_source(options.terrain, robot, material=material, checkpoint=options.checkpoint)
+    source = choose_terrain_source(
+        options.terrain, robot, material=material, checkpoint=options.checkpoint, memory=options.memory
+    )
     predictor = Predictor(robot, source, horizon=max(options.horizons), options=PhysicsOptions())
     topics = tuple(options.images or recording.images) if "camera" in source.sensors else ()
     evaluation = evaluate_drive(

@@ -20,7 +20,7 @@ from monoforce_ros.encoder import EncoderConfig
 from monoforce_ros.encoder.view import network_image
 from monoforce_ros.motion import CommandTrack, MotionTrack, StaleDataError, transform_points
 from monoforce_ros.physics.effects import corrected_commands, corrected_motion
-from monoforce_ros.prediction.terrain_sources import support_points
+from monoforce_ros.prediction.footing import support_points
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import Grid
 from monoforce_ros.terrain.lidar import TerrainError
