@@ -89,6 +89,26 @@ def test_what_was_seen_before_the_turn_is_still_there_at_its_height():
     assert height_at(alone, motion, 2.5, 1.0) is None, "without memory it is gone"
 
 
+def test_what_is_remembered_for_long_does_not_melt():
+    """The robot turns to and fro, ten images a second; the block has lost nothing of its height and edges."""
+    drive(memory := remembering(seconds=60.0))
+    for index in range(200):
+        motion = at(7.0 + 0.1 * index, 1.5, heading=-1.5 - 0.3 * np.sin(0.2 * index))
+        terrain = see(memory, motion)
+    assert height_at(terrain, motion, 2.5, 1.0) == pytest.approx(0.65, abs=0.03)
+    assert height_at(terrain, motion, 2.5, 0.45) == pytest.approx(0.25, abs=0.06)
+
+
+def test_it_goes_along_over_any_distance():
+    memory = remembering()
+    for index in range(120):
+        motion = at(0.5 * index, 0.25 * index, speed=0.5)
+        terrain = see(memory, motion)
+    x = motion.position[0]
+    for place in ((x + 2.0, 0.5), (x + 0.7, 0.3), (x - 1.0, 0.2)):
+        assert height_at(terrain, motion, *place) == pytest.approx(ground(*place), abs=0.03)
+
+
 def test_what_is_seen_now_replaces_what_was_seen_before():
     source = Ahead()
     memory = remembering(source)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import cv2
@@ -20,16 +20,6 @@ if TYPE_CHECKING:
 
 _JUMP = 1.0
 """A robot that is further than this from where its velocity would have taken it has been moved, or its odometry [m]."""
-
-
-@dataclass(frozen=True)
-class _Memory:
-    motion: MotionState
-    terrain: TerrainMap
-    seen: np.ndarray
-    """When each cell was seen last [ns] ``[rows, columns]``; 0 where it never was."""
-    travelled: np.ndarray
-    """How far the robot has moved since [m]."""
 
 
 class RememberedTerrain:
@@ -55,6 +45,7 @@ class RememberedTerrain:
         self._source, self._robot, self._stiffness = source, robot, stiffness
         self._seconds, self._distance = seconds, distance
         self._memory: _Memory | None = None
+        self._before: MotionState | None = None
 
     @property
     def sensors(self) -> tuple[str, ...]:
@@ -69,53 +60,109 @@ class RememberedTerrain:
     def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
         """Map of what is seen now and what was seen before; errors are the source's."""
         now = self._source.terrain(observation, motion)
-        seen = np.where(now.observed.numpy(), motion.stamp, 0)
-        travelled = np.zeros(seen.shape)
-        if self._memory is not None and self._belongs(self._memory.motion, motion):
-            now, seen, travelled = self._joined(now, seen, self._memory, motion)
-        self._memory = _Memory(motion, now, seen, travelled)
-        return now
-
-    @staticmethod
-    def _belongs(before: MotionState, motion: MotionState) -> bool:
-        """Whether a robot can have come from one place to the other."""
-        elapsed = (motion.stamp - before.stamp) * NANOSECOND
-        expected = before.position + before.rotation @ before.linear_velocity * elapsed
-        return elapsed >= 0.0 and float(np.linalg.norm(motion.position - expected)) < _JUMP * max(1.0, elapsed)
-
-    def _joined(
-        self, now: TerrainMap, seen: np.ndarray, memory: _Memory, motion: MotionState
-    ) -> tuple[TerrainMap, np.ndarray, np.ndarray]:
-        grid = now.grid
-        then_from_now = np.linalg.inv(memory.motion.odometry_from_terrain) @ motion.odometry_from_terrain
-        # Both frames stand upright: a cell's place turns and moves, its height moves.
-        places = np.stack(np.meshgrid(grid.x, grid.y), axis=-1) @ then_from_now[:2, :2].T + then_from_now[:2, 3]
-        index = ((places - np.array(grid.origin)) / grid.resolution).astype(np.float32)
-        column, row = index[..., 0], index[..., 1]
-
-        def carried(values: np.ndarray, how: int = cv2.INTER_LINEAR) -> np.ndarray:
-            return cv2.remap(values, column, row, how, borderMode=cv2.BORDER_CONSTANT, borderValue=0.0)
-
-        # Seconds since rather than stamps: they fit into a float.
-        age = np.where(memory.seen > 0, (motion.stamp - memory.seen) * NANOSECOND, 1e6).astype(np.float32)
-        # What was not seen then must not leak into what was.
-        known = (memory.seen > 0).astype(np.float32)
-        weight = carried(known)
-        age = np.where(weight > 0.5, carried(age, cv2.INTER_NEAREST), 1e6)
-        step = float(np.linalg.norm(motion.position - memory.motion.position))
-        travelled = carried(memory.travelled.astype(np.float32), cv2.INTER_NEAREST) + step
-        kept = (seen == 0) & (age < self._seconds) & (travelled < self._distance)
+        if self._before is None or not _follows(motion, self._before):
+            self._memory = _Memory(now.grid)
+        else:
+            self._memory.travelled += float(np.linalg.norm(motion.position - self._before.position))
+        self._before = motion
+        memory = self._memory
+        memory.move_to(motion.position[:2])
+        values, age, since = memory.read(motion)
+        kept = ~now.observed.numpy() & (age < self._seconds) & (since < self._distance)
+        memory.write(now, motion)
         if not kept.any():
-            return now, seen, np.zeros(seen.shape)
-        values = {}
-        for name in CHANNELS:
-            before = carried(getattr(memory.terrain, name).numpy() * known) / np.maximum(weight, 0.5)
-            if name in ("height", "geometric_height"):
-                before = before - np.float32(then_from_now[2, 3])
-            values[name] = torch.where(torch.from_numpy(kept), torch.from_numpy(before), getattr(now, name))
-        observed = now.observed | torch.from_numpy(kept)
-        joined = replace(now, **values, observed=observed)
+            return now
+        known = torch.from_numpy(kept)
+        joined = replace(
+            now,
+            observed=now.observed | known,
+            **{
+                name: torch.where(known, torch.from_numpy(value).to(now.height), getattr(now, name))
+                for name, value in zip(CHANNELS, values, strict=True)
+            },
+        )
         support = support_points(self._robot, motion, self._stiffness)
-        joined = clear_of(laid_under(joined, support), self._robot, motion)
-        seen = np.where(kept, motion.stamp - (age / NANOSECOND).astype(np.int64), seen)
-        return joined, seen, np.where(kept, travelled, 0.0)
+        return clear_of(laid_under(joined, support), self._robot, motion)
+
+
+def _follows(motion: MotionState, before: MotionState) -> bool:
+    """Whether a robot can have come from one place to the other."""
+    elapsed = (motion.stamp - before.stamp) * NANOSECOND
+    expected = before.position + before.rotation @ before.linear_velocity * elapsed
+    return elapsed >= 0.0 and float(np.linalg.norm(motion.position - expected)) < _JUMP * max(1.0, elapsed)
+
+
+class _Memory:
+    """A map that stands still in the odometry frame and covers what is around the robot.
+
+    Cells keep their place, so that a value is resampled once when it is written and once when it is read, however long
+    it is kept: resampled with each image, walls would melt.
+    """
+
+    def __init__(self, grid: Grid):
+        self.travelled = 0.0
+        """By the robot, all in all [m]."""
+        self._grid = grid
+        # Whichever way the map around the robot is turned, it lies within.
+        self._size = 2 * int(np.ceil(np.hypot(grid.rows, grid.columns) / 2.0)) + 2
+        self._corner: np.ndarray | None = None
+        self._values = np.zeros((len(CHANNELS), self._size, self._size), np.float32)
+        self._seen = np.zeros((self._size, self._size), np.int64)
+        """When each cell was seen last [ns]; 0 where it never was."""
+        self._odometer = np.zeros((self._size, self._size))
+        """How far the robot had travelled then [m]."""
+
+    def move_to(self, place: np.ndarray) -> None:
+        """Cover what is around a place ``[2]`` in the odometry frame; what falls off is forgotten."""
+        corner = np.rint(place / self._grid.resolution).astype(np.int64) - self._size // 2
+        if self._corner is not None and (shift := corner - self._corner).any():
+            gone = np.zeros((self._size, self._size), bool)
+            for axis, by in ((1, int(shift[0])), (0, int(shift[1]))):
+                by = int(np.clip(by, -self._size, self._size))
+                self._values = np.roll(self._values, -by, axis + 1)
+                self._seen, self._odometer = np.roll(self._seen, -by, axis), np.roll(self._odometer, -by, axis)
+                gone = np.roll(gone, -by, axis)
+                entered = slice(self._size - by, None) if by > 0 else slice(0, -by)
+                gone[(slice(None), entered) if axis else (entered, slice(None))] = True
+            self._seen[gone] = 0
+        self._corner = corner
+
+    def write(self, terrain: TerrainMap, motion: MotionState) -> None:
+        """Keep the observed cells of a map in the terrain frame of a motion."""
+        grid, pose = terrain.grid, motion.odometry_from_terrain
+        index = np.arange(self._size)
+        places = (np.stack(np.meshgrid(index, index), axis=-1) + self._corner) * grid.resolution
+        local = (places - pose[:2, 3]) @ pose[:2, :2]
+        cells = ((local - np.array(grid.origin)) / grid.resolution).astype(np.float32)
+        channels = np.stack([getattr(terrain, name).numpy() for name in CHANNELS])
+        values, weight = _sampled(channels, terrain.observed.numpy(), cells)
+        seen = weight > 0.5
+        values[:2] += np.float32(pose[2, 3])
+        self._values[:, seen] = values[:, seen]
+        self._seen[seen], self._odometer[seen] = motion.stamp, self.travelled
+
+    def read(self, motion: MotionState) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Channels in the terrain frame of a motion ``[5, rows, columns]``, how long ago each cell was seen [s] and how
+        far the robot has travelled since [m], ``[rows, columns]``; both infinite where it never was."""
+        grid, pose = self._grid, motion.odometry_from_terrain
+        places = np.stack(np.meshgrid(grid.x, grid.y), axis=-1) @ pose[:2, :2].T + pose[:2, 3]
+        cells = (places / grid.resolution - self._corner).astype(np.float32)
+        values, weight = _sampled(self._values, self._seen > 0, cells)
+        values[:2] -= np.float32(pose[2, 3])
+        column, row = np.moveaxis(np.clip(np.rint(cells).astype(np.int64), 0, self._size - 1), -1, 0)
+        known = (weight > 0.5) & (self._seen[row, column] > 0)
+        age = np.where(known, (motion.stamp - self._seen[row, column]) * NANOSECOND, np.inf)
+        return values, age, np.where(known, self.travelled - self._odometer[row, column], np.inf)
+
+
+def _sampled(channels: np.ndarray, known: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Channels ``[C, H, W]`` at fractional columns and rows ``[h, w, 2]`` from ``known`` cells alone; their weight."""
+
+    def at(values: np.ndarray) -> np.ndarray:
+        return cv2.remap(
+            values.astype(np.float32), cells[..., 0], cells[..., 1], cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_CONSTANT, borderValue=0.0,
+        )  # fmt: skip
+
+    weight = at(known)
+    return np.stack([at(np.where(known, values, 0.0)) / np.maximum(weight, 0.5) for values in channels]), weight
