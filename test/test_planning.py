@@ -176,8 +176,8 @@ def test_the_choice_weighs_cost_against_the_way_left():
     assert choose(candidates, robot, np.array([1.2, 0.0])) == 0
     barred = candidates | {"feasible": np.array([0.0, 1.0, 1.0, 1.0])}
     assert choose(barred, robot, np.array([8.0, 0.0])) in (1, 3)
-    costly = candidates | {"cost": np.array([5.0, 5.0, 0.1, 5.0])}
-    assert choose(costly, robot, np.array([8.0, 0.0]), ChoiceWeights(cost=10.0)) == 2
+    costly = candidates | {"cost": np.array([5.0, 0.1, 0.1, 5.0])}
+    assert choose(costly, robot, np.array([8.0, 0.0]), ChoiceWeights(cost=10.0)) == 1
     assert choose(candidates | {"feasible": np.zeros(4)}, robot, np.array([8.0, 0.0])) is None
     assert choose(candidates | {"cost": np.full(4, np.inf)}, robot, np.array([8.0, 0.0])) is None
     with pytest.raises(ValueError, match="fields \\['cost'\\] are missing"):
@@ -240,6 +240,18 @@ def test_the_choice_goes_around_what_lies_between():
     weights = ChoiceWeights(heading=0.0)
     assert choose(candidates, np.zeros(2), goal, weights) == 0
     assert choose(candidates, np.zeros(2), goal, weights, ways) == 1
+
+
+def test_standing_is_chosen_only_where_nothing_leads_nearer():
+    """However dear the ways are: a robot that stands before an obstacle would stand there for ever."""
+    ends = {"x": [1.0, 0.8, 0.0], "y": [0.5, -0.5, 0.0], "heading": [0.5, -0.5, 0.0], "speed": [0.5, 0.4, 0.0],
+            "yaw_rate": [0.4, -0.4, 0.0], "cost": [9.0, 8.0, 0.0], "feasible": [1.0, 1.0, 1.0]}  # fmt: skip
+    for share in (25, 50, 75):
+        ends |= {f"{axis}_{share}": [share / 100 * v for v in ends[axis]] for axis in "xy"}
+    candidates = {name: np.array(values) for name, values in ends.items()}
+    assert choose(candidates, np.zeros(2), np.array([5.0, 0.0])) == 1
+    assert choose(candidates, np.zeros(2), np.array([-5.0, 0.0])) == 2
+    assert choose(candidates | {"feasible": np.array([0.0, 0.0, 1.0])}, np.zeros(2), np.array([5.0, 0.0])) == 2
 
 
 def test_the_choice_keeps_room_to_a_wall():

@@ -1,12 +1,13 @@
 """What a terrain source saw a moment ago fills what it does not see now, as long as that is to be trusted."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from monoforce_ros.camera import CameraModel
 from monoforce_ros.motion import MotionState, transform_points
 from monoforce_ros.prediction import Observation
 from monoforce_ros.prediction.remembered import RememberedTerrain
@@ -154,6 +155,18 @@ def test_it_stays_clear_of_the_robot_that_drives_where_it_saw_something():
         terrain = see(memory, motion)
     rows, columns, _ = GRID.cells(np.array([[0.0, 0.0], [0.3, 0.2]]))
     assert (terrain.height[rows, columns] < 0.05).all()
+
+
+def test_another_calibration_ends_it():
+    memory = remembering()
+    drive(memory)
+    wide = CameraModel(100, 80, np.array([[50.0, 0, 50], [0, 50, 40], [0, 0, 1]]), np.zeros(5))
+    long = replace(wide, matrix=wide.matrix * np.array([[3, 1, 1], [1, 3, 1], [1, 1, 1]]))
+    alone = Ahead().terrain(Observation(0), at(6.5, 1.5, heading=-1.5)).observed.sum()
+    for index, (camera, remembers) in enumerate(((wide, True), (replace(wide), True), (long, False))):
+        motion = at(6.5 + 0.1 * index, 1.5, heading=-1.5)
+        terrain = memory.terrain(Observation(motion.stamp, cameras={"front": camera}), motion)
+        assert (terrain.observed.sum() > alone) == remembers
 
 
 def test_a_memory_of_no_length_is_refused():

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import torch
 
+from monoforce_ros.camera import CameraModel
 from monoforce_ros.motion import NANOSECOND, MotionState
 from monoforce_ros.prediction.footing import clear_of, laid_under, support_points
 from monoforce_ros.robots import RobotModel
@@ -46,6 +47,7 @@ class RememberedTerrain:
         self._seconds, self._distance = seconds, distance
         self._memory: _Memory | None = None
         self._before: MotionState | None = None
+        self._cameras: dict[str, CameraModel] = {}
 
     @property
     def sensors(self) -> tuple[str, ...]:
@@ -60,7 +62,12 @@ class RememberedTerrain:
     def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
         """Map of what is seen now and what was seen before; errors are the source's."""
         now = self._source.terrain(observation, motion)
-        if self._before is None or not _follows(motion, self._before):
+        changed = any(
+            not _same(camera, self._cameras.get(name, camera)) for name, camera in observation.cameras.items()
+        )
+        self._cameras |= observation.cameras
+        # What was seen through a calibration that turned out wrong was seen in the wrong place.
+        if self._before is None or changed or not _follows(motion, self._before):
             self._memory = _Memory(now.grid)
         else:
             self._memory.travelled += float(np.linalg.norm(motion.position - self._before.position))
@@ -83,6 +90,15 @@ class RememberedTerrain:
         )
         support = support_points(self._robot, motion, self._stiffness)
         return clear_of(laid_under(joined, support), self._robot, motion)
+
+
+def _same(camera: CameraModel, other: CameraModel) -> bool:
+    """Whether two calibrations see the same."""
+    return (
+        (camera.width, camera.height, camera.distortion_model) == (other.width, other.height, other.distortion_model)
+        and np.array_equal(camera.matrix, other.matrix)
+        and np.array_equal(camera.distortion, other.distortion)
+    )
 
 
 def _follows(motion: MotionState, before: MotionState) -> bool:

@@ -13,6 +13,8 @@ WAYPOINTS = (25, 50, 75)
 """Shares of the horizon at which a candidate's place is known beside its end [%]."""
 _LOOK = 0.5
 """Length of a look ahead [m]."""
+_NEARER = 0.1
+"""What a candidate must gain of the way to be better than standing [m]."""
 FIELDS = (
     *("x", "y", "heading", "speed", "yaw_rate", "cost", "feasible"),
     *(f"{axis}_{share}" for share in WAYPOINTS for axis in "xy"),
@@ -76,6 +78,11 @@ def choose(
     # A candidate that passes the goal may look anywhere.
     off = np.where(at_end, off, 0.0)
     close = 0.0 if ways is None else np.mean([ways.near(place) for place in (*way[1:], end)], axis=0)
+    # To stand leads nowhere, and tomorrow as little as today: only where nothing feasible leads nearer.
+    here = float(np.linalg.norm(robot - goal)) if ways is None else float(ways.at(robot))
+    standing = (np.abs(candidates["speed"]) < 1e-6) & (np.abs(candidates["yaw_rate"]) < 1e-6)
+    if (feasible & ~standing & (here - nearest > _NEARER)).any():
+        feasible = feasible & ~standing
     score = weights.cost * candidates["cost"] + weights.distance * nearest / reach + weights.heading * off
     score = score + weights.clearance * close
     return int(np.where(feasible, score, np.inf).argmin())
