@@ -21,13 +21,7 @@ from monoforce_ros.encoder.lift import feature_rays
 from monoforce_ros.physics import PhysicsOptions
 from monoforce_ros.robots import load_robot
 from monoforce_ros.training.drive_samples import SamplesError, SampleSettings, cut_drive, read_samples
-from monoforce_ros.training.losses import (
-    geometric_loss,
-    measured_decrease_loss,
-    standing_decrease_loss,
-    terrain_loss,
-    trajectory_loss,
-)
+from monoforce_ros.training.losses import geometric_loss, measured_decrease_loss, terrain_loss, trajectory_loss
 from monoforce_ros.training.samples import MIRROR, Targets, Variation, sample
 
 TINY = EncoderConfig(image_width=128, image_height=96, map_size=6.4, resolution=0.2)
@@ -168,28 +162,6 @@ def test_the_decrease_is_learnt_where_both_surfaces_are_known(drive):
     # What is not known of both does not count; a surface never gives way upwards.
     higher = replace(targets, geometric=targets.supporting - 0.4)
     assert float(measured_decrease_loss(maps_of(targets, decrease=said * 0.0), higher)) == 0.0
-
-
-def test_what_stands_high_and_was_never_driven_through_is_firm(drive):
-    """A wall is few cells: in the mean over the map it could be taken for tall grass at no price."""
-    batch, targets = sample(drive, 3, TINY)
-    ground = batch.ground[:, None, None].expand_as(targets.geometric)
-    wall = torch.zeros_like(targets.observed)
-    wall[:, 10, 5:15] = True
-    grass = torch.zeros_like(targets.observed)
-    grass[:, 20:, :] = True
-    felt = torch.zeros_like(targets.felt)
-    measured = ground + 0.9 * wall + 0.35 * grass
-    targets = replace(targets, geometric=measured, observed=torch.ones_like(targets.observed), felt=felt)
-    said = torch.full_like(measured, 0.3).requires_grad_()
-    maps = replace(maps_of(targets, decrease=said), covered=torch.ones_like(felt))
-    loss = standing_decrease_loss(maps, targets, batch.ground)
-    assert float(loss) == pytest.approx(0.3 - 0.025, abs=1e-4)
-    (gradient,) = torch.autograd.grad(loss, said)
-    assert bool((gradient[wall] > 0).all()) and float(gradient[~wall].abs().max()) == 0.0
-    # Where wheels went through it, they tell better.
-    driven = replace(targets, felt=wall)
-    assert float(standing_decrease_loss(maps, driven, batch.ground)) == 0.0
 
 
 def test_the_trajectory_loss_reaches_heights_and_material(drive, husky):

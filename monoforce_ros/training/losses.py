@@ -24,9 +24,6 @@ _KNEE = 0.05
 _STANDING, _STANDING_WEIGHT, _AROUND = 0.3, 3.0, 12
 """Height over the mean of so many cells to all sides from which on a cell stands out [m], and by how much more it then
 counts."""
-_TALL = 0.45
-"""Height over its surroundings from which on a cell that nobody drove through is taken as firm [m]: most of what can be
-driven through is lower, and of a tall thing it is safer to believe so."""
 _UNSEEN = 0.1
 """Weight of measured cells that no camera looks at: only what surrounds them tells of them."""
 _ACROSS, _UP, _TURN, _HEADING = 0.15, 0.03, np.radians(2.0), np.radians(4.0)
@@ -45,11 +42,9 @@ class LossWeights:
     """Of the mean square of H_d (λ_d of the paper's equation 3)."""
     measured_decrease: float = 2.0
     """Of H_d where it was measured; together with the geometric and the terrain loss alone."""
-    standing_decrease: float = 1.0
-    """Of H_d of what stands up high and was never driven through; with the geometric and the terrain loss alone."""
 
     def __post_init__(self):
-        for name in ("geometric", "terrain", "trajectory", "decrease", "measured_decrease", "standing_decrease"):
+        for name in ("geometric", "terrain", "trajectory", "decrease", "measured_decrease"):
             if not 0.0 <= getattr(self, name) <= 1e6:
                 raise ValueError(f"loss weight {name}: got {getattr(self, name)}, expected 0 or more")
         if self.geometric == self.terrain == self.trajectory == 0.0:
@@ -89,17 +84,6 @@ def measured_decrease_loss(maps: EncodedMaps, targets: Targets) -> Tensor:
     known = targets.felt & targets.observed
     weight = known * torch.where(maps.covered, 1.0, _UNSEEN)
     return _masked(maps.decrease, torch.where(known, measured, 0.0), weight)
-
-
-def standing_decrease_loss(maps: EncodedMaps, targets: Targets, ground: Tensor) -> Tensor:
-    """H_d of what stands out high and was never driven through: walls and trunks, which no wheel ever tells of; robust.
-
-    In the mean over the map they are so few that an encoder may take them for tall grass at no price.
-    """
-    prominence = _prominence(_limited(targets.geometric, ground), targets.observed)
-    standing = ((prominence - _TALL) / _STANDING).clamp(0.0, 1.0)
-    weight = standing * (targets.observed & ~targets.felt & maps.covered)
-    return _masked(maps.decrease, torch.zeros_like(maps.decrease), weight)
 
 
 def trajectory_loss(
