@@ -101,14 +101,13 @@ class LidarTerrain:
         if observation.cloud is None:
             raise ValueError("the lidar terrain source needs a point cloud, and the observation has none")
         cloud = observation.cloud[~self.robot.covers(observation.cloud)].astype(np.float64)
-        found = terrain_from_cloud(
+        return terrain_from_cloud(
             transform_points(motion.terrain_from_base, cloud),
             self.grid,
             settings=self.settings,
             material=self.material,
             support=support_points(self.robot, motion, self.material.stiffness),
         )
-        return clear_of(found, self.robot, motion)
 
 
 @dataclass(frozen=True)
@@ -132,7 +131,7 @@ class LidarNetworkTerrain:
         cloud = cloud[np.isfinite(cloud).all(axis=1)]
         support = support_points(self.robot, motion, self.encoder.config.stiffness)
         found = self.encoder.terrain(transform_points(motion.terrain_from_base, cloud), support)
-        return clear_of(laid_under(found, support), self.robot, motion)
+        return laid_under(found, support)
 
 
 @dataclass(frozen=True)
@@ -167,7 +166,7 @@ class CameraTerrain:
             found = self.encoder.terrain(views, support)
         finally:
             torch.set_num_threads(before)
-        return clear_of(laid_under(found, support), self.robot, motion)
+        return laid_under(found, support)
 
 
 @dataclass(frozen=True)
@@ -192,7 +191,9 @@ class LidarCameraTerrain:
             return self.camera.terrain(observation, motion)
         if not observation.images:
             return self.lidar.terrain(observation, motion)
-        return lowered(self.lidar.terrain(observation, motion), self.camera.terrain(observation, motion))
+        found = lowered(self.lidar.terrain(observation, motion), self.camera.terrain(observation, motion))
+        # What is high still is firm. (A lidar alone takes grass for that, and would see the robot walled in by it.)
+        return clear_of(found, self.lidar.robot, motion)
 
 
 def choose_terrain_source(
