@@ -72,9 +72,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     robot = load_robot(options.robot)
-    predictor = Predictor(
-        robot, choose_terrain_source(options.terrain, robot, checkpoint=options.checkpoint, memory=10.0)
-    )
+    predictor = Predictor(robot, choose_terrain_source(options.terrain, robot, checkpoint=options.checkpoint))
     settings = EnsembleSettings(members=options.members, scale=options.scale)
     rows, sizes = zip(
         *(drive_ratios(bag, predictor, settings) for bag in tqdm(options.bags, unit="drive")), strict=True
