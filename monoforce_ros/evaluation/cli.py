@@ -48,9 +48,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--memory",
         type=float,
-        default=10.0,
+        default=0.0,
         metavar="S",
-        help="for so long what cameras saw is remembered (default 10)",
+        help="for so long what cameras saw is remembered (default: not at all, as in the node)",
     )
     parser.add_argument("--images", nargs="+", default=None, metavar="TOPIC", help="image topics (default: all)")
     parser.add_argument("--odometry", default=None, metavar="TOPIC", help="odometry topic (default: found by type)")
