@@ -230,7 +230,12 @@ def test_the_live_gap_is_small_where_predictions_hold_and_says_what_to_do_where_
 
     peer.clear()
     peer.drive(7.5, speed=0.0)
-    assert peer.until(lambda: gap()[0] == OK, 5.0), (gap(), predictor.output[-2000:])
+    # The first comparison takes five seconds from the first prediction; on a busy machine that may come late.
+    for _ in range(20):
+        if peer.until(lambda: gap()[0] == OK, 0.5):
+            break
+        peer.drive(1.0, speed=0.0)
+    assert gap()[0] == OK, (gap(), predictor.output[-2000:])
     first = next(
         status
         for array in peer.received["/diagnostics"]

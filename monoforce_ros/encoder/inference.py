@@ -46,8 +46,27 @@ def fused(encoder: Encoder, precision: str = "float32") -> Encoder:
     if precision == "bfloat16" or (precision == "auto" and multiplies_bfloat16()):
         for name, part in encoder.named_children():
             if name != "heads":
+                for convolution in part.modules():
+                    if isinstance(convolution, nn.Conv2d):
+                        convolution.weight.data = _rounded(convolution.weight.data)
                 part.to(torch.bfloat16)
     return encoder.to(memory_format=torch.channels_last)
+
+
+def _rounded(weight: Tensor) -> Tensor:
+    """Weights ``[outputs, ...]`` that bfloat16 holds, rounded so that each filter keeps its sum.
+
+    What is lost at one weight is added to the next. Features behind a rectifier are positive, so errors that do not
+    cancel would shift all of a channel: half of what bfloat16 costs in heights.
+    """
+    flat = weight.flatten(1).double()
+    carried = torch.zeros_like(flat[:, 0])
+    rounded = torch.empty_like(flat)
+    for i, column in enumerate(flat.unbind(1)):
+        wanted = column + carried
+        rounded[:, i] = wanted.to(torch.bfloat16)
+        carried = wanted - rounded[:, i]
+    return rounded.view_as(weight).to(weight.dtype)
 
 
 def _with_border(convolution: nn.Conv2d) -> nn.Conv2d:

@@ -89,14 +89,20 @@ def measured_decrease_loss(maps: EncodedMaps, targets: Targets) -> Tensor:
 def trajectory_loss(
     maps: EncodedMaps, targets: Targets, robot: RobotModel, config: EncoderConfig, options: PhysicsOptions
 ) -> Tensor:
-    """Equation 2 over pieces of motion that start at measured states, in units of what may be ignored; robust."""
+    """Equation 2 over pieces of motion that start at measured states, in units of what may be ignored; robust.
+
+    Motion tells how high the ground is where wheels or tracks touched it, and nowhere else: a wall that is seen a
+    little too near, so that the robot predicted beside it runs into it, would otherwise be learnt as lower.
+    """
     if not len(targets.map_of):
         return maps.geometric_height.sum() * 0.0
+    heights = {
+        name: torch.where(targets.felt, getattr(maps, name), getattr(maps, name).detach())[targets.map_of]
+        for name in ("height", "geometric_height")
+    }
     terrain = TerrainMap(
-        **{
-            name: getattr(maps, name)[targets.map_of]
-            for name in ("height", "geometric_height", "stiffness", "damping", "friction")
-        },
+        **heights,
+        **{name: getattr(maps, name)[targets.map_of] for name in ("stiffness", "damping", "friction")},
         observed=maps.covered[targets.map_of],
         grid=config.grid,
     )
