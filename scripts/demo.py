@@ -23,6 +23,7 @@ from monoforce_ros.evaluation.cli import main as evaluate
 from monoforce_ros.evaluation.report import figure_png
 from monoforce_ros.evaluation.view import PredictionView
 from monoforce_ros.messages.decoding import stamp_of
+from monoforce_ros.prediction import Predictor, choose_terrain_source
 from monoforce_ros.robots import load_robot
 from monoforce_ros.shared_files import share_directory
 
@@ -105,9 +106,14 @@ def draw(bag: Path, out: Path, robot_name: str, moment: float) -> int:
     view = PredictionView.of_messages(
         found["terrain"], found["path"], found["contact_forces"], recording.motion.at(stamp)
     )
+    # The node cannot know how the driver steers on, and holds his command; with what he then did, the physics is shown.
+    predictor = Predictor(robot, choose_terrain_source("flat", robot))
+    twists = recording.commands.sample(predictor.command_stamps(stamp))
+    rolled = predictor.roll_out(view.terrain, [view.motion], twists[None], with_forces=False)
     figure = figures.prediction_figure(
         view,
         robot,
+        as_steered=rolled.position[0].double().numpy(),
         picture=camera_picture(recording, robot, stamp),
         measured=recording.motion.positions[(later >= 0) & (later <= 5e9)],
     )
@@ -128,7 +134,7 @@ def main() -> None:
         default="camera",
         help="where terrain comes from (%(default)s)",
     )
-    parser.add_argument("--moment", type=float, default=1.2, help="time in the bag to draw [s]")
+    parser.add_argument("--moment", type=float, default=3.3, help="time in the bag to draw [s]")
     options = parser.parse_args()
     began = time.monotonic()
     # A domain of its own keeps the demo apart from robots and other runs on the network.

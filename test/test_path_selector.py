@@ -83,6 +83,18 @@ def test_it_stops_when_predictions_are_late_and_goes_on_with_them(peer, nodes, t
     moves(peer, told)
 
 
+def test_it_stops_when_all_falls_silent(peer, nodes, told):
+    """Odometry that stops takes the candidates with it: by their stamps, neither ever gets old."""
+    send(peer, 9.0, 2.0)
+    moves(peer, told)
+    assert peer.until(lambda: told[-1].twist.linear.x == 0.0, 4.0), "it drives on blindly"
+    told.clear()
+    peer.spin(0.5)
+    assert told and not any(command.twist.linear.x for command in told)
+    assert peer.until(lambda: "no odometry for" in status(peer)[1], 5.0), status(peer)
+    moves(peer, told)
+
+
 def test_it_stops_at_the_goal_and_for_a_goal_in_another_frame(peer, nodes, told):
     send(peer, 9.0, 2.0, frame="map")
     peer.drive(1.0)

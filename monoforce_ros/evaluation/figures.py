@@ -21,6 +21,7 @@ from monoforce_ros.robots import RobotModel
 
 COLOURS = {PHYSICS: "#0b84a5", FLAT_PHYSICS: "#9b59b6", CONSTANT_VELOCITY: "#e08214", "measured": "#1a1a1a"}
 _PATH = "#ffb020"
+_STEERED = "#5ad1ff"
 _FORCE = "#e8285a"
 
 matplotlib.rcParams.update(
@@ -50,6 +51,7 @@ def prediction_figure(
     *,
     picture: CameraPicture | None = None,
     measured: np.ndarray | None = None,
+    as_steered: np.ndarray | None = None,
     title: str = "",
 ) -> Figure:
     """The prediction in the camera image beside its map from above.
@@ -59,6 +61,8 @@ def prediction_figure(
         robot: whose prediction it is.
         picture: the camera image of the same moment, if there is one.
         measured: where the robot went, ``[n, 3]`` in the odometry frame [m].
+        as_steered: where it is predicted to go under the commands that followed, ``[n, 3]`` in the terrain frame [m];
+            the prediction itself then holds the command of its start.
         title: a line above the figure.
     """
     colour_range = _colour_range(view)
@@ -76,7 +80,7 @@ def prediction_figure(
         axes[0].imshow(drawn, interpolation="lanczos")
         axes[0].set_axis_off()
         axes[0].set_title("from the camera: predicted ground, path and contact forces")
-    _draw_map(axes[-1], view, robot, measured, colour_range)
+    _draw_map(axes[-1], view, robot, measured, as_steered, colour_range)
     if title:
         figure.suptitle(title, x=0.01, ha="left", fontsize=13, fontweight="bold")
     return figure
@@ -97,6 +101,7 @@ def _draw_map(
     view: PredictionView,
     robot: RobotModel,
     measured: np.ndarray | None,
+    as_steered: np.ndarray | None,
     colour_range: tuple[float, float],
 ) -> None:
     terrain = view.terrain
@@ -118,7 +123,11 @@ def _draw_map(
         axes.plot(
             track[:, 0], track[:, 1], color="black", linewidth=1.8, linestyle=(0, (4, 2)), label="measured", zorder=7
         )
-    axes.plot(view.positions[:, 0], view.positions[:, 1], color=_PATH, linewidth=3.5, label="predicted", zorder=6)
+    label = "predicted" if as_steered is None else "predicted, the command held"
+    axes.plot(view.positions[:, 0], view.positions[:, 1], color=_PATH, linewidth=3.5, label=label, zorder=6)
+    if as_steered is not None:
+        label = "predicted, as steered later"
+        axes.plot(as_steered[:, 0], as_steered[:, 1], color=_STEERED, linewidth=3.5, label=label, zorder=6.2)
     for second in range(int(view.times[-1] + 1e-6) + 1):
         index = int(np.argmin(np.abs(view.times - second)))
         _draw_robot(axes, robot, view.positions[index], view.rotations[index], filled=second == 0)

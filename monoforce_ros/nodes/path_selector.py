@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped, TwistStamped
@@ -35,6 +36,7 @@ class PathSelectorNode(Node):
         self.health = Health(self, [PART])
         self._goal: tuple[np.ndarray, str] | None = None
         self._motion: MotionState | None = None
+        self._moved_at = 0.0
         self._candidates: tuple[int, str, dict[str, np.ndarray]] | None = None
         self._moving = False
         self._map: tuple[np.ndarray, float, np.ndarray] | None = None
@@ -62,7 +64,7 @@ class PathSelectorNode(Node):
 
     def _on_odometry(self, message: Odometry) -> None:
         try:
-            self._motion = decoding.decode_odometry(message)[0]
+            self._motion, self._moved_at = decoding.decode_odometry(message)[0], time.monotonic()
         except decoding.MessageError as error:
             self.health.report(PART, ERROR, f"odometry: {error}", reason="odometry")
 
@@ -103,6 +105,10 @@ class PathSelectorNode(Node):
             self._goal = None
             self.health.report(PART, OK, f"the goal is reached, {left:.2f} m away", reason="reached")
             return None
+        # Stamps alone do not tell: where odometry stops, so do the candidates, and neither grows older by the other.
+        silence = time.monotonic() - self._moved_at
+        if silence > self.settings.timeout:
+            return self._stopped(f"no odometry for {silence:.1f} s: nobody knows where the robot is", "silent")
         if self._candidates is None:
             return self._stopped("no candidates yet: does the predictor run with `candidates`?", "none")
         stamp, frame, fields = self._candidates
