@@ -99,12 +99,19 @@ def test_simulated_time_that_starts_over_is_said_and_lived_with(start, peer):
 
     before = peer.now
     peer.clear()
-    drive(2.5)
-    first = len(peer.received["/predicted/path"])
-    assert first
+    # New publishers need a moment to be found, longer on a busy machine.
+    for _ in range(10):
+        drive(1.5)
+        if peer.received["/predicted/path"]:
+            break
+    assert peer.received["/predicted/path"]
     peer.now = before - 100 * 10**9
     peer.clear()
     drive(4.0)
+    for _ in range(10):
+        if len(peer.received["/predicted/path"]) > 3:
+            break
+        drive(1.0)
     assert peer.received["/predicted/path"]
     stamps = [m.header.stamp.sec for m in peer.received["/predicted/path"]]
     assert all(stamp < before // 10**9 for stamp in stamps[-3:])
@@ -140,8 +147,11 @@ def test_two_nodes_of_one_name_both_predict(start, peer):
     for node in nodes:
         node.wait_for("predicting 5 s ahead for husky")
     peer.clear()
-    peer.drive(3.0)
-    assert peer.until(lambda: len(peer.received["/predicted/path"]) > 10)
+    for _ in range(10):
+        peer.drive(1.5)
+        if peer.until(lambda: len(peer.received["/predicted/path"]) > 10, 0.5):
+            break
+    assert len(peer.received["/predicted/path"]) > 10
     peer.drive(0.5)
     for node in nodes:
         assert node.stop() == 0, node.output

@@ -156,8 +156,9 @@ def test_without_commands_the_robot_is_predicted_to_stand_and_a_warning_says_so(
     peer.spin(0.6)
     peer.clear()
     peer.drive(2.0, command=lambda stamp: None)
-    level, text = peer.status("commands")
-    assert level == WARN and "predicted to stand still" in text
+    silent = lambda: peer.status("commands") or (OK, "")  # noqa: E731
+    assert peer.until(lambda: silent()[0] == WARN, 3.0), silent()
+    assert "predicted to stand still" in silent()[1]
     assert peer.received["/predicted/path"][-1].poses[-1].pose.position.x == pytest.approx(1.0, abs=0.05)
 
 
