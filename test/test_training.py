@@ -21,7 +21,13 @@ from monoforce_ros.encoder.lift import feature_rays
 from monoforce_ros.physics import PhysicsOptions
 from monoforce_ros.robots import load_robot
 from monoforce_ros.training.drive_samples import SamplesError, SampleSettings, cut_drive, read_samples
-from monoforce_ros.training.losses import geometric_loss, measured_decrease_loss, terrain_loss, trajectory_loss
+from monoforce_ros.training.losses import (
+    LossWeights,
+    geometric_loss,
+    measured_decrease_loss,
+    terrain_loss,
+    trajectory_loss,
+)
 from monoforce_ros.training.samples import MIRROR, Targets, Variation, sample
 
 TINY = EncoderConfig(image_width=128, image_height=96, map_size=6.4, resolution=0.2)
@@ -111,6 +117,20 @@ def test_a_mirrored_sample_mirrors_its_maps(drive):
     assert float((plain.felt ^ mirrored.felt.flip(1)).float().mean()) < 0.02
     np.testing.assert_allclose(other.origins[0], MIRROR @ batch.origins[0].numpy(), atol=1e-5)
     assert float(batch.ground[0]) == pytest.approx(float(other.ground[0]), abs=1e-6)
+
+
+def test_a_wall_that_is_left_out_costs_more_the_more_what_stands_counts(drive):
+    batch, targets = sample(drive, 3, TINY)
+    ground = batch.ground[:, None, None].expand_as(targets.geometric)
+    wall = torch.zeros_like(targets.observed)
+    wall[:, 10, 5:15] = True
+    targets = replace(targets, geometric=ground + 0.9 * wall, observed=torch.ones_like(wall))
+    level = maps_of(targets, geometric_height=ground.clone())
+    plain, more = (float(geometric_loss(level, targets, batch.ground, standing)) for standing in (0.0, 8.0))
+    cells = wall.float().mean() / (1.0 + 8.0 * wall.float().mean())
+    assert more == pytest.approx(9.0 * float(cells) * (0.9 - 0.025), rel=0.05) and more > 6.0 * plain
+    with pytest.raises(ValueError, match="loss weight standing: got -1"):
+        LossWeights(standing=-1.0)
 
 
 def test_losses_are_means_over_measured_cells(drive):

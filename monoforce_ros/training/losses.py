@@ -21,9 +21,8 @@ HIGHEST, LOWEST = 1.0, -1.5
 """Heights above and below the ground under the robot that are told apart [m]; a tree is a wall (paper, figure 6)."""
 _KNEE = 0.05
 """Errors beyond it count linearly, so that few walls and trees do not outweigh the ground [m]."""
-_STANDING, _STANDING_WEIGHT, _AROUND = 0.3, 3.0, 12
-"""Height over the mean of so many cells to all sides from which on a cell stands out [m], and by how much more it then
-counts."""
+_STANDING, _AROUND = 0.3, 12
+"""Height over the mean of so many cells to all sides from which on a cell stands out [m]."""
 _UNSEEN = 0.1
 """Weight of measured cells that no camera looks at: only what surrounds them tells of them."""
 _ACROSS, _UP, _TURN, _HEADING = 0.15, 0.03, np.radians(2.0), np.radians(4.0)
@@ -42,24 +41,28 @@ class LossWeights:
     """Of the mean square of H_d (λ_d of the paper's equation 3)."""
     measured_decrease: float = 2.0
     """Of H_d where it was measured; together with the geometric and the terrain loss alone."""
+    standing: float = 3.0
+    """By how much more what stands out of its surroundings counts in the geometric loss."""
 
     def __post_init__(self):
-        for name in ("geometric", "terrain", "trajectory", "decrease", "measured_decrease"):
+        for name in ("geometric", "terrain", "trajectory", "decrease", "measured_decrease", "standing"):
             if not 0.0 <= getattr(self, name) <= 1e6:
                 raise ValueError(f"loss weight {name}: got {getattr(self, name)}, expected 0 or more")
         if self.geometric == self.terrain == self.trajectory == 0.0:
             raise ValueError("loss weights: all are 0, expected geometric, terrain or trajectory above it")
 
 
-def geometric_loss(maps: EncodedMaps, targets: Targets, ground: Tensor) -> Tensor:
+def geometric_loss(
+    maps: EncodedMaps, targets: Targets, ground: Tensor, standing: float = LossWeights.standing
+) -> Tensor:
     """Equation 4, averaged over the cells that the lidar measured; robust instead of squared.
 
-    What stands out of its surroundings counts more: walls, trunks and the edges of grass are few, and an error that
-    counts linearly is least where they are left out.
+    What stands out of its surroundings counts more, ``1 + standing`` times: walls, trunks and the edges of grass are
+    few, and an error that counts linearly is least where they are left out.
     """
     measured = _limited(targets.geometric, ground)
-    standing = (_prominence(measured, targets.observed) / _STANDING).clamp(0.0, 1.0)
-    weight = targets.observed * torch.where(maps.covered, 1.0, _UNSEEN) * (1.0 + _STANDING_WEIGHT * standing)
+    stands = (_prominence(measured, targets.observed) / _STANDING).clamp(0.0, 1.0)
+    weight = targets.observed * torch.where(maps.covered, 1.0, _UNSEEN) * (1.0 + standing * stands)
     return _masked(maps.geometric_height, measured, weight)
 
 

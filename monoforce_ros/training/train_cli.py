@@ -54,6 +54,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--losses", nargs="+", default=["geometric", "terrain", "trajectory"],
                         choices=("geometric", "terrain", "trajectory"),
                         help="(all; `geometric` alone is LSS)")  # fmt: skip
+    parser.add_argument("--standing", type=float, default=LossWeights.standing, metavar="WEIGHT", help="by how much "
+                        "more walls, trunks and edges count in the geometric loss (%(default)s)")  # fmt: skip
     parser.add_argument("--no-vegetation", action="store_true", help="do not fit how hard vegetation holds the robot")
     parser.add_argument("--seed", type=int, default=TrainingSettings.seed, help="(%(default)s)")
     parser.add_argument("--no-variation", action="store_true", help="do not mirror, turn, cut and recolour samples")
@@ -207,9 +209,9 @@ def _settings(options: argparse.Namespace) -> TrainingSettings:
     chosen = {name: getattr(defaults, name) if name in options.losses else 0.0 for name in
               ("geometric", "terrain", "trajectory")}  # fmt: skip
     return TrainingSettings(
-        steps=options.steps, batch=options.batch, rate=options.rate, weights=LossWeights(**chosen), seed=options.seed,
-        vary=not options.no_variation, validate_every=options.validate_every, save_every=options.save_every,
-        precision=options.precision,
+        steps=options.steps, batch=options.batch, rate=options.rate,
+        weights=LossWeights(**chosen, standing=options.standing), seed=options.seed, vary=not options.no_variation,
+        validate_every=options.validate_every, save_every=options.save_every, precision=options.precision,
     )  # fmt: skip
 
 

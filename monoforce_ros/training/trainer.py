@@ -119,7 +119,7 @@ class _Losses(nn.Module):
         maps = self.encoder(batch)
         weights, losses = self.weights, {}
         if weights.geometric:
-            losses["geometric"] = weights.geometric * geometric_loss(maps, targets, batch.ground)
+            losses["geometric"] = weights.geometric * geometric_loss(maps, targets, batch.ground, weights.standing)
         if weights.terrain:
             losses["terrain"] = weights.terrain * terrain_loss(maps, targets)
         if weights.trajectory:
