@@ -8,6 +8,7 @@ from ros_peer import ground_cloud
 
 from monoforce_ros.bags import builders
 from monoforce_ros.messages.message_types import message_class
+from monoforce_ros.prediction.uncertainty import EnsembleSettings
 
 TOPICS = {
     "/predicted/candidates": "visualization_msgs/msg/MarkerArray",
@@ -168,7 +169,9 @@ def test_what_a_planner_asks_for_is_compared_and_refined(peer, start):
     assert {"time", "along", "across", "heading", "radius_90"} <= set(names) and len(values) > 10
     radius = values[:, names.index("radius_90")]
     # At the start the band is as wide as odometry jumps.
-    assert radius[0] == pytest.approx(0.02 * np.sqrt(2 * np.log(10)), rel=0.02) and np.isfinite(radius).all()
+    settings = EnsembleSettings()
+    jumps = settings.scale * settings.position * np.sqrt(2 * np.log(10))
+    assert radius[0] == pytest.approx(jumps, rel=0.02) and np.isfinite(radius).all()
     # Wrong dimensions are refused in words, and what was asked before goes on until it is old.
     wrong = type(array)()
     wrong.layout.dim = [dimension(label="n", size=3)]

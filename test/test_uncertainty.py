@@ -24,7 +24,8 @@ BUMPS = (
     + 0.03 * np.sin(3 * X) * np.cos(2 * Y)
 )
 STILL = MotionState(0, np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3))
-NOTHING = {"friction": 0.0, "speed": 0.0, "yaw_rate": 0.0, "heading": 0.0, "gain": 0.0, "position": 0.0, "drift": 0.0}
+NOTHING = {"friction": 0.0, "speed": 0.0, "yaw_rate": 0.0, "heading": 0.0, "gain": 0.0, "position": 0.0, "drift": 0.0,
+           "scale": 1.0}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +64,7 @@ def test_each_thing_spreads_what_it_should(predictor):
     jumping = spread(predictor, prediction, twists, EnsembleSettings(members=4, **{**NOTHING, "position": 0.03}))
     np.testing.assert_allclose(jumping.radius, 0.03 * np.sqrt(2 * np.log(10)), rtol=1e-3)
     assert jumping.up[0] == pytest.approx(0.03) and jumping.heading.max() < 1e-5
-    wide = spread(predictor, prediction, twists, EnsembleSettings(members=4, scale=2.0, **{**NOTHING, "drift": 0.1}))
+    wide = spread(predictor, prediction, twists, EnsembleSettings(members=4, **{**NOTHING, "drift": 0.1, "scale": 2.0}))
     np.testing.assert_allclose(wide.radius, 2 * drift.radius, rtol=1e-6)
 
 
@@ -81,7 +82,7 @@ def test_the_interval_of_an_effect_spreads_and_an_exact_value_does_not(predictor
 def test_the_band_holds_what_its_own_variations_bring_about(predictor):
     """Of members drawn with another seed about 90 % lie within the band."""
     prediction, twists = predicted(predictor, BUMPS)
-    settings = EnsembleSettings(members=64, drift=0.0, position=0.0)
+    settings = EnsembleSettings(members=64, drift=0.0, position=0.0, scale=1.0)
     found = spread(predictor, prediction, twists, settings)
     other = spread(predictor, prediction, twists, replace(settings, seed=5))
     assert other.radius[-1] == pytest.approx(found.radius[-1], rel=0.5)
