@@ -265,7 +265,8 @@ def _verdict(search: Search, outcome: Outcome) -> tuple[str, Trial | None, tuple
     elif best.loss > _CLEARLY:
         drift, thirds = search.drifting(best)
         numbers["share_by_drift"] = drift / excess
-        if drift > LARGEST_DRIFT * excess:
+        # A formula that repeats the effect with one value for all of the drive tells against a change of it.
+        if drift > (2.0 if _same(best, formula_trial, nominal) else 1.0) * LARGEST_DRIFT * excess:
             why = f"{_changing(thirds, len(search.known))} over the drive, as no single value can"
         elif share < SMALLEST_SHARE and not search.known and not _same(best, formula_trial, nominal):
             # What the gyro and the wheels show is so, however much else there is.

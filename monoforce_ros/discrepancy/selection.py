@@ -258,11 +258,14 @@ class Search:
         return fit_effects(self.predictions, [effects], self.scale, iterations=6, free=self._held(effects))
 
     def ranked(self, fit: Fit) -> list[int]:
-        """Indices of a fit's effects, that first without which most would be unexplained again."""
+        """Indices of a fit's effects, that first which the others, fitted anew without it, replace least."""
         if len(fit.effects) < 2:
             return list(range(len(fit.effects)))
-        others = [fit.effects[:i] + fit.effects[i + 1 :] for i in range(len(fit.effects))]
-        losses = [float(self.loss_of(effects).mean()) for effects in others]
+        losses = []
+        for i in range(len(fit.effects)):
+            others = fit.effects[:i] + fit.effects[i + 1 :]
+            alone = fit_effects(self._coarse, [others], self.scale, iterations=4, free=self._held(others))
+            losses.append(float(alone.loss.mean()))
         return sorted(range(len(losses)), key=lambda i: -losses[i])
 
     def _held(self, effects: Effects) -> int:
