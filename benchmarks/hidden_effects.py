@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 from docs_section import replace_section
-from hidden_drives import SINGLES, Case, all_cases, record_case
+from hidden_drives import SEED, SINGLES, Case, all_cases, record_case
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
@@ -35,11 +35,11 @@ DRAGS = frozenset({"viscous_drag", "quadratic_drag"})
 """Resistance that grows with speed: a drive at about one speed cannot tell how; reports list the other as a rival."""
 
 
-def commissioned(folder: Path) -> Path:
+def commissioned(folder: Path, seed: int) -> Path:
     """The robot file of the healthy drive; made once."""
     from monoforce_ros.discrepancy.cli import main as diagnose
 
-    case = next(case for case in all_cases() if case.kind == "healthy")
+    case = next(case for case in all_cases(seed) if case.kind == "healthy")
     bag, out = record_case(case, folder), folder / "nominal"
     if not (out / "husky.yaml").exists():
         diagnose(["--commission", str(bag), "--robot", "husky", "--out", str(out), "--quiet"])
@@ -322,6 +322,7 @@ def section(rows: list[dict], found: dict, figure: Path | None, folder: Path) ->
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--folder", type=Path, default=Path("out/hidden"), help="for drives and reports (%(default)s)")
+    parser.add_argument("--seed", type=int, default=SEED, help="the drives' first one (%(default)s)")
     parser.add_argument("--jobs", type=int, default=2, help="drives at a time (%(default)s)")
     parser.add_argument("--only", nargs="+", default=[""], metavar="TEXT", help="drives whose name holds one of these")
     parser.add_argument("--again", action="store_true", help="diagnose drives that have a report too")
@@ -332,8 +333,8 @@ def main() -> None:
     )
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
-    robot = commissioned(options.folder)
-    cases = [c for c in all_cases() if c.kind != "healthy" and any(text in c.name for text in options.only)]
+    robot = commissioned(options.folder, options.seed)
+    cases = [c for c in all_cases(options.seed) if c.kind != "healthy" and any(text in c.name for text in options.only)]
     rows = []
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(options.jobs, mp_context=context) as pool:

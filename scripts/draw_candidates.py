@@ -35,7 +35,7 @@ def draw(recording: Recording, seconds: float) -> Figure:
     motion = recording.motion.at(frame.stamp)
     terrain = predictor.source.terrain(observe(recording, robot, frame.stamp, predictor.source.sensors), motion)
     before = recording.commands.sample(predictor.command_stamps(frame.stamp))[: predictor.history]
-    fan = fan_of_arcs(CandidateSettings(41, (0.4, 0.8), 0.9))[:, None]
+    fan = fan_of_arcs(CandidateSettings(41, (0.4, 0.8), 0.9))
     twists = over_horizon(fan, before, predictor.steps)
     every = force_every(predictor.options.time_step)
     rolled = predictor.roll_out(terrain, [motion] * len(fan), twists, with_contact=True, force_every=every)

@@ -37,8 +37,9 @@ def terrain_of(height: np.ndarray, **changes) -> TerrainMap:
 
 def assessed(husky, terrain, fan, **how):
     """Costs of commands held for 3 s from standing on the middle of a map."""
-    fan = np.atleast_2d(np.array(fan, float))
-    twists = torch.from_numpy(over_horizon(fan[:, None], np.zeros((0, 2)), STEPS)).float()
+    fan = np.array(fan, float)
+    fan = fan if fan.ndim == 3 else np.atleast_2d(fan)[:, None]
+    twists = torch.from_numpy(over_horizon(fan, np.zeros((0, 2)), STEPS)).float()
     low = float(husky.points[:, 2].min())
     middle = GRID.rows // 2
     height = float(terrain.height[middle, middle]) - low - float(rest_depth(husky, float(terrain.stiffness.mean())))
@@ -49,16 +50,41 @@ def assessed(husky, terrain, fan, **how):
 
 def test_a_fan_holds_every_speed_from_right_to_left_and_a_stop():
     fan = fan_of_arcs(CandidateSettings(count=11, speeds=(0.5, 1.0), yaw_rate=0.6))
-    assert fan.shape == (11, 2) and fan[-1].tolist() == [0.0, 0.0]
+    assert fan.shape == (11, 4, 2) and not fan[-1].any() and (fan == fan[:, :1]).all()
     for speed in (0.5, 1.0):
-        rates = fan[fan[:, 0] == speed, 1]
+        rates = fan[fan[:, 0, 0] == speed, 0, 1]
         assert rates.tolist() == pytest.approx([-0.6, -0.3, 0.0, 0.3, 0.6])
-    assert fan_of_arcs(CandidateSettings(count=1, speeds=(0.5,))).tolist() == [[0.5, 0.0]]
-    twists = over_horizon(fan[:, None], np.full((20, 2), 0.3), 50)
-    assert twists.shape == (11, 70, 2) and (twists[:, :20] == 0.3).all() and (twists[3, 20:] == fan[3]).all()
+    assert fan_of_arcs(CandidateSettings(count=1, speeds=(0.5,))).tolist() == [[[0.5, 0.0]] * 4]
+    twists = over_horizon(fan, np.full((20, 2), 0.3), 50)
+    assert twists.shape == (11, 70, 2) and (twists[:, :20] == 0.3).all() and (twists[3, 20:] == fan[3, 0]).all()
     for wrong in ({"count": 0}, {"speeds": ()}, {"speeds": (float("nan"),)}, {"yaw_rate": -1.0}):
         with pytest.raises(ValueError, match="got"):
             CandidateSettings(**wrong)
+
+
+def test_turns_on_the_spot_lead_somewhere():
+    fan = fan_of_arcs(CandidateSettings(count=11, speeds=(0.0, 1.0), yaw_rate=0.6))
+    turns = fan[:5]
+    assert turns[:, 0] == pytest.approx(np.array([[0.0, rate] for rate in (-0.6, -0.3, 0.0, 0.3, 0.6)]))
+    on = [1.0, 0.0]
+    assert turns[1, 2:].tolist() == [turns[1, 0].tolist(), on] and turns[2, 2:].tolist() == [on, on]
+    assert (turns[[0, 4]] == turns[[0, 4], :1]).all()
+    # What is on the right is on the left.
+    assert turns[::-1, :, 1] == pytest.approx(-turns[..., 1])
+    # Where nothing is faster than a turn, a turn is all that there is.
+    only = fan_of_arcs(CandidateSettings(count=6, speeds=(0.0,), yaw_rate=0.6))
+    assert (only == only[:, :1]).all()
+
+
+def test_a_robot_right_before_a_wall_has_a_way_out(husky):
+    """Every arc ahead runs into the wall; only turning first and driving then leads anywhere."""
+    settings = CandidateSettings(count=20, speeds=(0.0, 0.8), yaw_rate=1.5)
+    # The husky's nose is 0.5 m ahead of its middle.
+    found, result = assessed(husky, terrain_of(np.where(X > 0.75, 1.0, 0.0)), fan_of_arcs(settings))
+    arcs = torch.from_numpy(fan_of_arcs(settings)[:, 0, 0] == 0.8)
+    assert not bool((found.feasible & arcs).any())
+    away = result.position[:, -1, :2].norm(dim=-1)
+    assert float(away[found.feasible].max()) > 0.5
 
 
 def test_level_ground_is_feasible_and_standing_costs_least(husky):
@@ -269,3 +295,21 @@ def test_the_choice_keeps_room_to_a_wall():
     # By way and heading alone they are as good as each other; the wall decides.
     assert choose(candidates, np.zeros(2), goal, ChoiceWeights(distance=0.0, heading=0.0, clearance=0.0), ways) == 0
     assert choose(candidates, np.zeros(2), goal, ChoiceWeights(distance=0.0, heading=0.0), ways) == 1
+
+
+def test_the_choice_keeps_to_one_of_two_ways_that_are_about_as_good():
+    """A robot before the middle of a wall would turn left and right for ever by what is left of noise."""
+    ends = {"x": [1.0, 1.0], "y": [1.0, -1.0], "heading": [0.8, -0.8], "speed": [0.0, 0.0], "yaw_rate": [0.8, -0.8],
+            "cost": [0.5, 0.5], "feasible": [1.0, 1.0]}  # fmt: skip
+    for share in (25, 50, 75):
+        ends |= {f"{axis}_{share}": [share / 100 * v for v in ends[axis]] for axis in "xy"}
+    candidates = {name: np.array(values) for name, values in ends.items()}
+    goal = np.array([5.0, 0.0])
+    for noise in (0.1, -0.1):
+        noisy = candidates | {"cost": candidates["cost"] + [noise, -noise]}
+        assert choose(noisy, np.zeros(2), goal) == int(noise > 0.0)
+        assert choose(noisy, np.zeros(2), goal, former=(0.0, 0.8)) == 0
+        assert choose(noisy, np.zeros(2), goal, former=(0.0, -0.7)) == 1
+    # A way that is much better is taken all the same.
+    better = candidates | {"cost": np.array([2.0, 0.5])}
+    assert choose(better, np.zeros(2), goal, former=(0.0, 0.8)) == 1

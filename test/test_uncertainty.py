@@ -123,6 +123,21 @@ def test_refinement_costs_less_and_ends_where_it_did(predictor):
     assert np.abs(found.sequence[:, 0]).max() <= predictor.robot.maximum_speed
 
 
+def test_refinement_leaves_what_comes_before_the_candidate_begins(predictor):
+    prediction, _ = predicted(predictor, BUMPS)
+    held = predictor.steps // 4
+    before = np.concatenate([np.zeros((predictor.history, 2)), np.full((held, 2), [0.3, 0.2])])
+    found = refine(predictor, prediction, before, np.array([[0.6, 0.0]]), seconds=30.0)
+    assert found.rounds >= 1 and found.cost < found.cost_before
+    assert found.sequence.shape == (predictor.steps - held, 2)
+    twists = over_horizon(found.sequence[None], before, predictor.steps - held)
+    assert twists.shape == (1, predictor.history + predictor.steps, 2)
+    rolled = predictor.roll_out(prediction.terrain, [STILL], twists, with_forces=False, with_contact=True)
+    asked = torch.from_numpy(twists[:, predictor.history :]).float()
+    cost = float(assess(rolled, prediction.terrain, predictor.robot, asked).cost[0])
+    assert cost == pytest.approx(found.cost, rel=0.1)
+
+
 def test_refinement_keeps_to_its_budget_and_leaves_what_is_not_feasible(predictor):
     prediction, _ = predicted(predictor, BUMPS)
     before, best = np.zeros((predictor.history, 2)), np.array([[0.6, 0.0]])

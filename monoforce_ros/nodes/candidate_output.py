@@ -44,10 +44,10 @@ class CandidateOutput:
         robot = load_robot(settings.robot, spacing=settings.candidate_spacing)
         self._predictor = Predictor(robot, predictor.source, horizon=settings.horizon, options=options)
         self._force_every = force_every(options.time_step)
-        self._fan = np.zeros((0, 1, 2))
+        self._fan = np.zeros((0, 4, 2))
         if settings.candidates:
             fan = CandidateSettings(settings.candidates, tuple(settings.candidate_speeds), settings.candidate_yaw_rate)
-            self._fan = fan_of_arcs(fan)[:, None]
+            self._fan = fan_of_arcs(fan)
         self._asked: tuple[float, np.ndarray] | None = None
         self._round_seconds = 0.0
         self.apply(settings)
@@ -99,30 +99,35 @@ class CandidateOutput:
         sequences = self._sequences()
         if not len(sequences):
             return
-        stamps = self._predictor.command_stamps(prediction.stamp)[: self._predictor.history]
-        before = commands.sample(stamps, timeout=self._settings.command_timeout)
-        motion, terrain, settings, steps = prediction.motion, prediction.terrain, self._settings, self._predictor.steps
-        rolled, found = self._assess(prediction, over_horizon(sequences, before, steps))
+        motion, terrain, settings = prediction.motion, prediction.terrain, self._settings
+        # Candidates act when they have been compared and told; until then the robot does what it was told before.
+        held = min(round(settings.candidate_delay / self._predictor.options.time_step), self._predictor.steps - 1)
+        begins, steps = self._predictor.history + held, self._predictor.steps - held
+        stamps = self._predictor.command_stamps(prediction.stamp)[:begins]
+        before = commands.sample(stamps, timeout=settings.command_timeout)
+        twists = over_horizon(sequences, before, steps)
+        rolled, found = self._assess(prediction, twists)
         if settings.refine_seconds and found.best is not None:
-            refined = self._refined(prediction, before, sequences[found.best])
-            again, assessed = self._assess(prediction, over_horizon(refined, before, steps))
-            sequences = np.concatenate([over_horizon(sequences, np.zeros((0, 2)), steps), refined])
+            refined = over_horizon(self._refined(prediction, before, sequences[found.best]), before, steps)
+            again, assessed = self._assess(prediction, refined)
+            twists = np.concatenate([twists, refined])
             rolled, found = rolled.joined(again), found.joined(assessed)
         grid = occupancy(
             terrain, motion.odometry_from_terrain, slope_limit=settings.slope_limit, step_limit=settings.step_limit
         )
         data = {
             "candidates": messages.candidate_markers(motion, rolled, found, frame_id),
-            "candidate_costs": messages.candidate_costs(motion, rolled, sequences[:, 0], found, frame_id),
+            "candidate_costs": messages.candidate_costs(motion, rolled, twists[:, begins], found, frame_id),
             "occupancy": messages.occupancy_grid(motion.stamp, grid, frame_id),
         }
         if found.best is not None:
             data["best_path"] = messages.best_path(motion, rolled, found.best, frame_id, settings.path_time_step)
         if "candidate_rollouts" in self._publishers:
             data["candidate_rollouts"] = messages.candidate_rollouts(
-                motion, rolled, self._predictor.robot, sequences, found, frame_id, settings.path_time_step
-            )
-        self._figures["feasible candidates"] = f"{int(found.feasible.sum())} of {len(sequences)}"
+                motion, rolled, self._predictor.robot, twists[:, self._predictor.history :], found, frame_id,
+                settings.path_time_step,
+            )  # fmt: skip
+        self._figures["feasible candidates"] = f"{int(found.feasible.sum())} of {len(twists)}"
         if self._node.context.ok():
             for name, message in data.items():
                 self._publishers[name].publish(message)

@@ -31,7 +31,11 @@ class PathSelectorNode(Node):
         super().__init__("path_selector")
         self.settings = settings = declare_parameters(self, read_parameter_file(PARAMETER_FILE))
         self.weights = ChoiceWeights(
-            settings.weight_cost, settings.weight_distance, settings.weight_heading, settings.weight_clearance
+            settings.weight_cost,
+            settings.weight_distance,
+            settings.weight_heading,
+            settings.weight_clearance,
+            settings.weight_change,
         )
         self.health = Health(self, [PART])
         self._goal: tuple[np.ndarray, str] | None = None
@@ -39,6 +43,7 @@ class PathSelectorNode(Node):
         self._moved_at = 0.0
         self._candidates: tuple[int, str, dict[str, np.ndarray]] | None = None
         self._moving = False
+        self._told = (0.0, 0.0)
         self._map: tuple[np.ndarray, float, np.ndarray] | None = None
         self._ways: WayToGoal | None = None
         self._commands = self.create_publisher(TwistStamped, settings.command_topic, 10)
@@ -87,7 +92,7 @@ class PathSelectorNode(Node):
         # A robot that nobody sent anywhere is left alone; one that was moving is told to stop until it is.
         if command is None and not self._moving:
             return
-        speed, rate = command or (0.0, 0.0)
+        speed, rate = self._told = command or (0.0, 0.0)
         self._moving = command is not None or self._goal is not None
         message = TwistStamped()
         message.header.stamp = self.get_clock().now().to_msg()
@@ -120,7 +125,7 @@ class PathSelectorNode(Node):
         try:
             if self._ways is None and self._map is not None:
                 self._ways = way_to_goal(*self._map, goal, radius=self.settings.robot_radius)
-            best = choose(fields, self._motion.position[:2], goal, self.weights, self._ways)
+            best = choose(fields, self._motion.position[:2], goal, self.weights, self._ways, self._told)
         except ValueError as error:
             return self._stopped(str(error), "fields")
         if best is None:

@@ -31,7 +31,7 @@ class Refinement:
     """A candidate before and after."""
 
     sequence: np.ndarray
-    """Forward speed [m/s] and yaw rate [rad/s] of each step ``[T, 2]``."""
+    """Forward speed [m/s] and yaw rate [rad/s] of each step from where the candidate begins ``[T, 2]``."""
     cost_before: float
     cost: float
     """Weighted terms; what keeps the end in place is not in it."""
@@ -59,15 +59,15 @@ def refine(
     Args:
         predictor: rolls out.
         prediction: whose map and start are used.
-        before: commands that led to now ``[history, 2]``.
-        sequence: commands of equal shares of the horizon ``[K, 2]``.
+        before: commands that led there, ``[history, 2]`` or longer where the candidate begins later.
+        sequence: commands of equal shares of the rest of the horizon ``[K, 2]``.
         weights: of the cost.
         limits: of what is feasible.
         seconds: budget; no round begins that would likely exceed it.
         round_seconds: how long a round takes on this machine, from an earlier refinement.
     """
     started = time.monotonic()
-    steps, robot = predictor.steps, predictor.robot
+    steps, robot = predictor.history + predictor.steps - len(before), predictor.robot
     every = force_every(predictor.options.time_step)
     base = torch.from_numpy(over_horizon(sequence[None], np.zeros((0, 2)), steps)[0]).float()
     led = torch.from_numpy(np.ascontiguousarray(before)).float()
@@ -82,20 +82,20 @@ def refine(
         """``[B, T, 2]`` of changes at the knots ``[B, K, 2]``."""
         return (base + (1 - share) * change[:, low] + share * change[:, low + 1]).clamp(-bound, bound)
 
-    def score(change: Tensor) -> tuple[Tensor, Assessment, Tensor]:
-        asked = commands(change)
-        twists = torch.cat([led.expand(len(change), -1, -1), asked], dim=1)
+    def score(change: Tensor) -> tuple[Tensor, Assessment]:
+        twists = torch.cat([led.expand(len(change), -1, -1), commands(change)], dim=1)
+        asked = twists[:, predictor.history :]
         motions = [prediction.motion] * len(change)
         rolled = predictor.differentiable_roll_out(
             prediction.terrain, motions, twists, start_states(motions), robot, with_forces=False,
             with_contact=True, force_every=every,
         )  # fmt: skip
         found = assess(rolled, prediction.terrain, robot, asked, weights=weights, limits=limits)
-        return rolled.position[:, -1], found, asked
+        return rolled.position[:, -1], found
 
     change = torch.zeros(1, _KNOTS, 2)
     with torch.no_grad():
-        end, found, _ = score(change)
+        end, found = score(change)
     cost_before = best = best_cost = float(found.cost)
     reach = float((end[0] - end.new_zeros(3)).norm().clamp_min(0.5))
     count = 0
@@ -105,14 +105,14 @@ def refine(
     while count < _MOST and time.monotonic() - started + max(slowest, round_seconds) < seconds:
         round_started = time.monotonic()
         leaf = change.clone().requires_grad_()
-        place_now, found, _ = score(leaf)
+        place_now, found = score(leaf)
         total = found.cost + _STAY * ((place_now - end) / reach).square().sum(dim=1)
         (gradient,) = torch.autograd.grad(total.sum(), leaf)
         if not bool(torch.isfinite(gradient).all()):
             break
         with torch.no_grad():
             tried = change - _steps_along(gradient[0])
-            place_now, found, _ = score(tried)
+            place_now, found = score(tried)
             totals = found.cost + _STAY * ((place_now - end) / reach).square().sum(dim=1)
             totals = torch.where(found.feasible & torch.isfinite(totals), totals, torch.inf)
             index = int(totals.argmin())

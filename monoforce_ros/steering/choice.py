@@ -33,6 +33,9 @@ class ChoiceWeights:
     """Of the angle between the last heading and the goal, over half a turn."""
     clearance: float = 1.0
     """Of how near to what is lethal a candidate comes, 0 to 1, on the average of the places where it is looked at."""
+    change: float = 0.5
+    """Of how far a candidate's command is from the former one, over the largest among the candidates: of two ways that
+    are about as good a robot must keep to one."""
 
 
 def choose(
@@ -41,6 +44,7 @@ def choose(
     goal: np.ndarray,
     weights: ChoiceWeights = ChoiceWeights(),
     ways: WayToGoal | None = None,
+    former: tuple[float, float] | None = None,
 ) -> int | None:
     """Index of the best feasible candidate; None where there is none.
 
@@ -50,6 +54,7 @@ def choose(
         goal: where it shall go ``[2]`` [m].
         weights: of cost, distance, heading and clearance.
         ways: to the goal around obstacles; without them distances are straight.
+        former: forward speed [m/s] and yaw rate [rad/s] that the robot was told last.
 
     Raises:
         ValueError: a field is missing.
@@ -85,6 +90,10 @@ def choose(
         feasible = feasible & ~standing
     score = weights.cost * candidates["cost"] + weights.distance * nearest / reach + weights.heading * off
     score = score + weights.clearance * close
+    if former is not None:
+        asked = np.column_stack([candidates["speed"], candidates["yaw_rate"]])
+        largest = np.maximum(np.abs(asked).max(axis=0), 1e-6)
+        score = score + weights.change * (np.abs(asked - former) / largest).mean(axis=1)
     return int(np.where(feasible, score, np.inf).argmin())
 
 
