@@ -40,7 +40,7 @@ def commissioned(folder: Path, seed: int) -> Path:
     from monoforce_ros.discrepancy.cli import main as diagnose
 
     case = next(case for case in all_cases(seed) if case.kind == "healthy")
-    bag, out = record_case(case, folder), folder / "nominal"
+    bag, out = record_case(case, folder), folder / f"nominal-{seed}"
     if not (out / "husky.yaml").exists():
         diagnose(["--commission", str(bag), "--robot", "husky", "--out", str(out), "--quiet"])
     return out / "husky.yaml"
