@@ -121,6 +121,23 @@ def test_what_is_seen_now_replaces_what_was_seen_before():
     assert height_at(*drive(memory, 1.0), 2.5, 1.0) == pytest.approx(0.25, abs=0.02)
 
 
+def test_what_stood_out_is_not_believed_to_be_gone_from_nearby():
+    """An encoder that sees no more than a piece of a wall takes it for ground; the robot would drive into it."""
+    source = Ahead()
+    memory = remembering(source, seconds=3.0)
+    motion = at(1.0, 1.0)
+    assert height_at(see(memory, motion), motion, 2.5, 1.0) == pytest.approx(0.65, abs=0.02)
+    source.block = False
+    for seconds in (1.5, 2.0, 2.5):
+        terrain = see(memory, motion := at(seconds, 0.9 + 0.1 * seconds, speed=0.1))
+        assert height_at(terrain, motion, 2.5, 1.0) == pytest.approx(0.65, abs=0.03)
+        # What does not stand out is taken as it is seen now.
+        assert height_at(terrain, motion, 2.4, -0.5) == pytest.approx(0.24, abs=0.02)
+    # It is not seen again either, and forgotten after its time.
+    terrain = see(memory, motion := at(4.5, 1.15))
+    assert height_at(terrain, motion, 2.5, 1.0) == pytest.approx(0.25, abs=0.02)
+
+
 def test_it_is_forgotten_after_its_time_and_after_a_way():
     memory = remembering(seconds=4.0)
     _, motion = drive(memory)

@@ -19,6 +19,9 @@ from monoforce_ros.terrain.terrain_map import CHANNELS
 if TYPE_CHECKING:
     from monoforce_ros.prediction.terrain_sources import Observation, TerrainSource
 
+_LOST_WITHIN, _STANDS = 2.0, 0.25
+"""What stood out by so much [m] is not believed to be gone from within this distance of the robot [m]: an encoder that
+sees no more than a piece of a wall does not know it for one."""
 _JUMP = 1.0
 """A robot that is further than this from where its velocity would have taken it has been moved, or its odometry [m]."""
 
@@ -27,8 +30,8 @@ class RememberedTerrain:
     """Fills what a source does not see with what it saw before, carried along by odometry.
 
     A camera that looks ahead sees neither the ground under the robot's nose nor the wall that it has just turned away
-    from, and has seen both as the robot came. What is seen now always replaces what was seen before, and what was not
-    seen again for a while is forgotten: people walk away.
+    from, and has seen both as the robot came. What is seen now replaces what was seen before, unless something that
+    stood out nearby seems to be gone; and what was not seen again for a while is forgotten: people walk away.
 
     Args:
         source: that sees.
@@ -45,6 +48,7 @@ class RememberedTerrain:
             raise ValueError(f"memory: got {seconds} s and {distance} m, expected more than 0")
         self._source, self._robot, self._stiffness = source, robot, stiffness
         self._seconds, self._distance = seconds, distance
+        self._near = np.hypot(*np.meshgrid(source.grid.x, source.grid.y)) < _LOST_WITHIN
         self._memory: _Memory | None = None
         self._before: MotionState | None = None
         self._cameras: dict[str, CameraModel] = {}
@@ -75,8 +79,10 @@ class RememberedTerrain:
         memory = self._memory
         memory.move_to(motion.position[:2])
         values, age, since = memory.read(motion)
-        kept = ~now.observed.numpy() & (age < self._seconds) & (since < self._distance)
-        memory.write(now, motion)
+        fresh = (age < self._seconds) & (since < self._distance)
+        lost = fresh & now.observed.numpy() & self._near & (values[0] - now.height.numpy() > _STANDS)
+        kept = (fresh & ~now.observed.numpy()) | lost
+        memory.write(replace(now, observed=now.observed & ~torch.from_numpy(lost)), motion)
         if not kept.any():
             return now
         known = torch.from_numpy(kept)
