@@ -55,6 +55,8 @@ def test_a_fan_holds_every_speed_from_right_to_left_and_a_stop():
         rates = fan[fan[:, 0, 0] == speed, 0, 1]
         assert rates.tolist() == pytest.approx([-0.6, -0.3, 0.0, 0.3, 0.6])
     assert fan_of_arcs(CandidateSettings(count=1, speeds=(0.5,))).tolist() == [[[0.5, 0.0]] * 4]
+    # Fewer arcs than speeds: the last ones are driven.
+    assert fan_of_arcs(CandidateSettings(count=2, speeds=(0.0, 0.4, 0.8)))[:, 0].tolist() == [[0.8, 0.0], [0.0, 0.0]]
     twists = over_horizon(fan, np.full((20, 2), 0.3), 50)
     assert twists.shape == (11, 70, 2) and (twists[:, :20] == 0.3).all() and (twists[3, 20:] == fan[3, 0]).all()
     for wrong in ({"count": 0}, {"speeds": ()}, {"speeds": (float("nan"),)}, {"yaw_rate": -1.0}):

@@ -39,7 +39,8 @@ def fan_of_arcs(settings: CandidateSettings) -> np.ndarray:
     turning.
     """
     arcs = settings.count - int(settings.stop and settings.count > 1)
-    shares = np.array_split(np.arange(arcs), len(settings.speeds))
+    # What does not come out even goes to the speeds named last: a single arc must not be a turn on the spot.
+    shares = np.array_split(np.arange(arcs), len(settings.speeds))[::-1]
     onward = max(settings.speeds)
     fan = []
     for speed, share in zip(settings.speeds, shares, strict=True):
