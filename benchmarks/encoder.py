@@ -2,7 +2,8 @@
 
     scripts/run.sh python benchmarks/encoder.py [--json FILE] [--threads 2] [--quick]
 
-The plain encoder and the one with folded norms run side by side; every figure is the median of several runs.
+The encoder as trained, with folded norms, with weights laid out for the processor and in bfloat16 (where it multiplies
+that) run side by side; every figure is the median of several runs.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ import numpy as np
 import torch
 
 from monoforce_ros.camera import CameraModel
-from monoforce_ros.encoder import CameraView, EncoderConfig, TerrainEncoder, encoder_input, fused
+from monoforce_ros.encoder import CameraView, EncoderConfig, TerrainEncoder, encoder_input, fused, packed
+from monoforce_ros.encoder.inference import multiplies_bfloat16
 from monoforce_ros.encoder.lift import lifted_points, map_cells, splat
 from monoforce_ros.encoder.terrain_encoder import terrain_maps
 from monoforce_ros.evaluation.report import write_text
@@ -92,20 +94,27 @@ def main() -> None:
     torch.manual_seed(0)
     repeats = 3 if options.quick else 30
     plain = TerrainEncoder(EncoderConfig()).eval()
-    quick = fused(plain)
+    kinds = {"fused": fused(plain), "packed": packed(fused(plain))}
+    if multiplies_bfloat16():
+        kinds["packed bfloat16"] = packed(fused(plain, "bfloat16"))
+    quick = list(kinds.values())[-1]
     figures: dict = {"threads": options.threads, "processor": platform.processor(), "torch": torch.__version__}
     for count in (1, 4):
         seen = views(count)
-        before, after = (timed(lambda e=e: e.terrain(seen, SUPPORT), repeats) for e in (plain, quick))  # noqa: B023
+        before = timed(lambda: plain.terrain(seen, SUPPORT), repeats)  # noqa: B023
+        times = {kind: timed(lambda e=e: e.terrain(seen, SUPPORT), repeats) for kind, e in kinds.items()}  # noqa: B023
+        after = list(times.values())[-1]
         parts = stages(quick, seen, repeats)
         figures[f"{count} cameras"] = {
             "plain_ms": before,
-            "fused_ms": after,
+            **{f"{kind.replace(' ', '_')}_ms": duration for kind, duration in times.items()},
             "ratio": before / after,
             "stages_ms": parts,
         }
-        print(f"{count} camera(s) 320 × 240, {options.threads} threads: {after:.1f} ms ({before:.1f} ms without folded "
-              f"norms, {before / after:.2f} ×)")  # fmt: skip
+        print(f"{count} camera(s) 320 × 240, {options.threads} threads: {before:.1f} ms as trained")
+        for kind, duration in times.items():
+            print(f"    {kind:28s} {duration:7.1f} ms  {before / duration:.2f} ×")
+        print("  of the last:")
         for name, duration in parts.items():
             print(f"    {name:28s} {duration:7.1f} ms  {100 * duration / after:4.0f} %")
     if options.json:

@@ -17,6 +17,7 @@ from monoforce_ros.encoder import (
     fused,
     load_encoder,
     new_encoder,
+    packed,
     save_encoder,
 )
 from monoforce_ros.encoder.backbone import Backbone, WeightsError
@@ -153,13 +154,21 @@ def test_a_fused_encoder_predicts_the_same(sensor):
     one, other = encoder.terrain(seen), quick.terrain(seen)
     torch.testing.assert_close(one.height, other.height, atol=1e-4, rtol=1e-4)
     torch.testing.assert_close(one.friction, other.friction, atol=1e-4, rtol=1e-4)
+    convolutions = [part for part in quick.modules() if isinstance(part, torch.nn.Conv2d)]
+    assert packed(quick) is quick
+    # The layers whose weights were laid out anew: all but the two that end in plain outputs.
+    assert len([part for part in quick.modules() if isinstance(part, torch.nn.Conv2d)]) <= 2 < len(convolutions)
+    again, third = quick.terrain(seen), quick.terrain(seen)
+    torch.testing.assert_close(one.height, again.height, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(one.friction, again.friction, atol=1e-4, rtol=1e-4)
+    assert torch.equal(again.height, third.height)
 
 
 def test_half_precision_differs_by_millimetres(demo_bag):
     recording = Recording.open(demo_bag)
     topic = next(iter(recording.images))
     shipped = load_encoder("", "camera")
-    exact, quick = fused(shipped), fused(shipped, "bfloat16")
+    exact, quick = fused(shipped), packed(fused(shipped, "bfloat16"))
     assert quick.lift.weight.dtype == torch.bfloat16 and quick.heads.weight.dtype == torch.float32
     for frame in recording.images[topic][::20]:
         seen = [

@@ -2,7 +2,7 @@
 
 from monoforce_ros.encoder.checkpoint import CheckpointError, Encoder, load_encoder, new_encoder, save_encoder
 from monoforce_ros.encoder.config import EncoderConfig
-from monoforce_ros.encoder.inference import fused
+from monoforce_ros.encoder.inference import fused, packed
 from monoforce_ros.encoder.lidar_encoder import LidarEncoder
 from monoforce_ros.encoder.terrain_encoder import EncodedMaps, TerrainEncoder
 from monoforce_ros.encoder.view import CameraView, EncoderInput, encoder_input
@@ -20,5 +20,6 @@ __all__ = [
     "fused",
     "load_encoder",
     "new_encoder",
+    "packed",
     "save_encoder",
 ]

@@ -6,6 +6,7 @@ import copy
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
+from typing import override
 
 import torch
 from torch import Tensor, nn
@@ -51,6 +52,77 @@ def fused(encoder: Encoder, precision: str = "float32") -> Encoder:
                         convolution.weight.data = _rounded(convolution.weight.data)
                 part.to(torch.bfloat16)
     return encoder.to(memory_format=torch.channels_last)
+
+
+def packed(encoder: Encoder) -> Encoder:
+    """A fused encoder with its convolutions' weights laid out once as the processor multiplies them; changed in place.
+
+    A convolution bounds its own output then, in place of an operation that reads and writes all of it again. That is
+    oneDNN's doing: the encoder must stay on the CPU, and is returned as it is where PyTorch comes without oneDNN.
+    """
+    if not _packs():
+        return encoder
+    for parent in list(encoder.modules()):
+        if getattr(parent, "bounded", None) is not None:
+            parent.conv = _PackedConvolution(parent.conv, _BOUNDS[nn.ReLU6 if parent.bounded else None])
+            parent.bounded = False
+        elif isinstance(parent, nn.Sequential):
+            _pack_sequence(parent)
+    return encoder
+
+
+def _pack_sequence(parent: nn.Sequential) -> None:
+    parts = [(name, part) for name, part in parent.named_children() if not isinstance(part, nn.Identity)]
+    for (name, part), (next_name, following) in pairwise([*parts, ("", None)]):
+        if isinstance(part, nn.Conv2d):
+            bound = type(following) if type(following) in _BOUNDS else None
+            setattr(parent, name, _PackedConvolution(part, _BOUNDS[bound]))
+            if bound is not None:
+                setattr(parent, next_name, nn.Identity())
+
+
+_BOUNDS: dict[type | None, tuple[str, list[float]]] = {
+    None: ("none", []),
+    nn.ReLU: ("relu", []),
+    nn.ReLU6: ("hardtanh", [0.0, 6.0]),
+}
+"""What oneDNN calls a bound, and its values."""
+
+
+class _PackedConvolution(nn.Module):
+    """A convolution and the bound of its output, by oneDNN."""
+
+    def __init__(self, convolution: nn.Conv2d, bound: tuple[str, list[float]]):
+        super().__init__()
+        self.weight, self.bias = convolution.weight, convolution.bias
+        self.kernel_size = convolution.kernel_size
+        placing = (convolution.padding, convolution.stride, convolution.dilation)
+        self.placing = (*(list(values) for values in placing), convolution.groups)
+        self.bound, self.values = bound
+        self.laid_out: Tensor | None = None
+
+    @override
+    def forward(self, features: Tensor) -> Tensor:
+        if self.laid_out is None:
+            # The best layout depends on the size of the images, which comes with the first one; any other works too.
+            weight = self.weight.contiguous()
+            size = list(features.shape)
+            self.laid_out = torch.ops.mkldnn._reorder_convolution_weight(weight, *self.placing, size)
+        return torch.ops.mkldnn._convolution_pointwise(
+            features, self.laid_out, self.bias, *self.placing, self.bound, self.values, ""
+        )
+
+
+@cache
+def _packs() -> bool:
+    """Whether this PyTorch offers what :class:`_PackedConvolution` calls, tried and found right."""
+    plain = nn.Conv2d(4, 4, 3, padding=1).requires_grad_(False)
+    features = torch.linspace(-8.0, 8.0, 4 * 64).view(1, 4, 8, 8)
+    try:
+        found = _PackedConvolution(plain, _BOUNDS[nn.ReLU6])(features)
+    except (AttributeError, RuntimeError):
+        return False
+    return torch.allclose(found, functional.relu6(plain(features)), atol=1e-4)
 
 
 def _rounded(weight: Tensor) -> Tensor:

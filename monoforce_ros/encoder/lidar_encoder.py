@@ -35,6 +35,7 @@ class LidarEncoder(nn.Module):
     @torch.no_grad()
     def terrain(self, points: np.ndarray, support: np.ndarray | None = None) -> TerrainMap:
         """Terrain map from a sweep ``[n, 3]`` in the terrain frame; cells that it hit count as observed."""
-        self.eval()
+        if self.training:
+            self.eval()
         batch = sweep_input(points, support, self.config).to(self.heads.weight.device)
         return terrain_maps(self(batch), self.config)[0]

@@ -132,7 +132,8 @@ class TerrainEncoder(nn.Module):
             views: one of each camera.
             support: points that the robot's wheels stand on ``[m, 3]`` in that frame.
         """
-        self.eval()
+        if self.training:
+            self.eval()
         batch = encoder_input(views, support, self.config).to(self.depths.device)
         return terrain_maps(self(batch), self.config)[0]
 

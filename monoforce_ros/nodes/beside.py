@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -15,10 +17,13 @@ class Beside:
     Args:
         name: of the thread.
         work: what to do with a job; it must not raise.
+        niceness: how far the thread, and threads that it starts, step back for others where cores are scarce, 0 to 19
+            as ``nice(1)`` counts. Linux only; elsewhere all threads are equal.
     """
 
-    def __init__(self, name: str, work: Callable[[Any], None]):
+    def __init__(self, name: str, work: Callable[[Any], None], niceness: int = 0):
         self._work = work
+        self._niceness = niceness
         self._changed = threading.Condition()
         self._job: Any = None
         self._running = True
@@ -43,6 +48,9 @@ class Beside:
     def _run(self) -> None:
         # Each thread has a setting of its own.
         torch.set_num_threads(1)
+        if self._niceness and sys.platform == "linux":
+            # There it is the thread's own; elsewhere it would be the whole process's.
+            os.nice(self._niceness)
         while True:
             with self._changed:
                 while self._running and self._job is None:

@@ -112,7 +112,7 @@ class PredictorNode(ManagedNode):
         self._watch = self.create_timer(0.5, self._watch_inputs)
         self._running = True
         compares = self.candidates is not None or self.spread is not None
-        self._beside = Beside("comparison", self._compare) if compares else None
+        self._beside = Beside("comparison", self._compare, self.settings.comparison_niceness) if compares else None
         self._worker = threading.Thread(target=self._work, name="prediction", daemon=True)
         self._worker.start()
         settings = self.settings

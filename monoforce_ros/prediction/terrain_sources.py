@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from monoforce_ros.camera import CameraModel
-from monoforce_ros.encoder import CameraView, LidarEncoder, TerrainEncoder, fused, load_encoder
+from monoforce_ros.encoder import CameraView, LidarEncoder, TerrainEncoder, fused, load_encoder, packed
 from monoforce_ros.motion import MotionState, transform_points
 from monoforce_ros.prediction.footing import clear_of, laid_under, support_points
 from monoforce_ros.prediction.remembered import RememberedTerrain
@@ -233,8 +233,8 @@ def choose_terrain_source(
     if kind == "lidar":
         return LidarTerrain(robot, grid, material)
     encoder = load_encoder(checkpoint, "camera")
-    # What is gained by folding and by half precision is gained on the CPU.
-    encoder = fused(encoder, precision) if device == "cpu" else fused(encoder).to(device)
+    # What is gained by packing and by half precision is gained on the CPU.
+    encoder = packed(fused(encoder, precision)) if device == "cpu" else fused(encoder).to(device)
     camera: CameraTerrain | RememberedTerrain = CameraTerrain(encoder, robot, threads)
     if memory:
         camera = RememberedTerrain(camera, robot, stiffness=encoder.config.stiffness, seconds=memory)
