@@ -1,5 +1,7 @@
 """From measured motion to the state that a prediction starts from."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -131,6 +133,14 @@ def test_a_lidars_surfaces_are_lowered_by_what_gives_way_and_walls_stand():
     np.testing.assert_allclose(height[firm], 0.1, atol=1e-6)
     np.testing.assert_allclose((both.geometric_height - both.height).numpy()[grass], 0.3, atol=1e-6)
     assert float((both.geometric_height - both.height).numpy()[firm].max()) == 0.0
+    # Firm ground is of the material that the lidar's source was given, what gives way of the encoder's.
+    soft = replace(seen, stiffness=of(1e5), damping=of(3e3), friction=of(0.3))
+    slick = TerrainMap.from_height(of(measured), grid, material=TerrainDefaults(2e6, 4e4, 0.0))
+    mixed = lowered(slick, soft)
+    for name, given, learnt in (("stiffness", 2e6, 1e5), ("damping", 4e4, 3e3), ("friction", 0.0, 0.3)):
+        values = getattr(mixed, name).numpy()
+        np.testing.assert_allclose(values[firm], given)
+        np.testing.assert_allclose(values[grass], learnt, rtol=1e-5)
     # A wall in the grass is more than the grass explains; so is ground that the encoder sees far below.
     inside = lowered(TerrainMap.from_height(of(np.where(grass, 1.2, 0.1)), grid), seen)
     assert float(inside.height.numpy()[grass].min()) > 0.6

@@ -57,6 +57,9 @@ class TerrainSource(Protocol):
 def lowered(swept: TerrainMap, seen: TerrainMap) -> TerrainMap:
     """A lidar's surfaces, lowered to where an encoder says that the ground carries where it says that they give way.
 
+    So far goes the encoder's word on the material, too: what it has learnt of it is what explains drives on all ground
+    together, and drives on firm ground are predicted better with what a user says of that.
+
     Args:
         swept: from a lidar.
         seen: from an encoder, on the same grid.
@@ -66,9 +69,12 @@ def lowered(swept: TerrainMap, seen: TerrainMap) -> TerrainMap:
     # A surface far above what the encoder explains is another one, which it has not seen.
     above = (swept.height - seen.height).clamp_min(0.0)
     height = swept.height - gives * torch.minimum(above, decrease + _UNSURE)
-    return replace(
-        seen, height=height, geometric_height=height + gives * decrease, observed=swept.observed | seen.observed
-    )
+    material = {
+        name: torch.lerp(getattr(swept, name), getattr(seen, name), gives)
+        for name in ("stiffness", "damping", "friction")
+    }
+    observed = swept.observed | seen.observed
+    return replace(seen, height=height, geometric_height=height + gives * decrease, observed=observed, **material)
 
 
 @dataclass(frozen=True)
