@@ -1,6 +1,6 @@
 """Speed of the terrain encoder: images to terrain, one and four cameras, and where the time goes.
 
-    scripts/run.sh python benchmarks/encoder.py [--json FILE] [--threads 2] [--quick]
+    scripts/run.sh python benchmarks/encoder.py [--json FILE] [--threads 2] [--compile] [--quick]
 
 The encoder as trained, with folded norms, with weights laid out for the processor and in bfloat16 (where it multiplies
 that) run side by side; every figure is the median of several runs.
@@ -87,6 +87,7 @@ def stages(encoder: TerrainEncoder, seen: list[CameraView], repeats: int) -> dic
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--threads", type=int, default=2, help="of PyTorch (%(default)s)")
+    parser.add_argument("--compile", action="store_true", help="torch.compile beside it (needs a C++ compiler)")
     parser.add_argument("--quick", action="store_true", help="few runs, for a test")
     parser.add_argument("--json", type=Path, help="write the figures to this file")
     options = parser.parse_args()
@@ -97,13 +98,24 @@ def main() -> None:
     kinds = {"fused": fused(plain), "packed": packed(fused(plain))}
     if multiplies_bfloat16():
         kinds["packed bfloat16"] = packed(fused(plain, "bfloat16"))
-    quick = list(kinds.values())[-1]
+    best, quick = list(kinds.items())[-1]
+    if options.compile:
+        for kind, precision in (("compiled", "float32"), ("compiled bfloat16", "bfloat16")):
+            if kind.replace("compiled", "packed") in kinds:
+                kinds[kind] = fused(plain, precision)
+                kinds[kind].compile(options={"freezing": True})
     figures: dict = {"threads": options.threads, "processor": platform.processor(), "torch": torch.__version__}
     for count in (1, 4):
         seen = views(count)
         before = timed(lambda: plain.terrain(seen, SUPPORT), repeats)  # noqa: B023
-        times = {kind: timed(lambda e=e: e.terrain(seen, SUPPORT), repeats) for kind, e in kinds.items()}  # noqa: B023
-        after = list(times.values())[-1]
+        times = {}
+        for kind, encoder in kinds.items():
+            began = time.perf_counter()
+            encoder.terrain(seen, SUPPORT)
+            if kind.startswith("compiled"):
+                print(f"torch.compile, {kind}: {time.perf_counter() - began:.0f} s")
+            times[kind] = timed(lambda e=encoder: e.terrain(seen, SUPPORT), repeats)  # noqa: B023
+        after = times[best]
         parts = stages(quick, seen, repeats)
         figures[f"{count} cameras"] = {
             "plain_ms": before,
@@ -114,7 +126,7 @@ def main() -> None:
         print(f"{count} camera(s) 320 × 240, {options.threads} threads: {before:.1f} ms as trained")
         for kind, duration in times.items():
             print(f"    {kind:28s} {duration:7.1f} ms  {before / duration:.2f} ×")
-        print("  of the last:")
+        print(f"  of {best}:")
         for name, duration in parts.items():
             print(f"    {name:28s} {duration:7.1f} ms  {100 * duration / after:4.0f} %")
     if options.json:
