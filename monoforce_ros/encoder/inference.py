@@ -23,7 +23,7 @@ def fused(encoder: Encoder, precision: str = "float32") -> Encoder:
 
     Args:
         encoder: as loaded.
-        precision: of the convolutions: ``float32``; ``bfloat16``, about twice as fast on processors that multiply it,
+        precision: of the convolutions: ``float32``; ``bfloat16``, half as fast again on processors that multiply it,
             with heights within a few millimetres; ``auto`` takes it where the processor does. Heads, depths and the
             splat stay float32.
 
