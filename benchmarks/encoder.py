@@ -23,7 +23,7 @@ from monoforce_ros.camera import CameraModel
 from monoforce_ros.encoder import CameraView, EncoderConfig, TerrainEncoder, encoder_input, fused, packed
 from monoforce_ros.encoder.inference import multiplies_bfloat16
 from monoforce_ros.encoder.lift import lifted_points, map_cells, splat
-from monoforce_ros.encoder.terrain_encoder import terrain_maps
+from monoforce_ros.encoder.terrain_encoder import terrain_maps, with_edges
 from monoforce_ros.evaluation.report import write_text
 from monoforce_ros.motion import homogeneous
 
@@ -80,7 +80,7 @@ def stages(encoder: TerrainEncoder, seen: list[CameraView], repeats: int) -> dic
             ),
             "splat": timed(lambda: splat(depth, features, cells, points[..., 2], size), repeats),
             "bird's-eye-view network": timed(lambda: encoder.heads(encoder.bird(maps.to(kind)).float()), repeats),
-            "terrain map": timed(lambda: terrain_maps(encoded, config), repeats),
+            "edges and terrain map": timed(lambda: terrain_maps(with_edges(encoded, config), config), repeats),
         }
 
 

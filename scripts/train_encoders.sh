@@ -47,23 +47,21 @@ held_out="$worlds/mixed/50018 $worlds/mixed/50019 $worlds/grass/51015 $worlds/ri
 # All drives are cut before the first step; two trainings at once would both cut them.
 run train "$worlds"/{mixed,grass,rigid,yard}/* --held-out $held_out --cut "$worlds/cut" --cut-only
 
-first=out/encoders/geometric/encoder.safetensors
 if [ "$what" = tables ]; then
   worlds test_rigid rigid 60000 8
   worlds test_grass grass 61000 8
   others() {
-    train no_geometric 800 --losses terrain trajectory &&
-      train lidar_network 400 --sensor lidar --losses geometric &&
-      until [ -f out/encoders/geometric/training.json ]; do sleep 5; done &&
-      train lss 400 --losses geometric --start-from $first
+    train no_geometric 1200 --losses terrain trajectory &&
+      train lidar_network 400 --sensor lidar --losses geometric
   }
   beside out/encoders/others.log others &
   other=$!
 fi
-# What is seen first, then what carries: the second step starts from the first, slowly, or walls that were learnt in it are
-# forgotten, and with more weight on them. What is trained on heights alone forgets none, and is best at the full rate.
+# What is seen first, which is lift-splat-shoot, then what carries. The second step goes more slowly and with more weight on
+# what is seen and stands out, or the walls that were learnt in the first are forgotten.
 train geometric 800 --losses geometric
-train monoforce 400 --start-from $first --rate 0.0007 --standing 8
+train lss 400 --losses geometric --start-from out/encoders/geometric/encoder.safetensors
+train monoforce 800 --start-from out/encoders/lss/encoder.safetensors --rate 0.001 --geometric 3 --standing 8
 for ending in safetensors json; do
   cp "out/encoders/monoforce/encoder.$ending" "models/.terrain_encoder.$ending"
   mv "models/.terrain_encoder.$ending" "models/terrain_encoder.$ending"

@@ -147,6 +147,7 @@ def test_a_fused_encoder_predicts_the_same(sensor):
         if isinstance(module, torch.nn.BatchNorm2d):
             module.running_mean.normal_(0.0, 0.1)
             module.running_var.uniform_(0.5, 2.0)
+    torch.nn.init.normal_(encoder.heads.weight, std=0.2)
     quick = fused(encoder)
     assert not any(isinstance(module, torch.nn.BatchNorm2d) for module in quick.modules())
     image = np.random.default_rng(1).integers(0, 255, (96, 128, 3), np.uint8)
@@ -211,6 +212,20 @@ def test_heads_keep_their_signs_and_any_number_of_cameras_goes():
         assert terrain.grid == SMALL.grid
         # Behind the camera nothing was seen.
         assert not bool(terrain.observed[:, terrain.grid.x < 0.0].any())
+
+
+@pytest.mark.parametrize("sensor", ["camera", "lidar"])
+def test_material_that_nothing_taught_is_the_one_configured(sensor):
+    torch.manual_seed(5)
+    config = replace(SMALL, sensor=sensor, friction=0.6, stiffness=1e6, damping=3e4)
+    random = np.random.default_rng(1)
+    seen = (
+        random.normal(size=(500, 3)) if sensor == "lidar" else [view(random.integers(0, 255, (96, 128, 3), np.uint8))]
+    )
+    terrain = new_encoder(config).terrain(seen)
+    for name in ("friction", "stiffness", "damping"):
+        values = getattr(terrain, name)
+        torch.testing.assert_close(values, torch.full_like(values, getattr(config, name)))
 
 
 def test_an_image_that_is_not_the_calibrated_size_is_named():

@@ -25,6 +25,7 @@ from monoforce_ros.training.losses import (
     LossWeights,
     geometric_loss,
     measured_decrease_loss,
+    standing_decrease_loss,
     terrain_loss,
     trajectory_loss,
 )
@@ -182,6 +183,26 @@ def test_the_decrease_is_learnt_where_both_surfaces_are_known(drive):
     # What is not known of both does not count; a surface never gives way upwards.
     higher = replace(targets, geometric=targets.supporting - 0.4)
     assert float(measured_decrease_loss(maps_of(targets, decrease=said * 0.0), higher)) == 0.0
+
+
+def test_what_stands_and_nobody_drove_over_does_not_give_way(drive):
+    batch, targets = sample(drive, 3, TINY)
+    wall, patch, level = (torch.zeros_like(targets.observed) for _ in range(3))
+    wall[:, 10, 5:15], patch[:, 20, 5:15], level[:, 2, 2:8] = True, True, True
+    targets = replace(
+        targets,
+        geometric=batch.ground[:, None, None] + 0.9 * (wall | patch),
+        observed=torch.ones_like(wall),
+        felt=patch,
+    )
+
+    def loss_of(where):
+        return float(standing_decrease_loss(maps_of(targets, decrease=0.2 * where), targets, batch.ground))
+
+    # Neither what was driven over counts, nor what does not stand; other cells do not thin out a wall.
+    assert loss_of(wall) == pytest.approx(0.2**2, rel=1e-4) and loss_of(patch) == loss_of(level) == 0.0
+    nothing = replace(targets, observed=torch.zeros_like(wall))
+    assert float(standing_decrease_loss(maps_of(targets, decrease=0.2 * wall), nothing, batch.ground)) == 0.0
 
 
 def test_the_trajectory_loss_reaches_heights_and_material(drive, husky):

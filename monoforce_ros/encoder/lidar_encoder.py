@@ -10,7 +10,7 @@ from torch import nn
 
 from monoforce_ros.encoder.birds_eye import BirdsEyeNetwork
 from monoforce_ros.encoder.config import EncoderConfig
-from monoforce_ros.encoder.terrain_encoder import EncodedMaps, maps_from_heads, terrain_maps
+from monoforce_ros.encoder.terrain_encoder import EncodedMaps, map_heads, maps_from_heads, terrain_maps
 from monoforce_ros.encoder.view import EncoderInput, sweep_input
 from monoforce_ros.terrain import TerrainMap
 
@@ -23,7 +23,7 @@ class LidarEncoder(nn.Module):
         self.config = config
         # Lowest and highest hit, whether there is one, the support plane and where it holds.
         self.bird = BirdsEyeNetwork(5, config.map_features)
-        self.heads = nn.Conv2d(config.map_features, 5, kernel_size=1)
+        self.heads = map_heads(config.map_features)
 
     @override
     def forward(self, batch: EncoderInput) -> EncodedMaps:

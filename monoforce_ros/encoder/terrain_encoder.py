@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -13,6 +13,7 @@ from torch.nn import functional
 from monoforce_ros.encoder.backbone import COARSE_CHANNELS, FINE_CHANNELS, Backbone
 from monoforce_ros.encoder.birds_eye import BirdsEyeNetwork
 from monoforce_ros.encoder.config import EncoderConfig
+from monoforce_ros.encoder.edges import restore_edges
 from monoforce_ros.encoder.lift import depth_values, lifted_points, map_cells, splat
 from monoforce_ros.encoder.view import CameraView, EncoderInput, encoder_input
 from monoforce_ros.terrain import TerrainMap
@@ -75,7 +76,7 @@ class TerrainEncoder(nn.Module):
         self.level_weight = nn.Parameter(torch.tensor(1.0))
         # Features, mean height, its spread, how much was seen, the support plane and where it holds.
         self.bird = BirdsEyeNetwork(config.image_features + 5, config.map_features)
-        self.heads = nn.Conv2d(config.map_features, 5, kernel_size=1)
+        self.heads = map_heads(config.map_features)
         depths = torch.from_numpy(depth_values(config)).float()
         self.register_buffer("depths", depths, persistent=False)
 
@@ -135,7 +136,19 @@ class TerrainEncoder(nn.Module):
         if self.training:
             self.eval()
         batch = encoder_input(views, support, self.config).to(self.depths.device)
-        return terrain_maps(self(batch), self.config)[0]
+        return terrain_maps(with_edges(self(batch), self.config), self.config)[0]
+
+
+def map_heads(features: int) -> nn.Conv2d:
+    """Heads for H_g, H_d, stiffness, damping and friction, as an untrained encoder has them.
+
+    Material starts as the configuration says it is, everywhere: what no loss reaches shall not differ by accident.
+    """
+    heads = nn.Conv2d(features, 5, kernel_size=1)
+    with torch.no_grad():
+        heads.weight[2:] = 0.0
+        heads.bias[2:] = 0.0
+    return heads
 
 
 def maps_from_heads(
@@ -152,6 +165,12 @@ def maps_from_heads(
         covered=covered,
         seen=seen,
     )
+
+
+def with_edges(maps: EncodedMaps, config: EncoderConfig) -> EncodedMaps:
+    """The same with steps where what carries rises too steeply; grass that gives way keeps its outline."""
+    change = restore_edges(maps.height, config.resolution) - maps.height
+    return replace(maps, geometric_height=maps.geometric_height + change)
 
 
 def terrain_maps(maps: EncodedMaps, config: EncoderConfig) -> list[TerrainMap]:

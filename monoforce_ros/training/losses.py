@@ -41,11 +41,15 @@ class LossWeights:
     """Of the mean square of H_d (λ_d of the paper's equation 3)."""
     measured_decrease: float = 2.0
     """Of H_d where it was measured; together with the geometric and the terrain loss alone."""
+    standing_decrease: float = 0.5
+    """Of H_d where something stands that nobody drove over; together with the geometric loss alone."""
     standing: float = 3.0
     """By how much more what stands out of its surroundings counts in the geometric loss."""
 
     def __post_init__(self):
-        for name in ("geometric", "terrain", "trajectory", "decrease", "measured_decrease", "standing"):
+        for name in (
+            "geometric", "terrain", "trajectory", "decrease", "measured_decrease", "standing_decrease", "standing",
+        ):  # fmt: skip
             if not 0.0 <= getattr(self, name) <= 1e6:
                 raise ValueError(f"loss weight {name}: got {getattr(self, name)}, expected 0 or more")
         if self.geometric == self.terrain == self.trajectory == 0.0:
@@ -61,8 +65,7 @@ def geometric_loss(
     few, and an error that counts linearly is least where they are left out.
     """
     measured = _limited(targets.geometric, ground)
-    stands = (_prominence(measured, targets.observed) / _STANDING).clamp(0.0, 1.0)
-    weight = targets.observed * torch.where(maps.covered, 1.0, _UNSEEN) * (1.0 + standing * stands)
+    weight = targets.observed * torch.where(maps.covered, 1.0, _UNSEEN) * (1.0 + standing * _stands(targets, ground))
     return _masked(maps.geometric_height, measured, weight)
 
 
@@ -75,6 +78,18 @@ def terrain_loss(maps: EncodedMaps, targets: Targets) -> Tensor:
 def decrease_loss(maps: EncodedMaps) -> Tensor:
     """Second part of equation 3: what nobody drove over is as high as it looks."""
     return (maps.decrease**2).mean()
+
+
+def standing_decrease_loss(maps: EncodedMaps, targets: Targets, ground: Tensor) -> Tensor:
+    """Second part of equation 3 where it decides: H_d of what stands out and nobody drove over, squared.
+
+    Motion tells only of what a robot dares to enter. Grass that is entered teaches H_d; walls never are, and what is
+    learnt from grass would be said of walls too. What stands beside the way is as high as it looks, unless the same is
+    seen to give way elsewhere: grass is felt in many places, a wall in none. Squared, so that what both are said of
+    comes to lie in between rather than at 0.
+    """
+    weight = _stands(targets, ground) * (targets.observed & ~targets.felt) * torch.where(maps.covered, 1.0, _UNSEEN)
+    return _mean_over_maps(maps.decrease**2, weight)
 
 
 def measured_decrease_loss(maps: EncodedMaps, targets: Targets) -> Tensor:
@@ -146,6 +161,11 @@ def _limited(heights: Tensor, ground: Tensor) -> Tensor:
     return ground[:, None, None] + above.clamp(LOWEST, HIGHEST)
 
 
+def _stands(targets: Targets, ground: Tensor) -> Tensor:
+    """How surely what the lidar measured stands out of its surroundings, 0 to 1 ``[B, rows, columns]``."""
+    return (_prominence(_limited(targets.geometric, ground), targets.observed) / _STANDING).clamp(0.0, 1.0)
+
+
 def _prominence(heights: Tensor, known: Tensor) -> Tensor:
     """Height of cells over the mean of the known ones around them [m]; all ``[B, rows, columns]``."""
     mask = known.to(heights.dtype)
@@ -157,8 +177,12 @@ def _prominence(heights: Tensor, known: Tensor) -> Tensor:
 
 
 def _masked(predicted: Tensor, measured: Tensor, weight: Tensor) -> Tensor:
+    """Robust error, averaged as :func:`_mean_over_maps` does."""
+    return _mean_over_maps(functional.smooth_l1_loss(predicted, measured, reduction="none", beta=_KNEE), weight)
+
+
+def _mean_over_maps(error: Tensor, weight: Tensor) -> Tensor:
     """Mean over weighted cells of each map, then over the maps that have any."""
-    error = functional.smooth_l1_loss(predicted, measured, reduction="none", beta=_KNEE)
     total = weight.sum(dim=(1, 2))
     mean = (error * weight).sum(dim=(1, 2)) / total.clamp_min(1e-6)
     some = total > 0

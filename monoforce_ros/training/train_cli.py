@@ -54,6 +54,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--losses", nargs="+", default=["geometric", "terrain", "trajectory"],
                         choices=("geometric", "terrain", "trajectory"),
                         help="(all; `geometric` alone is LSS)")  # fmt: skip
+    parser.add_argument("--geometric", type=float, default=LossWeights.geometric, metavar="WEIGHT", help="of the "
+                        "geometric loss among the others (%(default)s)")  # fmt: skip
     parser.add_argument("--standing", type=float, default=LossWeights.standing, metavar="WEIGHT", help="by how much "
                         "more walls, trunks and edges count in the geometric loss (%(default)s)")  # fmt: skip
     parser.add_argument("--no-vegetation", action="store_true", help="do not fit how hard vegetation holds the robot")
@@ -205,8 +207,8 @@ def _config(options: argparse.Namespace) -> EncoderConfig:
 
 
 def _settings(options: argparse.Namespace) -> TrainingSettings:
-    defaults = LossWeights()
-    chosen = {name: getattr(defaults, name) if name in options.losses else 0.0 for name in
+    given = LossWeights(geometric=options.geometric)
+    chosen = {name: getattr(given, name) if name in options.losses else 0.0 for name in
               ("geometric", "terrain", "trajectory")}  # fmt: skip
     return TrainingSettings(
         steps=options.steps, batch=options.batch, rate=options.rate,

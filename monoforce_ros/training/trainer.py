@@ -28,6 +28,7 @@ from monoforce_ros.training.losses import (
     decrease_loss,
     geometric_loss,
     measured_decrease_loss,
+    standing_decrease_loss,
     terrain_loss,
     trajectory_loss,
 )
@@ -130,6 +131,10 @@ class _Losses(nn.Module):
             losses["decrease"] = weights.decrease * decrease_loss(maps)
         if self.encoder.config.decreases and weights.geometric and weights.terrain:
             losses["measured decrease"] = weights.measured_decrease * measured_decrease_loss(maps, targets)
+        if self.encoder.config.decreases and weights.geometric:
+            losses["standing decrease"] = weights.standing_decrease * standing_decrease_loss(
+                maps, targets, batch.ground
+            )
         losses["total"] = torch.stack(list(losses.values())).sum()
         # Heads without a loss get a gradient of zero: processes that train together expect one for each weight.
         unused = maps.decrease.sum() + maps.stiffness.sum() + maps.damping.sum() + maps.friction.sum()

@@ -1,0 +1,127 @@
+"""Edges that an encoder blurred: restored where heights rise too steeply, left alone elsewhere."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from monoforce_ros.camera import CameraModel
+from monoforce_ros.encoder import CameraView, EncoderConfig, TerrainEncoder, encoder_input
+from monoforce_ros.encoder.edges import restore_edges
+from monoforce_ros.motion import homogeneous
+from monoforce_ros.physics import State, rollout
+from monoforce_ros.robots import load_robot
+from monoforce_ros.terrain import Grid, TerrainMap
+
+WALL = 2.0
+
+
+def rise(grid: Grid, height: float, width: float, heading: float = 0.0) -> torch.Tensor:
+    """Heights ``[1, rows, columns]`` that rise by ``height`` over ``width``, ``WALL`` ahead towards a heading [m]."""
+    x, y = np.meshgrid(np.asarray(grid.x), np.asarray(grid.y))
+    ahead = torch.from_numpy(np.cos(heading) * x + np.sin(heading) * y)
+    return (height * ((ahead - WALL) / width + 0.5).clamp(0.0, 1.0)).float()[None]
+
+
+def driven(heights: torch.Tensor, grid: Grid) -> float:
+    """How far a Husky gets that is told to drive 4 m ahead."""
+    robot = load_robot("husky")
+    speeds = robot.drive_speeds(torch.tensor([0.8, 0.0]).expand(1, 500, 2))
+    with torch.no_grad():
+        result = rollout(TerrainMap.from_height(heights[0], grid), robot, speeds, State.at_rest(robot.ground_clearance))
+    return float(result.position[0, -1, 0])
+
+
+@pytest.mark.parametrize("resolution", [0.05, 0.1, 0.2])
+@pytest.mark.parametrize(("height", "width"), [(0.5, 0.6), (0.4, 0.5), (0.9, 0.6)])
+def test_a_wall_blurred_to_a_slope_is_a_step_again_where_its_middle_was(resolution, height, width):
+    grid = Grid.square(8.0, resolution)
+    restored = restore_edges(rise(grid, height, width), resolution)[0, 0].double()
+    x = torch.from_numpy(np.asarray(grid.x))
+    assert float(restored.min()) >= 0.0 and float(restored.max()) <= height + 1e-6
+    steep = restored[(x > WALL - 0.11 - resolution) & (x < WALL + 0.11 + resolution)]
+    assert float(steep[-1] - steep[0]) > 0.8 * height
+    half = float(x[restored > 0.5 * height][0])
+    assert half == pytest.approx(WALL, abs=1.01 * resolution)
+
+
+def test_a_robot_climbs_the_blurred_wall_and_stops_at_the_restored_one():
+    grid = Grid.square()
+    blurred = rise(grid, 0.5, 0.6)
+    assert driven(blurred, grid) > 3.0
+    assert 1.0 < driven(restore_edges(blurred, grid.resolution), grid) < WALL
+
+
+@pytest.mark.parametrize("heading", [0.0, 20.0, 45.0])
+@pytest.mark.parametrize(
+    ("height", "width"),
+    [
+        pytest.param(2.0, 2.0 / np.tan(np.radians(20)), id="a ramp of 20 degrees"),
+        pytest.param(0.2, 0.1, id="a kerb of 20 cm"),
+        pytest.param(0.0, 1.0, id="level ground"),
+    ],
+)
+def test_ground_that_is_no_wall_is_returned_as_it_was_whichever_way_it_lies(height, width, heading):
+    heights = rise(Grid.square(), height, width, heading=np.radians(heading))
+    assert torch.equal(restore_edges(heights, 0.1), heights)
+
+
+@pytest.mark.parametrize("heading", [0.0, 20.0, 45.0, 90.0])
+def test_walls_are_restored_whichever_way_they_face(heading):
+    grid = Grid.square()
+    blurred, sharp = (rise(grid, 0.5, width, heading=np.radians(heading)) for width in (0.6, 1e-3))
+    off = [float((heights - sharp).abs().mean()) for heights in (blurred, restore_edges(blurred, 0.1))]
+    assert off[1] < 0.5 * off[0]
+
+
+def test_a_long_steep_slope_stays_a_slope_between_its_ends():
+    grid = Grid.square()
+    slope = rise(grid, 2.0, 2.0 / np.tan(np.radians(40)))
+    middle = np.abs(np.asarray(grid.x) - WALL) < 0.8
+    torch.testing.assert_close(restore_edges(slope, 0.1)[0, :, middle], slope[0, :, middle])
+
+
+def test_a_sharp_wall_stays_where_it_is():
+    step = rise(Grid.square(), 0.6, 1e-3)
+    torch.testing.assert_close(restore_edges(step, 0.1), step)
+
+
+@given(seed=st.integers(0, 2**31), roughness=st.floats(0.0, 2.0), offset=st.floats(-50.0, 50.0))
+def test_heights_stay_within_their_surroundings_wherever_the_map_lies_and_however_it_is_turned(seed, roughness, offset):
+    heights = roughness * torch.from_numpy(np.random.default_rng(seed).normal(size=(2, 24, 31)))
+    restored = restore_edges(heights, 0.1)
+    around, below = (sign * torch.nn.functional.max_pool2d(sign * heights[:, None], 7, 1, 3)[:, 0] for sign in (1, -1))
+    assert bool(((restored <= around + 1e-9) & (restored >= below - 1e-9)).all())
+    torch.testing.assert_close(restore_edges(heights + offset, 0.1), restored + offset, atol=1e-6, rtol=0.0)
+    for turned in (lambda h: h.flip(-1), lambda h: h.flip(-2), lambda h: h.transpose(-1, -2)):
+        torch.testing.assert_close(restore_edges(turned(heights), 0.1), turned(restored))
+
+
+def test_small_changes_of_a_prediction_change_the_restored_map_little():
+    blurred = rise(Grid.square(), 0.5, 0.6).double()
+    other = blurred + 1e-3 * torch.from_numpy(np.random.default_rng(0).normal(size=blurred.shape))
+    assert float((restore_edges(other, 0.1) - restore_edges(blurred, 0.1)).abs().max()) < 0.1
+
+
+def test_an_encoder_restores_what_carries_and_keeps_how_much_gives_way():
+    config = EncoderConfig(
+        image_width=128, image_height=96, map_size=6.4, resolution=0.1, depth_bins=12, map_features=8
+    )
+    torch.manual_seed(3)
+    encoder = TerrainEncoder(config).eval()
+    random = np.random.default_rng(0)
+    matrix = np.array([[77.0, 0, 63.5], [0, 77.0, 47.5], [0, 0, 1]])
+    forward = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
+    image = random.integers(0, 255, (96, 128, 3), np.uint8)
+    seen = [
+        CameraView(image, CameraModel(128, 96, matrix, np.array([])), homogeneous(forward, np.array([0.2, 0, 0.5])))
+    ]
+    with torch.no_grad():
+        # An untrained encoder's map is all but level.
+        encoder.heads.weight[:2] *= 0.3 / float(encoder(encoder_input(seen, None, config)).height.std())
+        raw = encoder(encoder_input(seen, None, config))
+    terrain = encoder.terrain(seen)
+    torch.testing.assert_close(terrain.height, restore_edges(raw.height, 0.1)[0])
+    assert float((terrain.height - raw.height[0]).abs().max()) > 0.05
+    torch.testing.assert_close(terrain.geometric_height - terrain.height, raw.decrease[0], atol=1e-5, rtol=0.0)
