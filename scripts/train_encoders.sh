@@ -51,7 +51,7 @@ if [ "$what" = tables ]; then
   worlds test_rigid rigid 60000 8
   worlds test_grass grass 61000 8
   others() {
-    train no_geometric 1200 --losses terrain trajectory &&
+    train no_geometric 1200 --losses terrain trajectory --no-edges &&
       train lidar_network 400 --sensor lidar --losses geometric
   }
   beside out/encoders/others.log others &
@@ -61,7 +61,8 @@ fi
 # what is seen and stands out, or the walls that were learnt in the first are forgotten.
 train geometric 800 --losses geometric
 train lss 400 --losses geometric --start-from out/encoders/geometric/encoder.safetensors
-train monoforce 800 --start-from out/encoders/lss/encoder.safetensors --rate 0.001 --geometric 3 --standing 8
+train monoforce 320 --start-from out/encoders/lss/encoder.safetensors --rate 0.0007 --geometric 3 --standing 8 \
+  --seed 2
 for ending in safetensors json; do
   cp "out/encoders/monoforce/encoder.$ending" "models/.terrain_encoder.$ending"
   mv "models/.terrain_encoder.$ending" "models/terrain_encoder.$ending"

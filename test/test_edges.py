@@ -1,5 +1,7 @@
 """Edges that an encoder blurred: restored where heights rise too steeply, left alone elsewhere."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -104,6 +106,24 @@ def test_small_changes_of_a_prediction_change_the_restored_map_little():
     assert float((restore_edges(other, 0.1) - restore_edges(blurred, 0.1)).abs().max()) < 0.1
 
 
+def test_gradients_reach_every_height_and_are_those_of_the_ground_where_nothing_changes():
+    level = torch.zeros(1, 20, 20, dtype=torch.float64, requires_grad=True)
+    (gradient,) = torch.autograd.grad(restore_edges(level, 0.1).sum(), level)
+    torch.testing.assert_close(gradient, torch.ones_like(level))
+    blurred = rise(Grid.square(6.0), 0.5, 0.6).double()
+    # Away from ties, at which a highest cell is another one.
+    blurred = (blurred + 1e-3 * torch.from_numpy(np.random.default_rng(1).normal(size=blurred.shape))).requires_grad_()
+    weight = torch.from_numpy(np.random.default_rng(2).normal(size=blurred.shape))
+    (gradient,) = torch.autograd.grad((weight * restore_edges(blurred, 0.1)).sum(), blurred)
+    assert bool(gradient.isfinite().all()) and float((gradient - weight).abs().max()) > 1.0
+    for row, column in ((10, 47), (20, 49), (30, 50), (5, 51)):
+        moved = [blurred.detach().clone() for _ in range(2)]
+        for heights, sign in zip(moved, (1, -1), strict=True):
+            heights[0, row, column] += sign * 1e-6
+        up, down = (float((weight * restore_edges(heights, 0.1)).sum()) for heights in moved)
+        assert float(gradient[0, row, column]) == pytest.approx((up - down) / 2e-6, rel=1e-4, abs=1e-6)
+
+
 def test_an_encoder_restores_what_carries_and_keeps_how_much_gives_way():
     config = EncoderConfig(
         image_width=128, image_height=96, map_size=6.4, resolution=0.1, depth_bins=12, map_features=8
@@ -120,7 +140,9 @@ def test_an_encoder_restores_what_carries_and_keeps_how_much_gives_way():
     with torch.no_grad():
         # An untrained encoder's map is all but level.
         encoder.heads.weight[:2] *= 0.3 / float(encoder(encoder_input(seen, None, config)).height.std())
+        encoder.config = replace(config, edges=False)
         raw = encoder(encoder_input(seen, None, config))
+    encoder.config = config
     terrain = encoder.terrain(seen)
     torch.testing.assert_close(terrain.height, restore_edges(raw.height, 0.1)[0])
     assert float((terrain.height - raw.height[0]).abs().max()) > 0.05

@@ -40,6 +40,8 @@ class EncoderConfig:
     """Lifted points further below or above the ground under the robot are left out [m]."""
     decreases: bool = True
     """Whether the ground may carry lower than it looks; without it H_t = H_g, which is lift-splat-shoot alone."""
+    edges: bool = True
+    """Whether slopes that uncertainty makes of steps become steps again; for cameras."""
     stiffness: float = TerrainDefaults.stiffness
     damping: float = TerrainDefaults.damping
     friction: float = TerrainDefaults.friction
@@ -64,8 +66,9 @@ class EncoderConfig:
             value = getattr(self, name)
             if not isinstance(value, int | float) or isinstance(value, bool) or not low <= value <= high:
                 raise ValueError(f"encoder {name}: got {value!r}, expected {low} to {high}")
-        if not isinstance(self.decreases, bool):
-            raise ValueError(f"encoder decreases: got {self.decreases!r}, expected true or false")
+        for name in ("decreases", "edges"):
+            if not isinstance(getattr(self, name), bool):
+                raise ValueError(f"encoder {name}: got {getattr(self, name)!r}, expected true or false")
         if self.image_width % 16 or self.image_height % 16:
             raise ValueError(
                 f"encoder image size: got {self.image_width} × {self.image_height}, expected multiples of 16"

@@ -105,7 +105,8 @@ class TerrainEncoder(nn.Module):
         hits = torch.zeros(batch.maps * size, device=cells.device)
         hits[cells[cells >= 0]] = 1.0
         covered = functional.max_pool2d(hits.view(batch.maps, 1, grid.rows, grid.columns), 5, 1, 2)[:, 0] > 0
-        return maps_from_heads(outputs, batch, config, covered, seen.view(shape[:-1]))
+        maps = maps_from_heads(outputs, batch, config, covered, seen.view(shape[:-1]))
+        return with_edges(maps, config) if config.edges else maps
 
     def _lift(self, batch: EncoderInput) -> tuple[Tensor, Tensor]:
         """Probability of each depth ``[N, bins, rows, columns]`` and features ``[N, C, rows, columns]``."""
@@ -136,7 +137,7 @@ class TerrainEncoder(nn.Module):
         if self.training:
             self.eval()
         batch = encoder_input(views, support, self.config).to(self.depths.device)
-        return terrain_maps(with_edges(self(batch), self.config), self.config)[0]
+        return terrain_maps(self(batch), self.config)[0]
 
 
 def map_heads(features: int) -> nn.Conv2d:

@@ -66,6 +66,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--map-size", type=float, default=EncoderConfig.map_size, metavar="M", help="(%(default)s)")
     parser.add_argument("--resolution", type=float, default=EncoderConfig.resolution, metavar="M", help="of a cell "
                         "(%(default)s)")  # fmt: skip
+    parser.add_argument("--edges", action=argparse.BooleanOptionalAction, help="steps in place of slopes that "
+                        "uncertainty makes of them (with the terrain loss, from cameras)")  # fmt: skip
     parser.add_argument("--start-from", type=Path, metavar="FILE.safetensors", help="an encoder to go on from")
     parser.add_argument("--backbone-weights", choices=("imagenet", "random"), default="imagenet", help="(%(default)s)")
     parser.add_argument("--validate-every", type=int, default=TrainingSettings.validate_every, metavar="STEPS")
@@ -177,7 +179,7 @@ def _encoder(options: argparse.Namespace, config: EncoderConfig) -> Encoder:
     if options.start_from is not None:
         encoder = load_encoder(options.start_from)
         before, now = asdict(encoder.config), asdict(config)
-        wrong = [name for name in now if name != "decreases" and now[name] != before[name]]
+        wrong = [name for name in now if name not in ("decreases", "edges") and now[name] != before[name]]
         if wrong:
             raise CheckpointError(
                 f"{options.start_from}: its {', '.join(wrong)} {'differ' if len(wrong) > 1 else 'differs'} from what "
@@ -203,6 +205,7 @@ def _config(options: argparse.Namespace) -> EncoderConfig:
         map_size=options.map_size,
         resolution=options.resolution,
         decreases=options.losses != ["geometric"],
+        edges=options.losses != ["geometric"] if options.edges is None else options.edges,
     )
 
 
