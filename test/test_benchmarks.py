@@ -7,8 +7,6 @@ import sys
 import pytest
 from conftest import ROOT
 
-sys.path.insert(0, str(ROOT / "benchmarks"))
-
 
 @pytest.fixture(scope="module")
 def check():

@@ -1,18 +1,13 @@
 """The encoder on real cameras: what the lidar hit lands in its cell, and images can say what the lidar saw."""
 
-import sys
-
 import numpy as np
 import pytest
 import torch
-from conftest import ROOT
 
 from monoforce_ros.datasets.rough import LIDAR_FRAME, RoughScene
 from monoforce_ros.encoder import EncoderConfig
 from monoforce_ros.encoder.lift import feature_rays, map_cells
 from monoforce_ros.motion import transform_points
-
-sys.path.insert(0, str(ROOT / "benchmarks"))
 
 CONFIG = EncoderConfig()
 

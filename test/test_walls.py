@@ -1,27 +1,16 @@
 """A wall ahead (paper, figure 9): the shipped encoder predicts the crash by heights, and none where none stands."""
 
-import sys
-
 import pytest
 import torch
-from conftest import ROOT
+import wall
 
 from monoforce_ros.encoder import fused, load_encoder
 from monoforce_ros.prediction import CameraTerrain, Predictor
 from monoforce_ros.robots import load_robot
 
-sys.path.insert(0, str(ROOT / "benchmarks"))
-
 
 @pytest.fixture(scope="module")
-def wall():
-    import wall
-
-    return wall
-
-
-@pytest.fixture(scope="module")
-def predictor(wall):
+def predictor():
     robot = load_robot("husky")
     return Predictor(robot, CameraTerrain(fused(load_encoder("", "camera")), robot), horizon=wall.HORIZON)
 
@@ -29,7 +18,7 @@ def predictor(wall):
 @pytest.mark.parametrize(
     ("seed", "stands"), [(80000, False), (80006, False), (80004, True), (80005, True), (80010, True), (80019, True)]
 )
-def test_the_shipped_encoder_predicts_where_the_simulated_robot_stops(wall, predictor, seed, stands):
+def test_the_shipped_encoder_predicts_where_the_simulated_robot_stops(predictor, seed, stands):
     found = wall.scene(seed)
     least = wall.STOPPED * wall.SPEED * wall.HORIZON
     assert (found.wall is not None) == stands == (found.driven < least)
