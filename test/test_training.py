@@ -25,6 +25,7 @@ from monoforce_ros.training.losses import (
     LossWeights,
     geometric_loss,
     measured_decrease_loss,
+    slope_loss,
     standing_decrease_loss,
     terrain_loss,
     trajectory_loss,
@@ -150,6 +151,34 @@ def test_losses_are_means_over_measured_cells(drive):
     assert float(felt) == pytest.approx(0.2 - 0.025, abs=1e-4)
     nothing = replace(targets, felt=torch.zeros_like(targets.felt))
     assert float(terrain_loss(maps_of(targets), nothing)) == 0.0
+
+
+def test_slopes_count_beside_heights(drive):
+    _, targets = sample(drive, 3, TINY)
+    felt = torch.zeros_like(targets.felt)
+    felt[:, 5:20, 5:20] = True
+    targets = replace(targets, felt=felt)
+    up, right = (steps.to(torch.float32) for steps in torch.meshgrid(*map(torch.arange, felt.shape[1:]), indexing="ij"))
+
+    def loss_of(error):
+        return float(
+            slope_loss(maps_of(targets, geometric_height=targets.supporting + error), targets, TINY.resolution)
+        )
+
+    # All heights wrong by as much tilt nobody, and neither do those that nobody touched.
+    assert loss_of(0.3 * torch.ones_like(up)) == pytest.approx(0.0, abs=1e-6)
+    assert loss_of(torch.where(felt[0], 0.0, 1.0)) == 0.0
+    # Planes: 60 cm apart are 3, 0, 2 and 2 rows of 20 cm; rows and columns together 3, 3, 4 and 0.
+    grade = 0.1
+    expected = grade * (3 + 2 + 2) / 4 - 3 * 0.025 / 4
+    assert loss_of(grade * up) == pytest.approx(expected, rel=1e-4)
+    assert loss_of(-grade * right) == pytest.approx(expected, rel=1e-4)
+    assert loss_of(grade * (up + right)) == pytest.approx(grade * (3 + 3 + 4) / 4 - 3 * 0.025 / 4, rel=1e-4)
+    nothing = replace(targets, felt=torch.zeros_like(felt))
+    assert (
+        float(slope_loss(maps_of(targets, geometric_height=targets.supporting + grade * up), nothing, TINY.resolution))
+        == 0.0
+    )
 
 
 def test_what_stands_out_counts_more(drive):

@@ -25,6 +25,8 @@ _STANDING, _AROUND = 0.3, 12
 """Height over the mean of so many cells to all sides from which on a cell stands out [m]."""
 _UNSEEN = 0.1
 """Weight of measured cells that no camera looks at: only what surrounds them tells of them."""
+_APART = 0.6
+"""How far apart errors are compared: as the wheels of a robot [m]."""
 _ACROSS, _UP, _TURN, _HEADING = 0.15, 0.03, np.radians(2.0), np.radians(4.0)
 """How far a prediction may be off before it weighs: along the ground, where slip decides, up, in roll and pitch, and in
 heading, which slip decides too."""
@@ -36,19 +38,22 @@ class LossWeights:
 
     geometric: float = 1.0
     terrain: float = 2.0
+    slope: float = 4.0
+    """Of slopes of H_t, where wheels or tracks touched both ends; together with the terrain loss alone."""
     trajectory: float = 0.05
     decrease: float = 0.3
     """Of the mean square of H_d (λ_d of the paper's equation 3)."""
     measured_decrease: float = 2.0
     """Of H_d where it was measured; together with the geometric and the terrain loss alone."""
-    standing_decrease: float = 0.5
+    standing_decrease: float = 0.1
     """Of H_d where something stands that nobody drove over; together with the geometric loss alone."""
     standing: float = 3.0
     """By how much more what stands out of its surroundings counts in the geometric loss."""
 
     def __post_init__(self):
         for name in (
-            "geometric", "terrain", "trajectory", "decrease", "measured_decrease", "standing_decrease", "standing",
+            "geometric", "terrain", "slope", "trajectory", "decrease", "measured_decrease", "standing_decrease",
+            "standing",
         ):  # fmt: skip
             if not 0.0 <= getattr(self, name) <= 1e6:
                 raise ValueError(f"loss weight {name}: got {getattr(self, name)}, expected 0 or more")
@@ -73,6 +78,22 @@ def terrain_loss(maps: EncodedMaps, targets: Targets) -> Tensor:
     """First part of equation 3, averaged over the cells that wheels or tracks touched; robust instead of squared."""
     weight = targets.felt * torch.where(maps.covered, 1.0, _UNSEEN)
     return _masked(maps.height, targets.supporting, weight)
+
+
+def slope_loss(maps: EncodedMaps, targets: Targets, resolution: float) -> Tensor:
+    """Slopes of H_t where wheels or tracks touched both ends, in four directions; robust, as a difference in metres.
+
+    A robot stands on several cells at once. Heights that are all wrong by as much lift it, heights that are wrong by
+    different amounts tilt it; the terrain loss (equation 3) tells the two no more apart than a sum of them does.
+    """
+    weight = targets.felt * torch.where(maps.covered, 1.0, _UNSEEN)
+    error = torch.where(targets.felt, maps.height - targets.supporting, 0.0)
+    straight, slanted = (max(round(_APART * share / resolution), 1) for share in (1.0, 0.5**0.5))
+    losses = []
+    for rows, columns in ((straight, 0), (0, straight), (slanted, slanted), (slanted, -slanted)):
+        first, second = ((_shifted(error, *by), _shifted(weight, *by)) for by in ((rows, columns), (-rows, -columns)))
+        losses.append(_masked(first[0], second[0], first[1] * second[1]))
+    return torch.stack(losses).mean()
 
 
 def decrease_loss(maps: EncodedMaps) -> Tensor:
@@ -174,6 +195,15 @@ def _prominence(heights: Tensor, known: Tensor) -> Tensor:
         functional.avg_pool2d(values[:, None], around, 1, _AROUND)[:, 0] for values in (heights * mask, mask)
     )
     return heights - summed / count.clamp_min(1e-6)
+
+
+def _shifted(values: Tensor, rows: int, columns: int) -> Tensor:
+    """Without the first rows and columns, or without the last if negative: two of opposite sign fit on each other."""
+    return values[
+        :,
+        slice(max(rows, 0), min(rows, 0) or None),
+        slice(max(columns, 0), min(columns, 0) or None),
+    ]
 
 
 def _masked(predicted: Tensor, measured: Tensor, weight: Tensor) -> Tensor:

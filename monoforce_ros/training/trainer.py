@@ -28,6 +28,7 @@ from monoforce_ros.training.losses import (
     decrease_loss,
     geometric_loss,
     measured_decrease_loss,
+    slope_loss,
     standing_decrease_loss,
     terrain_loss,
     trajectory_loss,
@@ -123,6 +124,7 @@ class _Losses(nn.Module):
             losses["geometric"] = weights.geometric * geometric_loss(maps, targets, batch.ground, weights.standing)
         if weights.terrain:
             losses["terrain"] = weights.terrain * terrain_loss(maps, targets)
+            losses["slope"] = weights.slope * slope_loss(maps, targets, self.encoder.config.resolution)
         if weights.trajectory:
             losses["trajectory"] = weights.trajectory * trajectory_loss(
                 maps, targets, self.robot, self.encoder.config, self.options
