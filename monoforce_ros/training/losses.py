@@ -38,7 +38,7 @@ class LossWeights:
 
     geometric: float = 1.0
     terrain: float = 2.0
-    slope: float = 4.0
+    slope: float = 2.0
     """Of slopes of H_t, where wheels or tracks touched both ends; together with the terrain loss alone."""
     trajectory: float = 0.05
     decrease: float = 0.3
