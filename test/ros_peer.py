@@ -78,7 +78,7 @@ class Peer:
             messages.clear()
 
     def stamps(self, topic: str) -> list[int]:
-        return [stamp_of(m.markers[0] if hasattr(m, "markers") else m) for m in self.received[topic]]
+        return [stamp_in(message) for message in self.received[topic]]
 
     def status(self, part: str) -> tuple[int, str] | None:
         """Level and text that the last diagnostics give for a part."""
@@ -112,6 +112,11 @@ class Peer:
                 self.publish("/cmd_vel", message)
             self.spin(max(0.0, begin + step * 0.02 - time.monotonic()))
         self.now += 20_000_000
+
+
+def stamp_in(message) -> int:
+    """Stamp of a message that has one, or whose first marker has [ns]."""
+    return stamp_of(message.markers[0] if hasattr(message, "markers") else message)
 
 
 def ground_cloud(seed: int = 0) -> np.ndarray:

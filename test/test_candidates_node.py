@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
-from ros_peer import ground_cloud
+from ros_peer import ground_cloud, stamp_in
 
 from monoforce_ros.bags import builders
-from monoforce_ros.messages.decoding import stamp_of
 from monoforce_ros.messages.message_types import message_class
 from monoforce_ros.prediction.uncertainty import EnsembleSettings
 
@@ -69,7 +68,7 @@ def feed(peer, heard, **world) -> None:
 
     def enough() -> bool:
         for messages in heard.values():
-            messages[:] = [m for m in messages if stamp_of(m.markers[0] if hasattr(m, "markers") else m) >= begin]
+            messages[:] = [message for message in messages if stamp_in(message) >= begin]
         return all(len(messages) >= 2 for messages in heard.values())
 
     for _ in range(8):

@@ -171,6 +171,7 @@ def test_half_precision_differs_by_millimetres(demo_bag):
     shipped = load_encoder("", "camera")
     exact, quick = fused(shipped), packed(fused(shipped, "bfloat16"))
     assert quick.lift.weight.dtype == torch.bfloat16 and quick.heads.weight.dtype == torch.float32
+    medians = []
     for frame in recording.images[topic][::20]:
         seen = [
             CameraView(recording.image(frame), recording.cameras[topic], homogeneous(FORWARD, np.array([0.3, 0, 0.4])))
@@ -178,8 +179,10 @@ def test_half_precision_differs_by_millimetres(demo_bag):
         one, other = exact.terrain(seen), quick.terrain(seen)
         away = (one.height - other.height).abs()[one.observed]
         # Half precision keeps 8 bits of a weight; what becomes of that varies with what was learnt, image by image.
-        assert float(away.median()) < 0.005 and float(away.quantile(0.95)) < 0.015
+        medians.append(float(away.median()))
+        assert medians[-1] < 0.005 and float(away.quantile(0.95)) < 0.015
         assert float((one.friction / other.friction).log().abs().median()) < 0.02
+    assert np.mean(medians) < 0.003
     with pytest.raises(ValueError, match="encoder precision: got 'float8'"):
         fused(shipped, "float8")
 
