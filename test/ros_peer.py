@@ -40,11 +40,12 @@ class Peer:
             self.node.create_subscription(
                 kind,
                 topic,
-                lambda data, topic=topic, kind=kind: self.received[topic].append(deserialize_message(data, kind)),
+                lambda data, topic=topic, kind=kind: self._keep(topic, deserialize_message(data, kind)),
                 quality,
                 raw=True,
             )
         self._publishers: dict[str, object] = {}
+        self._since = 0
         self.now = 1_700_000_000_000_000_000
         self.clouds_sent: list[int] = []
 
@@ -73,9 +74,30 @@ class Peer:
             self.executor.spin_once(timeout_sec=0.05)
         return True
 
+    def _keep(self, topic: str, message) -> None:
+        # Diagnostics are stamped by the node's own clock, everything else by the data it was made from.
+        if topic == "/diagnostics" or stamp_in(message) >= self._since:
+            self.received[topic].append(message)
+
     def clear(self) -> None:
+        """Forget what has come; what was made from data sent before may still come."""
+        self._since = 0
         for messages in self.received.values():
             messages.clear()
+
+    def begin(self) -> None:
+        """Forget what has come, and from now on drop every output made from data sent before."""
+        self.clear()
+        self._since = self.now
+
+    def settle(self, seconds: float = 0.5) -> None:
+        """Wait until no prediction has come for a while: a busy machine makes the last ones late."""
+        for _ in range(20):
+            before = [len(self.received[topic]) for topic in OUTPUTS if topic != "/diagnostics"]
+            self.spin(seconds)
+            if before == [len(self.received[topic]) for topic in OUTPUTS if topic != "/diagnostics"]:
+                return
+        raise AssertionError("predictions do not cease although nothing is sent")
 
     def stamps(self, topic: str) -> list[int]:
         return [stamp_in(message) for message in self.received[topic]]

@@ -59,7 +59,7 @@ def look(peer, seconds, *, image=picture, info=information):
 
 
 def healthy(peer, predictor):
-    peer.clear()
+    peer.begin()
     for _ in range(8):
         look(peer, 0.8)
         if peer.received["/predicted/path"] and peer.until(lambda: peer.status("prediction") == (OK, "predicting"), 1):
@@ -70,8 +70,8 @@ def healthy(peer, predictor):
 def nothing_new(peer, predictor, text, **bad):
     # Counted before the pause: a camera's silence may be noticed in it already.
     said_before = sum(text in line for line in predictor.output.splitlines())
-    peer.spin(0.8)
-    peer.clear()
+    peer.settle()
+    peer.begin()
     bad_from = peer.now
     look(peer, 1.4, **bad)
     assert peer.until(lambda: peer.status(PART) is not None and text in peer.status(PART)[1], 5.0), predictor.output
@@ -129,7 +129,7 @@ def test_a_calibration_that_changes_counts_from_then_on(peer, predictor):
     healthy(peer, predictor)
     before = np.frombuffer(bytes(peer.received["/predicted/terrain"][-1].data), "<f4").reshape(-1, 8)
     narrow = MATRIX * np.array([[3, 1, 1], [1, 3, 1], [1, 1, 1]])
-    peer.clear()
+    peer.begin()
     look(peer, 2.0, info=lambda stamp: information(stamp, matrix=narrow))
     assert peer.until(lambda: len(peer.received["/predicted/terrain"]) > 3)
     after = np.frombuffer(bytes(peer.received["/predicted/terrain"][-1].data), "<f4").reshape(-1, 8)

@@ -105,8 +105,9 @@ def test_simulated_time_that_starts_over_is_said_and_lived_with(start, peer):
         if peer.received["/predicted/path"]:
             break
     assert peer.received["/predicted/path"]
-    peer.now = before - 100 * 10**9
+    peer.settle()
     peer.clear()
+    peer.now = before - 100 * 10**9
     drive(4.0)
     for _ in range(10):
         if len(peer.received["/predicted/path"]) > 3:

@@ -65,7 +65,7 @@ def heights(peer):
 
 
 def predicted(peer, **how):
-    peer.clear()
+    peer.begin()
     for _ in range(8):
         drive(peer, 0.8, **how)
         if len(peer.received["/predicted/terrain"]) >= 2:

@@ -24,7 +24,7 @@ def predictor(start, peer):
 
 def healthy(peer, predictor) -> None:
     """Feed good data until predictions come back; publishers that are new need a moment to be found."""
-    peer.clear()
+    peer.begin()
     for _ in range(6):
         peer.drive(0.8)
         complete = all(peer.received[topic] for topic in PREDICTED)
@@ -63,8 +63,8 @@ def test_outputs_carry_the_stamp_and_frame_of_their_input(peer, predictor):
 def nothing_new(peer, predictor, part: str, text: str, seconds: float = 1.4, **bad) -> None:
     """Feed something bad: a diagnostic that names it, no prediction, the node lives; then all is well again."""
     healthy(peer, predictor)
-    peer.spin(0.8)
-    peer.clear()
+    peer.settle()
+    peer.begin()
     bad_from = peer.now
     peer.drive(seconds, **bad)
     assert peer.until(lambda: peer.status(part) is not None and text in peer.status(part)[1], 5.0), (
@@ -89,7 +89,7 @@ def test_clouds_full_of_nan(peer, predictor):
 def test_clouds_with_some_nan_are_used(peer, predictor):
     cloud = ground_cloud()
     cloud[::2] = np.nan
-    peer.clear()
+    peer.begin()
     peer.drive(1.2, cloud=lambda stamp: builders.point_cloud(stamp, "lidar", cloud))
     assert peer.until(lambda: bool(peer.received["/predicted/terrain"]))
     data = np.frombuffer(peer.received["/predicted/terrain"][-1].data, "<f4")
@@ -144,17 +144,19 @@ def test_a_lidar_that_falls_silent(peer, predictor):
 
 def test_commands_of_nan_are_not_obeyed(peer, predictor):
     healthy(peer, predictor)
-    peer.clear()
+    peer.begin()
     peer.drive(1.6, command=lambda stamp: builders.twist_stamped(stamp, "base_link", np.nan, 0.0))
-    assert peer.status("commands")[0] == ERROR and "expected finite numbers" in peer.status("commands")[1]
+    said = lambda: peer.status("commands") or (OK, "")  # noqa: E731
+    assert peer.until(lambda: said()[0] == ERROR, 3.0) and "expected finite numbers" in said()[1], said()
+    peer.settle()
     # The last good command has expired by then: the robot is predicted to stop.
     path = peer.received["/predicted/path"][-1]
     assert path.poses[-1].pose.position.x == pytest.approx(1.0, abs=0.05)
 
 
 def test_without_commands_the_robot_is_predicted_to_stand_and_a_warning_says_so(peer, predictor):
-    peer.spin(0.6)
-    peer.clear()
+    peer.settle()
+    peer.begin()
     peer.drive(2.0, command=lambda stamp: None)
     silent = lambda: peer.status("commands") or (OK, "")  # noqa: E731
     assert peer.until(lambda: silent()[0] == WARN, 3.0), silent()
@@ -164,7 +166,7 @@ def test_without_commands_the_robot_is_predicted_to_stand_and_a_warning_says_so(
 
 def test_time_that_jumps_back(peer, predictor):
     healthy(peer, predictor)
-    peer.spin(1.0)
+    peer.settle(1.0)
     peer.clear()
     peer.now -= 60_000_000_000
     jumped_to = peer.now
