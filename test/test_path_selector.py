@@ -15,7 +15,8 @@ def nodes(start, peer):
     predictor = start(
         "predictor", "--ros-args", "-p", "candidates:=15", "-p", "candidate_speeds:=[0.8]", "-p", "horizon:=3.0"
     )
-    selector = start("path_selector", "--ros-args", "-r", "cmd_vel:=told")
+    # Twice the default: what is tested is that the robot stops, not how fast a busy machine predicts.
+    selector = start("path_selector", "--ros-args", "-r", "cmd_vel:=told", "-p", "timeout:=1.2")
     predictor.wait_for("predicting 3 s ahead for husky")
     selector.wait_for("waiting for a goal")
     return selector
@@ -77,7 +78,7 @@ def test_it_goes_around_a_wall(peer, nodes, told):
 def test_it_stops_when_predictions_are_late_and_goes_on_with_them(peer, nodes, told):
     send(peer, 9.0, 2.0)
     moves(peer, told)
-    peer.drive(1.6, cloud=lambda stamp: None)
+    peer.drive(2.4, cloud=lambda stamp: None)
     assert told[-1].twist.linear.x == 0.0 and told[-1].twist.angular.z == 0.0
     assert peer.until(lambda: "s old" in status(peer)[1], 5.0), status(peer)
     moves(peer, told)
@@ -87,7 +88,7 @@ def test_it_stops_when_all_falls_silent(peer, nodes, told):
     """Odometry that stops takes the candidates with it: by their stamps, neither ever gets old."""
     send(peer, 9.0, 2.0)
     moves(peer, told)
-    assert peer.until(lambda: told[-1].twist.linear.x == 0.0, 4.0), "it drives on blindly"
+    assert peer.until(lambda: told[-1].twist.linear.x == 0.0, 5.0), "it drives on blindly"
     told.clear()
     peer.spin(0.5)
     assert told and not any(command.twist.linear.x for command in told)
