@@ -1,6 +1,13 @@
 """Terrain encoder: camera images → terrain map by lift, splat, shoot (paper III-A); and the lidar's network."""
 
-from monoforce_ros.encoder.checkpoint import CheckpointError, Encoder, load_encoder, new_encoder, save_encoder
+from monoforce_ros.encoder.checkpoint import (
+    CheckpointError,
+    Encoder,
+    averaged,
+    load_encoder,
+    new_encoder,
+    save_encoder,
+)
 from monoforce_ros.encoder.config import EncoderConfig
 from monoforce_ros.encoder.inference import fused, packed
 from monoforce_ros.encoder.lidar_encoder import LidarEncoder
@@ -16,6 +23,7 @@ __all__ = [
     "EncoderInput",
     "LidarEncoder",
     "TerrainEncoder",
+    "averaged",
     "encoder_input",
     "fused",
     "load_encoder",

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
+import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
@@ -87,3 +89,32 @@ def load_encoder(path: str | Path, sensor: str | None = None) -> Encoder:
     if any(not value.isfinite().all() for value in weights.values() if value.is_floating_point()):
         raise CheckpointError(f"{path}: some weights are not finite, the training that wrote it had diverged")
     return encoder.eval()
+
+
+def averaged(paths: Sequence[str | Path], shares: Sequence[float]) -> Encoder:
+    """The encoder whose weights are the mean of others', all trained on from the same start.
+
+    Such encoders lie in one basin of the loss, and their mean is often better than each of them (Wortsman et al.,
+    "Model soups", ICML 2022); of encoders trained apart it is worth nothing.
+
+    Args:
+        paths: of the checkpoints.
+        shares: by how much each counts, above 0; they need not add up to 1.
+
+    Raises:
+        CheckpointError: a checkpoint cannot be read, or two are of different networks.
+        ValueError: there are not as many shares as checkpoints, or a share is not a number above 0.
+    """
+    if len(paths) != len(shares) or not paths or not all(0.0 < share < float("inf") for share in shares):
+        raise ValueError(f"shares of {len(paths)} encoders: got {list(shares)}, expected a number above 0 for each")
+    encoders = [load_encoder(path) for path in paths]
+    for path, encoder in zip(paths, encoders, strict=True):
+        if encoder.config != encoders[0].config:
+            raise CheckpointError(f"{path}: is of another network than {paths[0]}; only equal ones can be averaged")
+    mean = new_encoder(encoders[0].config)
+    states = [encoder.state_dict() for encoder in encoders]
+    with torch.no_grad():
+        for name, value in mean.state_dict().items():
+            total = sum(share * state[name].double() for share, state in zip(shares, states, strict=True))
+            value.copy_(total / sum(shares))
+    return mean.eval()
