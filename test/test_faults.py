@@ -104,7 +104,7 @@ def test_simulated_time_that_starts_over_is_said_and_lived_with(start, peer):
         drive(1.5)
         if peer.received["/predicted/path"]:
             break
-    assert peer.received["/predicted/path"]
+    assert peer.received["/predicted/path"], node.output[-3000:]
     peer.settle()
     peer.clear()
     peer.now = before - 100 * 10**9
