@@ -1,4 +1,5 @@
-"""The predictor under a manager: states, parameters that change while it runs, and two robots side by side."""
+"""The predictor under a manager: states, parameters that change while it runs, simulated time, and two robots or two
+nodes of one name side by side."""
 
 import pytest
 from lifecycle_msgs.msg import State, Transition
@@ -6,6 +7,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.srv import DescribeParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
+from rosgraph_msgs.msg import Clock
 
 from monoforce_ros.bags import builders
 from monoforce_ros.messages.message_types import message_class
@@ -172,3 +174,53 @@ def test_two_robots_in_namespaces_do_not_hear_each_other(peer, start):
     assert abs(paths["left"][-1].poses[0].pose.position.x - 10.0) < 0.1
     assert abs(paths["right"][-1].poses[0].pose.position.x - 20.0) < 0.1
     assert all(process.stop() == 0 for process in processes)
+
+
+def test_simulated_time_that_starts_over_is_said_and_lived_with(start, peer):
+    """`use_sim_time` with a /clock that goes back, as a looping bag brings it."""
+    node = start("predictor", "--ros-args", "-p", "use_sim_time:=true", "-r", "__node:=dreaming")
+    node.wait_for("predicting 5 s ahead for husky")
+    clock = peer.node.create_publisher(Clock, "/clock", 10)
+
+    def drive(seconds: float) -> None:
+        for _ in range(round(2 * seconds)):
+            message = Clock()
+            message.clock.sec, message.clock.nanosec = divmod(peer.now, 10**9)
+            clock.publish(message)
+            peer.drive(0.5)
+
+    before = peer.now
+    peer.clear()
+    # New publishers need a moment to be found, longer on a busy machine.
+    for _ in range(10):
+        drive(1.5)
+        if peer.received["/predicted/path"]:
+            break
+    assert peer.received["/predicted/path"], node.output[-3000:]
+    peer.settle()
+    peer.clear()
+    peer.now = before - 100 * 10**9
+    drive(4.0)
+    for _ in range(10):
+        if len(peer.received["/predicted/path"]) > 3:
+            break
+        drive(1.0)
+    assert peer.received["/predicted/path"]
+    stamps = [m.header.stamp.sec for m in peer.received["/predicted/path"]]
+    assert all(stamp < before // 10**9 for stamp in stamps[-3:])
+    assert "time went back" in node.output and node.stop() == 0
+
+
+def test_two_nodes_of_one_name_both_predict(start, peer):
+    nodes = [start("predictor", "--ros-args", "-p", "terrain_source:=flat") for _ in range(2)]
+    for node in nodes:
+        node.wait_for("predicting 5 s ahead for husky")
+    peer.clear()
+    for _ in range(10):
+        peer.drive(1.5)
+        if peer.until(lambda: len(peer.received["/predicted/path"]) > 10, 0.5):
+            break
+    assert len(peer.received["/predicted/path"]) > 10
+    peer.drive(0.5)
+    for node in nodes:
+        assert node.stop() == 0, node.output
