@@ -16,7 +16,7 @@ import torch
 from monoforce_ros.discrepancy.commissioning import COMMISSIONED
 from monoforce_ros.discrepancy.fit import fit_effects
 from monoforce_ros.discrepancy.gap import relative_motion
-from monoforce_ros.discrepancy.hypothesis import Drive, DriveData, Predictions, sample_motion
+from monoforce_ros.discrepancy.hypothesis import Evidence, EvidenceWindows, Predictions, sample_motion
 from monoforce_ros.discrepancy.selection import folds_of
 from monoforce_ros.robots import RobotModel
 
@@ -24,7 +24,9 @@ _STEP = 0.05
 _HISTORY = 0.5
 
 
-def baseline_errors(drive: Drive, data: DriveData, robot: RobotModel, scale: np.ndarray) -> dict[str, np.ndarray]:
+def baseline_errors(
+    drive: Evidence, data: EvidenceWindows, robot: RobotModel, scale: np.ndarray
+) -> dict[str, np.ndarray]:
     """Residuals ``[W, 3]`` at the last sample of each window, of every baseline trained on the other fold."""
     predictions = Predictions(robot, data)
     before = predictions.residuals([()])[0][:, -1]
@@ -32,18 +34,18 @@ def baseline_errors(drive: Drive, data: DriveData, robot: RobotModel, scale: np.
     results = {name: before.copy() for name in ("refit", "network", "sindy")}
     features = _features(data)
     for left in np.unique(folds):
-        seen, unseen = folds != left, folds == left
-        train, test = replace(data, starts=data.starts[seen]), replace(data, starts=data.starts[unseen])
+        seen, held_out = folds != left, folds == left
+        train, test = replace(data, starts=data.starts[seen]), replace(data, starts=data.starts[held_out])
         own = dict(robot.effects)
         start = tuple((name, dict(own.get(name, values))) for name, values in COMMISSIONED)
         fit = fit_effects(Predictions(robot, train), [start], scale, iterations=6)
-        results["refit"][unseen] = Predictions(robot, test).residuals([fit.effects])[0][:, -1]
-        results["network"][unseen] = before[unseen] - _network(features[seen], before[seen], features[unseen])
-        results["sindy"][unseen] = _sindy(drive, train, test)
+        results["refit"][held_out] = Predictions(robot, test).residuals([fit.effects])[0][:, -1]
+        results["network"][held_out] = before[held_out] - _network(features[seen], before[seen], features[held_out])
+        results["sindy"][held_out] = _sindy(drive, train, test)
     return results
 
 
-def _features(data: DriveData) -> np.ndarray:
+def _features(data: EvidenceWindows) -> np.ndarray:
     """Start velocity and commands around each window, ``[W, F]``."""
     _, _, linear, angular = sample_motion(data.motion, data.starts)
     stamps = data.starts[:, None] + (np.arange(-2, 9) * 0.25e9).astype(np.int64)
@@ -71,13 +73,13 @@ def _network(features: np.ndarray, errors: np.ndarray, asked: np.ndarray) -> np.
         return net(torch.as_tensor((asked - mean) / spread, dtype=torch.float32)).numpy() * size
 
 
-def _sindy(drive: Drive, train: DriveData, test: DriveData) -> np.ndarray:
+def _sindy(drive: Evidence, train: EvidenceWindows, test: EvidenceWindows) -> np.ndarray:
     """Residuals of predictions by sparse regression of the accelerations, ``[W, 3]``."""
     import pysindy
 
     motion = drive.smoothed.motion
 
-    def pieces(data: DriveData) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    def pieces(data: EvidenceWindows) -> tuple[list[np.ndarray], list[np.ndarray]]:
         count = round(data.horizon / _STEP) + 1
         stamps = data.starts[:, None] + (np.arange(count) * _STEP * 1e9).astype(np.int64)
         _, _, linear, angular = sample_motion(motion, stamps)

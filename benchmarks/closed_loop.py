@@ -27,9 +27,11 @@ from nav_msgs.msg import Odometry
 from rclpy.qos import QoSProfile
 from ros_peer import Peer
 
-from monoforce_ros.evaluation.report import write_between, write_text
+from monoforce_ros.core import write_text
+from monoforce_ros.reporting import write_between
 from monoforce_ros.robots import load_robot
-from monoforce_ros.synthetic.course import WALL_THICKNESS, CourseSettings
+from monoforce_ros.synthetic import CourseSettings
+from monoforce_ros.synthetic.course import WALL_THICKNESS
 
 ROOT = Path(__file__).resolve().parent.parent
 ENVIRONMENT = {"ROS_DOMAIN_ID": "88", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from monoforce_ros.evaluation.report import write_text
+from monoforce_ros.core import write_text
 
 
 def replace_section(document: Path, name: str, text: str) -> None:

@@ -19,13 +19,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from monoforce_ros.camera import CameraModel
+from monoforce_ros.core import CameraModel, homogeneous, write_text
 from monoforce_ros.encoder import CameraView, EncoderConfig, TerrainEncoder, encoder_input, fused, packed
 from monoforce_ros.encoder.inference import multiplies_bfloat16
 from monoforce_ros.encoder.lift import lifted_points, map_cells, splat
 from monoforce_ros.encoder.terrain_encoder import terrain_maps, with_edges
-from monoforce_ros.evaluation.report import write_text
-from monoforce_ros.motion import homogeneous
 
 FORWARD = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
 SUPPORT = np.array([[0.3, 0.3, -0.1], [0.3, -0.3, -0.1], [-0.3, 0.3, -0.1], [-0.3, -0.3, -0.1]])

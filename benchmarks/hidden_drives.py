@@ -112,11 +112,10 @@ def all_cases(first: int = SEED) -> list[Case]:
 
 def record_case(case: Case, folder: Path) -> Path:
     """Record a drive unless it is there; returns the bag."""
+    from monoforce_ros.synthetic import LidarSettings, TerrainSettings
     from monoforce_ros.synthetic.hidden import parse_hidden
     from monoforce_ros.synthetic.odometry import OdometrySettings
     from monoforce_ros.synthetic.recording import RecordingSettings, record
-    from monoforce_ros.synthetic.sensors import LidarSettings
-    from monoforce_ros.synthetic.terrain_shape import TerrainSettings
 
     bag = folder / case.name
     if bag.exists():

@@ -1,4 +1,4 @@
-"""Hidden effects: MuJoCo drives with physics planted in them, diagnosed as a user would.
+"""Hidden effects: MuJoCo drives with physics injected in them, diagnosed as a user would.
 
     scripts/run.sh python benchmarks/hidden_effects.py [--jobs 2] [--json FILE] [--docs docs/discrepancy.md]
 
@@ -23,7 +23,7 @@ from hidden_drives import SEED, SINGLES, Case, all_cases, record_case
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
-from monoforce_ros.evaluation.report import figure_png
+from monoforce_ros.reporting import figure_png
 
 STRONG = 2.0
 """Gap over noise and a healthy robot's, root mean squares, from which on an effect is strong enough to matter.
@@ -86,15 +86,14 @@ def with_baselines(result: dict, bag: Path, robot: Path, row: Path) -> dict:
     from monoforce_ros.discrepancy.bag_diagnosis import read_drive
     from monoforce_ros.discrepancy.gap import noise_floor, noisy_motions, residual_scale
     from monoforce_ros.discrepancy.hypothesis import window_starts
-    from monoforce_ros.robots import load_robot
-    from monoforce_ros.robots.robot_copy import read_leftover
+    from monoforce_ros.robots import load_robot, read_nominal_residual
 
     model = load_robot(robot)
     drive, _ = read_drive(bag, model, "lidar" if result["ground"] == "hills" else "flat")
     starts = window_starts(drive.smoothed.motion, drive.smoothed.stretches, 2.0, 1.0)
     data = drive.cut(starts, np.array([0.5, 1.0, 1.5, 2.0]))
     floor = noise_floor(drive.smoothed.motion, noisy_motions(drive.smoothed), data)
-    errors = baseline_errors(drive, data, model, residual_scale(floor, read_leftover(robot, data.samples)))
+    errors = baseline_errors(drive, data, model, residual_scale(floor, read_nominal_residual(robot, data.samples)))
     result["baselines"] = {name: float(np.median(np.hypot(e[:, 0], e[:, 1]))) for name, e in errors.items()}
     row.write_text(json.dumps(result, indent=1))
     return result

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from monoforce_ros.evaluation.report import write_text
+from monoforce_ros.core import write_text
 from monoforce_ros.physics import OdeOptions, PhysicsOptions, State, rollout
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainMap

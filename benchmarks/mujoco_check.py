@@ -18,16 +18,17 @@ import torch
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
-from monoforce_ros.evaluation.report import figure_png, write_text
+from monoforce_ros.core import write_text
+from monoforce_ros.effects import drive_speeds
 from monoforce_ros.physics import Rollout, State, rollout
-from monoforce_ros.physics.effects import drive_speeds
+from monoforce_ros.reporting import figure_png
 from monoforce_ros.robots import RobotModel, load_robot
-from monoforce_ros.synthetic.graphics import mujoco  # noqa: F401  (chooses the graphics library before others load it)
+from monoforce_ros.synthetic import TerrainSettings
 from monoforce_ros.synthetic.random_streams import random_stream
 from monoforce_ros.synthetic.route import Route
 from monoforce_ros.synthetic.scenery import Scenery
 from monoforce_ros.synthetic.simulation import Simulation
-from monoforce_ros.synthetic.terrain_shape import TerrainSettings, build_ground
+from monoforce_ros.synthetic.terrain_shape import build_ground
 from monoforce_ros.synthetic.vegetation import Grass
 from monoforce_ros.synthetic.vehicle import Vehicle
 from monoforce_ros.synthetic.world import TIME_STEP, build_model

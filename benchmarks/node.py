@@ -28,10 +28,10 @@ import yaml
 from rclpy.qos import QoSProfile
 from ros_peer import Peer
 
-from monoforce_ros.bags import Recording, builders
-from monoforce_ros.bags.types import type_store
-from monoforce_ros.evaluation.report import write_between, write_text
-from monoforce_ros.messages.message_types import message_class
+from monoforce_ros.bags import Recording, builders, type_store
+from monoforce_ros.core import write_text
+from monoforce_ros.messages import message_class
+from monoforce_ros.reporting import write_between
 from monoforce_ros.robots import robot_file
 
 ROOT = Path(__file__).resolve().parent.parent

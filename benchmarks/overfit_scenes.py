@@ -19,13 +19,12 @@ from matplotlib.figure import Figure
 from torch import Tensor
 from tqdm import tqdm
 
-from monoforce_ros.datasets.dataset import DatasetError
-from monoforce_ros.datasets.rough import LIDAR_FRAME, RoughScene
+from monoforce_ros.core import MotionState, transform_points, write_text
+from monoforce_ros.datasets import DatasetError, RoughScene
+from monoforce_ros.datasets.rough import LIDAR_FRAME
 from monoforce_ros.encoder import CameraView, EncoderConfig, EncoderInput, TerrainEncoder, encoder_input
-from monoforce_ros.evaluation.report import figure_png, write_text
-from monoforce_ros.motion import MotionState, transform_points
-from monoforce_ros.prediction import LidarTerrain, Observation
-from monoforce_ros.prediction.terrain_sources import support_points
+from monoforce_ros.perception import LidarTerrain, Observation, support_points
+from monoforce_ros.reporting import figure_png
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import TerrainDefaults
 from monoforce_ros.training.losses import HIGHEST, LOWEST

@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from monoforce_ros.evaluation.report import write_text
+from monoforce_ros.core import write_text
 from monoforce_ros.physics import PhysicsOptions, State, rollout
 from monoforce_ros.physics.problem import Problem
 from monoforce_ros.physics.torch_backend import integrate

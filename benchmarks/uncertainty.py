@@ -17,11 +17,11 @@ import torch
 from tqdm import tqdm
 
 from monoforce_ros.bags import Recording
-from monoforce_ros.evaluation.drive import corrected_recording, observe
-from monoforce_ros.evaluation.report import write_text
-from monoforce_ros.motion import StaleDataError
-from monoforce_ros.prediction import SOURCES, Prediction, Predictor, choose_terrain_source
-from monoforce_ros.prediction.uncertainty import COVERAGE, EnsembleSettings, spread
+from monoforce_ros.core import StaleDataError, write_text
+from monoforce_ros.evaluation.recording_evaluation import corrected_recording, observe
+from monoforce_ros.perception import SOURCES, choose_terrain_source
+from monoforce_ros.prediction import EnsembleSettings, Prediction, Predictor, spread
+from monoforce_ros.prediction.ensemble import COVERAGE
 from monoforce_ros.robots import load_robot
 
 HORIZONS = (1.0, 2.0, 5.0)

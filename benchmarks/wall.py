@@ -21,15 +21,15 @@ import torch
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
+from monoforce_ros.core import write_text
 from monoforce_ros.encoder import fused, load_encoder
-from monoforce_ros.evaluation.report import write_between, write_text
 from monoforce_ros.messages import decoding
-from monoforce_ros.prediction import CameraTerrain, LidarTerrain, Observation, Prediction, Predictor
+from monoforce_ros.perception import CameraTerrain, LidarTerrain, Observation
+from monoforce_ros.prediction import Prediction, Predictor
+from monoforce_ros.reporting import write_between
 from monoforce_ros.robots import load_robot
-from monoforce_ros.synthetic.course import CourseSettings
-from monoforce_ros.synthetic.live import LiveSettings, LiveWorld
+from monoforce_ros.synthetic import CameraSettings, CourseSettings, LiveSettings, LiveWorld
 from monoforce_ros.synthetic.random_streams import random_stream
-from monoforce_ros.synthetic.sensors import CameraSettings
 from monoforce_ros.terrain import Grid, TerrainDefaults
 
 SPEED, HORIZON = 0.8, 5.0

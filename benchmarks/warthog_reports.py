@@ -16,7 +16,7 @@ from pathlib import Path
 import torch
 from docs_section import replace_section
 
-from monoforce_ros.datasets.drive import DriveRecording, drive_to_bag
+from monoforce_ros.datasets import DriveRecording, drive_to_bag
 from monoforce_ros.discrepancy.bag_diagnosis import diagnose_bag
 
 GROUNDS = {

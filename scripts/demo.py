@@ -17,15 +17,16 @@ from pathlib import Path
 import numpy as np
 
 from monoforce_ros.bags import BagReader, Recording
+from monoforce_ros.core import share_directory
 from monoforce_ros.evaluation import figures
 from monoforce_ros.evaluation.cli import camera_picture
 from monoforce_ros.evaluation.cli import main as evaluate
-from monoforce_ros.evaluation.report import figure_png
 from monoforce_ros.evaluation.view import PredictionView
-from monoforce_ros.messages.decoding import stamp_of
-from monoforce_ros.prediction import Predictor, choose_terrain_source
+from monoforce_ros.messages import stamp_of
+from monoforce_ros.perception import choose_terrain_source
+from monoforce_ros.prediction import Predictor
+from monoforce_ros.reporting import figure_png
 from monoforce_ros.robots import load_robot
-from monoforce_ros.shared_files import share_directory
 
 OUTPUTS = ("height_map", "terrain", "path", "contact_forces")
 EXECUTABLES = share_directory().parent.parent / "lib" / "monoforce_ros"

@@ -14,12 +14,10 @@ from matplotlib import colormaps
 from matplotlib.figure import Figure
 
 from monoforce_ros.bags import Recording
-from monoforce_ros.evaluation.drive import observe
-from monoforce_ros.planning import CandidateSettings, assess, fan_of_arcs, occupancy, refine
-from monoforce_ros.planning.candidates import over_horizon
-from monoforce_ros.planning.costs import force_every
-from monoforce_ros.prediction import LidarTerrain, Prediction, Predictor
-from monoforce_ros.prediction.uncertainty import EnsembleSettings, spread
+from monoforce_ros.evaluation.recording_evaluation import observe
+from monoforce_ros.perception import LidarTerrain
+from monoforce_ros.planning import CandidateSettings, assess, fan_of_arcs, force_every, occupancy, over_horizon, refine
+from monoforce_ros.prediction import EnsembleSettings, Prediction, Predictor, spread
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainDefaults
 

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from monoforce_ros.evaluation.report import figure_png
 from monoforce_ros.physics import PhysicsOptions, State, rollout
+from monoforce_ros.reporting import figure_png
 from monoforce_ros.robots import load_robot, shipped_robots
 from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap
 

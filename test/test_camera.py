@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from monoforce_ros.camera import CameraModel
+from monoforce_ros.core import CameraModel
 
 MATRIX = np.array([[300.0, 0, 321.5], [0, 305.0, 238.0], [0, 0, 1]])
 LENSES = {

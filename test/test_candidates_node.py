@@ -8,7 +8,7 @@ from ros_peer import ground_cloud, stamp_in
 
 from monoforce_ros.bags import builders
 from monoforce_ros.messages.message_types import message_class
-from monoforce_ros.prediction.uncertainty import EnsembleSettings
+from monoforce_ros.prediction.ensemble import EnsembleSettings
 
 TOPICS = {
     "/predicted/candidates": "visualization_msgs/msg/MarkerArray",

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import Recording, cut_windows
-from monoforce_ros.camera import CameraModel
+from monoforce_ros.core import CameraModel
 from monoforce_ros.datasets import DatasetError, DriveRecording, RellisSequence, cli, drive_to_bag, read_splits
 
 LIDAR_ON_ROBOT = np.array([0.2, 0.0, 1.0])

@@ -10,6 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import Recording, SmoothedMotion, builders, smooth
+from monoforce_ros.core import AngularVelocityTrack, CommandTrack, MotionTrack, WheelTrack
 from monoforce_ros.discrepancy.bag_diagnosis import diagnose_bag
 from monoforce_ros.discrepancy.clocks import compare_with_gyro
 from monoforce_ros.discrepancy.commissioning import commission
@@ -17,23 +18,23 @@ from monoforce_ros.discrepancy.diagnosis import Settings, _same, diagnose
 from monoforce_ros.discrepancy.fit import first_values, fit_effects
 from monoforce_ros.discrepancy.gap import map_floor, noise_floor, noisy_motions
 from monoforce_ros.discrepancy.hypothesis import (
-    Drive,
-    DriveData,
+    Evidence,
+    EvidenceWindows,
     Predictions,
-    thinned,
-    undo_measurement,
+    correct_measurements,
+    subsampled,
     window_starts,
 )
 from monoforce_ros.discrepancy.selection import Search, Trial
 from monoforce_ros.discrepancy.wheels import compare_with_wheels
-from monoforce_ros.evaluation.drive import PHYSICS, evaluate_drive
+from monoforce_ros.effects.catalogue import drive_speeds, recorded_commands, recorded_motion
+from monoforce_ros.evaluation.recording_evaluation import PHYSICS, evaluate_recording
 from monoforce_ros.messages import decoding
-from monoforce_ros.motion import CommandTrack, MotionTrack, TurningTrack, WheelTrack
+from monoforce_ros.perception import FlatTerrain
 from monoforce_ros.physics import State, rollout
-from monoforce_ros.physics.effects import drive_speeds, recorded_commands, recorded_motion
-from monoforce_ros.prediction import FlatTerrain, Predictor
+from monoforce_ros.prediction import Predictor
 from monoforce_ros.robots import RobotFileError, load_robot
-from monoforce_ros.robots.robot_copy import read_leftover, write_robot
+from monoforce_ros.robots.robot_copy import read_nominal_residual, write_robot
 from monoforce_ros.synthetic.hidden import parse_hidden
 from monoforce_ros.synthetic.odometry import OdometrySettings
 from monoforce_ros.synthetic.recording import RecordingSettings, record
@@ -51,7 +52,7 @@ def husky():
 
 
 def own_drive(husky, effects, seconds=24.0):
-    """A drive in our own physics with effects planted, as it would be recorded."""
+    """A drive in our own physics with effects injected, as it would be recorded."""
     random = np.random.default_rng(4)
     robot = replace(husky, effects=effects)
     steps = round(seconds / 0.01)
@@ -86,7 +87,7 @@ def own_drive(husky, effects, seconds=24.0):
 def test_planted_parameters_are_recovered_by_the_fit(husky, name, parameters):
     motion, commands = own_drive(husky, ((name, parameters),))
     starts = window_starts(motion, [slice(0, len(motion))], 2.0, 1.0)
-    predictions = Predictions(husky, DriveData(motion, commands, starts, 2.0, SAMPLES))
+    predictions = Predictions(husky, EvidenceWindows(motion, commands, starts, 2.0, SAMPLES))
     scale = np.tile([0.01, 0.01, 0.005], (4, 1))
     before = np.abs(predictions.residuals([()])[0]).mean()
     fit = fit_effects(predictions, first_values(name, list(parameters)), scale)
@@ -97,11 +98,13 @@ def test_planted_parameters_are_recovered_by_the_fit(husky, name, parameters):
 
 
 def test_what_matters_most_is_named_first(husky):
-    planted = (("drive_asymmetry", {"difference": 0.01}), ("drive_gain", {"gain": 0.8}))
-    motion, commands = own_drive(husky, planted)
+    injected = (("drive_asymmetry", {"difference": 0.01}), ("drive_gain", {"gain": 0.8}))
+    motion, commands = own_drive(husky, injected)
     starts = window_starts(motion, [slice(0, len(motion))], 2.0, 1.0)
-    search = Search(husky, DriveData(motion, commands, starts, 2.0, SAMPLES), np.tile([0.01, 0.01, 0.005], (4, 1)))
-    fit = search.refit(planted)
+    search = Search(
+        husky, EvidenceWindows(motion, commands, starts, 2.0, SAMPLES), np.tile([0.01, 0.01, 0.005], (4, 1))
+    )
+    fit = search.refit(injected)
     assert search.ranked(fit) == [1, 0]
     alone = replace(fit, effects=fit.effects[:1])
     assert search.ranked(alone) == [0]
@@ -127,7 +130,7 @@ def test_a_formula_that_is_an_effect_and_a_small_rest_keeps_the_effects_name():
 def test_hypotheses_of_a_batch_are_those_of_single_calls(husky):
     motion, commands = own_drive(husky, ())
     starts = window_starts(motion, [slice(0, len(motion))], 2.0, 2.0)
-    predictions = Predictions(husky, DriveData(motion, commands, starts, 2.0, SAMPLES))
+    predictions = Predictions(husky, EvidenceWindows(motion, commands, starts, 2.0, SAMPLES))
     tried = [
         (),
         *(((("drive_gain", {"gain": gain}),)) for gain in (0.8, 1.1)),
@@ -136,7 +139,7 @@ def test_hypotheses_of_a_batch_are_those_of_single_calls(husky):
     together = predictions.residuals(tried)
     for effects, expected in zip(tried, together, strict=True):
         np.testing.assert_allclose(predictions.residuals([effects])[0], expected, atol=1e-5)
-    # Nothing is planted and nothing disagrees.
+    # Nothing is injected and nothing disagrees.
     assert np.abs(together[0]).max() < 0.02
 
 
@@ -144,7 +147,7 @@ def test_measurement_effects_are_undone(husky):
     effects = (("sensor_yaw_offset", {"angle": 0.2}), ("pose_clock_offset", {"offset": 0.3}))
     clean, commands = own_drive(husky, (), seconds=6.0)
     recorded = recorded_motion(clean, replace(husky, effects=effects))
-    back, _ = undo_measurement(recorded, commands, effects)
+    back, _ = correct_measurements(recorded, commands, effects)
     np.testing.assert_allclose(back.stamps, clean.stamps, rtol=0, atol=100)
     np.testing.assert_allclose(back.positions, clean.positions)
     turned = Rotation.from_quat(back.quaternions).inv() * Rotation.from_quat(clean.quaternions)
@@ -162,7 +165,7 @@ def test_the_noise_floor_is_the_error_of_a_perfect_model(husky):
     )
     smoothed = smooth(noisy)
     starts = window_starts(motion, smoothed.stretches, 2.0, 0.5)
-    data = DriveData(smoothed.motion, commands, starts, 2.0, SAMPLES)
+    data = EvidenceWindows(smoothed.motion, commands, starts, 2.0, SAMPLES)
     floor = noise_floor(smoothed.motion, noisy_motions(smoothed), data)
     shown = np.sqrt((Predictions(husky, data).residuals([()])[0] ** 2).mean(axis=0))
     assert (floor[-1] < 1.5 * shown[-1]).all()
@@ -178,7 +181,7 @@ def test_drives_that_cannot_tell_are_said_to_be(husky, still):
     zeros = np.zeros_like(positions)
     motion = MotionTrack(stamps, positions, Rotation.identity(len(times)).as_quat(), zeros, zeros)
     commands = CommandTrack(stamps, np.tile([0.0 if still else 0.5, 0.0], (len(times), 1)))
-    diagnosis = diagnose(Drive(smooth(motion), commands), husky)
+    diagnosis = diagnose(Evidence(smooth(motion), commands), husky)
     assert diagnosis.verdict == "not_identifiable"
     assert diagnosis.effects == ()
     assert "drive" in diagnosis.advice[0] or "step the speed" in diagnosis.advice[0]
@@ -229,7 +232,7 @@ def test_a_hidden_delay_is_named_added_and_closes_the_gap(late_robot, tmp_path, 
     errors = []
     for robot in (load_robot("husky"), found):
         predictor = Predictor(robot, FlatTerrain(robot, Grid.square(), TerrainDefaults()), horizon=2.0)
-        evaluation = evaluate_drive(recording, predictor, horizons=(1.0, 2.0), stride=1.0, progress=False)
+        evaluation = evaluate_recording(recording, predictor, horizons=(1.0, 2.0), stride=1.0, progress=False)
         errors.append(evaluation.summary(PHYSICS)[2.0][0].median)
     assert errors[1] < 0.5 * errors[0]
 
@@ -237,44 +240,44 @@ def test_a_hidden_delay_is_named_added_and_closes_the_gap(late_robot, tmp_path, 
 def test_without_a_disagreement_nothing_is_added(husky):
     motion, commands = own_drive(husky, (), seconds=30.0)
     smoothed = SmoothedMotion(motion, 0.003, 0.002, (slice(0, len(motion)),))
-    diagnosis = diagnose(Drive(smoothed, commands), husky, settings=Settings(most_effects=1))
+    diagnosis = diagnose(Evidence(smoothed, commands), husky, settings=Settings(most_effects=1))
     assert diagnosis.verdict == "no_discrepancy"
     assert diagnosis.effects == () and diagnosis.fitted == ()
 
 
 def test_a_healthy_robot_is_commissioned_and_then_nothing_is_missing(husky, tmp_path):
-    planted = (
+    injected = (
         ("friction_scale", {"factor": 0.7}),
         ("turning_scrub", {"track_width_factor": 1.2}),
         ("actuator_lag", {"time_constant": 0.15}),
     )
-    motion, commands = own_drive(husky, planted)
+    motion, commands = own_drive(husky, injected)
     smoothed = SmoothedMotion(motion, 0.002, 0.001, (slice(0, len(motion)),))
-    effects, leftover = commission([Drive(smoothed, commands)], husky)
+    effects, nominal_residual = commission([Evidence(smoothed, commands)], husky)
     found = {effect["name"]: effect["parameters"] for effect in effects}
     assert found["turning_scrub"]["track_width_factor"]["value"] == pytest.approx(1.2, rel=0.05)
     assert found["actuator_lag"]["time_constant"]["value"] == pytest.approx(0.15, abs=0.03)
-    assert leftover.shape == (4, 3)
-    kept = {"samples_s": [0.5, 1.0, 1.5, 2.0], "residual_rms": leftover.tolist()}
+    assert nominal_residual.shape == (4, 3)
+    kept = {"samples_s": [0.5, 1.0, 1.5, 2.0], "residual_rms": nominal_residual.tolist()}
     file = write_robot("husky", tmp_path / "husky.yaml", effects, [tmp_path], "0", kept)
-    np.testing.assert_allclose(read_leftover(file, (0.5, 1.0, 1.5, 2.0)), leftover)
-    assert read_leftover("husky", (0.5, 1.0)) is None
+    np.testing.assert_allclose(read_nominal_residual(file, (0.5, 1.0, 1.5, 2.0)), nominal_residual)
+    assert read_nominal_residual("husky", (0.5, 1.0)) is None
     nominal = load_robot(file)
     starts = window_starts(motion, [slice(0, len(motion))], 2.0, 1.0)
     before, after = (
-        np.abs(Predictions(robot, DriveData(motion, commands, starts, 2.0, SAMPLES)).residuals([()])[0]).mean()
+        np.abs(Predictions(robot, EvidenceWindows(motion, commands, starts, 2.0, SAMPLES)).residuals([()])[0]).mean()
         for robot in (husky, nominal)
     )
     assert after < 0.2 * before
     with pytest.raises(RobotFileError, match="commission the robot again"):
-        read_leftover(file, (1.0, 2.0))
+        read_nominal_residual(file, (1.0, 2.0))
 
 
 def test_a_gyro_tells_a_late_clock_from_a_late_robot(husky):
     def turning(motion, bias=0.0, sign=1.0, axis=2):
         rates = np.zeros((len(motion), 3))
         rates[:, axis] = sign * motion.angular_velocities[:, 2] + bias
-        return TurningTrack(motion.stamps, rates)
+        return AngularVelocityTrack(motion.stamps, rates)
 
     clean, commands = own_drive(husky, (), seconds=40.0)
     late = replace(clean, stamps=clean.stamps + 230_000_000)
@@ -291,8 +294,8 @@ def test_a_gyro_tells_a_late_clock_from_a_late_robot(husky):
     assert biased.biased and biased.bias == pytest.approx(0.04, abs=0.005)
     assert compare_with_gyro(in_time, None) is None
     noise = np.random.default_rng(0).standard_normal((len(clean), 3))
-    assert compare_with_gyro(in_time, TurningTrack(clean.stamps, noise)) is None
-    diagnosis = diagnose(Drive(smoothed, commands, turning=turning(clean)), husky, settings=Settings(most_effects=1))
+    assert compare_with_gyro(in_time, AngularVelocityTrack(clean.stamps, noise)) is None
+    diagnosis = diagnose(Evidence(smoothed, commands, turning=turning(clean)), husky, settings=Settings(most_effects=1))
     assert diagnosis.verdict == "effect_found"
     assert [effect["name"] for effect in diagnosis.effects] == ["pose_clock_offset"]
 
@@ -323,8 +326,8 @@ def test_wheel_speeds_tell_how_the_drives_follow_commands(husky, effects):
     commands = CommandTrack(10**9 + np.arange(len(twists)) * 50_000_000, twists)
     found = compare_with_wheels(commands, wheels_of(commands, husky, effects), husky)
     assert [name for name, _ in found.effects] == [name for name, _ in effects]
-    for (_, values), (_, planted) in zip(found.effects, effects, strict=True):
-        for key, value in planted.items():
+    for (_, values), (_, injected) in zip(found.effects, effects, strict=True):
+        for key, value in injected.items():
             assert values[key] == pytest.approx(value, rel=0.08, abs=0.02)
     assert ("late" in found.told()) == any(name == "command_delay" for name, _ in effects)
     assert compare_with_wheels(commands, None, husky) is None
@@ -345,18 +348,18 @@ def test_wheels_are_found_among_the_joints():
 
 def test_long_drives_are_thinned_over_all_of_their_length():
     starts = np.arange(0, 3600, dtype=np.int64) * 10**9
-    kept = thinned(starts, 8.0, 120)
+    kept = subsampled(starts, 8.0, 120)
     assert 60 <= len(kept) <= 130
     assert kept[0] == starts[0] and kept[-1] > starts[-1] - 600 * 10**9
     # Whole pairs of blocks, so that each fold keeps its share.
     assert set(np.unique((kept // (8 * 10**9)) % 2)) == {0, 1}
-    assert len(thinned(starts[:100], 8.0, 120)) == 100
+    assert len(subsampled(starts[:100], 8.0, 120)) == 100
 
 
 def test_level_ground_excuses_nothing_and_an_unsure_map_does(husky):
     motion, commands = own_drive(husky, (), seconds=12.0)
     starts = window_starts(motion, [slice(0, len(motion))], 2.0, 1.0)
-    level = DriveData(motion, commands, starts, 2.0, SAMPLES)
+    level = EvidenceWindows(motion, commands, starts, 2.0, SAMPLES)
     assert (map_floor(husky, level, None) == 0).all()
     grid = Grid.square(24.0, 0.1)
     x, y = np.meshgrid(grid.x, grid.y)

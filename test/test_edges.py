@@ -8,10 +8,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from monoforce_ros.camera import CameraModel
+from monoforce_ros.core import CameraModel, homogeneous
 from monoforce_ros.encoder import CameraView, EncoderConfig, TerrainEncoder, encoder_input
 from monoforce_ros.encoder.edges import restore_edges
-from monoforce_ros.motion import homogeneous
 from monoforce_ros.physics import State, rollout
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainMap

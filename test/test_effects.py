@@ -10,9 +10,8 @@ import yaml
 from conftest import ROOT
 from scipy.spatial.transform import Rotation
 
-from monoforce_ros.motion import CommandTrack, MotionTrack
-from monoforce_ros.physics import PhysicsOptions, State, rollout
-from monoforce_ros.physics.effects import (
+from monoforce_ros.core import CommandTrack, MotionTrack
+from monoforce_ros.effects.catalogue import (
     CATALOGUE,
     EffectError,
     drive_speeds,
@@ -21,7 +20,8 @@ from monoforce_ros.physics.effects import (
     recorded_motion,
     turned_effects,
 )
-from monoforce_ros.physics.effects.page import catalogue_page
+from monoforce_ros.effects.page import catalogue_page
+from monoforce_ros.physics import PhysicsOptions, State, rollout
 from monoforce_ros.physics.rest import rest_depth
 from monoforce_ros.robots import RobotFileError, load_robot, robot_file
 from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap
@@ -238,7 +238,7 @@ def test_a_learned_term_contains_the_effects_it_can_spell(husky):
 
 
 def test_payload_follows_the_parallel_axis_theorem(husky):
-    from monoforce_ros.physics.effects.catalogue import applied_setup
+    from monoforce_ros.effects.catalogue import applied_setup
 
     loaded = applied_setup(
         TerrainMap.flat(GRID, dtype=torch.float64), having(husky, payload={"mass": 10.0, "x": 0.3, "y": 0.1, "z": 0.4})

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from monoforce_ros.bags import Recording
-from monoforce_ros.camera import CameraModel
+from monoforce_ros.core import CameraModel, homogeneous, transform_points
 from monoforce_ros.encoder import (
     CameraView,
     CheckpointError,
@@ -25,7 +25,6 @@ from monoforce_ros.encoder.backbone import Backbone, WeightsError
 from monoforce_ros.encoder.checkpoint import shipped_checkpoint
 from monoforce_ros.encoder.lift import depth_values, feature_rays, lifted_points, map_cells, splat
 from monoforce_ros.encoder.view import EncoderInput, encoder_input, support_plane
-from monoforce_ros.motion import homogeneous, transform_points
 
 SMALL = EncoderConfig(image_width=128, image_height=96, map_size=6.4, resolution=0.2, depth_bins=12, map_features=8)
 FORWARD = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])  # optical axes of a camera that looks along x

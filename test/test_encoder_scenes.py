@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
+from monoforce_ros.core import transform_points
 from monoforce_ros.datasets.rough import LIDAR_FRAME, RoughScene
 from monoforce_ros.encoder import EncoderConfig
 from monoforce_ros.encoder.lift import feature_rays, map_cells
-from monoforce_ros.motion import transform_points
 
 CONFIG = EncoderConfig()
 

@@ -8,9 +8,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import BagWriter, builders
-from monoforce_ros.evaluation.drive import constant_velocity
+from monoforce_ros.core import MotionState
 from monoforce_ros.evaluation.metrics import Poses, bootstrap_interval, position_errors, rotation_errors, summarise
-from monoforce_ros.motion import MotionState
+from monoforce_ros.evaluation.recording_evaluation import constant_velocity
 
 
 def test_errors_are_metres_and_degrees():

@@ -10,8 +10,8 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 
 from monoforce_ros.bags import BagReader, builders
+from monoforce_ros.core import share_directory
 from monoforce_ros.encoder.checkpoint import shipped_checkpoint
-from monoforce_ros.shared_files import share_directory
 
 START = 1_700_000_000_000_000_000
 

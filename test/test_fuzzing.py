@@ -17,7 +17,7 @@ from monoforce_ros.messages.decoding import MessageError
 from monoforce_ros.robots import RobotFileError, load_robot
 from monoforce_ros.robots.loader import robot_file
 from monoforce_ros.terrain import TerrainFileError, load_terrain
-from monoforce_ros.training.drive_samples import SamplesError, read_samples
+from monoforce_ros.training.recording_samples import SamplesError, read_samples
 
 STAMP = 1_700_000_000_123_456_789
 

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.highlevel import AnyReader
 
-from monoforce_ros.physics.effects import catalogue
+from monoforce_ros.effects import catalogue
 from monoforce_ros.synthetic import cli
-from monoforce_ros.synthetic.hidden import PLANTS, draw_hidden, parse_hidden, truth_file
+from monoforce_ros.synthetic.hidden import FAULTS, draw_hidden, parse_hidden, truth_file
 from monoforce_ros.synthetic.recording import RecordingSettings, record
 from monoforce_ros.synthetic.scenery import build_scenery
 from monoforce_ros.synthetic.simulation import Simulation
@@ -34,8 +34,8 @@ def level():
 
 def speeds(robot, scenery, command, *hidden, seconds=4.0):
     """Forward speed, speed to the left and yaw rate over time, of a command that starts as a step."""
-    plants = tuple(parse_hidden(text) for text in hidden)
-    simulation = Simulation(build_model(scenery, robot, 0, {}, plants), scenery, robot, plants)
+    faults = tuple(parse_hidden(text) for text in hidden)
+    simulation = Simulation(build_model(scenery, robot, 0, {}, faults), scenery, robot, faults)
     simulation.drive(*command)
     shown = []
     for _ in range(round(seconds / TIME_STEP)):
@@ -56,10 +56,10 @@ def rise_time(shown):
 
 
 def test_every_name_in_the_catalogue_that_is_hidden_is_an_effect_of_that_name():
-    hidden = {name for name, plant in PLANTS.items() if plant.in_catalogue}
+    hidden = {name for name, fault in FAULTS.items() if fault.in_catalogue}
     assert hidden <= set(catalogue.CATALOGUE)
     assert len(hidden) >= 19
-    assert not {name for name in PLANTS if name not in hidden} & set(catalogue.CATALOGUE)
+    assert not {name for name in FAULTS if name not in hidden} & set(catalogue.CATALOGUE)
 
 
 def test_delay_and_lag_come_later_by_their_time(husky, level):
@@ -224,30 +224,30 @@ def test_the_truth_lies_beside_the_bag_and_nowhere_in_it(recorded):
 
 def test_drawing_lots_covers_everything_and_repeats():
     drawn = [draw_hidden(seed) for seed in range(400)]
-    counts = [len(plants) for plants in drawn]
+    counts = [len(faults) for faults in drawn]
     assert 0.12 < counts.count(0) / 400 < 0.28
     assert 0.12 < counts.count(2) / 400 < 0.28
-    assert {type(plant) for plants in drawn for plant in plants} == set(PLANTS.values())
-    outsiders = [plants for plants in drawn if plants and not plants[0].in_catalogue]
-    assert all(len(plants) == 1 for plants in outsiders)
+    assert {type(fault) for faults in drawn for fault in faults} == set(FAULTS.values())
+    outsiders = [faults for faults in drawn if faults and not faults[0].in_catalogue]
+    assert all(len(faults) == 1 for faults in outsiders)
     first, again = draw_hidden(7), draw_hidden(7)
-    assert [vars(plant) for plant in first] == [vars(plant) for plant in again]
+    assert [vars(fault) for fault in first] == [vars(fault) for fault in again]
     level = [draw_hidden(seed, ("vegetation_drag",)) for seed in range(200)]
-    assert not any(isinstance(plant, PLANTS["vegetation_drag"]) for plants in level for plant in plants)
+    assert not any(isinstance(fault, FAULTS["vegetation_drag"]) for faults in level for fault in faults)
 
 
 @given(
     st.text(max_size=30)
-    | st.sampled_from(sorted(PLANTS)).flatmap(lambda n: st.text(max_size=20).map(f"{n}:{{}}".format))
+    | st.sampled_from(sorted(FAULTS)).flatmap(lambda n: st.text(max_size=20).map(f"{n}:{{}}".format))
 )
 @settings(max_examples=150, deadline=None)
 def test_any_text_is_a_plant_or_a_clear_error(text):
     try:
-        plant = parse_hidden(text)
+        fault = parse_hidden(text)
     except ValueError as error:
         assert "--hide" in str(error)  # noqa: PT017
     else:
-        assert type(plant) in PLANTS.values()
+        assert type(fault) in FAULTS.values()
 
 
 @pytest.mark.parametrize(

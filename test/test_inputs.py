@@ -4,9 +4,9 @@ import time
 
 import numpy as np
 
-from monoforce_ros.motion import MotionState
+from monoforce_ros.core import MotionState
 from monoforce_ros.nodes.inputs import Inputs
-from monoforce_ros.nodes.pace import Pace
+from monoforce_ros.nodes.rate_limiter import RateLimiter
 
 SECOND = 10**9
 
@@ -61,7 +61,7 @@ def test_cameras_that_are_triggered_together_are_not_mixed_with_their_last_image
 def test_inputs_are_left_out_rather_than_kept_waiting():
     def used(interval, rate, jitter):
         times = np.arange(400) * interval + np.random.default_rng(0).uniform(-jitter, jitter, 400)
-        pace = Pace()
+        pace = RateLimiter()
         return np.array([pace.due(now, rate) for now in times]), times
 
     assert used(0.1, 10.0, 0.01)[0].mean() > 0.99

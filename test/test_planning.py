@@ -12,13 +12,15 @@ from monoforce_ros.planning import (
     CandidateSettings,
     CostWeights,
     Limits,
+    SelectionWeights,
     assess,
+    cost_to_go,
     fan_of_arcs,
     occupancy,
+    select_candidate,
 )
 from monoforce_ros.planning.candidates import over_horizon
 from monoforce_ros.robots import load_robot
-from monoforce_ros.steering import ChoiceWeights, choose, way_to_goal
 from monoforce_ros.terrain import Grid, TerrainMap
 
 GRID = Grid.square(12.8, 0.1)
@@ -196,20 +198,20 @@ def test_the_choice_weighs_cost_against_the_way_left():
     for share in (25, 50, 75):
         candidates |= {f"{axis}_{share}": candidates[axis] * share / 100 for axis in "xy"}
     robot = np.zeros(2)
-    assert choose(candidates, robot, np.array([8.0, 0.0])) == 0
-    assert choose(candidates, robot, np.array([5.0, 6.0])) == 1
+    assert select_candidate(candidates, robot, np.array([8.0, 0.0])) == 0
+    assert select_candidate(candidates, robot, np.array([5.0, 6.0])) == 1
     # Where the robot is already, standing is best; what is not feasible is never chosen, however near it ends.
-    assert choose(candidates, robot, np.array([0.0, 0.0])) == 2
+    assert select_candidate(candidates, robot, np.array([0.0, 0.0])) == 2
     # A goal nearer than any candidate ends is passed, not stopped before.
-    assert choose(candidates, robot, np.array([1.2, 0.0])) == 0
+    assert select_candidate(candidates, robot, np.array([1.2, 0.0])) == 0
     barred = candidates | {"feasible": np.array([0.0, 1.0, 1.0, 1.0])}
-    assert choose(barred, robot, np.array([8.0, 0.0])) in (1, 3)
+    assert select_candidate(barred, robot, np.array([8.0, 0.0])) in (1, 3)
     costly = candidates | {"cost": np.array([5.0, 0.1, 0.1, 5.0])}
-    assert choose(costly, robot, np.array([8.0, 0.0]), ChoiceWeights(cost=10.0)) == 1
-    assert choose(candidates | {"feasible": np.zeros(4)}, robot, np.array([8.0, 0.0])) is None
-    assert choose(candidates | {"cost": np.full(4, np.inf)}, robot, np.array([8.0, 0.0])) is None
+    assert select_candidate(costly, robot, np.array([8.0, 0.0]), SelectionWeights(cost=10.0)) == 1
+    assert select_candidate(candidates | {"feasible": np.zeros(4)}, robot, np.array([8.0, 0.0])) is None
+    assert select_candidate(candidates | {"cost": np.full(4, np.inf)}, robot, np.array([8.0, 0.0])) is None
     with pytest.raises(ValueError, match="fields \\['cost'\\] are missing"):
-        choose({k: v for k, v in candidates.items() if k != "cost"}, robot, np.zeros(2))
+        select_candidate({k: v for k, v in candidates.items() if k != "cost"}, robot, np.zeros(2))
 
 
 def test_the_way_to_a_goal_leads_around_a_wall():
@@ -217,23 +219,23 @@ def test_the_way_to_a_goal_leads_around_a_wall():
     # Cells of 0.1 m from (-5, -5): a wall at x = 1 from y = -3 to the upper border.
     data[20:, 60:63] = 100
     goal = np.array([3.0, 1.0])
-    ways = way_to_goal(data, 0.1, np.array([-5.0, -5.0]), goal, radius=0.3)
+    ways = cost_to_go(data, 0.1, np.array([-5.0, -5.0]), goal, radius=0.3)
     behind, before = float(ways.at(np.array([2.0, 1.0]))), float(ways.at(np.array([0.0, 1.0])))
     assert behind == pytest.approx(1.0, abs=0.2)
     # Around the wall's lower end, not through it.
     around = np.hypot(1.0, 4.3) + np.hypot(2.0, 4.3)
     assert 0.9 * around < before < 1.4 * around
-    free = way_to_goal(np.zeros_like(data), 0.1, np.array([-5.0, -5.0]), goal, radius=0.3)
+    free = cost_to_go(np.zeros_like(data), 0.1, np.array([-5.0, -5.0]), goal, radius=0.3)
     assert float(free.at(np.array([0.0, 1.0]))) == pytest.approx(3.0, abs=0.2)
     # A goal beyond the map, and a place off it.
-    far = way_to_goal(np.zeros_like(data), 0.1, np.array([-5.0, -5.0]), np.array([9.0, 0.0]), radius=0.3)
+    far = cost_to_go(np.zeros_like(data), 0.1, np.array([-5.0, -5.0]), np.array([9.0, 0.0]), radius=0.3)
     assert float(far.at(np.array([0.0, 0.0]))) == pytest.approx(9.0, abs=0.4)
     assert float(far.at(np.array([8.0, 0.0]))) == pytest.approx(1.0)
     # A robot that stands too near to the wall still finds away from it.
     assert np.isfinite(ways.length).all()
     assert float(ways.at(np.array([0.85, 0.0]))) > float(ways.at(np.array([0.5, 0.0])))
     with pytest.raises(ValueError, match="costmap"):
-        way_to_goal(np.zeros((0, 4)), 0.1, np.zeros(2), goal, radius=0.3)
+        cost_to_go(np.zeros((0, 4)), 0.1, np.zeros(2), goal, radius=0.3)
 
 
 def test_the_way_to_a_goal_prefers_the_wider_gap_a_little_further_on():
@@ -244,13 +246,13 @@ def test_the_way_to_a_goal_prefers_the_wider_gap_a_little_further_on():
     data[60:80, 60:62] = 0
     goal = np.array([3.0, 0.0])
     corner, start = np.array([-5.0, -5.0]), np.array([-2.0, 0.0])
-    both = float(way_to_goal(data, 0.1, corner, goal, radius=0.3).at(start))
+    both = float(cost_to_go(data, 0.1, corner, goal, radius=0.3).at(start))
     data[45:54, 60:62] = 100
-    wide = float(way_to_goal(data, 0.1, corner, goal, radius=0.3).at(start))
+    wide = float(cost_to_go(data, 0.1, corner, goal, radius=0.3).at(start))
     assert both == wide
     data[60:80, 60:62] = 100
     data[45:54, 60:62] = 0
-    narrow = float(way_to_goal(data, 0.1, corner, goal, radius=0.3).at(start))
+    narrow = float(cost_to_go(data, 0.1, corner, goal, radius=0.3).at(start))
     assert np.isfinite(narrow) and narrow > wide
 
 
@@ -259,15 +261,15 @@ def test_the_choice_goes_around_what_lies_between():
     data = np.zeros((100, 100), np.int8)
     data[30:, 70:73] = 100
     goal = np.array([4.0, 0.0])
-    ways = way_to_goal(data, 0.1, np.array([-5.0, -5.0]), goal, radius=0.3)
+    ways = cost_to_go(data, 0.1, np.array([-5.0, -5.0]), goal, radius=0.3)
     ends = {"x": [1.2, 0.9], "y": [0.0, -0.9], "heading": [0.0, -0.8], "speed": [0.5, 0.5], "yaw_rate": [0.0, -0.5],
             "cost": [0.2, 0.2], "feasible": [1.0, 1.0]}  # fmt: skip
     for share in (25, 50, 75):
         ends |= {f"{axis}_{share}": [share / 100 * v for v in ends[axis]] for axis in "xy"}
     candidates = {name: np.array(values) for name, values in ends.items()}
-    weights = ChoiceWeights(heading=0.0)
-    assert choose(candidates, np.zeros(2), goal, weights) == 0
-    assert choose(candidates, np.zeros(2), goal, weights, ways) == 1
+    weights = SelectionWeights(heading=0.0)
+    assert select_candidate(candidates, np.zeros(2), goal, weights) == 0
+    assert select_candidate(candidates, np.zeros(2), goal, weights, ways) == 1
 
 
 def test_standing_is_chosen_only_where_nothing_leads_nearer():
@@ -277,9 +279,11 @@ def test_standing_is_chosen_only_where_nothing_leads_nearer():
     for share in (25, 50, 75):
         ends |= {f"{axis}_{share}": [share / 100 * v for v in ends[axis]] for axis in "xy"}
     candidates = {name: np.array(values) for name, values in ends.items()}
-    assert choose(candidates, np.zeros(2), np.array([5.0, 0.0])) == 1
-    assert choose(candidates, np.zeros(2), np.array([-5.0, 0.0])) == 2
-    assert choose(candidates | {"feasible": np.array([0.0, 0.0, 1.0])}, np.zeros(2), np.array([5.0, 0.0])) == 2
+    assert select_candidate(candidates, np.zeros(2), np.array([5.0, 0.0])) == 1
+    assert select_candidate(candidates, np.zeros(2), np.array([-5.0, 0.0])) == 2
+    assert (
+        select_candidate(candidates | {"feasible": np.array([0.0, 0.0, 1.0])}, np.zeros(2), np.array([5.0, 0.0])) == 2
+    )
 
 
 def test_the_choice_keeps_room_to_a_wall():
@@ -287,7 +291,7 @@ def test_the_choice_keeps_room_to_a_wall():
     data = np.zeros((100, 100), np.int8)
     data[57:59, 40:80] = 100  # at y = 0.7 to 0.9
     goal = np.array([4.0, 0.0])
-    ways = way_to_goal(data, 0.1, np.array([-5.0, -5.0]), goal, radius=0.3)
+    ways = cost_to_go(data, 0.1, np.array([-5.0, -5.0]), goal, radius=0.3)
     assert ways.near(np.array([[1.0, 0.5], [1.0, -0.6], [9.0, 0.5]])).tolist() == [1.0, 0.0, 0.0]
     ends = {"x": [1.5, 1.5], "y": [0.4, -0.45], "heading": [0.0, 0.0], "speed": [0.5, 0.5], "yaw_rate": [0.1, -0.1],
             "cost": [0.2, 0.25], "feasible": [1.0, 1.0]}  # fmt: skip
@@ -295,8 +299,13 @@ def test_the_choice_keeps_room_to_a_wall():
         ends |= {f"{axis}_{share}": [share / 100 * v for v in ends[axis]] for axis in "xy"}
     candidates = {name: np.array(values) for name, values in ends.items()}
     # By way and heading alone they are as good as each other; the wall decides.
-    assert choose(candidates, np.zeros(2), goal, ChoiceWeights(distance=0.0, heading=0.0, clearance=0.0), ways) == 0
-    assert choose(candidates, np.zeros(2), goal, ChoiceWeights(distance=0.0, heading=0.0), ways) == 1
+    assert (
+        select_candidate(
+            candidates, np.zeros(2), goal, SelectionWeights(distance=0.0, heading=0.0, clearance=0.0), ways
+        )
+        == 0
+    )
+    assert select_candidate(candidates, np.zeros(2), goal, SelectionWeights(distance=0.0, heading=0.0), ways) == 1
 
 
 def test_the_choice_keeps_to_one_of_two_ways_that_are_about_as_good():
@@ -309,9 +318,9 @@ def test_the_choice_keeps_to_one_of_two_ways_that_are_about_as_good():
     goal = np.array([5.0, 0.0])
     for noise in (0.1, -0.1):
         noisy = candidates | {"cost": candidates["cost"] + [noise, -noise]}
-        assert choose(noisy, np.zeros(2), goal) == int(noise > 0.0)
-        assert choose(noisy, np.zeros(2), goal, former=(0.0, 0.8)) == 0
-        assert choose(noisy, np.zeros(2), goal, former=(0.0, -0.7)) == 1
+        assert select_candidate(noisy, np.zeros(2), goal) == int(noise > 0.0)
+        assert select_candidate(noisy, np.zeros(2), goal, former=(0.0, 0.8)) == 0
+        assert select_candidate(noisy, np.zeros(2), goal, former=(0.0, -0.7)) == 1
     # A way that is much better is taken all the same.
     better = candidates | {"cost": np.array([2.0, 0.5])}
-    assert choose(better, np.zeros(2), goal, former=(0.0, 0.8)) == 1
+    assert select_candidate(better, np.zeros(2), goal, former=(0.0, 0.8)) == 1

@@ -7,12 +7,13 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from monoforce_ros.motion import MotionState
+from monoforce_ros.core import MotionState
+from monoforce_ros.perception import FlatTerrain, Observation
+from monoforce_ros.perception.ground_alignment import aligned_to_ground, clear_of
+from monoforce_ros.perception.terrain_sources import choose_terrain_source, lowered
 from monoforce_ros.physics import State, rollout
-from monoforce_ros.prediction import FlatTerrain, Observation, Predictor
-from monoforce_ros.prediction.footing import clear_of, laid_under
+from monoforce_ros.prediction import Predictor
 from monoforce_ros.prediction.predictor import start_states
-from monoforce_ros.prediction.terrain_sources import choose_terrain_source, lowered
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap
 
@@ -100,7 +101,7 @@ def test_a_predicted_map_is_laid_under_the_wheels_and_left_alone_elsewhere():
     x, _ = np.meshgrid(grid.x, grid.y)
     terrain = TerrainMap.from_height(torch.from_numpy((0.3 + 0.1 * x).astype(np.float32)), grid)
     wheels = np.array([[0.3, 0.3, -0.05], [0.3, -0.3, -0.05], [-0.3, 0.3, -0.1], [-0.3, -0.3, -0.1]])
-    laid = laid_under(terrain, wheels)
+    laid = aligned_to_ground(terrain, wheels)
     rows, columns, _ = grid.cells(wheels[:, :2])
     np.testing.assert_allclose(laid.height.numpy()[rows, columns], wheels[:, 2], atol=0.02)
     far = np.hypot(x, x.T) > 1.2
@@ -109,7 +110,7 @@ def test_a_predicted_map_is_laid_under_the_wheels_and_left_alone_elsewhere():
     torch.testing.assert_close(laid.geometric_height - laid.height, terrain.geometric_height - terrain.height)
     # No step at the border of what was moved.
     assert float(np.abs(np.diff(laid.height.numpy(), axis=1)).max()) < 0.15
-    assert laid_under(terrain, wheels + np.array([50.0, 0.0, 0.0])) is terrain
+    assert aligned_to_ground(terrain, wheels + np.array([50.0, 0.0, 0.0])) is terrain
 
 
 def test_a_lidars_surfaces_are_lowered_by_what_gives_way_and_walls_stand():

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from monoforce_ros.bags import BagReader, Recording
+from monoforce_ros.core import MotionTrack, transform_points
 from monoforce_ros.datasets.rough import DatasetError, RoughScene, robot_file_for, scene_to_bag
 from monoforce_ros.messages.decoding import stamp_of
-from monoforce_ros.motion import MotionTrack, transform_points
 from monoforce_ros.nodes.inputs import AHEAD
 from monoforce_ros.robots import load_robot
 

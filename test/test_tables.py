@@ -8,20 +8,20 @@ import pytest
 import torch
 
 from monoforce_ros.encoder import EncoderConfig, new_encoder, save_encoder
-from monoforce_ros.evaluation.drive import PHYSICS, DriveEvaluation
 from monoforce_ros.evaluation.metrics import Poses
+from monoforce_ros.evaluation.recording_evaluation import PHYSICS, RecordingEvaluation
 from monoforce_ros.evaluation.tables import FLAT, LIDAR, _sequence, evaluate_sequence, mean_over, ratio_over
 from monoforce_ros.robots import load_robot
 
 
-def straight(away: float, speed: float = 2.0, windows: int = 2) -> DriveEvaluation:
+def straight(away: float, speed: float = 2.0, windows: int = 2) -> RecordingEvaluation:
     """Windows of 5 s straight ahead, predicted ``away`` metres to the side."""
     times = np.arange(51) * 0.1
     measured = np.zeros((windows, 51, 3))
     measured[..., 0] = speed * times
     level = np.broadcast_to(np.eye(3), (windows, 51, 3, 3)).copy()
     predicted = measured + np.array([0.0, away, 0.0])
-    return DriveEvaluation(
+    return RecordingEvaluation(
         times=times,
         stamps=np.arange(windows),
         measured=Poses(measured, level),

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import Recording, smooth
-from monoforce_ros.motion import CommandTrack, MotionTrack
+from monoforce_ros.core import CommandTrack, MotionTrack
 from monoforce_ros.physics import State, rollout
 from monoforce_ros.robots import load_robot
 from monoforce_ros.synthetic.labels import GroundClass, labels_file

@@ -15,12 +15,11 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from monoforce_ros.camera import CameraModel
+from monoforce_ros.core import CameraModel
 from monoforce_ros.encoder import EncodedMaps, EncoderConfig, load_encoder
 from monoforce_ros.encoder.lift import feature_rays
 from monoforce_ros.physics import PhysicsOptions
 from monoforce_ros.robots import load_robot
-from monoforce_ros.training.drive_samples import SamplesError, SampleSettings, cut_drive, read_samples
 from monoforce_ros.training.losses import (
     LossWeights,
     geometric_loss,
@@ -30,6 +29,7 @@ from monoforce_ros.training.losses import (
     terrain_loss,
     trajectory_loss,
 )
+from monoforce_ros.training.recording_samples import SamplesError, SampleSettings, cut_recording, read_samples
 from monoforce_ros.training.samples import MIRROR, Targets, Variation, sample
 
 TINY = EncoderConfig(image_width=128, image_height=96, map_size=6.4, resolution=0.2)
@@ -46,7 +46,7 @@ def husky():
 def cut(tmp_path_factory, demo_bag, husky):
     """Folder of the demo drive's samples, which every training below reads."""
     folder = tmp_path_factory.mktemp("cut")
-    cut_drive(demo_bag, husky, TINY, folder)
+    cut_recording(demo_bag, husky, TINY, folder)
     return folder
 
 
@@ -261,7 +261,7 @@ def test_a_sweep_lies_where_the_map_of_many_sweeps_does(drive):
 def test_samples_are_cut_once_and_damage_is_named(tmp_path, demo_bag, husky, cut, drive):
     file = next(cut.glob("*.safetensors"))
     before = file.stat().st_mtime_ns
-    assert cut_drive(demo_bag, husky, TINY, cut) == file
+    assert cut_recording(demo_bag, husky, TINY, cut) == file
     assert file.stat().st_mtime_ns == before and len(read_samples(file)) == len(drive)
     assert len(list(cut.iterdir())) == 1
     broken = tmp_path / "broken.safetensors"

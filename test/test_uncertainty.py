@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from monoforce_ros.motion import MotionState
+from monoforce_ros.core import MotionState
 from monoforce_ros.planning import CostWeights, Limits, assess, refine
 from monoforce_ros.planning.candidates import over_horizon
 from monoforce_ros.planning.costs import force_every
 from monoforce_ros.prediction import Prediction, Predictor
-from monoforce_ros.prediction.uncertainty import EnsembleSettings, spread
+from monoforce_ros.prediction.ensemble import EnsembleSettings, spread
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainMap
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from monoforce_ros.effects.catalogue import drive_speeds
 from monoforce_ros.encoder import EncoderConfig
 from monoforce_ros.physics import State, rollout
-from monoforce_ros.physics.effects import drive_speeds
 from monoforce_ros.physics.options import PhysicsOptions
 from monoforce_ros.physics.rest import rest_depth
 from monoforce_ros.robots import load_robot
@@ -17,7 +17,7 @@ from monoforce_ros.synthetic.course import CourseSettings, build_course
 from monoforce_ros.synthetic.scenery import build_scenery
 from monoforce_ros.synthetic.terrain_shape import TerrainSettings
 from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap
-from monoforce_ros.training.drive_samples import Chunks, DriveSamples, Segment
+from monoforce_ros.training.recording_samples import Chunks, RecordingSamples, Segment
 from monoforce_ros.training.vegetation_fit import EFFECT, fit_vegetation
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -26,7 +26,7 @@ COUNT, HISTORY = 200, 50
 PLANTED = {"coefficient": 2.0e4, "yield_speed": 0.3}
 
 
-def drive(robot, height: float) -> DriveSamples:
+def drive(robot, height: float) -> RecordingSamples:
     """Pieces of motion on level ground under vegetation, as the robot's own physics brings them about."""
     random = np.random.default_rng(3)
     ground = torch.zeros(GRID.rows, GRID.columns)
@@ -55,8 +55,8 @@ def drive(robot, height: float) -> DriveSamples:
     seen = (ground + height).numpy()
     segment = Segment(GRID, np.eye(4), seen, known, ground.numpy(), known)
     nothing = np.zeros((COUNT, 0))
-    return DriveSamples(
-        "planted", (), torch.zeros(COUNT, 0, 4, 4, 3, dtype=torch.uint8), stamps, pose, nothing, nothing, nothing,
+    return RecordingSamples(
+        "injected", (), torch.zeros(COUNT, 0, 4, 4, 3, dtype=torch.uint8), stamps, pose, nothing, nothing, nothing,
         nothing, np.zeros(COUNT, int), (segment,), chunks,
     )  # fmt: skip
 
@@ -67,8 +67,8 @@ def husky():
 
 
 def test_a_planted_drag_is_recovered(husky):
-    planted = replace(husky, effects=((EFFECT, PLANTED),))
-    found = fit_vegetation([drive(planted, 0.35)], husky, EncoderConfig())
+    injected = replace(husky, effects=((EFFECT, PLANTED),))
+    found = fit_vegetation([drive(injected, 0.35)], husky, EncoderConfig())
     assert found is not None and found.pieces >= 30
     # What counts is the drag at the speeds that were driven.
     for speed in (0.2, 0.6):
@@ -83,8 +83,8 @@ def test_nothing_is_fitted_where_nothing_holds_or_nothing_grows(husky):
 
 
 def test_the_robot_file_that_is_written_predicts_with_it(husky, tmp_path):
-    planted = replace(husky, effects=((EFFECT, PLANTED),))
-    found = fit_vegetation([drive(planted, 0.35)], husky, EncoderConfig())
+    injected = replace(husky, effects=((EFFECT, PLANTED),))
+    found = fit_vegetation([drive(injected, 0.35)], husky, EncoderConfig())
     file = write_robot("husky", tmp_path / "robot.yaml", [found.effect], [], "none", found_by="train")
     written = load_robot(file)
     assert dict(written.effects)[EFFECT]["coefficient"] == pytest.approx(found.coefficient, rel=1e-4)

@@ -5,7 +5,8 @@ import torch
 import wall
 
 from monoforce_ros.encoder import fused, load_encoder
-from monoforce_ros.prediction import CameraTerrain, Predictor
+from monoforce_ros.perception import CameraTerrain
+from monoforce_ros.prediction import Predictor
 from monoforce_ros.robots import load_robot
 
 

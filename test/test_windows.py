@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import BagWriter, Recording, builders, cut_windows, smooth, synchronise
-from monoforce_ros.motion import CommandTrack, MotionTrack
+from monoforce_ros.core import CommandTrack, MotionTrack
 
 START = 1_700_000_000_000_000_000
 

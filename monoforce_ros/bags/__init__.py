@@ -1,13 +1,20 @@
 """Reading and writing rosbag files: ROS 2 (sqlite3, mcap) and ROS 1, without a ROS installation."""
 
+from monoforce_ros.bags import builders
 from monoforce_ros.bags.reader import BagError, BagReader
-from monoforce_ros.bags.recording import Recording
+from monoforce_ros.bags.recording import CAMERA_INFO, CLOUD, COMMANDS, IMAGES, ODOMETRY, Recording, camera_info_topic
 from monoforce_ros.bags.samples import Sample, synchronise
 from monoforce_ros.bags.smoothing import SmoothedMotion, smooth
+from monoforce_ros.bags.types import type_store
 from monoforce_ros.bags.windows import Windows, cut_windows
 from monoforce_ros.bags.writer import BagWriter
 
 __all__ = [
+    "CAMERA_INFO",
+    "CLOUD",
+    "COMMANDS",
+    "IMAGES",
+    "ODOMETRY",
     "BagError",
     "BagReader",
     "BagWriter",
@@ -15,7 +22,10 @@ __all__ = [
     "Sample",
     "SmoothedMotion",
     "Windows",
+    "builders",
+    "camera_info_topic",
     "cut_windows",
     "smooth",
     "synchronise",
+    "type_store",
 ]

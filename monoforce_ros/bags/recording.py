@@ -10,9 +10,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags.reader import BagError, BagReader
-from monoforce_ros.camera import CameraModel
+from monoforce_ros.core import AngularVelocityTrack, CameraModel, CommandTrack, MotionTrack, WheelTrack
 from monoforce_ros.messages import decoding
-from monoforce_ros.motion import CommandTrack, MotionTrack, TurningTrack, WheelTrack
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 COMMANDS = ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist")
@@ -50,7 +49,7 @@ class Recording:
     """The topics chosen: ``odometry``, ``commands``, ``cloud``, ``imu``, ``joints``."""
     complaints: tuple[str, ...] = field(default=())
     """What was wrong with single messages; they were left out."""
-    turning: TurningTrack | None = None
+    turning: AngularVelocityTrack | None = None
     """What the IMU shows, where there is one."""
     wheels: WheelTrack | None = None
     """Measured wheel speeds, where there are."""
@@ -310,10 +309,10 @@ class _Collector:
         stamps, first = np.unique([stamp for stamp, _ in self.wheels], return_index=True)
         return WheelTrack(stamps.astype(np.int64), np.array([self.wheels[index][1] for index in first]))
 
-    def _turning_track(self) -> TurningTrack | None:
+    def _turning_track(self) -> AngularVelocityTrack | None:
         if not self.turning:
             return None
         self.turning.sort(key=lambda entry: entry[0])
         stamps, first = np.unique([stamp for stamp, _ in self.turning], return_index=True)
         rates = np.array([self.turning[index][1] for index in first])
-        return TurningTrack(stamps.astype(np.int64), rates, self.turning_frame)
+        return AngularVelocityTrack(stamps.astype(np.int64), rates, self.turning_frame)

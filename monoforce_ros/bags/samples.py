@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from monoforce_ros.bags.recording import Frame, Recording
-from monoforce_ros.motion import MotionState, StaleDataError
+from monoforce_ros.core import MotionState, StaleDataError
 
 
 @dataclass(frozen=True)

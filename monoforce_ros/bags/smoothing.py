@@ -10,7 +10,7 @@ from scipy.interpolate import BSpline, make_smoothing_spline
 from scipy.optimize import brentq, minimize_scalar
 from scipy.spatial.transform import Rotation
 
-from monoforce_ros.motion import NANOSECOND, MotionTrack
+from monoforce_ros.core import NANOSECOND, MotionTrack
 
 LARGEST_GAP = 1.0
 """Poses further apart in time are not smoothed together [s]."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from monoforce_ros.shared_files import share_directory
+from monoforce_ros.core import share_directory
 
 
 @cache

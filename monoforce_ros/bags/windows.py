@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from monoforce_ros.motion import CommandTrack, MotionState, MotionTrack, StaleDataError
+from monoforce_ros.core import CommandTrack, MotionState, MotionTrack, StaleDataError
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from monoforce_ros.bags import builders
-from monoforce_ros.motion import MotionTrack
+from monoforce_ros.core import MotionTrack
 
 
 class DatasetError(ValueError):

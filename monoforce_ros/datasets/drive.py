@@ -18,8 +18,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import BagWriter, builders, smooth
+from monoforce_ros.core import MotionTrack
 from monoforce_ros.datasets.dataset import DatasetError, odometry_message
-from monoforce_ros.motion import MotionTrack
 
 WHEEL_RADIUS, TRACK_WIDTH = 0.3, 1.08
 """Of the Warthog that recorded the data [m]."""

@@ -19,10 +19,9 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import BagWriter, builders
-from monoforce_ros.camera import CameraModel
+from monoforce_ros.core import CameraModel, homogeneous
 from monoforce_ros.datasets.dataset import DatasetError, odometry_message
 from monoforce_ros.datasets.rough import motion_from_poses
-from monoforce_ros.motion import homogeneous
 
 LIDAR_FRAME, CAMERA_FRAME, BASE_FRAME = "os1_lidar", "pylon_camera", "base_link"
 CLOUDS, IMAGES = "os1_cloud_node_kitti_bin", "pylon_camera_node"

@@ -16,9 +16,8 @@ import yaml
 from scipy.spatial.transform import Rotation, Slerp
 
 from monoforce_ros.bags import BagWriter, builders
-from monoforce_ros.camera import CameraModel
+from monoforce_ros.core import NANOSECOND, CameraModel, MotionTrack, homogeneous
 from monoforce_ros.datasets.dataset import DatasetError, odometry_message
-from monoforce_ros.motion import NANOSECOND, MotionTrack, homogeneous
 from monoforce_ros.robots import robot_file
 
 LIDAR_FRAME = "os_sensor"

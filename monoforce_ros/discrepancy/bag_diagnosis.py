@@ -13,12 +13,11 @@ from monoforce_ros.bags import Recording, smooth
 from monoforce_ros.discrepancy.comparison import compare, gap_table
 from monoforce_ros.discrepancy.diagnosis import Diagnosis, Settings, diagnose
 from monoforce_ros.discrepancy.gap import noisy_motions
-from monoforce_ros.discrepancy.hypothesis import Drive, Effects, undone, window_starts
+from monoforce_ros.discrepancy.hypothesis import Effects, Evidence, corrected_evidence, window_starts
 from monoforce_ros.discrepancy.report import write_diagnosis
-from monoforce_ros.robots import RobotModel, load_robot
-from monoforce_ros.robots.robot_copy import fingerprint, read_leftover, write_robot
+from monoforce_ros.robots import RobotModel, fingerprint, load_robot, read_nominal_residual, write_robot
 from monoforce_ros.terrain import Grid, load_terrain
-from monoforce_ros.training.visible import visible_halves
+from monoforce_ros.training import split_maps
 
 _MARGIN = 4.0
 
@@ -51,7 +50,7 @@ class BagDiagnosis:
         return replace(self, diagnosis=replace(self.diagnosis, details={}))
 
 
-def read_drive(bag: Path, robot: RobotModel, terrain: str, topics: Topics = Topics()) -> tuple[Drive, Recording]:
+def read_drive(bag: Path, robot: RobotModel, terrain: str, topics: Topics = Topics()) -> tuple[Evidence, Recording]:
     """A bag's smoothed motion, commands and ground.
 
     Args:
@@ -65,7 +64,7 @@ def read_drive(bag: Path, robot: RobotModel, terrain: str, topics: Topics = Topi
     """
     recording = Recording.open(bag, odometry=topics.odometry, commands=topics.commands, cloud=topics.cloud)
     smoothed = smooth(recording.motion)
-    drive = Drive(smoothed, recording.commands, turning=recording.turning, wheels=recording.wheels)
+    drive = Evidence(smoothed, recording.commands, turning=recording.turning, wheels=recording.wheels)
     if terrain == "flat":
         return drive, recording
     if terrain != "lidar":
@@ -75,7 +74,7 @@ def read_drive(bag: Path, robot: RobotModel, terrain: str, topics: Topics = Topi
     low, high = motion.positions.min(axis=0)[:2] - _MARGIN, motion.positions.max(axis=0)[:2] + _MARGIN
     columns, rows = np.ceil((high - low) / 0.1).astype(int) + 1
     grid = Grid(int(rows), int(columns), 0.1, (float(low[0]), float(low[1])))
-    ground, halves = visible_halves(recording, motion, robot, grid)
+    ground, halves = split_maps(recording, motion, robot, grid)
     return replace(drive, terrain=ground, odometry_from_terrain=np.eye(4), halves=halves), recording
 
 
@@ -109,7 +108,7 @@ def diagnose_bag(
     diagnosis = diagnose(
         drive,
         model,
-        leftover=read_leftover(robot, settings.samples),
+        nominal_residual=read_nominal_residual(robot, settings.samples),
         settings=settings,
         progress=progress,
     )
@@ -138,7 +137,7 @@ def diagnose_bag(
 def _held_out(bag: Path, robot: RobotModel, effects: Effects, terrain: str, topics: Topics) -> dict[str, dict]:
     """Errors before and after on a drive that no fit saw."""
     drive, _ = read_drive(bag, robot, terrain, topics)
-    drive = undone(drive, robot.effects)
+    drive = corrected_evidence(drive, robot.effects)
     starts = window_starts(drive.smoothed.motion, drive.smoothed.stretches, 2.0, 1.0)
     if not len(starts):
         raise ValueError(f"{bag}: no windows of 2 s without a gap: it cannot show what was gained")

@@ -17,11 +17,9 @@ from monoforce_ros.discrepancy.bag_diagnosis import BagDiagnosis, Topics, diagno
 from monoforce_ros.discrepancy.commissioning import commission
 from monoforce_ros.discrepancy.diagnosis import Settings
 from monoforce_ros.discrepancy.report import summary_lines
-from monoforce_ros.physics.effects import EffectError
-from monoforce_ros.robots import RobotFileError, load_robot, shipped_robots
-from monoforce_ros.robots.robot_copy import fingerprint, write_robot
-from monoforce_ros.terrain import TerrainFileError
-from monoforce_ros.terrain.lidar import TerrainError
+from monoforce_ros.effects import EffectError
+from monoforce_ros.robots import RobotFileError, fingerprint, load_robot, shipped_robots, write_robot
+from monoforce_ros.terrain import TerrainError, TerrainFileError
 
 _ERRORS = (BagError, EffectError, RobotFileError, TerrainFileError, TerrainError, ValueError, OSError)
 
@@ -158,10 +156,10 @@ def _commission(options: argparse.Namespace) -> int:
     topics = Topics(options.odometry, options.commands, options.cloud)
     drives = [read_drive(bag, robot, options.terrain, topics)[0] for bag in options.bags]
     settings = Settings()
-    effects, leftover = commission(drives, robot, samples=settings.samples)
+    effects, nominal_residual = commission(drives, robot, samples=settings.samples)
     kept = {
         "samples_s": list(settings.samples),
-        "residual_rms": [[float(f"{value:.4g}") for value in row] for row in leftover],
+        "residual_rms": [[float(f"{value:.4g}") for value in row] for row in nominal_residual],
     }
     out = write_robot(
         options.robot, options.out / f"{robot.name}.yaml", effects, options.bags, fingerprint(options.bags), kept
@@ -169,7 +167,7 @@ def _commission(options: argparse.Namespace) -> int:
     for effect in effects:
         for key, entry in effect["parameters"].items():
             print(f"{effect['name']}: {key} {entry['value']:.3g} {entry['unit']}")
-    along, across, heading = leftover[-1]
+    along, across, heading = nominal_residual[-1]
     print(
         f"left on the healthy robot after {settings.horizon:g} s: {100 * along:.1f} cm along, "
         f"{100 * across:.1f} cm across, {np.degrees(heading):.2f}° in heading"

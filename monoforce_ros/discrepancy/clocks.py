@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from monoforce_ros.bags import SmoothedMotion
-from monoforce_ros.motion import TurningTrack
+from monoforce_ros.core import AngularVelocityTrack
 
 _STEP = 0.02
 _LAGS = np.arange(-50, 81) * _STEP
@@ -53,7 +53,7 @@ class GyroFinding:
         return abs(self.bias) > max(_SMALLEST_BIAS, 1.5 * self.bias_half)
 
 
-def compare_with_gyro(smoothed: SmoothedMotion, turning: TurningTrack | None) -> GyroFinding | None:
+def compare_with_gyro(smoothed: SmoothedMotion, turning: AngularVelocityTrack | None) -> GyroFinding | None:
     """Delay of the poses and bias of the gyro; None where the drive does not tell.
 
     Which axis of the IMU is vertical, and whether it points up, is found too: mounts differ, and files are wrong.

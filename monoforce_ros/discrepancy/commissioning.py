@@ -9,7 +9,7 @@ import numpy as np
 
 from monoforce_ros.discrepancy.fit import Fit, described, fit_effects, flat, with_values
 from monoforce_ros.discrepancy.gap import map_floor, noise_floor, noisy_motions, residual_scale
-from monoforce_ros.discrepancy.hypothesis import Drive, Effects, Predictions, window_starts
+from monoforce_ros.discrepancy.hypothesis import Effects, Evidence, Predictions, window_starts
 from monoforce_ros.discrepancy.preflight import complaints
 from monoforce_ros.discrepancy.selection import blocks_of
 from monoforce_ros.robots import RobotModel
@@ -23,7 +23,7 @@ COMMISSIONED: Effects = (
 
 
 def commission(
-    drives: Sequence[Drive],
+    drives: Sequence[Evidence],
     robot: RobotModel,
     *,
     samples: Sequence[float] = (0.5, 1.0, 1.5, 2.0),

@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from monoforce_ros.bags import SmoothedMotion
+from monoforce_ros.core import MotionTrack
 from monoforce_ros.discrepancy.gap import find_regimes, noise_residuals, relative_motion
-from monoforce_ros.discrepancy.hypothesis import DriveData, Effects, Predictions, window_starts
+from monoforce_ros.discrepancy.hypothesis import Effects, EvidenceWindows, Predictions, window_starts
 from monoforce_ros.discrepancy.selection import BLOCK, blocks_of, folds_of
-from monoforce_ros.motion import MotionTrack
 from monoforce_ros.robots import RobotModel
 
 HORIZONS = (1.0, 2.0, 5.0)
@@ -29,7 +29,7 @@ class Comparison:
     after: np.ndarray | None
     floor: np.ndarray
     """Errors by the noise of the poses alone, ``[any, 3]``."""
-    data: DriveData
+    data: EvidenceWindows
 
     def errors(self, metric: str, which: np.ndarray) -> np.ndarray:
         """``position`` [m] or ``heading`` [deg] of residuals ``[..., 3]``."""
@@ -40,7 +40,7 @@ class Comparison:
 
 def compare(
     robot: RobotModel,
-    data: DriveData,
+    data: EvidenceWindows,
     smoothed: SmoothedMotion,
     parts: Sequence[Effects] | None,
     noisy: Sequence[MotionTrack],
@@ -72,12 +72,12 @@ def compare(
         floor = noise_residuals(data.motion, noisy, own)
         rolled = Predictions(robot, own)
         before = rolled.residuals([()])[0][:, 0]
-        after = None if parts is None else _unseen(rolled, data.starts[0], parts)[:, 0]
+        after = None if parts is None else _held_out(rolled, data.starts[0], parts)[:, 0]
         results.append(Comparison(own.horizon, own.starts, before, after, floor[:, 0], own))
     return results
 
 
-def _unseen(rolled: Predictions, first: int, parts: Sequence[Effects]) -> np.ndarray:
+def _held_out(rolled: Predictions, first: int, parts: Sequence[Effects]) -> np.ndarray:
     """Residuals ``[W, K, 3]`` of each window by the effects that were found without its fold."""
     which = folds_of(np.r_[first, rolled.data.starts])[1:]
     return rolled.residuals(list(parts))[which, np.arange(len(which))]
@@ -133,7 +133,9 @@ def regime_table(comparison: Comparison) -> list[dict]:
     return rows
 
 
-def shown_paths(robot: RobotModel, data: DriveData, parts: Sequence[Effects] | None, count: int = 6) -> list[dict]:
+def measured_paths(
+    robot: RobotModel, data: EvidenceWindows, parts: Sequence[Effects] | None, count: int = 6
+) -> list[dict]:
     """Predicted and measured paths of some windows, spread over those with the largest errors before.
 
     Returns:
@@ -150,7 +152,7 @@ def shown_paths(robot: RobotModel, data: DriveData, parts: Sequence[Effects] | N
     measured = relative_motion(own.motion, own)
     rolled = Predictions(robot, own)
     before = rolled.residuals([()])[0]
-    after = None if parts is None else _unseen(rolled, data.starts[0], parts)
+    after = None if parts is None else _held_out(rolled, data.starts[0], parts)
     order = np.argsort(np.hypot(before[:, -1, 0], before[:, -1, 1]))
     picked = order[np.unique(np.linspace(0.5 * len(order), len(order) - 1, count).astype(int))]
     return [

@@ -9,15 +9,15 @@ import numpy as np
 
 from monoforce_ros.discrepancy.clocks import GyroFinding, compare_with_gyro
 from monoforce_ros.discrepancy.commissioning import COMMISSIONED
-from monoforce_ros.discrepancy.comparison import compare, gap_table, regime_table, shown_paths
+from monoforce_ros.discrepancy.comparison import compare, gap_table, measured_paths, regime_table
 from monoforce_ros.discrepancy.fit import described
 from monoforce_ros.discrepancy.gap import find_regimes, localise, map_floor, noise_floor, noisy_motions, residual_scale
-from monoforce_ros.discrepancy.hypothesis import Drive, Effects, thinned, undone, window_starts
+from monoforce_ros.discrepancy.hypothesis import Effects, Evidence, corrected_evidence, subsampled, window_starts
 from monoforce_ros.discrepancy.learned import LEARNED, formula
 from monoforce_ros.discrepancy.preflight import advice, complaints
 from monoforce_ros.discrepancy.selection import BLOCK, HEALTHY_LOSS, SMALLEST_GAIN, Outcome, Search, Trial, paired
 from monoforce_ros.discrepancy.wheels import WheelFinding, compare_with_wheels
-from monoforce_ros.physics.effects import CATALOGUE
+from monoforce_ros.effects import CATALOGUE
 from monoforce_ros.robots import RobotModel
 
 VERDICTS = ("effect_found", "no_discrepancy", "unknown_effect", "not_identifiable", "no_improvement")
@@ -80,10 +80,10 @@ class Diagnosis:
 
 
 def diagnose(
-    drive: Drive,
+    drive: Evidence,
     robot: RobotModel,
     *,
-    leftover: np.ndarray | None = None,
+    nominal_residual: np.ndarray | None = None,
     settings: Settings = Settings(),
     progress: Callable[[float, str], None] = lambda share, what: None,
 ) -> Diagnosis:
@@ -92,16 +92,16 @@ def diagnose(
     Args:
         drive: motion, commands and ground.
         robot: the nominal model; its file's effects act already.
-        leftover: what disagreed on the healthy robot, root mean square ``[K, 3]`` at ``settings.samples``.
+        nominal_residual: what disagreed on the healthy robot, root mean square ``[K, 3]`` at ``settings.samples``.
         settings: of the diagnosis.
         progress: called with the share of the work done and what comes next.
     """
     progress(0.0, "preflight")
     # What the robot's file says of its sensors and clocks is known already.
-    drive = undone(drive, robot.effects)
+    drive = corrected_evidence(drive, robot.effects)
     smoothed = drive.smoothed
     starts = window_starts(smoothed.motion, smoothed.stretches, settings.horizon, settings.stride)
-    starts = thinned(starts, BLOCK, settings.most_windows)
+    starts = subsampled(starts, BLOCK, settings.most_windows)
     found = complaints(smoothed, drive.commands, starts)
     if found:
         return Diagnosis("not_identifiable", (), (), {}, {}, tuple(found))
@@ -110,7 +110,7 @@ def diagnose(
     progress(0.02, "noise floor")
     noisy = noisy_motions(smoothed, settings.seed)
     floor = np.hypot(noise_floor(smoothed.motion, noisy, data), map_floor(robot, data, drive.halves))
-    scale = residual_scale(floor, leftover)
+    scale = residual_scale(floor, nominal_residual)
     gyro = compare_with_gyro(smoothed, drive.turning)
     own = dict(robot.effects)
     known: Effects = ()
@@ -163,7 +163,7 @@ def diagnose(
     if wheels is not None and drive.wheels is not None:
         remarks = (*remarks, wheels.told())
     two = next((c for c in compared if c.horizon == settings.horizon), None)
-    allowed = np.hypot(floor, 0 if leftover is None else leftover)
+    allowed = np.hypot(floor, 0 if nominal_residual is None else nominal_residual)
     details = {
         "data": data,
         "starts": starts,
@@ -171,7 +171,7 @@ def diagnose(
         "scale": scale,
         "floor": floor,
         "compared": compared,
-        "paths": shown_paths(robot, data, parts),
+        "paths": measured_paths(robot, data, parts),
     }
     progress(1.0, "done")
     return Diagnosis(
@@ -251,7 +251,7 @@ def _verdict(search: Search, outcome: Outcome) -> tuple[str, Trial | None, tuple
     formula_trial = search.learn()
     numbers["loss_by_formula"] = formula_trial.loss
     if not best.effects:
-        gain, low, _ = paired(nominal.unseen, formula_trial.unseen, search.data.starts)
+        gain, low, _ = paired(nominal.held_out_loss, formula_trial.held_out_loss, search.data.starts)
         if low > 0 and gain > SMALLEST_GAIN * nominal.loss:
             return *_unknown(formula_trial, nominal, "no effect explains it"), numbers
         if nominal.loss < 1.7 * _CLEARLY:
@@ -259,7 +259,7 @@ def _verdict(search: Search, outcome: Outcome) -> tuple[str, Trial | None, tuple
         return *_unknown(formula_trial, nominal, "it is far larger than noise, and no effect explains it"), numbers
     why = ""
     # A formula has more freedom than an effect with a name: what fits well keeps its name although one fits better.
-    better, low, _ = paired(best.unseen, formula_trial.unseen, search.data.starts)
+    better, low, _ = paired(best.held_out_loss, formula_trial.held_out_loss, search.data.starts)
     if low > 0 and better > 0.1 * excess and best.loss > _WELL and not _same(best, formula_trial, nominal):
         why = f"a formula predicts held-out data better than {' and '.join(best.names)}"
     elif best.loss > _CLEARLY:

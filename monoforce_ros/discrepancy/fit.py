@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from monoforce_ros.discrepancy.hypothesis import DriveData, Effects, Predictions
-from monoforce_ros.physics.effects import CATALOGUE
+from monoforce_ros.discrepancy.hypothesis import Effects, EvidenceWindows, Predictions
+from monoforce_ros.effects import CATALOGUE
 
 OUTLIER = 3.0
 """Scaled residuals beyond this weigh with their size rather than their square."""
@@ -167,7 +167,7 @@ def _jacobian(
     return np.nan_to_num((shifted - residual) * factors).reshape(len(moved), -1)
 
 
-def _covariance(jacobian: np.ndarray, residual: np.ndarray, typical: np.ndarray, data: DriveData) -> np.ndarray:
+def _covariance(jacobian: np.ndarray, residual: np.ndarray, typical: np.ndarray, data: EvidenceWindows) -> np.ndarray:
     """Of the parameters, by what each block of the drive says on its own (sandwich estimate, White 1980).
 
     Windows of a block share motion and the model's other errors; blocks hardly do. So the spread of the blocks' pulls

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import SmoothedMotion, smooth
-from monoforce_ros.discrepancy.hypothesis import DriveData, Predictions, sample_motion
-from monoforce_ros.motion import MotionTrack
+from monoforce_ros.core import MotionTrack
+from monoforce_ros.discrepancy.hypothesis import EvidenceWindows, Predictions, sample_motion
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import TerrainMap
 
@@ -42,7 +42,7 @@ def noisy_motions(smoothed: SmoothedMotion, seed: int = 0) -> list[MotionTrack]:
     return drawn
 
 
-def noise_residuals(motion: MotionTrack, noisy: Sequence[MotionTrack], data: DriveData) -> np.ndarray:
+def noise_residuals(motion: MotionTrack, noisy: Sequence[MotionTrack], data: EvidenceWindows) -> np.ndarray:
     """Residuals that a perfect model would have by the noise of the poses alone, ``[draws W, K, 3]``.
 
     Args:
@@ -54,7 +54,7 @@ def noise_residuals(motion: MotionTrack, noisy: Sequence[MotionTrack], data: Dri
     return np.concatenate([relative_motion(other, data) - own for other in noisy])
 
 
-def noise_floor(motion: MotionTrack, noisy: Sequence[MotionTrack], data: DriveData) -> np.ndarray:
+def noise_floor(motion: MotionTrack, noisy: Sequence[MotionTrack], data: EvidenceWindows) -> np.ndarray:
     """Size of :func:`noise_residuals`, ``[K, 3]`` [m, m, rad]: two thirds are smaller, as of a standard deviation.
 
     Robust: where a localisation jumps, smoothing other noise gives another motion altogether.
@@ -62,7 +62,7 @@ def noise_floor(motion: MotionTrack, noisy: Sequence[MotionTrack], data: DriveDa
     return np.quantile(np.abs(noise_residuals(motion, noisy, data)), 0.683, axis=0)
 
 
-def map_floor(robot: RobotModel, data: DriveData, halves: tuple[TerrainMap, TerrainMap] | None) -> np.ndarray:
+def map_floor(robot: RobotModel, data: EvidenceWindows, halves: tuple[TerrainMap, TerrainMap] | None) -> np.ndarray:
     """What residuals have by the ground's shape, however right the robot's model is, ``[K, 3]`` [m, m, rad].
 
     Two parts: predictions on the maps of both halves of the sweeps differ by twice what the whole map's own noise does
@@ -84,7 +84,7 @@ def map_floor(robot: RobotModel, data: DriveData, halves: tuple[TerrainMap, Terr
     return shape if halves is None else np.hypot(shape, 0.5 * spread(*halves))
 
 
-def relative_motion(motion: MotionTrack, data: DriveData) -> np.ndarray:
+def relative_motion(motion: MotionTrack, data: EvidenceWindows) -> np.ndarray:
     """Motion since the start of each window in the axes of its start, ``[W, K, 3]`` [m, m, rad]."""
     stamps = data.starts[:, None] + np.rint(np.r_[0.0, data.samples] * 1e9).astype(np.int64)
     positions, rotations, _, _ = sample_motion(motion, stamps)
@@ -95,15 +95,15 @@ def relative_motion(motion: MotionTrack, data: DriveData) -> np.ndarray:
     return np.concatenate([moved[..., :2], turned[..., None]], axis=-1)
 
 
-def residual_scale(floor: np.ndarray, leftover: np.ndarray | None) -> np.ndarray:
+def residual_scale(floor: np.ndarray, nominal_residual: np.ndarray | None) -> np.ndarray:
     """Size of a residual that means nothing, ``[K, 3]``: noise, and what disagreed on the healthy robot already."""
     squares = floor**2 + _SMALLEST**2
-    if leftover is not None:
-        squares = squares + leftover**2
+    if nominal_residual is not None:
+        squares = squares + nominal_residual**2
     return np.sqrt(squares)
 
 
-def find_regimes(data: DriveData) -> dict[str, np.ndarray]:
+def find_regimes(data: EvidenceWindows) -> dict[str, np.ndarray]:
     """Ways of driving in plain words, each with the mask ``[W]`` of its windows; a window may be in several."""
     count = round((data.horizon + 0.5) / 0.05)
     stamps = data.starts[:, None] + (np.arange(count) * 50_000_000 - 500_000_000)
@@ -129,7 +129,9 @@ def find_regimes(data: DriveData) -> dict[str, np.ndarray]:
     return {name: mask for name, mask in masks.items() if 3 <= mask.sum() < len(mask)}
 
 
-def localise(residuals: np.ndarray, floor: np.ndarray, data: DriveData, regimes: dict[str, np.ndarray]) -> list[dict]:
+def localise(
+    residuals: np.ndarray, floor: np.ndarray, data: EvidenceWindows, regimes: dict[str, np.ndarray]
+) -> list[dict]:
     """Where the disagreement lives: shares of the squared error over its floor by axis and regime, strongest first.
 
     Args:

@@ -15,11 +15,9 @@ import torch
 from scipy.spatial.transform import Rotation, Slerp
 
 from monoforce_ros.bags import SmoothedMotion
-from monoforce_ros.motion import CommandTrack, MotionTrack, TurningTrack, WheelTrack
-from monoforce_ros.physics import PhysicsOptions, State, rollout
-from monoforce_ros.physics.effects import CATALOGUE, corrected_commands, corrected_motion, drive_speeds
-from monoforce_ros.physics.lookup import TerrainLookup
-from monoforce_ros.physics.rest import rest_depth
+from monoforce_ros.core import AngularVelocityTrack, CommandTrack, MotionTrack, WheelTrack
+from monoforce_ros.effects import CATALOGUE, corrected_commands, corrected_motion, drive_speeds
+from monoforce_ros.physics import PhysicsOptions, State, TerrainLookup, rest_depth, rollout
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import Grid, TerrainMap
 
@@ -38,7 +36,7 @@ _LEVEL_REACH, _HILLY_REACH = 0.1, 0.3
 
 
 @dataclass(frozen=True)
-class Drive:
+class Evidence:
     """A recorded drive on its ground."""
 
     smoothed: SmoothedMotion
@@ -49,14 +47,14 @@ class Drive:
     """Pose ``[4, 4]`` of the map."""
     halves: tuple[TerrainMap, TerrainMap] | None = None
     """Maps that each half of the sweeps gives alone."""
-    turning: TurningTrack | None = None
+    turning: AngularVelocityTrack | None = None
     """What an IMU shows."""
     wheels: WheelTrack | None = None
     """Measured wheel speeds."""
 
-    def cut(self, starts: np.ndarray, samples: np.ndarray) -> DriveData:
+    def cut(self, starts: np.ndarray, samples: np.ndarray) -> EvidenceWindows:
         """Windows from ``starts`` [ns] to the last of ``samples`` [s]."""
-        return DriveData(
+        return EvidenceWindows(
             self.smoothed.motion,
             self.commands,
             starts,
@@ -68,7 +66,7 @@ class Drive:
 
 
 @dataclass(frozen=True)
-class DriveData:
+class EvidenceWindows:
     """What a hypothesis is held against."""
 
     motion: MotionTrack
@@ -97,7 +95,7 @@ def window_starts(motion: MotionTrack, stretches: Sequence[slice], horizon: floa
     return np.array(starts, np.int64)
 
 
-def thinned(starts: np.ndarray, block: float, most: int) -> np.ndarray:
+def subsampled(starts: np.ndarray, block: float, most: int) -> np.ndarray:
     """At most about ``most`` of the windows of a long drive: pairs of blocks [s], evenly over all of it."""
     if len(starts) <= most:
         return starts
@@ -121,13 +119,15 @@ def sample_motion(motion: MotionTrack, stamps: np.ndarray) -> tuple[np.ndarray, 
     return blend(motion.positions), rotations, blend(motion.linear_velocities), blend(motion.angular_velocities)
 
 
-def undone(drive: Drive, effects: Effects) -> Drive:
+def corrected_evidence(drive: Evidence, effects: Effects) -> Evidence:
     """The drive without what a robot's file says of its sensors and clocks."""
-    motion, commands = undo_measurement(drive.smoothed.motion, drive.commands, effects)
+    motion, commands = correct_measurements(drive.smoothed.motion, drive.commands, effects)
     return replace(drive, smoothed=replace(drive.smoothed, motion=motion), commands=commands)
 
 
-def undo_measurement(motion: MotionTrack, commands: CommandTrack, effects: Effects) -> tuple[MotionTrack, CommandTrack]:
+def correct_measurements(
+    motion: MotionTrack, commands: CommandTrack, effects: Effects
+) -> tuple[MotionTrack, CommandTrack]:
     """The record without what measurement effects did to it: each is its own inverse with the opposite sign."""
     return corrected_motion(motion, effects), corrected_commands(commands, effects)
 
@@ -140,7 +140,7 @@ class Predictions:
         data: the drive.
     """
 
-    def __init__(self, robot: RobotModel, data: DriveData):
+    def __init__(self, robot: RobotModel, data: EvidenceWindows):
         self.data = data
         self.options = PhysicsOptions()
         if data.terrain is None:
@@ -180,7 +180,7 @@ class Predictions:
         if key not in self._prepared:
             if len(self._prepared) > 40:
                 self._prepared.clear()
-            motion, commands = undo_measurement(
+            motion, commands = correct_measurements(
                 self.data.motion, self.data.commands, tuple((name, dict(values)) for name, values in key)
             )
             self._prepared[key] = self._prepare(motion, commands)

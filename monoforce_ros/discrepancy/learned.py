@@ -10,7 +10,7 @@ import numpy as np
 
 from monoforce_ros.discrepancy.fit import OUTLIER, flat, with_values
 from monoforce_ros.discrepancy.hypothesis import Effects, Predictions
-from monoforce_ros.physics.effects import CATALOGUE
+from monoforce_ros.effects import CATALOGUE
 
 LEARNED = "learned_term"
 _STEP = 0.02

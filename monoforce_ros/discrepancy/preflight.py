@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from monoforce_ros.bags import SmoothedMotion
+from monoforce_ros.core import CommandTrack
 from monoforce_ros.discrepancy.selection import EQUIVALENT
-from monoforce_ros.motion import CommandTrack
 
 FEWEST_WINDOWS = 12
 

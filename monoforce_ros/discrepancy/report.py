@@ -7,6 +7,7 @@ import html
 import json
 from pathlib import Path
 
+from monoforce_ros.core import write_text
 from monoforce_ros.discrepancy.diagnosis import Diagnosis
 from monoforce_ros.discrepancy.figures import (
     candidates_figure,
@@ -16,8 +17,8 @@ from monoforce_ros.discrepancy.figures import (
     regime_figure,
     timeline_figure,
 )
-from monoforce_ros.evaluation.report import PAGE_STYLE, figure_png, write_text
-from monoforce_ros.physics.effects import CATALOGUE
+from monoforce_ros.effects import CATALOGUE
+from monoforce_ros.reporting import PAGE_STYLE, figure_png
 
 _VERDICTS = {
     "effect_found": ("Something is missing in the model, and it was named.", "#0b6e4f"),

@@ -14,9 +14,9 @@ import numpy as np
 from scipy.stats import wilcoxon
 
 from monoforce_ros.discrepancy.fit import Fit, first_values, fit_effects, robust, without
-from monoforce_ros.discrepancy.hypothesis import DriveData, Effects, Predictions
+from monoforce_ros.discrepancy.hypothesis import Effects, EvidenceWindows, Predictions
 from monoforce_ros.discrepancy.learned import learned_terms
-from monoforce_ros.physics.effects import CATALOGUE
+from monoforce_ros.effects import CATALOGUE
 from monoforce_ros.robots import RobotModel
 
 CANDIDATES: tuple[tuple[str, tuple[str, ...]], ...] = (
@@ -71,7 +71,7 @@ class Trial:
     """By the fit to the part of the drive that explains the rest best."""
     parts: tuple[Effects, ...]
     """Fits with each fold left out."""
-    unseen: np.ndarray
+    held_out_loss: np.ndarray
     """Loss of each window by the fit that did not see it, ``[W]``."""
 
     @property
@@ -82,7 +82,7 @@ class Trial:
     @property
     def loss(self) -> float:
         """Mean over windows."""
-        return float(self.unseen.mean())
+        return float(self.held_out_loss.mean())
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class Search:
     def __init__(
         self,
         robot: RobotModel,
-        data: DriveData,
+        data: EvidenceWindows,
         scale: np.ndarray,
         *,
         known: Effects = (),
@@ -234,7 +234,7 @@ class Search:
             predictions = Predictions(self.robot, replace(self.data, starts=starts[part]))
             held = self._held(trial.effects)
             fit = fit_effects(predictions, [trial.effects], self.scale, iterations=4, free=held)
-            gain += float(trial.unseen[part].sum() - fit.loss.sum()) / len(starts)
+            gain += float(trial.held_out_loss[part].sum() - fit.loss.sum()) / len(starts)
             fits.append(fit.effects)
         return gain, fits
 
@@ -244,14 +244,14 @@ class Search:
 
     def judge(self, effects: Effects, iterations: int = 4) -> Trial:
         """Fit on every fold's complement and judge on the fold."""
-        unseen = np.zeros(len(self.data.starts))
+        held_out_loss = np.zeros(len(self.data.starts))
         parts, losses = [], []
         for seen, other, where in self._split:
             fit = fit_effects(seen, [effects], self.scale, iterations=iterations, free=self._held(effects))
-            unseen[where] = robust(other.residuals([fit.effects])[0] / self.scale)
+            held_out_loss[where] = robust(other.residuals([fit.effects])[0] / self.scale)
             parts.append(fit.effects)
-            losses.append(float(fit.loss.mean()) + float(unseen[where].mean()))
-        return Trial(parts[int(np.argmin(losses))], tuple(parts), unseen)
+            losses.append(float(fit.loss.mean()) + float(held_out_loss[where].mean()))
+        return Trial(parts[int(np.argmin(losses))], tuple(parts), held_out_loss)
 
     def refit(self, effects: Effects) -> Fit:
         """Fit to the whole drive."""
@@ -304,7 +304,7 @@ class Search:
         return sorted(judged, key=lambda trial: trial.loss), listed
 
     def _gain(self, before: Trial, after: Trial) -> tuple[float, float, float]:
-        return paired(before.unseen, after.unseen, self.data.starts)
+        return paired(before.held_out_loss, after.held_out_loss, self.data.starts)
 
     def _pays(self, before: Trial, after: Trial, nominal: Trial) -> bool:
         gain, low, chance = self._gain(before, after)

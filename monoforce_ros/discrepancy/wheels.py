@@ -8,8 +8,8 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
+from monoforce_ros.core import CommandTrack, WheelTrack
 from monoforce_ros.discrepancy.hypothesis import Effects
-from monoforce_ros.motion import CommandTrack, WheelTrack
 from monoforce_ros.robots import RobotModel
 
 _STEP = 0.02

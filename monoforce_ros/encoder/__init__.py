@@ -1,18 +1,13 @@
 """Terrain encoder: camera images → terrain map by lift, splat, shoot (paper III-A); and the lidar's network."""
 
-from monoforce_ros.encoder.checkpoint import (
-    CheckpointError,
-    Encoder,
-    averaged,
-    load_encoder,
-    new_encoder,
-    save_encoder,
-)
+from monoforce_ros.encoder.backbone import WeightsError
+from monoforce_ros.encoder.checkpoint import CheckpointError, Encoder, averaged, load_encoder, new_encoder, save_encoder
 from monoforce_ros.encoder.config import EncoderConfig
 from monoforce_ros.encoder.inference import fused, packed
 from monoforce_ros.encoder.lidar_encoder import LidarEncoder
+from monoforce_ros.encoder.lift import feature_rays
 from monoforce_ros.encoder.terrain_encoder import EncodedMaps, TerrainEncoder
-from monoforce_ros.encoder.view import CameraView, EncoderInput, encoder_input
+from monoforce_ros.encoder.view import CameraView, EncoderInput, assemble, encoder_input, network_image
 
 __all__ = [
     "CameraView",
@@ -23,10 +18,14 @@ __all__ = [
     "EncoderInput",
     "LidarEncoder",
     "TerrainEncoder",
+    "WeightsError",
+    "assemble",
     "averaged",
     "encoder_input",
+    "feature_rays",
     "fused",
     "load_encoder",
+    "network_image",
     "new_encoder",
     "packed",
     "save_encoder",

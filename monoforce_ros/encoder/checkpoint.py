@@ -12,10 +12,10 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
+from monoforce_ros.core import share_directory
 from monoforce_ros.encoder.config import EncoderConfig
 from monoforce_ros.encoder.lidar_encoder import LidarEncoder
 from monoforce_ros.encoder.terrain_encoder import TerrainEncoder
-from monoforce_ros.shared_files import share_directory
 
 Encoder = TerrainEncoder | LidarEncoder
 

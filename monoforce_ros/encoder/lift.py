@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from monoforce_ros.camera import CameraModel
+from monoforce_ros.core import CameraModel
 from monoforce_ros.encoder.config import EncoderConfig
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from monoforce_ros.camera import CameraModel
+from monoforce_ros.core import CameraModel
 from monoforce_ros.encoder.config import EncoderConfig
 from monoforce_ros.encoder.lift import feature_rays
 from monoforce_ros.terrain import Grid

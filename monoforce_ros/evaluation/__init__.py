@@ -1,5 +1,8 @@
 """How good predictions are: metrics, baselines, figures and reports over recorded drives."""
 
-from monoforce_ros.evaluation.drive import DriveEvaluation, evaluate_drive
+from monoforce_ros.evaluation.recording_evaluation import RecordingEvaluation, evaluate_recording
 
-__all__ = ["DriveEvaluation", "evaluate_drive"]
+__all__ = [
+    "RecordingEvaluation",
+    "evaluate_recording",
+]

@@ -9,10 +9,21 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from monoforce_ros.bags import BagError, BagReader, Recording, SmoothedMotion, smooth
-from monoforce_ros.bags.recording import CAMERA_INFO, CLOUD, COMMANDS, IMAGES, ODOMETRY, camera_info_topic
+from monoforce_ros.bags import (
+    CAMERA_INFO,
+    CLOUD,
+    COMMANDS,
+    IMAGES,
+    ODOMETRY,
+    BagError,
+    BagReader,
+    Recording,
+    SmoothedMotion,
+    camera_info_topic,
+    smooth,
+)
+from monoforce_ros.core import CommandTrack, MotionTrack
 from monoforce_ros.messages import decoding
-from monoforce_ros.motion import CommandTrack, MotionTrack
 from monoforce_ros.robots import RobotModel
 
 IMU, JOINTS = "sensor_msgs/msg/Imu", "sensor_msgs/msg/JointState"

@@ -11,24 +11,26 @@ import numpy as np
 import torch
 
 from monoforce_ros.bags import BagError, Recording
+from monoforce_ros.core import share_directory
+from monoforce_ros.effects import EffectError
 from monoforce_ros.encoder import CheckpointError
 from monoforce_ros.evaluation import figures
 from monoforce_ros.evaluation.check import check_bag, check_text
-from monoforce_ros.evaluation.drive import (
+from monoforce_ros.evaluation.recording_evaluation import (
     CONSTANT_VELOCITY,
     PHYSICS,
     EvaluationError,
-    evaluate_drive,
+    evaluate_recording,
     predict_at,
 )
-from monoforce_ros.evaluation.report import figure_png, terminal_table, write_reports
+from monoforce_ros.evaluation.report import terminal_table, write_reports
 from monoforce_ros.evaluation.view import PredictionView
-from monoforce_ros.messages.decoding import MessageError
+from monoforce_ros.messages import MessageError
+from monoforce_ros.perception import SOURCES, choose_terrain_source
 from monoforce_ros.physics import PhysicsOptions
-from monoforce_ros.physics.effects import EffectError
-from monoforce_ros.prediction import SOURCES, Predictor, choose_terrain_source
+from monoforce_ros.prediction import Predictor
+from monoforce_ros.reporting import figure_png
 from monoforce_ros.robots import RobotFileError, RobotModel, load_robot, shipped_robots
-from monoforce_ros.shared_files import share_directory
 from monoforce_ros.terrain import TerrainDefaults
 
 
@@ -116,7 +118,7 @@ def run(options: argparse.Namespace) -> None:
     )
     predictor = Predictor(robot, source, horizon=max(options.horizons), options=PhysicsOptions())
     topics = tuple(options.images or recording.images) if "camera" in source.sensors else ()
-    evaluation = evaluate_drive(
+    evaluation = evaluate_recording(
         recording,
         predictor,
         image_topics=topics,

@@ -12,11 +12,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from matplotlib.patheffects import withStroke
 
-from monoforce_ros.camera import CameraModel
-from monoforce_ros.evaluation.drive import CONSTANT_VELOCITY, FLAT_PHYSICS, PHYSICS, DriveEvaluation
+from monoforce_ros.core import CameraModel, transform_points
 from monoforce_ros.evaluation.overlay import SURFACE_COLOURS, draw_prediction
+from monoforce_ros.evaluation.recording_evaluation import CONSTANT_VELOCITY, FLAT_PHYSICS, PHYSICS, RecordingEvaluation
 from monoforce_ros.evaluation.view import PredictionView
-from monoforce_ros.motion import transform_points
 from monoforce_ros.robots import RobotModel
 
 COLOURS = {PHYSICS: "#0b84a5", FLAT_PHYSICS: "#9b59b6", CONSTANT_VELOCITY: "#e08214", "measured": "#1a1a1a"}
@@ -188,7 +187,7 @@ def _draw_forces(axes: Axes, view: PredictionView) -> None:
     )
 
 
-def error_figure(evaluation: DriveEvaluation) -> Figure:
+def error_figure(evaluation: RecordingEvaluation) -> Figure:
     """Position and rotation error against the horizon: median and middle half of the windows, per method."""
     figure = Figure(figsize=(11, 3.8), layout="constrained", dpi=110)
     axes = figure.subplots(1, 2)
@@ -213,7 +212,7 @@ def error_figure(evaluation: DriveEvaluation) -> Figure:
     return figure
 
 
-def drive_figure(evaluation: DriveEvaluation, track: np.ndarray, *, most: int = 12) -> Figure:
+def drive_figure(evaluation: RecordingEvaluation, track: np.ndarray, *, most: int = 12) -> Figure:
     """The measured drive from above with some of the predictions that were made along it.
 
     Args:

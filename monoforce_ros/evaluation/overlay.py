@@ -6,9 +6,8 @@ import cv2
 import numpy as np
 from matplotlib import colormaps
 
-from monoforce_ros.camera import CameraModel
+from monoforce_ros.core import CameraModel, transform_points
 from monoforce_ros.evaluation.view import PredictionView
-from monoforce_ros.motion import transform_points
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import TerrainMap
 

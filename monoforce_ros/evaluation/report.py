@@ -4,44 +4,24 @@ from __future__ import annotations
 
 import base64
 import html
-import io
 import json
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from matplotlib.figure import Figure
-
-from monoforce_ros.evaluation.drive import DriveEvaluation
+from monoforce_ros.core import write_text
 from monoforce_ros.evaluation.metrics import Summary
-
-PAGE_STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; color: #1c2733; background: #f5f7f8; margin: 0; }
-main { max-width: 1120px; margin: 0 auto; padding: 32px 24px 64px; }
-h1 { font-size: 26px; margin: 0 0 4px; } h2 { font-size: 18px; margin: 36px 0 10px; }
-p.lead { color: #51606e; margin: 0 0 20px; max-width: 80ch; }
-section.card { background: white; border-radius: 10px; padding: 18px 22px; margin: 18px 0;
-  box-shadow: 0 1px 3px #0002; }
-img { max-width: 100%; display: block; margin: 0 auto; }
-table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }
-th, td { padding: 6px 10px; text-align: right; border-bottom: 1px solid #e3e8ec; white-space: nowrap; }
-th:first-child, td:first-child { text-align: left; }
-td.best { font-weight: 700; color: #0b6e4f; }
-small, .muted { color: #6b7a88; }
-details { margin-top: 12px; } summary { cursor: pointer; }
-dl { display: grid; grid-template-columns: max-content 1fr; gap: 2px 18px; margin: 0; }
-dt { color: #6b7a88; } dd { margin: 0; overflow-wrap: anywhere; }
-"""
+from monoforce_ros.evaluation.recording_evaluation import RecordingEvaluation
+from monoforce_ros.reporting import PAGE_STYLE
 
 
-def summary_table(evaluation: DriveEvaluation) -> dict[str, dict[float, tuple[Summary, Summary]]]:
+def summary_table(evaluation: RecordingEvaluation) -> dict[str, dict[float, tuple[Summary, Summary]]]:
     """Summary of every method at every horizon."""
     return {method: evaluation.summary(method) for method in evaluation.predicted}
 
 
-def terminal_table(evaluation: DriveEvaluation) -> str:
+def terminal_table(evaluation: RecordingEvaluation) -> str:
     """A short table of median errors at the horizons."""
     heads = [f"Δx {h:g} s [m]" for h in evaluation.horizons] + [f"ΔR {h:g} s [deg]" for h in evaluation.horizons]
     width = max(len(method) for method in evaluation.predicted) + 2
@@ -55,7 +35,7 @@ def terminal_table(evaluation: DriveEvaluation) -> str:
     return "\n".join(lines)
 
 
-def report_content(evaluation: DriveEvaluation, settings: dict[str, object]) -> dict[str, object]:
+def report_content(evaluation: RecordingEvaluation, settings: dict[str, object]) -> dict[str, object]:
     """The content of ``report.json``; numbers that do not exist are null."""
     methods = {
         method: {
@@ -82,43 +62,9 @@ def _numbers(values: dict) -> dict:
     }
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write a file beside its target and rename it, so that a reader never meets half of it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.name}.unfinished-{os.getpid()}")
-    try:
-        unfinished.write_text(text, encoding="utf-8")
-        unfinished.rename(path)
-    except OSError:
-        # A full disk: what was there stays, and what could not be finished does not fill it further.
-        unfinished.unlink(missing_ok=True)
-        raise
-
-
-def write_between(document: Path, name: str, text: str) -> None:
-    """Put a text into a document, between its comments ``<!-- NAME -->`` and ``<!-- end of NAME -->``.
-
-    Raises:
-        ValueError: the document has no such comments.
-    """
-    content = document.read_text(encoding="utf-8")
-    begin, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
-    if begin not in content or end not in content:
-        raise ValueError(f"{document}: no {begin} and {end} to write between")
-    before, _, rest = content.partition(begin)
-    write_text(document, f"{before}{begin}\n{text.strip()}\n{end}{rest.partition(end)[2]}")
-
-
-def figure_png(figure: Figure) -> bytes:
-    """A figure as PNG."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
-    return buffer.getvalue()
-
-
 def write_reports(
     folder: Path,
-    evaluation: DriveEvaluation,
+    evaluation: RecordingEvaluation,
     settings: dict[str, object],
     figures: Sequence[tuple[str, str, bytes]],
 ) -> tuple[Path, Path]:
@@ -139,7 +85,9 @@ def write_reports(
     return folder / "report.json", folder / "report.html"
 
 
-def _page(evaluation: DriveEvaluation, settings: dict[str, object], figures: Sequence[tuple[str, str, bytes]]) -> str:
+def _page(
+    evaluation: RecordingEvaluation, settings: dict[str, object], figures: Sequence[tuple[str, str, bytes]]
+) -> str:
     pictures = "".join(
         f'<section class="card"><h2 style="margin-top:0">{html.escape(heading)}</h2>'
         f'<p class="muted">{html.escape(caption)}</p>'
@@ -166,7 +114,7 @@ def _page(evaluation: DriveEvaluation, settings: dict[str, object], figures: Seq
     )
 
 
-def _table(evaluation: DriveEvaluation) -> str:
+def _table(evaluation: RecordingEvaluation) -> str:
     rows = summary_table(evaluation)
     columns = [(part, h) for part in (0, 1) for h in evaluation.horizons]
     best = {}

@@ -10,10 +10,16 @@ import numpy as np
 
 from monoforce_ros.bags import Recording
 from monoforce_ros.encoder import fused, load_encoder
-from monoforce_ros.evaluation.drive import CONSTANT_VELOCITY, FLAT_PHYSICS, PHYSICS, DriveEvaluation, evaluate_drive
 from monoforce_ros.evaluation.metrics import Poses, position_errors, rotation_errors
-from monoforce_ros.prediction import CameraTerrain, LidarNetworkTerrain, Predictor, choose_terrain_source
-from monoforce_ros.prediction.terrain_sources import TerrainSource
+from monoforce_ros.evaluation.recording_evaluation import (
+    CONSTANT_VELOCITY,
+    FLAT_PHYSICS,
+    PHYSICS,
+    RecordingEvaluation,
+    evaluate_recording,
+)
+from monoforce_ros.perception import CameraTerrain, LidarNetworkTerrain, TerrainSource, choose_terrain_source
+from monoforce_ros.prediction import Predictor
 from monoforce_ros.robots import RobotModel
 
 HORIZON = 5.0
@@ -70,13 +76,13 @@ def evaluate_sequence(bag: Path, robot: RobotModel, systems: Sequence[System]) -
         BagError, CheckpointError, EvaluationError: the bag or a checkpoint cannot be used.
     """
     recording = Recording.open(bag)
-    poses: dict[str, DriveEvaluation] = {}
+    poses: dict[str, RecordingEvaluation] = {}
     for system in systems:
         if system.key in (FLAT.key, CONSTANT.key):
             continue
         source = terrain_source(system, robot)
         topics = tuple(recording.images) if "camera" in source.sensors else ()
-        poses[system.key] = evaluate_drive(
+        poses[system.key] = evaluate_recording(
             recording, Predictor(robot, source, horizon=HORIZON), image_topics=topics,
             horizons=(HORIZON,), stride=STRIDE, progress=False, shortest=1.0,
         )  # fmt: skip
@@ -103,7 +109,7 @@ def terrain_source(system: System, robot: RobotModel) -> TerrainSource:
     return CameraTerrain(encoder, robot)
 
 
-def _sequence(name: str, evaluation: DriveEvaluation, method: str, chosen: np.ndarray) -> SequenceErrors:
+def _sequence(name: str, evaluation: RecordingEvaluation, method: str, chosen: np.ndarray) -> SequenceErrors:
     measured = Poses(evaluation.measured.positions[chosen], evaluation.measured.rotations[chosen])
     predicted = evaluation.predicted[method]
     predicted = Poses(predicted.positions[chosen], predicted.rotations[chosen])

@@ -14,11 +14,12 @@ import torch
 from tqdm import tqdm
 
 from monoforce_ros.bags import BagError
+from monoforce_ros.core import write_text
 from monoforce_ros.encoder import CheckpointError
-from monoforce_ros.evaluation.drive import EvaluationError
-from monoforce_ros.evaluation.report import write_between, write_text
+from monoforce_ros.evaluation.recording_evaluation import EvaluationError
 from monoforce_ros.evaluation.tables import CONSTANT, FLAT, LIDAR, SequenceErrors, System, evaluate_sequence
 from monoforce_ros.evaluation.tables_report import comparison, markdown, page
+from monoforce_ros.reporting import write_between
 from monoforce_ros.robots import RobotFileError, load_robot, shipped_robots
 
 LEARNED = {

@@ -11,8 +11,8 @@ from dataclasses import asdict
 import numpy as np
 from matplotlib.figure import Figure
 
-from monoforce_ros.evaluation.report import PAGE_STYLE, figure_png
 from monoforce_ros.evaluation.tables import SequenceErrors, System, mean_over, ratio_over
+from monoforce_ros.reporting import PAGE_STYLE, figure_png
 
 GROUNDS = {"rigid": "Rigid ground (as the paper's Table I)", "grass": "Tall grass (as the paper's Table II)"}
 METRICS = {"position": ("Δx", "m", 3), "rotation": ("ΔR", "deg", 2)}

@@ -10,10 +10,9 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from monoforce_ros.messages.decoding import MessageError, stamp_of
-from monoforce_ros.messages.prediction import FORCE_LENGTH, contact_points, force_steps, usable_steps
-from monoforce_ros.motion import MotionState, transform_points
-from monoforce_ros.prediction import Prediction
+from monoforce_ros.core import MotionState, transform_points
+from monoforce_ros.messages import MessageError, stamp_of
+from monoforce_ros.prediction import FORCE_LENGTH, Prediction, contact_points, force_steps, usable_steps
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import Grid, TerrainMap
 

@@ -1,1 +1,15 @@
 """Arrays ↔ ROS messages. Decoders take messages of rclpy and of bags alike: both have the same attributes."""
+
+from monoforce_ros.messages import decoding, encoding
+from monoforce_ros.messages.cdr import CdrWriter
+from monoforce_ros.messages.decoding import MessageError, stamp_of
+from monoforce_ros.messages.message_types import message_class
+
+__all__ = [
+    "CdrWriter",
+    "MessageError",
+    "decoding",
+    "encoding",
+    "message_class",
+    "stamp_of",
+]

@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from monoforce_ros.camera import CameraModel
-from monoforce_ros.motion import MotionState
+from monoforce_ros.core import CameraModel, MotionState
 
 MAXIMUM_IMAGE_PIXELS = 64_000_000
 MAXIMUM_CLOUD_POINTS = 8_000_000

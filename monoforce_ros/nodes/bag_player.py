@@ -17,8 +17,8 @@ from rosgraph_msgs.msg import Clock
 from tqdm import tqdm
 
 from monoforce_ros.bags import BagError, BagReader
-from monoforce_ros.messages.message_types import message_class
-from monoforce_ros.shared_files import share_directory
+from monoforce_ros.core import share_directory
+from monoforce_ros.messages import message_class
 
 # Fast DDS 2 (Jazzy) reads the first, Fast DDS 3 the second.
 _PROFILES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")

@@ -13,7 +13,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.utilities import remove_ros_args
 
 from monoforce_ros.bags import BagWriter
-from monoforce_ros.messages.message_types import message_class
+from monoforce_ros.messages import message_class
 
 
 def _arguments(arguments: list[str]) -> argparse.Namespace:

@@ -14,14 +14,22 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Float32MultiArray
 from visualization_msgs.msg import MarkerArray
 
-from monoforce_ros.messages import decoding
-from monoforce_ros.messages import planning as messages
-from monoforce_ros.messages.message_types import message_class
-from monoforce_ros.motion import CommandTrack
+from monoforce_ros.core import CommandTrack
+from monoforce_ros.messages import decoding, message_class
+from monoforce_ros.nodes import candidate_messages as messages
 from monoforce_ros.nodes.health import ERROR, OK, WARN, Health
-from monoforce_ros.planning import CandidateSettings, CostWeights, Limits, assess, fan_of_arcs, occupancy, refine
-from monoforce_ros.planning.candidates import over_horizon
-from monoforce_ros.planning.costs import TERMS, force_every
+from monoforce_ros.planning import (
+    TERMS,
+    CandidateSettings,
+    CostWeights,
+    Limits,
+    assess,
+    fan_of_arcs,
+    force_every,
+    occupancy,
+    over_horizon,
+    refine,
+)
 from monoforce_ros.prediction import Prediction, Predictor
 from monoforce_ros.robots import load_robot
 

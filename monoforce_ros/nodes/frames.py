@@ -7,7 +7,7 @@ from rclpy.node import Node
 from rclpy.time import Time
 from scipy.spatial.transform import Rotation
 
-from monoforce_ros.messages.decoding import MessageError
+from monoforce_ros.messages import MessageError
 from monoforce_ros.robots import RobotModel
 
 

@@ -6,11 +6,10 @@ import numpy as np
 from rclpy.node import Node
 from std_msgs.msg import Float32MultiArray
 
-from monoforce_ros.messages import planning as messages
-from monoforce_ros.motion import CommandTrack, MotionTrack
+from monoforce_ros.core import CommandTrack, MotionTrack
+from monoforce_ros.nodes import candidate_messages as messages
 from monoforce_ros.nodes.health import OK, WARN, Health
-from monoforce_ros.prediction import Prediction, Predictor
-from monoforce_ros.prediction.live_gap import HORIZONS, GapSummary, LiveGap
+from monoforce_ros.prediction import HORIZONS, GapSummary, LiveGap, Prediction, Predictor
 
 PART = "live gap"
 

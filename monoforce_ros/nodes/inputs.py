@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from monoforce_ros.motion import NANOSECOND, CommandTrack, MotionState, MotionTrack, quaternions
+from monoforce_ros.core import NANOSECOND, CommandTrack, MotionState, MotionTrack, quaternions
 
 MEMORY = 10_000_000_000
 """How long motion and commands are remembered [ns]."""

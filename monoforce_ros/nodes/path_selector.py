@@ -12,13 +12,12 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import PointCloud2
 
+from monoforce_ros.core import NANOSECOND, MotionState, share_directory
 from monoforce_ros.messages import decoding
-from monoforce_ros.motion import NANOSECOND, MotionState
 from monoforce_ros.nodes.health import ERROR, OK, WARN, Health
 from monoforce_ros.nodes.parameters import declare_parameters, parameter_help, read_parameter_file
 from monoforce_ros.nodes.process import run_node
-from monoforce_ros.shared_files import share_directory
-from monoforce_ros.steering import ChoiceWeights, WayToGoal, choose, way_to_goal
+from monoforce_ros.planning import CostToGo, SelectionWeights, cost_to_go, select_candidate
 
 PARAMETER_FILE = share_directory() / "config" / "path_selector.yaml"
 PART = "choice"
@@ -30,7 +29,7 @@ class PathSelectorNode(Node):
     def __init__(self):
         super().__init__("path_selector")
         self.settings = settings = declare_parameters(self, read_parameter_file(PARAMETER_FILE))
-        self.weights = ChoiceWeights(
+        self.weights = SelectionWeights(
             settings.weight_cost,
             settings.weight_distance,
             settings.weight_heading,
@@ -45,7 +44,7 @@ class PathSelectorNode(Node):
         self._moving = False
         self._told = (0.0, 0.0)
         self._map: tuple[np.ndarray, float, np.ndarray] | None = None
-        self._ways: WayToGoal | None = None
+        self._ways: CostToGo | None = None
         self._commands = self.create_publisher(TwistStamped, settings.command_topic, 10)
         newest = QoSProfile(depth=1)
         self._inputs = (
@@ -124,8 +123,8 @@ class PathSelectorNode(Node):
             return self._stopped(f"candidates are {age:.2f} s old, at most {self.settings.timeout:g} s count", "late")
         try:
             if self._ways is None and self._map is not None:
-                self._ways = way_to_goal(*self._map, goal, radius=self.settings.robot_radius)
-            best = choose(fields, self._motion.position[:2], goal, self.weights, self._ways, self._told)
+                self._ways = cost_to_go(*self._map, goal, radius=self.settings.robot_radius)
+            best = select_candidate(fields, self._motion.position[:2], goal, self.weights, self._ways, self._told)
         except ValueError as error:
             return self._stopped(str(error), "fields")
         if best is None:

@@ -16,29 +16,27 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from visualization_msgs.msg import MarkerArray
 
-from monoforce_ros.bags.recording import camera_info_topic
-from monoforce_ros.camera import CameraModel
+from monoforce_ros.bags import camera_info_topic
+from monoforce_ros.core import NANOSECOND, CameraModel, CommandTrack, MotionTrack, share_directory, transform_points
+from monoforce_ros.effects import corrected_commands, corrected_motion
 from monoforce_ros.messages import decoding
-from monoforce_ros.messages import prediction as encoders
-from monoforce_ros.motion import NANOSECOND, CommandTrack, MotionTrack, transform_points
-from monoforce_ros.nodes.beside import Beside
+from monoforce_ros.nodes import prediction_messages as encoders
+from monoforce_ros.nodes.background_worker import BackgroundWorker
 from monoforce_ros.nodes.candidate_output import CandidateOutput
 from monoforce_ros.nodes.frames import SensorFrames
 from monoforce_ros.nodes.gap_output import GapOutput
 from monoforce_ros.nodes.health import ERROR, OK, STALE, WARN, Health
 from monoforce_ros.nodes.inputs import Inputs, Received
 from monoforce_ros.nodes.managed import ManagedNode
-from monoforce_ros.nodes.pace import Pace
 from monoforce_ros.nodes.parameters import declare_parameters, follow_changes, parameter_help, read_parameter_file
 from monoforce_ros.nodes.process import run_node
+from monoforce_ros.nodes.rate_limiter import RateLimiter
 from monoforce_ros.nodes.spread_output import SpreadOutput
 from monoforce_ros.nodes.subscriptions import AdaptiveSubscription
+from monoforce_ros.perception import Observation, TerrainSource, choose_terrain_source
 from monoforce_ros.physics import PhysicsOptions
-from monoforce_ros.physics.effects import corrected_commands, corrected_motion
-from monoforce_ros.prediction import Observation, Prediction, Predictor, choose_terrain_source
-from monoforce_ros.prediction.terrain_sources import TerrainSource
+from monoforce_ros.prediction import Prediction, Predictor
 from monoforce_ros.robots import load_robot
-from monoforce_ros.shared_files import share_directory
 from monoforce_ros.terrain import Grid, TerrainDefaults
 
 PARAMETER_FILE = share_directory() / "config" / "predictor.yaml"
@@ -53,7 +51,7 @@ class PredictorNode(ManagedNode):
         self.settings = declare_parameters(self, entries)
         self.candidates: CandidateOutput | None = None
         self.spread: SpreadOutput | None = None
-        self._beside: Beside | None = None
+        self._beside: BackgroundWorker | None = None
         follow_changes(self, entries, self._change_settings)
         if self.settings.autostart:
             self.autostart()
@@ -112,7 +110,9 @@ class PredictorNode(ManagedNode):
         self._watch = self.create_timer(0.5, self._watch_inputs)
         self._running = True
         compares = self.candidates is not None or self.spread is not None
-        self._beside = Beside("comparison", self._compare, self.settings.comparison_niceness) if compares else None
+        self._beside = (
+            BackgroundWorker("comparison", self._compare, self.settings.comparison_niceness) if compares else None
+        )
         self._worker = threading.Thread(target=self._work, name="prediction", daemon=True)
         self._worker.start()
         settings = self.settings
@@ -289,7 +289,7 @@ class PredictorNode(ManagedNode):
     # The worker: one prediction after the other, always from the newest data.
 
     def _work(self) -> None:
-        pace = Pace()
+        pace = RateLimiter()
         last = 0
         while self._running:
             if self.sensor_topics:

@@ -13,13 +13,11 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.utilities import remove_ros_args
 
-from monoforce_ros.bags.types import type_store
-from monoforce_ros.messages import decoding
-from monoforce_ros.messages.message_types import message_class
+from monoforce_ros.bags import type_store
+from monoforce_ros.messages import decoding, message_class
 from monoforce_ros.nodes.process import run_node
 from monoforce_ros.nodes.subscriptions import AdaptiveSubscription
-from monoforce_ros.synthetic.live import LiveSettings, LiveWorld
-from monoforce_ros.synthetic.terrain_shape import GROUNDS
+from monoforce_ros.synthetic import GROUNDS, LiveSettings, LiveWorld
 
 _ODOMETRY_RATE = 50.0
 _TICK = 0.01
@@ -114,9 +112,7 @@ class SimulatorNode(Node):
 
 
 def _settings(options: argparse.Namespace) -> LiveSettings:
-    from monoforce_ros.synthetic.course import CourseSettings
-    from monoforce_ros.synthetic.sensors import CameraSettings, LidarSettings
-    from monoforce_ros.synthetic.terrain_shape import TerrainSettings
+    from monoforce_ros.synthetic import CameraSettings, CourseSettings, LidarSettings, TerrainSettings
 
     return LiveSettings(
         seed=options.seed,

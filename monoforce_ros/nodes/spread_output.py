@@ -10,9 +10,8 @@ from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import MarkerArray
 
-from monoforce_ros.messages import planning as messages
-from monoforce_ros.prediction import Prediction, Predictor
-from monoforce_ros.prediction.uncertainty import EnsembleSettings, spread
+from monoforce_ros.nodes import candidate_messages as messages
+from monoforce_ros.prediction import EnsembleSettings, Prediction, Predictor, spread
 
 
 class SpreadOutput:

@@ -1,8 +1,18 @@
 """Differentiable robot–terrain physics (paper III-B to III-E)."""
 
+from monoforce_ros.physics.lookup import TerrainLookup
 from monoforce_ros.physics.neural_ode import OdeOptions
 from monoforce_ros.physics.options import PhysicsOptions
+from monoforce_ros.physics.rest import rest_depth
 from monoforce_ros.physics.rollout import rollout
 from monoforce_ros.physics.state import Rollout, State
 
-__all__ = ["OdeOptions", "PhysicsOptions", "Rollout", "State", "rollout"]
+__all__ = [
+    "OdeOptions",
+    "PhysicsOptions",
+    "Rollout",
+    "State",
+    "TerrainLookup",
+    "rest_depth",
+    "rollout",
+]

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from monoforce_ros.effects import applied_setup, per_trajectory
 from monoforce_ros.physics.contact_summary import ContactSummary
-from monoforce_ros.physics.effects.catalogue import applied_setup
-from monoforce_ros.physics.effects.effect import per_trajectory
 from monoforce_ros.physics.state import State
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import TerrainMap

@@ -23,7 +23,7 @@ def tilted_gravity(tilt: Tensor, gravity: float) -> Tensor:
 
 
 def features(in_body: Tensor, rotation: Tensor) -> Tensor:
-    """Features ``[B, F]`` (:data:`monoforce_ros.physics.setup.FEATURES`) of the body-frame velocities ``[B, 3, 2]``."""
+    """Features ``[B, F]`` (:data:`monoforce_ros.effects.FEATURES`) of the body-frame velocities ``[B, 3, 2]``."""
     forward, left, rate = in_body[:, 0, 0], in_body[:, 1, 0], in_body[:, 2, 1]
     listed = [torch.ones_like(forward), forward, left, rate]
     listed += [forward * forward.abs(), left * left.abs(), rate * rate.abs(), forward * rate, left * rate]

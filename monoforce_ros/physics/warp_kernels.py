@@ -13,7 +13,7 @@ from typing import Any
 
 import warp as wp
 
-from monoforce_ros.physics.setup import FEATURES
+from monoforce_ros.effects import FEATURES
 
 CONSTANT_LOOKUP, BILINEAR_LOOKUP = 0, 1
 VERTICAL_FORCE, NORMAL_FORCE = 0, 1

@@ -1,19 +1,70 @@
 """What a planner needs: candidate commands, what each would cost the robot, and where it can drive at all."""
 
-from monoforce_ros.planning.candidates import CandidateSettings, fan_of_arcs
-from monoforce_ros.planning.costs import Assessment, CostWeights, Limits, assess
-from monoforce_ros.planning.occupancy import Occupancy, occupancy
-from monoforce_ros.planning.refine import Refinement, refine
+from typing import TYPE_CHECKING
+
+from monoforce_ros.core.lazy import lazy_exports
+
+if TYPE_CHECKING:
+    from monoforce_ros.planning.candidates import CandidateSettings, fan_of_arcs, over_horizon
+    from monoforce_ros.planning.costs import TERMS, Assessment, CostWeights, Limits, assess, force_every
+    from monoforce_ros.planning.goal_planner import CostToGo, cost_to_go
+    from monoforce_ros.planning.occupancy_grid import Occupancy, occupancy
+    from monoforce_ros.planning.refinement import Refinement, refine
+    from monoforce_ros.planning.selection import WAYPOINTS, SelectionWeights, select_candidate
+else:
+    __getattr__ = lazy_exports(
+        __name__,
+        {
+            "candidates": (
+                "CandidateSettings",
+                "fan_of_arcs",
+                "over_horizon",
+            ),
+            "costs": (
+                "Assessment",
+                "CostWeights",
+                "Limits",
+                "TERMS",
+                "assess",
+                "force_every",
+            ),
+            "goal_planner": (
+                "CostToGo",
+                "cost_to_go",
+            ),
+            "occupancy_grid": (
+                "Occupancy",
+                "occupancy",
+            ),
+            "refinement": (
+                "Refinement",
+                "refine",
+            ),
+            "selection": (
+                "SelectionWeights",
+                "WAYPOINTS",
+                "select_candidate",
+            ),
+        },
+    )
 
 __all__ = [
+    "TERMS",
+    "WAYPOINTS",
     "Assessment",
     "CandidateSettings",
+    "CostToGo",
     "CostWeights",
     "Limits",
     "Occupancy",
     "Refinement",
+    "SelectionWeights",
     "assess",
+    "cost_to_go",
     "fan_of_arcs",
+    "force_every",
     "occupancy",
+    "over_horizon",
     "refine",
+    "select_candidate",
 ]

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from monoforce_ros.motion import MotionState, transform_points
+from monoforce_ros.core import MotionState, transform_points
+from monoforce_ros.effects import drive_speeds, turned_effects
+from monoforce_ros.perception import Observation, TerrainSource
 from monoforce_ros.physics import PhysicsOptions, Rollout, State, rollout
-from monoforce_ros.physics.effects import drive_speeds, turned_effects
-from monoforce_ros.prediction.terrain_sources import Observation, TerrainSource
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import Grid, TerrainMap
 

@@ -12,9 +12,9 @@ import torch
 import yaml
 from scipy.spatial.transform import Rotation
 
+from monoforce_ros.core import share_directory
 from monoforce_ros.robots.belt import belt_outline
 from monoforce_ros.robots.robot_model import Flipper, RobotModel
-from monoforce_ros.shared_files import share_directory
 
 MAXIMUM_FILE_BYTES = 1_000_000
 DEFAULT_SPACING = 0.05

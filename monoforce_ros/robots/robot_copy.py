@@ -75,7 +75,7 @@ def write_robot(
     return out
 
 
-def read_leftover(robot: str | Path, samples: Sequence[float]) -> np.ndarray | None:
+def read_nominal_residual(robot: str | Path, samples: Sequence[float]) -> np.ndarray | None:
     """What disagreed on the healthy robot, ``[K, 3]`` [m, m, rad], by its file; None if it was never commissioned.
 
     Raises:

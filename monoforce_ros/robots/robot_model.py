@@ -80,7 +80,7 @@ class RobotModel:
     point_flippers: Tensor | None = None
     """Index of the flipper that each point belongs to, ``[N]`` int64; -1 elsewhere."""
     effects: tuple[tuple[str, Mapping[str, float | Tensor]], ...] = ()
-    """Effects that act on the robot: name and parameter values, see :mod:`monoforce_ros.physics.effects`."""
+    """Effects that act on the robot: name and parameter values, see :mod:`monoforce_ros.effects`."""
     effect_intervals: tuple[tuple[str, Mapping[str, tuple[float, float]]], ...] = ()
     """Between which values parameters of the effects lie (95 %), where that is known."""
 

@@ -55,11 +55,11 @@ def build_parser() -> argparse.ArgumentParser:
         "--hide",
         action="append",
         metavar="NAME[:VALUE|:PARAMETER=VALUE,...]",
-        help="plant a physical effect for `diagnose` to find, as payload:20; may be repeated; `--hide list` lists "
+        help="fault a physical effect for `diagnose` to find, as payload:20; may be repeated; `--hide list` lists "
         "them. The truth goes to OUT.hidden.json and nowhere into the bag",
     )
     hiding.add_argument(
-        "--hide-random", type=int, metavar="SEED", help="plant by lot: nothing, one, two, or one unknown to diagnose"
+        "--hide-random", type=int, metavar="SEED", help="fault by lot: nothing, one, two, or one unknown to diagnose"
     )
     shape = parser.add_mutually_exclusive_group()
     shape.add_argument(
@@ -105,11 +105,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _list_hidden() -> int:
-    from monoforce_ros.synthetic.hidden import PLANTS
+    from monoforce_ros.synthetic.hidden import FAULTS
 
-    for name, plant in sorted(PLANTS.items()):
-        values = ", ".join(f"{p} = {v:g} ({low:g} to {high:g})" for p, (v, low, high) in plant.parameters.items())
-        print(f"{name}: {values}\n    {plant.__doc__.splitlines()[0]}")
+    for name, fault in sorted(FAULTS.items()):
+        values = ", ".join(f"{p} = {v:g} ({low:g} to {high:g})" for p, (v, low, high) in fault.parameters.items())
+        print(f"{name}: {values}\n    {fault.__doc__.splitlines()[0]}")
     return 0
 
 

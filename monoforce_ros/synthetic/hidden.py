@@ -1,4 +1,4 @@
-"""Hidden: which physics is planted in a world, by name or by lot, and the file that keeps the truth."""
+"""Hidden: which physics is injected in a world, by name or by lot, and the file that keeps the truth."""
 
 from __future__ import annotations
 
@@ -10,36 +10,36 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from monoforce_ros.synthetic import plants
-from monoforce_ros.synthetic.plant import Plant
+from monoforce_ros.synthetic import faults
+from monoforce_ros.synthetic.fault import Fault
 from monoforce_ros.synthetic.random_streams import random_stream
 
 
-def _catalogue() -> dict[str, type[Plant]]:
+def _catalogue() -> dict[str, type[Fault]]:
     def snake(name: str) -> str:
         return re.sub(r"(?<!^)(?=[A-Z])", "_", name).lower()
 
-    kinds = [kind for _, kind in inspect.getmembers(plants, inspect.isclass) if issubclass(kind, Plant)]
-    return {snake(kind.__name__): kind for kind in kinds if kind is not Plant}
+    kinds = [kind for _, kind in inspect.getmembers(faults, inspect.isclass) if issubclass(kind, Fault)]
+    return {snake(kind.__name__): kind for kind in kinds if kind is not Fault}
 
 
-PLANTS: dict[str, type[Plant]] = _catalogue()
+FAULTS: dict[str, type[Fault]] = _catalogue()
 """Everything that can be hidden, by name: that of the catalogue's effect where it has one."""
 
 # Chances of a drawn world: nothing hidden, one effect, two, one that the catalogue does not hold.
 _KINDS = (("nothing", 0.2), ("single", 0.45), ("pair", 0.2), ("outsider", 0.15))
 
 
-def parse_hidden(text: str) -> Plant:
-    """The plant of ``NAME``, ``NAME:VALUE`` or ``NAME:PARAMETER=VALUE,PARAMETER=VALUE``.
+def parse_hidden(text: str) -> Fault:
+    """The fault of ``NAME``, ``NAME:VALUE`` or ``NAME:PARAMETER=VALUE,PARAMETER=VALUE``.
 
     Raises:
         ValueError: there is none of that name, no such parameter, or a value is out of range.
     """
     name, _, rest = text.partition(":")
-    if name not in PLANTS:
-        raise ValueError(f"--hide: got {name!r}, expected one of {', '.join(sorted(PLANTS))}")
-    kind = PLANTS[name]
+    if name not in FAULTS:
+        raise ValueError(f"--hide: got {name!r}, expected one of {', '.join(sorted(FAULTS))}")
+    kind = FAULTS[name]
     values = {parameter: default for parameter, (default, _, _) in kind.parameters.items()}
     for number, part in enumerate(filter(None, rest.split(","))):
         parameter, equals, value = part.partition("=")
@@ -59,7 +59,7 @@ def parse_hidden(text: str) -> Plant:
     return kind(**values)
 
 
-def draw_hidden(seed: int, without: Sequence[str] = ()) -> tuple[Plant, ...]:
+def draw_hidden(seed: int, without: Sequence[str] = ()) -> tuple[Fault, ...]:
     """Hidden effects by lot: none, one, two of different names, or one that is not in the catalogue.
 
     Values are spread over the middle of their range about the default.
@@ -71,30 +71,30 @@ def draw_hidden(seed: int, without: Sequence[str] = ()) -> tuple[Plant, ...]:
     random = random_stream(seed, "hidden")
     kind = random.choice([name for name, _ in _KINDS], p=[chance for _, chance in _KINDS])
     count = {"nothing": 0, "pair": 2}.get(kind, 1)
-    names = [n for n, p in sorted(PLANTS.items()) if p.in_catalogue == (kind != "outsider") and n not in without]
+    names = [n for n, p in sorted(FAULTS.items()) if p.in_catalogue == (kind != "outsider") and n not in without]
     drawn = []
     for name in random.choice(names, count, replace=False):
         values = {}
-        for parameter, (default, low, high) in PLANTS[name].parameters.items():
+        for parameter, (default, low, high) in FAULTS[name].parameters.items():
             sign = random.choice([-1.0, 1.0]) if low < 0.0 < high and low == -high else 1.0
             # Parameters that mean nothing at 1 keep their distance from it, the others from 0.
             neutral = 1.0 if parameter in ("gain", "factor", "wheelbase_factor", "strength") else 0.0
             value = neutral + sign * (default - neutral) * random.uniform(0.6, 1.4)
             values[parameter] = float(min(max(value, low), high))
-        drawn.append(PLANTS[name](**values))
+        drawn.append(FAULTS[name](**values))
     return tuple(drawn)
 
 
-def describe(hidden: Sequence[Plant]) -> list[dict]:
-    """Name, parameters and whether the catalogue holds it, of each plant."""
-    names = {kind: name for name, kind in PLANTS.items()}
+def describe(hidden: Sequence[Fault]) -> list[dict]:
+    """Name, parameters and whether the catalogue holds it, of each fault."""
+    names = {kind: name for name, kind in FAULTS.items()}
     return [
         {
-            "name": names[type(plant)],
-            "parameters": {parameter: getattr(plant, parameter) for parameter in plant.parameters},
-            "in_catalogue": plant.in_catalogue,
+            "name": names[type(fault)],
+            "parameters": {parameter: getattr(fault, parameter) for parameter in fault.parameters},
+            "in_catalogue": fault.in_catalogue,
         }
-        for plant in hidden
+        for fault in hidden
     ]
 
 
@@ -103,7 +103,7 @@ def truth_file(bag: Path) -> Path:
     return bag.with_name(f"{bag.name}.hidden.json")
 
 
-def write_truth(bag: Path, hidden: Sequence[Plant], seed: int) -> Path:
+def write_truth(bag: Path, hidden: Sequence[Fault], seed: int) -> Path:
     """Write what is hidden in a bag beside it; returns the file, which appears only when it is complete."""
     target = truth_file(bag)
     unfinished = target.with_name(f".{target.name}.unfinished-{os.getpid()}")

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from monoforce_ros.synthetic.plant import Plant
+from monoforce_ros.synthetic.fault import Fault
 from monoforce_ros.synthetic.simulation import BaseState
 
 
@@ -65,7 +65,7 @@ class OdometrySettings:
 class Odometry:
     """Turns true states into recorded ones."""
 
-    def __init__(self, settings: OdometrySettings, random: np.random.Generator, hidden: Sequence[Plant] = ()):
+    def __init__(self, settings: OdometrySettings, random: np.random.Generator, hidden: Sequence[Fault] = ()):
         self.settings = settings
         self._random, self._hidden = random, hidden
         self._last: np.ndarray | None = None
@@ -80,12 +80,12 @@ class Odometry:
         self._turn += settings.heading_drift * math.sqrt(driven) * float(draw())
         position, rotation = state.position, Rotation.from_quat(state.quaternion)
         linear, angular = state.linear_velocity, state.angular_velocity
-        for plant in self._hidden:
-            arm, yaw = plant.sensor_pose()
+        for fault in self._hidden:
+            arm, yaw = fault.sensor_pose()
             turn = Rotation.from_euler("z", yaw)
             position, linear = position + rotation.apply(arm), linear + np.cross(angular, arm)
             rotation, linear, angular = rotation * turn, turn.inv().apply(linear), turn.inv().apply(angular)
-            angular = angular + np.array([0.0, 0.0, plant.gyro_offset])
+            angular = angular + np.array([0.0, 0.0, fault.gyro_offset])
         drifted = Rotation.from_euler("z", self._turn)
         noise = Rotation.from_rotvec(settings.rotation_noise * draw(3))
         return BaseState(

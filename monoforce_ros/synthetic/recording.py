@@ -15,11 +15,11 @@ from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import BagWriter, builders
 from monoforce_ros.synthetic.command_profile import CommandProfile, make_profile
+from monoforce_ros.synthetic.fault import Fault
+from monoforce_ros.synthetic.faults import VegetationDrag
 from monoforce_ros.synthetic.hidden import write_truth
 from monoforce_ros.synthetic.labels import world_labels, write_labels
 from monoforce_ros.synthetic.odometry import Odometry, OdometrySettings
-from monoforce_ros.synthetic.plant import Plant
-from monoforce_ros.synthetic.plants import VegetationDrag
 from monoforce_ros.synthetic.random_streams import DEFAULT_SEED, random_stream
 from monoforce_ros.synthetic.scenery import Scenery, build_scenery
 from monoforce_ros.synthetic.sensors import Camera, CameraSettings, Imu, ImuSettings, Lidar, LidarSettings, encode_jpeg
@@ -60,7 +60,7 @@ class RecordingSettings:
         lidar: settings, or None to record no clouds.
         imu: settings.
         odometry: settings.
-        hidden: physics planted for a workflow to find; the truth goes to a file beside the bag, and nowhere into it.
+        hidden: physics injected for a workflow to find; the truth goes to a file beside the bag, and nowhere into it.
         storage: ``mcap`` or ``sqlite3``.
         labels: write the world's truth beside the bag.
         overwrite: replace an existing bag.
@@ -76,7 +76,7 @@ class RecordingSettings:
     imu: ImuSettings = field(default_factory=ImuSettings)
     cameras: int | None = None
     odometry: OdometrySettings = field(default_factory=OdometrySettings)
-    hidden: tuple[Plant, ...] | None = None
+    hidden: tuple[Fault, ...] | None = None
     storage: str = "mcap"
     labels: bool = False
     overwrite: bool = False
@@ -164,9 +164,9 @@ class _Drive:
         model = build_model(scenery, robot, settings.seed, view, hidden)
         self.simulation = Simulation(model, scenery, robot, hidden)
         self._odometry = Odometry(settings.odometry, random_stream(settings.seed, "odometry"), hidden)
-        self._command_offset = round(1e9 * sum(plant.command_stamp_offset for plant in hidden))
-        self._pose_offset = round(1e9 * sum(plant.pose_stamp_offset for plant in hidden))
-        self._gyro_offset = np.array([0.0, 0.0, sum(plant.gyro_offset for plant in hidden)])
+        self._command_offset = round(1e9 * sum(fault.command_stamp_offset for fault in hidden))
+        self._pose_offset = round(1e9 * sum(fault.pose_stamp_offset for fault in hidden))
+        self._gyro_offset = np.array([0.0, 0.0, sum(fault.gyro_offset for fault in hidden)])
         # Clouds and images are made in other threads; what follows them waits, so that the bag is in order.
         self._workers = ThreadPoolExecutor(2, thread_name_prefix="recording")
         self._outbox: deque[tuple[str, int, object]] = deque()

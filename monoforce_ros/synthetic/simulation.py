@@ -11,8 +11,8 @@ from scipy.ndimage import maximum_filter
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.synthetic import vehicle, world
+from monoforce_ros.synthetic.fault import Fault
 from monoforce_ros.synthetic.graphics import mujoco
-from monoforce_ros.synthetic.plant import Plant
 from monoforce_ros.synthetic.scenery import Scenery
 from monoforce_ros.synthetic.vehicle import Vehicle
 
@@ -64,7 +64,7 @@ class Simulation:
         tyre_friction: friction coefficient of each tyre on ordinary ground ``[wheels]``.
     """
 
-    def __init__(self, model: mujoco.MjModel, scenery: Scenery, robot: Vehicle, hidden: Sequence[Plant] = ()):
+    def __init__(self, model: mujoco.MjModel, scenery: Scenery, robot: Vehicle, hidden: Sequence[Fault] = ()):
         self.model, self.data = model, mujoco.MjData(model)
         self.robot = robot
         self._scenery, self._hidden = scenery, hidden
@@ -96,8 +96,8 @@ class Simulation:
         self.steps = 0
         self.odom_origin = self.data.qpos[:3].copy()
         # Only now: the robot settles as it would with nothing hidden.
-        for plant in hidden:
-            plant.prepare(self)
+        for fault in hidden:
+            fault.prepare(self)
         self._on_patch = True
         self._set_friction()
 
@@ -118,9 +118,9 @@ class Simulation:
         if grass is not None:
             self.data.xfrc_applied[self.wheel_bodies, :3] = grass
         if hasattr(self, "odom_origin"):
-            for plant in self._hidden:
-                speeds = plant.wheel_speeds(self.time, speeds)
-                plant.push(self)
+            for fault in self._hidden:
+                speeds = fault.wheel_speeds(self.time, speeds)
+                fault.push(self)
             self._set_friction()
         self.data.ctrl[:] = speeds
         mujoco.mj_step(self.model, self.data)

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.synthetic import textures, vehicle
+from monoforce_ros.synthetic.fault import Fault
 from monoforce_ros.synthetic.graphics import mujoco
-from monoforce_ros.synthetic.plant import Plant
 from monoforce_ros.synthetic.random_streams import random_stream
 from monoforce_ros.synthetic.scenery import Scenery
 from monoforce_ros.synthetic.shapes import Shape
@@ -37,7 +37,7 @@ _TILE_SIZE = 5.0
 
 
 def build_model(
-    scenery: Scenery, robot: Vehicle, seed: int, cameras: Mapping[str, float], hidden: Sequence[Plant] = ()
+    scenery: Scenery, robot: Vehicle, seed: int, cameras: Mapping[str, float], hidden: Sequence[Fault] = ()
 ) -> mujoco.MjModel:
     """Compile a world.
 
@@ -74,8 +74,8 @@ def build_model(
     robot.add_to(spec, robot.clearance + _SPAWN_HEIGHT)
     for frame, field_of_view in cameras.items():
         _add_camera(spec, frame, robot.sensors[frame], field_of_view)
-    for plant in hidden:
-        plant.shape(spec, robot)
+    for fault in hidden:
+        fault.shape(spec, robot)
     return spec.compile()
 
 

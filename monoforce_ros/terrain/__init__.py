@@ -3,16 +3,19 @@
 from monoforce_ros.terrain.accumulation import accumulate
 from monoforce_ros.terrain.files import TerrainFileError, load_terrain, save_terrain
 from monoforce_ros.terrain.grid import Grid
-from monoforce_ros.terrain.lidar import LidarSettings, terrain_from_cloud
-from monoforce_ros.terrain.terrain_map import TerrainDefaults, TerrainMap
+from monoforce_ros.terrain.lidar import LidarSettings, TerrainError, fill_holes, terrain_from_cloud
+from monoforce_ros.terrain.terrain_map import CHANNELS, TerrainDefaults, TerrainMap
 
 __all__ = [
+    "CHANNELS",
     "Grid",
     "LidarSettings",
     "TerrainDefaults",
+    "TerrainError",
     "TerrainFileError",
     "TerrainMap",
     "accumulate",
+    "fill_holes",
     "load_terrain",
     "save_terrain",
     "terrain_from_cloud",

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from monoforce_ros.motion import transform_points
+from monoforce_ros.core import transform_points
 
 VOXEL = 0.1
 """Edge of the cubes in which a return looks for company [m]."""

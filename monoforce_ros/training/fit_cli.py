@@ -16,10 +16,10 @@ import torch
 from tqdm import tqdm
 
 from monoforce_ros.bags import BagError, Recording, SmoothedMotion, smooth
-from monoforce_ros.evaluation.report import figure_png, write_text
+from monoforce_ros.core import write_text
+from monoforce_ros.reporting import figure_png
 from monoforce_ros.robots import RobotFileError, RobotModel, load_robot, shipped_robots
-from monoforce_ros.terrain import TerrainDefaults, save_terrain
-from monoforce_ros.terrain.lidar import TerrainError
+from monoforce_ros.terrain import TerrainDefaults, TerrainError, save_terrain
 from monoforce_ros.training.fit_figure import fit_figure
 from monoforce_ros.training.terrain_fit import FitSettings, fit_terrain, trajectory_frame, trajectory_grid
 from monoforce_ros.training.visible import visible_terrain

@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from monoforce_ros.effects import drive_speeds
 from monoforce_ros.encoder import EncodedMaps, EncoderConfig
 from monoforce_ros.physics import PhysicsOptions, State, rollout
-from monoforce_ros.physics.effects import drive_speeds
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import TerrainMap
-from monoforce_ros.training.drive_samples import CHUNK
+from monoforce_ros.training.recording_samples import CHUNK
 from monoforce_ros.training.samples import Targets
 
 HIGHEST, LOWEST = 1.0, -1.5

@@ -10,11 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from monoforce_ros.encoder import EncoderConfig, EncoderInput
-from monoforce_ros.encoder.lift import feature_rays
-from monoforce_ros.encoder.view import assemble
-from monoforce_ros.motion import homogeneous, transform_points
-from monoforce_ros.training.drive_samples import DriveSamples, Segment
+from monoforce_ros.core import homogeneous, transform_points
+from monoforce_ros.encoder import EncoderConfig, EncoderInput, assemble, feature_rays
+from monoforce_ros.training.recording_samples import RecordingSamples, Segment
 
 MIRROR = np.diag([1.0, -1.0, 1.0])
 
@@ -127,7 +125,7 @@ class Targets:
 
 
 def sample(
-    drive: DriveSamples,
+    drive: RecordingSamples,
     index: int,
     config: EncoderConfig,
     variation: Variation = Variation(),
@@ -161,7 +159,7 @@ def sample(
 
 
 def targets(
-    drive: DriveSamples,
+    drive: RecordingSamples,
     index: int,
     config: EncoderConfig,
     variation: Variation = Variation(),
@@ -176,7 +174,7 @@ def targets(
     return Targets(**{name: torch.from_numpy(value) for name, value in (maps | motion).items()})
 
 
-def _odometry_from_terrain(drive: DriveSamples, index: int, variation: Variation) -> np.ndarray:
+def _odometry_from_terrain(drive: RecordingSamples, index: int, variation: Variation) -> np.ndarray:
     """Pose of a sample's varied terrain frame ``[4, 4]``.
 
     It is left-handed where the scene is mirrored: everything that happens in it is mirrored too.
@@ -217,7 +215,7 @@ def _maps(segment: Segment, odometry_from_terrain: np.ndarray, config: EncoderCo
 
 
 def _motion(
-    drive: DriveSamples, index: int, terrain_from_odometry: np.ndarray, mirrored: bool, count: int, horizon: float
+    drive: RecordingSamples, index: int, terrain_from_odometry: np.ndarray, mirrored: bool, count: int, horizon: float
 ) -> dict[str, np.ndarray]:
     """Pieces of motion after the image, in the varied frame."""
     chunks = drive.chunks

@@ -13,13 +13,11 @@ from torch import Tensor
 from torch.nn import functional
 
 from monoforce_ros.bags import Windows, cut_windows
-from monoforce_ros.motion import CommandTrack, MotionTrack, homogeneous, transform_points
-from monoforce_ros.physics import PhysicsOptions, State, rollout
-from monoforce_ros.physics.effects import drive_speeds
-from monoforce_ros.physics.rest import rest_depth
+from monoforce_ros.core import CommandTrack, MotionTrack, homogeneous, transform_points
+from monoforce_ros.effects import drive_speeds
+from monoforce_ros.physics import PhysicsOptions, State, rest_depth, rollout
 from monoforce_ros.robots import RobotModel
-from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap
-from monoforce_ros.terrain.lidar import fill_holes
+from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap, fill_holes
 
 _SAMPLE_TIME = 0.1
 # How far a prediction may be off before it weighs: along the ground, where slip decides, up, and in rotation.

@@ -16,13 +16,17 @@ import torch
 from tqdm import tqdm
 
 from monoforce_ros.bags import BagError
-from monoforce_ros.encoder import CheckpointError, Encoder, EncoderConfig, load_encoder, new_encoder
-from monoforce_ros.encoder.backbone import WeightsError
-from monoforce_ros.evaluation.report import write_text
-from monoforce_ros.robots import RobotFileError, RobotModel, load_robot, shipped_robots
-from monoforce_ros.robots.robot_copy import fingerprint, write_robot
-from monoforce_ros.training.drive_samples import DriveSamples, SamplesError, SampleSettings, cut_drive, read_samples
+from monoforce_ros.core import write_text
+from monoforce_ros.encoder import CheckpointError, Encoder, EncoderConfig, WeightsError, load_encoder, new_encoder
+from monoforce_ros.robots import RobotFileError, RobotModel, fingerprint, load_robot, shipped_robots, write_robot
 from monoforce_ros.training.losses import LossWeights
+from monoforce_ros.training.recording_samples import (
+    RecordingSamples,
+    SamplesError,
+    SampleSettings,
+    cut_recording,
+    read_samples,
+)
 from monoforce_ros.training.trainer import Process, Trainer, TrainingError, TrainingSettings, describe
 from monoforce_ros.training.vegetation_fit import EFFECT, fit_vegetation
 
@@ -146,7 +150,7 @@ def _train(options: argparse.Namespace, process: Process) -> None:
 
 def _with_vegetation(
     robot: RobotModel,
-    training: Sequence[DriveSamples],
+    training: Sequence[RecordingSamples],
     config: EncoderConfig,
     settings: TrainingSettings,
     options: argparse.Namespace,
@@ -222,7 +226,7 @@ def _settings(options: argparse.Namespace) -> TrainingSettings:
 
 def _cut(
     bags: Sequence[Path], robot, config: EncoderConfig, options: argparse.Namespace, what: str
-) -> list[DriveSamples]:
+) -> list[RecordingSamples]:
     drives = []
     settings = SampleSettings(period=options.period)
     folder = options.cut or options.out / "samples"
@@ -253,7 +257,7 @@ def _cut_one(task: tuple) -> tuple[Path | None, str]:
     """File of a bag's samples, or why there is none."""
     bag, robot, config, folder, settings, topics = task
     try:
-        return cut_drive(bag, robot, config, folder, settings=settings, image_topics=topics), ""
+        return cut_recording(bag, robot, config, folder, settings=settings, image_topics=topics), ""
     except SamplesError as error:
         return None, str(error)
 

@@ -20,7 +20,6 @@ from torch import Tensor, nn
 from monoforce_ros.encoder import EncodedMaps, Encoder, EncoderConfig, EncoderInput, TerrainEncoder, save_encoder
 from monoforce_ros.physics import PhysicsOptions
 from monoforce_ros.robots import RobotModel
-from monoforce_ros.training.drive_samples import DriveSamples
 from monoforce_ros.training.losses import (
     HIGHEST,
     LOWEST,
@@ -33,6 +32,7 @@ from monoforce_ros.training.losses import (
     terrain_loss,
     trajectory_loss,
 )
+from monoforce_ros.training.recording_samples import RecordingSamples
 from monoforce_ros.training.samples import Targets, Variation, sample
 
 
@@ -161,8 +161,8 @@ class Trainer:
         self,
         encoder: Encoder,
         robot: RobotModel,
-        drives: Sequence[DriveSamples],
-        held_out: Sequence[DriveSamples],
+        drives: Sequence[RecordingSamples],
+        held_out: Sequence[RecordingSamples],
         out: Path,
         settings: TrainingSettings,
         process: Process,
@@ -331,7 +331,7 @@ class Trainer:
 
 
 @torch.no_grad()
-def validate(encoder: Encoder, drives: Sequence[DriveSamples], device: torch.device) -> Validation:
+def validate(encoder: Encoder, drives: Sequence[RecordingSamples], device: torch.device) -> Validation:
     """Measure an encoder on whole drives, without variations."""
     encoder.eval()
     geometric, supporting, losses = [], [], []
@@ -354,7 +354,7 @@ def validate(encoder: Encoder, drives: Sequence[DriveSamples], device: torch.dev
     return Validation(median(geometric), median(supporting), float(np.mean(losses)))
 
 
-def describe(config: EncoderConfig, settings: TrainingSettings, drives: Sequence[DriveSamples]) -> dict:
+def describe(config: EncoderConfig, settings: TrainingSettings, drives: Sequence[RecordingSamples]) -> dict:
     """What stands beside a checkpoint: how it came to be."""
     return {
         "config": asdict(config),

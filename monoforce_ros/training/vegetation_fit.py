@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from scipy.optimize import minimize
 
+from monoforce_ros.effects import drive_speeds
 from monoforce_ros.encoder import EncoderConfig
 from monoforce_ros.physics import PhysicsOptions, State, rollout
-from monoforce_ros.physics.effects import drive_speeds
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import TerrainDefaults, TerrainMap
-from monoforce_ros.training.drive_samples import CHUNK, DriveSamples
+from monoforce_ros.training.recording_samples import CHUNK, RecordingSamples
 from monoforce_ros.training.samples import Targets, targets
 
 EFFECT = "vegetation_drag"
@@ -57,7 +57,9 @@ class _Pieces:
     targets: Targets
 
 
-def fit_vegetation(drives: Sequence[DriveSamples], robot: RobotModel, config: EncoderConfig) -> VegetationFit | None:
+def fit_vegetation(
+    drives: Sequence[RecordingSamples], robot: RobotModel, config: EncoderConfig
+) -> VegetationFit | None:
     """Fit :data:`EFFECT` to pieces of motion on what the lidar saw over the ground that the robot felt.
 
     Both heights come from the drives alone (H_g*, H_t*), so that no encoder is needed. Other effects of the robot stay.
@@ -92,7 +94,7 @@ def fit_vegetation(drives: Sequence[DriveSamples], robot: RobotModel, config: En
     )
 
 
-def _through_vegetation(drives: Sequence[DriveSamples], config: EncoderConfig) -> _Pieces | None:
+def _through_vegetation(drives: Sequence[RecordingSamples], config: EncoderConfig) -> _Pieces | None:
     """Pieces of motion whose start stands in vegetation, spread over the drives."""
     maps, motions, count = [], [], 0
     # Several seconds lie between samples from which pieces are taken: they hardly overlap.

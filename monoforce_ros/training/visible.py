@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from monoforce_ros.bags import Recording
-from monoforce_ros.motion import MotionTrack, StaleDataError
+from monoforce_ros.core import MotionTrack, StaleDataError
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import Grid, LidarSettings, TerrainDefaults, TerrainMap, accumulate, terrain_from_cloud
 
@@ -46,7 +46,7 @@ def visible_terrain(
     return terrain_from_cloud(accumulate(sweeps), grid, settings=settings, material=material)
 
 
-def visible_halves(
+def split_maps(
     recording: Recording, motion: MotionTrack, robot: RobotModel, grid: Grid
 ) -> tuple[TerrainMap, tuple[TerrainMap, TerrainMap]]:
     """A drive's map in the odometry frame, and two more from every other sweep alone.

@@ -1,0 +1,27 @@
+"""Where the package's data files lie, in the source tree and in an installed workspace."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+PACKAGE = "monoforce_ros"
+
+
+def share_directory() -> Path:
+    """Folder that holds ``config/``, ``msg_defs/`` and ``bags/``.
+
+    The source tree wins when the package is imported from it, so that a stale installation is never read by accident.
+    Raises ``FileNotFoundError`` with what to do when neither place exists.
+    """
+    source_tree = Path(__file__).resolve().parent.parent.parent
+    if (source_tree / "package.xml").is_file():
+        return source_tree
+    from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
+
+    try:
+        return Path(get_package_share_directory(PACKAGE))
+    except PackageNotFoundError as error:
+        raise FileNotFoundError(
+            f"the data files of {PACKAGE} were not found beside the code or below AMENT_PREFIX_PATH: "
+            "source install/setup.bash of the workspace that the package was built in"
+        ) from error

@@ -1,0 +1,205 @@
+"""Tracks: measured motion, angular velocity, wheel speeds and commands over time, and the terrain frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from monoforce_ros.core.geometry import homogeneous
+
+NANOSECOND = 1e-9
+
+
+class StaleDataError(ValueError):
+    """No measurement lies close enough to the time asked for; the message says how far the nearest is."""
+
+
+@dataclass(frozen=True)
+class MotionState:
+    """A robot's measured motion at one time (REP 105, nav_msgs/Odometry)."""
+
+    stamp: int
+    """Time [ns]."""
+    position: np.ndarray
+    """Position of the base frame in the odometry frame [m], ``[3]``."""
+    rotation: np.ndarray
+    """Rotation odometry ← base, ``[3, 3]``."""
+    linear_velocity: np.ndarray
+    """Velocity in base axes [m/s], ``[3]``."""
+    angular_velocity: np.ndarray
+    """Angular velocity in base axes [rad/s], ``[3]``."""
+
+    @property
+    def heading(self) -> float:
+        """Angle of the base's x axis about the vertical [rad]."""
+        return float(np.arctan2(self.rotation[1, 0], self.rotation[0, 0]))
+
+    def onwards(self, seconds: float) -> MotionState:
+        """The state after ``seconds`` > 0 of the same velocities in base axes, with its own stamp; else itself."""
+        if seconds <= 0.0:
+            return self
+        turn = Rotation.from_rotvec(self.angular_velocity * seconds).as_matrix()
+        half = Rotation.from_rotvec(self.angular_velocity * (0.5 * seconds)).as_matrix()
+        position = self.position + self.rotation @ half @ self.linear_velocity * seconds
+        return replace(self, position=position, rotation=self.rotation @ turn)
+
+    @property
+    def odometry_from_base(self) -> np.ndarray:
+        """Homogeneous transform ``[4, 4]``."""
+        return homogeneous(self.rotation, self.position)
+
+    @property
+    def odometry_from_terrain(self) -> np.ndarray:
+        """Homogeneous transform ``[4, 4]`` from the terrain frame: at the base, x along its heading, z up."""
+        return homogeneous(Rotation.from_euler("z", self.heading).as_matrix(), self.position)
+
+    @property
+    def terrain_from_base(self) -> np.ndarray:
+        """Homogeneous transform ``[4, 4]``: roll and pitch of the robot, no translation."""
+        return np.linalg.inv(self.odometry_from_terrain) @ self.odometry_from_base
+
+
+@dataclass(frozen=True)
+class MotionTrack:
+    """Measured motion over time, in order of stamp."""
+
+    stamps: np.ndarray
+    """``[n]`` int64 [ns], strictly increasing."""
+    positions: np.ndarray
+    """``[n, 3]`` [m]."""
+    quaternions: np.ndarray
+    """``[n, 4]`` x, y, z, w, odometry ← base."""
+    linear_velocities: np.ndarray
+    """``[n, 3]`` in base axes [m/s]."""
+    angular_velocities: np.ndarray
+    """``[n, 3]`` in base axes [rad/s]."""
+    frame_id: str = "odom"
+    child_frame_id: str = "base_link"
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    def at(self, stamp: int, *, maximum_gap: float = 0.5) -> MotionState:
+        """The motion at a time, interpolated between the measurements around it.
+
+        After the last measurement the robot is taken to go on as it did: sensors are often a little ahead of odometry.
+
+        Args:
+            stamp: time [ns].
+            maximum_gap: largest distance in time [s] to the measurements used; beyond it nothing is invented.
+
+        Raises:
+            StaleDataError: the nearest measurements are further away than ``maximum_gap``.
+        """
+        if not len(self):
+            raise StaleDataError("no odometry has been received")
+        after = int(np.searchsorted(self.stamps, stamp))
+        before = max(after - 1, 0)
+        after = min(after, len(self) - 1)
+        if after == before:  # before the first or after the last measurement
+            gap = abs(int(self.stamps[after]) - stamp) * NANOSECOND
+            self._refuse_gap(gap, maximum_gap)
+            return self._state(after, stamp).onwards((stamp - int(self.stamps[after])) * NANOSECOND)
+        span = int(self.stamps[after] - self.stamps[before])
+        gaps = (stamp - int(self.stamps[before])) * NANOSECOND, (int(self.stamps[after]) - stamp) * NANOSECOND
+        if min(gaps) > maximum_gap:
+            self._refuse_gap(min(gaps), maximum_gap)
+        if max(gaps) > maximum_gap:
+            return self._state(before if gaps[0] < gaps[1] else after, stamp)
+        fraction = (stamp - int(self.stamps[before])) / span
+
+        def blend(values: np.ndarray) -> np.ndarray:
+            return (1 - fraction) * values[before] + fraction * values[after]
+
+        pair = Rotation.from_quat(self.quaternions[[before, after]])
+        return MotionState(
+            stamp=int(stamp),
+            position=blend(self.positions),
+            rotation=Slerp([0.0, 1.0], pair)(fraction).as_matrix(),
+            linear_velocity=blend(self.linear_velocities),
+            angular_velocity=blend(self.angular_velocities),
+        )
+
+    def base_between(self, start: int, end: int, *, maximum_gap: float = 0.5) -> np.ndarray:
+        """Pose ``[4, 4]`` of the base frame of time ``start`` [ns] in that of ``end``; errors as in :meth:`at`."""
+        if start == end:
+            return np.eye(4)
+        before, after = (self.at(stamp, maximum_gap=maximum_gap) for stamp in (start, end))
+        return np.linalg.inv(homogeneous(after.rotation, after.position)) @ homogeneous(
+            before.rotation, before.position
+        )
+
+    def _refuse_gap(self, gap: float, maximum_gap: float) -> None:
+        if gap > maximum_gap:
+            raise StaleDataError(
+                f"the nearest odometry is {gap:.2f} s away from the time asked for, expected at most {maximum_gap:g} s"
+            )
+
+    def _state(self, index: int, stamp: int) -> MotionState:
+        return MotionState(
+            stamp=int(stamp),
+            position=self.positions[index],
+            rotation=Rotation.from_quat(self.quaternions[index]).as_matrix(),
+            linear_velocity=self.linear_velocities[index],
+            angular_velocity=self.angular_velocities[index],
+        )
+
+
+@dataclass(frozen=True)
+class AngularVelocityTrack:
+    """Angular velocity over time as an IMU shows it, in its own axes."""
+
+    stamps: np.ndarray
+    """``[n]`` int64 [ns], ascending."""
+    rates: np.ndarray
+    """``[n, 3]`` [rad/s]."""
+    frame_id: str = "imu_link"
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+
+@dataclass(frozen=True)
+class WheelTrack:
+    """Measured turning speed of the wheels on either side over time."""
+
+    stamps: np.ndarray
+    """``[n]`` int64 [ns], ascending."""
+    speeds: np.ndarray
+    """Mean of the left and of the right wheels, ``[n, 2]`` [rad/s]."""
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+
+@dataclass(frozen=True)
+class CommandTrack:
+    """Commanded forward speed and yaw rate over time; each command holds until the next."""
+
+    stamps: np.ndarray
+    """``[n]`` int64 [ns], increasing."""
+    twists: np.ndarray
+    """``[n, 2]`` forward speed [m/s], yaw rate [rad/s]."""
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    def sample(self, stamps: np.ndarray, *, timeout: float = np.inf) -> np.ndarray:
+        """Commands in force at times.
+
+        Args:
+            stamps: ``[...]`` int64 [ns].
+            timeout: age [s] beyond which a command no longer holds and the base stands still.
+
+        Returns:
+            ``[..., 2]``; zero before the first command.
+        """
+        stamps = np.asarray(stamps, np.int64)
+        if not len(self):
+            return np.zeros((*stamps.shape, 2))
+        index = np.searchsorted(self.stamps, stamps, side="right") - 1
+        held = self.twists[np.maximum(index, 0)]
+        age = (stamps - self.stamps[np.maximum(index, 0)]) * NANOSECOND
+        return np.where(((index >= 0) & (age <= timeout))[..., None], held, 0.0)

@@ -1,0 +1,46 @@
+"""First-order lag of the drives."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from monoforce_ros.effects.effect import Effect, Parameter, Values
+
+
+class ActuatorLag(Effect):
+    """First-order lag of the drives."""
+
+    name = "actuator_lag"
+    stage = "command"
+    summary = "The drives approach the commanded speed exponentially."
+    formula = "du/dt = (u_cmd - u) / τ"
+    source = "first-order servo response"
+    parameters = (Parameter("time_constant", "s", 0.0, 0.0, 3.0, 0.2, "time to reach 63 % of a step"),)
+
+    def drive_speeds(self, speeds: Tensor, values: Values, time_step: float, offsets: Tensor) -> Tensor:
+        """Drive speeds with this effect in them; see :class:`Effect`."""
+        constant = values["time_constant"]
+        # exp(-Δt/τ) with a quotient that stays finite, and a gradient that is zero, at τ = 0.
+        slow = constant > 1e-6
+        safe = torch.where(slow, constant, torch.ones_like(constant))
+        kept = torch.where(slow, torch.exp(-time_step / safe), torch.zeros_like(constant))
+        if constant.ndim:
+            return _step_by_step(speeds, kept[:, None])
+        count = speeds.shape[1]
+        steps = torch.arange(count, device=speeds.device)
+        distance = (steps[:, None] - steps).to(speeds.dtype)
+        # The response to all commands so far, the first of which has always held, as one matrix.
+        decay = kept ** distance.clamp_min(0.0)
+        weights = torch.where(distance >= 0, (1.0 - kept) * decay, torch.zeros_like(decay))
+        return torch.where(slow, weights @ speeds + (decay[:, :1] * kept) * speeds[:, :1], speeds)
+
+
+def _step_by_step(speeds: Tensor, kept: Tensor) -> Tensor:
+    """The same where each trajectory has a constant of its own: a matrix for each would be large."""
+    state = speeds[:, 0]
+    result = []
+    for speed in speeds.unbind(1):
+        state = speed + kept * (state - speed)
+        result.append(state)
+    return torch.stack(result, dim=1)

@@ -1,0 +1,24 @@
+"""Commands stamped too late or too early."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from monoforce_ros.core import CommandTrack
+from monoforce_ros.effects.effect import Effect, Parameter
+
+
+class CommandClockOffset(Effect):
+    """Commands stamped too late or too early."""
+
+    name = "command_clock_offset"
+    stage = "measurement"
+    summary = "The command's clock runs ahead by the offset."
+    formula = "stamp ← stamp + offset"
+    source = "unsynchronised clocks"
+    parameters = (Parameter("offset", "s", 0.0, -2.0, 2.0, 0.2, "recorded minus true time"),)
+
+    def commands(self, commands: CommandTrack, values: Mapping[str, float]) -> CommandTrack:
+        """Commands as they are recorded under this effect."""
+        return replace(commands, stamps=commands.stamps + round(values["offset"] * 1e9))

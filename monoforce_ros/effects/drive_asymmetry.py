@@ -1,0 +1,24 @@
+"""Left and right drives of unequal speed."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from monoforce_ros.effects.effect import Effect, Parameter, Values, per_trajectory
+
+
+class DriveAsymmetry(Effect):
+    """Left and right drives of unequal speed."""
+
+    name = "drive_asymmetry"
+    stage = "command"
+    summary = "The right side runs faster than the left by the difference, in parts of the speed."
+    formula = "u_left ← (1 - d/2) u, u_right ← (1 + d/2) u"
+    source = "unequal tyres or motors"
+    parameters = (Parameter("difference", "-", 0.0, -1.0, 1.0, 0.1, "right minus left, over their mean"),)
+
+    def drive_speeds(self, speeds: Tensor, values: Values, time_step: float, offsets: Tensor) -> Tensor:
+        """Drive speeds with this effect in them; see :class:`Effect`."""
+        side = torch.sign(offsets).to(speeds)
+        return speeds * (1.0 - 0.5 * per_trajectory(values["difference"], 3) * side)

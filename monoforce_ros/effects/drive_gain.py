@@ -1,0 +1,22 @@
+"""Drives that run faster or slower than commanded, all alike."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from monoforce_ros.effects.effect import Effect, Parameter, Values, per_trajectory
+
+
+class DriveGain(Effect):
+    """Drives that run faster or slower than commanded, all alike."""
+
+    name = "drive_gain"
+    stage = "command"
+    summary = "Wheel radius error or uniform slip: every speed is scaled."
+    formula = "u ← gain u"
+    source = "calibration of the wheel radius"
+    parameters = (Parameter("gain", "-", 1.0, 0.2, 2.0, 0.1, "true over commanded speed"),)
+
+    def drive_speeds(self, speeds: Tensor, values: Values, time_step: float, offsets: Tensor) -> Tensor:
+        """Drive speeds with this effect in them; see :class:`Effect`."""
+        return speeds * per_trajectory(values["gain"], 3)

@@ -1,0 +1,24 @@
+"""Friction across the rolling direction that differs from that along it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from monoforce_ros.effects.effect import Effect, Parameter, Values
+from monoforce_ros.effects.setup import Setup
+
+
+class FrictionAnisotropy(Effect):
+    """Friction across the rolling direction that differs from that along it."""
+
+    name = "friction_anisotropy"
+    stage = "contact"
+    summary = "Lateral friction is scaled, longitudinal friction is not."
+    formula = "μ_lat ← factor μ_lat"
+    source = "friction ellipse of tyres and grousers (Pacejka 2012)"
+    parameters = (Parameter("factor", "-", 1.0, 0.05, 3.0, 0.3, "lateral over longitudinal friction"),)
+
+    def setup(self, setup: Setup, values: Values) -> Setup:
+        """The setup with this effect in it."""
+        robot = setup.robot
+        return replace(setup, robot=replace(robot, friction_lateral=robot.friction_lateral * values["factor"]))

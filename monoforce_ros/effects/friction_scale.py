@@ -1,0 +1,31 @@
+"""Ground of another friction than the map says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from monoforce_ros.effects.effect import Effect, Parameter, Values
+from monoforce_ros.effects.setup import Setup
+
+
+class FrictionScale(Effect):
+    """Ground of another friction than the map says."""
+
+    name = "friction_scale"
+    stage = "contact"
+    summary = "The friction coefficient is scaled everywhere."
+    formula = "μ ← factor μ"
+    source = "wet, loose or icy ground"
+    parameters = (Parameter("factor", "-", 1.0, 0.02, 3.0, 0.3, "true over mapped friction"),)
+
+    def setup(self, setup: Setup, values: Values) -> Setup:
+        """The setup with this effect in it."""
+        robot, factor = setup.robot, values["factor"]
+        return replace(
+            setup,
+            robot=replace(
+                robot,
+                friction_longitudinal=robot.friction_longitudinal * factor,
+                friction_lateral=robot.friction_lateral * factor,
+            ),
+        )

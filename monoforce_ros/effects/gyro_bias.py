@@ -1,0 +1,26 @@
+"""Bias of the recorded yaw rate."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from monoforce_ros.core import MotionTrack
+from monoforce_ros.effects.effect import Effect, Parameter
+
+
+class GyroBias(Effect):
+    """Bias of the recorded yaw rate."""
+
+    name = "gyro_bias"
+    stage = "measurement"
+    summary = "The gyro shows a rate at rest."
+    formula = "ω_z ← ω_z + bias"
+    source = "sensor bias"
+    parameters = (Parameter("bias", "rad/s", 0.0, -0.5, 0.5, 0.02, "rate shown at rest"),)
+
+    def motion(self, motion: MotionTrack, values: Mapping[str, float]) -> MotionTrack:
+        """Motion as it is recorded under this effect."""
+        return replace(motion, angular_velocities=motion.angular_velocities + np.array([0.0, 0.0, values["bias"]]))

@@ -1,0 +1,48 @@
+"""What the catalogue does not hold: a sparse sum of named features as a body wrench."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from monoforce_ros.effects.effect import Effect, Parameter, Values
+from monoforce_ros.effects.setup import FEATURES, Setup
+
+_ROWS = {"force_x": 0, "force_y": 1, "torque_z": 5}
+
+
+class LearnedTerm(Effect):
+    """What the catalogue does not hold: a sparse sum of named features as a body wrench."""
+
+    name = "learned_term"
+    stage = "body"
+    summary = "A force forward, a force to the left and a torque about the vertical, each a weighted sum of features."
+    formula = "f = Σ w_k φ_k(v, ω, pitch, roll) in body axes"
+    source = "sparse regression of what the residual shows (Brunton et al. 2016)"
+    parameters = tuple(
+        Parameter(
+            f"{row}:{feature}",
+            "N" if row.startswith("force") else "N m",
+            0.0,
+            -2000.0,
+            2000.0,
+            20.0,
+            f"weight of {feature} in the {row.replace('_', ' along ' if row.startswith('force') else ' about ')}",
+        )
+        for row in _ROWS
+        for feature in FEATURES
+    )
+
+    def setup(self, setup: Setup, values: Values) -> Setup:
+        """The setup with this effect in it."""
+        loads = setup.loads
+        zero = torch.zeros((), dtype=loads.wrench.dtype, device=loads.wrench.device)
+        names = {index: row for row, index in _ROWS.items()}
+        entries = [
+            values.get(f"{names[row]}:{feature}", zero) if row in names else zero
+            for row in range(6)
+            for feature in FEATURES
+        ]
+        weights = torch.stack(torch.broadcast_tensors(*entries), dim=-1).unflatten(-1, (6, len(FEATURES)))
+        return replace(setup, loads=replace(loads, wrench=loads.wrench + weights.to(loads.wrench)))

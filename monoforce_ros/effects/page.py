@@ -1,0 +1,54 @@
+"""The page of docs/ that lists every effect, made from the catalogue itself."""
+
+from __future__ import annotations
+
+from monoforce_ros.effects.catalogue import CATALOGUE
+from monoforce_ros.effects.effect import STAGES
+
+_INTRODUCTION = """# Effects
+
+An effect is a named piece of physics that a robot may or may not have. It is switched on in the robot's file and leaves
+the prediction unchanged, bit for bit, at its neutral values:
+
+```yaml
+effects:
+  - name: actuator_lag
+    parameters:
+      time_constant: {value: 0.31, low: 0.27, high: 0.36, unit: s}   # or just: time_constant: 0.31
+    provenance: {bag: yard.mcap, date: 2026-11-02}
+```
+
+Effects compose. Command effects act in the order in which a command meets them: delay, deadband, saturation, lag, gain,
+asymmetry, turning scrub; delay and lag use the commands from before the start. Contact and body effects act in the
+rollout, in both backends, and every parameter is differentiable. Measurement effects change what is recorded, not what
+happens.
+
+This page is made from the code: `python -m monoforce_ros.effects.page > docs/effects.md`.
+"""
+
+
+def catalogue_page() -> str:
+    """Markdown of all effects with formula, parameters, bounds and source."""
+    parts = [_INTRODUCTION]
+    for stage in STAGES:
+        parts.append(f"## {stage.capitalize()}\n")
+        for effect in CATALOGUE.values():
+            if effect.stage != stage:
+                continue
+            parts.append(f"### {effect.name}\n\n{effect.summary}\n\n`{effect.formula}` — {effect.source}\n")
+            rows = ["| parameter | unit | neutral | bounds | typical | meaning |", "|---|---|---|---|---|---|"]
+            shown = effect.parameters if len(effect.parameters) < 8 else effect.parameters[:3]
+            rows += [
+                f"| `{p.name}` | {p.unit} | {p.neutral:g} | {p.low:g} … {p.high:g} | ± {p.scale:g} | {p.meaning} |"
+                for p in shown
+            ]
+            rows = [row.replace("vx|vx|", "vx\\|vx\\|") for row in rows]
+            if len(shown) < len(effect.parameters):
+                names = ", ".join(f"`{p.name}`" for p in effect.parameters[len(shown) :])
+                rows.append(f"\nand likewise {names}")
+            parts.append("\n".join(rows) + "\n")
+    return "\n".join(parts).rstrip() + "\n"
+
+
+if __name__ == "__main__":
+    print(catalogue_page(), end="")

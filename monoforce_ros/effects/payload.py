@@ -1,0 +1,35 @@
+"""A load that the robot carries."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from monoforce_ros.effects.effect import Effect, Parameter, Values
+from monoforce_ros.effects.setup import Setup
+from monoforce_ros.robots import add_point_mass
+
+
+class Payload(Effect):
+    """A load that the robot carries."""
+
+    name = "payload"
+    stage = "body"
+    summary = "A point mass at a place on the robot changes mass, centre of mass and inertia."
+    formula = "M ← M + m, c and J by the parallel-axis theorem"
+    source = "rigid-body mechanics"
+    parameters = (
+        Parameter("mass", "kg", 0.0, -20.0, 200.0, 10.0, "added mass"),
+        Parameter("x", "m", 0.0, -1.0, 1.0, 0.2, "its place forward of the base frame"),
+        Parameter("y", "m", 0.0, -1.0, 1.0, 0.2, "its place to the left"),
+        Parameter("z", "m", 0.0, -0.5, 1.5, 0.2, "its place above"),
+    )
+
+    def setup(self, setup: Setup, values: Values) -> Setup:
+        """The setup with this effect in it."""
+        robot = setup.robot
+        added = values["mass"]
+        place = torch.stack(torch.broadcast_tensors(values["x"], values["y"], values["z"]), dim=-1).to(robot.mass)
+        total, centre, inertia = add_point_mass(robot.mass, robot.centre_of_mass, robot.inertia, added, place)
+        return replace(setup, robot=replace(robot, mass=total, centre_of_mass=centre, inertia=inertia))

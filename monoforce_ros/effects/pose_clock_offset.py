@@ -1,0 +1,24 @@
+"""Poses stamped too late or too early."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from monoforce_ros.core import MotionTrack
+from monoforce_ros.effects.effect import Effect, Parameter
+
+
+class PoseClockOffset(Effect):
+    """Poses stamped too late or too early."""
+
+    name = "pose_clock_offset"
+    stage = "measurement"
+    summary = "The pose's clock runs ahead by the offset."
+    formula = "stamp ← stamp + offset"
+    source = "unsynchronised clocks, filter delay"
+    parameters = (Parameter("offset", "s", 0.0, -2.0, 2.0, 0.2, "recorded minus true time"),)
+
+    def motion(self, motion: MotionTrack, values: Mapping[str, float]) -> MotionTrack:
+        """Motion as it is recorded under this effect."""
+        return replace(motion, stamps=motion.stamps + round(values["offset"] * 1e9))

@@ -1,0 +1,24 @@
+"""Drag in proportion to the square of the speed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from monoforce_ros.effects.effect import Effect, Parameter, Values
+from monoforce_ros.effects.setup import Setup
+
+
+class QuadraticDrag(Effect):
+    """Drag in proportion to the square of the speed."""
+
+    name = "quadratic_drag"
+    stage = "body"
+    summary = "The body is held back in proportion to the square of its speed."
+    formula = "f = -c |v| v"
+    source = "fluid drag"
+    parameters = (Parameter("coefficient", "N s²/m²", 0.0, 0.0, 2000.0, 30.0, "drag coefficient"),)
+
+    def setup(self, setup: Setup, values: Values) -> Setup:
+        """The setup with this effect in it."""
+        loads = setup.loads
+        return replace(setup, loads=replace(loads, quadratic_drag=loads.quadratic_drag + values["coefficient"]))

@@ -1,0 +1,24 @@
+"""Resistance to rolling."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from monoforce_ros.effects.effect import Effect, Parameter, Values
+from monoforce_ros.effects.setup import Setup
+
+
+class RollingResistance(Effect):
+    """Resistance to rolling."""
+
+    name = "rolling_resistance"
+    stage = "contact"
+    summary = "Each loaded point is held back by a part of its load."
+    formula = "f = -c N v / sqrt(v² + ε²) along the rolling direction"
+    source = "Wong, Theory of Ground Vehicles"
+    parameters = (Parameter("coefficient", "-", 0.0, 0.0, 1.0, 0.05, "resistance over load"),)
+
+    def setup(self, setup: Setup, values: Values) -> Setup:
+        """The setup with this effect in it."""
+        loads = setup.loads
+        return replace(setup, loads=replace(loads, rolling_resistance=loads.rolling_resistance + values["coefficient"]))

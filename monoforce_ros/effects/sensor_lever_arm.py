@@ -1,0 +1,35 @@
+"""A pose sensor away from the place it is taken for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from monoforce_ros.core import MotionTrack
+from monoforce_ros.effects.effect import Effect, Parameter
+
+
+class SensorLeverArm(Effect):
+    """A pose sensor away from the place it is taken for."""
+
+    name = "sensor_lever_arm"
+    stage = "measurement"
+    summary = "Recorded positions are those of another point of the robot."
+    formula = "p ← p + R r, v ← v + ω × r"
+    source = "mounting error"
+    parameters = (
+        Parameter("x", "m", 0.0, -2.0, 2.0, 0.2, "sensor forward of the base frame"),
+        Parameter("y", "m", 0.0, -2.0, 2.0, 0.2, "sensor to the left"),
+    )
+
+    def motion(self, motion: MotionTrack, values: Mapping[str, float]) -> MotionTrack:
+        """Motion as it is recorded under this effect."""
+        arm = np.array([values["x"], values["y"], 0.0])
+        return replace(
+            motion,
+            positions=motion.positions + Rotation.from_quat(motion.quaternions).apply(arm),
+            linear_velocities=motion.linear_velocities + np.cross(motion.angular_velocities, arm),
+        )

@@ -1,0 +1,32 @@
+"""A pose sensor turned about the robot's vertical."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from scipy.spatial.transform import Rotation
+
+from monoforce_ros.core import MotionTrack
+from monoforce_ros.effects.effect import Effect, Parameter
+
+
+class SensorYawOffset(Effect):
+    """A pose sensor turned about the robot's vertical."""
+
+    name = "sensor_yaw_offset"
+    stage = "measurement"
+    summary = "Recorded headings are off by the angle, and body velocities turned."
+    formula = "R ← R R_z(angle)"
+    source = "mounting error"
+    parameters = (Parameter("angle", "rad", 0.0, -3.2, 3.2, 0.1, "yaw of the sensor on the robot"),)
+
+    def motion(self, motion: MotionTrack, values: Mapping[str, float]) -> MotionTrack:
+        """Motion as it is recorded under this effect."""
+        turn = Rotation.from_euler("z", values["angle"])
+        return replace(
+            motion,
+            quaternions=(Rotation.from_quat(motion.quaternions) * turn).as_quat(),
+            linear_velocities=turn.inv().apply(motion.linear_velocities),
+            angular_velocities=turn.inv().apply(motion.angular_velocities),
+        )

@@ -1,0 +1,27 @@
+"""Ground softer or stiffer than the map says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from monoforce_ros.effects.effect import Effect, Parameter, Values, per_trajectory
+from monoforce_ros.effects.setup import Setup
+
+
+class TerrainSoftness(Effect):
+    """Ground softer or stiffer than the map says."""
+
+    name = "terrain_softness"
+    stage = "contact"
+    summary = "Stiffness is divided, damping with it."
+    formula = "e ← e / factor, d ← d / factor"
+    source = "loose soil"
+    parameters = (Parameter("factor", "-", 1.0, 0.1, 100.0, 3.0, "mapped over true stiffness"),)
+
+    def setup(self, setup: Setup, values: Values) -> Setup:
+        """The setup with this effect in it."""
+        terrain = setup.terrain
+        factor = per_trajectory(values["factor"], 3)
+        return replace(
+            setup, terrain=replace(terrain, stiffness=terrain.stiffness / factor, damping=terrain.damping / factor)
+        )

@@ -1,0 +1,25 @@
+"""Effective track width of a skid-steered turn."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from monoforce_ros.effects.effect import Effect, Parameter, Values, per_trajectory
+
+
+class TurningScrub(Effect):
+    """Effective track width of a skid-steered turn."""
+
+    name = "turning_scrub"
+    stage = "contact"
+    summary = "Turning is as slow as if the drives were further apart."
+    formula = "u - ū ← (u - ū) / factor, ū the mean of the drives"
+    source = "Mandow et al. 2007, experimental kinematics of skid-steer vehicles"
+    parameters = (Parameter("track_width_factor", "-", 1.0, 0.3, 4.0, 0.3, "effective over modelled track width"),)
+
+    def drive_speeds(self, speeds: Tensor, values: Values, time_step: float, offsets: Tensor) -> Tensor:
+        """Drive speeds with this effect in them; see :class:`Effect`."""
+        mean = speeds.mean(dim=-1, keepdim=True)
+        factor = per_trajectory(values["track_width_factor"], 3)
+        return torch.where(factor == 1.0, speeds, mean + (speeds - mean) / factor)

@@ -1,0 +1,24 @@
+"""Drag in proportion to speed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from monoforce_ros.effects.effect import Effect, Parameter, Values
+from monoforce_ros.effects.setup import Setup
+
+
+class ViscousDrag(Effect):
+    """Drag in proportion to speed."""
+
+    name = "viscous_drag"
+    stage = "body"
+    summary = "The body is held back in proportion to its speed."
+    formula = "f = -c v"
+    source = "fluid drag"
+    parameters = (Parameter("coefficient", "N s/m", 0.0, 0.0, 2000.0, 30.0, "drag coefficient"),)
+
+    def setup(self, setup: Setup, values: Values) -> Setup:
+        """The setup with this effect in it."""
+        loads = setup.loads
+        return replace(setup, loads=replace(loads, linear_drag=loads.linear_drag + values["coefficient"]))

@@ -1,0 +1,292 @@
+"""Evaluation of a recorded drive: predictions along it against what the robot did."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from tqdm import tqdm
+
+from monoforce_ros.bags import Recording
+from monoforce_ros.core import MotionState, StaleDataError, transform_points
+from monoforce_ros.effects import corrected_commands, corrected_motion
+from monoforce_ros.evaluation.metrics import Poses, Summary, position_errors, rotation_errors, summarise
+from monoforce_ros.messages import MessageError
+from monoforce_ros.perception import FlatTerrain, Observation
+from monoforce_ros.prediction import Prediction, Predictor
+from monoforce_ros.robots import RobotModel
+from monoforce_ros.terrain import TerrainDefaults, TerrainMap
+
+SAMPLE_TIME = 0.1
+"""Time between the poses that are compared [s]."""
+PHYSICS, FLAT_PHYSICS, CONSTANT_VELOCITY = "physics", "physics, flat ground", "constant velocity, flat ground"
+BATCH = 16
+_TOGETHER = 100_000_000
+"""Largest difference between the stamps of what is used together [ns]."""
+MAXIMUM_GAP = 0.3
+"""Largest distance in time between a compared pose and the odometry around it [s]."""
+
+
+class EvaluationError(ValueError):
+    """A recording from which nothing can be evaluated; the message says what is missing."""
+
+
+@dataclass(frozen=True)
+class RecordingEvaluation:
+    """Predicted and measured trajectories of the windows of a drive, in the odometry frame."""
+
+    times: np.ndarray
+    """Time since the start of a window [s], ``[T]``."""
+    stamps: np.ndarray
+    """Start of each window [ns], ``[W]``."""
+    measured: Poses
+    """``[W, T]``; NaN where odometry ends or has a gap."""
+    predicted: dict[str, Poses]
+    """Per method, ``[W, T]``."""
+    inside: np.ndarray
+    """Whether the measured and the predicted robot are on the predicted map, ``[W, T]``."""
+    horizons: tuple[float, ...]
+    remarks: tuple[str, ...] = field(default=())
+
+    def errors(self, method: str) -> tuple[np.ndarray, np.ndarray]:
+        """Position [m] and rotation errors [deg] of a method, each ``[W, T]``."""
+        return (
+            position_errors(self.predicted[method], self.measured),
+            rotation_errors(self.predicted[method], self.measured),
+        )
+
+    def summary(self, method: str) -> dict[float, tuple[Summary, Summary]]:
+        """Δx and ΔR of a method at each horizon, over the part inside the map."""
+        position, rotation = self.errors(method)
+        result = {}
+        for horizon in self.horizons:
+            index = round(horizon / SAMPLE_TIME)
+            result[horizon] = (
+                summarise(position, self.inside, index),
+                summarise(rotation, self.inside, index),
+            )
+        return result
+
+
+def evaluate_recording(
+    recording: Recording,
+    predictor: Predictor,
+    *,
+    image_topics: Sequence[str] = (),
+    horizons: Sequence[float] = (1.0, 2.0, 5.0),
+    stride: float = 0.4,
+    shortest: float | None = None,
+    progress: bool = True,
+) -> RecordingEvaluation:
+    """Predict from moments along a drive and compare with the motion that followed.
+
+    A window starts at each cloud or image (at least ``stride`` [s] apart; on flat ground, at odometry) and uses the
+    commands that were recorded during it.
+
+    Args:
+        recording: the drive.
+        predictor: robot, terrain source and horizon; the horizon must cover ``horizons``.
+        image_topics: cameras to use with a camera terrain source; the first one sets the times.
+        horizons: at which errors are summed up [s].
+        stride: least time between windows [s].
+        shortest: odometry that a window needs after its start [s]; by default the shortest horizon.
+        progress: show a bar.
+
+    Raises:
+        EvaluationError: there is nothing to predict from, or no window with odometry after it.
+    """
+    recording = corrected_recording(recording, predictor.robot)
+    sensors = predictor.source.sensors
+    stamps = _window_stamps(recording, sensors, image_topics, stride, shortest or min(horizons))
+    count = round(max(horizons) / SAMPLE_TIME) + 1
+    times = np.arange(count) * SAMPLE_TIME
+    remarks: list[str] = []
+    motions: list[MotionState] = []
+    terrains: list[TerrainMap] = []
+    collected: dict[str, list[Poses]] = {PHYSICS: [], FLAT_PHYSICS: [], CONSTANT_VELOCITY: []}
+    inside: list[np.ndarray] = []
+    level = FlatTerrain(predictor.robot, predictor.source.grid, TerrainDefaults())
+
+    def finish_batch(batch: list[MotionState], maps: list[TerrainMap]) -> None:
+        twists = np.stack([recording.commands.sample(predictor.command_stamps(m.stamp)) for m in batch])
+        for method, batch_maps in ((PHYSICS, maps), (FLAT_PHYSICS, [level.terrain(Observation(0), m) for m in batch])):
+            if method == FLAT_PHYSICS and not sensors:
+                continue
+            result = predictor.roll_out(TerrainMap.stack(batch_maps), batch, twists)
+            index = np.rint(times / predictor.options.time_step).astype(int)
+            for row, motion in enumerate(batch):
+                transform = motion.odometry_from_terrain
+                positions = result.position[row].double().numpy()[index]
+                rotations = result.rotation[row].double().numpy()[index]
+                collected[method].append(Poses(transform_points(transform, positions), transform[:3, :3] @ rotations))
+                if method == PHYSICS:
+                    inside.append(result.inside[row].numpy()[index])
+
+    bar = tqdm(stamps, desc="predicting", unit="window", disable=None if progress else True)
+    pending: list[MotionState] = []
+    pending_maps: list[TerrainMap] = []
+    for stamp in bar:
+        try:
+            motion = recording.motion.at(int(stamp), maximum_gap=MAXIMUM_GAP)
+            observation = observe(recording, predictor.robot, int(stamp), sensors, image_topics)
+            pending_maps.append(predictor.source.terrain(observation, motion))
+        except (StaleDataError, MessageError, ValueError) as error:
+            remarks.append(f"window at {(stamp - recording.motion.stamps[0]) * 1e-9:.1f} s left out: {error}")
+            continue
+        pending.append(motion)
+        terrains.append(pending_maps[-1])
+        motions.append(motion)
+        if len(pending) == BATCH:
+            finish_batch(pending, pending_maps)
+            pending, pending_maps = [], []
+    if pending:
+        finish_batch(pending, pending_maps)
+    if not motions:
+        raise EvaluationError(
+            f"{recording.path}: no prediction could be made: {remarks[0] if remarks else 'no sensor data'}"
+        )
+    measured = measured_poses(recording, motions, times)
+    collected[CONSTANT_VELOCITY] = [constant_velocity(motion, times) for motion in motions]
+    on_map = np.array(inside) & np.array(
+        [
+            _on_map(terrain, motion, positions)
+            for terrain, motion, positions in zip(terrains, motions, measured.positions, strict=True)
+        ]
+    )
+    return RecordingEvaluation(
+        times=times,
+        stamps=np.array([motion.stamp for motion in motions]),
+        measured=measured,
+        predicted={
+            method: Poses(np.stack([p.positions for p in poses]), np.stack([p.rotations for p in poses]))
+            for method, poses in collected.items()
+            if poses
+        },
+        inside=on_map,
+        horizons=tuple(horizons),
+        remarks=(*recording.complaints, *remarks),
+    )
+
+
+def predict_at(recording: Recording, predictor: Predictor, stamp: int, image_topics: Sequence[str] = ()) -> Prediction:
+    """One prediction with all its forces, from the data at ``stamp`` [ns] and the commands recorded after it."""
+    recording = corrected_recording(recording, predictor.robot)
+    return predictor.predict(
+        observe(recording, predictor.robot, stamp, predictor.source.sensors, image_topics),
+        recording.motion.at(stamp, maximum_gap=MAXIMUM_GAP),
+        recording.commands.sample(predictor.command_stamps(stamp)),
+    )
+
+
+def corrected_recording(recording: Recording, robot: RobotModel) -> Recording:
+    """The drive without what the robot's file says its clocks and sensors do to the record."""
+    return replace(
+        recording,
+        motion=corrected_motion(recording.motion, robot.effects),
+        commands=corrected_commands(recording.commands, robot.effects),
+    )
+
+
+def observe(
+    recording: Recording, robot: RobotModel, stamp: int, sensors: Sequence[str], image_topics: Sequence[str] = ()
+) -> Observation:
+    """What sensors (``lidar``, ``camera``) saw nearest to a stamp [ns], seen from where the robot was then.
+
+    With cameras and a lidar, or several cameras, what is further away than 0.1 s is left out.
+    """
+    cloud, images, cameras, poses = None, {}, {}, {}
+    if "lidar" in sensors:
+        frame = min(recording.clouds, key=lambda entry: abs(entry.stamp - stamp), default=None)
+        if frame is not None and ("camera" not in sensors or abs(frame.stamp - stamp) <= _TOGETHER):
+            points, frame_id = recording.cloud(frame)
+            pose = recording.sensor_pose(frame_id, robot.base_frame, robot.sensors)
+            cloud = transform_points(_moved(recording, frame.stamp, stamp) @ pose, points).astype(np.float32)
+    for topic in image_topics if "camera" in sensors else ():
+        frame = min(recording.images[topic], key=lambda entry: abs(entry.stamp - stamp), default=None)
+        if frame is None or abs(frame.stamp - stamp) > _TOGETHER:
+            continue
+        if topic not in recording.cameras:
+            raise EvaluationError(f"{recording.path}: no CameraInfo beside {topic}")
+        images[topic] = recording.image(frame)
+        cameras[topic] = recording.cameras[topic]
+        pose = recording.sensor_pose(cameras[topic].frame_id, robot.base_frame, robot.sensors)
+        poses[topic] = _moved(recording, frame.stamp, stamp) @ pose
+    return Observation(stamp, cloud, images, cameras, poses)
+
+
+def _moved(recording: Recording, start: int, end: int) -> np.ndarray:
+    return recording.motion.base_between(start, end, maximum_gap=MAXIMUM_GAP)
+
+
+def measured_poses(recording: Recording, motions: list[MotionState], times: np.ndarray) -> Poses:
+    """Measured poses ``[W, T]`` after each motion; NaN beyond the odometry's end and within its gaps."""
+    stamps = np.array([m.stamp for m in motions])[:, None] + np.rint(times * 1e9).astype(np.int64)
+    positions = np.full((*stamps.shape, 3), np.nan)
+    rotations = np.full((*stamps.shape, 3, 3), np.nan)
+    last = recording.motion.stamps[-1]
+    for index in np.ndindex(stamps.shape):
+        if stamps[index] <= last:
+            try:
+                state = recording.motion.at(int(stamps[index]), maximum_gap=MAXIMUM_GAP)
+            except StaleDataError:
+                continue
+            positions[index], rotations[index] = state.position, state.rotation
+    return Poses(positions, rotations)
+
+
+def constant_velocity(motion: MotionState, times: np.ndarray) -> Poses:
+    """The baseline: forward speed and yaw rate of the start go on, at the start's height, roll and pitch."""
+    speed, rate = motion.linear_velocity[0], motion.angular_velocity[2]
+    angles = rate * times
+    # ∫ cos(ωt) and ∫ sin(ωt), exact for ω → 0 too.
+    along = speed * times * np.sinc(angles / np.pi)
+    across = speed * times * np.sin(angles / 2) * np.sinc(angles / 2 / np.pi)
+    heading = motion.heading
+    positions = motion.position + np.stack(
+        [
+            np.cos(heading) * along - np.sin(heading) * across,
+            np.sin(heading) * along + np.cos(heading) * across,
+            np.zeros_like(along),
+        ],
+        axis=-1,
+    )
+    return Poses(positions, Rotation.from_euler("z", angles[:, None]).as_matrix() @ motion.rotation)
+
+
+def _window_stamps(
+    recording: Recording, sensors: Sequence[str], image_topics: Sequence[str], stride: float, shortest: float
+) -> np.ndarray:
+    if not sensors:
+        candidates = recording.motion.stamps
+    elif "camera" in sensors and image_topics:
+        unknown = [topic for topic in image_topics if topic not in recording.images]
+        if unknown:
+            raise EvaluationError(f"{recording.path}: no images on {unknown}; there are {sorted(recording.images)}")
+        candidates = np.array([frame.stamp for frame in recording.images[image_topics[0]]], np.int64)
+    else:
+        frames = () if "camera" in sensors else recording.clouds
+        candidates = np.array([frame.stamp for frame in frames], np.int64)
+    if not len(candidates):
+        missing = "images" if "camera" in sensors else "point clouds"
+        raise EvaluationError(
+            f"{recording.path}: no {missing} to predict from; with `--terrain flat` odometry and commands suffice"
+        )
+    if not len(recording.commands):
+        raise EvaluationError(f"{recording.path}: no commands (Twist or TwistStamped): the prediction needs them")
+    end = recording.motion.stamps[-1] - int(shortest * 1e9)
+    candidates = candidates[(candidates >= recording.motion.stamps[0]) & (candidates <= end)]
+    chosen: list[int] = []
+    for stamp in candidates:
+        if not chosen or stamp - chosen[-1] >= stride * 1e9 - 1e6:
+            chosen.append(int(stamp))
+    if not chosen:
+        raise EvaluationError(f"{recording.path}: no sensor data with {shortest:g} s of odometry after it")
+    return np.array(chosen, np.int64)
+
+
+def _on_map(terrain: TerrainMap, motion: MotionState, positions: np.ndarray) -> np.ndarray:
+    local = transform_points(np.linalg.inv(motion.odometry_from_terrain), positions)
+    _, _, inside = terrain.grid.cells(np.nan_to_num(local[:, :2], nan=np.inf))
+    return inside

@@ -1,0 +1,76 @@
+"""A Prediction → the messages that show it: height map, terrain, path, contact forces."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib import colormaps
+
+from monoforce_ros.core import quaternions
+from monoforce_ros.messages import encoding
+from monoforce_ros.prediction import FORCE_LENGTH, Prediction, cell_points, contact_points, force_steps, usable_steps
+from monoforce_ros.robots import RobotModel
+
+
+def height_map(prediction: Prediction, frame_id: str) -> bytes:
+    """``nav_msgs/GridCells``: every cell of the predicted map at its height."""
+    points = cell_points(prediction.terrain, prediction.motion.odometry_from_terrain)
+    return encoding.grid_cells(prediction.stamp, frame_id, prediction.terrain.grid.resolution, points)
+
+
+def terrain_cloud(prediction: Prediction, frame_id: str) -> bytes:
+    """``sensor_msgs/PointCloud2``: every cell with all channels; heights are z in the odometry frame."""
+    terrain, transform = prediction.terrain, prediction.motion.odometry_from_terrain
+    points = cell_points(terrain, transform)
+    return encoding.point_cloud(
+        prediction.stamp,
+        frame_id,
+        {
+            "x": points[:, 0],
+            "y": points[:, 1],
+            "z": points[:, 2],
+            "geometric_height": terrain.geometric_height.numpy().ravel() + transform[2, 3],
+            "stiffness": terrain.stiffness.numpy(),
+            "damping": terrain.damping.numpy(),
+            "friction": terrain.friction.numpy(),
+            "observed": terrain.observed.numpy().astype(np.float32),
+        },
+    )
+
+
+def path(prediction: Prediction, frame_id: str, time_step: float) -> bytes:
+    """``nav_msgs/Path`` every ``time_step`` [s], as far as the map reaches; poses carry their own time."""
+    times = prediction.rollout.times.double().numpy()
+    stride = max(1, round(time_step / (times[1] - times[0])))
+    chosen = np.arange(0, max(1, usable_steps(prediction)), stride)
+    return encoding.path(
+        frame_id,
+        prediction.stamp + np.rint(times[chosen] * 1e9).astype(np.int64),
+        prediction.positions()[chosen],
+        quaternions(prediction.rotations()[chosen]),
+    )
+
+
+def contact_forces(prediction: Prediction, robot: RobotModel, frame_id: str) -> bytes:
+    """``visualization_msgs/MarkerArray``: contact points and forces along the path, coloured by size.
+
+    ``contact_forces`` are lines as long as the force in units of the robot's weight, ``contact_points`` their feet.
+    """
+    weight = float(robot.mass.mean()) * 9.81
+    contacts = [contact_points(prediction, robot, step) for step in force_steps(prediction)]
+    feet, forces = (np.concatenate(parts) for parts in zip(*contacts, strict=True))
+    tips = feet + forces * (FORCE_LENGTH / weight)
+    colours = colormaps["turbo"](np.clip(np.linalg.norm(forces, axis=1) / (0.25 * weight), 0, 1)).astype(np.float32)
+    return encoding.marker_array(
+        prediction.stamp,
+        frame_id,
+        [
+            encoding.ListMarker(
+                "contact_forces",
+                "lines",
+                np.stack([feet, tips], axis=1).reshape(-1, 3),
+                np.repeat(colours, 2, axis=0),
+                0.012,
+            ),
+            encoding.ListMarker("contact_points", "spheres", feet, colours, 0.03),
+        ],
+    )
