@@ -27,7 +27,7 @@ demo: build
 	@scripts/run.sh python scripts/demo.py --out out/demo
 
 lint: environment
-	@scripts/run.sh ruff check --quiet . && scripts/run.sh ruff format --check --quiet . && echo "[lint] clean"
+	@scripts/run.sh ruff check --quiet . && scripts/run.sh ruff format --check --quiet . && scripts/run.sh mypy && echo "[lint] clean"
 
 # Tests that compute share the cores; those of nodes run one after another: their timing wants the machine.
 TEST_PROCESSES ?= 2

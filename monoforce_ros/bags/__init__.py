@@ -3,7 +3,7 @@
 from monoforce_ros.bags import builders
 from monoforce_ros.bags.reader import BagError, BagReader
 from monoforce_ros.bags.recording import CAMERA_INFO, CLOUD, COMMANDS, IMAGES, ODOMETRY, Recording, camera_info_topic
-from monoforce_ros.bags.samples import Sample, synchronise
+from monoforce_ros.bags.samples import Sample, nearest_frame, synchronise
 from monoforce_ros.bags.smoothing import SmoothedMotion, smooth
 from monoforce_ros.bags.types import type_store
 from monoforce_ros.bags.windows import Windows, cut_windows
@@ -25,6 +25,7 @@ __all__ = [
     "builders",
     "camera_info_topic",
     "cut_windows",
+    "nearest_frame",
     "smooth",
     "synchronise",
     "type_store",

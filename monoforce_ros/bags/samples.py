@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from monoforce_ros.bags.recording import Frame, Recording
-from monoforce_ros.core import MotionState, StaleDataError
+from monoforce_ros.core import MotionState, StaleDataError, nearest_stamp
 
 
 @dataclass(frozen=True)
@@ -22,6 +22,12 @@ class Sample:
     """One frame of each topic."""
     motion: MotionState
     """At ``stamp``."""
+
+
+def nearest_frame(frames: Sequence[Frame], stamp: int, *, limit: float = np.inf) -> Frame | None:
+    """The frame nearest to a stamp [ns], within ``limit`` [s]; None where there is none."""
+    index = nearest_stamp(np.array([frame.stamp for frame in frames], np.int64), stamp, limit=limit)
+    return None if index is None else frames[index]
 
 
 def synchronise(
@@ -57,8 +63,8 @@ def synchronise(
     for frame in frames[topics[0]]:
         chosen = {topics[0]: frame}
         for topic in topics[1:]:
-            nearest = _nearest(stamps[topic], frame.stamp)
-            if nearest is None or abs(int(stamps[topic][nearest]) - frame.stamp) > limit * 1e9:
+            nearest = nearest_stamp(stamps[topic], frame.stamp, limit=limit)
+            if nearest is None:
                 missing[topic] += 1
                 break
             chosen[topic] = frames[topic][nearest]
@@ -70,11 +76,3 @@ def synchronise(
                 continue
             samples.append(Sample(frame.stamp, chosen, motion))
     return samples, missing
-
-
-def _nearest(stamps: np.ndarray, stamp: int) -> int | None:
-    if not len(stamps):
-        return None
-    after = int(np.searchsorted(stamps, stamp))
-    around = [index for index in (after - 1, after) if 0 <= index < len(stamps)]
-    return min(around, key=lambda index: abs(int(stamps[index]) - stamp))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import sqlite3
 from pathlib import Path
@@ -14,6 +13,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.rosbag2.storage_mcap import McapWriter
 
 from monoforce_ros.bags.types import type_store
+from monoforce_ros.core import unfinished_path
 
 _STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 _FOREVER = QosTime(sec=0x7FFFFFFF, nsec=0xFFFFFFFF)
@@ -54,7 +54,7 @@ class BagWriter:
         self.path = Path(path)
         if self.path.exists() and not overwrite:
             raise FileExistsError(f"{self.path} exists already: remove it, choose another name or allow overwriting")
-        self._unfinished = self.path.with_name(f".{self.path.name}.unfinished-{os.getpid()}")
+        self._unfinished = unfinished_path(self.path)
         self._keep = keep
         self._writer = Writer(self._unfinished, version=9, storage_plugin=_STORAGES[storage])
         if storage == "mcap":

@@ -1,9 +1,12 @@
-"""TODO."""
+"""What every room shares: cameras, rotations, tracks of motion and commands, time alignment, files."""
 
+from monoforce_ros.core.alignment import DelayCorrelation, Delayed, largest_spread, nearest_stamp
 from monoforce_ros.core.camera import CameraModel
-from monoforce_ros.core.files import write_text
-from monoforce_ros.core.geometry import homogeneous, quaternions, transform_points
+from monoforce_ros.core.files import atomic_path, unfinished_path, write_bytes, write_text
+from monoforce_ros.core.geometry import homogeneous, quaternions, small_rotation, transform_points, wrap_angle
+from monoforce_ros.core.regimes import FAST_SHARE, motion_regimes
 from monoforce_ros.core.shared_files import share_directory
+from monoforce_ros.core.statistics import huber
 from monoforce_ros.core.tracks import (
     NANOSECOND,
     AngularVelocityTrack,
@@ -15,17 +18,29 @@ from monoforce_ros.core.tracks import (
 )
 
 __all__ = [
+    "FAST_SHARE",
     "NANOSECOND",
     "AngularVelocityTrack",
     "CameraModel",
     "CommandTrack",
+    "DelayCorrelation",
+    "Delayed",
     "MotionState",
     "MotionTrack",
     "StaleDataError",
     "WheelTrack",
+    "atomic_path",
     "homogeneous",
+    "huber",
+    "largest_spread",
+    "motion_regimes",
+    "nearest_stamp",
     "quaternions",
     "share_directory",
+    "small_rotation",
     "transform_points",
+    "unfinished_path",
+    "wrap_angle",
+    "write_bytes",
     "write_text",
 ]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 
@@ -37,3 +39,20 @@ def homogeneous(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
 def transform_points(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Points ``[..., 3]`` moved by a homogeneous transform ``[4, 4]``."""
     return points @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def wrap_angle(angle: np.ndarray | float) -> np.ndarray:
+    """Angles brought into -π … π [rad]."""
+    return np.angle(np.exp(1j * np.asarray(angle)))
+
+
+def small_rotation(relative: Any) -> tuple[Any, Any, Any]:
+    """Components x, y, z of the rotation vectors of small rotations ``[..., 3, 3]``, arrays or tensors [rad].
+
+    Half the antisymmetric part: exact to third order in the angle, and smooth where the logarithm is not.
+    """
+    return (
+        0.5 * (relative[..., 2, 1] - relative[..., 1, 2]),
+        0.5 * (relative[..., 0, 2] - relative[..., 2, 0]),
+        0.5 * (relative[..., 1, 0] - relative[..., 0, 1]),
+    )

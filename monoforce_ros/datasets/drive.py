@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import BagWriter, builders, smooth
-from monoforce_ros.core import MotionTrack
+from monoforce_ros.core import DelayCorrelation, Delayed, MotionTrack
 from monoforce_ros.datasets.dataset import DatasetError, odometry_message
 
 WHEEL_RADIUS, TRACK_WIDTH = 0.3, 1.08
@@ -110,28 +110,15 @@ class DriveRecording:
         All delays are compared over the same samples of the poses; before and after a run the gyro is taken to go on as
         at its ends, where commands were held. The steady part of a run tells no delay and is left out.
         """
-        shown = [pair for pair in map(_yaw_rates, self.runs) if pair is not None]
-        products = np.zeros(len(_LAGS))
-        energies = np.zeros((2, len(_LAGS)))
-        for pose, gyro, step in shown:
-            shifts = np.rint(_LAGS / step).astype(int)
-            reach = int(np.abs(shifts).max())
-            padded = np.pad(gyro, reach, mode="edge")
-            count = len(pose) if len(pose) * step > _LONG_RUN else min(len(pose), round(_TRANSIENT / step))
-            own = pose[:count]
-            for index, shift in enumerate(shifts):
-                other = padded[reach - shift : reach - shift + count]
-                products[index] += float(own @ other)
-                energies[:, index] += float(own @ own), float(other @ other)
-        scale = np.sqrt(energies[0] * energies[1])
-        if not len(shown) or scale.max() < 0.2:
+        pairs = [pair for pair in map(_yaw_rates, self.runs) if pair is not None]
+        found = DelayCorrelation.of(map(_delayed_gyro, pairs), _LAGS)
+        if not len(found) or np.sqrt(found.energies.sum(axis=0).prod(axis=0)).max() < 0.2:
             return ClockFinding(0, float("nan"), 0.0)
-        correlations = products / np.maximum(scale, 1e-9)
-        best = int(np.argmax(np.abs(correlations)))
-        strength = float(abs(correlations[best]))
-        if strength < _WEAKEST:
-            return ClockFinding(0, float("nan"), strength)
-        return ClockFinding(1 if correlations[best] > 0 else -1, float(_LAGS[best]), strength)
+        best = found.strongest
+        correlation = float(found.values[best])
+        if abs(correlation) < _WEAKEST:
+            return ClockFinding(0, float("nan"), abs(correlation))
+        return ClockFinding(1 if correlation > 0 else -1, float(_LAGS[best]), abs(correlation))
 
 
 def drive_to_bag(
@@ -237,6 +224,20 @@ def _yaw_rates(run: DriveRun) -> tuple[np.ndarray, np.ndarray, float] | None:
     pose = np.clip((yaw[reach:] - yaw[:-reach]) / (reach * step), -_FASTEST_TURN, _FASTEST_TURN)
     gyro = np.convolve(run.gyro, np.ones(reach) / reach, mode="valid")[: len(pose)]
     return pose[: len(gyro)], gyro, step
+
+
+def _delayed_gyro(pair: tuple[np.ndarray, np.ndarray, float]) -> tuple[np.ndarray, Delayed]:
+    """The turning part of a run: yaw rate by the poses, and by the gyro as a function of the delay."""
+    pose, gyro, step = pair
+    reach = int(np.rint(np.abs(_LAGS).max() / step))
+    padded = np.pad(gyro, reach, mode="edge")
+    count = len(pose) if len(pose) * step > _LONG_RUN else min(len(pose), round(_TRANSIENT / step))
+
+    def delayed(lag: float) -> tuple[np.ndarray, np.ndarray]:
+        first = reach - int(np.rint(lag / step))
+        return padded[first : first + count], np.ones(count, bool)
+
+    return pose[:count], delayed
 
 
 def _open_windows(path: Path) -> DriveRecording:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from monoforce_ros.bags import SmoothedMotion
-from monoforce_ros.core import AngularVelocityTrack
+from monoforce_ros.core import AngularVelocityTrack, DelayCorrelation
 
 _STEP = 0.02
 _LAGS = np.arange(-50, 81) * _STEP
@@ -71,33 +72,19 @@ def compare_with_gyro(smoothed: SmoothedMotion, turning: AngularVelocityTrack | 
         rate = np.interp(times, stamps, smoothed.motion.angular_velocities[stretch, 2])
         count = max(1, round((times[-1] - times[0]) / _PIECE))
         pieces += list(zip(np.array_split(times, count), np.array_split(rate, count), strict=True))
-    best = None
-    for axis in range(3):
-        products, energies = _correlations(pieces, clock, turning.rates[:, axis])
-        if not len(products):
-            return None
-        total = _normalised(products.sum(axis=0), energies.sum(axis=0))
-        if best is None or np.abs(total).max() > np.abs(best[0]).max():
-            best = (total, products, energies, axis)
-    if best is None:
+    axes = [_correlated(pieces, clock, turning.rates[:, axis]) for axis in range(3)]
+    if not all(map(len, axes)):
         return None
-    total, products, energies, axis = best
-    peak = int(np.argmax(np.abs(total)))
-    correlation, sign = float(np.abs(total[peak])), int(np.sign(total[peak]))
+    axis = int(np.argmax([np.abs(found.values).max() for found in axes]))
+    found = axes[axis]
+    peak = found.strongest
+    correlation, sign = float(np.abs(found.values[peak])), int(np.sign(found.values[peak]))
     if correlation < _WEAKEST or not 0 < peak < len(_LAGS) - 1:
         return None
     # Leaving out one piece at a time: how far the delay hangs on single turns (jackknife).
-    whole = (products.sum(axis=0), energies.sum(axis=0))
-    offset = _peak(sign * _normalised(*whole), around=peak)
-    count = len(products)
-    left_out = np.array(
-        [
-            _peak(sign * _normalised(whole[0] - p, whole[1] - e), around=peak)
-            for p, e in zip(products, energies, strict=True)
-        ]
-        if count > 2
-        else [offset]
-    )
+    offset = found.peak(peak)
+    count = len(found)
+    left_out = found.peak_without_each(peak) if count > 2 else np.array([offset])
     spread = np.sqrt((count - 1) / count * np.sum((left_out - left_out.mean()) ** 2))
     differences, medians = [], []
     for times, rate in pieces:
@@ -127,38 +114,16 @@ def _shown(times: np.ndarray, clock: np.ndarray, rates: np.ndarray) -> tuple[np.
     return np.interp(times, clock, rates), near < 0.1
 
 
-def _correlations(pieces: list, clock: np.ndarray, rates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Products ``[P, lags]`` of both yaw rates, and energies ``[P, 2, lags]``, of pieces that turn."""
-    products, energies = [], []
-    # About the mean of the whole drive: a piece may turn one way throughout.
+def _correlated(pieces: list, clock: np.ndarray, rates: np.ndarray) -> DelayCorrelation:
+    """Correlation of both yaw rates over pieces that turn."""
+    # About the mean of the whole recording: a piece may turn one way throughout.
     means = np.mean([rate.mean() for _, rate in pieces]) if pieces else 0.0, float(np.mean(rates))
-    for times, rate in pieces:
-        if rate.std() < _LEAST_TURNING:
-            continue
-        row, energy = np.zeros(len(_LAGS)), np.zeros((2, len(_LAGS)))
-        for index, lag in enumerate(_LAGS):
-            shown, known = _shown(times - lag, clock, rates)
-            if known.sum() < 20:
-                continue
-            one, other = rate[known] - means[0], shown[known] - means[1]
-            row[index], energy[:, index] = one @ other, (one @ one, other @ other)
-        products.append(row)
-        energies.append(energy)
-    return np.array(products), np.array(energies)
 
+    def delayed(times: np.ndarray, lag: float) -> tuple[np.ndarray, np.ndarray]:
+        measured, known = _shown(times - lag, clock, rates)
+        return measured - means[1], known
 
-def _normalised(products: np.ndarray, energies: np.ndarray) -> np.ndarray:
-    """Correlation at each lag: of ``products`` ``[lags]`` and ``energies`` ``[2, lags]``."""
-    return products / np.sqrt(np.maximum(energies.prod(axis=0), 1e-12))
-
-
-def _peak(values: np.ndarray, around: int) -> float:
-    """Place of the maximum near a lag, by a parabola through three values [s]."""
-    low, high = max(1, around - 10), min(len(values) - 1, around + 11)
-    top = low + int(np.argmax(values[low:high]))
-    if not 0 < top < len(values) - 1:
-        return float(_LAGS[top])
-    left, middle, right = values[top - 1 : top + 2]
-    bend = left - 2 * middle + right
-    shift = 0.5 * (left - right) / bend if bend < 0 else 0.0
-    return float(_LAGS[top] + np.clip(shift, -1.0, 1.0) * _STEP)
+    turning = [(times, rate) for times, rate in pieces if rate.std() >= _LEAST_TURNING]
+    return DelayCorrelation.of(
+        ((rate - means[0], partial(delayed, times)) for times, rate in turning), _LAGS, fewest=20
+    )

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from monoforce_ros.core import huber
 from monoforce_ros.discrepancy.hypothesis import Effects, EvidenceWindows, Predictions
 from monoforce_ros.effects import CATALOGUE
 
@@ -40,9 +41,7 @@ def robust(scaled: np.ndarray) -> np.ndarray:
 
     A prediction that is not finite counts as one that is very wrong.
     """
-    size = np.abs(np.nan_to_num(scaled, nan=_LOST))
-    values = np.where(size <= OUTLIER, 0.5 * size**2, OUTLIER * (size - 0.5 * OUTLIER))
-    return np.minimum(values, 1e6).mean(axis=(-1, -2))
+    return np.minimum(huber(np.nan_to_num(scaled, nan=_LOST), OUTLIER), 1e6).mean(axis=(-1, -2))
 
 
 def flat(effects: Effects) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import SmoothedMotion, smooth
-from monoforce_ros.core import MotionTrack
+from monoforce_ros.core import MotionTrack, motion_regimes, wrap_angle
 from monoforce_ros.discrepancy.hypothesis import EvidenceWindows, Predictions, sample_motion
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import TerrainMap
@@ -91,7 +91,7 @@ def relative_motion(motion: MotionTrack, data: EvidenceWindows) -> np.ndarray:
     headings = np.arctan2(rotations[..., 1, 0], rotations[..., 0, 0])
     turn = Rotation.from_euler("z", headings[:, 0, None]).as_matrix()
     moved = np.einsum("wji,wkj->wki", turn, positions[:, 1:] - positions[:, :1])
-    turned = np.angle(np.exp(1j * (headings[:, 1:] - headings[:, :1])))
+    turned = wrap_angle(headings[:, 1:] - headings[:, :1])
     return np.concatenate([moved[..., :2], turned[..., None]], axis=-1)
 
 
@@ -104,27 +104,19 @@ def residual_scale(floor: np.ndarray, nominal_residual: np.ndarray | None) -> np
 
 
 def find_regimes(data: EvidenceWindows) -> dict[str, np.ndarray]:
-    """Ways of driving in plain words, each with the mask ``[W]`` of its windows; a window may be in several."""
+    """Motion regimes, each with the mask ``[W]`` of its windows; a window may be in several."""
     count = round((data.horizon + 0.5) / 0.05)
     stamps = data.starts[:, None] + (np.arange(count) * 50_000_000 - 500_000_000)
-    told = data.commands.sample(stamps)
+    commanded = data.commands.sample(stamps)
     rotations = sample_motion(data.motion, stamps)[1]
-    speed, turning = np.abs(told[..., 0]).mean(axis=1), np.abs(told[..., 1]).mean(axis=1)
-    change = np.abs(np.diff(told[..., 0], axis=1)).sum(axis=1)
+    speed = np.abs(commanded[..., 0]).mean(axis=1)
     pitch = np.abs(rotations[..., 2, 0]).mean(axis=1)
+    # A recording has its own fast windows, whatever the robot could do.
     fast = max(0.3, float(np.quantile(speed, 0.7)))
-    masks = {
-        "turning faster than 0.4 rad/s": turning > 0.4,
-        "driving straight": (turning < 0.1) & (speed > 0.1),
-        f"faster than {fast:.1f} m/s": speed > fast,
-        "reversing": told[..., 0].mean(axis=1) < -0.05,
-        "changing speed": change > 0.3,
-        "standing or nearly": (speed < 0.05) & (turning < 0.05),
-        "turning left": told[..., 1].mean(axis=1) > 0.2,
-        "turning right": told[..., 1].mean(axis=1) < -0.2,
+    masks = motion_regimes(commanded, fast) | {
         "on slopes steeper than 5°": pitch > np.sin(np.radians(5.0)),
-        "in the first third of the drive": np.arange(len(speed)) < len(speed) / 3,
-        "in the last third of the drive": np.arange(len(speed)) >= 2 * len(speed) / 3,
+        "in the first third of the recording": np.arange(len(speed)) < len(speed) / 3,
+        "in the last third of the recording": np.arange(len(speed)) >= 2 * len(speed) / 3,
     }
     return {name: mask for name, mask in masks.items() if 3 <= mask.sum() < len(mask)}
 

@@ -15,7 +15,7 @@ import torch
 from scipy.spatial.transform import Rotation, Slerp
 
 from monoforce_ros.bags import SmoothedMotion
-from monoforce_ros.core import AngularVelocityTrack, CommandTrack, MotionTrack, WheelTrack
+from monoforce_ros.core import AngularVelocityTrack, CommandTrack, MotionTrack, WheelTrack, wrap_angle
 from monoforce_ros.effects import CATALOGUE, corrected_commands, corrected_motion, drive_speeds
 from monoforce_ros.physics import PhysicsOptions, State, TerrainLookup, rest_depth, rollout
 from monoforce_ros.robots import RobotModel
@@ -193,7 +193,7 @@ class Predictions:
         headings = np.arctan2(rotations[..., 1, 0], rotations[..., 0, 0])
         turn = Rotation.from_euler("z", headings[:, 0, None]).as_matrix()
         moved = np.einsum("wji,wkj->wki", turn, positions[:, 1:] - positions[:, :1])
-        turned = np.angle(np.exp(1j * (headings[:, 1:] - headings[:, :1])))
+        turned = wrap_angle(headings[:, 1:] - headings[:, :1])
         steps = np.arange(-round(HISTORY / self.options.time_step), self._index[-1] + 1)
         asked = data.starts[:, None] + np.rint(steps * self.options.time_step * 1e9).astype(np.int64)
         if data.terrain is None:
@@ -269,7 +269,7 @@ class Predictions:
             [
                 away[..., 0] - windows["moved"][..., 0],
                 away[..., 1] - windows["moved"][..., 1],
-                np.angle(np.exp(1j * (heading - windows["turned"]))),
+                wrap_angle(heading - windows["turned"]),
             ],
             axis=-1,
         )

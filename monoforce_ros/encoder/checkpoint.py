@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -12,7 +11,7 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
-from monoforce_ros.core import share_directory
+from monoforce_ros.core import atomic_path, share_directory, write_text
 from monoforce_ros.encoder.config import EncoderConfig
 from monoforce_ros.encoder.lidar_encoder import LidarEncoder
 from monoforce_ros.encoder.terrain_encoder import TerrainEncoder
@@ -43,15 +42,12 @@ def new_encoder(config: EncoderConfig) -> Encoder:
 def save_encoder(encoder: Encoder, path: str | Path) -> None:
     """Write ``path`` (.safetensors) and its configuration (.json); both appear complete or not at all."""
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.name}.unfinished-{os.getpid()}")
-    save_file({name: value.contiguous() for name, value in encoder.state_dict().items()}, str(unfinished))
-    description = unfinished.with_suffix(".json.part")
-    description.write_text(json.dumps(asdict(encoder.config), indent=2), encoding="utf-8")
-    # safetensors writes for its owner alone; a checkpoint is to be read by whoever runs the node.
-    unfinished.chmod(0o644)
-    description.rename(path.with_suffix(".json"))
-    unfinished.rename(path)
+    with atomic_path(path) as unfinished:
+        save_file({name: value.contiguous() for name, value in encoder.state_dict().items()}, str(unfinished))
+        # safetensors writes for its owner alone; a checkpoint is to be read by whoever runs the node.
+        unfinished.chmod(0o644)
+        # The description first: weights without one are refused, a description without weights is none.
+        write_text(path.with_suffix(".json"), json.dumps(asdict(encoder.config), indent=2))
 
 
 def load_encoder(path: str | Path, sensor: str | None = None) -> Encoder:

@@ -22,7 +22,7 @@ from monoforce_ros.bags import (
     camera_info_topic,
     smooth,
 )
-from monoforce_ros.core import CommandTrack, MotionTrack
+from monoforce_ros.core import CommandTrack, DelayCorrelation, MotionTrack
 from monoforce_ros.messages import decoding
 from monoforce_ros.robots import RobotModel
 
@@ -314,32 +314,27 @@ def _command_findings(recording: Recording, motion: MotionTrack, robot: RobotMod
 
 
 def command_delay(motion: MotionTrack, commands: CommandTrack) -> tuple[float, float]:
-    """How much later the robot does what it was told [s], and the correlation of both at that delay, 0 to 1."""
+    """How much later the robot moves as commanded [s], and the correlation of both at that delay, 0 to 1."""
     first, last = int(motion.stamps[0]), int(motion.stamps[-1])
     stamps = np.arange(first, last, 25_000_000, dtype=np.int64)
     if len(stamps) < 80:
         return float("nan"), 0.0
-    seconds = (stamps - first) * 1e-9
-    times = (motion.stamps - first) * 1e-9
-    best = (float("nan"), 0.0)
-    done = np.stack(
-        [
-            np.interp(seconds, times, motion.linear_velocities[:, 0]),
-            np.interp(seconds, times, motion.angular_velocities[:, 2]),
-        ]
-    )
-    for lag in _LAGS:
-        told = commands.sample(stamps - round(1e9 * lag)).T
-        product, scale = 0.0, 0.0
-        for a, b in zip(done, told, strict=True):
-            a, b = a - a.mean(), b - b.mean()
-            spread = float(a.std() * b.std())
-            if b.std() > 0.02:
-                product += float((a * b).mean())
-                scale += spread
-        if scale > 0 and product / scale > best[1]:
-            best = float(lag), product / scale
-    return best
+    seconds, times = (stamps - first) * 1e-9, (motion.stamps - first) * 1e-9
+    pieces = []
+    for axis, values in enumerate((motion.linear_velocities[:, 0], motion.angular_velocities[:, 2])):
+        measured = np.interp(seconds, times, values)
+
+        def delayed(lag: float, axis: int = axis) -> tuple[np.ndarray, np.ndarray]:
+            commanded = commands.sample(stamps - round(1e9 * lag))[:, axis]
+            # A command that hardly changes tells no delay.
+            return commanded - commanded.mean(), np.full(len(stamps), commanded.std() > 0.02)
+
+        pieces.append((measured - measured.mean(), delayed))
+    found = DelayCorrelation.of(pieces, _LAGS)
+    if not len(found) or found.values.max() <= 0.0:
+        return float("nan"), 0.0
+    best = int(np.argmax(found.values))
+    return float(_LAGS[best]), float(found.values[best])
 
 
 def check_text(check: BagCheck) -> str:

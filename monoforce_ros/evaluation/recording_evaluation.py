@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from monoforce_ros.bags import Recording
+from monoforce_ros.bags import Recording, nearest_frame
 from monoforce_ros.core import MotionState, StaleDataError, transform_points
 from monoforce_ros.effects import corrected_commands, corrected_motion
 from monoforce_ros.evaluation.metrics import Poses, Summary, position_errors, rotation_errors, summarise
@@ -198,14 +198,14 @@ def observe(
     """
     cloud, images, cameras, poses = None, {}, {}, {}
     if "lidar" in sensors:
-        frame = min(recording.clouds, key=lambda entry: abs(entry.stamp - stamp), default=None)
-        if frame is not None and ("camera" not in sensors or abs(frame.stamp - stamp) <= _TOGETHER):
+        frame = nearest_frame(recording.clouds, stamp, limit=_TOGETHER if "camera" in sensors else np.inf)
+        if frame is not None:
             points, frame_id = recording.cloud(frame)
             pose = recording.sensor_pose(frame_id, robot.base_frame, robot.sensors)
             cloud = transform_points(_moved(recording, frame.stamp, stamp) @ pose, points).astype(np.float32)
     for topic in image_topics if "camera" in sensors else ():
-        frame = min(recording.images[topic], key=lambda entry: abs(entry.stamp - stamp), default=None)
-        if frame is None or abs(frame.stamp - stamp) > _TOGETHER:
+        frame = nearest_frame(recording.images[topic], stamp, limit=_TOGETHER)
+        if frame is None:
             continue
         if topic not in recording.cameras:
             raise EvaluationError(f"{recording.path}: no CameraInfo beside {topic}")

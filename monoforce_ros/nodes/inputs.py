@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from monoforce_ros.core import NANOSECOND, CommandTrack, MotionState, MotionTrack, quaternions
+from monoforce_ros.core import NANOSECOND, CommandTrack, MotionState, MotionTrack, largest_spread, quaternions
 
 MEMORY = 10_000_000_000
 """How long motion and commands are remembered [ns]."""
@@ -44,7 +44,7 @@ class Inputs:
     def __init__(self, sensors: list[str], *, slop: float, patience: float, on_time_jump: Callable[[str, float], None]):
         self.changed = threading.Condition()
         self._sensors = sensors
-        self._slop = int(slop * 1e9)
+        self._slop = slop
         self._patience = patience
         self._on_time_jump = on_time_jump
         self._last_stamps: dict[str, int] = {}
@@ -111,19 +111,13 @@ class Inputs:
             self._first_sensor = self._first_sensor or now
             if len(self._newest) < len(self._sensors) and now - self._first_sensor < self._patience:
                 return  # the others may still be starting
-            if max(e.stamp for e in live) - min(e.stamp for e in live) > self._largest_spread():
+            if max(e.stamp for e in live) - min(e.stamp for e in live) > 1e9 * largest_spread(
+                self._slop, (1e-9 * entry for entry in self._intervals.values())
+            ):
                 return
             self.dropped += bool(self._pending)
             self._pending = {name: entry for name, entry in self._newest.items() if entry in live}
             self.changed.notify_all()
-
-    def _largest_spread(self) -> int:
-        """Difference of stamps [ns] up to which messages make a set.
-
-        What is more than half the slowest sensor's interval behind the others belongs to the set before: of cameras
-        that are triggered together one must not be used with the others' last images.
-        """
-        return min([self._slop, *([max(self._intervals.values()) // 2] if self._intervals else [])])
 
     def take(self, *, odometry_timeout: float, wait: float) -> dict[str, Received] | None:
         """The newest complete set of sensor messages once odometry has caught up with it, else None after ``wait`` [s].

@@ -35,7 +35,7 @@ from monoforce_ros.nodes.spread_output import SpreadOutput
 from monoforce_ros.nodes.subscriptions import AdaptiveSubscription
 from monoforce_ros.perception import Observation, TerrainSource, choose_terrain_source
 from monoforce_ros.physics import PhysicsOptions
-from monoforce_ros.prediction import Prediction, Predictor
+from monoforce_ros.prediction import FORCE_INTERVAL, Prediction, Predictor
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainDefaults
 
@@ -71,7 +71,7 @@ class PredictorNode(ManagedNode):
             horizon=settings.horizon,
             options=PhysicsOptions(time_step=settings.time_step),
         )
-        self._force_every = max(1, round(encoders.FORCE_INTERVAL / settings.time_step))
+        self._force_every = max(1, round(FORCE_INTERVAL / settings.time_step))
         self.get_logger().info(
             "preparing the physics; the first time on a machine its kernels are compiled, about 10 s"
         )

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from monoforce_ros.core import wrap_angle
 from monoforce_ros.planning.goal_planner import CostToGo
 
 WAYPOINTS = (25, 50, 75)
@@ -75,7 +76,7 @@ def select_candidate(
         nearest, at_end = np.minimum(left.min(axis=1), np.where(nearest < _LOOK, nearest, np.inf)), nearest >= _LOOK
     reach = max(float(np.linalg.norm(end - robot, axis=1).max()), 0.1)
     towards = np.arctan2(goal[1] - end[:, 1], goal[0] - end[:, 0])
-    off = np.abs((candidates["heading"] - towards + np.pi) % (2.0 * np.pi) - np.pi) / np.pi
+    off = np.abs(wrap_angle(candidates["heading"] - towards)) / np.pi
     if ways is not None:
         # Where the way is not straight, looking along it counts: by how much half a metre ahead would shorten it.
         ahead = end + _LOOK * np.column_stack([np.cos(candidates["heading"]), np.sin(candidates["heading"])])

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from monoforce_ros.core import wrap_angle
 from monoforce_ros.physics import State
 from monoforce_ros.prediction.predictor import Prediction, Predictor, start_states
 from monoforce_ros.robots import RobotModel
@@ -115,7 +116,7 @@ def spread(predictor: Predictor, prediction: Prediction, twists: np.ndarray, set
     across = cosine * away[..., 1] - sine * away[..., 0]
     rotation = rolled.rotation.double().numpy()[finite]
     turn = np.arctan2(rotation[..., 1, 0], rotation[..., 0, 0]) - heading
-    turn = (turn + np.pi) % (2.0 * np.pi) - np.pi
+    turn = wrap_angle(turn)
     driven = np.linalg.norm(np.diff(nominal[:, :2], axis=0, prepend=nominal[:1, :2]), axis=1).cumsum()
     drift = np.hypot(settings.drift * driven, settings.position)
     radius = np.hypot(np.quantile(np.hypot(along, across), COVERAGE, axis=0), _RAYLEIGH * drift)

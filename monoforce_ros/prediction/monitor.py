@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from monoforce_ros.core import CommandTrack, MotionTrack, StaleDataError
+from monoforce_ros.core import FAST_SHARE, CommandTrack, MotionTrack, StaleDataError, motion_regimes, wrap_angle
 from monoforce_ros.prediction.predictor import Prediction, Predictor
 
 HORIZONS = (1.0, 2.0, 5.0)
@@ -16,8 +16,6 @@ _EVERY = 0.5
 """Least time between the predictions that are kept to be compared [s]."""
 _KEPT = 120
 _LARGEST_GAP = 0.3
-_TURNING, _FAST = 0.3, 0.6
-"""Yaw rate [rad/s] and share of the fastest speed from which on a stretch counts as turning or fast."""
 _FEWEST = 6
 """Comparisons that a regime needs to be named."""
 _FREEDOM = 6.0
@@ -161,25 +159,16 @@ def _compared(prediction: Prediction, motion: MotionTrack, twists: np.ndarray, p
             continue
         position[i] = np.linalg.norm(positions[step] - state.position)
         turned = np.arctan2(rotations[step][1, 0], rotations[step][0, 0]) - state.heading
-        heading[i] = (turned + np.pi) % (2.0 * np.pi) - np.pi
+        heading[i] = wrap_angle(turned)
         moved[i] = np.linalg.norm(state.position - prediction.motion.position)
     first = twists[: round(2.0 / predictor.options.time_step)]
     return GapSample(prediction.stamp, position, heading, moved, _regimes(first, predictor))
 
 
 def _regimes(twists: np.ndarray, predictor: Predictor) -> frozenset[str]:
-    """What the commands of the two seconds ask for."""
-    speed, rate = float(np.mean(twists[:, 0])), float(np.mean(np.abs(twists[:, 1])))
-    fastest = predictor.robot.maximum_speed
-    named = {
-        "turning": rate > _TURNING,
-        "going straight": rate < _TURNING / 3 and abs(speed) > 0.05,
-        "reversing": speed < -0.05,
-        "fast": np.isfinite(fastest) and abs(speed) > _FAST * fastest,
-        "changing speed": float(np.ptp(twists[:, 0])) > 0.3,
-        "standing": abs(speed) < 0.02 and rate < 0.02,
-    }
-    return frozenset(name for name, holds in named.items() if holds)
+    """Regimes of commands ``[T, 2]``."""
+    masks = motion_regimes(twists[None], FAST_SHARE * predictor.robot.maximum_speed)
+    return frozenset(name for name, mask in masks.items() if mask[0])
 
 
 def _median(values: np.ndarray) -> np.ndarray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -11,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from monoforce_ros.core import write_text
 from monoforce_ros.robots.loader import RobotFileError, robot_file
 
 
@@ -68,10 +68,7 @@ def write_robot(
     content["effects"] = list(present.values())
     if commissioning is not None:
         content["commissioning"] = commissioning
-    out.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = out.with_name(f".{out.name}.unfinished-{os.getpid()}")
-    unfinished.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
-    unfinished.replace(out)
+    write_text(out, yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
     return out
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import inspect
 import json
 import math
-import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
 
+from monoforce_ros.core import write_text
 from monoforce_ros.synthetic import faults
 from monoforce_ros.synthetic.fault import Fault
 from monoforce_ros.synthetic.random_streams import random_stream
@@ -106,7 +106,5 @@ def truth_file(bag: Path) -> Path:
 def write_truth(bag: Path, hidden: Sequence[Fault], seed: int) -> Path:
     """Write what is hidden in a bag beside it; returns the file, which appears only when it is complete."""
     target = truth_file(bag)
-    unfinished = target.with_name(f".{target.name}.unfinished-{os.getpid()}")
-    unfinished.write_text(json.dumps({"hidden": describe(hidden), "seed": seed}, indent=2) + "\n", encoding="utf-8")
-    unfinished.replace(target)
+    write_text(target, json.dumps({"hidden": describe(hidden), "seed": seed}, indent=2) + "\n")
     return target

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from monoforce_ros.core import atomic_path
 from monoforce_ros.synthetic.scenery import Scenery
 from monoforce_ros.synthetic.shapes import upper_surface
 
@@ -86,8 +87,6 @@ def labels_file(bag: Path) -> Path:
 def write_labels(bag: Path, labels: dict[str, np.ndarray]) -> Path:
     """Write labels beside a bag; returns their file, which appears only when it is complete."""
     target = labels_file(bag)
-    unfinished = target.with_name(f".{target.name}.unfinished")
-    with unfinished.open("wb") as file:
+    with atomic_path(target) as unfinished, unfinished.open("wb") as file:
         np.savez_compressed(file, **labels)
-    unfinished.replace(target)
     return target

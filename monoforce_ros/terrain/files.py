@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import zipfile
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from monoforce_ros.core import atomic_path
 from monoforce_ros.terrain.grid import Grid
 from monoforce_ros.terrain.terrain_map import CHANNELS, TerrainMap
 
@@ -37,11 +37,8 @@ def save_terrain(
     content["resolution"] = np.array(terrain.grid.resolution)
     content["origin"] = np.array(terrain.grid.origin)
     content["odometry_from_terrain"] = np.eye(4) if odometry_from_terrain is None else odometry_from_terrain
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.name}.unfinished-{os.getpid()}")
-    with unfinished.open("wb") as file:
+    with atomic_path(path) as unfinished, unfinished.open("wb") as file:
         np.savez_compressed(file, **content, **extra)
-    unfinished.replace(path)
     return path
 
 

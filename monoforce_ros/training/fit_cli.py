@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
-import os
 import sys
 import zipfile
 from dataclasses import asdict
@@ -16,7 +15,7 @@ import torch
 from tqdm import tqdm
 
 from monoforce_ros.bags import BagError, Recording, SmoothedMotion, smooth
-from monoforce_ros.core import write_text
+from monoforce_ros.core import write_bytes, write_text
 from monoforce_ros.reporting import figure_png
 from monoforce_ros.robots import RobotFileError, RobotModel, load_robot, shipped_robots
 from monoforce_ros.terrain import TerrainDefaults, TerrainError, save_terrain
@@ -149,10 +148,7 @@ def _fit_one(
     }
     title = f"{name}, {(start - recording.motion.stamps[0]) * 1e-9:.1f} s into the drive"
     picture = options.out / f"{name}.png"
-    options.out.mkdir(parents=True, exist_ok=True)
-    unfinished = picture.with_name(f".{picture.name}.unfinished-{os.getpid()}")
-    unfinished.write_bytes(figure_png(fit_figure(fit, title)))
-    unfinished.replace(picture)
+    write_bytes(picture, figure_png(fit_figure(fit, title)))
     # The map comes last: where it is, the picture is too.
     save_terrain(
         file,

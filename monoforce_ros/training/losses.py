@@ -16,6 +16,7 @@ from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import TerrainMap
 from monoforce_ros.training.recording_samples import CHUNK
 from monoforce_ros.training.samples import Targets
+from monoforce_ros.training.trajectory_residual import robust_loss, trajectory_residual
 
 HIGHEST, LOWEST = 1.0, -1.5
 """Heights above and below the ground under the robot that are told apart [m]; a tree is a wall (paper, figure 6)."""
@@ -155,20 +156,10 @@ def trajectory_loss(
     result = rollout(terrain, robot, speeds, start, options=options, with_forces=False)
     index = torch.linspace(0, steps, targets.positions.shape[1]).round().long()
     positions, rotations = result.position[:, index[1:]], result.rotation[:, index[1:]]
-    away = positions - targets.positions[:, 1:]
-    relative = targets.rotations[:, 1:].transpose(-1, -2) @ rotations
-    # Half the antisymmetric part is the rotation vector between them, for small angles.
-    turns = 0.5 * torch.stack(
-        [
-            relative[..., 2, 1] - relative[..., 1, 2],
-            relative[..., 0, 2] - relative[..., 2, 0],
-            relative[..., 1, 0] - relative[..., 0, 1],
-        ],
-        dim=-1,
-    )
+    away, turns = trajectory_residual(positions, rotations, targets.positions[:, 1:], targets.rotations[:, 1:])
     parts = [away[..., :2] / _ACROSS, away[..., 2:] / _UP, turns[..., :2] / _TURN, turns[..., 2:] / _HEADING]
     scaled = torch.cat(parts, dim=-1)
-    loss = functional.huber_loss(scaled, torch.zeros_like(scaled), reduction="none", delta=2.0).mean(dim=(1, 2))
+    loss = robust_loss(scaled, 2.0).mean(dim=(1, 2))
     # What left the map rolled on ground that nobody predicted.
     grid = config.grid
     left, right, bottom, top = grid.extent

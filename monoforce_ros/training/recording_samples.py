@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,7 +14,15 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from monoforce_ros.bags import BagError, Recording, cut_windows, smooth
-from monoforce_ros.core import CameraModel, CommandTrack, MotionTrack, StaleDataError, transform_points
+from monoforce_ros.core import (
+    CameraModel,
+    CommandTrack,
+    MotionTrack,
+    StaleDataError,
+    atomic_path,
+    nearest_stamp,
+    transform_points,
+)
 from monoforce_ros.effects import corrected_commands, corrected_motion
 from monoforce_ros.encoder import EncoderConfig, network_image
 from monoforce_ros.perception import support_points
@@ -143,10 +150,8 @@ def cut_recording(
     if file.is_file():
         return file
     tensors, description = _cut(bag, robot, config, settings, image_topics)
-    folder.mkdir(parents=True, exist_ok=True)
-    unfinished = file.with_name(f".{file.name}.unfinished-{os.getpid()}")
-    save_file(tensors, str(unfinished), metadata={"samples": json.dumps(description)})
-    unfinished.replace(file)
+    with atomic_path(file) as unfinished:
+        save_file(tensors, str(unfinished), metadata={"samples": json.dumps(description)})
     return file
 
 
@@ -359,8 +364,9 @@ def _sweeps_near(recording: Recording, motion: MotionTrack, robot: RobotModel, s
     clouds = np.array([frame.stamp for frame in recording.clouds], np.int64)
     nearest: dict[int, list[int]] = {}
     for index, stamp in enumerate(stamps):
-        if len(clouds) and np.abs(clouds - stamp).min() <= _SWEEP_MATCH:
-            nearest.setdefault(int(clouds[np.abs(clouds - stamp).argmin()]), []).append(index)
+        match = nearest_stamp(clouds, int(stamp), limit=_SWEEP_MATCH * 1e-9)
+        if match is not None:
+            nearest.setdefault(int(clouds[match]), []).append(index)
     found = [np.zeros((0, 3))] * len(stamps)
     first, last = (min(nearest), max(nearest)) if nearest else (0, -1)
     for frame, points, frame_id in recording.clouds_between(first, last):

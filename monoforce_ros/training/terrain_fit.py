@@ -18,6 +18,7 @@ from monoforce_ros.effects import drive_speeds
 from monoforce_ros.physics import PhysicsOptions, State, rest_depth, rollout
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap, fill_holes
+from monoforce_ros.training.trajectory_residual import robust_loss, trajectory_residual
 
 _SAMPLE_TIME = 0.1
 # How far a prediction may be off before it weighs: along the ground, where slip decides, up, and in rotation.
@@ -210,14 +211,12 @@ class _Chunks:
     def loss(self, terrain: TerrainMap, backend: str) -> Tensor:
         """How far predictions are from what was measured, in units of what may be ignored; robust to slips."""
         positions, rotations = self.roll_out(terrain, backend)
-        away = positions[:, 1:] - self.positions[:, 1:]
-        # Half the antisymmetric part of R_measuredᵀ R is the rotation vector between them, for small angles.
-        relative = self.rotations[:, 1:].transpose(-1, -2) @ rotations[:, 1:]
-        turns = 0.5 * torch.stack(
-            [relative[..., 2, 1] - relative[..., 1, 2], relative[..., 0, 2] - relative[..., 2, 0]], dim=-1
+        away, turns = trajectory_residual(
+            positions[:, 1:], rotations[:, 1:], self.positions[:, 1:], self.rotations[:, 1:]
         )
-        scaled = torch.cat([away[..., :2] / _ACROSS, away[..., 2:] / _UP, turns / _TURN], dim=-1)
-        per_sample = functional.huber_loss(scaled, torch.zeros_like(scaled), reduction="none", delta=3.0)
+        # Headings say nothing of heights.
+        scaled = torch.cat([away[..., :2] / _ACROSS, away[..., 2:] / _UP, turns[..., :2] / _TURN], dim=-1)
+        per_sample = robust_loss(scaled, 3.0)
         finite = torch.isfinite(per_sample)
         return torch.where(finite, per_sample, 0.0).sum() / finite.sum().clamp_min(1)
 

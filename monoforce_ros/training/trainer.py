@@ -17,6 +17,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
+from monoforce_ros.core import atomic_path
 from monoforce_ros.encoder import EncodedMaps, Encoder, EncoderConfig, EncoderInput, TerrainEncoder, save_encoder
 from monoforce_ros.physics import PhysicsOptions
 from monoforce_ros.robots import RobotModel
@@ -274,7 +275,6 @@ class Trainer:
     def save(self) -> None:
         """Keep weights, the optimiser's moments and the step, so that training goes on from here."""
         folder = self.out / "state"
-        folder.mkdir(parents=True, exist_ok=True)
         tensors = {f"encoder.{name}": value for name, value in self.encoder.state_dict().items()}
         names = {parameter: name for name, parameter in self.encoder.named_parameters()}
         for parameter, moments in self.optimiser.state.items():
@@ -284,12 +284,11 @@ class Trainer:
             "step": self.step, "best": self.best, "history": self.history, "settings": asdict(self.settings),
             "config": asdict(self.encoder.config), "written": time.time(),
         }  # fmt: skip
-        unfinished = folder / f".state.unfinished-{os.getpid()}"
-        save_file(
-            {name: value.detach().cpu().contiguous() for name, value in tensors.items()}, str(unfinished),
-            metadata={"training": json.dumps(description)},
-        )  # fmt: skip
-        unfinished.replace(folder / "state.safetensors")
+        with atomic_path(folder / "state.safetensors") as unfinished:
+            save_file(
+                {name: value.detach().cpu().contiguous() for name, value in tensors.items()}, str(unfinished),
+                metadata={"training": json.dumps(description)},
+            )  # fmt: skip
 
     def resume(self) -> bool:
         """Go on from the folder's state; False where there is none.
