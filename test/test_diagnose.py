@@ -27,7 +27,7 @@ from monoforce_ros.discrepancy.hypothesis import (
 )
 from monoforce_ros.discrepancy.selection import Search, Trial
 from monoforce_ros.discrepancy.wheels import compare_with_wheels
-from monoforce_ros.effects.catalogue import drive_speeds, recorded_commands, recorded_motion
+from monoforce_ros.effects.catalogue import CATALOGUE, drive_speeds, recorded_commands, recorded_motion
 from monoforce_ros.evaluation.recording_evaluation import PHYSICS, evaluate_recording
 from monoforce_ros.messages import decoding
 from monoforce_ros.perception import FlatTerrain
@@ -90,7 +90,7 @@ def test_planted_parameters_are_recovered_by_the_fit(husky, name, parameters):
     predictions = Predictions(husky, EvidenceWindows(motion, commands, starts, 2.0, SAMPLES))
     scale = np.tile([0.01, 0.01, 0.005], (4, 1))
     before = np.abs(predictions.residuals([()])[0]).mean()
-    fit = fit_effects(predictions, first_values(name, list(parameters)), scale)
+    fit = fit_effects(predictions, first_values(CATALOGUE[name]), scale)
     for key, value in parameters.items():
         assert dict(fit.effects)[name][key] == pytest.approx(value, rel=0.05, abs=0.012)
     after = np.abs(predictions.residuals([fit.effects])[0]).mean()

@@ -12,12 +12,11 @@ from monoforce_ros.discrepancy.gap import map_floor, noise_floor, noisy_motions,
 from monoforce_ros.discrepancy.hypothesis import Effects, Evidence, Predictions, window_starts
 from monoforce_ros.discrepancy.preflight import complaints
 from monoforce_ros.discrepancy.selection import blocks_of
+from monoforce_ros.effects import CATALOGUE
 from monoforce_ros.robots import RobotModel
 
-COMMISSIONED: Effects = (
-    ("friction_scale", {"factor": 1.0}),
-    ("turning_scrub", {"track_width_factor": 1.05}),
-    ("actuator_lag", {"time_constant": 0.03}),
+COMMISSIONED: Effects = tuple(
+    (effect.name, dict(effect.commissioning_start)) for effect in CATALOGUE.values() if effect.commissioning_start
 )
 """What every new robot needs, and where its fit starts."""
 

@@ -17,7 +17,7 @@ from monoforce_ros.discrepancy.learned import LEARNED, formula
 from monoforce_ros.discrepancy.preflight import advice, complaints
 from monoforce_ros.discrepancy.selection import BLOCK, HEALTHY_LOSS, SMALLEST_GAIN, Outcome, Search, Trial, paired
 from monoforce_ros.discrepancy.wheels import WheelFinding, compare_with_wheels
-from monoforce_ros.effects import CATALOGUE
+from monoforce_ros.effects import CATALOGUE, FEATURE_SIZES, FEATURES
 from monoforce_ros.robots import RobotModel
 
 VERDICTS = ("effect_found", "no_discrepancy", "unknown_effect", "not_identifiable", "no_improvement")
@@ -25,14 +25,6 @@ SMALLEST_SHARE = 0.6
 """Of what is to explain: effects that explain less are not what is missing."""
 LARGEST_DRIFT = 0.12
 """Of what is to explain: parameters that would have to change by more over the drive are not those of one effect."""
-_DRAGS = frozenset({"viscous_drag", "quadratic_drag"})
-_ACTS_AS = {
-    "force_x:1": frozenset({"constant_force"}), "force_y:1": frozenset({"constant_force"}), "force_x:vx": _DRAGS,
-    "force_x:vx|vx|": _DRAGS,
-}  # fmt: skip
-"""Terms of a formula that an effect of the catalogue consists of; at about one speed the drags are alike."""
-_TYPICAL = {"vx": 0.5, "vx|vx|": 0.3, "wz": 0.5, "wz|wz|": 0.3}
-"""How large features of the motion are on a drive, to compare what terms amount to."""
 _CLEARLY = 3.0 * HEALTHY_LOSS
 _WELL = 2.0 * HEALTHY_LOSS
 """Loss from which on something is missing, whether it can be named or not."""
@@ -286,8 +278,9 @@ def _same(best: Trial, formula_trial: Trial, nominal: Trial) -> bool:
     terms = dict(formula_trial.effects).get(LEARNED)
     if not terms:
         return False
-    largest = max(terms, key=lambda key: abs(terms[key]) * _TYPICAL.get(key.split(":")[1], 1.0))
-    if not _ACTS_AS.get(largest, frozenset()) & set(best.names):
+    feature_sizes = dict(zip(FEATURES, FEATURE_SIZES, strict=True))
+    largest = max(terms, key=lambda key: abs(terms[key]) * feature_sizes[key.split(":")[1]])
+    if not any(largest in CATALOGUE[name].formula_terms for name in best.names):
         return False
     return nominal.loss - best.loss > SMALLEST_SHARE * (nominal.loss - formula_trial.loss)
 

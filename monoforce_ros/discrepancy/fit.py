@@ -9,7 +9,7 @@ import numpy as np
 
 from monoforce_ros.core import huber
 from monoforce_ros.discrepancy.hypothesis import Effects, EvidenceWindows, Predictions
-from monoforce_ros.effects import CATALOGUE
+from monoforce_ros.effects import CATALOGUE, Effect
 
 OUTLIER = 3.0
 """Scaled residuals beyond this weigh with their size rather than their square."""
@@ -185,30 +185,9 @@ def _covariance(jacobian: np.ndarray, residual: np.ndarray, typical: np.ndarray,
     return few * inverse @ (sums.T @ sums) @ inverse * np.outer(typical, typical)
 
 
-def first_values(name: str, keys: Sequence[str]) -> list[Effects]:
+def first_values(effect: Effect) -> list[Effects]:
     """Starts over the range where an effect is typically found, its neutral value excepted."""
-    known = {p.name: p for p in CATALOGUE[name].parameters}
-    if name == "payload":
-        # A load in the middle hardly shows: it is sought towards the ends.
-        return [
-            ((name, {"mass": mass, **{key: place if key == "x" else 0.0 for key in keys if key != "mass"}}),)
-            for mass in (8.0, 20.0)
-            for place in (-0.3, 0.3)
-        ]
-    main = known[keys[0]]
-    starts = []
-    for factor in (-2.0, -1.0, -0.4, 0.4, 1.0, 2.0):
-        neutral = main.neutral
-        if np.isinf(neutral):
-            value = {-2.0: 0.15, -1.0: 0.3, -0.4: 0.5, 0.4: 0.7, 1.0: 0.9, 2.0: 1.5}[factor]
-        else:
-            value = neutral + factor * main.scale
-        if not main.low <= value <= main.high:
-            continue
-        values = {key: known[key].neutral for key in keys}
-        values[keys[0]] = float(value)
-        starts.append(((name, values),))
-    return starts
+    return [((effect.name, values),) for values in effect.first_values()]
 
 
 def described(fit: Fit, rivals: Mapping[str, Sequence[str]]) -> list[dict]:

@@ -8,28 +8,9 @@ import numpy as np
 
 from monoforce_ros.bags import SmoothedMotion
 from monoforce_ros.core import CommandTrack
-from monoforce_ros.discrepancy.selection import EQUIVALENT
+from monoforce_ros.effects import separating_manoeuvre, separating_sensor
 
 FEWEST_WINDOWS = 12
-
-_MANOEUVRES: dict[frozenset[str], str] = {
-    frozenset({"command_delay", "actuator_lag"}): "steps of the speed from standing",
-    frozenset({"drive_gain", "actuator_saturation"}): "slow and fast stretches straight ahead",
-    frozenset({"drive_gain", "actuator_deadband"}): "slow and fast stretches straight ahead",
-    frozenset({"drive_gain", "viscous_drag"}): "slow and fast stretches straight ahead",
-    frozenset({"drive_gain", "rolling_resistance"}): "slow and fast stretches straight ahead",
-    frozenset({"rolling_resistance", "viscous_drag"}): "slow and fast stretches straight ahead",
-    frozenset({"viscous_drag", "quadratic_drag"}): "slow and fast stretches straight ahead",
-    frozenset({"friction_scale", "turning_scrub"}): "turns on the spot and hard starts",
-    frozenset({"drive_gain", "turning_scrub"}): "straight stretches and turns on the spot",
-    frozenset({"drive_gain", "pose_clock_offset"}): "stops and starts",
-    frozenset({"drive_asymmetry", "constant_force"}): "the same stretch forward and in reverse",
-    frozenset({"drive_asymmetry", "sensor_yaw_offset"}): "turns on the spot to both sides",
-    frozenset({"constant_force", "gravity_tilt"}): "the same stretch in opposite directions",
-    frozenset({"payload", "turning_scrub"}): "turns on the spot, and driving across a slope",
-    frozenset({"payload", "sensor_lever_arm"}): "hard starts and stops straight ahead",
-    frozenset({"payload", "friction_scale"}): "driving up and across a slope",
-}
 
 
 def complaints(smoothed: SmoothedMotion, commands: CommandTrack, starts: np.ndarray) -> list[str]:
@@ -57,10 +38,9 @@ def advice(verdict: str, effects: Sequence[dict]) -> tuple[str, ...]:
     """What would tell more."""
     told = []
     for effect in effects:
-        if any({effect["name"], rival} <= group for group in EQUIVALENT for rival in effect["rivals"]):
-            told.append("an IMU's gyro tells whether the poses are late or the base waits: record it")
+        told += [sensor for rival in effect["rivals"] if (sensor := separating_sensor(effect["name"], rival))]
         for rival in effect["rivals"]:
-            what = _MANOEUVRES.get(frozenset({effect["name"], rival}))
+            what = separating_manoeuvre(effect["name"], rival)
             if what:
                 told.append(f"{what} would tell {effect['name']} from {rival}")
     if verdict == "no_discrepancy":

@@ -16,34 +16,9 @@ from scipy.stats import wilcoxon
 from monoforce_ros.discrepancy.fit import Fit, first_values, fit_effects, robust, without
 from monoforce_ros.discrepancy.hypothesis import Effects, EvidenceWindows, Predictions
 from monoforce_ros.discrepancy.learned import learned_terms
-from monoforce_ros.effects import CATALOGUE
+from monoforce_ros.effects import CATALOGUE, Effect, identifiable_effects, separating_sensor
 from monoforce_ros.robots import RobotModel
 
-CANDIDATES: tuple[tuple[str, tuple[str, ...]], ...] = (
-    ("pose_clock_offset", ("offset",)),
-    ("sensor_yaw_offset", ("angle",)),
-    ("sensor_lever_arm", ("x", "y")),
-    ("command_delay", ("delay",)),
-    ("actuator_lag", ("time_constant",)),
-    ("actuator_saturation", ("limit",)),
-    ("actuator_deadband", ("width",)),
-    ("drive_gain", ("gain",)),
-    ("drive_asymmetry", ("difference",)),
-    ("turning_scrub", ("track_width_factor",)),
-    ("friction_scale", ("factor",)),
-    ("rolling_resistance", ("coefficient",)),
-    ("viscous_drag", ("coefficient",)),
-    ("quadratic_drag", ("coefficient",)),
-    ("constant_force", ("x", "y")),
-    ("gravity_tilt", ("about_y", "about_x")),
-    ("payload", ("mass", "x", "y")),
-)
-"""Effects that are tried, and the parameters that a drive can tell."""
-EQUIVALENT: tuple[frozenset[str], ...] = (
-    # The motion and the commands of a drive cannot tell which of their clocks is off, or whether the base waits.
-    frozenset({"command_delay", "pose_clock_offset", "command_clock_offset"}),
-)
-"""Effects that a drive without further sensors cannot tell apart."""
 HEALTHY_LOSS = 0.5
 """Robust loss of residuals that are no larger than their scale: half the square of a standard deviation."""
 SMALLEST_GAIN = 0.05
@@ -60,7 +35,6 @@ _ALTERNATIVES = 2
 _LATER_GAIN = 0.1
 """What a further effect must gain: of what is unexplained while that is much, else of what was to explain at all. A
 small rest is the model's more often than the robot's."""
-_PARAMETERS = {name: len(keys) for name, keys in CANDIDATES}
 
 
 @dataclass(frozen=True)
@@ -276,11 +250,12 @@ class Search:
         results = []
         before = float(robust(self._coarse.residuals([base])[0] / self.scale).mean())
         names = {name for name, _ in base}
-        for name, keys in CANDIDATES:
+        for effect in identifiable_effects():
+            name = effect.name
             if name in names or name in self._taken:
                 continue
             self._progress(f"{number}{name}")
-            starts = [base + start for start in self._starts(name, keys)]
+            starts = [base + start for start in self._starts(effect)]
             fit = fit_effects(self._coarse, starts, self.scale, iterations=3, free=len(base))
             results.append((name, fit.effects, float(fit.loss.mean())))
         return before, sorted(results, key=lambda entry: entry[2])
@@ -290,7 +265,7 @@ class Search:
         span = before - screened[0][2]
         judged = []
         for place, (name, effects, loss) in enumerate(screened):
-            related = any({name, screened[0][0]} <= group for group in EQUIVALENT)
+            related = bool(name != screened[0][0] and separating_sensor(name, screened[0][0]))
             if (place < _JUDGED or related) and before - loss > 0.05 * span:
                 self._progress(f"{number}: {name}, judged")
                 judged.append(self.judge(effects))
@@ -322,7 +297,7 @@ class Search:
         best = judged[0]
         for trial in judged[1:]:
             margin, low, _ = self._gain(trial, best)
-            simpler = _PARAMETERS[trial.names[-1]] < _PARAMETERS[best.names[-1]]
+            simpler = _parameter_count(trial) < _parameter_count(best)
             if simpler and (low <= 0 or margin < 0.02 * before.loss):
                 best = trial
         return best
@@ -366,14 +341,20 @@ class Search:
             if other is None:
                 continue
             _, low, _ = self._gain(trial, best)
-            if low <= 0 or any({other, own} <= group for group in EQUIVALENT):
+            if low <= 0 or separating_sensor(other, own):
                 rivals.append(other)
         return rivals
 
-    def _starts(self, name: str, keys: Sequence[str]) -> list[Effects]:
-        starts = first_values(name, keys)
+    def _starts(self, effect: Effect) -> list[Effects]:
+        name = effect.name
+        starts = first_values(effect)
         if name in self._own:
             known = {key: float(value) for key, value in dict(self._own[name]).items()}
             starts = [((name, {**known, **dict(values)}),) for ((_, values),) in starts]
             starts.append(((name, {key: known.get(key, value) for key, value in starts[0][0][1].items()}),))
         return starts
+
+
+def _parameter_count(trial: Trial) -> int:
+    """Parameters of the effect that was added last."""
+    return len(CATALOGUE[trial.names[-1]].identified)

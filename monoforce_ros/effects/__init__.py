@@ -8,27 +8,41 @@ from monoforce_ros.effects.catalogue import (
     corrected_motion,
     drive_speeds,
     effect_values,
+    identifiable_effects,
     recorded_commands,
     recorded_motion,
+    separating_manoeuvre,
+    separating_sensor,
+    speed_effects,
     turned_effects,
+    wheel_effects,
 )
-from monoforce_ros.effects.effect import STAGES, Effect, Parameter, per_trajectory
-from monoforce_ros.effects.setup import FEATURES
+from monoforce_ros.effects.effect import STAGES, Effect, Parameter, WheelResponse, per_trajectory
+from monoforce_ros.effects.setup import FEATURE_SIZES, FEATURES, Loads, Setup
 
 __all__ = [
     "CATALOGUE",
     "FEATURES",
+    "FEATURE_SIZES",
     "STAGES",
     "Effect",
     "EffectError",
+    "Loads",
     "Parameter",
+    "Setup",
+    "WheelResponse",
     "applied_setup",
     "corrected_commands",
     "corrected_motion",
     "drive_speeds",
     "effect_values",
+    "identifiable_effects",
     "per_trajectory",
     "recorded_commands",
     "recorded_motion",
+    "separating_manoeuvre",
+    "separating_sensor",
+    "speed_effects",
     "turned_effects",
+    "wheel_effects",
 ]

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
+import numpy as np
 import torch
 from torch import Tensor
 
-from monoforce_ros.effects.effect import Effect, Parameter, Values, per_trajectory
+from monoforce_ros.effects.effect import Effect, Parameter, Values, WheelResponse, per_trajectory
 
 
 class ActuatorDeadband(Effect):
@@ -17,8 +20,21 @@ class ActuatorDeadband(Effect):
     formula = "u ← sign(u) max(|u| - width, 0)"
     source = "static friction in motor and gear"
     parameters = (Parameter("width", "m/s", 0.0, 0.0, 1.0, 0.05, "half width of the band"),)
+    order = 20
+    identified = ("width",)
+    manoeuvre = "slow and fast stretches straight ahead"
+    separated_by: ClassVar = {"drive_gain": "slow and fast stretches straight ahead"}
+    wheel_response = WheelResponse(
+        parameter="width",
+        speeds=lambda speeds, value, step: np.sign(speeds) * np.maximum(np.abs(speeds) - value, 0.0),
+        starts=lambda top: (0.05 * top,),
+        bounds=lambda top: (0.0, 0.6 * top),
+        counts=lambda value, top: value >= 0.02,
+        wording="slower by {:.2f} m/s",
+        excludes=("actuator_saturation",),
+    )
 
     def drive_speeds(self, speeds: Tensor, values: Values, time_step: float, offsets: Tensor) -> Tensor:
-        """Drive speeds with this effect in them; see :class:`Effect`."""
+        """Drive speeds with this effect applied; see :class:`Effect`."""
         width = per_trajectory(values["width"], 3)
         return torch.sign(speeds) * (speeds.abs() - width).clamp_min(0.0)

@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
+import numpy as np
 import torch
+from scipy.signal import lfilter
 from torch import Tensor
 
-from monoforce_ros.effects.effect import Effect, Parameter, Values
+from monoforce_ros.effects.effect import Effect, Parameter, Values, WheelResponse
+
+
+def _lagging(speeds: np.ndarray, value: float, step: float) -> np.ndarray:
+    if value <= 1e-4:
+        return speeds
+    kept = np.exp(-step / value)
+    return lfilter([1.0 - kept], [1.0, -kept], speeds, axis=1, zi=kept * speeds[:, :1])[0]
 
 
 class ActuatorLag(Effect):
@@ -17,9 +28,21 @@ class ActuatorLag(Effect):
     formula = "du/dt = (u_cmd - u) / τ"
     source = "first-order servo response"
     parameters = (Parameter("time_constant", "s", 0.0, 0.0, 3.0, 0.2, "time to reach 63 % of a step"),)
+    order = 40
+    identified = ("time_constant",)
+    manoeuvre = "steps of the speed from standing"
+    commissioning_start: ClassVar = {"time_constant": 0.03}
+    wheel_response = WheelResponse(
+        parameter="time_constant",
+        speeds=_lagging,
+        starts=lambda top: (0.1, 0.4),
+        bounds=lambda top: (0.0, 2.0),
+        counts=lambda value, top: value >= 0.08,
+        wording="with a time constant of {:.2f} s",
+    )
 
     def drive_speeds(self, speeds: Tensor, values: Values, time_step: float, offsets: Tensor) -> Tensor:
-        """Drive speeds with this effect in them; see :class:`Effect`."""
+        """Drive speeds with this effect applied; see :class:`Effect`."""
         constant = values["time_constant"]
         # exp(-Δt/τ) with a quotient that stays finite, and a gradient that is zero, at τ = 0.
         slow = constant > 1e-6

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from typing import ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from monoforce_ros.effects.effect import Effect, Parameter, Values, per_trajectory
+from monoforce_ros.effects.effect import Effect, Parameter, Values, WheelResponse, per_trajectory
 
 
 class ActuatorSaturation(Effect):
@@ -19,8 +21,26 @@ class ActuatorSaturation(Effect):
     formula = "u ← clamp(u, -limit, limit)"
     source = "limited voltage of the motors"
     parameters = (Parameter("limit", "m/s", math.inf, 0.05, 20.0, 1.0, "largest surface speed of a drive"),)
+    order = 30
+    identified = ("limit",)
+    manoeuvre = "slow and fast stretches straight ahead"
+    separated_by: ClassVar = {"drive_gain": "slow and fast stretches straight ahead"}
+    wheel_response = WheelResponse(
+        parameter="limit",
+        speeds=lambda speeds, value, step: np.clip(speeds, -value, value),
+        starts=lambda top: (0.9 * top, 0.6 * top),
+        bounds=lambda top: (0.02 * top, 1.5 * top),
+        # A limit just below the fastest command, or above it, changes nothing.
+        counts=lambda value, top: value <= 0.95 * top,
+        wording="up to {:.2f} m/s and no faster",
+        excludes=("actuator_deadband",),
+    )
+
+    def first_values(self) -> list[dict[str, float]]:
+        """Limits between a slow walk and the speed of most robots: neutral is no limit at all."""
+        return [{"limit": value} for value in (0.15, 0.3, 0.5, 0.7, 0.9, 1.5)]
 
     def drive_speeds(self, speeds: Tensor, values: Values, time_step: float, offsets: Tensor) -> Tensor:
-        """Drive speeds with this effect in them; see :class:`Effect`."""
+        """Drive speeds with this effect applied; see :class:`Effect`."""
         limit = per_trajectory(values["limit"], 3)
         return torch.minimum(torch.maximum(speeds, -limit), limit)

@@ -23,31 +23,60 @@ class EffectError(ValueError):
     """An effect that does not exist, or a parameter that it does not have or that is out of bounds."""
 
 
+_NO_EFFECTS = frozenset({"catalogue", "effect", "page", "setup"})
+"""Modules of this package that hold no effect."""
+
+
 def _discover() -> dict[str, Effect]:
-    found = {}
+    found: dict[str, Effect] = {}
     for module in pkgutil.iter_modules(package.__path__):
-        if module.name in ("effect", "catalogue", "page"):
+        if module.name in _NO_EFFECTS:
             continue
         content = importlib.import_module(f"{package.__name__}.{module.name}")
         for _, kind in inspect.getmembers(content, inspect.isclass):
-            if issubclass(kind, Effect) and kind.__module__ == content.__name__:
-                found[kind.name] = kind()
+            if not issubclass(kind, Effect) or kind.__module__ != content.__name__:
+                continue
+            effect = kind()
+            complaint = effect.complaint()
+            if complaint:
+                raise EffectError(f"{content.__file__}: {kind.__name__} {complaint}")
+            if effect.name in found:
+                raise EffectError(f"{content.__file__}: an effect named {effect.name!r} exists already")
+            found[effect.name] = effect
     return dict(sorted(found.items(), key=lambda entry: (STAGES.index(entry[1].stage), entry[0])))
 
 
 CATALOGUE: dict[str, Effect] = _discover()
 """Effects by name, in the order of their stages."""
 
-# Commands pass the drives' electronics first, then their mechanics, then the ground.
-_COMMAND_ORDER = (
-    "command_delay",
-    "actuator_deadband",
-    "actuator_saturation",
-    "actuator_lag",
-    "drive_gain",
-    "drive_asymmetry",
-    "turning_scrub",
-)
+
+def speed_effects() -> tuple[Effect, ...]:
+    """Effects that change drive speeds, in the order in which a command meets them."""
+    return tuple(sorted((e for e in CATALOGUE.values() if e.order is not None), key=lambda e: (e.order, e.name)))
+
+
+def identifiable_effects() -> tuple[Effect, ...]:
+    """Effects that a recording of motion and commands can identify; sensors and clocks come before dynamics."""
+    first = ("measurement", "command", "contact", "body")
+    found = [effect for effect in CATALOGUE.values() if effect.identified]
+    return tuple(sorted(found, key=lambda e: (first.index(e.stage), e.order or 0, e.name)))
+
+
+def wheel_effects() -> tuple[Effect, ...]:
+    """Effects that measured wheel speeds show, in the order in which a command meets them."""
+    return tuple(effect for effect in speed_effects() if effect.wheel_response is not None)
+
+
+def separating_manoeuvre(first: str, second: str) -> str:
+    """What to drive so that a recording separates two effects; empty where neither file says."""
+    one, two = _catalogued(first), _catalogued(second)
+    return one.separated_by.get(second, "") or two.separated_by.get(first, "")
+
+
+def separating_sensor(first: str, second: str) -> str:
+    """The sensor that separates two effects which no manoeuvre does; empty where that is not so."""
+    one, two = _catalogued(first), _catalogued(second)
+    return one.separated_by_sensor.get(second, "") or two.separated_by_sensor.get(first, "")
 
 
 def effect_values(name: str, parameters: Mapping[str, float | Tensor], like: Tensor | None = None) -> dict[str, Tensor]:
@@ -78,7 +107,7 @@ def effect_values(name: str, parameters: Mapping[str, float | Tensor], like: Ten
 
 
 def drive_speeds(robot: RobotModel, twists: Tensor, time_step: float, *, history: int = 0) -> Tensor:
-    """Drive speeds that commanded twists bring about, with the robot's command effects.
+    """Drive speeds that result from commanded twists, with the robot's command effects.
 
     Args:
         robot: its ``effects`` act in the order in which a command meets them.
@@ -91,10 +120,10 @@ def drive_speeds(robot: RobotModel, twists: Tensor, time_step: float, *, history
     """
     speeds = robot.drive_speeds(twists)
     active = dict(robot.effects)
-    for name in _COMMAND_ORDER:
-        if name in active:
-            values = effect_values(name, active[name], speeds)
-            speeds = CATALOGUE[name].drive_speeds(speeds, values, time_step, robot.drive_offsets)
+    for effect in speed_effects():
+        if effect.name in active:
+            values = effect_values(effect.name, active[effect.name], speeds)
+            speeds = effect.drive_speeds(speeds, values, time_step, robot.drive_offsets)
     return speeds[:, history:]
 
 

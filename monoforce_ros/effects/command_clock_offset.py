@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import ClassVar
 
 from monoforce_ros.core import CommandTrack
 from monoforce_ros.effects.effect import Effect, Parameter
@@ -18,6 +19,9 @@ class CommandClockOffset(Effect):
     formula = "stamp ← stamp + offset"
     source = "unsynchronised clocks"
     parameters = (Parameter("offset", "s", 0.0, -2.0, 2.0, 0.2, "recorded minus true time"),)
+    separated_by_sensor: ClassVar = {
+        "pose_clock_offset": "an IMU's gyro shows whether the poses are late or the base waits: record it"
+    }
 
     def commands(self, commands: CommandTrack, values: Mapping[str, float]) -> CommandTrack:
         """Commands as they are recorded under this effect."""

@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
+import numpy as np
 import torch
 from torch import Tensor
 
-from monoforce_ros.effects.effect import Effect, Parameter, Values
+from monoforce_ros.effects.effect import Effect, Parameter, Values, WheelResponse
+
+
+def _delayed(speeds: np.ndarray, value: float, step: float) -> np.ndarray:
+    place = np.arange(speeds.shape[1]) - value / step
+    return np.stack([np.interp(place, np.arange(speeds.shape[1]), side) for side in speeds])
 
 
 class CommandDelay(Effect):
@@ -17,9 +25,26 @@ class CommandDelay(Effect):
     formula = "u(t) ← u(t - delay), linear between steps"
     source = "communication and controller latency"
     parameters = (Parameter("delay", "s", 0.0, 0.0, 2.0, 0.2, "dead time"),)
+    order = 10
+    identified = ("delay",)
+    manoeuvre = "steps of the speed from standing"
+    separated_by: ClassVar = {"actuator_lag": "steps of the speed from standing"}
+    # Motion and commands alone do not say which of their clocks is off, or whether the base waits.
+    separated_by_sensor: ClassVar = {
+        "pose_clock_offset": "an IMU's gyro shows whether the poses are late or the base waits: record it",
+        "command_clock_offset": "an IMU's gyro shows whether the poses are late or the base waits: record it",
+    }
+    wheel_response = WheelResponse(
+        parameter="delay",
+        speeds=_delayed,
+        starts=lambda top: (0.05, 0.3, 0.7),
+        bounds=lambda top: (0.0, 1.8),
+        counts=lambda value, top: value >= 0.06,
+        wording="{:.2f} s late",
+    )
 
     def drive_speeds(self, speeds: Tensor, values: Values, time_step: float, offsets: Tensor) -> Tensor:
-        """Drive speeds with this effect in them; see :class:`Effect`."""
+        """Drive speeds with this effect applied; see :class:`Effect`."""
         count = speeds.shape[1]
         # Before the first command there is none to delay: it is taken to have held.
         place = torch.arange(count, dtype=speeds.dtype, device=speeds.device) - values["delay"][..., None] / time_step

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-
-import torch
+from typing import ClassVar
 
 from monoforce_ros.effects.effect import Effect, Parameter, Values
 from monoforce_ros.effects.setup import Setup
@@ -22,11 +21,12 @@ class ConstantForce(Effect):
         Parameter("x", "N", 0.0, -1000.0, 1000.0, 50.0, "force forward"),
         Parameter("y", "N", 0.0, -1000.0, 1000.0, 50.0, "force to the left"),
     )
+    identified = ("x", "y")
+    manoeuvre = "the same stretch forward and in reverse"
+    separated_by: ClassVar = {"gravity_tilt": "the same stretch in opposite directions"}
+    formula_terms = ("force_x:1", "force_y:1")
 
     def setup(self, setup: Setup, values: Values) -> Setup:
-        """The setup with this effect in it."""
-        loads = setup.loads
-        force = torch.stack(torch.broadcast_tensors(values["x"], values["y"]), dim=-1).to(loads.wrench)
-        constant = torch.nn.functional.pad(force, (0, 4))[..., None]
-        added = torch.nn.functional.pad(constant, (0, loads.wrench.shape[-1] - 1))
-        return replace(setup, loads=replace(loads, wrench=loads.wrench + added))
+        """The setup with this effect applied."""
+        loads = setup.loads.with_wrench(0, "1", values["x"]).with_wrench(1, "1", values["y"])
+        return replace(setup, loads=loads)

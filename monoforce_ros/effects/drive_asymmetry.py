@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 from torch import Tensor
 
@@ -17,8 +19,15 @@ class DriveAsymmetry(Effect):
     formula = "u_left ← (1 - d/2) u, u_right ← (1 + d/2) u"
     source = "unequal tyres or motors"
     parameters = (Parameter("difference", "-", 0.0, -1.0, 1.0, 0.1, "right minus left, over their mean"),)
+    order = 60
+    identified = ("difference",)
+    manoeuvre = "straight stretches forward and in reverse"
+    separated_by: ClassVar = {
+        "constant_force": "the same stretch forward and in reverse",
+        "sensor_yaw_offset": "turns on the spot to both sides",
+    }
 
     def drive_speeds(self, speeds: Tensor, values: Values, time_step: float, offsets: Tensor) -> Tensor:
-        """Drive speeds with this effect in them; see :class:`Effect`."""
+        """Drive speeds with this effect applied; see :class:`Effect`."""
         side = torch.sign(offsets).to(speeds)
         return speeds * (1.0 - 0.5 * per_trajectory(values["difference"], 3) * side)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from torch import Tensor
 
 from monoforce_ros.effects.effect import Effect, Parameter, Values, per_trajectory
@@ -16,7 +18,16 @@ class DriveGain(Effect):
     formula = "u ← gain u"
     source = "calibration of the wheel radius"
     parameters = (Parameter("gain", "-", 1.0, 0.2, 2.0, 0.1, "true over commanded speed"),)
+    order = 50
+    identified = ("gain",)
+    manoeuvre = "slow and fast stretches straight ahead"
+    separated_by: ClassVar = {
+        "viscous_drag": "slow and fast stretches straight ahead",
+        "rolling_resistance": "slow and fast stretches straight ahead",
+        "turning_scrub": "straight stretches and turns on the spot",
+        "pose_clock_offset": "stops and starts",
+    }
 
     def drive_speeds(self, speeds: Tensor, values: Values, time_step: float, offsets: Tensor) -> Tensor:
-        """Drive speeds with this effect in them; see :class:`Effect`."""
+        """Drive speeds with this effect applied; see :class:`Effect`."""
         return speeds * per_trajectory(values["gain"], 3)

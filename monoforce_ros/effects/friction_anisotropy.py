@@ -19,6 +19,6 @@ class FrictionAnisotropy(Effect):
     parameters = (Parameter("factor", "-", 1.0, 0.05, 3.0, 0.3, "lateral over longitudinal friction"),)
 
     def setup(self, setup: Setup, values: Values) -> Setup:
-        """The setup with this effect in it."""
+        """The setup with this effect applied."""
         robot = setup.robot
         return replace(setup, robot=replace(robot, friction_lateral=robot.friction_lateral * values["factor"]))

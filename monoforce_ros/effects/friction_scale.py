@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import ClassVar
 
 from monoforce_ros.effects.effect import Effect, Parameter, Values
 from monoforce_ros.effects.setup import Setup
@@ -17,9 +18,13 @@ class FrictionScale(Effect):
     formula = "μ ← factor μ"
     source = "wet, loose or icy ground"
     parameters = (Parameter("factor", "-", 1.0, 0.02, 3.0, 0.3, "true over mapped friction"),)
+    identified = ("factor",)
+    manoeuvre = "turns on the spot and hard starts"
+    separated_by: ClassVar = {"turning_scrub": "turns on the spot and hard starts"}
+    commissioning_start: ClassVar = {"factor": 1.0}
 
     def setup(self, setup: Setup, values: Values) -> Setup:
-        """The setup with this effect in it."""
+        """The setup with this effect applied."""
         robot, factor = setup.robot, values["factor"]
         return replace(
             setup,

@@ -24,9 +24,11 @@ class GravityTilt(Effect):
         Parameter("about_x", "rad", 0.0, -0.5, 0.5, 0.05, "tilt about the odometry frame's x axis"),
         Parameter("about_y", "rad", 0.0, -0.5, 0.5, 0.05, "tilt about its y axis"),
     )
+    identified = ("about_y", "about_x")
+    manoeuvre = "the same stretch in opposite directions"
 
     def setup(self, setup: Setup, values: Values) -> Setup:
-        """The setup with this effect in it."""
+        """The setup with this effect applied."""
         loads = setup.loads
         tilt = torch.stack(torch.broadcast_tensors(values["about_x"], values["about_y"]), dim=-1)
         return replace(setup, loads=replace(loads, gravity_tilt=loads.gravity_tilt + tilt.to(loads.gravity_tilt)))

@@ -20,6 +20,7 @@ class GyroBias(Effect):
     formula = "ω_z ← ω_z + bias"
     source = "sensor bias"
     parameters = (Parameter("bias", "rad/s", 0.0, -0.5, 0.5, 0.02, "rate shown at rest"),)
+    gyro_measures = "bias"
 
     def motion(self, motion: MotionTrack, values: Mapping[str, float]) -> MotionTrack:
         """Motion as it is recorded under this effect."""

@@ -35,7 +35,7 @@ class LearnedTerm(Effect):
     )
 
     def setup(self, setup: Setup, values: Values) -> Setup:
-        """The setup with this effect in it."""
+        """The setup with this effect applied."""
         loads = setup.loads
         zero = torch.zeros((), dtype=loads.wrench.dtype, device=loads.wrench.device)
         names = {index: row for row, index in _ROWS.items()}

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from monoforce_ros.effects.catalogue import CATALOGUE
+from monoforce_ros.effects.catalogue import CATALOGUE, speed_effects
 from monoforce_ros.effects.effect import STAGES
 
 _INTRODUCTION = """# Effects
 
-An effect is a named piece of physics that a robot may or may not have. It is switched on in the robot's file and leaves
-the prediction unchanged, bit for bit, at its neutral values:
+Use this page to describe your robot beyond plain mechanics: look up an effect, its parameters and their units, and add
+it to the robot's file. `diagnose` finds most of them in recordings and writes them there by itself.
+
+An effect is a named piece of physics that a robot may or may not have. At its neutral values it leaves the prediction
+unchanged, bit for bit:
 
 ```yaml
 effects:
@@ -18,8 +21,8 @@ effects:
     provenance: {bag: yard.mcap, date: 2026-11-02}
 ```
 
-Effects compose. Command effects act in the order in which a command meets them: delay, deadband, saturation, lag, gain,
-asymmetry, turning scrub; delay and lag use the commands from before the start. Contact and body effects act in the
+Effects compose. Effects on commands act in the order in which a command meets them: {order}.
+Delay and lag use the commands from before the start. Contact and body effects act in the
 rollout, in both backends, and every parameter is differentiable. Measurement effects change what is recorded, not what
 happens.
 
@@ -29,7 +32,7 @@ This page is made from the code: `python -m monoforce_ros.effects.page > docs/ef
 
 def catalogue_page() -> str:
     """Markdown of all effects with formula, parameters, bounds and source."""
-    parts = [_INTRODUCTION]
+    parts = [_INTRODUCTION.replace("{order}", ", ".join(f"`{effect.name}`" for effect in speed_effects()))]
     for stage in STAGES:
         parts.append(f"## {stage.capitalize()}\n")
         for effect in CATALOGUE.values():
@@ -46,6 +49,8 @@ def catalogue_page() -> str:
             if len(shown) < len(effect.parameters):
                 names = ", ".join(f"`{p.name}`" for p in effect.parameters[len(shown) :])
                 rows.append(f"\nand likewise {names}")
+            if effect.manoeuvre:
+                rows.append(f"\nShows in: {effect.manoeuvre}.")
             parts.append("\n".join(rows) + "\n")
     return "\n".join(parts).rstrip() + "\n"
 

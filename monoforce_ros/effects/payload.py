@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import ClassVar
 
 import torch
 
@@ -25,9 +26,20 @@ class Payload(Effect):
         Parameter("y", "m", 0.0, -1.0, 1.0, 0.2, "its place to the left"),
         Parameter("z", "m", 0.0, -0.5, 1.5, 0.2, "its place above"),
     )
+    identified = ("mass", "x", "y")
+    manoeuvre = "turns on the spot, and driving up and across a slope"
+    separated_by: ClassVar = {
+        "turning_scrub": "turns on the spot, and driving across a slope",
+        "sensor_lever_arm": "hard starts and stops straight ahead",
+        "friction_scale": "driving up and across a slope",
+    }
+
+    def first_values(self) -> list[dict[str, float]]:
+        """Loads ahead and behind: one in the middle changes the motion too little to start from."""
+        return [{"mass": mass, "x": place, "y": 0.0} for mass in (8.0, 20.0) for place in (-0.3, 0.3)]
 
     def setup(self, setup: Setup, values: Values) -> Setup:
-        """The setup with this effect in it."""
+        """The setup with this effect applied."""
         robot = setup.robot
         added = values["mass"]
         place = torch.stack(torch.broadcast_tensors(values["x"], values["y"], values["z"]), dim=-1).to(robot.mass)

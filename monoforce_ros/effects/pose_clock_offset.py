@@ -18,6 +18,9 @@ class PoseClockOffset(Effect):
     formula = "stamp ← stamp + offset"
     source = "unsynchronised clocks, filter delay"
     parameters = (Parameter("offset", "s", 0.0, -2.0, 2.0, 0.2, "recorded minus true time"),)
+    identified = ("offset",)
+    manoeuvre = "stops and starts"
+    gyro_measures = "offset"
 
     def motion(self, motion: MotionTrack, values: Mapping[str, float]) -> MotionTrack:
         """Motion as it is recorded under this effect."""

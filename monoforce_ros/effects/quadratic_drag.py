@@ -17,8 +17,11 @@ class QuadraticDrag(Effect):
     formula = "f = -c |v| v"
     source = "fluid drag"
     parameters = (Parameter("coefficient", "N s²/m²", 0.0, 0.0, 2000.0, 30.0, "drag coefficient"),)
+    identified = ("coefficient",)
+    manoeuvre = "slow and fast stretches straight ahead"
+    formula_terms = ("force_x:vx", "force_x:vx|vx|")
 
     def setup(self, setup: Setup, values: Values) -> Setup:
-        """The setup with this effect in it."""
+        """The setup with this effect applied."""
         loads = setup.loads
         return replace(setup, loads=replace(loads, quadratic_drag=loads.quadratic_drag + values["coefficient"]))

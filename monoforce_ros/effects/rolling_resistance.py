@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import ClassVar
 
 from monoforce_ros.effects.effect import Effect, Parameter, Values
 from monoforce_ros.effects.setup import Setup
@@ -17,8 +18,11 @@ class RollingResistance(Effect):
     formula = "f = -c N v / sqrt(v² + ε²) along the rolling direction"
     source = "Wong, Theory of Ground Vehicles"
     parameters = (Parameter("coefficient", "-", 0.0, 0.0, 1.0, 0.05, "resistance over load"),)
+    identified = ("coefficient",)
+    manoeuvre = "slow and fast stretches straight ahead"
+    separated_by: ClassVar = {"viscous_drag": "slow and fast stretches straight ahead"}
 
     def setup(self, setup: Setup, values: Values) -> Setup:
-        """The setup with this effect in it."""
+        """The setup with this effect applied."""
         loads = setup.loads
         return replace(setup, loads=replace(loads, rolling_resistance=loads.rolling_resistance + values["coefficient"]))

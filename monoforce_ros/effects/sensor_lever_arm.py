@@ -24,6 +24,8 @@ class SensorLeverArm(Effect):
         Parameter("x", "m", 0.0, -2.0, 2.0, 0.2, "sensor forward of the base frame"),
         Parameter("y", "m", 0.0, -2.0, 2.0, 0.2, "sensor to the left"),
     )
+    identified = ("x", "y")
+    manoeuvre = "turns on the spot to both sides"
 
     def motion(self, motion: MotionTrack, values: Mapping[str, float]) -> MotionTrack:
         """Motion as it is recorded under this effect."""

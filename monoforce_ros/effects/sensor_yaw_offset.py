@@ -20,6 +20,8 @@ class SensorYawOffset(Effect):
     formula = "R ← R R_z(angle)"
     source = "mounting error"
     parameters = (Parameter("angle", "rad", 0.0, -3.2, 3.2, 0.1, "yaw of the sensor on the robot"),)
+    identified = ("angle",)
+    manoeuvre = "straight stretches and turns on the spot"
 
     def motion(self, motion: MotionTrack, values: Mapping[str, float]) -> MotionTrack:
         """Motion as it is recorded under this effect."""

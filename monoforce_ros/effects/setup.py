@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -13,6 +13,10 @@ from monoforce_ros.terrain import TerrainMap
 FEATURES = ("1", "vx", "vy", "wz", "vx|vx|", "vy|vy|", "wz|wz|", "vx wz", "vy wz", "pitch", "roll")
 """Features of a learned body wrench, from the body-frame velocity of the centre of mass [m/s], yaw rate [rad/s], and
 the sines of pitch (nose up) and roll (left side up)."""
+
+
+FEATURE_SIZES = (1.0, 0.5, 1.0, 0.5, 0.3, 1.0, 0.3, 1.0, 1.0, 1.0, 1.0)
+"""Typical size of each feature on a recording, to compare what their weights amount to."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +43,18 @@ class Loads:
         """No extra load, in the precision and on the device of ``like``."""
         zero = torch.zeros((), dtype=like.dtype, device=like.device)
         return cls(zero.expand(2), zero, zero, zero, zero, zero, zero.expand(6, len(FEATURES)))
+
+    def with_wrench(self, row: int, feature: str, weight: Tensor) -> Loads:
+        """These loads and one more term of the body wrench.
+
+        Args:
+            row: 0, 1, 2 for the force along x, y, z of the body [N], 3, 4, 5 for the torque about them [N m].
+            feature: one of :data:`FEATURES`.
+            weight: of the feature, a scalar or ``[B]``.
+        """
+        place = torch.zeros(6, len(FEATURES), dtype=self.wrench.dtype, device=self.wrench.device)
+        place[row, FEATURES.index(feature)] = 1.0
+        return replace(self, wrench=self.wrench + weight.to(self.wrench)[..., None, None] * place)
 
 
 @dataclass(frozen=True)

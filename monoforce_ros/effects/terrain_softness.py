@@ -19,7 +19,7 @@ class TerrainSoftness(Effect):
     parameters = (Parameter("factor", "-", 1.0, 0.1, 100.0, 3.0, "mapped over true stiffness"),)
 
     def setup(self, setup: Setup, values: Values) -> Setup:
-        """The setup with this effect in it."""
+        """The setup with this effect applied."""
         terrain = setup.terrain
         factor = per_trajectory(values["factor"], 3)
         return replace(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 from torch import Tensor
 
@@ -17,9 +19,13 @@ class TurningScrub(Effect):
     formula = "u - ū ← (u - ū) / factor, ū the mean of the drives"
     source = "Mandow et al. 2007, experimental kinematics of skid-steer vehicles"
     parameters = (Parameter("track_width_factor", "-", 1.0, 0.3, 4.0, 0.3, "effective over modelled track width"),)
+    order = 70
+    identified = ("track_width_factor",)
+    manoeuvre = "turns on the spot and wide arcs"
+    commissioning_start: ClassVar = {"track_width_factor": 1.05}
 
     def drive_speeds(self, speeds: Tensor, values: Values, time_step: float, offsets: Tensor) -> Tensor:
-        """Drive speeds with this effect in them; see :class:`Effect`."""
+        """Drive speeds with this effect applied; see :class:`Effect`."""
         mean = speeds.mean(dim=-1, keepdim=True)
         factor = per_trajectory(values["track_width_factor"], 3)
         return torch.where(factor == 1.0, speeds, mean + (speeds - mean) / factor)

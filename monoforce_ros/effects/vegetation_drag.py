@@ -22,7 +22,7 @@ class VegetationDrag(Effect):
     )
 
     def setup(self, setup: Setup, values: Values) -> Setup:
-        """The setup with this effect in it."""
+        """The setup with this effect applied."""
         loads = setup.loads
         return replace(
             setup,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import ClassVar
 
 from monoforce_ros.effects.effect import Effect, Parameter, Values
 from monoforce_ros.effects.setup import Setup
@@ -17,8 +18,13 @@ class ViscousDrag(Effect):
     formula = "f = -c v"
     source = "fluid drag"
     parameters = (Parameter("coefficient", "N s/m", 0.0, 0.0, 2000.0, 30.0, "drag coefficient"),)
+    identified = ("coefficient",)
+    manoeuvre = "slow and fast stretches straight ahead"
+    separated_by: ClassVar = {"quadratic_drag": "slow and fast stretches straight ahead"}
+    # At about one speed both drags are alike.
+    formula_terms = ("force_x:vx", "force_x:vx|vx|")
 
     def setup(self, setup: Setup, values: Values) -> Setup:
-        """The setup with this effect in it."""
+        """The setup with this effect applied."""
         loads = setup.loads
         return replace(setup, loads=replace(loads, linear_drag=loads.linear_drag + values["coefficient"]))
