@@ -3,17 +3,28 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import torch
 import warp as wp
 from torch import Tensor
 
-from monoforce_ros.physics import warp_kernels
 from monoforce_ros.physics.clusters import PointClusters, point_clusters
 from monoforce_ros.physics.contact_summary import STEEP, ContactSummary
 from monoforce_ros.physics.options import PhysicsOptions
 from monoforce_ros.physics.problem import Motion, Problem
+from monoforce_ros.physics.warp_kernels import (
+    COULOMB,
+    NO_FRICTION,
+    SIGMOID,
+    Types,
+    forces_kernel,
+    integrate_kernel,
+    summarise_kernel,
+    types,
+)
 from monoforce_ros.terrain import Grid
 
 CPU_THREADS = 2
@@ -24,7 +35,7 @@ SMALLEST_SHARE = 4
 CHUNK = 8
 """Trajectories whose per-step sums are kept at a time on the way back."""
 
-_TANGENTIAL = {"none": warp_kernels.NO_FRICTION, "coulomb": warp_kernels.COULOMB, "sigmoid": warp_kernels.SIGMOID}
+_TANGENTIAL = {"none": NO_FRICTION, "coulomb": COULOMB, "sigmoid": SIGMOID}
 _threads: ThreadPoolExecutor | None = None
 
 wp.init()
@@ -46,14 +57,16 @@ def integrate(
     drives = problem.point_drives.to(torch.int32)
     sampled = (problem.points, problem.point_areas, problem.point_tangents, share)
 
-    def common(body: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    def inputs(body: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+        """In the order of :data:`_INPUTS`."""
         return (
             height,
             material,
-            problem.drive_speeds,
             *body,
+            problem.drive_speeds,
             problem.mass,
             problem.centre_of_mass,
+            problem.inertia,
             problem.friction_factors,
             problem.gravity_tilt,
             problem.resistance,
@@ -64,16 +77,24 @@ def integrate(
     clusters = point_clusters(problem.points)
     fixed = _Fixed(options, terrain.grid, drives[clusters.order], clusters)
     # Points of a cluster lie side by side.
-    ordered = common(tuple(t[clusters.order] for t in sampled))
-    states = _Integrate.apply(fixed, *ordered, problem.inertia, *start)
+    ordered = inputs(tuple(t[clusters.order] for t in sampled))
+    states = _Integrate.apply(fixed, *ordered, *start)
     if not problem.steps or not (with_forces or with_contact):
         return Motion(*states)
     with_gradient = torch.is_grad_enabled() and any(t.requires_grad for t in (*ordered, *states))
     if with_contact and not with_forces and not with_gradient:
-        sums = _launch_summary(fixed, force_every, _contiguous(ordered), states)
+        sums = _launch_summary(fixed, force_every, _contiguous(ordered), _contiguous(states))
         return Motion(*states, contact=ContactSummary.split(sums, problem.drive_speeds.shape[2]))
     fixed = _Fixed(options, terrain.grid, drives, clusters)
-    return Motion(*states, *_Forces.apply(fixed, force_every, *common(sampled), *states))
+    return Motion(*states, *_Forces.apply(fixed, force_every, *inputs(sampled), *states))
+
+
+_INPUTS = (
+    "height", "material", "points", "areas", "tangents", "share", "speeds", "mass", "centre_of_mass", "inertia",
+    "friction", "tilt", "resistance", "wrench",
+)  # fmt: skip
+"""Tensors that carry gradients into the kernels, besides the states."""
+_STATES = ("centre", "rotation", "velocity", "angular_velocity")
 
 
 class _Fixed:
@@ -86,237 +107,248 @@ class _Fixed:
         self.clusters = clusters
         self._ceiling: Tensor | None = None
 
-    def structs(self, kernels: warp_kernels.Kernels):
-        grid = kernels.integrate.grid_type()
-        grid.rows, grid.columns = self.grid.rows, self.grid.columns
-        grid.origin_x, grid.origin_y = (kernels.scalar(value) for value in self.grid.origin)
-        grid.inverse_resolution = kernels.scalar(1.0 / self.grid.resolution)
-        options = kernels.integrate.options_type()
-        options.time_step = kernels.scalar(self.options.time_step)
-        options.gravity = kernels.scalar(self.options.gravity)
-        options.slip_square = kernels.scalar(self.options.slip_regularisation**2)
-        options.lookup = int(self.options.lookup == "bilinear")
-        options.normal = int(self.options.normal_force == "normal")
-        options.tangential = _TANGENTIAL[self.options.tangential_force]
-        return grid, options
-
-    def broad_phase(self, kernels: warp_kernels.Kernels, height: Tensor) -> tuple[wp.array, tuple[wp.array, ...]]:
-        """The highest ground near each node, and the clusters of points that it is compared with."""
-        found = self.clusters
-        listed = ((found.centres, kernels.vec3), (found.radii, kernels.scalar), (found.edges, wp.int32))
+    def ceiling(self, height: Tensor) -> Tensor:
+        """The highest ground near each node, which clusters of points are compared with."""
         if self._ceiling is None:
-            self._ceiling = found.ceiling(height, self.grid.resolution).contiguous()
-        return wp.from_torch(self._ceiling, dtype=kernels.scalar), tuple(wp.from_torch(t, dtype=k) for t, k in listed)
+            self._ceiling = self.clusters.ceiling(height, self.grid.resolution).contiguous()
+        return self._ceiling
 
 
-def _kernels(tensor: Tensor) -> warp_kernels.Kernels:
+class _Arguments:
+    """The structs of a launch over tensors, and the arrays of those that may carry gradients.
+
+    Args:
+        fixed: what carries none.
+        inputs: in the order of :data:`_INPUTS`.
+        states: in the order of :data:`_STATES`.
+        gradients: whether to collect gradients of the inputs.
+        state_gradients: into which those of the states are added; made anew where ``gradients`` are asked for.
+    """
+
+    def __init__(
+        self,
+        fixed: _Fixed,
+        inputs: Sequence[Tensor],
+        states: Sequence[Tensor],
+        *,
+        gradients: bool = False,
+        state_gradients: Sequence[Tensor] | None = None,
+    ):
+        self.double, kinds = _precision(inputs[0])
+        element = _elements(kinds)
+        given = dict(zip(_INPUTS, inputs, strict=True))
+        self.inputs = {
+            name: wp.from_torch(
+                value, dtype=element[name], requires_grad=gradients, grad=torch.zeros_like(value) if gradients else None
+            )
+            for name, value in given.items()
+        }
+        if state_gradients is None and gradients:
+            state_gradients = [torch.zeros_like(value) for value in states]
+        self.states = {
+            name: wp.from_torch(value, dtype=element[name], requires_grad=gradients, grad=gradient)
+            for name, value, gradient in zip(_STATES, states, state_gradients or [None] * 4, strict=True)
+        }
+        clusters = fixed.clusters
+        ground, body, robots, options = kinds.Ground(), kinds.Body(), kinds.Robots(), kinds.Options()
+        ground.height, ground.material = self.inputs["height"], self.inputs["material"]
+        ground.ceiling = wp.from_torch(fixed.ceiling(inputs[0]), dtype=kinds.scalar)
+        ground.rows, ground.columns = fixed.grid.rows, fixed.grid.columns
+        ground.origin_x, ground.origin_y = (kinds.scalar(value) for value in fixed.grid.origin)
+        ground.inverse_resolution = kinds.scalar(1.0 / fixed.grid.resolution)
+        body.points, body.areas = self.inputs["points"], self.inputs["areas"]
+        body.tangents, body.share = self.inputs["tangents"], self.inputs["share"]
+        body.drives = wp.from_torch(fixed.drives, dtype=wp.int32)
+        body.cluster_centres = wp.from_torch(clusters.centres, dtype=kinds.vec3)
+        body.cluster_radii = wp.from_torch(clusters.radii, dtype=kinds.scalar)
+        body.cluster_edges = wp.from_torch(clusters.edges, dtype=wp.int32)
+        for name in _INPUTS[6:]:
+            setattr(robots, name, self.inputs[name])
+        options.time_step = kinds.scalar(fixed.options.time_step)
+        options.gravity = kinds.scalar(fixed.options.gravity)
+        options.slip_square = kinds.scalar(fixed.options.slip_regularisation**2)
+        options.lookup = int(fixed.options.lookup == "bilinear")
+        options.normal = int(fixed.options.normal_force == "normal")
+        options.tangential = _TANGENTIAL[fixed.options.tangential_force]
+        moving = kinds.States()
+        for name, array in self.states.items():
+            setattr(moving, name, array)
+        self.structs: list[Any] = [ground, body, robots, options, moving]
+
+    def gradients(self) -> list[Tensor]:
+        """Of the inputs, then of the states."""
+        return [wp.to_torch(array.grad) for array in (*self.inputs.values(), *self.states.values())]
+
+
+def _precision(tensor: Tensor) -> tuple[bool, Types]:
     if tensor.dtype not in (torch.float32, torch.float64):
         raise ValueError(f"rollout precision: got {tensor.dtype}, expected float32 or float64")
-    return warp_kernels.kernels(tensor.dtype == torch.float64)
+    double = tensor.dtype == torch.float64
+    return double, types(double)
 
 
-def _types(kernels: warp_kernels.Kernels) -> tuple:
-    """Warp element types of the tensors in ``common``, in their order."""
-    s, v2, v3, v4 = kernels.scalar, kernels.vec2, kernels.vec3, kernels.vec4
-    return (s, v4, s, v3, s, v3, s, s, v3, v2, v2, v4, kernels.wrench)
+def _elements(kinds: Types) -> dict[str, Any]:
+    """Warp element types of inputs and states."""
+    s, v2, v3, v4, m = kinds.scalar, kinds.vec2, kinds.vec3, kinds.vec4, kinds.mat33
+    inputs = (s, v4, v3, s, v3, s, s, s, v3, m, v2, v2, v4, kinds.wrench)
+    return dict(zip((*_INPUTS, *_STATES), (*inputs, v3, m, v3, v3), strict=True))
 
 
-def _wrap(tensors, types, *, gradients: bool) -> list[wp.array]:
-    """Zero-copy Warp arrays of contiguous tensors, with fresh gradient arrays where asked for."""
-    return [
-        wp.from_torch(t, dtype=kind, requires_grad=gradients, grad=torch.zeros_like(t) if gradients else None)
-        for t, kind in zip(tensors, types, strict=True)
-    ]
-
-
-def _contiguous(tensors) -> list[Tensor]:
+def _contiguous(tensors: Sequence[Tensor]) -> list[Tensor]:
     return [t.detach().contiguous() for t in tensors]
 
 
 class _Integrate(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, fixed, *tensors):
-        kernels = _kernels(tensors[0])
-        inputs = _contiguous(tensors)
-        (*common, inertia), start = inputs[:14], inputs[14:]
-        batch, steps = common[2].shape[:2]
+    def forward(ctx: Any, fixed: _Fixed, *tensors: Tensor) -> tuple[Tensor, ...]:
+        given = _contiguous(tensors)
+        inputs, start = given[: len(_INPUTS)], given[len(_INPUTS) :]
+        batch, steps = inputs[6].shape[:2]
         states = []
         for value in start:
             history = value.new_empty((batch, steps + 1, *value.shape[1:]))
             history[:, 0] = value
             states.append(history)
-        needs_gradient = any(ctx.needs_input_grad)
-        _launch(kernels, fixed, common, inertia, states)
-        if needs_gradient:
+        _launch(fixed, inputs, states)
+        if any(ctx.needs_input_grad):
             ctx.fixed = fixed
-            ctx.save_for_backward(*common, inertia, *states)
+            ctx.save_for_backward(*inputs, *states)
         return tuple(states)
 
     @staticmethod
-    def backward(ctx, *state_gradients):
-        (*common, inertia), states = ctx.saved_tensors[:14], ctx.saved_tensors[14:]
-        kernels = _kernels(common[0])
+    def backward(ctx: Any, *state_gradients: Tensor) -> tuple[Tensor | None, ...]:
+        saved = ctx.saved_tensors
         # The adjoint adds to these while it walks back in time, hence copies.
         gradients = [g.clone(memory_format=torch.contiguous_format) for g in state_gradients]
-        given = _launch(kernels, ctx.fixed, common, inertia, states, state_gradients=gradients)
-        start = [g[:, 0] for g in gradients]
-        return (None, *given, *start)
+        given = _launch(ctx.fixed, saved[: len(_INPUTS)], saved[len(_INPUTS) :], state_gradients=gradients)
+        return (None, *given, *(g[:, 0] for g in gradients))
 
 
 class _Forces(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, fixed, every, *tensors):
-        kernels = _kernels(tensors[0])
-        inputs = _contiguous(tensors)
-        batch, steps = inputs[2].shape[0], -(-inputs[2].shape[1] // every)
-        count = inputs[3].shape[0]
-        normal = inputs[0].new_zeros((batch, steps, count))
-        tangential = inputs[0].new_zeros((batch, steps, count, 3))
-        whole = torch.zeros_like(tangential)
-        _launch_forces(kernels, fixed, every, inputs, (normal, tangential, whole))
+    def forward(ctx: Any, fixed: _Fixed, every: int, *tensors: Tensor) -> tuple[Tensor, ...]:
+        given = _contiguous(tensors)
+        speeds, points = given[6], given[2]
+        batch, steps, count = speeds.shape[0], -(-speeds.shape[1] // every), points.shape[0]
+        normal = speeds.new_zeros((batch, steps, count))
+        tangential = speeds.new_zeros((batch, steps, count, 3))
+        outputs = (normal, tangential, torch.zeros_like(tangential))
+        _launch_forces(fixed, every, given, outputs)
         if any(ctx.needs_input_grad):
             ctx.fixed, ctx.every = fixed, every
-            ctx.save_for_backward(*inputs, normal, tangential, whole)
-        return normal, tangential, whole
+            ctx.save_for_backward(*given, *outputs)
+        return outputs
 
     @staticmethod
-    def backward(ctx, *output_gradients):
-        *inputs, normal, tangential, whole = ctx.saved_tensors
-        kernels = _kernels(inputs[0])
-        given = _launch_forces(
-            kernels,
-            ctx.fixed,
-            ctx.every,
-            inputs,
-            (normal, tangential, whole),
-            output_gradients=[gradient.contiguous() for gradient in output_gradients],
-        )
-        return (None, None, *given)
+    def backward(ctx: Any, *output_gradients: Tensor) -> tuple[Tensor | None, ...]:
+        given, outputs = ctx.saved_tensors[:-3], ctx.saved_tensors[-3:]
+        gradients = [gradient.contiguous() for gradient in output_gradients]
+        return (None, None, *_launch_forces(ctx.fixed, ctx.every, given, outputs, output_gradients=gradients))
 
 
-def _launch(kernels, fixed, common, inertia, states, *, state_gradients=None):
+def _launch(
+    fixed: _Fixed,
+    inputs: Sequence[Tensor],
+    states: Sequence[Tensor],
+    *,
+    state_gradients: Sequence[Tensor] | None = None,
+) -> list[Tensor]:
     """Launch the integration, or its adjoint if ``state_gradients`` are given; then return the inputs' gradients."""
-    batch, steps = common[2].shape[:2]
+    batch, steps = inputs[6].shape[:2]
     backward = state_gradients is not None
-    grid, options = fixed.structs(kernels)
-    device = str(common[0].device)
-    types = (*_types(kernels), kernels.mat33)
-    state_types = (kernels.vec3, kernels.mat33, kernels.vec3, kernels.vec3)
-    drives = wp.from_torch(fixed.drives, dtype=wp.int32)
-    ceiling, clusters = fixed.broad_phase(kernels, common[0])
+    device = str(inputs[0].device)
+    double, kinds = _precision(inputs[0])
+    kernel = integrate_kernel(double)
+    # Before the threads start, which would each compute it.
+    fixed.ceiling(inputs[0])
 
-    def work(part: tuple[int, int]) -> list[Tensor | None]:
+    def work(part: tuple[int, int]) -> list[Tensor]:
         first, count = part
-        arrays = _wrap((*common, inertia), types, gradients=backward)
-        (
-            height, material, speeds, points, areas, tangents, weights, mass, centre_of_mass, factors, tilt, resistance,
-            wrench, moments,
-        ) = arrays  # fmt: skip
-        moving = [
-            wp.from_torch(t, dtype=kind, requires_grad=backward, grad=g)
-            for t, kind, g in zip(states, state_types, state_gradients or [None] * 4, strict=True)
-        ]
+        arguments = _Arguments(fixed, inputs, states, gradients=backward, state_gradients=state_gradients)
         for chunk in range(first, first + count, CHUNK if backward else count):
             width = min(CHUNK, first + count - chunk) if backward else count
             # The adjoint reads the sums of every step; keeping them for a few trajectories at a time costs one more
             # forward launch and saves most of the memory.
             slots = max(1, steps) if backward else 1
-            scratch = _wrap((common[0].new_zeros((width, slots, 9, 3)),), (kernels.vec3,), gradients=backward)
-            inputs = [
-                chunk, steps, int(backward), height, ceiling, material, grid, options, speeds, *clusters, points, areas,
-                tangents, drives, weights, mass, centre_of_mass, moments, factors, tilt, resistance, wrench,
-            ]  # fmt: skip
-            launch = {"dim": width, "inputs": inputs, "outputs": [*moving, *scratch], "device": device}
-            wp.launch(kernels.integrate, record_tape=False, **launch)
+            sums = inputs[0].new_zeros((width, slots, 9, 3))
+            scratch = wp.from_torch(
+                sums, dtype=kinds.vec3, requires_grad=backward, grad=torch.zeros_like(sums) if backward else None
+            )
+            given = [chunk, steps, int(backward), *arguments.structs, scratch]
+            wp.launch(kernel, dim=width, inputs=given, device=device, record_tape=False)
             if backward:
-                wp.launch(kernels.integrate, record_tape=False, **launch, **_adjoint(inputs, outputs=5))
-        return [wp.to_torch(array.grad) if backward else None for array in arrays]
+                wp.launch(kernel, dim=width, inputs=given, device=device, record_tape=False, **_adjoint(given))
+        return arguments.gradients()[: len(_INPUTS)] if backward else []
 
     # Compiled here: two threads must not do so at once.
-    kernels.integrate.module.load(wp.get_device(device))
-    parts = list(_in_parallel(work, _shares(batch, common[0].device)))
-    if not backward:
-        return []
-    return [torch.stack(entries).sum(0) if len(entries) > 1 else entries[0] for entries in zip(*parts, strict=True)]
+    kernel.module.load(wp.get_device(device))
+    return _summed(list(_in_parallel(work, _shares(batch, inputs[0].device))))
 
 
-def _launch_forces(kernels, fixed, every, inputs, outputs, *, output_gradients=None):
-    """Launch the forces of every so many steps, or their adjoint; then return the inputs' gradients."""
+def _launch_forces(
+    fixed: _Fixed,
+    every: int,
+    given: Sequence[Tensor],
+    outputs: Sequence[Tensor],
+    *,
+    output_gradients: Sequence[Tensor] | None = None,
+) -> list[Tensor]:
+    """Launch the forces of every so many steps, or their adjoint; then return the gradients of what was given."""
     backward = output_gradients is not None
-    grid, options = fixed.structs(kernels)
-    state_types = (kernels.vec3, kernels.mat33, kernels.vec3, kernels.vec3)
-    device = str(inputs[0].device)
-    drives = wp.from_torch(fixed.drives, dtype=wp.int32)
+    device = str(given[0].device)
+    inputs, states = given[: len(_INPUTS)], given[len(_INPUTS) :]
+    double, kinds = _precision(given[0])
+    kernel = forces_kernel(double)
+    fixed.ceiling(inputs[0])
 
     def work(part: tuple[int, int]) -> list[Tensor]:
         first, count = part
-        arrays = _wrap(inputs, (*_types(kernels), *state_types), gradients=backward)
-        (
-            height, material, speeds, points, areas, tangents, weights, mass, centre_of_mass, factors, tilt, resistance,
-            wrench, *moving,
-        ) = arrays  # fmt: skip
-        gradients = output_gradients or (None, None, None)
+        arguments = _Arguments(fixed, inputs, states, gradients=backward)
         results = [
             wp.from_torch(t, dtype=kind, requires_grad=backward, grad=g)
-            for t, kind, g in zip(outputs, (kernels.scalar, kernels.vec3, kernels.vec3), gradients, strict=True)
+            for t, kind, g in zip(
+                outputs, (kinds.scalar, kinds.vec3, kinds.vec3), output_gradients or (None,) * 3, strict=True
+            )
         ]
-        before = [
-            first, every, height, material, grid, options, speeds, points, areas, tangents, drives, weights, mass,
-            centre_of_mass, factors, tilt, resistance, wrench, *moving,
-        ]  # fmt: skip
-        extra = _adjoint(before, outputs=3) if backward else {}
-        wp.launch(
-            kernels.forces,
-            dim=(count, *outputs[0].shape[1:]),
-            inputs=before,
-            outputs=results,
-            device=device,
-            record_tape=False,
-            **extra,
-        )
-        return [wp.to_torch(array.grad) for array in arrays] if backward else []
+        listed = [first, every, *arguments.structs, *results]
+        extra = _adjoint(listed) if backward else {}
+        dim = (count, *outputs[0].shape[1:])
+        wp.launch(kernel, dim=dim, inputs=listed, device=device, record_tape=False, **extra)
+        return arguments.gradients() if backward else []
 
-    parts = list(_in_parallel(work, _shares(outputs[0].shape[0], inputs[0].device)))
-    if not backward:
-        return []
-    return [torch.stack(entries).sum(0) if len(entries) > 1 else entries[0] for entries in zip(*parts, strict=True)]
+    kernel.module.load(wp.get_device(device))
+    return _summed(list(_in_parallel(work, _shares(outputs[0].shape[0], given[0].device))))
 
 
-def _launch_summary(fixed, every, common, states) -> Tensor:
+def _launch_summary(fixed: _Fixed, every: int, inputs: Sequence[Tensor], states: Sequence[Tensor]) -> Tensor:
     """Launch the sums of the forces of every so many steps, ``[B, S, 2 D + 8]``."""
-    kernels = _kernels(common[0])
-    grid, options = fixed.structs(kernels)
-    batch, steps, drives = common[2].shape
-    state_types = (kernels.vec3, kernels.mat33, kernels.vec3, kernels.vec3)
-    sums = common[0].new_zeros((batch, -(-steps // every), 2 * drives + 8))
-    ceiling, clusters = fixed.broad_phase(kernels, common[0])
-    (
-        height, material, speeds, points, areas, tangents, weights, mass, centre_of_mass, factors, tilt, resistance,
-        wrench, *moving,
-    ) = _wrap((*common, *_contiguous(states)), (*_types(kernels), *state_types), gradients=False)  # fmt: skip
-    result, moved = wp.from_torch(sums, dtype=kernels.scalar), wp.from_torch(fixed.drives, dtype=wp.int32)
+    batch, steps, drives = inputs[6].shape
+    device = str(inputs[0].device)
+    double, kinds = _precision(inputs[0])
+    kernel = summarise_kernel(double)
+    sums = inputs[0].new_zeros((batch, -(-steps // every), 2 * drives + 8))
+    arguments = _Arguments(fixed, inputs, states)
+    result = wp.from_torch(sums, dtype=kinds.scalar)
 
     def work(part: tuple[int, int]) -> None:
         first, count = part
-        inputs = [
-            first, every, kernels.scalar(STEEP), height, ceiling, material, grid, options, speeds, *clusters, points,
-            areas, tangents, moved, weights, mass, centre_of_mass, factors, tilt, resistance, wrench, *moving,
-        ]  # fmt: skip
-        device = str(common[0].device)
-        wp.launch(
-            kernels.summarise, dim=(count, sums.shape[1]), inputs=inputs, outputs=[result], device=device,
-            record_tape=False,
-        )  # fmt: skip
+        given = [first, every, kinds.scalar(STEEP), *arguments.structs, result]
+        wp.launch(kernel, dim=(count, sums.shape[1]), inputs=given, device=device, record_tape=False)
 
-    kernels.summarise.module.load(wp.get_device(str(common[0].device)))
-    list(_in_parallel(work, _shares(batch, common[0].device)))
+    kernel.module.load(wp.get_device(device))
+    _in_parallel(work, _shares(batch, inputs[0].device))
     return sums
 
 
-def _adjoint(inputs: list, outputs: int) -> dict:
+def _adjoint(inputs: Sequence[Any]) -> dict[str, Any]:
     """Arguments that make a launch run a kernel's adjoint: arrays bring their gradients, the rest has none."""
     adjoints = [None if isinstance(value, wp.array) else type(value)() for value in inputs]
-    return {"adjoint": True, "adj_inputs": adjoints, "adj_outputs": [None] * outputs}
+    return {"adjoint": True, "adj_inputs": adjoints, "adj_outputs": []}
+
+
+def _summed(parts: list[list[Tensor]]) -> list[Tensor]:
+    """Gradients of several launches together."""
+    return [torch.stack(entries).sum(0) if len(entries) > 1 else entries[0] for entries in zip(*parts, strict=True)]
 
 
 def _shares(batch: int, device: torch.device) -> list[tuple[int, int]]:
@@ -326,7 +358,7 @@ def _shares(batch: int, device: torch.device) -> list[tuple[int, int]]:
     return [(low, high - low) for low, high in itertools.pairwise(edges)]
 
 
-def _in_parallel(work, shares):
+def _in_parallel[Result](work: Callable[[tuple[int, int]], Result], shares: list[tuple[int, int]]) -> list[Result]:
     global _threads
     if len(shares) == 1:
         return [work(shares[0])]

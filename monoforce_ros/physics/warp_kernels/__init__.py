@@ -1,0 +1,24 @@
+"""The rollout as Warp kernels, a file for each: motion, forces of every point, and their sums over the body."""
+
+import warp as wp
+
+from monoforce_ros.physics.warp_kernels.contact import COULOMB, NO_FRICTION, SIGMOID
+from monoforce_ros.physics.warp_kernels.forces import forces_kernel
+from monoforce_ros.physics.warp_kernels.integrate import integrate_kernel
+from monoforce_ros.physics.warp_kernels.loads import external_loads
+from monoforce_ros.physics.warp_kernels.structs import Types, types
+from monoforce_ros.physics.warp_kernels.summarise import summarise_kernel
+
+wp.config.log_level = wp.LOG_ERROR
+
+__all__ = [
+    "COULOMB",
+    "NO_FRICTION",
+    "SIGMOID",
+    "Types",
+    "external_loads",
+    "forces_kernel",
+    "integrate_kernel",
+    "summarise_kernel",
+    "types",
+]

@@ -1,0 +1,224 @@
+"""Contact of one body point with the ground, and what integration shares (the formulas of ``physics/contact.py``)."""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from monoforce_ros.physics.warp_kernels.structs import types
+
+CONSTANT_LOOKUP, BILINEAR_LOOKUP = 0, 1
+VERTICAL_FORCE, NORMAL_FORCE = 0, 1
+NO_FRICTION, COULOMB, SIGMOID = 0, 1, 2
+
+
+@dataclass(frozen=True)
+class ContactFunctions:
+    """Device functions of one precision."""
+
+    state_at: Any
+    may_touch: Any
+    below_ground: Any
+    touch_ground: Any
+    over_the_step: Any
+
+
+@cache
+def contact_functions(double: bool) -> ContactFunctions:
+    """Device functions in float64 (``double``) or float32."""
+    t = types(double)
+    scalar, vec3, vec4 = t.scalar, t.vec3, t.vec4
+    Ground, Body, Robots, States, State, Options, Touch = (
+        t.Ground, t.Body, t.Robots, t.States, t.State, t.Options, t.Touch
+    )  # fmt: skip
+
+    @wp.func
+    def state_at(states: States, b: int, step: int) -> State:
+        state = State()
+        state.position = states.centre[b, step]
+        state.rotation = states.rotation[b, step]
+        state.linear = states.velocity[b, step]
+        state.angular = states.angular_velocity[b, step]
+        return state
+
+    @wp.func
+    def corner(raw: scalar, cells: int) -> int:
+        # Never negative, so that cutting off the fraction is the floor, which would be a call on plain x86-64.
+        return wp.min(int(wp.clamp(raw, scalar(0.0), scalar(cells - 1))), cells - 2)
+
+    @wp.func
+    def nearest(raw: scalar, cells: int) -> int:
+        # rint rounds halves to even, as torch does.
+        return int(wp.rint(wp.clamp(raw, scalar(0.0), scalar(cells - 1))))
+
+    @wp.func
+    def nearby(raw: scalar, cells: int) -> int:
+        # Which way halves are rounded does not matter here, and rint would be a call.
+        return int(wp.clamp(raw, scalar(0.0), scalar(cells - 1)) + scalar(0.5))
+
+    @wp.func
+    def may_touch(ground: Ground, page: int, middle: vec3, radius: scalar) -> bool:
+        row = nearby((middle[1] - ground.origin_y) * ground.inverse_resolution, ground.rows)
+        column = nearby((middle[0] - ground.origin_x) * ground.inverse_resolution, ground.columns)
+        return ground.ceiling[page, row, column] > middle[2] - radius
+
+    @wp.func
+    def inside_axis(raw: scalar, cells: int) -> scalar:
+        return wp.where(raw >= scalar(0.0) and raw <= scalar(cells - 1), scalar(1.0), scalar(0.0))
+
+    @wp.func
+    def below_ground(ground: Ground, page: int, lookup: int, point: vec3) -> bool:
+        raw_x = (point[0] - ground.origin_x) * ground.inverse_resolution
+        raw_y = (point[1] - ground.origin_y) * ground.inverse_resolution
+        level = scalar(0.0)
+        if lookup == 1:
+            column = corner(raw_x, ground.columns)
+            row = corner(raw_y, ground.rows)
+            u = wp.clamp(raw_x, scalar(0.0), scalar(ground.columns - 1)) - scalar(column)
+            w = wp.clamp(raw_y, scalar(0.0), scalar(ground.rows - 1)) - scalar(row)
+            h00 = ground.height[page, row, column]
+            h01 = ground.height[page, row, column + 1]
+            h10 = ground.height[page, row + 1, column]
+            h11 = ground.height[page, row + 1, column + 1]
+            bottom = h00 + u * (h01 - h00)
+            level = bottom + w * (h10 + u * (h11 - h10) - bottom)
+        else:
+            level = ground.height[page, nearest(raw_y, ground.rows), nearest(raw_x, ground.columns)]
+        return level > point[2]
+
+    @wp.func
+    def touch_ground(
+        ground: Ground,
+        body: Body,
+        robots: Robots,
+        options: Options,
+        page: int,
+        b: int,
+        step: int,
+        i: int,
+        state: State,
+        arm: vec3,
+    ) -> Touch:
+        touch = Touch()
+        point = state.position + arm
+        raw_x = (point[0] - ground.origin_x) * ground.inverse_resolution
+        raw_y = (point[1] - ground.origin_y) * ground.inverse_resolution
+        column = corner(raw_x, ground.columns)
+        row = corner(raw_y, ground.rows)
+        u = wp.clamp(raw_x, scalar(0.0), scalar(ground.columns - 1)) - scalar(column)
+        w = wp.clamp(raw_y, scalar(0.0), scalar(ground.rows - 1)) - scalar(row)
+        h00 = scalar(0.0)
+        h01 = scalar(0.0)
+        h10 = scalar(0.0)
+        h11 = scalar(0.0)
+        level = scalar(0.0)
+        if options.lookup == 1:
+            h00 = ground.height[page, row, column]
+            h01 = ground.height[page, row, column + 1]
+            h10 = ground.height[page, row + 1, column]
+            h11 = ground.height[page, row + 1, column + 1]
+            bottom = h00 + u * (h01 - h00)
+            level = bottom + w * (h10 + u * (h11 - h10) - bottom)
+        else:
+            level = ground.height[page, nearest(raw_y, ground.rows), nearest(raw_x, ground.columns)]
+        gap = level - point[2]
+        # Most points are in the air: nothing more is computed for them.
+        if gap > scalar(0.0):
+            stuff = vec4()
+            if options.lookup == 1:
+                m00 = ground.material[page, row, column]
+                m01 = ground.material[page, row, column + 1]
+                m10 = ground.material[page, row + 1, column]
+                m11 = ground.material[page, row + 1, column + 1]
+                below = m00 + u * (m01 - m00)
+                above = m10 + u * (m11 - m10)
+                stuff = below + w * (above - below)
+            else:
+                stuff = ground.material[page, nearest(raw_y, ground.rows), nearest(raw_x, ground.columns)]
+            normal = vec3(scalar(0.0), scalar(0.0), scalar(1.0))
+            if options.normal == 1:
+                # Where the coordinate was clamped the height no longer depends on it.
+                slope_x = (
+                    ((scalar(1.0) - w) * (h01 - h00) + w * (h11 - h10))
+                    * ground.inverse_resolution
+                    * inside_axis(raw_x, ground.columns)
+                )
+                slope_y = (
+                    ((scalar(1.0) - u) * (h10 - h00) + u * (h11 - h01))
+                    * ground.inverse_resolution
+                    * inside_axis(raw_y, ground.rows)
+                )
+                upward = scalar(1.0) / wp.sqrt(scalar(1.0) + slope_x * slope_x + slope_y * slope_y)
+                normal = vec3(-slope_x * upward, -slope_y * upward, upward)
+            area = body.areas[i]
+            factors = robots.friction[b]
+            resistance = robots.resistance[b]
+            turned = state.rotation
+            velocity = state.linear + wp.cross(state.angular, arm)
+            # The hull has no drive; its tangents are zero.
+            belt = turned * (body.tangents[i] * robots.speeds[b, step, wp.max(body.drives[i], 0)])
+            lateral = vec3(turned[0, 1], turned[1, 1], turned[2, 1])
+            depth = gap * normal[2]
+            approach = -wp.dot(velocity, normal)
+            spring = stuff[0] * depth
+            load = area * wp.max(spring + stuff[1] * approach, scalar(0.0))
+            # Within the step the spring follows the motion: it acts as further damping.
+            damping = stuff[1] + options.time_step * stuff[0]
+            pressing = area * wp.max(spring + damping * approach, scalar(0.0))
+            normal_gain = wp.where(pressing > scalar(0.0), area * damping, scalar(0.0))
+            across = lateral - wp.dot(lateral, normal) * normal
+            across = across * (scalar(1.0) / wp.sqrt(wp.dot(across, across) + scalar(1.0e-12)))
+            along = wp.cross(across, normal)
+            moved_along = wp.dot(velocity, along)
+            moved_across = wp.dot(velocity, across)
+            slip_along = moved_along + wp.dot(belt, along)
+            slip_across = moved_across + wp.dot(belt, across)
+            friction_along = stuff[2] * factors[0]
+            friction_across = stuff[2] * factors[1]
+            force_along = scalar(0.0)
+            force_across = scalar(0.0)
+            gain_along = scalar(0.0)
+            gain_across = scalar(0.0)
+            if options.tangential == 1:
+                per_speed = load / wp.sqrt(slip_along * slip_along + slip_across * slip_across + options.slip_square)
+                gain_along = friction_along * per_speed
+                gain_across = friction_across * per_speed
+                force_along = -gain_along * slip_along
+                force_across = -gain_across * slip_across
+            if options.tangential == 2:
+                weight = robots.mass[b] * options.gravity * body.share[i]
+                active_along = scalar(1.0) / (scalar(1.0) + wp.exp(slip_along))
+                active_across = scalar(1.0) / (scalar(1.0) + wp.exp(slip_across))
+                force_along = friction_along * weight * (active_along - scalar(0.5))
+                force_across = friction_across * weight * (active_across - scalar(0.5))
+                gain_along = friction_along * weight * active_along * (scalar(1.0) - active_along)
+                gain_across = friction_across * weight * active_across * (scalar(1.0) - active_across)
+            # What resists the body's motion rather than the belt's: rolling resistance and vegetation.
+            moved = wp.sqrt(moved_along * moved_along + moved_across * moved_across + options.slip_square)
+            held_across = area * stuff[3] * (scalar(1.0) + resistance[3] / moved)
+            rolling = resistance[0] * load / wp.sqrt(moved_along * moved_along + options.slip_square)
+            held_along = rolling + held_across
+            force_along = force_along - held_along * moved_along
+            force_across = force_across - held_across * moved_across
+            gain_along = gain_along + held_along
+            gain_across = gain_across + held_across
+            touch.active = 1
+            touch.normal = normal
+            touch.along = along
+            touch.across = across
+            touch.force = vec3(pressing, force_along, force_across)
+            touch.gain = vec3(normal_gain, gain_along, gain_across)
+        return touch
+
+    @wp.func
+    def over_the_step(touch: Touch, arm: vec3, change: vec3, turning_change: vec3) -> vec3:
+        # The forces that acted over the step: what the point's change of velocity left of them.
+        moved = change + wp.cross(turning_change, arm)
+        return vec3(
+            wp.max(touch.force[0] - touch.gain[0] * wp.dot(touch.normal, moved), scalar(0.0)),
+            touch.force[1] - touch.gain[1] * wp.dot(touch.along, moved),
+            touch.force[2] - touch.gain[2] * wp.dot(touch.across, moved),
+        )
+
+    return ContactFunctions(state_at, may_touch, below_ground, touch_ground, over_the_step)

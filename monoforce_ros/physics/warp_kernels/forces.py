@@ -1,0 +1,53 @@
+"""Kernel of the contact forces: one thread for each trajectory, step and body point."""
+
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from monoforce_ros.physics.warp_kernels.contact import contact_functions
+from monoforce_ros.physics.warp_kernels.structs import types
+
+
+@cache
+def forces_kernel(double: bool) -> Any:
+    """The kernel in float64 (``double``) or float32."""
+    t = types(double)
+    functions = contact_functions(double)
+    state_at, touch_ground, over_the_step = functions.state_at, functions.touch_ground, functions.over_the_step
+    scalar, vec3 = t.scalar, t.vec3
+    Ground, Body, Robots, States, Options = t.Ground, t.Body, t.Robots, t.States, t.Options
+
+    @wp.kernel(module="unique")
+    def forces(
+        first_trajectory: int,
+        every: int,
+        ground: Ground,
+        body: Body,
+        robots: Robots,
+        options: Options,
+        states: States,
+        normal_forces: wp.array3d(dtype=scalar),
+        tangential_forces: wp.array3d(dtype=vec3),
+        whole_forces: wp.array3d(dtype=vec3),
+    ):
+        part, slot, i = wp.tid()
+        b = first_trajectory + part
+        step = slot * every
+        page = wp.min(b, ground.height.shape[0] - 1)
+        state = state_at(states, b, step)
+        arm = state.rotation * (body.points[i] - robots.centre_of_mass[b])
+        touch = touch_ground(ground, body, robots, options, page, b, step, i, state, arm)
+        if touch.active == 1:
+            acted = over_the_step(
+                touch,
+                arm,
+                states.velocity[b, step + 1] - state.linear,
+                states.angular_velocity[b, step + 1] - state.angular,
+            )
+            normal_forces[b, slot, i] = acted[0]
+            tangential = acted[1] * touch.along + acted[2] * touch.across
+            tangential_forces[b, slot, i] = tangential
+            whole_forces[b, slot, i] = acted[0] * touch.normal + tangential
+
+    return forces

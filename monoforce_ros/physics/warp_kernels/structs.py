@@ -1,0 +1,135 @@
+"""Structs that the kernels take, in one precision.
+
+Annotations must be real objects in Warp's language, not strings: the modules of this package do without
+``from __future__ import annotations``.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from monoforce_ros.effects import FEATURES
+
+
+@dataclass(frozen=True)
+class Types:
+    """Scalar, vector and struct types of one precision."""
+
+    scalar: Any
+    vec2: Any
+    vec3: Any
+    vec4: Any
+    mat33: Any
+    features: Any
+    wrench: Any
+    Ground: Any
+    Body: Any
+    Robots: Any
+    States: Any
+    State: Any
+    Options: Any
+    Touch: Any
+    Loads: Any
+
+
+@cache
+def types(double: bool) -> Types:
+    """Types in float64 (``double``) or float32."""
+    scalar = wp.float64 if double else wp.float32
+    vec2 = wp.types.vector(length=2, dtype=scalar)
+    vec3 = wp.types.vector(length=3, dtype=scalar)
+    vec4 = wp.types.vector(length=4, dtype=scalar)
+    mat33 = wp.types.matrix(shape=(3, 3), dtype=scalar)
+    features = wp.types.vector(length=len(FEATURES), dtype=scalar)
+    wrench_matrix = wp.types.matrix(shape=(6, len(FEATURES)), dtype=scalar)
+
+    @wp.struct
+    class Ground:
+        height: wp.array3d(dtype=scalar)  # [pages, rows, columns]
+        ceiling: wp.array3d(dtype=scalar)  # highest ground near each node
+        material: wp.array3d(dtype=vec4)  # stiffness, damping, friction, vegetation drag
+        rows: int
+        columns: int
+        origin_x: scalar
+        origin_y: scalar
+        inverse_resolution: scalar
+
+    @wp.struct
+    class Body:
+        points: wp.array(dtype=vec3)
+        areas: wp.array(dtype=scalar)
+        tangents: wp.array(dtype=vec3)
+        share: wp.array(dtype=scalar)  # of the robot's weight
+        drives: wp.array(dtype=wp.int32)  # -1 on the hull
+        cluster_centres: wp.array(dtype=vec3)
+        cluster_radii: wp.array(dtype=scalar)
+        cluster_edges: wp.array(dtype=wp.int32)
+
+    @wp.struct
+    class Robots:  # one entry per trajectory
+        speeds: wp.array3d(dtype=scalar)  # [B, T, D]
+        mass: wp.array(dtype=scalar)
+        centre_of_mass: wp.array(dtype=vec3)
+        inertia: wp.array(dtype=mat33)
+        friction: wp.array(dtype=vec2)  # longitudinal and lateral factor
+        tilt: wp.array(dtype=vec2)  # of gravity
+        resistance: wp.array(dtype=vec4)  # rolling, linear drag, quadratic drag, yield speed of vegetation
+        wrench: wp.array(dtype=wrench_matrix)
+
+    @wp.struct
+    class States:  # [B, T + 1]
+        centre: wp.array2d(dtype=vec3)
+        rotation: wp.array2d(dtype=mat33)
+        velocity: wp.array2d(dtype=vec3)
+        angular_velocity: wp.array2d(dtype=vec3)
+
+    @wp.struct
+    class State:  # of one trajectory at one step
+        position: vec3
+        rotation: mat33
+        linear: vec3
+        angular: vec3
+
+    @wp.struct
+    class Options:
+        time_step: scalar
+        gravity: scalar
+        slip_square: scalar
+        lookup: int
+        normal: int
+        tangential: int
+
+    @wp.struct
+    class Touch:  # of one point with the ground
+        active: int
+        normal: vec3
+        along: vec3
+        across: vec3
+        force: vec3  # along normal, along, across
+        gain: vec3
+
+    @wp.struct
+    class Loads:  # besides contact, about the centre of mass
+        force: vec3
+        torque: vec3
+        drag: scalar
+
+    return Types(
+        scalar,
+        vec2,
+        vec3,
+        vec4,
+        mat33,
+        features,
+        wrench_matrix,
+        Ground,
+        Body,
+        Robots,
+        States,
+        State,
+        Options,
+        Touch,
+        Loads,
+    )
