@@ -9,6 +9,7 @@ from torch import Tensor
 
 from monoforce_ros.physics.lookup import Ground
 from monoforce_ros.physics.options import PhysicsOptions
+from monoforce_ros.physics.rotation import cross
 
 
 @dataclass(frozen=True)
@@ -113,9 +114,3 @@ def contact(
         force=torch.cat([pressing[:, None], tangential_force - held * moved[:, 1:]], dim=1),
         gain=torch.cat([normal_gain[:, None], tangential_gain + held], dim=1),
     )
-
-
-def cross(first: Tensor, second: Tensor) -> Tensor:
-    """Cross product along dimension 1, component by component: many times faster here than torch's own."""
-    a, b = first.unbind(1), second.unbind(1)
-    return torch.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]], dim=1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 
 import torch
@@ -45,7 +46,7 @@ class TerrainLookup:
         if pages not in (1, batch):
             raise ValueError(f"terrain: got a batch of {pages} maps, expected 1 or {batch}")
         # One row of cells per channel: gathering along contiguous memory is what the reference spends its time on.
-        self._channels = channels.flatten(1)
+        self.channels = channels.flatten(1)
         cells = terrain.grid.rows * terrain.grid.columns
         self._page = None if pages == 1 else cells * torch.arange(batch, device=channels.device)[:, None]
         self._grid: Grid = terrain.grid
@@ -61,6 +62,12 @@ class TerrainLookup:
             :, None, None
         ]
 
+    def with_channels(self, channels: Tensor) -> TerrainLookup:
+        """The same maps with other values, packed as :attr:`channels`."""
+        other = copy(self)
+        other.channels = channels
+        return other
+
     def __call__(self, points: Tensor) -> Ground:
         """Ground below points ``[B, ≥ 2, N]`` [m]."""
         return self._bilinear(points) if self._kind == "bilinear" else self._constant(points)
@@ -69,7 +76,7 @@ class TerrainLookup:
         """Channels ``[5, ..., B, N]`` at flat indices ``[..., B, N]`` within a map."""
         if self._page is not None:
             flat = flat + self._page
-        return self._channels.index_select(1, flat.flatten()).unflatten(1, flat.shape)
+        return self.channels.index_select(1, flat.flatten()).unflatten(1, flat.shape)
 
     def _bilinear(self, points: Tensor) -> Ground:
         raw = (points[:, :2] - self._origin) / self._grid.resolution

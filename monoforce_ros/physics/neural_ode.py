@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from monoforce_ros.physics.contact import contact, cross
-from monoforce_ros.physics.lookup import TerrainLookup
+from monoforce_ros.physics.body_contact import BodyContact
+from monoforce_ros.physics.loads import LoadModel
 from monoforce_ros.physics.options import PhysicsOptions
 from monoforce_ros.physics.problem import Motion, Problem
-from monoforce_ros.physics.rotation import cross_matrix
-from monoforce_ros.physics.torch_backend import SMALLEST_SPEED, features, tilted_gravity
+from monoforce_ros.physics.rotation import cross, cross_matrix
 
 METHODS = ("euler", "midpoint", "rk4", "dopri5")
 
@@ -37,89 +37,142 @@ class OdeOptions:
             raise ValueError(f"ode step: got {self.step}, expected 1e-6 to 0.1 s")
 
 
-def integrate(problem: Problem, options: PhysicsOptions, ode: OdeOptions) -> Motion:
-    """Solve for the motion at the rollout's time steps; forces are not returned."""
-    from torchdiffeq import odeint, odeint_adjoint
+def integrate(
+    problem: Problem,
+    options: PhysicsOptions,
+    ode: OdeOptions,
+    with_forces: bool = False,
+    force_every: int = 1,
+) -> Motion:
+    """Solve for the motion at the rollout's time steps.
 
-    system = _System(problem, options)
-    count = problem.steps + 1
-    times = options.time_step * torch.arange(count, dtype=problem.centre.dtype, device=problem.centre.device)
-    settings: dict = {"method": ode.method}
-    if ode.method == "dopri5":
-        settings.update(rtol=ode.tolerance, atol=ode.tolerance)
-    else:
-        settings["options"] = {"step_size": ode.step}
-    start = (problem.centre, problem.rotation, problem.velocity, problem.angular_velocity)
+    Forces are those at the beginning of each step: a continuous-time solver has none that act over a step.
+    """
+    from torchdiffeq import odeint
+
+    system = _System.of(problem, options)
     if ode.adjoint:
-        # What the system depends on must be named for the adjoint to return its gradient.
-        parameters = tuple(t for t in system.dependencies if t.requires_grad)
-        states = odeint_adjoint(system, start, times, adjoint_params=parameters, **settings)
+        states = _AdjointSolution.apply(system, problem.steps, ode, *system.tensors, *_start(problem))
     else:
-        states = odeint(system, start, times, **settings)
+        times, settings = _solver(system, problem.steps, ode)
+        states = odeint(system, _start(problem), times, **settings)
     centre, rotation, velocity, angular_velocity = (state.transpose(0, 1) for state in states)
     # A general solver does not know that rotations are orthonormal. Two Newton steps lead back to the nearest ones;
     # a singular value decomposition would too, but has no gradient where the values are equal.
     for _ in range(2):
         rotation = 1.5 * rotation - 0.5 * rotation @ rotation.transpose(-1, -2) @ rotation
-    return Motion(centre, rotation, velocity, angular_velocity)
+    motion = Motion(centre, rotation, velocity, angular_velocity)
+    return _with_forces(motion, system.body, range(0, problem.steps, force_every)) if with_forces else motion
+
+
+def _start(problem: Problem) -> tuple[Tensor, ...]:
+    return problem.centre, problem.rotation, problem.velocity, problem.angular_velocity
+
+
+def _solver(system: _System, steps: int, ode: OdeOptions) -> tuple[Tensor, dict[str, Any]]:
+    """Times of the rollout's steps, and torchdiffeq's settings."""
+    like = system.body.points
+    times = system.options.time_step * torch.arange(steps + 1, dtype=like.dtype, device=like.device)
+    settings: dict[str, Any] = {"method": ode.method}
+    if ode.method == "dopri5":
+        settings.update(rtol=ode.tolerance, atol=ode.tolerance)
+    else:
+        settings["options"] = {"step_size": ode.step}
+    return times, settings
+
+
+def _with_forces(motion: Motion, body: BodyContact, steps: range) -> Motion:
+    normal_forces, tangential_forces, forces = [], [], []
+    for step in steps:
+        state = (motion.centre, motion.rotation, motion.velocity, motion.angular_velocity)
+        _, touch = body.at(step, *(values[:, step] for values in state), step_time=0.0)
+        tangential = (touch.directions[:, :, 1:] * touch.force[:, None, 1:]).sum(2)
+        normal_forces.append(touch.force[:, 0])
+        tangential_forces.append(tangential.transpose(1, 2))
+        forces.append(touch.vectors.transpose(1, 2))
+    if not forces:
+        return motion
+    return replace(
+        motion,
+        normal_forces=torch.stack(normal_forces, dim=1),
+        tangential_forces=torch.stack(tangential_forces, dim=1),
+        forces=torch.stack(forces, dim=1),
+    )
 
 
 class _System(nn.Module):
     """Time derivative of (centre, rotation, velocity, angular velocity), paper eq. 1."""
 
-    def __init__(self, problem: Problem, options: PhysicsOptions):
+    def __init__(self, body: BodyContact, loads: LoadModel, mass: Tensor, inertia: Tensor, options: PhysicsOptions):
         super().__init__()
-        self._problem = problem
-        self._options = options
-        self._lookup = TerrainLookup(problem.terrain, options.lookup, problem.batch_size, problem.vegetation_drag)
-        self._points = problem.points.T - problem.centre_of_mass[..., None]
-        hull = torch.zeros_like(problem.drive_speeds[..., :1])
-        self._speeds = torch.cat([problem.drive_speeds, hull], dim=-1)
-        share = problem.point_areas / problem.point_areas.sum()
-        self._weights = problem.mass[:, None] * options.gravity * share
+        self.body, self.loads, self.mass, self.inertia, self.options = body, loads, mass, inertia, options
+
+    @classmethod
+    def of(cls, problem: Problem, options: PhysicsOptions) -> _System:
+        """The system of a problem."""
+        body, loads = BodyContact.of(problem, options), LoadModel.of(problem, options.gravity)
+        return cls(body, loads, problem.mass, problem.inertia, options)
 
     @property
-    def dependencies(self) -> tuple[Tensor, ...]:
-        problem, terrain = self._problem, self._problem.terrain
-        maps = (terrain.height, terrain.stiffness, terrain.damping, terrain.friction)
-        body = (problem.mass, problem.centre_of_mass, problem.inertia, problem.friction_factors, problem.drive_speeds)
-        return maps + body
+    def tensors(self) -> tuple[Tensor, ...]:
+        """Everything that the derivative depends on and that may carry gradients."""
+        body, loads = self.body, self.loads
+        return (
+            body.lookup.channels, body.points, body.tangents, body.areas, body.weights, body.speeds,
+            body.friction_factors, body.rolling_resistance, body.yield_speed,
+            loads.weight, loads.linear_drag, loads.quadratic_drag, loads.wrench, self.mass, self.inertia,
+        )  # fmt: skip
+
+    def with_tensors(self, tensors: tuple[Tensor, ...]) -> _System:
+        """The same system with other :attr:`tensors`."""
+        channels, points, tangents, areas, weights, speeds, friction, rolling, yield_speed, *rest = tensors
+        *loads, mass, inertia = rest
+        body = replace(
+            self.body, lookup=self.body.lookup.with_channels(channels), points=points, tangents=tangents, areas=areas,
+            weights=weights, speeds=speeds, friction_factors=friction, rolling_resistance=rolling,
+            yield_speed=yield_speed,
+        )  # fmt: skip
+        return _System(body, LoadModel(*loads), mass, inertia, self.options)
 
     def forward(self, time: Tensor, state: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-        problem, options = self._problem, self._options
         centre, rotation, velocity, angular_velocity = state
-        turned = rotation.transpose(1, 2)
-        arms = rotation @ self._points
-        points = centre[..., None] + arms
-        step = min(int(float(time.detach()) / options.time_step + 1e-9), problem.steps - 1)
-        belt = rotation @ (self._speeds[:, step, problem.point_drives][:, None] * problem.point_tangents.T)
-        rolling, linear_drag, quadratic_drag, yield_speed = problem.resistance.unbind(-1)
-        touch = contact(
-            self._lookup(points),
-            points,
-            velocity[..., None] + cross_matrix(angular_velocity) @ arms,
-            belt,
-            rotation[..., 1],
-            problem.point_areas,
-            self._weights,
-            problem.friction_factors,
-            rolling,
-            yield_speed,
-            options,
-            step_time=0.0,
-        )
+        steps = self.body.speeds.shape[1]
+        step = min(int(float(time.detach()) / self.options.time_step + 1e-9), steps - 1)
+        arms, touch = self.body.at(step, centre, rotation, velocity, angular_velocity, step_time=0.0)
         forces = touch.vectors
-        in_body = turned @ torch.stack([velocity, angular_velocity], dim=-1)
-        extra = (problem.wrench @ features(in_body, rotation)[..., None])[..., 0]
-        drag = linear_drag + quadratic_drag * torch.sqrt((velocity * velocity).sum(-1) + SMALLEST_SPEED**2)
-        force = forces.sum(2) + problem.mass[:, None] * tilted_gravity(problem.gravity_tilt, options.gravity)
-        force = force - drag[:, None] * velocity + (rotation @ extra[:, :3, None])[..., 0]
-        inertia = rotation @ problem.inertia @ turned
-        torque = cross(arms, forces).sum(2) + (rotation @ extra[:, 3:, None])[..., 0]
-        torque = torque - cross(angular_velocity, (inertia @ angular_velocity[..., None])[..., 0])
+        inertia = rotation @ self.inertia @ rotation.transpose(1, 2)
+        external = self.loads.at(rotation, velocity, angular_velocity, inertia)
         return (
             velocity,
             cross_matrix(angular_velocity) @ rotation,
-            force / problem.mass[:, None],
-            torch.linalg.solve(inertia, torque),
+            (forces.sum(2) + external.force) / self.mass[:, None],
+            torch.linalg.solve(inertia, cross(arms, forces).sum(2) + external.torque),
         )
+
+
+class _AdjointSolution(torch.autograd.Function):
+    """Solves the adjoint equation for the gradient of every tensor of the system and of the start.
+
+    torchdiffeq's adjoint differentiates the system again and again with respect to the tensors that it is given. Here
+    these are copies without a history, so that one which depends on another (a payload's mass and centre of mass, a
+    map's height and its vegetation) is neither counted twice nor its graph walked twice.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, system: _System, steps: int, ode: OdeOptions, *tensors: Tensor) -> tuple[Tensor, ...]:
+        from torchdiffeq import odeint_adjoint
+
+        leaves = [tensor.detach().requires_grad_(tensor.requires_grad) for tensor in tensors]
+        own = system.with_tensors(tuple(leaves[:-4]))
+        times, settings = _solver(own, steps, ode)
+        with torch.enable_grad():
+            parameters = tuple(leaf for leaf in leaves[:-4] if leaf.requires_grad)
+            states = odeint_adjoint(own, tuple(leaves[-4:]), times, adjoint_params=parameters, **settings)
+        ctx.leaves, ctx.states = leaves, states
+        return tuple(state.detach() for state in states)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        wanted = [leaf for leaf in ctx.leaves if leaf.requires_grad]
+        found = iter(torch.autograd.grad(ctx.states, wanted, gradients, allow_unused=True))
+        return (None, None, None, *(next(found) if leaf.requires_grad else None for leaf in ctx.leaves))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -50,7 +51,8 @@ def rollout(
         with_contact: whether to return their sums over the body, which without gradients cost little.
         force_every: of so many steps the first one's forces are returned; where many candidates are compared, all of
             them would cost more than the motion.
-        ode: integrate by a solver of torchdiffeq instead, as the paper's Neural-ODE variant does; without forces.
+        ode: integrate by a solver of torchdiffeq instead, as the paper's Neural-ODE variant does; forces are then those
+            at the beginning of each step.
         backend: ``warp`` (compiled kernels), ``torch`` (the reference), or ``auto``: Warp where it is installed.
 
     Raises:
@@ -68,22 +70,29 @@ def rollout(
         raise ValueError(f"terrain: got a batch of {terrain.batch_size} maps, expected 1 or {batch}")
     problem, finite = Problem.pose(terrain, robot, drive_speeds, state)
     if ode is not None:
-        motion = neural_ode.integrate(problem, options, ode)
+        motion = neural_ode.integrate(problem, options, ode, with_forces or with_contact, force_every)
     else:
         motion = _backend(backend).integrate(problem, options, with_forces, with_contact, force_every)
     result = replace(_result(problem, motion, finite, options), force_every=force_every)
-    if not with_contact or not problem.steps or result.contact is not None or result.forces is None:
+    normal, tangential, forces = result.normal_forces, result.tangential_forces, result.forces
+    if not with_contact or result.contact is not None or normal is None or tangential is None or forces is None:
         return result
     contact = ContactSummary.of_points(
         robot.to(result.position.dtype, result.position.device), result.rotation[:, :-1:force_every],
-        result.normal_forces, result.tangential_forces, result.forces,
+        normal, tangential, forces,
     )  # fmt: skip
     if with_forces:
         return replace(result, contact=contact)
     return replace(result, contact=contact, normal_forces=None, tangential_forces=None, forces=None)
 
 
-def _backend(name: str):
+class _Backend(Protocol):
+    def integrate(
+        self, problem: Problem, options: PhysicsOptions, with_forces: bool, with_contact: bool, force_every: int, /
+    ) -> Motion: ...
+
+
+def _backend(name: str) -> _Backend:
     if name not in BACKENDS:
         raise ValueError(f"backend: got {name!r}, expected one of {BACKENDS}")
     if name == "torch":
@@ -104,10 +113,13 @@ def _result(problem: Problem, motion: Motion, finite: Tensor, options: PhysicsOp
     states = (position, motion.rotation, velocity, motion.angular_velocity)
     valid = finite & torch.stack([torch.isfinite(t.detach()).flatten(1).all(1) for t in states]).all(0)
 
-    def mark(values: Tensor | None) -> Tensor | None:
-        if values is None or bool(valid.all()):
+    def mark(values: Tensor) -> Tensor:
+        if bool(valid.all()):
             return values
         return values.masked_fill(~valid.view(-1, *[1] * (values.ndim - 1)), torch.nan)
+
+    def mark_if_there(values: Tensor | None) -> Tensor | None:
+        return None if values is None else mark(values)
 
     grid, points = problem.terrain.grid, position.detach()[..., :2]
     low = points.new_tensor([grid.extent[0], grid.extent[2]])
@@ -120,9 +132,9 @@ def _result(problem: Problem, motion: Motion, finite: Tensor, options: PhysicsOp
         angular_velocity=mark(motion.angular_velocity),
         inside=((points >= low) & (points <= high)).all(dim=-1),
         valid=valid,
-        normal_forces=mark(motion.normal_forces),
-        tangential_forces=mark(motion.tangential_forces),
-        forces=mark(motion.forces),
+        normal_forces=mark_if_there(motion.normal_forces),
+        tangential_forces=mark_if_there(motion.tangential_forces),
+        forces=mark_if_there(motion.forces),
         contact=motion.contact
         and ContactSummary(*(mark(getattr(motion.contact, f.name)) for f in fields(motion.contact))),
     )

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from monoforce_ros.core import small_rotation
+
 
 def exponential_map(vector: Tensor) -> Tensor:
     """Rotation matrices ``[..., 3, 3]`` of rotation vectors ``[..., 3]`` [rad] (Rodrigues' formula)."""
@@ -30,13 +32,12 @@ def cross_matrix(vector: Tensor) -> Tensor:
 def rotation_angle(first: Tensor, second: Tensor) -> Tensor:
     """Angle [rad] between rotations ``[..., 3, 3]`` (paper eq. 6), accurate for small angles too."""
     relative = first.transpose(-1, -2) @ second
-    sine = 0.5 * torch.stack(
-        [
-            relative[..., 2, 1] - relative[..., 1, 2],
-            relative[..., 0, 2] - relative[..., 2, 0],
-            relative[..., 1, 0] - relative[..., 0, 1],
-        ],
-        dim=-1,
-    ).norm(dim=-1)
+    sine = torch.stack(small_rotation(relative), dim=-1).norm(dim=-1)
     cosine = 0.5 * (relative.diagonal(dim1=-2, dim2=-1).sum(-1) - 1.0)
     return torch.atan2(sine, cosine)
+
+
+def cross(first: Tensor, second: Tensor) -> Tensor:
+    """Cross product along dimension 1, component by component: many times faster here than torch's own."""
+    a, b = first.unbind(1), second.unbind(1)
+    return torch.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]], dim=1)

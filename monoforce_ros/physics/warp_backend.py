@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -78,15 +79,18 @@ def integrate(
     fixed = _Fixed(options, terrain.grid, drives[clusters.order], clusters)
     # Points of a cluster lie side by side.
     ordered = inputs(tuple(t[clusters.order] for t in sampled))
-    states = _Integrate.apply(fixed, *ordered, *start)
+    states: tuple[Tensor, ...] = _Integrate.apply(fixed, *ordered, *start)
+    centre, rotation, velocity, angular_velocity = states
+    motion = Motion(centre, rotation, velocity, angular_velocity)
     if not problem.steps or not (with_forces or with_contact):
-        return Motion(*states)
+        return motion
     with_gradient = torch.is_grad_enabled() and any(t.requires_grad for t in (*ordered, *states))
     if with_contact and not with_forces and not with_gradient:
         sums = _launch_summary(fixed, force_every, _contiguous(ordered), _contiguous(states))
-        return Motion(*states, contact=ContactSummary.split(sums, problem.drive_speeds.shape[2]))
+        return replace(motion, contact=ContactSummary.split(sums, problem.drive_speeds.shape[2]))
     fixed = _Fixed(options, terrain.grid, drives, clusters)
-    return Motion(*states, *_Forces.apply(fixed, force_every, *inputs(sampled), *states))
+    normal, tangential, forces = _Forces.apply(fixed, force_every, *inputs(sampled), *states)
+    return replace(motion, normal_forces=normal, tangential_forces=tangential, forces=forces)
 
 
 _INPUTS = (
@@ -147,7 +151,7 @@ class _Arguments:
             state_gradients = [torch.zeros_like(value) for value in states]
         self.states = {
             name: wp.from_torch(value, dtype=element[name], requires_grad=gradients, grad=gradient)
-            for name, value, gradient in zip(_STATES, states, state_gradients or [None] * 4, strict=True)
+            for name, value, gradient in zip(_STATES, states, state_gradients or (None,) * 4, strict=True)
         }
         clusters = fixed.clusters
         ground, body, robots, options = kinds.Ground(), kinds.Body(), kinds.Robots(), kinds.Options()
