@@ -4,6 +4,7 @@ from monoforce_ros.core.alignment import DelayCorrelation, Delayed, largest_spre
 from monoforce_ros.core.camera import CameraModel
 from monoforce_ros.core.files import atomic_path, unfinished_path, write_bytes, write_text
 from monoforce_ros.core.geometry import homogeneous, quaternions, small_rotation, transform_points, wrap_angle
+from monoforce_ros.core.lazy import lazy_exports
 from monoforce_ros.core.regimes import FAST_SHARE, motion_regimes
 from monoforce_ros.core.shared_files import share_directory
 from monoforce_ros.core.statistics import huber
@@ -33,6 +34,7 @@ __all__ = [
     "homogeneous",
     "huber",
     "largest_spread",
+    "lazy_exports",
     "motion_regimes",
     "nearest_stamp",
     "quaternions",

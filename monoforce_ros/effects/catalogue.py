@@ -7,11 +7,11 @@ import inspect
 import pkgutil
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from monoforce_ros import effects as package
 from monoforce_ros.core import CommandTrack, MotionTrack
 from monoforce_ros.effects.effect import STAGES, Effect
 from monoforce_ros.effects.setup import Loads, Setup
@@ -29,10 +29,10 @@ _NO_EFFECTS = frozenset({"catalogue", "effect", "page", "setup"})
 
 def _discover() -> dict[str, Effect]:
     found: dict[str, Effect] = {}
-    for module in pkgutil.iter_modules(package.__path__):
+    for module in pkgutil.iter_modules([str(Path(__file__).parent)]):
         if module.name in _NO_EFFECTS:
             continue
-        content = importlib.import_module(f"{package.__name__}.{module.name}")
+        content = importlib.import_module(f"{__package__}.{module.name}")
         for _, kind in inspect.getmembers(content, inspect.isclass):
             if not issubclass(kind, Effect) or kind.__module__ != content.__name__:
                 continue

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from monoforce_ros.core.lazy import lazy_exports
+from monoforce_ros.core import lazy_exports
 
 if TYPE_CHECKING:
     from monoforce_ros.synthetic.course import CourseSettings

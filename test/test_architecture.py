@@ -1,0 +1,95 @@
+"""The rooms' order in docs/architecture.md is the order that the imports follow."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+from conftest import ROOT
+
+PACKAGE = ROOT / "monoforce_ros"
+PAGE = ROOT / "docs" / "architecture.md"
+FILES = sorted(PACKAGE.rglob("*.py"))
+
+
+def rooms() -> list[str]:
+    """Rooms in the order of the page's table, from the ground up."""
+    return re.findall(r"^\| \[`(\w+)/`\]\(\.\./monoforce_ros/\w+\) \|", PAGE.read_text(), re.MULTILINE)
+
+
+def room_of(path: Path) -> str:
+    parts = path.relative_to(PACKAGE).parts
+    return parts[0] if len(parts) > 1 else ""
+
+
+def module_of(path: Path) -> str:
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+def imports(path: Path) -> list[tuple[str, str]]:
+    """Module and name of every import from the package, wherever it stands in the file."""
+    found = []
+    for node in ast.walk(ast.parse(path.read_text(), filename=str(path))):
+        if isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: a relative import hides where it leads"
+            if (node.module or "").split(".")[0] == "monoforce_ros":
+                found += [(node.module, alias.name) for alias in node.names]
+        elif isinstance(node, ast.Import):
+            found += [(alias.name, "") for alias in node.names if alias.name.split(".")[0] == "monoforce_ros"]
+    return found
+
+
+def exported(room: str) -> set[str]:
+    tree = ast.parse((PACKAGE / room / "__init__.py").read_text())
+    for node in tree.body:
+        if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "__all__":
+            return set(ast.literal_eval(node.value))
+    return set()
+
+
+def test_every_room_is_on_the_page_and_every_room_of_the_page_is_there():
+    folders = [p.name for p in PACKAGE.iterdir() if (p / "__init__.py").is_file()]
+    assert sorted(rooms()) == sorted(folders)
+    assert len(rooms()) == len(set(rooms())) > 10
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_a_file_imports_only_public_names_of_rooms_above_its_own(path):
+    order, own = rooms(), room_of(path)
+    for module, name in imports(path):
+        parts = module.split(".")
+        room = parts[1] if len(parts) > 1 else name
+        if not own or room == own:
+            continue
+        assert order.index(room) < order.index(own), f"{own}/ imports {room}/, which stands below it in {PAGE.name}"
+        assert len(parts) == 2 and name, f"{module}: import public names from monoforce_ros.{room}"
+        assert name in exported(room), f"{name} is not exported by monoforce_ros.{room}"
+        assert not name.startswith("_"), f"{module}.{name} is private"
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    known = {module_of(path) for path in FILES}
+    graph: dict[str, set[str]] = {}
+    for path in FILES:
+        targets = set()
+        for module, name in imports(path):
+            inner = f"{module}.{name}"
+            targets.add(inner if inner in known else module)
+        graph[module_of(path)] = targets - {module_of(path)}
+    done: set[str] = set()
+    open_modules: list[str] = []
+
+    def visit(module: str) -> None:
+        if module in done or module not in graph:
+            return
+        if module in open_modules:
+            circle = [*open_modules[open_modules.index(module) :], module]
+            pytest.fail(f"modules import each other: {' -> '.join(circle)}")
+        open_modules.append(module)
+        for target in sorted(graph[module]):
+            visit(target)
+        open_modules.pop()
+        done.add(module)
+
+    for module in sorted(graph):
+        visit(module)

@@ -1,0 +1,47 @@
+"""Every robot file of config/robots/ makes a robot that stands, drives straight and turns; new files are found."""
+
+import numpy as np
+import pytest
+import torch
+
+from monoforce_ros.effects import drive_speeds
+from monoforce_ros.physics import State, rollout
+from monoforce_ros.robots import load_robot, shipped_robots
+from monoforce_ros.terrain import Grid, TerrainMap
+
+FLAT = TerrainMap.flat(Grid.square(12.0, 0.5))
+
+
+def drive(robot, speed, yaw_rate, seconds=2.0):
+    """Rollout from rest under one command; the first second is for settling."""
+    steps = round(seconds / 0.01)
+    twists = torch.tensor([[0.0, 0.0]] * 100 + [[speed, yaw_rate]] * steps)[None]
+    return rollout(FLAT, robot, drive_speeds(robot, twists, 0.01), State.at_rest(robot.ground_clearance))
+
+
+def heading(result):
+    return float(np.degrees(torch.atan2(result.rotation[0, -1, 1, 0], result.rotation[0, -1, 0, 0])))
+
+
+@pytest.mark.parametrize("name", shipped_robots())
+def test_it_stands_still_at_rest(name):
+    robot = load_robot(name)
+    result = drive(robot, 0.0, 0.0)
+    # The first second is for settling: belly and wheels meet the ground at once.
+    moved = result.position[0, -1] - result.position[0, 100]
+    assert float(moved.norm()) < 2e-3
+    assert float(result.rotation[0, -1, 2, 2]) > 0.995
+    weight = float(robot.mass) * 9.81
+    assert float(result.normal_forces[0, -1].sum()) == pytest.approx(weight, rel=0.02)
+
+
+@pytest.mark.parametrize("name", shipped_robots())
+def test_it_drives_straight_and_turns_to_the_side_that_is_commanded(name):
+    robot = load_robot(name)
+    ahead = drive(robot, 0.5, 0.0)
+    moved = ahead.position[0, -1] - ahead.position[0, 100]
+    assert 0.75 < float(moved[0]) < 1.02 and abs(float(moved[1])) < 0.02
+    assert abs(heading(ahead)) < 1.0
+    left, right = drive(robot, 0.0, 0.6), drive(robot, 0.0, -0.6)
+    assert heading(left) > 3.0
+    assert heading(right) == pytest.approx(-heading(left), abs=2.0)
