@@ -70,10 +70,10 @@ EXAMPLES = {
         lambda: builders.odometry(STAMP, "odom", "base_link", [1, 2, 3], [0, 0, 0, 1], [0.5, 0, 0], [0, 0, 0.1]),
         decoding.decode_odometry,
     ),
-    "imu": (lambda: builders.imu(STAMP, "imu_link", [0, 0, 0.1], [0, 0, 9.81]), decoding.decode_turning),
+    "imu": (lambda: builders.imu(STAMP, "imu_link", [0, 0, 0.1], [0, 0, 9.81]), decoding.decode_angular_velocity),
     "joint_state": (
         lambda: builders.joint_state(STAMP, ["left_wheel", "right_wheel"], [0, 0], [1.0, 1.0]),
-        decoding.decode_wheels,
+        decoding.decode_wheel_speeds,
     ),
     "twist": (lambda: builders.twist(0.5, 0.1), decoding.decode_command),
     "twist_stamped": (lambda: builders.twist_stamped(STAMP, "base_link", 0.5, 0.1), decoding.decode_command),
@@ -81,7 +81,7 @@ EXAMPLES = {
         lambda: builders.static_transforms(STAMP, "base_link", {"lidar": np.eye(4)}),
         decoding.decode_transforms,
     ),
-    "sequences": (sequences, lambda message: decoding.decode_sequences(message, 16)),
+    "sequences": (sequences, lambda message: decoding.decode_command_sequences(message, 16)),
 }
 
 
