@@ -1,4 +1,4 @@
-"""Whatever stands in a message or a file from outside: it is decoded into finite numbers, or refused in words."""
+"""Arbitrary content in messages and files is decoded into finite numbers, or refused with a reason."""
 
 import copy
 import dataclasses
@@ -86,7 +86,7 @@ EXAMPLES = {
 
 
 def places(message, path=()):
-    """Where a message holds numbers, strings and arrays."""
+    """Paths to the numbers, strings and arrays of a message."""
     if dataclasses.is_dataclass(message):
         for entry in dataclasses.fields(message):
             if entry.name != "__msgtype__":
@@ -144,7 +144,7 @@ def another(value):
 @pytest.mark.parametrize("name", EXAMPLES)
 @settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.data_too_large, HealthCheck.too_slow])
 @given(data=st.data())
-def test_a_message_with_anything_in_it_is_decoded_or_refused(name, data):
+def test_a_message_with_arbitrary_content_is_decoded_or_refused(name, data):
     make, decode = EXAMPLES[name]
     message = make()
     for _ in range(data.draw(st.integers(1, 3), label="changes")):

@@ -112,32 +112,32 @@ class CandidateOutput:
         motion, terrain, settings = prediction.motion, prediction.terrain, self._settings
         # Candidates take effect after the delay; the last command holds until then.
         held = min(round(settings.candidate_delay / self._predictor.options.time_step), self._predictor.steps - 1)
-        begins, steps = self._predictor.history + held, self._predictor.steps - held
-        stamps = self._predictor.command_stamps(prediction.stamp)[:begins]
+        start, steps = self._predictor.history + held, self._predictor.steps - held
+        stamps = self._predictor.command_stamps(prediction.stamp)[:start]
         before = commands.sample(stamps, timeout=settings.command_timeout)
         twists = over_horizon(sequences, before, steps)
-        rolled, found = self._assess(prediction, twists)
-        if settings.refine_seconds and found.best is not None:
-            refined = over_horizon(self._refined(prediction, before, sequences[found.best]), before, steps)
+        rollout, assessment = self._assess(prediction, twists)
+        if settings.refine_seconds and assessment.best is not None:
+            refined = over_horizon(self._refined(prediction, before, sequences[assessment.best]), before, steps)
             refined_rollout, refined_assessment = self._assess(prediction, refined)
             twists = np.concatenate([twists, refined])
-            rolled, found = rolled.joined(refined_rollout), found.joined(refined_assessment)
+            rollout, assessment = rollout.joined(refined_rollout), assessment.joined(refined_assessment)
         grid = occupancy(
             terrain, motion.odometry_from_terrain, slope_limit=settings.slope_limit, step_limit=settings.step_limit
         )
         data = {
-            "candidates": messages.candidate_markers(motion, rolled, found, frame_id),
-            "candidate_costs": messages.candidate_costs(motion, rolled, twists[:, begins], found, frame_id),
+            "candidates": messages.candidate_markers(motion, rollout, assessment, frame_id),
+            "candidate_costs": messages.candidate_costs(motion, rollout, twists[:, start], assessment, frame_id),
             "occupancy": messages.occupancy_grid(motion.stamp, grid, frame_id),
         }
-        if found.best is not None:
-            data["best_path"] = messages.best_path(motion, rolled, found.best, frame_id, settings.path_time_step)
+        if assessment.best is not None:
+            data["best_path"] = messages.best_path(motion, rollout, assessment.best, frame_id, settings.path_time_step)
         if "candidate_rollouts" in self._publishers:
             data["candidate_rollouts"] = messages.candidate_rollouts(
-                motion, rolled, self._predictor.robot, twists[:, self._predictor.history :], found, frame_id,
+                motion, rollout, self._predictor.robot, twists[:, self._predictor.history :], assessment, frame_id,
                 settings.path_time_step,
             )  # fmt: skip
-        self._statistics["feasible candidates"] = f"{int(found.feasible.sum())} of {len(twists)}"
+        self._statistics["feasible candidates"] = f"{int(assessment.feasible.sum())} of {len(twists)}"
         if self._node.context.ok():
             for name, message in data.items():
                 self._publishers[name].publish(message)
@@ -162,13 +162,13 @@ class CandidateOutput:
 
     def _assess(self, prediction: Prediction, twists: np.ndarray) -> tuple[Rollout, Assessment]:
         motions = [prediction.motion] * len(twists)
-        rolled = self._predictor.roll_out(
+        rollout = self._predictor.roll_out(
             prediction.terrain, motions, twists, with_forces=False, with_contact=True, force_every=self._force_every
         )
         commanded = torch.from_numpy(twists[:, self._predictor.history :]).float()
         robot = self._predictor.robot
-        found = assess(rolled, prediction.terrain, robot, commanded, weights=self._weights, limits=self._limits)
-        return rolled, found
+        weights, limits = self._weights, self._limits
+        return rollout, assess(rollout, prediction.terrain, robot, commanded, weights=weights, limits=limits)
 
     def _refined(self, prediction: Prediction, before: np.ndarray, best: np.ndarray) -> np.ndarray:
         """The best candidate's refined commands at every step ``[1, T, 2]``."""

@@ -36,7 +36,7 @@ class MonitorOutput:
         if self._gap.compare(motion, commands) is None:
             return
         found = self._gap.summary()
-        where = f", most when {found.worst}" if found.worst else ""
+        where = f", largest when {found.worst}" if found.worst else ""
         if found.excessive:
             message = (
                 f"predictions are {found.position[1]:.2f} m off after 2 s{where}; record a bag and run `diagnose` to "
