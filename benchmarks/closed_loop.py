@@ -104,7 +104,7 @@ def drive(seed: int, source: str, robot: str, checkpoint: str, seconds: float, f
     parameters = [f"terrain_source:={source}", "candidates:=46", "horizon:=4.0", "rate:=5.0", f"robot:={robot}",
                   "candidate_yaw_rate:=1.0", "candidate_speeds:=[0.0,0.4,0.8]"]  # fmt: skip
     # What a camera comes near to it no longer sees.
-    parameters += ["camera_memory:=20.0"] if source == "camera" else []
+    parameters += ["camera_retention_time:=20.0"] if source == "camera" else []
     parameters += [f"checkpoint:={checkpoint}"] if checkpoint else []
     words = [word for parameter in parameters for word in ("-p", parameter)]
     processes.append(started("predictor", folder, "--ros-args", *words))

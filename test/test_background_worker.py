@@ -1,4 +1,4 @@
-"""Work beside the predictions: the newest of what waits, in a thread that lets others go first."""
+"""The background worker: newest job first, in a thread of lower priority."""
 
 import os
 import sys
@@ -9,7 +9,7 @@ import pytest
 from monoforce_ros.nodes.background_worker import BackgroundWorker
 
 
-def test_of_what_waits_the_newest_is_done_and_the_rest_is_counted():
+def test_the_newest_waiting_job_is_processed_and_the_others_are_counted():
     entered, leave, done, all_done = threading.Event(), threading.Event(), [], threading.Event()
 
     def work(job):
@@ -19,22 +19,22 @@ def test_of_what_waits_the_newest_is_done_and_the_rest_is_counted():
         if job == 4:
             all_done.set()
 
-    beside = BackgroundWorker("test", work)
-    beside.give(0)
+    worker = BackgroundWorker("test", work)
+    worker.submit(0)
     assert entered.wait(10)
     for job in range(1, 5):
-        beside.give(job)
+        worker.submit(job)
     leave.set()
     assert all_done.wait(10)
-    beside.stop()
-    assert done == [0, 4] and beside.dropped == 3
+    worker.stop()
+    assert done == [0, 4] and worker.dropped == 3
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="threads have a niceness of their own on Linux alone")
 @pytest.mark.parametrize("niceness", [0, 7])
-def test_it_steps_back_for_others_and_so_do_the_threads_that_it_starts(niceness):
+def test_the_niceness_applies_to_the_thread_and_to_threads_that_it_starts(niceness):
     found, done = {}, threading.Event()
-    own = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+    normal = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
 
     def note(name):
         found[name] = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
@@ -46,11 +46,11 @@ def test_it_steps_back_for_others_and_so_do_the_threads_that_it_starts(niceness)
         helper.join()
         done.set()
 
-    beside = BackgroundWorker("test", work, niceness)
-    beside.give("job")
+    worker = BackgroundWorker("test", work, niceness)
+    worker.submit("job")
     assert done.wait(10)
-    beside.stop()
-    # Counted from what the process has been given already.
-    wanted = min(19, own + niceness)
+    worker.stop()
+    # Relative to the niceness of the process.
+    wanted = min(19, normal + niceness)
     assert found == {"thread": wanted, "helper": wanted}
-    assert os.getpriority(os.PRIO_PROCESS, threading.get_native_id()) == own
+    assert os.getpriority(os.PRIO_PROCESS, threading.get_native_id()) == normal

@@ -1,4 +1,4 @@
-"""The installed player and recorder between processes: whole images, true timing, clear errors."""
+"""The installed player and recorder as processes: complete images, correct timing, clear errors."""
 
 import time
 
@@ -107,7 +107,7 @@ def cut(path, size):
     file.write_bytes(file.read_bytes()[:size])
 
 
-def test_a_bag_of_which_nothing_is_left_is_refused_in_one_line(start, bag, tmp_path):
+def test_an_unreadable_bag_is_refused_in_one_line(start, bag, tmp_path):
     player = start("bag_player", damaged(bag, tmp_path, lambda path: cut(path, 30)), "--quiet", "--wait", "0")
     assert player.wait(30) == 1
     lines = [line for line in player.output.splitlines() if line.startswith("error:")]
@@ -123,7 +123,7 @@ def test_a_bag_of_which_nothing_is_left_is_refused_in_one_line(start, bag, tmp_p
     ],
     ids=["cut off", "no metadata", "metadata makes no sense"],
 )
-def test_what_is_left_of_a_damaged_bag_is_played_and_said(start, peer, bag, tmp_path, damage):
+def test_the_readable_part_of_a_damaged_bag_is_played_with_a_warning(start, peer, bag, tmp_path, damage):
     images = Listener(peer, Image, "/camera/image_raw")
     player = start("bag_player", damaged(bag, tmp_path, damage), "--quiet", "--rate", "20", "--wait", "10")
     assert player.wait(60) == 0
@@ -137,13 +137,13 @@ def test_what_is_left_of_a_damaged_bag_is_played_and_said(start, peer, bag, tmp_
     ("arguments", "message"),
     [(["--topics", "/nothing"], "has no topics ['/nothing']"), (["--rate", "0"], "--rate: got 0.0")],
 )
-def test_wrong_arguments_are_named(start, bag, arguments, message):
+def test_wrong_arguments_are_reported(start, bag, arguments, message):
     player = start("bag_player", bag, *arguments)
     assert player.wait(30) in (1, 2)
     assert message in player.output and "Traceback" not in player.output
 
 
-def test_the_recorder_writes_what_it_hears(start, peer, tmp_path):
+def test_the_recorder_writes_the_received_messages(start, peer, tmp_path):
     recorder = start("bag_recorder", tmp_path / "out", "--topics", "/cmd_vel", "/odom")
     sent = 0
 

@@ -1,6 +1,6 @@
 """The predictor with cameras as its terrain source, in a process of its own.
 
-The encoder's weights are drawn by the test: what counts here is what the node does with images, not what it sees.
+The encoder has constant outputs: this tests how the node handles images, not the quality of the terrain.
 """
 
 import time
@@ -67,7 +67,7 @@ def healthy(peer, predictor):
     pytest.fail(f"no prediction from good images: {peer.status('prediction')}\n{predictor.output[-3000:]}")
 
 
-def nothing_new(peer, predictor, text, **bad):
+def refused(peer, predictor, text, **bad):
     # Counted before the pause: a camera's silence may be noticed in it already.
     said_before = sum(text in line for line in predictor.output.splitlines())
     peer.settle()
@@ -82,7 +82,7 @@ def nothing_new(peer, predictor, text, **bad):
 
 
 def test_without_camera_info_nothing_is_predicted_and_its_topic_is_named(peer, predictor):
-    nothing_new(peer, predictor, f"no usable CameraInfo on {INFO}", info=None)
+    refused(peer, predictor, f"no usable CameraInfo on {INFO}", info=None)
     healthy(peer, predictor)
 
 
@@ -96,19 +96,19 @@ def test_images_become_terrain_with_their_stamp(peer, predictor):
 
 
 def test_images_of_an_unknown_encoding(peer, predictor):
-    nothing_new(peer, predictor, "image encoding: got '32FC3'", image=lambda stamp: picture(stamp, "32FC3"))
+    refused(peer, predictor, "image encoding: got '32FC3'", image=lambda stamp: picture(stamp, "32FC3"))
     healthy(peer, predictor)
 
 
 def test_images_of_another_size_than_calibrated(peer, predictor):
-    nothing_new(
+    refused(
         peer, predictor, "images are 80 × 60 px, but CameraInfo says", image=lambda stamp: picture(stamp, size=(60, 80))
     )
     healthy(peer, predictor)
 
 
 def test_a_camera_that_is_not_calibrated(peer, predictor):
-    nothing_new(
+    refused(
         peer, predictor, "the camera is not calibrated", info=lambda stamp: information(stamp, matrix=np.zeros((3, 3)))
     )
     healthy(peer, predictor)
@@ -121,11 +121,11 @@ def test_images_without_a_pixel(peer, predictor):
         message.data = np.zeros(0, np.uint8)
         return message
 
-    nothing_new(peer, predictor, "image size: got 0", image=empty)
+    refused(peer, predictor, "image size: got 0", image=empty)
     healthy(peer, predictor)
 
 
-def test_a_calibration_that_changes_counts_from_then_on(peer, predictor):
+def test_a_changed_calibration_is_used_from_then_on(peer, predictor):
     healthy(peer, predictor)
     before = np.frombuffer(bytes(peer.received["/predicted/terrain"][-1].data), "<f4").reshape(-1, 8)
     narrow = MATRIX * np.array([[3, 1, 1], [1, 3, 1], [1, 1, 1]])
@@ -139,8 +139,17 @@ def test_a_calibration_that_changes_counts_from_then_on(peer, predictor):
 
 
 def test_a_camera_that_dies_and_comes_back(peer, predictor):
-    nothing_new(peer, predictor, f"publisher(s) on {IMAGE} send nothing", image=lambda stamp: None)
+    refused(peer, predictor, f"{IMAGE}: 1 publisher, no messages", image=lambda stamp: None)
     healthy(peer, predictor)
+
+
+def test_the_former_name_of_the_retention_time_still_works_with_a_warning(start):
+    process = start(
+        "predictor", "--ros-args", "-p", "terrain_source:=camera", "-p", "camera_memory:=10.0", "-r", "__node:=former"
+    )
+    process.wait_for("terrain from camera")
+    assert process.output.count("parameter 'camera_memory' is deprecated: use 'camera_retention_time'") == 1
+    assert process.stop() == 0
 
 
 def test_compressed_images_are_found_on_the_same_topic_name(start, peer, predictor):

@@ -1,4 +1,4 @@
-"""Candidates through the installed node: markers, table of costs, best path and occupancy, with a wall in the way."""
+"""Candidates of the installed node: markers, cost table, best path and occupancy grid, with a wall in the way."""
 
 import numpy as np
 import pytest
@@ -61,7 +61,7 @@ def table(message) -> tuple[list[str], np.ndarray]:
 
 
 def feed(peer, heard, **world) -> None:
-    """Drive until everything about this world has been heard twice; what is still said of the one before is dropped."""
+    """Drive until each output for this world has arrived twice; outputs for the previous world are dropped."""
     begin = peer.now
     for messages in heard.values():
         messages.clear()
@@ -87,7 +87,7 @@ def test_every_candidate_has_its_path_and_its_costs(peer, predictor, heard):
     assert column["speed"][-1] == column["yaw_rate"][-1] == 0.0
     # The robot stands at (1, 2): arcs to the right end there, to the left there, and stopping ends where it is.
     assert column["y"][0] < 1.5 and column["y"][COUNT - 2] > 2.5 and column["heading"][0] < -0.5
-    # But for 0.2 s it does what it is told now, 0.5 m/s: nobody can stop it earlier.
+    # The current command, 0.5 m/s, holds for the first 0.2 s.
     assert 0.05 < column["x"][-1] - 1.0 < 0.15 and abs(column["y"][-1] - 2.0) < 0.02
     np.testing.assert_allclose(
         column["x_50"][COUNT // 2 - 1], 1.0 + 0.5 * (column["x"][COUNT // 2 - 1] - 1.0), atol=0.15
@@ -137,21 +137,21 @@ def test_the_occupancy_grid_shows_the_wall_where_it_is(peer, predictor, heard):
     assert data.min() == -1
 
 
-def test_what_a_planner_asks_for_is_compared_and_refined(peer, start):
+def test_candidates_of_a_planner_are_compared_and_refined(peer, start):
     """Sequences of two commands over a topic; with the best refined as one more; everything in one typed message."""
     typed = message_class("monoforce_msgs/msg/Candidates")
     process = start(
-        "predictor", "--ros-args", "-r", "__node:=asked", "-p", "candidate_topic:=planned", "-p", "horizon:=2.0",
+        "predictor", "--ros-args", "-r", "__node:=requested", "-p", "candidate_topic:=planned", "-p", "horizon:=2.0",
         "-p", "refine_seconds:=0.8", "-p", "rate:=1.0", "-p", "ensemble:=8",
-        "-r", "predicted/candidate_costs:=asked_costs", "-r", "predicted/candidate_rollouts:=asked_rollouts",
+        "-r", "predicted/candidate_costs:=requested_costs", "-r", "predicted/candidate_rollouts:=requested_rollouts",
     )  # fmt: skip
     process.wait_for("predicting 2 s ahead for husky")
     costs, rollouts, spreads = [], [], []
     cloud = message_class("sensor_msgs/msg/PointCloud2")
-    peer.node.create_subscription(cloud, "/asked_costs", costs.append, QoSProfile(depth=10))
+    peer.node.create_subscription(cloud, "/requested_costs", costs.append, QoSProfile(depth=10))
     peer.node.create_subscription(cloud, "/predicted/path_spread", spreads.append, QoSProfile(depth=10))
     if typed is not None:
-        peer.node.create_subscription(typed, "/asked_rollouts", rollouts.append, QoSProfile(depth=10))
+        peer.node.create_subscription(typed, "/requested_rollouts", rollouts.append, QoSProfile(depth=10))
     sequences = np.array([[[0.6, 0.3], [0.6, -0.3]], [[0.4, 0.0], [0.8, 0.0]], [[0.0, 0.0], [0.0, 0.0]]])
     array = message_class("std_msgs/msg/Float32MultiArray")()
     dimension = message_class("std_msgs/msg/MultiArrayDimension")
@@ -181,17 +181,21 @@ def test_what_a_planner_asks_for_is_compared_and_refined(peer, start):
     settings = EnsembleSettings()
     jumps = settings.scale * settings.position * np.sqrt(2 * np.log(10))
     assert radius[0] == pytest.approx(jumps, rel=0.02) and np.isfinite(radius).all()
-    # Wrong dimensions are refused in words, and what was asked before goes on until it is old.
+    # Wrong dimensions are refused with a reason; the previous candidates are used until they expire.
     wrong = type(array)()
     wrong.layout.dim = [dimension(label="n", size=3)]
     wrong.data = [0.0] * 3
     peer.clear()
     planner.publish(wrong)
-    said = lambda: [s.message for a in peer.received["/diagnostics"] for s in a.status if s.name == "asked: candidates"]  # noqa: E731
+
+    def said() -> list[str]:
+        statuses = [status for array in peer.received["/diagnostics"] for status in array.status]
+        return [status.message for status in statuses if status.name == "requested: candidates"]
+
     assert peer.until(lambda: any("dimensions [3]" in text for text in said()), 10.0), said()
     costs.clear()
     peer.drive(5.0)
-    assert any("nothing for" in text for text in said()), said()
+    assert any("no candidates for" in text for text in said()), said()
     assert process.stop() == 0
     if typed is None:
         pytest.skip("monoforce_msgs is not built: its message was not looked at")
@@ -202,10 +206,10 @@ def test_what_a_planner_asks_for_is_compared_and_refined(peer, start):
     commands = np.array(message.commands).reshape(count, samples, 2)
     np.testing.assert_allclose(states[:, 0, :3], [[1.0, 2.0, 0.3]] * 4, atol=1e-3)
     np.testing.assert_allclose(np.linalg.norm(states[..., 3:], axis=-1), 1.0, atol=1e-5)
-    # Samples are 0.1 s apart. For the first two the robot does what it was told last; candidates share the rest.
-    told = commands[0, 0]
-    np.testing.assert_allclose(commands[:, :2], np.broadcast_to(told, (count, 2, 2)), atol=1e-6)
-    assert abs(told[0] - sequences[0, 0, 0]) > 0.01 or abs(told[1] - sequences[0, 0, 1]) > 0.01
+    # Samples are 0.1 s apart. The last command holds for the first two; candidates share the rest.
+    held = commands[0, 0]
+    np.testing.assert_allclose(commands[:, :2], np.broadcast_to(held, (count, 2, 2)), atol=1e-6)
+    assert abs(held[0] - sequences[0, 0, 0]) > 0.01 or abs(held[1] - sequences[0, 0, 1]) > 0.01
     np.testing.assert_allclose(commands[0, [2, 10, 12, 20]], sequences[0][[0, 0, 1, 1]], atol=1e-6)
     # The robot's weight rests on its drives, in every candidate and at every time after the start.
     loads = np.array(message.loads).reshape(count, samples, len(message.drives))

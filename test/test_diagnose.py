@@ -337,7 +337,7 @@ def test_wheel_speeds_tell_how_the_drives_follow_commands(husky, effects):
 
 def test_wheels_are_found_among_the_joints():
     def joints(names, speeds):
-        return decoding.decode_wheels(builders.joint_state(1, names, [0.0] * len(names), np.array(speeds, float)))
+        return decoding.decode_wheel_speeds(builders.joint_state(1, names, [0.0] * len(names), np.array(speeds, float)))
 
     names = ["front_left_wheel", "rear_left_wheel_joint", "front_right_wheel", "arm_left"]
     np.testing.assert_allclose(joints(names, [1.0, 3.0, 5.0, 99.0]), [2.0, 5.0])

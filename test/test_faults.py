@@ -45,7 +45,7 @@ def test_a_recording_that_is_killed_is_not_lost(start, peer, tmp_path, storage):
         assert len(list(bag.messages(["/cmd_vel"]))) >= 30
         assert bag.warnings
     again = start("bag_recorder", tmp_path / "out", "--topics", "/cmd_vel")
-    again.wait_for(f"an earlier recording was killed and lies in {left}")
+    again.wait_for(f"an earlier recording was killed and is in {left}")
     again.stop()
 
 

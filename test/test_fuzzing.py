@@ -1,4 +1,4 @@
-"""Whatever stands in a message or a file from outside: it is decoded into finite numbers, or refused in words."""
+"""Arbitrary content in messages and files is decoded into finite numbers, or refused with a reason."""
 
 import copy
 import dataclasses
@@ -70,10 +70,10 @@ EXAMPLES = {
         lambda: builders.odometry(STAMP, "odom", "base_link", [1, 2, 3], [0, 0, 0, 1], [0.5, 0, 0], [0, 0, 0.1]),
         decoding.decode_odometry,
     ),
-    "imu": (lambda: builders.imu(STAMP, "imu_link", [0, 0, 0.1], [0, 0, 9.81]), decoding.decode_turning),
+    "imu": (lambda: builders.imu(STAMP, "imu_link", [0, 0, 0.1], [0, 0, 9.81]), decoding.decode_angular_velocity),
     "joint_state": (
         lambda: builders.joint_state(STAMP, ["left_wheel", "right_wheel"], [0, 0], [1.0, 1.0]),
-        decoding.decode_wheels,
+        decoding.decode_wheel_speeds,
     ),
     "twist": (lambda: builders.twist(0.5, 0.1), decoding.decode_command),
     "twist_stamped": (lambda: builders.twist_stamped(STAMP, "base_link", 0.5, 0.1), decoding.decode_command),
@@ -81,12 +81,12 @@ EXAMPLES = {
         lambda: builders.static_transforms(STAMP, "base_link", {"lidar": np.eye(4)}),
         decoding.decode_transforms,
     ),
-    "sequences": (sequences, lambda message: decoding.decode_sequences(message, 16)),
+    "sequences": (sequences, lambda message: decoding.decode_command_sequences(message, 16)),
 }
 
 
 def places(message, path=()):
-    """Where a message holds numbers, strings and arrays."""
+    """Paths to the numbers, strings and arrays of a message."""
     if dataclasses.is_dataclass(message):
         for entry in dataclasses.fields(message):
             if entry.name != "__msgtype__":
@@ -144,7 +144,7 @@ def another(value):
 @pytest.mark.parametrize("name", EXAMPLES)
 @settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.data_too_large, HealthCheck.too_slow])
 @given(data=st.data())
-def test_a_message_with_anything_in_it_is_decoded_or_refused(name, data):
+def test_a_message_with_arbitrary_content_is_decoded_or_refused(name, data):
     make, decode = EXAMPLES[name]
     message = make()
     for _ in range(data.draw(st.integers(1, 3), label="changes")):

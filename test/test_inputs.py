@@ -1,4 +1,4 @@
-"""What the node keeps of its inputs."""
+"""Inputs and rate limiter of the predictor node."""
 
 import time
 
@@ -45,7 +45,7 @@ def test_cameras_are_used_together_when_their_stamps_agree():
     assert {name: entry.message for name, entry in taken.items()} == {"a": 3, "b": 2}
 
 
-def test_cameras_that_are_triggered_together_are_not_mixed_with_their_last_images():
+def test_images_triggered_together_are_not_mixed_with_previous_ones():
     kept = Inputs(["a", "b", "c"], slop=0.1, patience=5.0, on_time_jump=lambda *_: None)
     moved(kept, 9 * SECOND)
     taken = []
@@ -58,11 +58,11 @@ def test_cameras_that_are_triggered_together_are_not_mixed_with_their_last_image
     assert taken[-4:] == [{2}, {3}, {4}, {5}]
 
 
-def test_inputs_are_left_out_rather_than_kept_waiting():
+def test_inputs_are_skipped_instead_of_delayed():
     def used(interval, rate, jitter):
         times = np.arange(400) * interval + np.random.default_rng(0).uniform(-jitter, jitter, 400)
-        pace = RateLimiter()
-        return np.array([pace.due(now, rate) for now in times]), times
+        limiter = RateLimiter()
+        return np.array([limiter.due(now, rate) for now in times]), times
 
     assert used(0.1, 10.0, 0.01)[0].mean() > 0.99
     for interval in (0.01, 0.0333, 0.09):
@@ -81,7 +81,7 @@ def test_flat_ground_is_predicted_from_each_new_odometry_once():
     assert kept.take_motion(3 * SECOND, wait=0.01) is None
 
 
-def test_a_camera_that_never_starts_or_dies_holds_up_the_others_for_a_while_only():
+def test_a_silent_camera_delays_the_others_only_for_a_while():
     kept, _ = inputs(["a", "b"], patience=0.2)
     moved(kept, 99 * SECOND)
     began, taken = time.monotonic(), None
@@ -96,7 +96,7 @@ def test_a_camera_that_never_starts_or_dies_holds_up_the_others_for_a_while_only
     assert set(kept.take(odometry_timeout=1.0, wait=0.03)) == {"a", "b"}
 
 
-def test_time_that_goes_back_forgets_everything_and_says_so():
+def test_a_backward_time_jump_discards_everything_and_is_reported():
     kept, jumps = inputs(["a"])
     moved(kept, 100 * SECOND)
     kept.add_command("commands", 100 * SECOND, np.ones(2))

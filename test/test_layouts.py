@@ -1,4 +1,4 @@
-"""Layouts of RViz and Foxglove show what the node publishes, under the names and types that it has."""
+"""Layouts of RViz and Foxglove show the outputs of the node, with matching names and types."""
 
 import json
 import re
@@ -17,7 +17,7 @@ TYPES = {
 
 
 def published() -> dict[str, str]:
-    """Topic → type of every publisher in the nodes' code, and the odometry that comes in."""
+    """Topic → type of every publisher in the code of the nodes, and of the odometry input."""
     found = {"/odom": "Odometry", "/diagnostics": "DiagnosticArray"}
     for file in (ROOT / "monoforce_ros" / "nodes").glob("*.py"):
         for kind, topic in re.findall(r"create_publisher\((\w+), \"(predicted/\w+)\"", file.read_text()):

@@ -18,7 +18,7 @@ def predictor(start, peer, tmp_path_factory):
     torch.manual_seed(0)
     config = EncoderConfig(image_width=160, image_height=112, map_features=16, map_size=12.8, resolution=0.2)
     encoder = TerrainEncoder(config)
-    # Of this encoder all that is seen stands a foot above ground that carries at the wheels' height.
+    # This encoder predicts visible surfaces 0.3 m above the supporting ground at the height of the wheels.
     torch.nn.init.zeros_(encoder.heads.weight)
     encoder.heads.bias.data = torch.tensor([DECREASE, DECREASE, 0.0, 0.0, 0.0])
     path = tmp_path_factory.mktemp("checkpoint") / "encoder.safetensors"
@@ -56,7 +56,7 @@ def drive(peer, seconds, *, lidar=True, camera=True):
 
 
 def heights(peer):
-    """Of the last map: what lies 2 m ahead, and beside the robot where the wall stands."""
+    """Heights in the last map: 2 m ahead, and at the wall next to the robot."""
     values = np.frombuffer(bytes(peer.received["/predicted/terrain"][-1].data), "<f4").reshape(-1, 8)
     place = values[:, :2] - np.array([1.0, 2.0])
     ahead = (np.abs(place[:, 0] - 2.0) < 0.5) & (np.abs(place[:, 1]) < 0.5)
@@ -75,17 +75,17 @@ def predicted(peer, **how):
 
 def silent(peer, part):
     said = lambda: peer.status(part) or (0, "")  # noqa: E731
-    assert peer.until(lambda: said()[0] == ERROR and "nothing for" in said()[1], 3.0), said()
+    assert peer.until(lambda: said()[0] == ERROR and "no messages for" in said()[1], 3.0), said()
 
 
-def test_grass_that_a_lidar_measures_is_lowered_and_a_wall_stands(peer, predictor):
+def test_grass_measured_by_the_lidar_is_lowered_and_a_wall_is_kept(peer, predictor):
     predicted(peer)
     grass, wall = heights(peer)
     assert grass == pytest.approx(-0.1323, abs=0.04)
     assert wall > 0.5
 
 
-def test_without_its_camera_surfaces_are_the_lidars(peer, predictor):
+def test_without_the_camera_lidar_heights_are_used(peer, predictor):
     predicted(peer)
     drive(peer, 2.0, camera=False)
     predicted(peer, camera=False)
@@ -95,7 +95,7 @@ def test_without_its_camera_surfaces_are_the_lidars(peer, predictor):
     assert predictor.running and "Traceback" not in predictor.output
 
 
-def test_without_its_lidar_the_encoder_sees_alone(peer, predictor):
+def test_without_the_lidar_the_encoder_is_used_alone(peer, predictor):
     predicted(peer)
     drive(peer, 2.0, lidar=False)
     predicted(peer, lidar=False)

@@ -1,6 +1,9 @@
 """The predictor under a manager: states, parameters that change while it runs, simulated time, and two robots or two
 nodes of one name side by side."""
 
+import subprocess
+import sys
+
 import pytest
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
@@ -18,7 +21,7 @@ PATHS = "nav_msgs/msg/Path"
 def call(peer, kind, service: str, request):
     """Call a service; again where no answer comes, for it is lost if the server has not yet discovered who asks."""
     client = peer.node.create_client(kind, service)
-    assert client.wait_for_service(timeout_sec=10.0), f"nobody offers {service}"
+    assert client.wait_for_service(timeout_sec=10.0), f"{service} is not available"
     for _ in range(4):
         future = client.call_async(request)
         if peer.until(future.done, 8.0):
@@ -84,7 +87,7 @@ def test_a_manager_configures_activates_pauses_and_takes_down(peer, start):
     assert process.stop() == 0
 
 
-def test_a_node_that_cannot_be_configured_stays_and_says_why(peer, start):
+def test_a_node_that_cannot_be_configured_keeps_running_and_logs_the_reason(peer, start):
     process = start(
         "predictor", "--ros-args", "-p", "autostart:=false", "-p", "robot:=no_such_robot", "-r", "__node:=wrong"
     )
@@ -93,6 +96,51 @@ def test_a_node_that_cannot_be_configured_stays_and_says_why(peer, start):
     process.wait_for("no_such_robot")
     assert state(peer, "/wrong") == State.PRIMARY_STATE_UNCONFIGURED and process.running
     assert process.stop() == 0
+
+
+BROKEN = """
+import sys, rclpy
+from monoforce_ros.nodes.managed import ManagedNode
+from monoforce_ros.nodes.process import run_node
+
+class Broken(ManagedNode):
+    def __init__(self):
+        super().__init__("broken")
+        if {autostart}:
+            self.autostart()
+
+    def {step}(self):
+        self.create_timer(1.0, self.pause)
+        self.no_such_attribute.load()
+
+def work(node, executor):
+    configured = node.trigger_configure()
+    print(configured.name, [node._state_machine.current_state[1]], len(list(node.timers)))
+
+sys.exit(run_node(Broken, [], work))
+"""
+
+
+def run_broken(ros_environment, **how) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        [sys.executable, "-c", BROKEN.format(**how)],
+        env=ros_environment, capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("step", "outcome"), [("set_up", "configured"), ("begin", "activated")])
+def test_an_unexpected_error_at_the_start_is_named_with_its_traceback(ros_environment, step, outcome):
+    done = run_broken(ros_environment, step=step, autostart=True)
+    error = "AttributeError: 'Broken' object has no attribute 'no_such_attribute'"
+    assert done.returncode == 1
+    assert f"error: broken could not be {outcome}: {error}" in done.stderr
+    assert f"not {outcome}: {error}\nTraceback" in done.stderr and f"in {step}\n" in done.stderr
+
+
+def test_a_manager_sees_an_unexpected_error_as_a_failed_transition(ros_environment):
+    done = run_broken(ros_environment, step="set_up", autostart=False)
+    assert done.returncode == 0 and done.stdout.split("\n")[0] == "FAILURE ['unconfigured'] 0"
+    assert "not configured: AttributeError" in done.stderr and "in set_up\n" in done.stderr
 
 
 @pytest.fixture(scope="module")
@@ -176,7 +224,7 @@ def test_two_robots_in_namespaces_do_not_hear_each_other(peer, start):
     assert all(process.stop() == 0 for process in processes)
 
 
-def test_simulated_time_that_starts_over_is_said_and_lived_with(start, peer):
+def test_simulated_time_that_jumps_back_is_reported_and_handled(start, peer):
     """`use_sim_time` with a /clock that goes back, as a looping bag brings it."""
     node = start("predictor", "--ros-args", "-p", "use_sim_time:=true", "-r", "__node:=dreaming")
     node.wait_for("predicting 5 s ahead for husky")

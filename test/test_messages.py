@@ -1,4 +1,4 @@
-"""Messages: what is written is what ROS reads, and what is read is checked before it is used."""
+"""Messages: encoded messages are read back by ROS, and decoded ones are checked before use."""
 
 import cv2
 import numpy as np
@@ -81,7 +81,7 @@ def test_images_of_common_encodings_become_rgb(encoding_name, stored, expected):
 
 
 @pytest.mark.parametrize("name", ["bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8"])
-def test_bayer_patterns_have_their_red_where_the_name_says(name):
+def test_bayer_patterns_have_red_pixels_where_their_names_say(name):
     # A uniformly red scene: only the red sites of the pattern are lit.
     pattern = {c: name[6:10].index(c) for c in "rb"}
     raw = np.zeros((8, 8, 1), np.uint8)
@@ -108,7 +108,7 @@ def test_rows_with_padding_and_other_byte_orders_are_read():
         ({"width": 2**31, "height": 2**31}, "expected 1 to"),
     ],
 )
-def test_unusable_images_are_named(change, text):
+def test_unusable_images_are_refused_with_the_reason(change, text):
     message = builders.image(STAMP, "camera", PIXELS)
     for field, value in change.items():
         setattr(message, field, value)
@@ -125,13 +125,13 @@ def test_any_bytes_as_a_compressed_image_are_decoded_or_refused(data, name):
         pass
 
 
-def test_clouds_lose_their_empty_returns():
+def test_empty_returns_are_removed_from_clouds():
     points = np.array([[1, 2, 3], [np.nan, 0, 0], [0, 0, 0], [np.inf, 1, 1], [4, 5, 6], [1e30, 0, 0]], np.float32)
     cloud = builders.point_cloud(STAMP, "lidar", points)
     np.testing.assert_array_equal(decoding.decode_cloud(cloud), points[[0, 4]])
 
 
-def test_a_cloud_of_nothing_but_nan_is_named():
+def test_a_cloud_of_only_nan_is_refused():
     with pytest.raises(MessageError, match="none of its 9 points is a finite return"):
         decoding.decode_cloud(builders.point_cloud(STAMP, "lidar", np.full((9, 3), np.nan)))
 
@@ -168,7 +168,7 @@ def test_any_point_cloud_is_decoded_or_refused(width, height, point_step, row_st
         ([0, 0, 0, 1], [np.nan, 0, 0], "not finite"),
     ],
 )
-def test_unusable_odometry_is_named(quaternion, velocity, text):
+def test_unusable_odometry_is_refused_with_the_reason(quaternion, velocity, text):
     message = builders.odometry(STAMP, "odom", "base_link", [0, 0, 0], quaternion, velocity, [0, 0, 0])
     with pytest.raises(MessageError, match=text):
         decoding.decode_odometry(message)
@@ -184,7 +184,7 @@ def test_quaternions_are_read_as_x_y_z_w():
     assert state.heading == pytest.approx(np.pi / 2)
 
 
-def test_commands_of_both_types_and_nan_ones():
+def test_commands_of_both_types_are_decoded_and_nan_is_refused():
     assert decoding.decode_command(builders.twist(0.5, -0.1)).tolist() == [0.5, -0.1]
     assert decoding.decode_command(builders.twist_stamped(STAMP, "", 0.5, -0.1)).tolist() == [0.5, -0.1]
     with pytest.raises(MessageError, match="expected finite numbers"):

@@ -1,4 +1,4 @@
-"""The package as ROS tooling sees it, and the documents that are made from its files."""
+"""The package as seen by ROS tools, and the documents that are generated from its files."""
 
 import ast
 import re
@@ -28,7 +28,7 @@ EXECUTABLES = [
 ]
 
 
-def test_colcon_takes_it_for_an_ament_python_package(tmp_path):
+def test_colcon_recognises_an_ament_python_package(tmp_path):
     # An invalid package.xml silently makes it plain python, and ros2 run no longer finds it.
     listed = subprocess.run(
         ["colcon", "--log-base", str(tmp_path), "list"], cwd=ROOT, capture_output=True, text=True, check=True
@@ -50,7 +50,7 @@ def test_every_part_of_the_package_is_installed():
 
 
 @pytest.mark.parametrize("name", EXECUTABLES)
-def test_executables_are_where_ros2_run_looks_and_explain_themselves(executables, name):
+def test_executables_are_found_by_ros2_run_and_have_a_help(executables, name):
     shown = subprocess.run([str(executables / name), "--help"], capture_output=True, text=True, timeout=60)
     assert shown.returncode == 0
     assert "usage:" in shown.stdout.lower()
@@ -69,7 +69,7 @@ def test_the_licence_and_the_dependencies_are_stated():
     }
     ros = {name for name in imported if name.endswith(("_msgs", "_interfaces")) or name == "rclpy"}
     assert ros <= depends
-    # What is not ROS's comes by rosdep or pip, and is named for the one or the other.
+    # Dependencies outside ROS are installed by rosdep or pip, and must be listed for one of them.
     named = {name.removeprefix("python3-") for name in depends} | set(re.findall(r'"([a-z-]+)",', SETUP))
     others = {"cv2": "opencv", "yaml": "yaml", "warp": "warp-lang"}
     third = {others.get(name, name) for name in imported - set(sys.stdlib_module_names) - ros - {"monoforce_ros"}}
@@ -98,7 +98,7 @@ def parameter_table() -> list[str]:
     return rows
 
 
-def test_the_readme_lists_every_parameter_as_the_file_has_it():
+def test_the_readme_lists_every_parameter_as_the_file_describes_it():
     readme = (ROOT / "README.md").read_text()
     missing = [row for row in parameter_table() if row not in readme]
     assert not missing, "put these rows into README.md:\n" + "\n".join(parameter_table())

@@ -1,4 +1,4 @@
-"""The path selector with the real predictor: to the goal, around a wall, and standing where it must."""
+"""The path selector with the real predictor: to the goal, around a wall, and stopping when it must."""
 
 import math
 
@@ -16,16 +16,16 @@ def nodes(start, peer):
         "predictor", "--ros-args", "-p", "candidates:=15", "-p", "candidate_speeds:=[0.8]", "-p", "horizon:=3.0"
     )
     # Twice the default: what is tested is that the robot stops, not how fast a busy machine predicts.
-    selector = start("path_selector", "--ros-args", "-r", "cmd_vel:=told", "-p", "timeout:=1.2")
+    selector = start("path_selector", "--ros-args", "-r", "cmd_vel:=commanded", "-p", "timeout:=1.2")
     predictor.wait_for("predicting 3 s ahead for husky")
     selector.wait_for("waiting for a goal")
     return selector
 
 
 @pytest.fixture(scope="module")
-def told(peer, nodes):
+def sent(peer, nodes):
     commands: list[TwistStamped] = []
-    peer.node.create_subscription(TwistStamped, "/told", commands.append, QoSProfile(depth=50))
+    peer.node.create_subscription(TwistStamped, "/commanded", commands.append, QoSProfile(depth=50))
     return commands
 
 
@@ -48,78 +48,78 @@ def status(peer) -> tuple[int, str]:
     return -1, ""
 
 
-def moves(peer, told, **world) -> TwistStamped:
-    """Feed a world until the robot is told to move; returns the last command."""
+def moves(peer, sent, **world) -> TwistStamped:
+    """Feed a world until the robot is commanded to move; returns the last command."""
     for _ in range(10):
-        told.clear()
+        sent.clear()
         peer.drive(0.8, **world)
-        if len(told) >= 3 and told[-1].twist.linear.x > 0:
-            return told[-1]
-    pytest.fail(f"not told to move: {status(peer)}")
+        if len(sent) >= 3 and sent[-1].twist.linear.x > 0:
+            return sent[-1]
+    pytest.fail(f"not commanded to move: {status(peer)}")
 
 
-def test_the_robot_is_sent_towards_its_goal(peer, nodes, told):
+def test_the_robot_is_sent_towards_its_goal(peer, nodes, sent):
     # The robot stands at (1, 2) and looks along x.
     send(peer, 9.0, 2.0)
-    straight = moves(peer, told)
+    straight = moves(peer, sent)
     assert straight.twist.linear.x == pytest.approx(0.8) and abs(straight.twist.angular.z) < 0.2
     send(peer, 3.0, 7.0)
-    assert moves(peer, told).twist.angular.z > 0.3
+    assert moves(peer, sent).twist.angular.z > 0.3
     send(peer, 3.0, -3.0)
-    assert moves(peer, told).twist.angular.z < -0.3
+    assert moves(peer, sent).twist.angular.z < -0.3
 
 
-def test_it_goes_around_a_wall(peer, nodes, told):
+def test_it_goes_around_a_wall(peer, nodes, sent):
     send(peer, 9.0, 2.0)
-    command = moves(peer, told, cloud=walled, speed=0.0)
+    command = moves(peer, sent, cloud=walled, speed=0.0)
     assert abs(command.twist.angular.z) > 0.2
 
 
-def test_it_stops_when_predictions_are_late_and_goes_on_with_them(peer, nodes, told):
+def test_it_stops_when_predictions_are_late_and_goes_on_with_them(peer, nodes, sent):
     send(peer, 9.0, 2.0)
-    moves(peer, told)
+    moves(peer, sent)
     peer.drive(2.4, cloud=lambda stamp: None)
-    assert told[-1].twist.linear.x == 0.0 and told[-1].twist.angular.z == 0.0
+    assert sent[-1].twist.linear.x == 0.0 and sent[-1].twist.angular.z == 0.0
     assert peer.until(lambda: "s old" in status(peer)[1], 5.0), status(peer)
-    moves(peer, told)
+    moves(peer, sent)
 
 
-def test_it_stops_when_all_falls_silent(peer, nodes, told):
-    """Odometry that stops takes the candidates with it: by their stamps, neither ever gets old."""
+def test_it_stops_when_all_inputs_are_silent(peer, nodes, sent):
+    """Without odometry there are no new candidates: by their stamps alone neither would expire."""
     send(peer, 9.0, 2.0)
-    moves(peer, told)
-    assert peer.until(lambda: told[-1].twist.linear.x == 0.0, 5.0), "it drives on blindly"
-    told.clear()
+    moves(peer, sent)
+    assert peer.until(lambda: sent[-1].twist.linear.x == 0.0, 5.0), "it keeps driving without odometry"
+    sent.clear()
     peer.spin(0.5)
-    assert told and not any(command.twist.linear.x for command in told)
+    assert sent and not any(command.twist.linear.x for command in sent)
     assert peer.until(lambda: "no odometry for" in status(peer)[1], 5.0), status(peer)
-    moves(peer, told)
+    moves(peer, sent)
 
 
-def test_it_stops_at_the_goal_and_for_a_goal_in_another_frame(peer, nodes, told):
+def test_it_stops_at_the_goal_and_for_a_goal_in_another_frame(peer, nodes, sent):
     send(peer, 9.0, 2.0, frame="map")
     peer.drive(1.0)
-    assert told[-1].twist.linear.x == 0.0
+    assert sent[-1].twist.linear.x == 0.0
     assert peer.until(lambda: "the goal is in frame 'map'" in status(peer)[1], 5.0), status(peer)
     send(peer, 1.2, 2.1)
     peer.drive(1.0)
     assert peer.until(lambda: "the goal is reached" in status(peer)[1], 5.0), status(peer)
-    assert told[-1].twist.linear.x == 0.0
-    # Told once more to stop, it then leaves the robot to others.
-    told.clear()
+    assert sent[-1].twist.linear.x == 0.0
+    # After one more stop command nothing is published.
+    sent.clear()
     peer.drive(1.0)
-    assert not told
+    assert not sent
 
 
-def test_bad_goals_and_bad_candidates_do_not_move_it(peer, nodes, told):
-    told.clear()
+def test_bad_goals_and_bad_candidates_do_not_move_it(peer, nodes, sent):
+    sent.clear()
     send(peer, math.nan, 0.0)
     peer.drive(0.6)
-    assert not [command for command in told if command.twist.linear.x]
+    assert not [command for command in sent if command.twist.linear.x]
     assert peer.until(lambda: "not finite" in status(peer)[1], 5.0), status(peer)
     # Another publisher with a cloud that holds no candidates.
     send(peer, 9.0, 2.0)
-    moves(peer, told)
+    moves(peer, sent)
     for _ in range(5):
         peer.publish("/predicted/candidate_costs", builders.point_cloud(peer.now, "odom", [[1.0, 2.0, 3.0]]))
         peer.drive(0.2, cloud=lambda stamp: None)

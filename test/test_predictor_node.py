@@ -1,4 +1,4 @@
-"""The installed predictor as a process of its own: what it publishes, and how it takes bad input."""
+"""The installed predictor as a process of its own: its outputs, and its reaction to bad input."""
 
 import signal
 
@@ -7,7 +7,7 @@ import pytest
 from ros_peer import OUTPUTS, ground_cloud
 
 from monoforce_ros.bags import builders
-from monoforce_ros.nodes.inputs import AHEAD
+from monoforce_ros.nodes.inputs import ODOMETRY_LAG
 
 OK, WARN, ERROR = 0, 1, 2
 PREDICTED = [topic for topic in OUTPUTS if topic.startswith("/predicted")]
@@ -15,7 +15,7 @@ PREDICTED = [topic for topic in OUTPUTS if topic.startswith("/predicted")]
 
 @pytest.fixture(scope="module")
 def predictor(start, peer):
-    """One node for all tests of this file: what it is fed in one must not harm it in the next."""
+    """One node for all tests of this file: the input of one test must not affect the next."""
     process = start("predictor", "--ros-args", "-p", "data_timeout:=1.0")
     process.wait_for("predicting 5 s ahead for husky")
     assert peer.until(lambda: peer.node.count_subscribers("/diagnostics") > 0)
@@ -23,7 +23,7 @@ def predictor(start, peer):
 
 
 def healthy(peer, predictor) -> None:
-    """Feed good data until predictions come back; publishers that are new need a moment to be found."""
+    """Feed good data until predictions are back; discovery of new publishers takes a moment."""
     peer.begin()
     for _ in range(6):
         peer.drive(0.8)
@@ -60,8 +60,8 @@ def test_outputs_carry_the_stamp_and_frame_of_their_input(peer, predictor):
     assert abs(first_time.z - (0.3 - 0.14)) < 0.05
 
 
-def nothing_new(peer, predictor, part: str, text: str, seconds: float = 1.4, **bad) -> None:
-    """Feed something bad: a diagnostic that names it, no prediction, the node lives; then all is well again."""
+def refused(peer, predictor, part: str, text: str, seconds: float = 1.4, **bad) -> None:
+    """Feed bad input: a diagnostic names it, nothing is predicted, the node survives and then recovers."""
     healthy(peer, predictor)
     peer.settle()
     peer.begin()
@@ -73,7 +73,7 @@ def nothing_new(peer, predictor, part: str, text: str, seconds: float = 1.4, **b
     )
     assert peer.status(part)[0] == ERROR
     # For a moment a prediction may be made from the last good odometry.
-    first = bad_from + (AHEAD if part == "odometry" else -1)
+    first = bad_from + (ODOMETRY_LAG if part == "odometry" else -1)
     for topic in PREDICTED:
         assert [s for s in peer.stamps(topic) if s > first] == []
     assert predictor.running
@@ -83,7 +83,7 @@ def nothing_new(peer, predictor, part: str, text: str, seconds: float = 1.4, **b
 
 def test_clouds_full_of_nan(peer, predictor):
     bad = lambda stamp: builders.point_cloud(stamp, "lidar", np.full((500, 3), np.nan))  # noqa: E731
-    nothing_new(peer, predictor, "lidar", "none of its 500 points is a finite return", cloud=bad)
+    refused(peer, predictor, "lidar", "none of its 500 points is a finite return", cloud=bad)
 
 
 def test_clouds_with_some_nan_are_used(peer, predictor):
@@ -98,69 +98,69 @@ def test_clouds_with_some_nan_are_used(peer, predictor):
 
 def test_clouds_in_an_unknown_frame(peer, predictor):
     bad = lambda stamp: builders.point_cloud(stamp, "mystery", ground_cloud())  # noqa: E731
-    nothing_new(peer, predictor, "lidar", "the pose of frame 'mystery' on the robot is unknown", cloud=bad)
+    refused(peer, predictor, "lidar", "the pose of frame 'mystery' on the robot is unknown", cloud=bad)
 
 
-def test_clouds_whose_size_is_a_lie(peer, predictor):
+def test_clouds_with_a_wrong_size(peer, predictor):
     def bad(stamp):
         message = builders.point_cloud(stamp, "lidar", ground_cloud())
         message.width = 2_000_000
         return message
 
-    nothing_new(peer, predictor, "lidar", "point cloud data: got", cloud=bad)
+    refused(peer, predictor, "lidar", "point cloud data: got", cloud=bad)
 
 
 def test_clouds_that_miss_the_map(peer, predictor):
     bad = lambda stamp: builders.point_cloud(stamp, "lidar", ground_cloud() + np.float32([500, 0, 0]))  # noqa: E731
-    nothing_new(peer, predictor, "prediction", "hit 0 cells", cloud=bad)
+    refused(peer, predictor, "prediction", "hit 0 cells", cloud=bad)
 
 
 def test_stamps_of_zero(peer, predictor):
     bad = lambda stamp: builders.point_cloud(0, "lidar", ground_cloud())  # noqa: E731
-    nothing_new(peer, predictor, "lidar", "stamps are zero", cloud=bad)
+    refused(peer, predictor, "lidar", "stamps are zero", cloud=bad)
 
 
 def test_odometry_that_stops(peer, predictor):
-    nothing_new(peer, predictor, "odometry", "nothing for", seconds=2.5, odometry=lambda stamp: None)
+    refused(peer, predictor, "odometry", "no messages for", seconds=2.5, odometry=lambda stamp: None)
 
 
 def test_odometry_of_nan(peer, predictor):
     def bad(stamp):
         return builders.odometry(stamp, "odom", "base_link", [0, 0, 0], [0, 0, 0, 1], [np.nan, 0, 0], [0] * 3)
 
-    nothing_new(peer, predictor, "odometry", "position or velocity is not finite", odometry=bad)
+    refused(peer, predictor, "odometry", "position or velocity is not finite", odometry=bad)
 
 
 def test_odometry_with_a_zero_quaternion(peer, predictor):
     def bad(stamp):
         return builders.odometry(stamp, "odom", "base_link", [0, 0, 0], [0, 0, 0, 0], [0, 0, 0], [0] * 3)
 
-    nothing_new(peer, predictor, "odometry", "expected a unit quaternion", odometry=bad)
+    refused(peer, predictor, "odometry", "expected a unit quaternion", odometry=bad)
 
 
 def test_a_lidar_that_falls_silent(peer, predictor):
-    nothing_new(peer, predictor, "lidar", "nothing for", seconds=2.5, cloud=lambda stamp: None)
+    refused(peer, predictor, "lidar", "no messages for", seconds=2.5, cloud=lambda stamp: None)
 
 
-def test_commands_of_nan_are_not_obeyed(peer, predictor):
+def test_commands_of_nan_are_ignored(peer, predictor):
     healthy(peer, predictor)
     peer.begin()
     peer.drive(1.6, command=lambda stamp: builders.twist_stamped(stamp, "base_link", np.nan, 0.0))
-    said = lambda: peer.status("commands") or (OK, "")  # noqa: E731
-    assert peer.until(lambda: said()[0] == ERROR, 3.0) and "expected finite numbers" in said()[1], said()
+    reported = lambda: peer.status("commands") or (OK, "")  # noqa: E731
+    assert peer.until(lambda: reported()[0] == ERROR, 3.0) and "expected finite numbers" in reported()[1], reported()
     peer.settle()
     # The last good command has expired by then: the robot is predicted to stop.
     path = peer.received["/predicted/path"][-1]
     assert path.poses[-1].pose.position.x == pytest.approx(1.0, abs=0.05)
 
 
-def test_without_commands_the_robot_is_predicted_to_stand_and_a_warning_says_so(peer, predictor):
+def test_without_commands_zero_velocity_is_assumed_with_a_warning(peer, predictor):
     peer.settle()
     peer.begin()
     peer.drive(2.0, command=lambda stamp: None)
     silent = lambda: peer.status("commands") or (OK, "")  # noqa: E731
     assert peer.until(lambda: silent()[0] == WARN, 3.0), silent()
-    assert "predicted to stand still" in silent()[1]
+    assert "assuming zero velocity" in silent()[1]
     assert peer.received["/predicted/path"][-1].poses[-1].pose.position.x == pytest.approx(1.0, abs=0.05)
 
 
@@ -187,7 +187,7 @@ def test_late_messages_out_of_order_are_dropped(peer, predictor):
     healthy(peer, predictor)
 
 
-def test_diagnostics_say_why_only_once(predictor):
+def test_a_fault_is_logged_once(predictor):
     lines = [line for line in predictor.output.splitlines() if "none of its 500 points" in line]
     assert len(lines) == 1
 
@@ -212,14 +212,14 @@ def test_a_termination_ends_it_cleanly_too(start):
         (["horizon:=-1.0"], "horizon"),
     ],
 )
-def test_a_node_that_cannot_work_says_why_and_does_not_start(start, parameters, message):
+def test_a_node_that_cannot_start_names_the_reason(start, parameters, message):
     arguments = [word for parameter in parameters for word in ("-p", parameter)]
     process = start("predictor", "--ros-args", *arguments)
     assert process.wait() == 1
     assert message in process.output and "Traceback" not in process.output
 
 
-def test_the_live_gap_is_small_where_predictions_hold_and_says_what_to_do_where_not(peer, start):
+def test_the_live_gap_is_small_for_good_predictions_and_recommends_diagnose_otherwise(peer, start):
     predictor = start("predictor", "--ros-args", "-p", "data_timeout:=1.0", "-r", "__node:=watcher")
     predictor.wait_for("predicting 5 s ahead for husky")
 
@@ -245,13 +245,13 @@ def test_the_live_gap_is_small_where_predictions_hold_and_says_what_to_do_where_
         for status in array.status
         if status.name == "watcher: live gap" and status.level == bytes([OK])
     )
-    assert "compared predictions" in {entry.key for entry in first.values}, "a state was published without its figures"
+    assert "compared predictions" in {entry.key for entry in first.values}, "a state was published without its values"
     # A busy machine may leave a hole in the odometry where the first comparisons look.
     for _ in range(4):
         if "median error at 5 s [m]" not in gap()[2]:
             peer.drive(1.0, speed=0.0)
     assert float(gap()[2]["median error at 5 s [m]"]) < 0.05
-    # The robot does not move although it is told to: it stands in front of a kerb that nobody models.
+    # The robot does not move although it is commanded to: it is stuck at a kerb that is not modelled.
     peer.drive(14.0, speed=0.5)
     assert peer.until(lambda: gap()[0] == WARN, 5.0), (gap(), predictor.output[-2000:])
     assert "off after 2 s" in gap()[1] and "run `diagnose`" in gap()[1]

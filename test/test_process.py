@@ -1,4 +1,4 @@
-"""How a node's process ends: whatever a signal interrupts, in order; with a fault of its own, loudly."""
+"""End of a node's process: orderly after a signal, with a traceback after a fault of its own."""
 
 import subprocess
 import sys
@@ -36,7 +36,7 @@ def test_a_callback_that_outlives_its_context_is_no_fault(shut_down, ros_environ
 
 
 def test_choosing_among_candidates_needs_no_physics_engine():
-    """On the robot's own small computer a second process of half a gigabyte is felt."""
+    """A second process of half a gigabyte matters on the small computer of a robot."""
     loaded = (
         "import sys, monoforce_ros.nodes.path_selector; print(sorted({'torch', 'warp', 'mujoco'} & set(sys.modules)))"
     )

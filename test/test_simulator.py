@@ -29,7 +29,7 @@ def place(message: Odometry) -> np.ndarray:
     return np.array([message.pose.pose.position.x, message.pose.pose.position.y])
 
 
-def test_it_drives_as_told_and_stops_when_nobody_tells_it(peer, simulator, heard):
+def test_it_follows_commands_and_stops_without_them(peer, simulator, heard):
     publisher = peer.node.create_publisher(TwistStamped, "/cmd_vel", 5)
     assert peer.until(lambda: publisher.get_subscription_count() > 0 and heard["odom"], 20.0), simulator.output
     origin = place(heard["odom"][-1])
@@ -41,7 +41,7 @@ def test_it_drives_as_told_and_stops_when_nobody_tells_it(peer, simulator, heard
         peer.spin(0.05)
     gone = np.linalg.norm(place(heard["odom"][-1]) - origin)
     stamps = [m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for m in (first, heard["odom"][-1])]
-    # As fast as told, by the simulation's own clock, which may lag on a busy computer; starting takes a moment.
+    # As fast as commanded, by the simulation's own clock, which may lag on a busy computer; starting takes a moment.
     assert 0.3 < gone / (0.5 * (stamps[1] - stamps[0])) < 1.05
     assert heard["odom"][-1].twist.twist.linear.x == pytest.approx(0.5, abs=0.08)
     assert peer.until(lambda: abs(heard["odom"][-1].twist.twist.linear.x) < 0.02, 10.0)
@@ -76,7 +76,7 @@ def test_predictor_and_selector_drive_it_to_a_goal(peer, simulator, heard, start
     assert simulator.stop() == 0, simulator.output
 
 
-def test_what_cannot_be_simulated_is_said_in_one_line(start):
+def test_an_invalid_robot_is_reported_in_one_line(start):
     process = start("simulator", "--robot", "no_such_robot")
     assert process.wait(30) == 1
     assert "no_such_robot" in process.output and "Traceback" not in process.output

@@ -242,10 +242,10 @@ class _Collector:
             elif message.topic == self.chosen["commands"]:
                 self.twists.append((stamp, decoding.decode_command(decoded)))
             elif message.topic == self.chosen["imu"]:
-                rate, self.turning_frame = decoding.decode_turning(decoded)
+                rate, self.turning_frame = decoding.decode_angular_velocity(decoded)
                 self.turning.append((stamp, rate))
             elif message.topic == self.chosen["joints"]:
-                speeds = decoding.decode_wheels(decoded)
+                speeds = decoding.decode_wheel_speeds(decoded)
                 if speeds is not None:
                     self.wheels.append((stamp, speeds))
             elif message.message_type == CAMERA_INFO:

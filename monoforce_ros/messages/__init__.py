@@ -1,4 +1,4 @@
-"""Arrays ↔ ROS messages. Decoders take messages of rclpy and of bags alike: both have the same attributes."""
+"""Arrays ↔ ROS messages. Decoders accept messages of rclpy and of bags, which have the same attributes."""
 
 from monoforce_ros.messages import decoding, encoding
 from monoforce_ros.messages.cdr import CdrWriter

@@ -1,6 +1,6 @@
-"""CDR writer: ROS 2's wire format, for messages whose Python objects would be slow to build.
+"""CDR writer: the wire format of ROS 2, for messages whose Python objects would be slow to build.
 
-Large arrays are spliced in as blocks, so a grid of 16 384 cells costs microseconds instead of tens of milliseconds.
+Large arrays are copied as blocks, so that a grid of 16 384 cells takes microseconds instead of tens of milliseconds.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ _HEADER = b"\x00\x01\x00\x00"  # little endian, no options
 
 
 class CdrWriter:
-    """Appends fields in the order of a message's definition; alignment is kept as CDR asks."""
+    """Appends fields in the order of the message definition, aligned as CDR requires."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self._buffer = bytearray(_HEADER)
 
     def align(self, size: int) -> None:
@@ -25,7 +25,7 @@ class CdrWriter:
 
     @property
     def position(self) -> int:
-        """Bytes written, counted as alignment counts them."""
+        """Number of bytes written after the encapsulation header."""
         return len(self._buffer) - len(_HEADER)
 
     def fields(self, kinds: str, *values: float) -> None:
@@ -52,7 +52,7 @@ class CdrWriter:
         self.string(frame_id)
 
     def block(self, values: np.ndarray, alignment: int) -> None:
-        """Elements as they lie in memory, the first aligned."""
+        """Elements in memory order, the first one aligned."""
         if values.size:
             self.align(alignment)
             self._buffer += np.ascontiguousarray(values).tobytes()

@@ -1,4 +1,4 @@
-"""ROS messages → arrays, with every size and value checked before it is used."""
+"""ROS messages → arrays; every size and value is checked before use."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from monoforce_ros.core import CameraModel, MotionState
 MAXIMUM_IMAGE_PIXELS = 64_000_000
 MAXIMUM_CLOUD_POINTS = 8_000_000
 MAXIMUM_COMMANDS = 1000
-"""Of one candidate."""
+"""In one sequence."""
 MAXIMUM_SPEED = 100.0
-"""Larger commands are no robot's [m/s, rad/s]."""
+"""Larger commands are refused [m/s, rad/s]."""
 
 _POINT_DTYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-# encoding → (dtype, channels, OpenCV's conversion to RGB); Bayer names in ROS give the first two pixels of the first
-# row, OpenCV's names those of the second, hence the crossing over.
+# encoding → (dtype, channels, OpenCV's conversion to RGB). Bayer names of ROS start with the first pixels of the first
+# row, those of OpenCV with the second row, which explains the different letters.
 _IMAGE_ENCODINGS = {
     "rgb8": ("u1", 3, None),
     "bgr8": ("u1", 3, cv2.COLOR_BGR2RGB),
@@ -42,7 +42,7 @@ _IMAGE_ENCODINGS = {
 
 
 class MessageError(ValueError):
-    """A message whose content cannot be used; the message says what was got and what was expected."""
+    """A message with unusable content; the text states the value received and the value expected."""
 
 
 def stamp_of(message: Any) -> int:
@@ -75,7 +75,6 @@ def _decode_compressed(message: Any) -> np.ndarray:
     data = np.frombuffer(message.data, np.uint8)
     if "compressedDepth" in message.format:
         raise MessageError(f"image format: got {message.format!r}, a depth image; expected a colour or grey image")
-    # The header alone says how large the picture would be: a small file can claim a huge one.
     decoded = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
     if decoded is None:
         raise MessageError(
@@ -107,7 +106,7 @@ def _decode_raw(message: Any) -> np.ndarray:
 
 
 def decode_camera_info(message: Any) -> CameraModel:
-    """``sensor_msgs/CameraInfo`` → CameraModel; raises ``MessageError`` where it is not calibrated or inconsistent."""
+    """``sensor_msgs/CameraInfo`` → CameraModel; raises ``MessageError`` if it is uncalibrated or inconsistent."""
     model = message.distortion_model or "plumb_bob"
     coefficients = np.asarray(message.d, np.float64)
     # Drivers write "plumb_bob" with eight coefficients; OpenCV's rational model takes them as they are.
@@ -127,8 +126,8 @@ def decode_camera_info(message: Any) -> CameraModel:
 def decode_cloud(message: Any) -> np.ndarray:
     """``sensor_msgs/PointCloud2`` → finite returns ``[n, 3]`` float32 [m] in the sensor frame.
 
-    Empty returns (NaN, infinity, or all zeros) are left out. Raises ``MessageError`` where fields or sizes are wrong
-    or where not a single return remains.
+    Empty returns (NaN, infinity, or all zeros) are removed. Raises ``MessageError`` if fields or sizes are wrong, or if
+    no return remains.
     """
     missing = [name for name in "xyz" if name not in {field.name for field in message.fields}]
     if missing:
@@ -145,9 +144,9 @@ def decode_cloud(message: Any) -> np.ndarray:
 
 
 def decode_fields(message: Any, names: tuple[str, ...] | None = None) -> dict[str, np.ndarray]:
-    """Fields of a ``sensor_msgs/PointCloud2`` by name, each ``[points]``; all of them, or those that are named.
+    """Fields of a ``sensor_msgs/PointCloud2`` by name, each ``[points]``; all of them, or only ``names``.
 
-    Raises ``MessageError`` where sizes are wrong or a field is not of floating point numbers.
+    Raises ``MessageError`` if sizes are wrong or a field does not hold floating-point numbers.
     """
     count = int(message.width) * int(message.height)
     if count < 1 or count > MAXIMUM_CLOUD_POINTS:
@@ -179,7 +178,7 @@ def decode_fields(message: Any, names: tuple[str, ...] | None = None) -> dict[st
 
 
 def decode_odometry(message: Any) -> tuple[MotionState, str, str]:
-    """``nav_msgs/Odometry`` → state, frame and child frame; raises ``MessageError`` for NaNs or a zero quaternion."""
+    """``nav_msgs/Odometry`` → state, frame, child frame; raises ``MessageError`` for NaN or an invalid quaternion."""
     pose, twist = message.pose.pose, message.twist.twist
     quaternion = np.array([pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w], float)
     vectors = [
@@ -195,20 +194,20 @@ def decode_odometry(message: Any) -> tuple[MotionState, str, str]:
     return state, message.header.frame_id, message.child_frame_id
 
 
-def decode_turning(message: Any) -> tuple[np.ndarray, str]:
-    """``sensor_msgs/Imu`` → angular velocity ``[3]`` [rad/s] in its frame, and that frame's name."""
+def decode_angular_velocity(message: Any) -> tuple[np.ndarray, str]:
+    """``sensor_msgs/Imu`` → angular velocity ``[3]`` [rad/s] in the frame of the IMU, and the name of that frame."""
     rate = message.angular_velocity
     values = np.array([rate.x, rate.y, rate.z], np.float64)
     if not np.isfinite(values).all():
-        raise MessageError(f"imu: got the angular velocity {values.tolist()}, expected finite numbers")
+        raise MessageError(f"imu: got angular velocity {values.tolist()}, expected finite numbers")
     return values, message.header.frame_id
 
 
-def decode_wheels(message: Any) -> np.ndarray | None:
-    """``sensor_msgs/JointState`` → mean speed of the left and the right wheels ``[2]`` [rad/s].
+def decode_wheel_speeds(message: Any) -> np.ndarray | None:
+    """``sensor_msgs/JointState`` → mean speed of the left and of the right wheels ``[2]`` [rad/s].
 
-    Wheels are joints whose name says wheel, or track, and left or right; None where there are none on a side, or no
-    finite speeds.
+    Wheels are joints whose names contain wheel or track, and left or right. None if a side has no wheels or no finite
+    speeds.
     """
     sides: dict[str, list[float]] = {"left": [], "right": []}
     for name, speed in zip(message.name, np.asarray(message.velocity, np.float64).tolist(), strict=False):
@@ -232,34 +231,39 @@ def decode_command(message: Any) -> np.ndarray:
     return command
 
 
-def decode_sequences(message: Any, most: int) -> np.ndarray:
-    """``std_msgs/Float32MultiArray`` with dimensions candidates, commands and 2 → forward speeds [m/s] and yaw rates
+def decode_command_sequences(message: Any, maximum: int) -> np.ndarray:
+    """``std_msgs/Float32MultiArray`` with dimensions sequences, commands and 2 → forward speeds [m/s] and yaw rates
     [rad/s] ``[N, K, 2]``.
 
     Raises:
-        MessageError: other dimensions, numbers that are not finite or not a robot's, or more than ``most`` candidates.
+        MessageError: other dimensions, values that are not finite or above :data:`MAXIMUM_SPEED`, or more than
+            ``maximum`` sequences.
     """
     sizes = tuple(int(dimension.size) for dimension in message.layout.dim)
     if len(sizes) != 3 or sizes[2] != 2 or sizes[0] < 1 or not 1 <= sizes[1] <= MAXIMUM_COMMANDS:
         raise MessageError(
-            f"candidate commands have dimensions {list(sizes)}, expected [candidates, commands of each (1 to "
+            f"command sequences: got dimensions {list(sizes)}, expected [sequences, commands in each (1 to "
             f"{MAXIMUM_COMMANDS}), 2 (forward speed, yaw rate)]"
         )
-    if sizes[0] > most:
-        raise MessageError(f"{sizes[0]} candidates, at most {most} are rolled out")
+    if sizes[0] > maximum:
+        raise MessageError(f"command sequences: got {sizes[0]}, expected at most {maximum}")
     values, offset = np.asarray(message.data, np.float32), int(message.layout.data_offset)
     if len(values) - offset != sizes[0] * sizes[1] * 2:
-        raise MessageError(f"{len(values)} numbers after an offset of {offset}, expected {sizes[0] * sizes[1] * 2}")
+        raise MessageError(
+            f"command sequences: got {len(values)} numbers with an offset of {offset}, expected "
+            f"{sizes[0] * sizes[1] * 2} after it"
+        )
     if not np.isfinite(values).all() or np.abs(values).max() > MAXIMUM_SPEED:
-        raise MessageError(f"candidate commands are not all finite and below {MAXIMUM_SPEED:g} m/s or rad/s")
+        raise MessageError(f"command sequences: not all values are finite and below {MAXIMUM_SPEED:g} m/s or rad/s")
     return values[offset:].reshape(sizes).astype(np.float64)
 
 
 def decode_occupancy(message: Any) -> tuple[np.ndarray, float, np.ndarray]:
-    """``nav_msgs/OccupancyGrid`` → costs ``[rows, columns]`` int8, edge of a cell [m], corner of the first ``[2]`` [m].
+    """``nav_msgs/OccupancyGrid`` → costs ``[rows, columns]`` int8, edge length of a cell [m], corner of the first cell
+    ``[2]`` [m].
 
     Raises:
-        MessageError: sizes do not fit, or the grid is turned, which costmaps are not.
+        MessageError: sizes do not match, or the grid is rotated, which costmaps are not.
     """
     info = message.info
     rows, columns = int(info.height), int(info.width)
@@ -271,7 +275,7 @@ def decode_occupancy(message: Any) -> tuple[np.ndarray, float, np.ndarray]:
     if not (np.isfinite(corner).all() and 1e-3 <= resolution <= 100.0):
         raise MessageError(f"occupancy grid: cells of {resolution} m from {corner.tolist()}, expected finite numbers")
     if abs(float(info.origin.orientation.w)) < 0.9999:
-        raise MessageError("occupancy grid: it is turned, expected axes along those of its frame")
+        raise MessageError("occupancy grid: it is rotated, expected axes parallel to those of its frame")
     return data.reshape(rows, columns), resolution, corner
 
 

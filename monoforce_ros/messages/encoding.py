@@ -1,4 +1,4 @@
-"""Predictions → serialized ROS messages. Stamps are nanoseconds; positions are in the named frame."""
+"""Arrays → serialized ROS messages. Stamps are in nanoseconds, positions in the named frame."""
 
 from __future__ import annotations
 
@@ -41,20 +41,21 @@ def point_cloud(stamp: int, frame_id: str, channels: dict[str, np.ndarray]) -> b
 def path(frame_id: str, stamps: np.ndarray, positions: np.ndarray, quaternions: np.ndarray) -> bytes:
     """``nav_msgs/Path`` of poses ``[n, 3]`` [m] and ``[n, 4]`` (x, y, z, w) at ``stamps`` ``[n]`` [ns].
 
-    The path's own stamp is that of its first pose.
+    The stamp of the path is that of its first pose.
     """
     writer = CdrWriter()
     writer.header(int(stamps[0]), frame_id)
     writer.fields("I", len(stamps))
     name = frame_id.encode() + b"\x00"
-    # Poses end on a multiple of 8 bytes, so all but the first have one layout.
+    # Poses end on a multiple of 8 bytes, so that all but the first have the same layout.
     for first, last in ((0, 1), (1, len(stamps))):
         if first == last:
             continue
         padding = -(writer.position + 12 + len(name)) % 8
-        fields = [("sec", "<i4"), ("nanosec", "<u4"), ("length", "<u4"), ("name", f"V{len(name)}")]
-        fields += [("padding", f"V{padding}"), ("position", "<f8", 3), ("orientation", "<f8", 4)]
-        layout = np.dtype(fields)
+        layout = np.dtype([
+            ("sec", "<i4"), ("nanosec", "<u4"), ("length", "<u4"), ("name", f"V{len(name)}"),
+            ("padding", f"V{padding}"), ("position", "<f8", (3,)), ("orientation", "<f8", (4,)),
+        ])  # fmt: skip
         poses = np.zeros(last - first, layout)
         poses["sec"], poses["nanosec"] = np.divmod(stamps[first:last], 10**9)
         poses["length"], poses["name"] = len(name), np.void(name)
@@ -65,7 +66,7 @@ def path(frame_id: str, stamps: np.ndarray, positions: np.ndarray, quaternions: 
 
 @dataclass(frozen=True)
 class ListMarker:
-    """A ``visualization_msgs/Marker`` that draws a list of lines (pairs of points) or spheres in one colour each."""
+    """A ``visualization_msgs/Marker`` with a list of lines (pairs of points) or spheres, each with a colour."""
 
     namespace: str
     kind: str
@@ -80,14 +81,14 @@ class ListMarker:
 
 
 def marker_array(stamp: int, frame_id: str, markers: Sequence[ListMarker]) -> bytes:
-    """``visualization_msgs/MarkerArray``; each marker replaces the one of its namespace and identifier."""
+    """``visualization_msgs/MarkerArray``; each marker replaces the previous one of its namespace and identifier."""
     writer = CdrWriter()
     writer.fields("I", len(markers))
     for marker in markers:
         lines = marker.kind == "lines"
         writer.header(stamp, frame_id)
         writer.string(marker.namespace)
-        # An empty list would keep the marker of the last message on screen, so it is deleted instead.
+        # An empty list would leave the previous marker on screen, so the marker is deleted instead.
         writer.fields("iii", marker.identifier, _LINE_LIST if lines else _SPHERE_LIST, 0 if len(marker.points) else 2)
         writer.fields("ddddddd", 0, 0, 0, 0, 0, 0, 1)
         writer.fields("ddd", marker.size, 0.0 if lines else marker.size, 0.0 if lines else marker.size)

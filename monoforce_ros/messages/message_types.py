@@ -6,7 +6,7 @@ import importlib
 
 
 def message_class(name: str) -> type | None:
-    """The Python class of ``package/msg/Name``; None where its package is not installed."""
+    """The Python class of ``package/msg/Name``; None if its package is not installed."""
     package, _, message = name.partition("/msg/")
     try:
         return getattr(importlib.import_module(f"{package}.msg"), message, None)

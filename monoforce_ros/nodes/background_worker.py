@@ -1,4 +1,4 @@
-"""BackgroundWorker: work on the newest of what comes, in a thread of its own."""
+"""BackgroundWorker: processes the newest job in a thread of its own, at lower priority if asked to."""
 
 from __future__ import annotations
 
@@ -6,32 +6,32 @@ import os
 import sys
 import threading
 from collections.abc import Callable
-from typing import Any
 
 import torch
 
 
-class BackgroundWorker:
-    """Runs ``work`` on one job after the other; one that waits is replaced by a newer one, so that nothing piles up.
+class BackgroundWorker[Job]:
+    """Processes one job after the other; a newer job replaces the one that waits, so that no queue builds up.
 
     Args:
         name: of the thread.
-        work: what to do with a job; it must not raise.
-        niceness: how far the thread, and threads that it starts, step back for others where cores are scarce, 0 to 19
-            as ``nice(1)`` counts. Linux only; elsewhere all threads are equal.
+        work: processes a job; must not raise.
+        niceness: of the thread and of threads that it starts, 0 to 19, added to that of the process as ``nice(1)``
+            does. Linux only; elsewhere all threads have the same priority.
     """
 
-    def __init__(self, name: str, work: Callable[[Any], None], niceness: int = 0):
+    def __init__(self, name: str, work: Callable[[Job], None], niceness: int = 0):
         self._work = work
         self._niceness = niceness
         self._changed = threading.Condition()
-        self._job: Any = None
+        self._job: Job | None = None
         self._running = True
         self.dropped = 0
+        """Jobs that were replaced by newer ones before they were processed."""
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
-    def give(self, job: Any) -> None:
+    def submit(self, job: Job) -> None:
         """Hand over a job."""
         with self._changed:
             self.dropped += self._job is not None
@@ -39,23 +39,23 @@ class BackgroundWorker:
             self._changed.notify()
 
     def stop(self) -> None:
-        """End after the job in hand."""
+        """Stop after the current job."""
         with self._changed:
             self._running = False
             self._changed.notify()
         self._thread.join(timeout=10.0)
 
     def _run(self) -> None:
-        # Each thread has a setting of its own.
+        # PyTorch keeps its thread count per thread; small operations are fastest on one.
         torch.set_num_threads(1)
         if self._niceness and sys.platform == "linux":
-            # There it is the thread's own; elsewhere it would be the whole process's.
+            # On Linux the niceness is that of the calling thread, elsewhere that of the process.
             os.nice(self._niceness)
         while True:
             with self._changed:
                 while self._running and self._job is None:
                     self._changed.wait()
-                if not self._running:
+                if not self._running or self._job is None:
                     return
                 job, self._job = self._job, None
             self._work(job)

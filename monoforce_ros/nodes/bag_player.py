@@ -1,4 +1,4 @@
-"""bag_player: publishes a bag's messages into ROS with their timing."""
+"""bag_player: publishes the messages of a bag with their recorded timing."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _PROFILES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 
 def _arguments(arguments: list[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
-        prog="bag_player", description="Publish a bag (ROS 2 or ROS 1) into ROS with the timing of its recording."
+        prog="bag_player", description="Publish the messages of a bag (ROS 2 or ROS 1) with their recorded timing."
     )
     parser.add_argument("bag", nargs="?", help="rosbag2 folder or ROS 1 .bag file (default: the demo bag)")
     parser.add_argument("--rate", type=float, default=1.0, help="speed relative to the recording (default 1)")
@@ -48,7 +48,7 @@ def _arguments(arguments: list[str]) -> argparse.Namespace:
 
 
 class BagPlayer(Node):
-    """Publishes serialized messages as they stand in the bag; nothing is decoded on the way."""
+    """Publishes the serialized messages of a bag without decoding them."""
 
     def __init__(self, bag: BagReader, options: argparse.Namespace):
         super().__init__("bag_player")
@@ -58,8 +58,8 @@ class BagPlayer(Node):
         for topic, message_type in bag.topics.items():
             if options.topics and topic not in options.topics:
                 continue
-            kind = message_class(message_type)
-            if kind is None:
+            message_type_class = message_class(message_type)
+            if message_type_class is None:
                 self.get_logger().warning(f"{topic} is not played: {message_type} is not installed")
                 continue
             latched = topic.rsplit("/", 1)[-1] == "tf_static"
@@ -68,14 +68,14 @@ class BagPlayer(Node):
                 reliability=ReliabilityPolicy.RELIABLE,
                 durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
             )
-            self.playable[topic] = self.create_publisher(kind, topic, quality)
+            self.playable[topic] = self.create_publisher(message_type_class, topic, quality)
         missing = sorted(set(options.topics or ()) - set(bag.topics))
         if missing:
-            raise BagError(f"{bag.path} has no topics {missing}; it holds {sorted(bag.topics)}")
+            raise BagError(f"{bag.path} has no topics {missing}; its topics are {sorted(bag.topics)}")
         self.clock = self.create_publisher(Clock, "/clock", 10) if options.clock else None
 
     def wait_for_subscribers(self) -> None:
-        """Wait until somebody listens, and then a little for those who are just about to."""
+        """Wait for a first subscriber, and then a little longer for further ones."""
         deadline = time.monotonic() + self.options.wait
         while time.monotonic() < deadline and self.context.ok():
             if any(publisher.get_subscription_count() for publisher in self.playable.values()):
@@ -83,7 +83,7 @@ class BagPlayer(Node):
                 return
             self._sleep(0.05)
         if self.options.wait and self.context.ok():
-            self.get_logger().warning("nobody listens to the bag's topics; playing anyway")
+            self.get_logger().warning("no subscribers on the bag's topics; playing anyway")
 
     def play(self) -> int:
         """Play once or in a loop; returns the number of messages published."""
@@ -124,20 +124,20 @@ class BagPlayer(Node):
         return published
 
     def linger(self) -> None:
-        """Stay a moment after the last message: its publisher's farewell overtakes it where readers are slow."""
+        """Wait after the last message: slow readers may drop it if its publisher disappears at once."""
         self._sleep(0.5)
 
     def _sleep(self, seconds: float) -> None:
         deadline = time.monotonic() + seconds
-        while self.context.ok() and (left := deadline - time.monotonic()) > 0:
-            time.sleep(min(left, 0.1))
+        while self.context.ok() and (remaining := deadline - time.monotonic()) > 0:
+            time.sleep(min(remaining, 0.1))
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the player; see ``--help``."""
     given = sys.argv if arguments is None else ["bag_player", *arguments]
     options = _arguments(remove_ros_args(given)[1:])
-    # Raw images do not fit into the default shared memory; this must be set before the first node.
+    # Raw images do not fit into the default shared memory segment; this must be set before the first node.
     for variable in _PROFILES:
         os.environ.setdefault(variable, str(share_directory() / "config" / "fastdds_large_messages.xml"))
     rclpy.init(args=given, signal_handler_options=SignalHandlerOptions.ALL)
@@ -151,8 +151,8 @@ def main(arguments: list[str] | None = None) -> int:
                 player.get_logger().warning(warning)
             published = player.play()
             player.get_logger().info(f"published {published} messages")
-            # Messages still on their way are lost with their publisher: the reliable ones are acknowledged, the others
-            # are given time.
+            # Messages in transit are lost with their publisher: wait for acknowledgement of the reliable ones, and a
+            # moment for the others.
             for publisher in player.playable.values():
                 if player.context.ok():
                     publisher.wait_for_all_acked(rclpy.duration.Duration(seconds=1.0))

@@ -1,10 +1,11 @@
-"""bag_recorder: writes topics into a bag, for places where ros2 bag is not installed."""
+"""bag_recorder: records topics into a bag, for computers without ros2 bag."""
 
 from __future__ import annotations
 
 import argparse
 import sys
 import time
+from functools import partial
 
 import rclpy
 from rclpy.executors import ExternalShutdownException
@@ -21,14 +22,14 @@ def _arguments(arguments: list[str]) -> argparse.Namespace:
         prog="bag_recorder", description="Record topics into a rosbag2 bag until interrupted (SIGINT or SIGTERM)."
     )
     parser.add_argument("out", help="folder of the bag; must not exist")
-    parser.add_argument("--topics", nargs="+", default=None, metavar="TOPIC", help="topics (default: all there are)")
+    parser.add_argument("--topics", nargs="+", default=None, metavar="TOPIC", help="topics (default: all)")
     parser.add_argument("--storage", choices=["mcap", "sqlite3"], default="mcap", help="storage format (default mcap)")
     parser.add_argument("--overwrite", action="store_true", help="replace an existing bag")
     return parser.parse_args(arguments)
 
 
 class BagRecorder(Node):
-    """Subscribes to topics as they appear and writes their messages undecoded."""
+    """Subscribes to topics as they appear and writes their messages without decoding them."""
 
     def __init__(self, bag: BagWriter, topics: list[str] | None):
         super().__init__("bag_recorder")
@@ -36,11 +37,11 @@ class BagRecorder(Node):
         self._topics = topics
         self._subscribed: set[str] = set()
         self.recorded = 0
-        self._timer = self.create_timer(0.2, self._look)
+        self._timer = self.create_timer(0.2, self._subscribe_new)
         self._flusher = self.create_timer(1.0, bag.flush)
-        self._look()
+        self._subscribe_new()
 
-    def _look(self) -> None:
+    def _subscribe_new(self) -> None:
         for topic, types in self.get_topic_names_and_types():
             if topic in self._subscribed or (self._topics is not None and topic not in self._topics):
                 continue
@@ -52,7 +53,7 @@ class BagRecorder(Node):
             if kind is None:
                 self.get_logger().warning(f"{topic} is not recorded: {types[0]} is not installed")
                 continue
-            # The strictest quality that every publisher offers loses the least.
+            # The strictest QoS that every publisher offers loses the fewest messages.
             reliable = all(p.qos_profile.reliability == ReliabilityPolicy.RELIABLE for p in publishers)
             latched = all(p.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in publishers)
             quality = QoSProfile(
@@ -63,7 +64,7 @@ class BagRecorder(Node):
             self.create_subscription(
                 kind,
                 topic,
-                lambda data, topic=topic, name=types[0]: self._write(topic, name, data),
+                partial(self._write, topic, types[0]),
                 quality,
                 raw=True,
             )
@@ -79,8 +80,8 @@ def main(arguments: list[str] | None = None) -> int:
     given = sys.argv if arguments is None else ["bag_recorder", *arguments]
     options = _arguments(remove_ros_args(given)[1:])
     rclpy.init(args=given)
-    for left in BagWriter.unfinished(options.out):
-        print(f"an earlier recording was killed and lies in {left}: it can be read as it is", file=sys.stderr)
+    for unfinished in BagWriter.unfinished(options.out):
+        print(f"an earlier recording was killed and is in {unfinished}; it can be read as it is", file=sys.stderr)
     try:
         with BagWriter(options.out, storage=options.storage, overwrite=options.overwrite, keep=True) as bag:
             recorder = BagRecorder(bag, options.topics)

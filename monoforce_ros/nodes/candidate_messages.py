@@ -1,4 +1,4 @@
-"""Assessed candidates → the messages that planners and people read: markers, a table of costs, best path, occupancy."""
+"""Assessed candidates, ensemble and monitor → messages: markers, tables, best path, occupancy grid."""
 
 from __future__ import annotations
 
@@ -13,66 +13,66 @@ from monoforce_ros.planning import WAYPOINTS, Assessment, Occupancy
 from monoforce_ros.prediction import HORIZONS, GapSummary, Prediction, Spread, usable_steps
 from monoforce_ros.robots import RobotModel
 
-_SHOWN = 0.1
+_PATH_INTERVAL = 0.1
 """Time between the points of a drawn path [s]."""
-_CIRCLES = 0.5
-"""Time between the circles that are drawn about a path [s]."""
-_REFUSED = (0.45, 0.45, 0.45, 0.35)
+_CIRCLE_INTERVAL = 0.5
+"""Time between the circles drawn along a path [s]."""
+_INFEASIBLE = (0.45, 0.45, 0.45, 0.35)
 
 
 def candidate_markers(motion: MotionState, rollout: Rollout, assessment: Assessment, frame_id: str) -> bytes:
-    """``visualization_msgs/MarkerArray``: paths from green (cheapest) to red, grey where not feasible, the best thick.
+    """``visualization_msgs/MarkerArray``: paths from green (cheapest) to red, infeasible ones grey, the best one thick.
 
     Namespaces ``candidates`` and ``best_candidate``.
     """
     times = rollout.times
-    stride = max(1, round(_SHOWN / float(times[1] - times[0])))
+    stride = max(1, round(_PATH_INTERVAL / float(times[1] - times[0])))
     positions = rollout.position[:, ::stride].double().cpu().numpy()
-    usable = rollout.valid.cpu().numpy()
+    valid = rollout.valid.cpu().numpy()
     paths = transform_points(motion.odometry_from_terrain, positions)
     lines = np.stack([paths[:, :-1], paths[:, 1:]], axis=2).reshape(len(paths), -1, 3)
     cost, feasible = assessment.cost.cpu().numpy(), assessment.feasible.cpu().numpy()
     low, high = (cost[feasible].min(), cost[feasible].max()) if feasible.any() else (0.0, 1.0)
     shade = np.clip((np.nan_to_num(cost, posinf=high) - low) / max(high - low, 1e-6), 0.0, 1.0)
     colours = colormaps["RdYlGn_r"](shade).astype(np.float32)
-    colours[~feasible] = _REFUSED
-    each = np.repeat(colours[usable], lines.shape[1], axis=0)
+    colours[~feasible] = _INFEASIBLE
+    each = np.repeat(colours[valid], lines.shape[1], axis=0)
     best = assessment.best
     chosen = lines[best] if best is not None else np.zeros((0, 3))
     return encoding.marker_array(
         motion.stamp,
         frame_id,
         [
-            encoding.ListMarker("candidates", "lines", lines[usable].reshape(-1, 3), each, 0.015),
+            encoding.ListMarker("candidates", "lines", lines[valid].reshape(-1, 3), each, 0.015),
             encoding.ListMarker("best_candidate", "lines", chosen, np.array([0.1, 0.9, 0.3, 1.0]), 0.06),
         ],
     )
 
 
 def candidate_costs(
-    motion: MotionState, rollout: Rollout, fan: np.ndarray, assessment: Assessment, frame_id: str
+    motion: MotionState, rollout: Rollout, commands: np.ndarray, assessment: Assessment, frame_id: str
 ) -> bytes:
-    """``sensor_msgs/PointCloud2``: a point where each candidate ends, with its command, cost and every term as fields.
+    """``sensor_msgs/PointCloud2``: a point at the end of each candidate, with command, cost and every term as fields.
 
-    ``x_25``, ``y_25`` and so on are where it is after that share of the horizon, in per cent.
-    A message with stamp and frame that every ROS has, that planners read by field names and RViz colours by cost.
+    ``x_25``, ``y_25`` and so on are the position after that percentage of the horizon. The message type is standard;
+    planners read it by field names, and RViz can colour it by cost.
     """
     end = transform_points(motion.odometry_from_terrain, rollout.position[:, -1].double().cpu().numpy())
-    turned = motion.odometry_from_terrain[:3, :3] @ rollout.rotation[:, -1].double().cpu().numpy()
+    rotation = motion.odometry_from_terrain[:3, :3] @ rollout.rotation[:, -1].double().cpu().numpy()
     channels = {
         "x": end[:, 0],
         "y": end[:, 1],
         "z": end[:, 2],
-        "heading": np.arctan2(turned[:, 1, 0], turned[:, 0, 0]),
-        "speed": fan[:, 0],
-        "yaw_rate": fan[:, 1],
+        "heading": np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]),
+        "speed": commands[:, 0],
+        "yaw_rate": commands[:, 1],
         "cost": assessment.cost.cpu().numpy(),
         "feasible": assessment.feasible.cpu().numpy().astype(np.float32),
     }
     for share in WAYPOINTS:
         step = round(share / 100 * (rollout.position.shape[1] - 1))
-        place = transform_points(motion.odometry_from_terrain, rollout.position[:, step].double().cpu().numpy())
-        channels |= {f"x_{share}": place[:, 0], f"y_{share}": place[:, 1]}
+        position = transform_points(motion.odometry_from_terrain, rollout.position[:, step].double().cpu().numpy())
+        channels |= {f"x_{share}": position[:, 0], f"y_{share}": position[:, 1]}
     channels |= {name: value.cpu().numpy() for name, value in assessment.terms.items()}
     return encoding.point_cloud(motion.stamp, frame_id, channels)
 
@@ -86,13 +86,13 @@ def candidate_rollouts(
     frame_id: str,
     time_step: float,
 ) -> bytes:
-    """``monoforce_msgs/Candidates``: everything that is known of all candidates, sampled every ``time_step`` [s].
+    """``monoforce_msgs/Candidates``: the complete rollouts of all candidates, sampled every ``time_step`` [s].
 
     Args:
-        motion: start of all.
-        rollout: with the sums of its contact forces, ``[N]``.
-        robot: what rolled.
-        sequences: commands of equal shares of the horizon ``[N, K, 2]``.
+        motion: common start.
+        rollout: of ``N`` candidates, with contact forces.
+        robot: that was simulated.
+        sequences: commands, each for an equal share of the horizon ``[N, K, 2]``.
         assessment: of the rollouts.
         frame_id: of the odometry.
         time_step: between samples [s].
@@ -102,15 +102,17 @@ def candidate_rollouts(
     chosen = np.arange(0, len(times), stride)
     count, horizon = len(rollout.position), len(times) - 1
     pose = motion.odometry_from_terrain
-    turn = pose[:3, :3]
-    rotation = turn @ rollout.rotation[:, chosen].double().cpu().numpy()
-    places = transform_points(pose, rollout.position[:, chosen].double().cpu().numpy())
-    states = np.concatenate([places, quaternions(rotation)], axis=-1)
+    axes = pose[:3, :3]
+    rotation = axes @ rollout.rotation[:, chosen].double().cpu().numpy()
+    positions = transform_points(pose, rollout.position[:, chosen].double().cpu().numpy())
+    states = np.concatenate([positions, quaternions(rotation)], axis=-1)
     linear, angular = (
-        value[:, chosen].double().cpu().numpy() @ turn.T for value in (rollout.velocity, rollout.angular_velocity)
+        value[:, chosen].double().cpu().numpy() @ axes.T for value in (rollout.velocity, rollout.angular_velocity)
     )
     share = np.minimum(chosen, horizon - 1) * sequences.shape[1] // horizon
-    forces = _averaged(rollout.contact.force, chosen, rollout.force_every) @ turn.T
+    if rollout.contact is None:
+        raise ValueError("the rollout of the candidates has no contact forces")
+    forces = _averaged(rollout.contact.force, chosen, rollout.force_every) @ axes.T
     loads = rollout.contact.load
     best = assessment.best
     writer = CdrWriter()
@@ -134,9 +136,9 @@ def candidate_rollouts(
 
 
 def _averaged(values: torch.Tensor, chosen: np.ndarray, every: int) -> np.ndarray:
-    """Means of values of every so many steps ``[N, T / every, ...]`` from each chosen step to the next one.
+    """Means of values at every ``every``-th step ``[N, T / every, ...]`` over the interval before each chosen step.
 
-    The first is that of the start; a sample between which and the one before nothing was computed repeats it.
+    The first sample is the value at the start; a sample without values since its predecessor repeats it.
     """
     summed = torch.cat([torch.zeros_like(values[:, :1]), values.cumsum(dim=1)], dim=1).cpu().double().numpy()
     ends = np.minimum(-(-chosen // every), values.shape[1])
@@ -148,7 +150,7 @@ def _averaged(values: torch.Tensor, chosen: np.ndarray, every: int) -> np.ndarra
 
 
 def spread_table(prediction: Prediction, found: Spread, frame_id: str, time_step: float) -> bytes:
-    """``sensor_msgs/PointCloud2``: poses of the path with how far each may be off, one field each.
+    """``sensor_msgs/PointCloud2``: poses of the path with their uncertainty.
 
     ``time`` [s], standard deviations ``along``, ``across``, ``up`` [m] and ``heading`` [rad], and ``radius_90`` [m].
     """
@@ -162,8 +164,8 @@ def spread_table(prediction: Prediction, found: Spread, frame_id: str, time_step
 
 
 def spread_band(prediction: Prediction, found: Spread, frame_id: str, time_step: float) -> bytes:
-    """``visualization_msgs/MarkerArray``: circles about the path's poses that hold 90 % of what may happen."""
-    chosen = _path_steps(prediction, max(time_step, _CIRCLES))[1:]
+    """``visualization_msgs/MarkerArray``: circles around the path's poses that contain 90 % of the outcomes."""
+    chosen = _path_steps(prediction, max(time_step, _CIRCLE_INTERVAL))[1:]
     angle = np.linspace(0.0, 2.0 * np.pi, 25)
     circle = np.stack([np.cos(angle), np.sin(angle), np.zeros(25)], axis=1)
     rings = prediction.positions()[chosen][:, None] + found.radius[chosen][:, None, None] * circle
@@ -175,13 +177,13 @@ def spread_band(prediction: Prediction, found: Spread, frame_id: str, time_step:
 
 
 def _path_steps(prediction: Prediction, time_step: float) -> np.ndarray:
-    """Steps every ``time_step`` [s] as far as the map reaches."""
+    """Steps every ``time_step`` [s] up to the edge of the map."""
     times = prediction.rollout.times.double().numpy()
     return np.arange(0, max(1, usable_steps(prediction)), max(1, round(time_step / (times[1] - times[0]))))
 
 
 def best_path(motion: MotionState, rollout: Rollout, best: int, frame_id: str, time_step: float) -> bytes:
-    """``nav_msgs/Path`` of the best candidate, as far as the map reaches."""
+    """``nav_msgs/Path`` of the best candidate, up to the edge of the map."""
     times = rollout.times.double().numpy()
     stride = max(1, round(time_step / (times[1] - times[0])))
     outside = np.flatnonzero(~rollout.inside[best].numpy())
@@ -197,7 +199,7 @@ def best_path(motion: MotionState, rollout: Rollout, best: int, frame_id: str, t
 
 
 def live_gap(found: GapSummary) -> bytes:
-    """``std_msgs/Float32MultiArray``: a row for each horizon; the second dimension's label names the columns."""
+    """``std_msgs/Float32MultiArray``: one row per horizon; the label of the second dimension names the columns."""
     columns = ("horizon", "median_position_error", "median_heading_error", "noise_floor", "count")
     count = np.full(len(HORIZONS), found.count)
     values = np.column_stack([HORIZONS, found.position, found.heading, found.floor, count])
@@ -205,5 +207,5 @@ def live_gap(found: GapSummary) -> bytes:
 
 
 def occupancy_grid(stamp: int, found: Occupancy, frame_id: str) -> bytes:
-    """``nav_msgs/OccupancyGrid``, axes along those of the frame."""
+    """``nav_msgs/OccupancyGrid``, aligned with the axes of the frame."""
     return encoding.occupancy_grid(stamp, frame_id, found.resolution, (*found.origin, found.height), found.data)

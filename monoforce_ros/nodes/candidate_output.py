@@ -1,4 +1,4 @@
-"""CandidateOutput: candidate commands rolled out on each prediction's map, and what the node publishes of them."""
+"""CandidateOutput: rolls out and assesses candidate commands for each prediction, and publishes the results."""
 
 from __future__ import annotations
 
@@ -18,8 +18,10 @@ from monoforce_ros.core import CommandTrack
 from monoforce_ros.messages import decoding, message_class
 from monoforce_ros.nodes import candidate_messages as messages
 from monoforce_ros.nodes.health import ERROR, OK, WARN, Health
+from monoforce_ros.physics import Rollout
 from monoforce_ros.planning import (
     TERMS,
+    Assessment,
     CandidateSettings,
     CostWeights,
     Limits,
@@ -34,12 +36,12 @@ from monoforce_ros.prediction import Prediction, Predictor
 from monoforce_ros.robots import load_robot
 
 PART = "candidates"
-TYPED = "monoforce_msgs/msg/Candidates"
-MOST = 512
+TYPED_MESSAGE = "monoforce_msgs/msg/Candidates"
+MAXIMUM_CANDIDATES = 512
 
 
 class CandidateOutput:
-    """Compares commands with each prediction: a fan of arcs, or what a planner asks for.
+    """Compares candidate commands for each prediction: a fan of arcs, or those that a planner requests.
 
     Raises:
         ValueError: a setting is out of its range.
@@ -47,7 +49,7 @@ class CandidateOutput:
 
     def __init__(self, node: Node, predictor: Predictor, settings: SimpleNamespace, health: Health):
         self._node, self._settings, self._health = node, settings, health
-        # Coarser steps and samples than those of the one prediction that is looked at: candidates are many.
+        # Coarser time steps and contact points than for the prediction itself, as there are many candidates.
         options = replace(predictor.options, time_step=settings.candidate_time_step)
         robot = load_robot(settings.robot, spacing=settings.candidate_spacing)
         self._predictor = Predictor(robot, predictor.source, horizon=settings.horizon, options=options)
@@ -56,18 +58,18 @@ class CandidateOutput:
         if settings.candidates:
             fan = CandidateSettings(settings.candidates, tuple(settings.candidate_speeds), settings.candidate_yaw_rate)
             self._fan = fan_of_arcs(fan)
-        self._asked: tuple[float, np.ndarray] | None = None
+        self._requested: tuple[float, np.ndarray] | None = None
         self._round_seconds = 0.0
         self.apply(settings)
-        self._figures: dict[str, str] = {}
+        self._statistics: dict[str, str] = {}
         self._publishers = {
             "candidates": node.create_publisher(MarkerArray, "predicted/candidates", 1),
             "candidate_costs": node.create_publisher(PointCloud2, "predicted/candidate_costs", 1),
             "best_path": node.create_publisher(Path, "predicted/best_path", 1),
             "occupancy": node.create_publisher(OccupancyGrid, "predicted/occupancy", 1),
         }
-        # Where the message package is built, planners get everything in one typed message.
-        if typed := message_class(TYPED):
+        # If the message package is built, planners get everything in one typed message.
+        if typed := message_class(TYPED_MESSAGE):
             self._publishers["candidate_rollouts"] = node.create_publisher(typed, "predicted/candidate_rollouts", 1)
         self._subscription = None
         if settings.candidate_topic:
@@ -76,7 +78,7 @@ class CandidateOutput:
             )
 
     def apply(self, settings: SimpleNamespace) -> None:
-        """Take weights, limits and thresholds from settings that may have changed while the node runs.
+        """Apply weights, limits and thresholds that may have changed while the node runs.
 
         Raises:
             ValueError: one is out of its range.
@@ -87,96 +89,100 @@ class CandidateOutput:
 
     def _on_sequences(self, message: Float32MultiArray) -> None:
         try:
-            self._asked = time.monotonic(), decoding.decode_sequences(message, MOST)
+            self._requested = time.monotonic(), decoding.decode_command_sequences(message, MAXIMUM_CANDIDATES)
         except decoding.MessageError as error:
             self._health.report(PART, ERROR, f"{self._settings.candidate_topic}: {error}", reason="unusable")
 
     @property
-    def figures(self) -> dict[str, str]:
+    def statistics(self) -> dict[str, str]:
         """For the diagnostics."""
-        return self._figures
+        return self._statistics
 
     def publish(self, prediction: Prediction, commands: CommandTrack, frame_id: str) -> None:
-        """Roll out every candidate on the prediction's map and publish what each costs.
+        """Roll out all candidates on the prediction's map, and publish their costs.
 
         Args:
-            prediction: whose map and start state all share.
-            commands: that led to now.
+            prediction: provides the map and the start state.
+            commands: up to the prediction.
             frame_id: of the odometry.
         """
         sequences = self._sequences()
         if not len(sequences):
             return
         motion, terrain, settings = prediction.motion, prediction.terrain, self._settings
-        # Candidates act when they have been compared and told; until then the robot does what it was told before.
+        # Candidates take effect after the delay; the last command holds until then.
         held = min(round(settings.candidate_delay / self._predictor.options.time_step), self._predictor.steps - 1)
-        begins, steps = self._predictor.history + held, self._predictor.steps - held
-        stamps = self._predictor.command_stamps(prediction.stamp)[:begins]
+        start, steps = self._predictor.history + held, self._predictor.steps - held
+        stamps = self._predictor.command_stamps(prediction.stamp)[:start]
         before = commands.sample(stamps, timeout=settings.command_timeout)
         twists = over_horizon(sequences, before, steps)
-        rolled, found = self._assess(prediction, twists)
-        if settings.refine_seconds and found.best is not None:
-            refined = over_horizon(self._refined(prediction, before, sequences[found.best]), before, steps)
-            again, assessed = self._assess(prediction, refined)
+        rollout, assessment = self._assess(prediction, twists)
+        if settings.refine_seconds and assessment.best is not None:
+            refined = over_horizon(self._refined(prediction, before, sequences[assessment.best]), before, steps)
+            refined_rollout, refined_assessment = self._assess(prediction, refined)
             twists = np.concatenate([twists, refined])
-            rolled, found = rolled.joined(again), found.joined(assessed)
+            rollout, assessment = rollout.joined(refined_rollout), assessment.joined(refined_assessment)
         grid = occupancy(
             terrain, motion.odometry_from_terrain, slope_limit=settings.slope_limit, step_limit=settings.step_limit
         )
         data = {
-            "candidates": messages.candidate_markers(motion, rolled, found, frame_id),
-            "candidate_costs": messages.candidate_costs(motion, rolled, twists[:, begins], found, frame_id),
+            "candidates": messages.candidate_markers(motion, rollout, assessment, frame_id),
+            "candidate_costs": messages.candidate_costs(motion, rollout, twists[:, start], assessment, frame_id),
             "occupancy": messages.occupancy_grid(motion.stamp, grid, frame_id),
         }
-        if found.best is not None:
-            data["best_path"] = messages.best_path(motion, rolled, found.best, frame_id, settings.path_time_step)
+        if assessment.best is not None:
+            data["best_path"] = messages.best_path(motion, rollout, assessment.best, frame_id, settings.path_time_step)
         if "candidate_rollouts" in self._publishers:
             data["candidate_rollouts"] = messages.candidate_rollouts(
-                motion, rolled, self._predictor.robot, twists[:, self._predictor.history :], found, frame_id,
+                motion, rollout, self._predictor.robot, twists[:, self._predictor.history :], assessment, frame_id,
                 settings.path_time_step,
             )  # fmt: skip
-        self._figures["feasible candidates"] = f"{int(found.feasible.sum())} of {len(twists)}"
+        self._statistics["feasible candidates"] = f"{int(assessment.feasible.sum())} of {len(twists)}"
         if self._node.context.ok():
             for name, message in data.items():
                 self._publishers[name].publish(message)
 
     def _sequences(self) -> np.ndarray:
-        """Commands to compare ``[N, K, 2]``: the planner's while they are fresh, else the fan."""
+        """Commands to compare ``[N, K, 2]``: the planner's while they are fresh, otherwise the fan."""
         settings = self._settings
         if not settings.candidate_topic:
             return self._fan
-        age = np.inf if self._asked is None else time.monotonic() - self._asked[0]
-        if age <= settings.data_timeout:
-            self._health.report(PART, OK, f"comparing what {settings.candidate_topic} asks for", reason="planner")
-            return self._asked[1]
-        said = "nothing has come yet" if self._asked is None else f"nothing for {age:.1f} s"
-        instead = f"the fan of {len(self._fan)} arcs is compared" if len(self._fan) else "nothing is compared"
-        self._health.report(PART, WARN, f"{settings.candidate_topic}: {said}; {instead}", reason="silent")
+        problem = "no candidates received yet"
+        if self._requested is not None:
+            arrival, sequences = self._requested
+            age = time.monotonic() - arrival
+            if age <= settings.data_timeout:
+                message = f"comparing the candidates on {settings.candidate_topic}"
+                self._health.report(PART, OK, message, reason="planner")
+                return sequences
+            problem = f"no candidates for {age:.1f} s"
+        fallback = f"using the fan of {len(self._fan)} arcs" if len(self._fan) else "comparing none"
+        self._health.report(PART, WARN, f"{settings.candidate_topic}: {problem}; {fallback}", reason="silent")
         return self._fan
 
-    def _assess(self, prediction: Prediction, twists: np.ndarray):
+    def _assess(self, prediction: Prediction, twists: np.ndarray) -> tuple[Rollout, Assessment]:
         motions = [prediction.motion] * len(twists)
-        rolled = self._predictor.roll_out(
+        rollout = self._predictor.roll_out(
             prediction.terrain, motions, twists, with_forces=False, with_contact=True, force_every=self._force_every
         )
-        asked = torch.from_numpy(twists[:, self._predictor.history :]).float()
+        commanded = torch.from_numpy(twists[:, self._predictor.history :]).float()
         robot = self._predictor.robot
-        found = assess(rolled, prediction.terrain, robot, asked, weights=self._weights, limits=self._limits)
-        return rolled, found
+        weights, limits = self._weights, self._limits
+        return rollout, assess(rollout, prediction.terrain, robot, commanded, weights=weights, limits=limits)
 
     def _refined(self, prediction: Prediction, before: np.ndarray, best: np.ndarray) -> np.ndarray:
-        """The best candidate's commands of every step, improved ``[1, T, 2]``."""
+        """The best candidate's refined commands at every step ``[1, T, 2]``."""
         budget = self._settings.refine_seconds
         found = refine(
             self._predictor, prediction, before, best, weights=self._weights, limits=self._limits,
             seconds=budget, round_seconds=self._round_seconds,
         )  # fmt: skip
-        # A slow first round (kernels are loaded) must not end refinement for good.
+        # A slow first round, in which kernels are loaded, must not disable refinement for good.
         self._round_seconds = found.round_seconds if found.rounds else 0.9 * self._round_seconds
         if found.rounds:
-            self._figures["refined cost"] = f"{found.cost_before:.3f} to {found.cost:.3f} in {found.rounds} rounds"
+            self._statistics["refined cost"] = f"{found.cost_before:.3f} to {found.cost:.3f} in {found.rounds} rounds"
         else:
-            self._figures["refined cost"] = (
+            self._statistics["refined cost"] = (
                 f"not refined: a round takes {1e3 * self._round_seconds:.0f} ms, refine_seconds is {budget:g}"
             )
         return found.sequence[None]

@@ -1,4 +1,4 @@
-"""Health: what is wrong right now, part by part, as diagnostics and as log lines that are said once."""
+"""Health: the current state of each part of a node, as diagnostics and as log lines that are not repeated."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class _Part:
 
 
 class Health:
-    """The state of a node's parts. A change is logged once and published at once; the rest is published every second.
+    """The state of a node's parts. Changes are logged once and published at once; everything is published every second.
 
     Thread-safe.
     """
@@ -43,10 +43,10 @@ class Health:
         Args:
             part: which part.
             level: OK, WARN, ERROR or STALE.
-            message: what is the case, for people.
-            reason: a short key of the fault; while it stays the same, changing numbers in the message are not logged
-                again. Defaults to the message.
-            values: figures that go along.
+            message: the state in words.
+            reason: short key of the state; while it stays the same, a message with other numbers is not logged again.
+                Defaults to the message.
+            values: to attach to the diagnostics.
         """
         reason = reason or message
         with self._lock:
@@ -59,7 +59,7 @@ class Health:
             return
         logger = self._node.get_logger()
         text = f"{part}: {message}"
-        # Each severity has a call of its own: rclpy ties a log line's place in the code to one severity.
+        # Each severity needs a call of its own: rclpy allows only one severity per line of code.
         if level == ERROR:
             logger.error(text)
         elif level in (WARN, STALE):
@@ -69,7 +69,7 @@ class Health:
         self.publish()
 
     def report_values(self, part: str, values: dict[str, str]) -> None:
-        """Attach figures to a part without changing its state."""
+        """Attach values to a part without changing its state."""
         with self._lock:
             self._parts[part].values.update(values)
 

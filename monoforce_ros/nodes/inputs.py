@@ -1,4 +1,4 @@
-"""Inputs: the newest sensor data and a short memory of motion and commands, safe to use from several threads."""
+"""Inputs: the newest sensor data and a short history of motion and commands, thread-safe."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ import numpy as np
 
 from monoforce_ros.core import NANOSECOND, CommandTrack, MotionState, MotionTrack, largest_spread, quaternions
 
-MEMORY = 10_000_000_000
-"""How long motion and commands are remembered [ns]."""
-JUMP = 1_000_000_000
-"""A stamp this much older than the one before it on the same topic means that time was set back [ns]."""
+RETENTION = 10_000_000_000
+"""Retention time of motion and commands [ns]."""
+TIME_JUMP = 1_000_000_000
+"""A stamp that is older by this than its predecessor on the same topic is a backward time jump [ns]."""
 
-AHEAD = 30_000_000
+ODOMETRY_LAG = 30_000_000
 """By how much sensor data may be newer than the odometry that they are used with [ns]."""
 
 
@@ -32,13 +32,14 @@ class Received:
 
 
 class Inputs:
-    """What the node knows. Every method may be called from any thread.
+    """The data that a prediction starts from. Every method may be called from any thread.
 
     Args:
         sensors: topics whose newest message is kept.
-        slop: largest difference of stamps within one set of sensor messages [s].
-        patience: how long a set waits for a sensor that has fallen silent [s].
-        on_time_jump: called with a topic and how far its time went back [s], after everything was forgotten.
+        slop: largest difference between the stamps of one set of sensor messages [s].
+        patience: how long a set waits for a silent sensor [s].
+        on_time_jump: called after a backward time jump, when all data have been discarded, with the topic and the size
+            of the jump [s].
     """
 
     def __init__(self, sensors: list[str], *, slop: float, patience: float, on_time_jump: Callable[[str, float], None]):
@@ -63,9 +64,9 @@ class Inputs:
         self._first_sensor = 0.0
 
     def _admit(self, topic: str, stamp: int) -> bool:
-        """Whether a message may be used: not older than its predecessor, or first of a time that began anew."""
+        """Whether a message may be used: it is not older than its predecessor, or the first one after a time jump."""
         last = self._last_stamps.get(topic)
-        if last is not None and stamp < last - JUMP:
+        if last is not None and stamp < last - TIME_JUMP:
             self._clear()
             self._on_time_jump(topic, (last - stamp) * NANOSECOND)
         elif last is not None and stamp < last:
@@ -74,29 +75,29 @@ class Inputs:
         return True
 
     def add_motion(self, topic: str, state: MotionState, frame_id: str, child_frame_id: str) -> None:
-        """Remember measured motion."""
+        """Keep measured motion."""
         with self.changed:
             if not self._admit(topic, state.stamp) or (self._states and state.stamp == self._states[-1].stamp):
                 return
             self.frame_id, self.child_frame_id = frame_id, child_frame_id
             self._states.append(state)
-            while self._states[0].stamp < state.stamp - MEMORY:
+            while self._states[0].stamp < state.stamp - RETENTION:
                 self._states.popleft()
             self.changed.notify_all()
 
     def add_command(self, topic: str, stamp: int, twist: np.ndarray) -> None:
-        """Remember a command; one without a stamp (0) is dated by the newest odometry, the only clock it shares."""
+        """Keep a command; one without a stamp (0) gets the stamp of the newest odometry, the only clock available."""
         with self.changed:
             if not stamp:
                 stamp = self._states[-1].stamp if self._states else 0
             if not stamp or not self._admit(topic, stamp):
                 return
             self._commands.append((stamp, twist))
-            while self._commands[0][0] < stamp - MEMORY:
+            while self._commands[0][0] < stamp - RETENTION:
                 self._commands.popleft()
 
     def add_sensor(self, topic: str, stamp: int, message: Any) -> None:
-        """Keep a sensor's newest message; a set that is complete replaces the one that waits to be used."""
+        """Keep a sensor's newest message; a complete set replaces the one that waits to be used."""
         with self.changed:
             if not self._admit(topic, stamp):
                 self.dropped += 1
@@ -105,12 +106,11 @@ class Inputs:
             if topic in self._newest:
                 self._intervals[topic] = stamp - self._newest[topic].stamp
             self._newest[topic] = Received(message, stamp, now)
-            live = [
-                entry for entry in self._newest.values() if now - entry.arrival <= self._patience
-            ]  # a sensor that died does not hold up the others
+            # A sensor that has stopped does not delay the others.
+            live = [entry for entry in self._newest.values() if now - entry.arrival <= self._patience]
             self._first_sensor = self._first_sensor or now
             if len(self._newest) < len(self._sensors) and now - self._first_sensor < self._patience:
-                return  # the others may still be starting
+                return  # the other sensors may still be starting
             if max(e.stamp for e in live) - min(e.stamp for e in live) > 1e9 * largest_spread(
                 self._slop, (1e-9 * entry for entry in self._intervals.values())
             ):
@@ -120,10 +120,10 @@ class Inputs:
             self.changed.notify_all()
 
     def take(self, *, odometry_timeout: float, wait: float) -> dict[str, Received] | None:
-        """The newest complete set of sensor messages once odometry has caught up with it, else None after ``wait`` [s].
+        """The newest complete set of sensor messages once odometry has caught up with it; None after ``wait`` [s].
 
-        For the last :data:`AHEAD` the motion goes on as it did (:meth:`MotionTrack.at`), which beats waiting. Odometry
-        that stays behind for ``odometry_timeout`` [s] is not waited for any longer.
+        Over the last :data:`ODOMETRY_LAG` motion is extrapolated (:meth:`MotionTrack.at`), which beats waiting.
+        A set waits for odometry no longer than ``odometry_timeout`` [s].
         """
         deadline = time.monotonic() + wait
         with self.changed:
@@ -132,7 +132,7 @@ class Inputs:
                 if self._pending:
                     stamp = max(entry.stamp for entry in self._pending.values())
                     arrival = max(entry.arrival for entry in self._pending.values())
-                    caught_up = bool(self._states) and self._states[-1].stamp >= stamp - AHEAD
+                    caught_up = bool(self._states) and self._states[-1].stamp >= stamp - ODOMETRY_LAG
                     if caught_up or now - arrival >= odometry_timeout:
                         taken, self._pending = self._pending, {}
                         return taken
@@ -144,9 +144,9 @@ class Inputs:
                 self.changed.wait(max(0.0, limit - now) + 1e-3)
 
     def take_motion(self, last: int, *, wait: float) -> dict[str, Received] | None:
-        """The newest odometry as what to predict from, if it is not the one of stamp ``last`` [ns]; else None.
+        """The newest odometry as the input of a prediction, unless its stamp is ``last`` [ns].
 
-        Waits up to ``wait`` [s] for it.
+        Waits up to ``wait`` [s] for it, then returns None.
         """
         deadline = time.monotonic() + wait
         with self.changed:
@@ -158,12 +158,12 @@ class Inputs:
             return {"odometry": Received(None, self._states[-1].stamp, time.monotonic())}
 
     def drop(self, received: dict[str, Received]) -> None:
-        """Count what was taken and is not used."""
+        """Count a set that was taken but is not used."""
         with self.changed:
             self.dropped += received.keys() != {"odometry"}
 
     def motion(self) -> MotionTrack:
-        """The remembered motion."""
+        """Measured motion within the retention time."""
         with self.changed:
             states = list(self._states)
             frames = self.frame_id, self.child_frame_id
@@ -178,7 +178,7 @@ class Inputs:
         )
 
     def commands(self) -> CommandTrack:
-        """The remembered commands."""
+        """Commands within the retention time."""
         with self.changed:
             commands = list(self._commands)
         return CommandTrack(

@@ -1,67 +1,82 @@
-"""ManagedNode: a lifecycle node that starts by itself unless told to wait for its manager."""
+"""ManagedNode: a lifecycle node that starts by itself, or on request of a lifecycle manager."""
 
 from __future__ import annotations
 
+import traceback
+
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.publisher import Publisher
+from rclpy.subscription import Subscription
+from rclpy.timer import Timer
 
 
 class ManagedNode(LifecycleNode):
-    """Base of nodes whose work can be set up, started, paused and taken down from outside.
+    """Base class of nodes that can be configured, activated, deactivated and cleaned up from outside.
 
-    A child sets up in :meth:`set_up` (publishers, subscriptions, timers, models), works between :meth:`begin` and
-    :meth:`pause`; whatever it created on the node since set-up is destroyed when it is taken down.
+    A subclass creates publishers, subscriptions, timers and models in :meth:`set_up`, and works between :meth:`begin`
+    and :meth:`pause`. Clean-up destroys whatever was created on the node since set-up.
     """
 
     def __init__(self, name: str):
         super().__init__(name)
         self._failure: Exception | None = None
-        self._before: set[int] = set()
-        self._active = self._starting = False
+        self._entities_before: set[int] = set()
+        self._active = self._autostarting = False
 
     def set_up(self) -> None:
-        """Make ready to work.
+        """Get ready to work.
 
         Raises:
             ValueError, OSError: it cannot; the message says why.
         """
 
     def begin(self) -> None:
-        """Start to work."""
+        """Start working."""
 
     def pause(self) -> None:
-        """Stop to work, ready to begin again."""
+        """Stop working, ready to begin again."""
 
     def autostart(self) -> None:
         """Configure and activate at once, as nodes without a manager do.
 
         Raises:
-            ValueError, OSError: what :meth:`set_up` raised.
+            ValueError, OSError: as raised by :meth:`set_up`; a ``ValueError`` stands for any other error, whose
+                traceback has been logged.
         """
-        self._starting = True
+        self._autostarting = True
         configured = self.trigger_configure()
-        self._starting = False
+        self._autostarting = False
         if configured != TransitionCallbackReturn.SUCCESS:
-            raise self._failure or ValueError(f"{self.get_name()} could not be configured")
+            raise self._reason("configured")
         if self.trigger_activate() != TransitionCallbackReturn.SUCCESS:
-            raise self._failure or ValueError(f"{self.get_name()} could not be activated")
+            raise self._reason("activated")
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Set up; back to unconfigured where that fails."""
-        self._before = {id(entity) for entity in self._entities()}
+        """Set up; back to unconfigured if that fails."""
+        self._entities_before = {id(entity) for entity in self._entities()}
         try:
             self.set_up()
         except (ValueError, OSError) as error:
             self._failure = error
-            if not self._starting:
+            if not self._autostarting:
                 self.get_logger().error(f"not configured: {error}")
-            self._take_down()
+            self._clean_up()
+            return TransitionCallbackReturn.FAILURE
+        except Exception as error:
+            self._log_unexpected("not configured", error)
+            self._clean_up()
             return TransitionCallbackReturn.FAILURE
         return TransitionCallbackReturn.SUCCESS
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Begin."""
         self._active = True
-        self.begin()
+        try:
+            self.begin()
+        except Exception as error:
+            self._active = False
+            self._log_unexpected("not activated", error)
+            return TransitionCallbackReturn.ERROR
         return super().on_activate(state)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -70,36 +85,48 @@ class ManagedNode(LifecycleNode):
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Take down what set-up made."""
-        self._take_down()
+        """Destroy what was created since set-up."""
+        self._clean_up()
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Pause and take down, from whatever state."""
+        """Pause and clean up, from any state."""
         self._stop()
-        self._take_down()
+        self._clean_up()
         return TransitionCallbackReturn.SUCCESS
 
     def destroy_node(self) -> None:
-        """Stop to work, then end the node."""
+        """Stop working, then destroy the node."""
         self._stop()
         super().destroy_node()
+
+    def _log_unexpected(self, outcome: str, error: Exception) -> None:
+        """Log an error that no input explains; rclpy drops exceptions of transition callbacks silently."""
+        self._failure = error
+        self.get_logger().error(f"{outcome}: {type(error).__name__}: {error}\n{traceback.format_exc()}")
+
+    def _reason(self, transition: str) -> Exception:
+        """The error to raise after a failed transition."""
+        error = self._failure
+        if isinstance(error, ValueError | OSError):
+            return error
+        cause = "" if error is None else f": {type(error).__name__}: {error}"
+        return ValueError(f"{self.get_name()} could not be {transition}{cause}")
 
     def _stop(self) -> None:
         if self._active:
             self._active = False
             self.pause()
 
-    def _entities(self) -> list:
+    def _entities(self) -> list[Publisher | Subscription | Timer]:
         return [*self.publishers, *self.subscriptions, *self.timers]
 
-    def _take_down(self) -> None:
-        made = [entity for entity in self._entities() if id(entity) not in self._before]
-        timers, subscriptions = set(self.timers), set(self.subscriptions)
-        for entity in made:
-            if entity in timers:
+    def _clean_up(self) -> None:
+        created = [entity for entity in self._entities() if id(entity) not in self._entities_before]
+        for entity in created:
+            if isinstance(entity, Timer):
                 self.destroy_timer(entity)
-            elif entity in subscriptions:
+            elif isinstance(entity, Subscription):
                 self.destroy_subscription(entity)
             else:
                 self.destroy_publisher(entity)

@@ -1,4 +1,4 @@
-"""path_selector: drives the robot to a goal by the predictor's candidates; an example of their use."""
+"""path_selector: drives the robot to a goal with the predictor's candidates; an example of their use."""
 
 from __future__ import annotations
 
@@ -21,12 +21,13 @@ from monoforce_ros.planning import CostToGo, SelectionWeights, cost_to_go, selec
 
 PARAMETER_FILE = share_directory() / "config" / "path_selector.yaml"
 PART = "choice"
+DISTANCE = "distance to the goal [m]"
 
 
 class PathSelectorNode(Node):
-    """Tells the robot the best candidate's command; stops it where there is none that can be relied on."""
+    """Publishes the best candidate's command; stops the robot if there is no reliable one."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__("path_selector")
         self.settings = settings = declare_parameters(self, read_parameter_file(PARAMETER_FILE))
         self.weights = SelectionWeights(
@@ -39,12 +40,12 @@ class PathSelectorNode(Node):
         self.health = Health(self, [PART])
         self._goal: tuple[np.ndarray, str] | None = None
         self._motion: MotionState | None = None
-        self._moved_at = 0.0
+        self._odometry_arrival = 0.0
         self._candidates: tuple[int, str, dict[str, np.ndarray]] | None = None
         self._moving = False
-        self._told = (0.0, 0.0)
+        self._last_command = (0.0, 0.0)
         self._map: tuple[np.ndarray, float, np.ndarray] | None = None
-        self._ways: CostToGo | None = None
+        self._cost_to_go: CostToGo | None = None
         self._commands = self.create_publisher(TwistStamped, settings.command_topic, 10)
         newest = QoSProfile(depth=1)
         self._inputs = (
@@ -53,22 +54,20 @@ class PathSelectorNode(Node):
             self.create_subscription(PointCloud2, settings.candidate_topic, self._on_candidates, newest),
             self.create_subscription(OccupancyGrid, settings.occupancy_topic, self._on_occupancy, newest),
         )
-        self._clock_tick = self.create_timer(1.0 / settings.rate, self._tell)
+        self._command_timer = self.create_timer(1.0 / settings.rate, self._publish_command)
         self.get_logger().info(f"waiting for a goal on {self.resolve_topic_name(settings.goal_topic)}")
 
     def _on_goal(self, message: PoseStamped) -> None:
-        place = np.array([message.pose.position.x, message.pose.position.y])
-        if not np.isfinite(place).all():
-            self.health.report(
-                PART, ERROR, f"the goal is at {place.tolist()}: not finite, not driven to", reason="goal"
-            )
+        position = np.array([message.pose.position.x, message.pose.position.y])
+        if not np.isfinite(position).all():
+            self.health.report(PART, ERROR, f"the goal {position.tolist()} is not finite and is ignored", reason="goal")
             return
-        self._goal, self._ways = (place, message.header.frame_id), None
-        self.get_logger().info(f"driving to ({place[0]:.2f}, {place[1]:.2f})")
+        self._goal, self._cost_to_go = (position, message.header.frame_id), None
+        self.get_logger().info(f"driving to ({position[0]:.2f}, {position[1]:.2f})")
 
     def _on_odometry(self, message: Odometry) -> None:
         try:
-            self._motion, self._moved_at = decoding.decode_odometry(message)[0], time.monotonic()
+            self._motion, self._odometry_arrival = decoding.decode_odometry(message)[0], time.monotonic()
         except decoding.MessageError as error:
             self.health.report(PART, ERROR, f"odometry: {error}", reason="odometry")
 
@@ -82,16 +81,16 @@ class PathSelectorNode(Node):
 
     def _on_occupancy(self, message: OccupancyGrid) -> None:
         try:
-            self._map, self._ways = decoding.decode_occupancy(message), None
+            self._map, self._cost_to_go = decoding.decode_occupancy(message), None
         except decoding.MessageError as error:
             self.health.report(PART, ERROR, str(error), reason="occupancy")
 
-    def _tell(self) -> None:
+    def _publish_command(self) -> None:
         command = self._command()
-        # A robot that nobody sent anywhere is left alone; one that was moving is told to stop until it is.
+        # Without a goal nothing is published; a robot that was moving is commanded to stop first.
         if command is None and not self._moving:
             return
-        speed, rate = self._told = command or (0.0, 0.0)
+        speed, rate = self._last_command = command or (0.0, 0.0)
         self._moving = command is not None or self._goal is not None
         message = TwistStamped()
         message.header.stamp = self.get_clock().now().to_msg()
@@ -100,40 +99,47 @@ class PathSelectorNode(Node):
         self._commands.publish(message)
 
     def _command(self) -> tuple[float, float] | None:
-        """Speed [m/s] and yaw rate [rad/s] to tell; None to stop."""
+        """Speed [m/s] and yaw rate [rad/s] to publish; None to stop."""
         if self._goal is None or self._motion is None:
             return None
         goal, goal_frame = self._goal
-        left = float(np.linalg.norm(goal - self._motion.position[:2]))
-        if left < self.settings.goal_tolerance:
+        distance = float(np.linalg.norm(goal - self._motion.position[:2]))
+        if distance < self.settings.goal_tolerance:
             self._goal = None
-            self.health.report(PART, OK, f"the goal is reached, {left:.2f} m away", reason="reached")
+            self.health.report(PART, OK, f"the goal is reached: {distance:.2f} m away", reason="reached")
             return None
-        # Stamps alone do not tell: where odometry stops, so do the candidates, and neither grows older by the other.
-        silence = time.monotonic() - self._moved_at
+        # Stamps alone do not show this: without odometry there are no new candidates either, and their ages stay equal.
+        silence = time.monotonic() - self._odometry_arrival
         if silence > self.settings.timeout:
-            return self._stopped(f"no odometry for {silence:.1f} s: nobody knows where the robot is", "silent")
+            self._report_stop(f"no odometry for {silence:.1f} s: the position is unknown", "silent")
+            return None
         if self._candidates is None:
-            return self._stopped("no candidates yet: does the predictor run with `candidates`?", "none")
+            self._report_stop("no candidates received: is the predictor running with `candidates`?", "none")
+            return None
         stamp, frame, fields = self._candidates
         if goal_frame.lstrip("/") not in ("", frame.lstrip("/")):
-            return self._stopped(f"the goal is in frame {goal_frame!r}, candidates are in {frame!r}", "frame")
+            self._report_stop(f"the goal is in frame {goal_frame!r}, candidates are in {frame!r}", "frame")
+            return None
         age = (self._motion.stamp - stamp) * NANOSECOND
         if abs(age) > self.settings.timeout:
-            return self._stopped(f"candidates are {age:.2f} s old, at most {self.settings.timeout:g} s count", "late")
+            self._report_stop(f"candidates are {age:.2f} s old, the limit is {self.settings.timeout:g} s", "late")
+            return None
         try:
-            if self._ways is None and self._map is not None:
-                self._ways = cost_to_go(*self._map, goal, radius=self.settings.robot_radius)
-            best = select_candidate(fields, self._motion.position[:2], goal, self.weights, self._ways, self._told)
+            if self._cost_to_go is None and self._map is not None:
+                self._cost_to_go = cost_to_go(*self._map, goal, radius=self.settings.robot_radius)
+            position = self._motion.position[:2]
+            best = select_candidate(fields, position, goal, self.weights, self._cost_to_go, self._last_command)
         except ValueError as error:
-            return self._stopped(str(error), "fields")
+            self._report_stop(str(error), "fields")
+            return None
         if best is None:
-            return self._stopped("no candidate is feasible", "infeasible")
-        self.health.report(PART, OK, "driving to the goal", reason="driving", distance_left_m=f"{left:.2f}")
+            self._report_stop("no candidate is feasible", "infeasible")
+            return None
+        self.health.report(PART, OK, "driving to the goal", reason="driving", **{DISTANCE: f"{distance:.2f}"})
         return float(fields["speed"][best]), float(fields["yaw_rate"][best])
 
-    def _stopped(self, why: str, reason: str) -> None:
-        self.health.report(PART, WARN, f"stopped: {why}", reason=reason)
+    def _report_stop(self, cause: str, reason: str) -> None:
+        self.health.report(PART, WARN, f"stopped: {cause}", reason=reason)
 
 
 def main(arguments: list[str] | None = None) -> int:

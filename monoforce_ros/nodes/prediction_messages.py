@@ -1,4 +1,4 @@
-"""A Prediction → the messages that show it: height map, terrain, path, contact forces."""
+"""A Prediction → messages: height map, terrain, path, contact forces."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def height_map(prediction: Prediction, frame_id: str) -> bytes:
 
 
 def terrain_cloud(prediction: Prediction, frame_id: str) -> bytes:
-    """``sensor_msgs/PointCloud2``: every cell with all channels; heights are z in the odometry frame."""
+    """``sensor_msgs/PointCloud2``: every cell with all channels; heights are z coordinates in the odometry frame."""
     terrain, transform = prediction.terrain, prediction.motion.odometry_from_terrain
     points = cell_points(terrain, transform)
     return encoding.point_cloud(
@@ -38,7 +38,7 @@ def terrain_cloud(prediction: Prediction, frame_id: str) -> bytes:
 
 
 def path(prediction: Prediction, frame_id: str, time_step: float) -> bytes:
-    """``nav_msgs/Path`` every ``time_step`` [s], as far as the map reaches; poses carry their own time."""
+    """``nav_msgs/Path`` every ``time_step`` [s], up to the edge of the map; each pose has its own stamp."""
     times = prediction.rollout.times.double().numpy()
     stride = max(1, round(time_step / (times[1] - times[0])))
     chosen = np.arange(0, max(1, usable_steps(prediction)), stride)
@@ -53,7 +53,7 @@ def path(prediction: Prediction, frame_id: str, time_step: float) -> bytes:
 def contact_forces(prediction: Prediction, robot: RobotModel, frame_id: str) -> bytes:
     """``visualization_msgs/MarkerArray``: contact points and forces along the path, coloured by size.
 
-    ``contact_forces`` are lines as long as the force in units of the robot's weight, ``contact_points`` their feet.
+    ``contact_forces`` are lines, as long as the force in units of the robot's weight, that start at ``contact_points``.
     """
     weight = float(robot.mass.mean()) * 9.81
     contacts = [contact_points(prediction, robot, step) for step in force_steps(prediction)]

@@ -1,4 +1,4 @@
-"""Starting and ending a node's process."""
+"""Start and end of a node's process."""
 
 from __future__ import annotations
 
@@ -10,20 +10,24 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 
 
-def run_node(
-    make_node: Callable[[], Node],
+def _spin(node: Node, executor: SingleThreadedExecutor) -> None:
+    executor.spin()
+
+
+def run_node[NodeType: Node](
+    make_node: Callable[[], NodeType],
     arguments: list[str] | None = None,
-    work: Callable[[Node, SingleThreadedExecutor], None] = lambda node, executor: executor.spin(),
+    work: Callable[[NodeType, SingleThreadedExecutor], None] = _spin,
 ) -> int:
     """Spin a node until SIGINT or SIGTERM.
 
     Args:
-        make_node: makes it, once ROS is there.
+        make_node: creates the node; called after rclpy is initialised.
         arguments: of the command line.
-        work: spins it, where it has more to do than to wait for callbacks.
+        work: spins the node; the default only processes callbacks.
 
     Returns:
-        exit status: 0 after an ordinary end, 1 where the node could not start (its ``ValueError`` or ``OSError`` is
+        exit status: 0 after a regular end, 1 if the node could not start (its ``ValueError`` or ``OSError`` is
         printed as one line).
     """
     rclpy.init(args=arguments)
@@ -40,7 +44,7 @@ def run_node(
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except Exception:
-        # A signal ends the context at once; what a callback or the executor asks of it after that fails.
+        # A signal shuts the context down at once; a callback or the executor that uses it afterwards fails.
         if rclpy.ok():
             raise
     finally:

@@ -1,22 +1,22 @@
-"""RateLimiter: which inputs are used where more come than the largest rate allows."""
+"""RateLimiter: selects which inputs are used if they arrive faster than the largest rate allows."""
 
 from __future__ import annotations
 
 _EARLY = 0.25
-"""Share of a period by which an input may come before its time: sensors jitter about their rate."""
+"""Share of a period by which an input may be early: sensors jitter about their rate."""
 
 
 class RateLimiter:
-    """Leaves inputs out rather than make them wait: what is used is fresh.
+    """Skips inputs instead of delaying them, so that those in use are fresh.
 
-    Sleeping between inputs would delay each by what the one before came late.
+    Sleeping between inputs would add the lateness of each input to the next one.
     """
 
-    def __init__(self):
+    def __init__(self) -> None:
         self._next = 0.0
 
     def due(self, now: float, rate: float) -> bool:
-        """Whether an input that came at ``now`` [s] is to be used, with at most ``rate`` [Hz] of them on average."""
+        """Whether to use an input that arrived at ``now`` [s], for at most ``rate`` [Hz] inputs on average."""
         period = 1.0 / rate
         if now < self._next - _EARLY * period:
             return False

@@ -1,10 +1,11 @@
-"""simulator: a MuJoCo robot in the loop; takes commands and publishes what its sensors say, in real time."""
+"""simulator: a MuJoCo robot in the loop; takes commands and publishes sensor data in real time."""
 
 from __future__ import annotations
 
 import argparse
 import sys
 import time
+from typing import Any
 
 import rclpy
 from geometry_msgs.msg import Twist, TwistStamped
@@ -21,26 +22,28 @@ from monoforce_ros.synthetic import GROUNDS, LiveSettings, LiveWorld
 
 _ODOMETRY_RATE = 50.0
 _TICK = 0.01
-_TIMEOUT = 0.5
-"""Age at which a command no longer counts and the robot stops, as real bases do [s]."""
-_LATE = 0.5
-"""How far the simulation may fall behind before it gives the time up [s]."""
+_COMMAND_TIMEOUT = 0.5
+"""Commands older than this are ignored and the robot stops, as real bases do [s]."""
+_MAXIMUM_LAG = 0.5
+"""By how much the simulation may lag behind real time before the lag is discarded [s]."""
 
 
 def _arguments(arguments: list[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="simulator",
-        description="Drive a simulated robot through ROS: cmd_vel in, odom and points, and images, out.",
+        description="Drive a simulated robot through ROS: cmd_vel in; odom, points and images out.",
     )
-    parser.add_argument("--seed", type=int, default=12, help="of the world (%(default)s)")
-    parser.add_argument("--robot", default="husky", metavar="NAME|FILE.yaml", help="(%(default)s)")
-    parser.add_argument("--ground", choices=GROUNDS, default="mixed", help="(%(default)s)")
-    parser.add_argument("--flat", action="store_true", help="level ground with nothing on it")
-    parser.add_argument("--course", action="store_true", help="a test track: a wall in the way, behind "
-                        "it a band of tall grass")  # fmt: skip
-    parser.add_argument("--lidar-rate", type=float, default=5.0, metavar="HZ", help="0 for none (%(default)s)")
-    parser.add_argument("--camera-rate", type=float, default=0.0, metavar="HZ", help="0 for none (%(default)s)")
-    parser.add_argument("--duration", type=float, default=float("inf"), metavar="S", help="to simulate (until stopped)")
+    parser.add_argument("--seed", type=int, default=12, help="seed of the world (%(default)s)")
+    parser.add_argument("--robot", default="husky", metavar="NAME|FILE.yaml", help="robot name or file (%(default)s)")
+    parser.add_argument("--ground", choices=GROUNDS, default="mixed", help="type of ground (%(default)s)")
+    parser.add_argument("--flat", action="store_true", help="level ground without obstacles")
+    parser.add_argument("--course", action="store_true", help="test course: a wall across the way and a "
+                        "band of tall grass behind it")  # fmt: skip
+    parser.add_argument("--lidar-rate", type=float, default=5.0, metavar="HZ", help="0 disables it (%(default)s)")
+    parser.add_argument("--camera-rate", type=float, default=0.0, metavar="HZ", help="0 disables it (%(default)s)")
+    parser.add_argument(
+        "--duration", type=float, default=float("inf"), metavar="S", help="simulated time (default: until stopped)"
+    )
     options = parser.parse_args(arguments)
     for name in ("lidar_rate", "camera_rate"):
         if not 0.0 <= getattr(options, name) <= 50.0:
@@ -49,14 +52,14 @@ def _arguments(arguments: list[str]) -> argparse.Namespace:
 
 
 class SimulatorNode(Node):
-    """Publishes a live world's sensors and obeys the newest command."""
+    """Publishes the sensor data of a live world and executes the newest command."""
 
     def __init__(self, world: LiveWorld, options: argparse.Namespace):
         super().__init__("simulator")
         self._world = world
         self._options = options
         self._outputs: dict[str, Publisher] = {}
-        self._commanded = float("-inf")
+        self._last_command = float("-inf")
         self._subscription = AdaptiveSubscription(
             self,
             "cmd_vel",
@@ -64,7 +67,7 @@ class SimulatorNode(Node):
             self._on_command,
             depth=5,
         )
-        self._next = dict.fromkeys(("odometry", "cloud", "images"), 0.0)
+        self._next_output = dict.fromkeys(("odometry", "cloud", "images"), 0.0)
 
     def _on_command(self, message: Twist | TwistStamped) -> None:
         try:
@@ -72,21 +75,21 @@ class SimulatorNode(Node):
         except decoding.MessageError as error:
             self.get_logger().warning(f"cmd_vel: {error}", throttle_duration_sec=2.0)
             return
-        self._commanded = self._world.time
+        self._last_command = self._world.time
         self._world.simulation.drive(float(speed), float(rate))
 
-    def advance(self, until: float, stamp_of: float) -> None:
-        """Simulate up to a time, publishing what is due.
+    def advance(self, until: float, origin: float) -> None:
+        """Simulate up to a time and publish the outputs that are due.
 
         Args:
             until: simulated time [s].
-            stamp_of: time of the node's clock at simulated time zero [s].
+            origin: time of the node's clock at simulated time zero [s].
         """
         world = self._world
-        if world.time - self._commanded > _TIMEOUT:
+        if world.time - self._last_command > _COMMAND_TIMEOUT:
             world.simulation.drive(0.0, 0.0)
         world.advance(until)
-        stamp = round((stamp_of + world.time) * 1e9)
+        stamp = round((origin + world.time) * 1e9)
         if self._due("cloud", self._options.lidar_rate):
             self._publish("points", world.cloud(stamp))
         if self._due("images", self._options.camera_rate):
@@ -97,18 +100,19 @@ class SimulatorNode(Node):
             self._publish("odom", world.odometry(stamp))
 
     def _due(self, name: str, rate: float) -> bool:
-        if not rate or self._world.time < self._next[name] - 1e-6:
+        if not rate or self._world.time < self._next_output[name] - 1e-6:
             return False
-        self._next[name] = max(self._next[name] + 1.0 / rate, self._world.time)
+        self._next_output[name] = max(self._next_output[name] + 1.0 / rate, self._world.time)
         return True
 
-    def _publish(self, topic: str, message: object | None) -> None:
+    def _publish(self, topic: str, message: Any | None) -> None:
+        """Publish a message of the bag builders, whose types the rosbags library creates at run time."""
         if message is None or not self.context.ok():
             return
-        kind = message.__msgtype__
+        name = message.__msgtype__
         if topic not in self._outputs:
-            self._outputs[topic] = self.create_publisher(message_class(kind), topic, 5)
-        self._outputs[topic].publish(bytes(type_store().serialize_cdr(message, kind)))
+            self._outputs[topic] = self.create_publisher(message_class(name), topic, 5)
+        self._outputs[topic].publish(bytes(type_store().serialize_cdr(message, name)))
 
 
 def _settings(options: argparse.Namespace) -> LiveSettings:
@@ -146,18 +150,18 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _run(node: SimulatorNode, executor: SingleThreadedExecutor, world: LiveWorld, duration: float) -> None:
-    """Keep the simulated time at the heels of the real one."""
+    """Keep the simulated time in step with real time."""
     began = time.monotonic()
     origin = node.get_clock().now().nanoseconds * 1e-9
     while rclpy.ok() and world.time < duration:
         now = time.monotonic() - began
-        if now - world.time > _LATE:
-            # Too slow a computer: the world falls behind instead of jumping, and its stamps with it.
+        if now - world.time > _MAXIMUM_LAG:
+            # The computer is too slow: the world and its stamps fall behind instead of jumping.
             node.get_logger().warning("the simulation is slower than real time", throttle_duration_sec=5.0)
             began += now - world.time - _TICK
             origin += now - world.time - _TICK
         if (mishap := world.simulation.mishap()) is not None:
-            node.get_logger().error(f"the robot has come to grief: {mishap}")
+            node.get_logger().error(f"the simulation ended early: {mishap}")
             return
         if now > world.time:
             node.advance(world.time + _TICK, origin)

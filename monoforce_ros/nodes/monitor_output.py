@@ -1,4 +1,4 @@
-"""GapOutput: what the node says of how far its predictions have been off."""
+"""MonitorOutput: publishes the running error of past predictions."""
 
 from __future__ import annotations
 
@@ -14,38 +14,40 @@ from monoforce_ros.prediction import HORIZONS, GapSummary, LiveGap, Prediction, 
 PART = "live gap"
 
 
-class GapOutput:
-    """Compares earlier predictions with what the robot did, and publishes the running error."""
+class MonitorOutput:
+    """Compares past predictions with the measured motion, and publishes and reports the running error."""
 
     def __init__(self, node: Node, predictor: Predictor, health: Health):
         self._node, self._health = node, health
         self._gap = LiveGap(predictor)
-        self._began_anew = False
+        self._clear_requested = False
         self._publisher = node.create_publisher(Float32MultiArray, "predicted/live_gap", 1)
 
     def clear(self) -> None:
-        """Forget everything, for time began anew; may be called from any thread."""
-        self._began_anew = True
+        """Discard everything after a backward time jump; may be called from any thread."""
+        self._clear_requested = True
 
     def update(self, prediction: Prediction, motion: MotionTrack, commands: CommandTrack) -> None:
-        """Keep a prediction; compare an earlier one whose time has passed."""
-        if self._began_anew:
-            self._began_anew = False
+        """Keep a prediction, and compare a past one whose horizon has elapsed."""
+        if self._clear_requested:
+            self._clear_requested = False
             self._gap.clear()
         self._gap.remember(prediction)
         if self._gap.compare(motion, commands) is None:
             return
         found = self._gap.summary()
-        where = f", most when {found.worst}" if found.worst else ""
+        where = f", largest when {found.worst}" if found.worst else ""
         if found.excessive:
             message = (
                 f"predictions are {found.position[1]:.2f} m off after 2 s{where}; record a bag and run `diagnose` to "
-                "see what the model is missing"
+                "find the missing effect"
             )
             self._health.report(PART, WARN, message, reason="excessive", **_figures(found))
         else:
-            size = f"{found.position[1]:.2f} m off after 2 s" if np.isfinite(found.position[1]) else "not known at 2 s"
-            self._health.report(PART, OK, f"predictions are {size}{where}", reason="ok", **_figures(found))
+            message = f"predictions are {found.position[1]:.2f} m off after 2 s{where}"
+            if not np.isfinite(found.position[1]):
+                message = "no prediction compared at 2 s yet"
+            self._health.report(PART, OK, message, reason="ok", **_figures(found))
         if self._node.context.ok():
             self._publisher.publish(messages.live_gap(found))
 
@@ -55,6 +57,6 @@ def _figures(found: GapSummary) -> dict[str, str]:
     for i, horizon in enumerate(HORIZONS):
         if np.isfinite(found.position[i]):
             figures[f"median error at {horizon:g} s [m]"] = f"{found.position[i]:.3f}"
-            figures[f"of which noise at {horizon:g} s [m]"] = f"{found.floor[i]:.3f}"
+            figures[f"noise floor at {horizon:g} s [m]"] = f"{found.floor[i]:.3f}"
             figures[f"median heading error at {horizon:g} s [deg]"] = f"{np.degrees(found.heading[i]):.1f}"
     return figures

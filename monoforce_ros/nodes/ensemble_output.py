@@ -1,4 +1,4 @@
-"""SpreadOutput: how far each prediction may be off, published with it."""
+"""EnsembleOutput: publishes the uncertainty of each prediction, from an ensemble of rollouts."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from monoforce_ros.nodes import candidate_messages as messages
 from monoforce_ros.prediction import EnsembleSettings, Prediction, Predictor, spread
 
 
-class SpreadOutput:
+class EnsembleOutput:
     """Rolls out an ensemble of each prediction.
 
     Raises:
@@ -23,20 +23,20 @@ class SpreadOutput:
 
     def __init__(self, node: Node, predictor: Predictor, settings: SimpleNamespace):
         self._node, self._predictor = node, predictor
-        self._ensemble = EnsembleSettings()
+        self._settings = EnsembleSettings()
         self.apply(settings)
         self._table = node.create_publisher(PointCloud2, "predicted/path_spread", 1)
         self._band = node.create_publisher(MarkerArray, "predicted/path_band", 1)
 
     def apply(self, settings: SimpleNamespace) -> None:
-        """Take settings that may have changed while the node runs."""
+        """Apply settings that may have changed while the node runs."""
         scale = settings.ensemble_scale * EnsembleSettings.scale
-        self._ensemble = replace(self._ensemble, members=settings.ensemble, scale=scale)
+        self._settings = replace(self._settings, members=settings.ensemble, scale=scale)
         self._time_step = settings.path_time_step
 
     def publish(self, prediction: Prediction, twists: np.ndarray, frame_id: str) -> None:
         """Publish the spread of a prediction under its commands ``[history + T, 2]``."""
-        found = spread(self._predictor, prediction, twists, self._ensemble)
+        found = spread(self._predictor, prediction, twists, self._settings)
         if self._node.context.ok():
             self._table.publish(messages.spread_table(prediction, found, frame_id, self._time_step))
             self._band.publish(messages.spread_band(prediction, found, frame_id, self._time_step))

@@ -1,0 +1,100 @@
+"""SensorDecoder: undecoded sensor messages → an Observation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+
+from monoforce_ros.core import NANOSECOND, CameraModel, MotionTrack, transform_points
+from monoforce_ros.messages import MessageError, decoding
+from monoforce_ros.nodes.frames import SensorFrames
+from monoforce_ros.nodes.health import ERROR, OK, Health
+from monoforce_ros.nodes.inputs import Received
+from monoforce_ros.perception import Observation
+
+LIDAR = "lidar"
+"""Part of the diagnostics for the point clouds; every other sensor is a camera."""
+_AGE = "age relative to the newest sensor [s]"
+
+
+class SensorDecoder:
+    """Decodes the sensor messages of a prediction with their calibrations and poses.
+
+    Args:
+        frames: poses of the sensors on the robot.
+        health: where unusable messages are reported.
+    """
+
+    def __init__(self, frames: SensorFrames, health: Health):
+        self._frames, self._health = frames, health
+        self._info_topics: dict[str, str] = {}
+        self._cameras: dict[str, CameraModel | MessageError] = {}
+
+    def add_camera(self, part: str, info_topic: str) -> None:
+        """Name the CameraInfo topic of a camera, for error messages."""
+        self._info_topics[part] = info_topic
+
+    def set_camera_info(self, part: str, message: CameraInfo) -> None:
+        """Use a calibration from now on."""
+        try:
+            self._cameras[part] = decoding.decode_camera_info(message)
+        except MessageError as error:
+            # Reported with the next image, which cannot be used.
+            self._cameras[part] = error
+
+    def observe(
+        self, stamp: int, received: Mapping[str, Received], track: MotionTrack, *, maximum_gap: float
+    ) -> Observation | None:
+        """Decode sensor messages, report errors on their part, and return None if no usable data remain.
+
+        Data from before ``stamp`` are transformed to the robot's pose at ``stamp``.
+
+        Args:
+            stamp: of the observation [ns].
+            received: messages by part; ``odometry`` stands for an observation without sensors.
+            track: measured motion.
+            maximum_gap: largest distance in time to measured motion [s].
+        """
+        cloud: np.ndarray | None = None
+        images: dict[str, np.ndarray] = {}
+        cameras: dict[str, CameraModel] = {}
+        poses: dict[str, np.ndarray] = {}
+        for part, entry in received.items():
+            if part == "odometry":
+                continue
+            try:
+                pose = self._frames.base_from(entry.message.header.frame_id)
+                pose = track.base_between(entry.stamp, stamp, maximum_gap=maximum_gap) @ pose
+                if part == LIDAR:
+                    cloud = transform_points(pose, decoding.decode_cloud(entry.message))
+                else:
+                    images[part], cameras[part] = self._image(part, entry.message)
+                    poses[part] = pose
+            except ValueError as error:
+                self._health.report(part, ERROR, str(error), reason=str(error)[:40])
+                continue
+            kind = "point clouds" if part == LIDAR else "images"
+            age = (stamp - entry.stamp) * NANOSECOND
+            self._health.report(part, OK, f"receiving {kind}", **{_AGE: f"{age:.3f}"})
+        if not received.keys() <= {"odometry"} and cloud is None and not images:
+            return None
+        return Observation(stamp, cloud, images, cameras, poses)
+
+    def _image(self, part: str, message: Image | CompressedImage) -> tuple[np.ndarray, CameraModel]:
+        camera = self._cameras.get(part)
+        if isinstance(camera, MessageError):
+            raise camera
+        if camera is None:
+            raise MessageError(
+                f"no usable CameraInfo on {self._info_topics[part]}, which the camera needs; set its topic in "
+                "`camera_info_topics`"
+            )
+        image = decoding.decode_image(message)
+        if image.shape[:2] != (camera.height, camera.width):
+            raise MessageError(
+                f"images are {image.shape[1]} × {image.shape[0]} px, but CameraInfo says {camera.width} × "
+                f"{camera.height} px"
+            )
+        return image, camera
