@@ -332,6 +332,44 @@ def test_held_out_recordings_with_the_same_name_stay_apart(late_robot, late_agai
     assert all(table["position_2s"]["after"] is None for table in tables.values())
 
 
+def benchmark_row(injected, estimated, loss=9.0, **more):
+    """A row of ``benchmarks/hidden_effects.py`` with one effect that was named as it is."""
+    (name, truth), (named, values) = injected, estimated
+    gap = {"horizon_s": 2.0, "before": 0.2, "after": 0.05, "noise": 0.01, "closed": 0.8}
+    row = {
+        "kind": "single", "verdict": "effect_found", "truth": [{"name": name, "parameters": truth}], "seconds": 9.0,
+        "effects": [{"name": named, "parameters": {key: {"value": value} for key, value in values.items()}}],
+        "numbers": {"loss_before": loss}, "gap": {"position_2s": gap}, "ground": "flat", "noise": "usual", "case": name,
+    }  # fmt: skip
+    return row | more
+
+
+def test_figures_of_the_benchmark_say_what_they_are_conditional_on(tmp_path):
+    import hidden_effects
+
+    friction = benchmark_row(("friction_scale", {"factor": 0.25}), ("friction_scale", {"factor": 0.35}))
+    delay = benchmark_row(("command_delay", {"delay": 0.4}), ("command_delay", {"delay": 0.42}))
+    missed = benchmark_row(("drive_gain", {"gain": 0.8}), ("viscous_drag", {"coefficient": 99.0}))
+    weak = benchmark_row(("drive_gain", {"gain": 0.99}), ("drive_gain", {"gain": 0.5}), loss=1.0)
+    failed = missed | {"verdict": "not_identifiable", "effects": [], "numbers": {}, "gap": {}}
+    found = hidden_effects.scores([friction, delay, missed, weak, failed])
+    # An effect without a diagnosis is missed, and friction is part of the error.
+    assert found["singles_named_first"] == {"share": 0.5, "count": 2, "of": 4}
+    assert found["not_diagnosed"]["count"] == 1
+    assert found["parameter_error"] == {"median": pytest.approx(0.225), "count": 2, "of": 4}
+    text = hidden_effects.section([friction, delay, missed, weak, failed], found, None, tmp_path)
+    assert "the 2 strong single effects that were correctly named first" in text
+    assert "1 weak ones are not counted" in text
+    # Rows of reports from before, and where no effect was added.
+    nothing = {"before": 0.3, "after": None, "noise": 0.01}
+    row = {"verdict": "no_improvement", "effects": [], "gap": {"position_2s": nothing}, "baselines": {}}
+    row["baselines"] = dict.fromkeys(("refit", "network", "sindy"), 0.2)
+    assert hidden_effects._baseline_scores([row])["diagnose"] == {"error": 0.3, "closed": 0.0}
+    old = benchmark_row(("viscous_drag", {}), ("quadratic_drag", {}))
+    old["effects"][0]["rivals"] = ["viscous_drag"]
+    assert hidden_effects.named_as_other_drag(old)
+
+
 def test_a_commissioned_model_predicts_the_healthy_robot(husky, tmp_path):
     injected = (
         ("friction_scale", {"factor": 0.7}),
