@@ -1,8 +1,11 @@
-"""Baselines for ``hidden_effects.py``: other ways to close a gap, on the same held-out blocks of the same drives.
+"""Baselines for ``hidden_effects.py``: other ways to reduce the error, cross-validated on the same folds.
 
-``refit``: the parameters that commissioning fits, fitted once more. ``network``: a small neural network that learns the
-model's error after a window from how the window begins. ``sindy``: accelerations by sparse regression (pysindy)
+``refit``: the parameters of commissioning, fitted again. ``network``: a small neural network that predicts the model's
+error at the end of a window from its start state and commands. ``sindy``: accelerations by sparse regression (pysindy)
 instead of the physics, integrated from the start of each window.
+
+Baselines are trained and tested on all windows of a fold, also on those that reach into the next block; ``diagnose`` is
+tested only on windows that end within their block.
 """
 
 from __future__ import annotations
@@ -25,7 +28,7 @@ _HISTORY = 0.5
 
 
 def baseline_errors(
-    drive: Evidence, data: EvidenceWindows, robot: RobotModel, scale: np.ndarray
+    evidence: Evidence, data: EvidenceWindows, robot: RobotModel, scale: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Residuals ``[W, 3]`` at the last sample of each window, of every baseline trained on the other fold."""
     predictions = Predictions(robot, data)
@@ -33,15 +36,15 @@ def baseline_errors(
     folds = folds_of(data.starts)
     results = {name: before.copy() for name in ("refit", "network", "sindy")}
     features = _features(data)
-    for left in np.unique(folds):
-        seen, held_out = folds != left, folds == left
-        train, test = replace(data, starts=data.starts[seen]), replace(data, starts=data.starts[held_out])
-        own = dict(robot.effects)
-        start = tuple((name, dict(own.get(name, values))) for name, values in COMMISSIONED)
+    for fold in np.unique(folds):
+        fitted, held_out = folds != fold, folds == fold
+        train, test = replace(data, starts=data.starts[fitted]), replace(data, starts=data.starts[held_out])
+        present = dict(robot.effects)
+        start = tuple((name, dict(present.get(name, values))) for name, values in COMMISSIONED)
         fit = fit_effects(Predictions(robot, train), [start], scale, iterations=6)
         results["refit"][held_out] = Predictions(robot, test).residuals([fit.effects])[0][:, -1]
-        results["network"][held_out] = before[held_out] - _network(features[seen], before[seen], features[held_out])
-        results["sindy"][held_out] = _sindy(drive, train, test)
+        results["network"][held_out] = before[held_out] - _network(features[fitted], before[fitted], features[held_out])
+        results["sindy"][held_out] = _sindy(evidence, train, test)
     return results
 
 
@@ -49,12 +52,12 @@ def _features(data: EvidenceWindows) -> np.ndarray:
     """Start velocity and commands around each window, ``[W, F]``."""
     _, _, linear, angular = sample_motion(data.motion, data.starts)
     stamps = data.starts[:, None] + (np.arange(-2, 9) * 0.25e9).astype(np.int64)
-    told = data.commands.sample(stamps).reshape(len(data.starts), -1)
-    return np.concatenate([linear[:, :2], angular[:, 2:], told], axis=1)
+    commanded = data.commands.sample(stamps).reshape(len(data.starts), -1)
+    return np.concatenate([linear[:, :2], angular[:, 2:], commanded], axis=1)
 
 
-def _network(features: np.ndarray, errors: np.ndarray, asked: np.ndarray) -> np.ndarray:
-    """Errors that a small network expects, ``[A, 3]``."""
+def _network(features: np.ndarray, errors: np.ndarray, queries: np.ndarray) -> np.ndarray:
+    """Errors predicted by a small network, ``[Q, 3]``."""
     torch.manual_seed(0)
     mean, spread = features.mean(axis=0), features.std(axis=0) + 1e-6
     size = errors.std(axis=0) + 1e-6
@@ -70,14 +73,14 @@ def _network(features: np.ndarray, errors: np.ndarray, asked: np.ndarray) -> np.
         torch.nn.functional.smooth_l1_loss(net(x), y).backward()
         optimiser.step()
     with torch.no_grad():
-        return net(torch.as_tensor((asked - mean) / spread, dtype=torch.float32)).numpy() * size
+        return net(torch.as_tensor((queries - mean) / spread, dtype=torch.float32)).numpy() * size
 
 
-def _sindy(drive: Evidence, train: EvidenceWindows, test: EvidenceWindows) -> np.ndarray:
+def _sindy(evidence: Evidence, train: EvidenceWindows, test: EvidenceWindows) -> np.ndarray:
     """Residuals of predictions by sparse regression of the accelerations, ``[W, 3]``."""
     import pysindy
 
-    motion = drive.smoothed.motion
+    motion = evidence.smoothed.motion
 
     def pieces(data: EvidenceWindows) -> tuple[list[np.ndarray], list[np.ndarray]]:
         count = round(data.horizon / _STEP) + 1
@@ -86,7 +89,7 @@ def _sindy(drive: Evidence, train: EvidenceWindows, test: EvidenceWindows) -> np
         states = np.stack([linear[..., 0], angular[..., 2]], axis=-1)
         return list(states), list(data.commands.sample(stamps))
 
-    states, told = pieces(train)
+    states, commanded = pieces(train)
     model = pysindy.SINDy(
         optimizer=pysindy.STLSQ(threshold=0.05, alpha=0.05),
         feature_library=pysindy.PolynomialLibrary(degree=2),
@@ -94,7 +97,7 @@ def _sindy(drive: Evidence, train: EvidenceWindows, test: EvidenceWindows) -> np
     )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        model.fit(states, t=_STEP, u=told)
+        model.fit(states, t=_STEP, u=commanded)
     starts, commands = pieces(test)
     now = np.array([state[0] for state in starts])
     commands = np.array(commands)

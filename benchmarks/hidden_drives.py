@@ -1,4 +1,4 @@
-"""The drives of ``hidden_effects.py``: what is hidden in each, and how it is recorded."""
+"""The recordings of ``hidden_effects.py``: the faults injected in each, and how it is made."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ PAIRS = (
     ("actuator_deadband:0.12", "command_delay:0.3"),
     ("actuator_saturation:0.45", "turning_scrub:1.6"),
 )
-OUTSIDERS = (
+OUT_OF_CATALOGUE = (
     "fading_drive:40", "fading_drive:20", "gusting_wind:300", "gusting_wind:force=500,period=6",
     "eccentric_wheel:0.03", "eccentric_wheel:0.06", "sticky_turn:0.4", "sticky_turn:0.8", "speed_pull:200",
     "speed_pull:400",
@@ -50,10 +50,10 @@ OUTSIDERS = (
 
 @dataclass(frozen=True)
 class Case:
-    """One drive."""
+    """One recording."""
 
     kind: str
-    """``healthy`` (for commissioning), ``empty``, ``single``, ``pair`` or ``outsider``."""
+    """``healthy`` (for commissioning), ``empty``, ``single``, ``pair`` or ``out-of-catalogue``."""
     hidden: tuple[str, ...]
     ground: str
     """``flat`` or ``hills``."""
@@ -65,21 +65,21 @@ class Case:
     @property
     def name(self) -> str:
         """Of its folder."""
-        shown = "+".join(text.replace(":", "_").replace("=", "").replace(",", "_") for text in self.hidden)
-        return f"{self.kind}-{self.ground}-{self.noise}-{self.seed}" + (f"-{shown}" if shown else "")
+        faults = "+".join(text.replace(":", "_").replace("=", "").replace(",", "_") for text in self.hidden)
+        return f"{self.kind}-{self.ground}-{self.noise}-{self.seed}" + (f"-{faults}" if faults else "")
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of what is hidden."""
+        """Of the injected faults."""
         return tuple(text.partition(":")[0] for text in self.hidden)
 
 
 SEED = 40_000
-"""Before it lie the drives on which thresholds were set and rules chosen; none of the benchmark's is among them."""
+"""Thresholds and rules were chosen on recordings with smaller seeds, none of which is part of the benchmark."""
 
 
 def all_cases(first: int = SEED) -> list[Case]:
-    """Every drive of the benchmark, from a first seed on; no seed is used twice."""
+    """Every recording of the benchmark, from a first seed on; no seed is used twice."""
     cases = [
         Case("healthy", (), ground, noise, first + 9000 + number)
         for number, (ground, noise) in enumerate(
@@ -96,7 +96,7 @@ def all_cases(first: int = SEED) -> list[Case]:
     for number, strengths in enumerate(SINGLES):
         for which, text in enumerate(strengths):
             cases.append(Case("single", (text,), "flat", "usual", seed + 10 * number + which))
-        # The stronger one again: over hills, and with other noise.
+        # The stronger fault again: over hills, and with other noise.
         cases.append(Case("single", (strengths[-1],), "hills", "usual", seed + 10 * number + 5))
         noise = "none" if number % 2 else "rough"
         cases.append(Case("single", (strengths[-1],), "flat", noise, seed + 10 * number + 6))
@@ -104,14 +104,14 @@ def all_cases(first: int = SEED) -> list[Case]:
         Case("pair", pair, "hills" if n % 5 == 4 else "flat", "usual", first + 600 + n) for n, pair in enumerate(PAIRS)
     ]
     cases += [
-        Case("outsider", (text,), "hills" if n % 5 == 4 else "flat", "usual", first + 700 + n)
-        for n, text in enumerate(OUTSIDERS)
+        Case("out-of-catalogue", (text,), "hills" if n % 5 == 4 else "flat", "usual", first + 700 + n)
+        for n, text in enumerate(OUT_OF_CATALOGUE)
     ]
     return cases
 
 
 def record_case(case: Case, folder: Path) -> Path:
-    """Record a drive unless it is there; returns the bag."""
+    """Make the recording unless it exists; returns the bag."""
     from monoforce_ros.synthetic import LidarSettings, TerrainSettings
     from monoforce_ros.synthetic.hidden import parse_hidden
     from monoforce_ros.synthetic.odometry import OdometrySettings

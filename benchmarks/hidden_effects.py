@@ -1,10 +1,10 @@
-"""Hidden effects: MuJoCo drives with physics injected in them, diagnosed as a user would.
+"""Hidden effects: MuJoCo recordings with injected faults, diagnosed as a user would.
 
     scripts/run.sh python benchmarks/hidden_effects.py [--jobs 2] [--json FILE] [--docs docs/discrepancy.md]
 
-Drives are recorded once and kept in the folder, reports too. A healthy drive commissions the nominal robot file; every
-other drive is diagnosed with it: ones with nothing hidden, one effect at two strengths, over hills with a lidar map and
-at other noise, pairs, and effects that the catalogue does not hold. The truth beside a bag is read only to score.
+Recordings and reports are made once and kept in the folder. A recording of the healthy robot commissions the nominal
+robot file; all others are diagnosed with it: without a fault, with one effect at two strengths, over hills with a lidar
+map and at other noise, with pairs, and with out-of-catalogue effects. The truth next to a bag is read only to score.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from tqdm import tqdm
 from monoforce_ros.reporting import figure_png
 
 STRONG = 2.0
-"""Gap over noise and a healthy robot's, root mean squares, from which on an effect is strong enough to matter.
-Half the square of it is the loss per window that goes with it."""
-KINDS = ("empty", "single", "pair", "outsider")
+"""RMS residual over its scale (noise and nominal residual) from which on an effect counts as strong. The corresponding
+robust loss is half its square."""
+KINDS = ("empty", "single", "pair", "out-of-catalogue")
 CLASSES = (frozenset({"command_delay", "pose_clock_offset", "command_clock_offset"}),)
-"""Effects that count as one name; docs/discrepancy.md says why."""
+"""Effects that count as one; docs/discrepancy.md gives the reason."""
 DRAGS = frozenset({"viscous_drag", "quadratic_drag"})
-"""Resistance that grows with speed: a drive at about one speed cannot tell how; reports list the other as a rival."""
+"""Resistance that grows with speed: indistinguishable in a recording at about one speed."""
 
 
 def commissioned(folder: Path, seed: int) -> Path:
-    """The robot file of the healthy drive; made once."""
+    """The robot file commissioned on the healthy recording; made once."""
     from monoforce_ros.discrepancy.cli import main as diagnose
 
     case = next(case for case in all_cases(seed) if case.kind == "healthy")
@@ -47,7 +47,7 @@ def commissioned(folder: Path, seed: int) -> Path:
 
 
 def run_case(case: Case, folder: Path, robot: Path, options: argparse.Namespace) -> dict:
-    """Record and diagnose a drive; returns its row."""
+    """Make and diagnose a recording; returns its row."""
     import torch
 
     from monoforce_ros.discrepancy.cli import main as diagnose
@@ -77,23 +77,24 @@ def run_case(case: Case, folder: Path, robot: Path, options: argparse.Namespace)
 
 
 def with_baselines(result: dict, bag: Path, robot: Path, row: Path) -> dict:
-    """The row with what other methods reach on the same held-out blocks; single effects on level ground alone."""
-    alike = (result["kind"], result["ground"], result["noise"]) == ("single", "flat", "usual")
-    if not alike or "baselines" in result or result["verdict"] == "error":
+    """The row with the errors of other methods, for single effects on level ground only."""
+    comparable = (result["kind"], result["ground"], result["noise"]) == ("single", "flat", "usual")
+    if not comparable or "baselines" in result or result["verdict"] == "error":
         return result
     from baselines import baseline_errors
 
-    from monoforce_ros.discrepancy.bag_diagnosis import read_drive
+    from monoforce_ros.discrepancy import read_evidence
     from monoforce_ros.discrepancy.gap import noise_floor, noisy_motions, residual_scale
     from monoforce_ros.discrepancy.hypothesis import window_starts
     from monoforce_ros.robots import load_robot, read_nominal_residual
 
     model = load_robot(robot)
-    drive, _ = read_drive(bag, model, "lidar" if result["ground"] == "hills" else "flat")
-    starts = window_starts(drive.smoothed.motion, drive.smoothed.stretches, 2.0, 1.0)
-    data = drive.cut(starts, np.array([0.5, 1.0, 1.5, 2.0]))
-    floor = noise_floor(drive.smoothed.motion, noisy_motions(drive.smoothed), data)
-    errors = baseline_errors(drive, data, model, residual_scale(floor, read_nominal_residual(robot, data.samples)))
+    evidence, _ = read_evidence(bag, model, "lidar" if result["ground"] == "hills" else "flat")
+    smoothed = evidence.smoothed
+    starts = window_starts(smoothed.motion, smoothed.stretches, 2.0, 1.0)
+    data = evidence.cut(starts, np.array([0.5, 1.0, 1.5, 2.0]))
+    floor = noise_floor(smoothed.motion, noisy_motions(smoothed), data)
+    errors = baseline_errors(evidence, data, model, residual_scale(floor, read_nominal_residual(robot, data.samples)))
     result["baselines"] = {name: float(np.median(np.hypot(e[:, 0], e[:, 1]))) for name, e in errors.items()}
     row.write_text(json.dumps(result, indent=1))
     return result
@@ -105,9 +106,9 @@ def same(one: str, other: str) -> bool:
 
 
 def gap_over_noise(row: dict) -> float:
-    """Largest median error at 2 s over what the noise alone leaves."""
-    shown = [entry for key, entry in row["gap"].items() if key.endswith("_2s")]
-    return max((entry["before"] / max(entry["noise"], 1e-6) for entry in shown), default=float("nan"))
+    """Largest median error at 2 s over its noise floor."""
+    entries = [entry for key, entry in row["gap"].items() if key.endswith("_2s")]
+    return max((entry["before"] / max(entry["noise"], 1e-6) for entry in entries), default=float("nan"))
 
 
 def named(row: dict) -> list[str]:
@@ -115,48 +116,67 @@ def named(row: dict) -> list[str]:
     return [effect["name"] for effect in row["effects"]] if row["verdict"] == "effect_found" else []
 
 
-def drag_with_its_rival(row: dict) -> bool:
-    """Whether the other drag was named, and the right one said to do as well."""
+def named_as_other_drag(row: dict) -> bool:
+    """Whether the other drag was named, and the right one listed as indistinguishable."""
     truth = row["truth"][0]["name"]
     if not named(row) or not {truth, named(row)[0]} <= DRAGS:
         return False
-    rivals = row["effects"][0]["rivals"]
-    return truth in {rival["name"] if isinstance(rival, dict) else rival for rival in rivals}
+    effect = row["effects"][0]
+    return truth in effect.get("indistinguishable", effect.get("rivals", []))
+
+
+def diagnosed(row: dict) -> bool:
+    """Whether there was a diagnosis at all."""
+    return row["verdict"] not in ("error", "not_identifiable")
+
+
+def strong(row: dict) -> bool:
+    """Whether the effect is strong; without a diagnosis its strength is unknown and it counts as strong, and missed."""
+    return not diagnosed(row) or row["numbers"].get("loss_before", 0.0) >= 0.5 * STRONG**2
+
+
+def parameter_error(row: dict) -> float | None:
+    """Relative error of the largest injected parameter; None where it has no counterpart of the same name.
+
+    ``turning_scrub`` has none: it is injected as axles further apart and estimated as a factor on the track width.
+    """
+    truth, effect = row["truth"][0], row["effects"][0]
+    common = set(effect["parameters"]) & set(truth["parameters"])
+    if effect["name"] != truth["name"] or not common:
+        return None
+    main = max(common, key=lambda key: abs(truth["parameters"][key]))
+    value = truth["parameters"][main]
+    return abs(effect["parameters"][main]["value"] - value) / max(abs(value), 1e-6)
 
 
 def scores(rows: list[dict]) -> dict:
-    """Shares by kind, over drives strong enough to matter where that is said."""
-
-    def strong(row: dict) -> bool:
-        return row["numbers"].get("loss_before", 0.0) >= 0.5 * STRONG**2
-
+    """Shares by kind; every share holds its denominator."""
     singles = [row for row in rows if row["kind"] == "single"]
     matter = [row for row in singles if strong(row)]
     pairs = [row for row in rows if row["kind"] == "pair" and strong(row)]
     empty = [row for row in rows if row["kind"] == "empty"]
-    outsiders = [row for row in rows if row["kind"] == "outsider"]
-    strange = [row for row in outsiders if strong(row)]
+    outside = [row for row in rows if row["kind"] == "out-of-catalogue"]
+    strong_outside = [row for row in outside if strong(row)]
     first = [row for row in matter if named(row) and same(named(row)[0], row["truth"][0]["name"])]
-    drag = [row for row in matter if row not in first and drag_with_its_rival(row)]
+    drag = [row for row in matter if row not in first and named_as_other_drag(row)]
     only = [row for row in first if len(named(row)) == 1]
     both = [row for row in pairs if all(any(same(t["name"], n) for n in named(row)) for t in row["truth"])]
-    errors = []
-    for row in first:
-        values = {key: entry["value"] for key, entry in row["effects"][0]["parameters"].items()}
-        truth = row["truth"][0]["parameters"]
-        if row["effects"][0]["name"] == row["truth"][0]["name"] and set(values) & set(truth):
-            main = max(set(values) & set(truth), key=lambda key: abs(truth[key]))
-            if row["truth"][0]["name"] not in ("turning_scrub", "friction_scale", "payload"):
-                errors.append(abs(values[main] - truth[main]) / max(abs(truth[main]), 1e-6))
-    closed = [closed_share(row) for row in [*first, *both]]
-    closed = [value for value in closed if np.isfinite(value)]
+    errors = [error for row in first if (error := parameter_error(row)) is not None]
+    closed = [value for row in [*first, *both] if np.isfinite(value := closed_share(row))]
 
     def share(part: list, whole: list) -> dict:
         return {"share": len(part) / max(1, len(whole)), "count": len(part), "of": len(whole)}
 
+    def median(values: list[float], whole: list) -> dict:
+        return {
+            "median": float(np.median(values)) if values else float("nan"),
+            "count": len(values),
+            "of": len(whole),
+        }
+
     result = {
         "singles_named_first": share(first, matter),
-        "singles_named_or_as_rival_drag": share([*first, *drag], matter),
+        "singles_named_or_as_other_drag": share([*first, *drag], matter),
         "singles_named_alone": share(only, matter),
         "weak_singles": {
             "count": len(singles) - len(matter),
@@ -164,11 +184,14 @@ def scores(rows: list[dict]) -> dict:
         },
         "pairs_both_named": share(both, pairs),
         "false_alarms": share([row for row in empty if row["verdict"] == "effect_found"], empty),
-        "empty_not_said_to_be": share([row for row in empty if row["verdict"] != "no_discrepancy"], empty),
-        "outsiders_named_as_catalogue": share([row for row in outsiders if named(row)], outsiders),
-        "outsiders_unknown": share([row for row in strange if row["verdict"] == "unknown_effect"], strange),
-        "parameter_error_median": float(np.median(errors)) if errors else float("nan"),
-        "reducible_gap_closed_median": float(np.median(closed)) if closed else float("nan"),
+        "empty_with_another_verdict": share([row for row in empty if row["verdict"] != "no_discrepancy"], empty),
+        "out_of_catalogue_named": share([row for row in outside if named(row)], outside),
+        "out_of_catalogue_unknown": share(
+            [row for row in strong_outside if row["verdict"] == "unknown_effect"], strong_outside
+        ),
+        "not_diagnosed": share([row for row in rows if not diagnosed(row)], rows),
+        "parameter_error": median(errors, matter),
+        "reducible_gap_closed": median(closed, [*matter, *pairs]),
         "seconds_median": float(np.median([row["seconds"] for row in rows])),
         "seconds_most": float(np.max([row["seconds"] for row in rows])),
     }
@@ -179,8 +202,8 @@ def scores(rows: list[dict]) -> dict:
 
 
 def _baseline_scores(rows: list[dict]) -> dict[str, dict]:
-    """Median over drives of the median position error after 2 s, and of the share of the reducible gap closed."""
-    methods = {"model as it was": lambda row: row["gap"]["position_2s"]["before"]}
+    """Median over recordings of the median position error after 2 s, and of the share of the reducible gap closed."""
+    methods = {"nominal model": lambda row: row["gap"]["position_2s"]["before"]}
     titles = {
         "refit": "refit of friction, track width and lag",
         "network": "neural residual",
@@ -188,7 +211,7 @@ def _baseline_scores(rows: list[dict]) -> dict[str, dict]:
     }
     for key, title in titles.items():
         methods[title] = lambda row, key=key: row["baselines"][key]
-    methods["diagnose"] = lambda row: row["gap"]["position_2s"]["after"]
+    methods["diagnose"] = lambda row: _after(row["gap"]["position_2s"])
     table = {}
     for name, error in methods.items():
         errors = np.array([error(row) for row in rows])
@@ -199,30 +222,35 @@ def _baseline_scores(rows: list[dict]) -> dict[str, dict]:
     return table
 
 
+def _after(entry: dict) -> float:
+    """Error after the diagnosis: where no effect was added, that of the nominal model."""
+    return entry["before"] if entry["after"] is None else entry["after"]
+
+
 def closed_share(row: dict) -> float:
-    """Of the reducible gap after 2 s, in the metric that was furthest off before; NaN where nothing was found."""
-    shown = [entry for key, entry in row["gap"].items() if key.endswith("_2s") and "closed" in entry]
-    if not shown:
+    """Share of the reducible gap after 2 s in the metric with the largest error before; NaN where none was added."""
+    entries = [entry for key, entry in row["gap"].items() if key.endswith("_2s") and "closed" in entry]
+    if not entries:
         return float("nan")
-    return max(shown, key=lambda entry: entry["before"] / max(entry["noise"], 1e-6))["closed"]
+    return max(entries, key=lambda entry: entry["before"] / max(entry["noise"], 1e-6))["closed"]
 
 
 def confusion(rows: list[dict]) -> dict[str, Counter]:
-    """By hidden effect of single drives and outsiders: what was said first."""
+    """By injected effect, pairs left out: the effect that was named first, or else the verdict."""
     table: dict[str, Counter] = {}
     for row in rows:
         if row["kind"] == "pair":
             continue
         truth = row["truth"][0]["name"] if row["truth"] else "nothing"
-        said = named(row)[0] if named(row) else row["verdict"]
-        table.setdefault(truth, Counter())[said] += 1
+        answer = named(row)[0] if named(row) else row["verdict"]
+        table.setdefault(truth, Counter())[answer] += 1
     return table
 
 
 def print_rows(rows: list[dict]) -> None:
-    """One line a drive."""
+    """One line for each recording."""
     for row in sorted(rows, key=lambda row: (row["kind"], row["case"])):
-        shown = [
+        effects = [
             f"{effect['name']}(" + ",".join(f"{k}={v['value']:.3g}" for k, v in effect["parameters"].items()) + ")"
             for effect in row["effects"]
         ]
@@ -231,21 +259,21 @@ def print_rows(rows: list[dict]) -> None:
         print(
             f"{row['case']:64s} {row['verdict']:16s} ×{gap_over_noise(row):4.1f} {losses:12s} "
             f"f{numbers.get('loss_by_formula', np.nan):.2f} s{numbers.get('share_explained', np.nan):.2f} "
-            f"d{numbers.get('share_by_drift', np.nan):.2f} {row['seconds']:3.0f}s {' + '.join(shown)}"
+            f"d{numbers.get('share_by_drift', np.nan):.2f} {row['seconds']:3.0f}s {' + '.join(effects)}"
         )
 
 
 def confusion_figure(rows: list[dict]) -> Figure:
-    """Matrix of what was hidden and what was said first, as a picture."""
+    """Confusion matrix of injected effects and first answers."""
     table = confusion(rows)
     verdicts = ["no_discrepancy", "no_improvement", "unknown_effect", "not_identifiable"]
     order = ["nothing", *(text[0].partition(":")[0] for text in SINGLES)]
-    order += sorted({row["truth"][0]["name"] for row in rows if row["kind"] == "outsider"})
+    order += sorted({row["truth"][0]["name"] for row in rows if row["kind"] == "out-of-catalogue"})
     order = [truth for truth in order if truth in table]
-    said = [name for name in order if any(name in counts for counts in table.values())]
-    said += sorted({n for counts in table.values() for n in counts} - set(said) - set(verdicts))
-    said += [verdict for verdict in verdicts if any(verdict in counts for counts in table.values())]
-    values = np.array([[table[truth][name] for name in said] for truth in order], float)
+    answers = [name for name in order if any(name in counts for counts in table.values())]
+    answers += sorted({n for counts in table.values() for n in counts} - set(answers) - set(verdicts))
+    answers += [verdict for verdict in verdicts if any(verdict in counts for counts in table.values())]
+    values = np.array([[table[truth][name] for name in answers] for truth in order], float)
     shares = values / values.sum(axis=1, keepdims=True)
     figure = Figure(figsize=(12.0, 9.5), layout="constrained", dpi=110)
     ax = figure.subplots()
@@ -253,82 +281,96 @@ def confusion_figure(rows: list[dict]) -> Figure:
     for (row, column), count in np.ndenumerate(values):
         if count:
             ax.text(column, row, f"{count:.0f}", ha="center", va="center", fontsize=10)
-    ax.set_xticks(range(len(said)), said, rotation=55, ha="right")
+    ax.set_xticks(range(len(answers)), answers, rotation=55, ha="right")
     ax.set_yticks(range(len(order)), order)
-    ax.set_xlabel("said first")
-    ax.set_ylabel("hidden")
-    ax.set_title("drives by what was hidden and what was said", loc="left", fontweight="bold")
+    ax.set_xlabel("named first, or verdict")
+    ax.set_ylabel("injected")
+    ax.set_title("recordings by injected effect and answer", loc="left", fontweight="bold")
     ax.spines[:].set_visible(False)
     return figure
 
 
 def section(rows: list[dict], found: dict, figure: Path | None, folder: Path) -> str:
-    """What a document says of a run."""
+    """The section of the document."""
 
     def share(key: str) -> str:
         return f"{found[key]['count']} of {found[key]['of']} ({100 * found[key]['share']:.0f} %)"
 
+    error, closed = found["parameter_error"], found["reducible_gap_closed"]
+    weak = found["weak_singles"]
     lines = [
-        "| question | reach | measured |",
-        "|---|---|---|",
-        f"| single effect, strong enough to matter, named first | 90 % | {share('singles_named_first')} |",
-        f"| … or as the other drag, with the right one as its rival | – | {share('singles_named_or_as_rival_drag')} |",
-        f"| … named first and nothing else beside it | – | {share('singles_named_alone')} |",
-        f"| pair, both named | 80 % | {share('pairs_both_named')} |",
-        f"| drive with nothing hidden on which an effect is found | 5 % at most | {share('false_alarms')} |",
-        f"| drive with nothing hidden with any verdict but `no_discrepancy` | – | {share('empty_not_said_to_be')} |",
-        f"| effect outside the catalogue named as one of it | 20 % at most | {share('outsiders_named_as_catalogue')} |",
-        f"| … said to be `unknown_effect` | – | {share('outsiders_unknown')} |",
-        f"| parameter, median error | 15 % | {100 * found['parameter_error_median']:.0f} % |",
-        "| reducible gap closed on held-out blocks, median | 80 % | "
-        f"{100 * found['reducible_gap_closed_median']:.0f} % |",
-        f"| time of a diagnosis of 60 s, median and longest, two at a time on two cores | 180 s | "
+        "| question | of | target | measured |",
+        "|---|---|---|---|",
+        f"| named first | single effects that are strong; {weak['count']} weak ones are not counted | 90 % | "
+        f"{share('singles_named_first')} |",
+        f"| … or the other drag, with the right one as indistinguishable | same | – | "
+        f"{share('singles_named_or_as_other_drag')} |",
+        f"| … named first and no other effect added | same | – | {share('singles_named_alone')} |",
+        f"| both named | pairs that are strong | 80 % | {share('pairs_both_named')} |",
+        f"| an effect found | recordings without a fault | 5 % at most | {share('false_alarms')} |",
+        f"| any verdict but `no_discrepancy` | same | – | {share('empty_with_another_verdict')} |",
+        f"| named as an effect of the catalogue | out-of-catalogue effects | 20 % at most | "
+        f"{share('out_of_catalogue_named')} |",
+        f"| `unknown_effect` | out-of-catalogue effects that are strong | – | {share('out_of_catalogue_unknown')} |",
+        f"| no diagnosis (counted as missed) | all recordings | – | {share('not_diagnosed')} |",
+        f"| error of the main parameter, median | the {error['count']} strong single effects that were correctly named "
+        f"first and have a parameter to compare, of {error['of']} strong ones | 15 % | {100 * error['median']:.0f} % |",
+        f"| reducible gap closed on cross-validated blocks, median | the {closed['count']} strong single effects and "
+        f"pairs that were correctly named, of {closed['of']} strong ones | 80 % | {100 * closed['median']:.0f} % |",
+        f"| time of a diagnosis of 60 s, median and longest, two at a time on two cores | all recordings | 180 s | "
         f"{found['seconds_median']:.0f} s, {found['seconds_most']:.0f} s |",
         "",
     ]
     if "baselines" in found:
         lines += [
-            "Position error after 2 s [m] on held-out blocks; medians over level drives, one strong effect:",
+            "Position error after 2 s [m], cross-validated; medians over the level recordings with one strong effect:",
             "",
         ]
-        lines += ["| method | error | of the reducible gap closed |", "|---|---|---|"]
+        lines += ["| method | error | reducible gap closed |", "|---|---|---|"]
         lines += [
             f"| {name} | {entry['error']:.3f} | {100 * entry['closed']:.0f} % |"
             for name, entry in found["baselines"].items()
         ]
         lines.append("")
     if figure is not None:
-        lines += [f"![what was hidden and what was said]({figure.name})", ""]
-    lines += ["| hidden | ground, noise | gap over noise | verdict | found | closed |", "|---|---|---|---|---|---|"]
+        lines += [f"![injected effects and answers]({figure.name})", ""]
+    lines += [
+        "| injected | ground, noise | error over noise floor | verdict | found | closed |",
+        "|---|---|---|---|---|---|",
+    ]
     for row in sorted(rows, key=lambda row: (KINDS.index(row["kind"]), row["case"])):
         if row["kind"] == "empty":
             continue
         truth = ", ".join(
             f"{t['name']} {' '.join(f'{k} {v:g}' for k, v in t['parameters'].items() if v)}" for t in row["truth"]
         )
-        said = ", ".join(
+        found_effects = ", ".join(
             f"{e['name']} {' '.join(f'{k} {v["value"]:.3g}' for k, v in e['parameters'].items())}"
             for e in row["effects"]
         )
         closed = closed_share(row)
         lines.append(
             f"| {truth} | {row['ground']}, {row['noise']} | {gap_over_noise(row):.1f} | `{row['verdict']}` | "
-            f"{said or '–'} | {'–' if np.isnan(closed) else f'{100 * closed:.0f} %'} |"
+            f"{found_effects or '–'} | {'–' if np.isnan(closed) else f'{100 * closed:.0f} %'} |"
         )
     return "\n".join(lines)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--folder", type=Path, default=Path("out/hidden"), help="for drives and reports (%(default)s)")
-    parser.add_argument("--seed", type=int, default=SEED, help="the drives' first one (%(default)s)")
-    parser.add_argument("--jobs", type=int, default=2, help="drives at a time (%(default)s)")
-    parser.add_argument("--only", nargs="+", default=[""], metavar="TEXT", help="drives whose name holds one of these")
-    parser.add_argument("--again", action="store_true", help="diagnose drives that have a report too")
-    parser.add_argument("--baselines", action="store_true", help="compare with other ways to close a gap (pysindy)")
+    parser.add_argument(
+        "--folder", type=Path, default=Path("out/hidden"), help="for recordings and reports (%(default)s)"
+    )
+    parser.add_argument("--seed", type=int, default=SEED, help="first seed (%(default)s)")
+    parser.add_argument("--jobs", type=int, default=2, help="recordings diagnosed in parallel (%(default)s)")
+    parser.add_argument(
+        "--only", nargs="+", default=[""], metavar="TEXT", help="only recordings whose name contains one of these"
+    )
+    parser.add_argument("--again", action="store_true", help="diagnose again where there is a report")
+    parser.add_argument("--baselines", action="store_true", help="compare with other methods (needs pysindy)")
     parser.add_argument("--json", type=Path, help="write rows and scores to this file")
     parser.add_argument(
-        "--docs", type=Path, metavar="FILE", help="write the tables into this document, a PNG beside it"
+        "--docs", type=Path, metavar="FILE", help="write the tables into this document, and a PNG next to it"
     )
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
@@ -338,15 +380,15 @@ def main() -> None:
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(options.jobs, mp_context=context) as pool:
         running = [pool.submit(run_case, case, options.folder, robot, options) for case in cases]
-        with tqdm(total=len(cases), unit="drive") as bar:
+        with tqdm(total=len(cases), unit="recording") as bar:
             for done in as_completed(running):
                 rows.append(done.result())
                 bar.update()
     print_rows(rows)
     found = scores(rows)
     print(json.dumps(found, indent=1))
-    for truth, said in sorted(confusion(rows).items()):
-        print(f"{truth:24s} " + ", ".join(f"{name} {count}" for name, count in said.most_common()))
+    for truth, answers in sorted(confusion(rows).items()):
+        print(f"{truth:24s} " + ", ".join(f"{name} {count}" for name, count in answers.most_common()))
     if options.json:
         options.json.parent.mkdir(parents=True, exist_ok=True)
         options.json.write_text(json.dumps({"scores": found, "rows": rows}, indent=1) + "\n")

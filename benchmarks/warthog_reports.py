@@ -1,9 +1,9 @@
-"""Real drives: the Warthog of the DRIVE dataset on asphalt, gravel, sand and grass, from commands to motion.
+"""Real recordings: the Warthog of the DRIVE dataset on asphalt, gravel, sand and grass, from commands to motion.
 
     scripts/run.sh python benchmarks/warthog_reports.py FOLDER [--json FILE] [--docs docs/discrepancy.md]
 
 Each recording is converted to a bag and diagnosed with the shipped Warthog file on level ground; the second day on
-asphalt is held out from the first. Each ground gets a robot file with its effects.
+asphalt is the held-out recording of the first. Each ground gets a robot file with its effects.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import torch
 from docs_section import replace_section
 
 from monoforce_ros.datasets import DriveRecording, drive_to_bag
-from monoforce_ros.discrepancy.bag_diagnosis import diagnose_bag
+from monoforce_ros.discrepancy import diagnose_bag
 
 GROUNDS = {
     "asphalt": "warthog_wheels_asphalt.npz",
@@ -53,7 +53,7 @@ def run(source: Path, folder: Path, ground: str, held_out: list[Path]) -> dict:
 
 
 def section(rows: list[dict]) -> str:
-    """What a document says of a run."""
+    """The section of the document."""
     lines = [
         "| ground | verdict | found | position after 2 s [m] | after 5 s [m] | heading after 2 s [deg] | time |",
         "|---|---|---|---|---|---|---|",
@@ -61,24 +61,27 @@ def section(rows: list[dict]) -> str:
 
     def change(row: dict, metric: str) -> str:
         entry = row["gap"].get(metric)
-        return "–" if entry is None else f"{entry['before']:.2f} → {entry['after']:.2f}"
+        if entry is None:
+            return "–"
+        after = "–" if entry["after"] is None else f"{entry['after']:.2f}"
+        return f"{entry['before']:.2f} → {after}"
 
     for row in rows:
-        said = ", ".join(
+        found = ", ".join(
             f"`{e['name']}` " + " ".join(f"{v['value']:.3g} {v['unit']}" for v in e["parameters"].values())
             for e in row["effects"]
         )
         lines.append(
-            f"| {row['ground']} | `{row['verdict']}` | {said or '–'} | {change(row, 'position_2s')} | "
+            f"| {row['ground']} | `{row['verdict']}` | {found or '–'} | {change(row, 'position_2s')} | "
             f"{change(row, 'position_5s')} | {change(row, 'heading_2s')} | {row['seconds']:.0f} s |"
         )
     lines.append("")
     for row in rows:
         for name, table in row["held_out"].items():
             entry = table.get("position_2s")
-            if entry:
+            if entry and entry["after"] is not None:
                 lines.append(
-                    f"What was found on {row['ground']}, on the held-out recording `{name}`: position error after 2 s "
+                    f"Effects found on {row['ground']}, on the held-out recording `{name}`: position error after 2 s "
                     f"{entry['before']:.2f} → {entry['after']:.2f} m (mean gain {entry['low']:.2f} to "
                     f"{entry['high']:.2f} m)."
                 )
@@ -89,7 +92,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("source", type=Path, help="folder of the dataset's files")
     parser.add_argument("--folder", type=Path, default=Path("out/warthog"), help="bags and reports (%(default)s)")
-    parser.add_argument("--only", nargs="+", default=[""], metavar="TEXT", help="grounds whose name holds one of these")
+    parser.add_argument(
+        "--only", nargs="+", default=[""], metavar="TEXT", help="only grounds whose name contains one of these"
+    )
     parser.add_argument("--json", type=Path, help="write the rows to this file")
     parser.add_argument("--docs", type=Path, metavar="FILE", help="write the table into this document")
     options = parser.parse_args()

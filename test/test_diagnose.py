@@ -1,6 +1,7 @@
-"""`diagnose`: what is hidden in a drive is named, sized, added to the robot's file, and makes predictions better."""
+"""`diagnose`: injected faults are named, estimated, added to the robot's file, and improve predictions."""
 
 import json
+import shutil
 import subprocess
 from dataclasses import replace
 
@@ -11,21 +12,34 @@ from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import Recording, SmoothedMotion, builders, smooth
 from monoforce_ros.core import AngularVelocityTrack, CommandTrack, MotionTrack, WheelTrack
-from monoforce_ros.discrepancy.bag_diagnosis import diagnose_bag
+from monoforce_ros.discrepancy import (
+    Diagnosis,
+    DiagnosisSettings,
+    EffectEstimate,
+    Evidence,
+    ParameterEstimate,
+    Verdict,
+    bag_diagnosis,
+    cli,
+    commission,
+    diagnose,
+    diagnose_bag,
+)
+from monoforce_ros.discrepancy import diagnosis as diagnosis_module
 from monoforce_ros.discrepancy.clocks import compare_with_gyro
-from monoforce_ros.discrepancy.commissioning import commission
-from monoforce_ros.discrepancy.diagnosis import Settings, _same, diagnose
+from monoforce_ros.discrepancy.comparison import GapRow, compare
 from monoforce_ros.discrepancy.fit import first_values, fit_effects
 from monoforce_ros.discrepancy.gap import map_floor, noise_floor, noisy_motions
 from monoforce_ros.discrepancy.hypothesis import (
-    Evidence,
     EvidenceWindows,
     Predictions,
     correct_measurements,
     subsampled,
     window_starts,
 )
+from monoforce_ros.discrepancy.report import effect_entry, report_content
 from monoforce_ros.discrepancy.selection import Search, Trial
+from monoforce_ros.discrepancy.verdict import _same
 from monoforce_ros.discrepancy.wheels import compare_with_wheels
 from monoforce_ros.effects.catalogue import CATALOGUE, drive_speeds, recorded_commands, recorded_motion
 from monoforce_ros.evaluation.recording_evaluation import PHYSICS, evaluate_recording
@@ -51,13 +65,13 @@ def husky():
     return load_robot("husky")
 
 
-def own_drive(husky, effects, seconds=24.0):
-    """A drive in our own physics with effects injected, as it would be recorded."""
+def simulated_recording(husky, effects, seconds=24.0):
+    """A recording of our own physics with injected effects."""
     random = np.random.default_rng(4)
     robot = replace(husky, effects=effects)
     steps = round(seconds / 0.01)
-    told = np.repeat(random.uniform([-0.2, -0.9], [0.9, 0.9], (round(seconds / 1.5), 2)), 150, axis=0)[:steps]
-    speeds = drive_speeds(robot, torch.as_tensor(told[None], dtype=torch.float32), 0.01)
+    commanded = np.repeat(random.uniform([-0.2, -0.9], [0.9, 0.9], (round(seconds / 1.5), 2)), 150, axis=0)[:steps]
+    speeds = drive_speeds(robot, torch.as_tensor(commanded[None], dtype=torch.float32), 0.01)
     terrain = TerrainMap.flat(Grid.square(2.0, 1.0))
     result = rollout(terrain, robot, speeds, State.at_rest(0.13), with_forces=False)
     rotations = Rotation.from_matrix(result.rotation[0, ::5].double().numpy())
@@ -69,7 +83,7 @@ def own_drive(husky, effects, seconds=24.0):
         linear_velocities=rotations.inv().apply(result.velocity[0, ::5].double().numpy()),
         angular_velocities=rotations.inv().apply(result.angular_velocity[0, ::5].double().numpy()),
     )
-    commands = CommandTrack(10**9 + np.arange(steps) * 10_000_000, told)
+    commands = CommandTrack(10**9 + np.arange(steps) * 10_000_000, commanded)
     return recorded_motion(motion, robot), recorded_commands(commands, robot)
 
 
@@ -84,8 +98,8 @@ def own_drive(husky, effects, seconds=24.0):
         ("pose_clock_offset", {"offset": 0.17}),
     ],
 )
-def test_planted_parameters_are_recovered_by_the_fit(husky, name, parameters):
-    motion, commands = own_drive(husky, ((name, parameters),))
+def test_injected_parameters_are_recovered_by_the_fit(husky, name, parameters):
+    motion, commands = simulated_recording(husky, ((name, parameters),))
     starts = window_starts(motion, [slice(0, len(motion))], 2.0, 1.0)
     predictions = Predictions(husky, EvidenceWindows(motion, commands, starts, 2.0, SAMPLES))
     scale = np.tile([0.01, 0.01, 0.005], (4, 1))
@@ -97,9 +111,9 @@ def test_planted_parameters_are_recovered_by_the_fit(husky, name, parameters):
     assert after < 0.2 * before
 
 
-def test_what_matters_most_is_named_first(husky):
+def test_effects_are_ranked_by_leave_one_out_loss(husky):
     injected = (("drive_asymmetry", {"difference": 0.01}), ("drive_gain", {"gain": 0.8}))
-    motion, commands = own_drive(husky, injected)
+    motion, commands = simulated_recording(husky, injected)
     starts = window_starts(motion, [slice(0, len(motion))], 2.0, 1.0)
     search = Search(
         husky, EvidenceWindows(motion, commands, starts, 2.0, SAMPLES), np.tile([0.01, 0.01, 0.005], (4, 1))
@@ -110,14 +124,14 @@ def test_what_matters_most_is_named_first(husky):
     assert search.ranked(alone) == [0]
 
 
-def test_a_formula_that_is_an_effect_and_a_small_rest_keeps_the_effects_name():
+def test_an_effect_keeps_its_name_against_a_formula_that_repeats_it():
     def trial(effects, loss):
         return Trial(effects, (effects, effects), np.full(4, loss))
 
     nominal, drag = trial((), 4.0), (("viscous_drag", {"coefficient": 150.0}),)
     as_formula = (("learned_term", {"force_x:vx": -170.0, "torque_z:vx": 20.0}),)
     assert _same(trial(drag, 1.2), trial(as_formula, 0.6), nominal)
-    # The formula explains far more, is of something else, or its largest term is.
+    # Not where the formula explains far more, or where its largest term belongs to another effect.
     assert not _same(trial(drag, 3.0), trial(as_formula, 0.6), nominal)
     assert not _same(trial((("payload", {"mass": 9.0}),), 1.2), trial(as_formula, 0.6), nominal)
     turned = (("learned_term", {"force_x:vx": -20.0, "torque_z:vx": 170.0}),)
@@ -127,8 +141,8 @@ def test_a_formula_that_is_an_effect_and_a_small_rest_keeps_the_effects_name():
     assert _same(trial(push, 1.5), trial(constant, 0.6), nominal)
 
 
-def test_hypotheses_of_a_batch_are_those_of_single_calls(husky):
-    motion, commands = own_drive(husky, ())
+def test_batched_hypotheses_equal_single_calls(husky):
+    motion, commands = simulated_recording(husky, ())
     starts = window_starts(motion, [slice(0, len(motion))], 2.0, 2.0)
     predictions = Predictions(husky, EvidenceWindows(motion, commands, starts, 2.0, SAMPLES))
     tried = [
@@ -139,13 +153,13 @@ def test_hypotheses_of_a_batch_are_those_of_single_calls(husky):
     together = predictions.residuals(tried)
     for effects, expected in zip(tried, together, strict=True):
         np.testing.assert_allclose(predictions.residuals([effects])[0], expected, atol=1e-5)
-    # Nothing is injected and nothing disagrees.
+    # Nothing is injected, so the residuals are small.
     assert np.abs(together[0]).max() < 0.02
 
 
-def test_measurement_effects_are_undone(husky):
+def test_measurement_effects_are_corrected(husky):
     effects = (("sensor_yaw_offset", {"angle": 0.2}), ("pose_clock_offset", {"offset": 0.3}))
-    clean, commands = own_drive(husky, (), seconds=6.0)
+    clean, commands = simulated_recording(husky, (), seconds=6.0)
     recorded = recorded_motion(clean, replace(husky, effects=effects))
     back, _ = correct_measurements(recorded, commands, effects)
     np.testing.assert_allclose(back.stamps, clean.stamps, rtol=0, atol=100)
@@ -155,7 +169,7 @@ def test_measurement_effects_are_undone(husky):
 
 
 def test_the_noise_floor_is_the_error_of_a_perfect_model(husky):
-    motion, commands = own_drive(husky, (), seconds=40.0)
+    motion, commands = simulated_recording(husky, (), seconds=40.0)
     random = np.random.default_rng(1)
     noise = Rotation.from_rotvec(np.radians(0.5) * random.standard_normal((len(motion), 3)))
     noisy = replace(
@@ -167,13 +181,13 @@ def test_the_noise_floor_is_the_error_of_a_perfect_model(husky):
     starts = window_starts(motion, smoothed.stretches, 2.0, 0.5)
     data = EvidenceWindows(smoothed.motion, commands, starts, 2.0, SAMPLES)
     floor = noise_floor(smoothed.motion, noisy_motions(smoothed), data)
-    shown = np.sqrt((Predictions(husky, data).residuals([()])[0] ** 2).mean(axis=0))
-    assert (floor[-1] < 1.5 * shown[-1]).all()
-    assert (shown[-1] < 2.5 * floor[-1]).all()
+    rms = np.sqrt((Predictions(husky, data).residuals([()])[0] ** 2).mean(axis=0))
+    assert (floor[-1] < 1.5 * rms[-1]).all()
+    assert (rms[-1] < 2.5 * floor[-1]).all()
 
 
 @pytest.mark.parametrize("still", [True, False])
-def test_drives_that_cannot_tell_are_said_to_be(husky, still):
+def test_insufficient_recordings_are_not_identifiable(husky, still):
     times = np.arange(0.0, 40.0, 0.05)
     stamps = (10**9 + np.rint(times * 1e9)).astype(np.int64)
     positions = np.zeros((len(times), 3))
@@ -189,7 +203,7 @@ def test_drives_that_cannot_tell_are_said_to_be(husky, still):
 
 @pytest.fixture(scope="module")
 def late_robot(tmp_path_factory):
-    """A MuJoCo drive of a robot that waits 0.3 s before it obeys, localised by something like SLAM."""
+    """A MuJoCo recording with a command delay of 0.3 s and the pose noise of SLAM."""
     out = tmp_path_factory.mktemp("hidden") / "drive"
     flat = TerrainSettings(flat=True)
     hidden = (parse_hidden("command_delay:0.3"),)
@@ -201,31 +215,47 @@ def late_robot(tmp_path_factory):
     return out
 
 
-def test_a_hidden_delay_is_named_added_and_closes_the_gap(late_robot, tmp_path, executables, ros_environment):
+@pytest.fixture(scope="module")
+def late_again(tmp_path_factory):
+    """The same robot on another recording: other commands and other noise."""
+    out = tmp_path_factory.mktemp("hidden") / "again"
+    settings = RecordingSettings(
+        duration=30.0, seed=4, terrain=TerrainSettings(flat=True), camera=None, lidar=None, commands="steps",
+        odometry=OdometrySettings.slam(), hidden=(parse_hidden("command_delay:0.3"),),
+    )  # fmt: skip
+    record(out, settings)
+    return out
+
+
+def test_an_injected_delay_is_named_added_and_closes_the_gap(
+    late_robot, late_again, tmp_path, executables, ros_environment
+):
     out = tmp_path / "report"
     done = subprocess.run(
-        [executables / "diagnose", late_robot, "--out", out, "--effects", "1", "--quiet", "--held-out", late_robot],
+        [executables / "diagnose", late_robot, "--out", out, "--effects", "1", "--quiet", "--held-out", late_again],
         env=ros_environment, capture_output=True, text=True, timeout=400, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     report = json.loads((out / "report.json").read_text())
     assert report["verdict"] == "effect_found"
     (effect,) = report["effects"]
-    # To commands and poses a late base and a late clock look the same; the gyro in the bag tells them apart.
+    # Commands and poses cannot distinguish a late base from a late pose clock; the gyro in the bag does.
     assert effect["name"] == "command_delay"
-    assert "pose_clock_offset" not in effect["rivals"]
+    assert "pose_clock_offset" not in effect["indistinguishable"]
+    # The former name of the key, for one release.
+    assert effect["rivals"] == effect["indistinguishable"]
     (value,) = effect["parameters"].values()
     assert value["value"] == pytest.approx(0.3, abs=0.05)
     gap = report["gap"]["position_2s"]
     assert gap["after"] < 0.5 * gap["before"]
     assert gap["low"] > 0
     assert gap["closed"] > 0.5
-    held_out = report["held_out"]["drive"]["position_2s"]
+    held_out = report["held_out"]["again"]["position_2s"]
     assert held_out["after"] < 0.5 * held_out["before"]
     page = (out / "report.html").read_text()
-    assert page.count("<img") >= 6 and "On drives that no fit saw" in page
-    assert "What is missing" in page and "data:image/png;base64" in page and "src='http" not in page
-    # The robot file it wrote is loaded as it is, and predicts the same drive better.
+    assert page.count("<img") >= 6 and "On held-out recordings" in page
+    assert "Effects missing in the model" in page and "data:image/png;base64" in page and "src='http" not in page
+    # The written robot file loads and predicts the same recording better.
     found = load_robot(report["robot_file"])
     assert dict(found.effects)[effect["name"]]
     recording = Recording.open(late_robot)
@@ -237,29 +267,125 @@ def test_a_hidden_delay_is_named_added_and_closes_the_gap(late_robot, tmp_path, 
     assert errors[1] < 0.5 * errors[0]
 
 
-def test_without_a_disagreement_nothing_is_added(husky):
-    motion, commands = own_drive(husky, (), seconds=30.0)
+def test_without_a_discrepancy_nothing_is_added(husky):
+    motion, commands = simulated_recording(husky, (), seconds=30.0)
     smoothed = SmoothedMotion(motion, 0.003, 0.002, (slice(0, len(motion)),))
-    diagnosis = diagnose(Evidence(smoothed, commands), husky, settings=Settings(most_effects=1))
+    diagnosis = diagnose(Evidence(smoothed, commands), husky, settings=DiagnosisSettings(max_effects=1))
     assert diagnosis.verdict == "no_discrepancy"
     assert diagnosis.effects == () and diagnosis.fitted == ()
 
 
-def test_a_healthy_robot_is_commissioned_and_then_nothing_is_missing(husky, tmp_path):
+@pytest.mark.parametrize(
+    ("injected", "verdict", "reason"),
+    [
+        (("drive_gain", {"gain": 0.8}), Verdict.NO_IMPROVEMENT, "do not decrease beyond chance"),
+        (("learned_term", {"torque_z:vx|vx|": 150.0}), Verdict.UNKNOWN_EFFECT, "the formula is not added"),
+    ],
+)
+def test_what_does_not_improve_held_out_windows_is_not_added(husky, monkeypatch, injected, verdict, reason):
+    def useless(*arguments, **named):
+        compared = compare(*arguments, **named)
+        return [c if c.after is None else replace(c, after=1.1 * c.before) for c in compared]
+
+    monkeypatch.setattr(diagnosis_module, "compare", useless)
+    motion, commands = simulated_recording(husky, (injected,), seconds=40.0)
+    smoothed = SmoothedMotion(motion, 0.003, 0.002, (slice(0, len(motion)),))
+    diagnosis = diagnose(Evidence(smoothed, commands), husky, settings=DiagnosisSettings(max_effects=1))
+    assert diagnosis.verdict == verdict
+    assert reason in diagnosis.remarks[-1]
+    # Effects go into the robot's file, and are what a report calls "after".
+    assert diagnosis.effects == () and diagnosis.fitted == ()
+    report = report_content(diagnosis, {}, None)
+    assert report["gap"] and all(row["after"] is None and "closed" not in row for row in report["gap"].values())
+    assert all(row["position_after"] is None and row["heading_after"] is None for row in report["regimes"])
+    assert all(path.after is None for path in diagnosis.details.paths)
+    assert all(comparison.after is None for comparison in diagnosis.details.compared)
+    assert any("drive_gain" in row.values() for row in report["candidates"])
+
+
+def test_a_verdict_without_effects_cannot_hold_any():
+    row = GapRow(2.0, before=0.5, after=0.4, gain_low=-0.1, gain_high=0.2, unit="m", noise=0.1)
+    effect = EffectEstimate("drive_gain", {"gain": ParameterEstimate(0.8, 0.7, 0.9, "-")})
+    for held in ({"gap": {"position_2s": row}}, {"effects": (effect,)}, {"held_out": {"b": {"position_2s": row}}}):
+        Diagnosis(Verdict.EFFECT_FOUND, **held)
+        with pytest.raises(ValueError, match="adds no effects"):
+            Diagnosis(Verdict.NO_IMPROVEMENT, **held)
+
+
+def test_the_diagnosed_recording_is_not_held_out(late_again, tmp_path, capsys):
+    copied = shutil.copytree(late_again, tmp_path / "copy")
+    for held_out in (late_again, copied):
+        status = cli.main([str(late_again), "--held-out", str(held_out), "--out", str(tmp_path / "out"), "--quiet"])
+        assert status == 1
+        assert "--held-out got the diagnosed recording" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_held_out_recordings_with_the_same_name_stay_apart(late_robot, late_again, tmp_path, monkeypatch):
+    monkeypatch.setattr(bag_diagnosis, "diagnose", lambda *_, **__: Diagnosis(Verdict.NO_DISCREPANCY))
+    first, second = (tmp_path / part / "recording" for part in ("monday", "tuesday"))
+    shutil.copytree(late_again, first)
+    shutil.copytree(late_again, second)
+    found = diagnose_bag(late_robot, "husky", tmp_path / "out", held_out=[first, second, first, late_again])
+    tables = json.loads(found.report.read_text())["held_out"]
+    assert list(tables) == ["monday/recording", "tuesday/recording", "again"]
+    assert all(table["position_2s"]["after"] is None for table in tables.values())
+
+
+def benchmark_row(injected, estimated, loss=9.0, **more):
+    """A row of ``benchmarks/hidden_effects.py`` with one effect that was named as it is."""
+    (name, truth), (named, values) = injected, estimated
+    gap = {"horizon_s": 2.0, "before": 0.2, "after": 0.05, "noise": 0.01, "closed": 0.8}
+    row = {
+        "kind": "single", "verdict": "effect_found", "truth": [{"name": name, "parameters": truth}], "seconds": 9.0,
+        "effects": [{"name": named, "parameters": {key: {"value": value} for key, value in values.items()}}],
+        "numbers": {"loss_before": loss}, "gap": {"position_2s": gap}, "ground": "flat", "noise": "usual", "case": name,
+    }  # fmt: skip
+    return row | more
+
+
+def test_figures_of_the_benchmark_say_what_they_are_conditional_on(tmp_path):
+    import hidden_effects
+
+    friction = benchmark_row(("friction_scale", {"factor": 0.25}), ("friction_scale", {"factor": 0.35}))
+    delay = benchmark_row(("command_delay", {"delay": 0.4}), ("command_delay", {"delay": 0.42}))
+    missed = benchmark_row(("drive_gain", {"gain": 0.8}), ("viscous_drag", {"coefficient": 99.0}))
+    weak = benchmark_row(("drive_gain", {"gain": 0.99}), ("drive_gain", {"gain": 0.5}), loss=1.0)
+    failed = missed | {"verdict": "not_identifiable", "effects": [], "numbers": {}, "gap": {}}
+    found = hidden_effects.scores([friction, delay, missed, weak, failed])
+    # An effect without a diagnosis is missed, and friction is part of the error.
+    assert found["singles_named_first"] == {"share": 0.5, "count": 2, "of": 4}
+    assert found["not_diagnosed"]["count"] == 1
+    assert found["parameter_error"] == {"median": pytest.approx(0.225), "count": 2, "of": 4}
+    text = hidden_effects.section([friction, delay, missed, weak, failed], found, None, tmp_path)
+    assert "the 2 strong single effects that were correctly named first" in text
+    assert "1 weak ones are not counted" in text
+    # Rows of reports from before, and where no effect was added.
+    nothing = {"before": 0.3, "after": None, "noise": 0.01}
+    row = {"verdict": "no_improvement", "effects": [], "gap": {"position_2s": nothing}, "baselines": {}}
+    row["baselines"] = dict.fromkeys(("refit", "network", "sindy"), 0.2)
+    assert hidden_effects._baseline_scores([row])["diagnose"] == {"error": 0.3, "closed": 0.0}
+    old = benchmark_row(("viscous_drag", {}), ("quadratic_drag", {}))
+    old["effects"][0]["rivals"] = ["viscous_drag"]
+    assert hidden_effects.named_as_other_drag(old)
+
+
+def test_a_commissioned_model_predicts_the_healthy_robot(husky, tmp_path):
     injected = (
         ("friction_scale", {"factor": 0.7}),
         ("turning_scrub", {"track_width_factor": 1.2}),
         ("actuator_lag", {"time_constant": 0.15}),
     )
-    motion, commands = own_drive(husky, injected)
+    motion, commands = simulated_recording(husky, injected)
     smoothed = SmoothedMotion(motion, 0.002, 0.001, (slice(0, len(motion)),))
     effects, nominal_residual = commission([Evidence(smoothed, commands)], husky)
-    found = {effect["name"]: effect["parameters"] for effect in effects}
-    assert found["turning_scrub"]["track_width_factor"]["value"] == pytest.approx(1.2, rel=0.05)
-    assert found["actuator_lag"]["time_constant"]["value"] == pytest.approx(0.15, abs=0.03)
+    found = {effect.name: effect.parameters for effect in effects}
+    assert found["turning_scrub"]["track_width_factor"].value == pytest.approx(1.2, rel=0.05)
+    assert found["actuator_lag"]["time_constant"].value == pytest.approx(0.15, abs=0.03)
     assert nominal_residual.shape == (4, 3)
     kept = {"samples_s": [0.5, 1.0, 1.5, 2.0], "residual_rms": nominal_residual.tolist()}
-    file = write_robot("husky", tmp_path / "husky.yaml", effects, [tmp_path], "0", kept)
+    entries = [effect_entry(effect) for effect in effects]
+    file = write_robot("husky", tmp_path / "husky.yaml", entries, [tmp_path], "0", kept)
     np.testing.assert_allclose(read_nominal_residual(file, (0.5, 1.0, 1.5, 2.0)), nominal_residual)
     assert read_nominal_residual("husky", (0.5, 1.0)) is None
     nominal = load_robot(file)
@@ -273,39 +399,40 @@ def test_a_healthy_robot_is_commissioned_and_then_nothing_is_missing(husky, tmp_
         read_nominal_residual(file, (1.0, 2.0))
 
 
-def test_a_gyro_tells_a_late_clock_from_a_late_robot(husky):
-    def turning(motion, bias=0.0, sign=1.0, axis=2):
+def test_a_gyro_distinguishes_a_late_pose_clock_from_a_late_robot(husky):
+    def gyro_of(motion, bias=0.0, sign=1.0, axis=2):
         rates = np.zeros((len(motion), 3))
         rates[:, axis] = sign * motion.angular_velocities[:, 2] + bias
         return AngularVelocityTrack(motion.stamps, rates)
 
-    clean, commands = own_drive(husky, (), seconds=40.0)
+    clean, commands = simulated_recording(husky, (), seconds=40.0)
     late = replace(clean, stamps=clean.stamps + 230_000_000)
     smoothed = SmoothedMotion(late, 0.003, 0.002, (slice(0, len(late)),))
-    found = compare_with_gyro(smoothed, turning(clean))
+    found = compare_with_gyro(smoothed, gyro_of(clean))
     assert found.poses_late and found.offset == pytest.approx(0.23, abs=0.01)
     assert not found.biased
-    # However the IMU is mounted.
-    tilted = compare_with_gyro(smoothed, turning(clean, sign=-1.0, axis=1))
+    # The mounting of the IMU is estimated too.
+    tilted = compare_with_gyro(smoothed, gyro_of(clean, sign=-1.0, axis=1))
     assert (tilted.axis, tilted.sign) == (1, -1) and tilted.offset == pytest.approx(0.23, abs=0.01)
     in_time = SmoothedMotion(clean, 0.003, 0.002, (slice(0, len(clean)),))
-    biased = compare_with_gyro(in_time, turning(clean, bias=0.04))
+    biased = compare_with_gyro(in_time, gyro_of(clean, bias=0.04))
     assert not biased.poses_late
     assert biased.biased and biased.bias == pytest.approx(0.04, abs=0.005)
     assert compare_with_gyro(in_time, None) is None
     noise = np.random.default_rng(0).standard_normal((len(clean), 3))
     assert compare_with_gyro(in_time, AngularVelocityTrack(clean.stamps, noise)) is None
-    diagnosis = diagnose(Evidence(smoothed, commands, turning=turning(clean)), husky, settings=Settings(most_effects=1))
+    evidence = Evidence(smoothed, commands, gyro=gyro_of(clean))
+    diagnosis = diagnose(evidence, husky, settings=DiagnosisSettings(max_effects=1))
     assert diagnosis.verdict == "effect_found"
-    assert [effect["name"] for effect in diagnosis.effects] == ["pose_clock_offset"]
+    assert [effect.name for effect in diagnosis.effects] == ["pose_clock_offset"]
 
 
 def wheels_of(commands, husky, effects, seconds=60.0):
-    """Wheel speeds of drives that follow commands under effects, as joint states would show them."""
+    """Wheel speeds as measured by joint states, with effects between commands and wheels."""
     steps = round(seconds / 0.01)
     stamps = commands.stamps[0] + np.arange(steps) * 10_000_000
-    told = torch.as_tensor(commands.sample(stamps)[None], dtype=torch.float32)
-    speeds = drive_speeds(replace(husky, effects=effects), told, 0.01)[0, ::5].double().numpy()
+    commanded = torch.as_tensor(commands.sample(stamps)[None], dtype=torch.float32)
+    speeds = drive_speeds(replace(husky, effects=effects), commanded, 0.01)[0, ::5].double().numpy()
     noise = np.random.default_rng(2).standard_normal(speeds.shape)
     return WheelTrack(stamps[::5], speeds / husky.wheel_radius + 0.05 * noise)
 
@@ -320,7 +447,7 @@ def wheels_of(commands, husky, effects, seconds=60.0):
          ("actuator_lag", {"time_constant": 0.25})),
     ],
 )  # fmt: skip
-def test_wheel_speeds_tell_how_the_drives_follow_commands(husky, effects):
+def test_wheel_speeds_identify_effects_of_the_drives(husky, effects):
     random = np.random.default_rng(3)
     twists = np.repeat(random.uniform([-0.3, -1.0], [1.0, 1.0], (30, 2)), 40, axis=0)
     commands = CommandTrack(10**9 + np.arange(len(twists)) * 50_000_000, twists)
@@ -329,10 +456,10 @@ def test_wheel_speeds_tell_how_the_drives_follow_commands(husky, effects):
     for (_, values), (_, injected) in zip(found.effects, effects, strict=True):
         for key, value in injected.items():
             assert values[key] == pytest.approx(value, rel=0.08, abs=0.02)
-    assert ("late" in found.told()) == any(name == "command_delay" for name, _ in effects)
+    assert ("late" in found.summary()) == any(name == "command_delay" for name, _ in effects)
     assert compare_with_wheels(commands, None, husky) is None
-    strange = WheelTrack(commands.stamps, random.standard_normal((len(twists), 2)))
-    assert compare_with_wheels(commands, strange, husky) is None
+    unrelated = WheelTrack(commands.stamps, random.standard_normal((len(twists), 2)))
+    assert compare_with_wheels(commands, unrelated, husky) is None
 
 
 def test_wheels_are_found_among_the_joints():
@@ -346,7 +473,7 @@ def test_wheels_are_found_among_the_joints():
     assert joints([], []) is None
 
 
-def test_long_drives_are_thinned_over_all_of_their_length():
+def test_long_recordings_are_subsampled_over_their_length():
     starts = np.arange(0, 3600, dtype=np.int64) * 10**9
     kept = subsampled(starts, 8.0, 120)
     assert 60 <= len(kept) <= 130
@@ -356,8 +483,8 @@ def test_long_drives_are_thinned_over_all_of_their_length():
     assert len(subsampled(starts[:100], 8.0, 120)) == 100
 
 
-def test_level_ground_excuses_nothing_and_an_unsure_map_does(husky):
-    motion, commands = own_drive(husky, (), seconds=12.0)
+def test_the_map_floor_is_zero_on_level_ground_and_grows_with_map_noise(husky):
+    motion, commands = simulated_recording(husky, (), seconds=12.0)
     starts = window_starts(motion, [slice(0, len(motion))], 2.0, 1.0)
     level = EvidenceWindows(motion, commands, starts, 2.0, SAMPLES)
     assert (map_floor(husky, level, None) == 0).all()
@@ -370,13 +497,13 @@ def test_level_ground_excuses_nothing_and_an_unsure_map_does(husky):
     ]
     on_map = replace(level, terrain=maps[0], odometry_from_terrain=np.eye(4))
     shape = map_floor(husky, on_map, None)
-    unsure = map_floor(husky, on_map, (maps[1], maps[2]))
-    assert (shape[-1] > 0).all() and (unsure[-1] > shape[-1]).all()
+    noisy = map_floor(husky, on_map, (maps[1], maps[2]))
+    assert (shape[-1] > 0).all() and (noisy[-1] > shape[-1]).all()
 
 
 @pytest.fixture(scope="module")
 def pulled_robot(tmp_path_factory):
-    """A MuJoCo drive of a robot that is turned by a torque which grows with the square of its speed."""
+    """A MuJoCo recording with a yaw torque that grows with the square of the speed."""
     out = tmp_path_factory.mktemp("hidden") / "drive"
     settings = RecordingSettings(
         duration=45.0, seed=5, terrain=TerrainSettings(flat=True), camera=None, lidar=None, commands="steps",
@@ -386,10 +513,10 @@ def pulled_robot(tmp_path_factory):
     return out
 
 
-def test_what_the_catalogue_does_not_hold_is_said_to_be_unknown(pulled_robot, late_robot, tmp_path, executables,
-                                                                 ros_environment):  # fmt: skip
+def test_an_out_of_catalogue_effect_is_reported_as_unknown(pulled_robot, late_robot, tmp_path, executables,
+                                                            ros_environment):  # fmt: skip
     out = tmp_path / "reports"
-    # Two bags at once, and a third that is not there: it does not stop the others.
+    # Two bags in parallel, and a third that does not exist: it does not stop the others.
     done = subprocess.run(
         [executables / "diagnose", pulled_robot, late_robot, tmp_path / "none", "--out", out, "--effects", "1",
          "--quiet"],
@@ -400,7 +527,7 @@ def test_what_the_catalogue_does_not_hold_is_said_to_be_unknown(pulled_robot, la
     assert report["verdict"] == "unknown_effect", done.stdout
     (effect,) = report["effects"]
     assert effect["name"] == "learned_term"
-    # A torque to the left that comes with speed; which power of it is told less surely on 45 s.
+    # A torque to the left that grows with speed; 45 s do not determine its power reliably.
     assert any(key.startswith("torque_z:") and entry["value"] > 50.0 for key, entry in effect["parameters"].items())
     assert report["gap"]["heading_2s"]["after"] < 0.5 * report["gap"]["heading_2s"]["before"]
     assert json.loads((out / "01_drive" / "report.json").read_text())["verdict"] == "effect_found"
@@ -408,15 +535,15 @@ def test_what_the_catalogue_does_not_hold_is_said_to_be_unknown(pulled_robot, la
 
 @pytest.mark.unhurried
 def test_the_node_predicts_better_with_the_written_file(tmp_path, start, peer):
-    """A robot with small wheels is diagnosed; the file that comes of it in a running node, against the nominal one."""
+    """A robot with small wheels is diagnosed; a running node predicts better with the written file than without."""
     bag = tmp_path / "drive"
     settings = RecordingSettings(
         duration=40.0, seed=8, terrain=TerrainSettings(flat=True), camera=None, lidar=None, commands="steps",
         odometry=OdometrySettings.slam(), hidden=(parse_hidden("drive_gain:0.7"),),
     )  # fmt: skip
     record(bag, settings)
-    found = diagnose_bag(bag, "husky", tmp_path / "report", settings=Settings(most_effects=1))
-    assert [effect["name"] for effect in found.diagnosis.effects] == ["drive_gain"]
+    found = diagnose_bag(bag, "husky", tmp_path / "report", settings=DiagnosisSettings(max_effects=1))
+    assert [effect.name for effect in found.diagnosis.effects] == ["drive_gain"]
     recording = Recording.open(bag)
     errors = []
     for robot in ("husky", found.robot_file):
@@ -427,15 +554,15 @@ def test_the_node_predicts_better_with_the_written_file(tmp_path, start, peer):
         assert peer.until(lambda player=player: not player.running, 90.0)
         peer.spin(1.0)
         node.stop()
-        own = []
+        distances = []
         for path in peer.received["/predicted/path"]:
             stamp = path.header.stamp.sec * 10**9 + path.header.stamp.nanosec
             # Where the robot was one second later; the path has a pose every tenth of a second.
             there = recording.motion.at(stamp + 10**9).position
             pose = path.poses[10].pose.position
-            own.append(np.hypot(pose.x - there[0], pose.y - there[1]))
-        assert len(own) > 10, node.output[-2000:]
-        errors.append(np.median(own))
+            distances.append(np.hypot(pose.x - there[0], pose.y - there[1]))
+        assert len(distances) > 10, node.output[-2000:]
+        errors.append(np.median(distances))
     assert errors[1] < 0.75 * errors[0], errors
 
 

@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import SmoothedMotion
 from monoforce_ros.core import CameraModel, CommandTrack, MotionTrack
-from monoforce_ros.discrepancy.diagnosis import Settings, diagnose
-from monoforce_ros.discrepancy.hypothesis import Evidence
+from monoforce_ros.discrepancy import DiagnosisSettings, Evidence, diagnose
 from monoforce_ros.effects.catalogue import drive_speeds, recorded_commands, recorded_motion
 from monoforce_ros.encoder import CameraView, load_encoder
 from monoforce_ros.physics import PhysicsOptions, State, rollout
@@ -128,14 +127,13 @@ def diagnosis() -> dict:
     commands = CommandTrack(10**9 + np.arange(len(twists)) * 10_000_000, twists)
     motion, commands = recorded_motion(motion, robot), recorded_commands(commands, robot)
     smoothed = SmoothedMotion(motion, 0.003, 0.002, (slice(0, len(motion)),))
-    found = diagnose(Evidence(smoothed, commands), husky, settings=Settings(most_effects=2))
+    found = diagnose(Evidence(smoothed, commands), husky, settings=DiagnosisSettings(max_effects=2))
     return {
         "verdict": found.verdict,
         "effects": {
-            entry["name"]: {key: value["value"] for key, value in entry["parameters"].items()}
-            for entry in found.effects
+            entry.name: {key: estimate.value for key, estimate in entry.parameters.items()} for entry in found.effects
         },
-        "gap": {metric: [row["before"], row["after"]] for metric, row in found.gap.items()},
+        "gap": {metric: [row.before, row.after] for metric, row in found.gap.items()},
     }
 
 

@@ -1,1 +1,23 @@
-"""Discrepancy: finds where simulation and measurement disagree, and names the physics that is missing."""
+"""Compares a robot's model with recordings and identifies the physical effects that it lacks."""
+
+from monoforce_ros.discrepancy.bag_diagnosis import BagDiagnosis, Topics, diagnose_bag, read_evidence
+from monoforce_ros.discrepancy.commissioning import commission
+from monoforce_ros.discrepancy.diagnosis import Diagnosis, DiagnosisSettings, diagnose
+from monoforce_ros.discrepancy.estimates import EffectEstimate, ParameterEstimate
+from monoforce_ros.discrepancy.hypothesis import Evidence
+from monoforce_ros.discrepancy.verdict import Verdict
+
+__all__ = [
+    "BagDiagnosis",
+    "Diagnosis",
+    "DiagnosisSettings",
+    "EffectEstimate",
+    "Evidence",
+    "ParameterEstimate",
+    "Topics",
+    "Verdict",
+    "commission",
+    "diagnose",
+    "diagnose_bag",
+    "read_evidence",
+]

@@ -1,4 +1,4 @@
-"""Bag diagnosis: a recorded drive, from the bag to the report and the robot's new file."""
+"""Bag diagnosis: from a bag to the report and the copy of the robot's file with the identified effects."""
 
 from __future__ import annotations
 
@@ -10,21 +10,22 @@ from pathlib import Path
 import numpy as np
 
 from monoforce_ros.bags import Recording, smooth
-from monoforce_ros.discrepancy.comparison import compare, gap_table
-from monoforce_ros.discrepancy.diagnosis import Diagnosis, Settings, diagnose
+from monoforce_ros.discrepancy.comparison import GapRow, compare, gap_table
+from monoforce_ros.discrepancy.diagnosis import Diagnosis, DiagnosisSettings, diagnose
 from monoforce_ros.discrepancy.gap import noisy_motions
 from monoforce_ros.discrepancy.hypothesis import Effects, Evidence, corrected_evidence, window_starts
-from monoforce_ros.discrepancy.report import write_diagnosis
+from monoforce_ros.discrepancy.report import effect_entry, write_diagnosis
 from monoforce_ros.robots import RobotModel, fingerprint, load_robot, read_nominal_residual, write_robot
 from monoforce_ros.terrain import Grid, load_terrain
 from monoforce_ros.training import split_maps
 
 _MARGIN = 4.0
+"""Of a lidar map around the driven path [m]."""
 
 
 @dataclass(frozen=True)
 class Topics:
-    """Names of topics; those that are None are found by type."""
+    """Names of topics; those that are None are detected by message type."""
 
     odometry: str | None = None
     commands: str | None = None
@@ -33,7 +34,7 @@ class Topics:
 
 @dataclass(frozen=True)
 class BagDiagnosis:
-    """What came of a bag."""
+    """The diagnosis of a bag and the files written for it."""
 
     bag: Path
     diagnosis: Diagnosis
@@ -41,41 +42,41 @@ class BagDiagnosis:
     """``report.json``."""
     page: Path
     robot_file: Path | None
-    """A copy of the robot's file that holds what was found, where something was."""
+    """A copy of the robot's file with the identified effects; None where there are none."""
     complaints: tuple[str, ...] = ()
-    """What was wrong with the bag."""
+    """Problems found when reading the bag."""
 
     def without_arrays(self) -> BagDiagnosis:
-        """The same without the arrays of its pictures, which are drawn."""
-        return replace(self, diagnosis=replace(self.diagnosis, details={}))
+        """The same without the arrays for figures, to pass it between processes."""
+        return replace(self, diagnosis=replace(self.diagnosis, details=None))
 
 
-def read_drive(bag: Path, robot: RobotModel, terrain: str, topics: Topics = Topics()) -> tuple[Evidence, Recording]:
+def read_evidence(bag: Path, robot: RobotModel, terrain: str, topics: Topics = Topics()) -> tuple[Evidence, Recording]:
     """A bag's smoothed motion, commands and ground.
 
     Args:
         bag: the recording.
-        robot: whose own body is taken out of the lidar's sweeps.
-        terrain: ``flat``, ``lidar`` (all sweeps of the drive as one map) or a file of ``fit_terrain``.
-        topics: where they are not to be found by type.
+        robot: its own body is removed from the lidar's sweeps.
+        terrain: ``flat``, ``lidar`` (all sweeps of the recording as one map) or a file of ``fit_terrain``.
+        topics: where they are not to be detected by type.
 
     Raises:
-        BagError, TerrainError, TerrainFileError: what is needed is not there, or damaged.
+        BagError, TerrainError, TerrainFileError: required data are missing or damaged.
     """
     recording = Recording.open(bag, odometry=topics.odometry, commands=topics.commands, cloud=topics.cloud)
     smoothed = smooth(recording.motion)
-    drive = Evidence(smoothed, recording.commands, turning=recording.turning, wheels=recording.wheels)
+    evidence = Evidence(smoothed, recording.commands, gyro=recording.turning, wheels=recording.wheels)
     if terrain == "flat":
-        return drive, recording
+        return evidence, recording
     if terrain != "lidar":
         ground, pose = load_terrain(Path(terrain))
-        return replace(drive, terrain=ground, odometry_from_terrain=pose), recording
+        return replace(evidence, terrain=ground, odometry_from_terrain=pose), recording
     motion = smoothed.motion
     low, high = motion.positions.min(axis=0)[:2] - _MARGIN, motion.positions.max(axis=0)[:2] + _MARGIN
     columns, rows = np.ceil((high - low) / 0.1).astype(int) + 1
     grid = Grid(int(rows), int(columns), 0.1, (float(low[0]), float(low[1])))
-    ground, halves = split_maps(recording, motion, robot, grid)
-    return replace(drive, terrain=ground, odometry_from_terrain=np.eye(4), halves=halves), recording
+    ground, parts = split_maps(recording, motion, robot, grid)
+    return replace(evidence, terrain=ground, odometry_from_terrain=np.eye(4), split_maps=parts), recording
 
 
 def diagnose_bag(
@@ -85,62 +86,88 @@ def diagnose_bag(
     *,
     terrain: str = "flat",
     topics: Topics = Topics(),
-    settings: Settings = Settings(),  # noqa: B008
+    settings: DiagnosisSettings = DiagnosisSettings(),  # noqa: B008
     held_out: Sequence[Path] = (),
-    progress: Callable[[float, str], None] = lambda share, what: None,
+    progress: Callable[[float, str], None] = lambda share, step: None,
 ) -> BagDiagnosis:
-    """Diagnose a bag and write ``report.json``, ``report.html`` and, where something was found, the robot's new file.
+    """Diagnose a bag; write ``report.json``, ``report.html`` and, if effects were identified, a new robot file.
 
     Args:
         bag: the recording.
-        robot: name or file of the nominal robot; a commissioned file brings what disagreed on the healthy robot.
+        robot: name or file of the nominal robot; a commissioned file contains the nominal residual RMS.
         out: folder of the reports.
-        terrain: see :func:`read_drive`.
-        topics: where they are not to be found by type.
+        terrain: see :func:`read_evidence`.
+        topics: where they are not to be detected by type.
         settings: of the diagnosis.
-        held_out: further bags on which before and after are compared; nothing is fitted to them.
-        progress: called with the share of the work done and what comes next.
+        held_out: further recordings on which errors before and after are compared; nothing is fitted to them.
+        progress: called with the share of the work done and the next step.
+
+    Raises:
+        BagError, TerrainError, TerrainFileError: required data are missing or damaged.
+        ValueError: a held-out recording is the diagnosed one, or too short.
     """
     began = time.monotonic()
     model = load_robot(robot)
     progress(0.0, "reading")
-    drive, recording = read_drive(bag, model, terrain, topics)
+    evidence, recording = read_evidence(bag, model, terrain, topics)
+    data = fingerprint([bag])
+    others = _distinct_names(held_out)
+    for other in others.values():
+        if other.exists() and fingerprint([other]) == data:
+            raise ValueError(f"{other}: --held-out got the diagnosed recording {bag}, expected another recording")
     diagnosis = diagnose(
-        drive,
+        evidence,
         model,
         nominal_residual=read_nominal_residual(robot, settings.samples),
         settings=settings,
         progress=progress,
     )
-    data = fingerprint([bag])
     robot_file = None
     if diagnosis.effects:
-        robot_file = write_robot(robot, out / f"{model.name}.yaml", diagnosis.effects, [bag], data)
-    if held_out:
-        progress(0.97, "held-out bags")
-        tables = {other.name: _held_out(other, model, diagnosis.fitted, terrain, topics) for other in held_out}
+        effects = [effect_entry(effect) for effect in diagnosis.effects]
+        robot_file = write_robot(robot, out / f"{model.name}.yaml", effects, [bag], data)
+    if others:
+        progress(0.97, "held-out recordings")
+        tables = {
+            name: _held_out_table(path, model, diagnosis.fitted, terrain, topics) for name, path in others.items()
+        }
         diagnosis = replace(diagnosis, held_out=tables)
+    smoothed = evidence.smoothed
     inputs = {
         "bag": str(bag),
         "data": data,
         "robot": str(robot),
         "terrain": terrain,
         "topics": ", ".join(f"{role} {topic}" for role, topic in recording.topics.items()),
-        "noise of the poses": f"{100 * drive.smoothed.position_noise:.1f} cm, "
-        f"{np.degrees(drive.smoothed.rotation_noise):.2f}°",
+        "noise of the poses": f"{100 * smoothed.position_noise:.1f} cm, {np.degrees(smoothed.rotation_noise):.2f}°",
         "duration_s": round(time.monotonic() - began, 1),
     }
     report, page = write_diagnosis(out, diagnosis, inputs, robot_file)
     return BagDiagnosis(bag, diagnosis, report, page, robot_file, tuple(recording.complaints))
 
 
-def _held_out(bag: Path, robot: RobotModel, effects: Effects, terrain: str, topics: Topics) -> dict[str, dict]:
-    """Errors before and after on a drive that no fit saw."""
-    drive, _ = read_drive(bag, robot, terrain, topics)
-    drive = corrected_evidence(drive, robot.effects)
-    starts = window_starts(drive.smoothed.motion, drive.smoothed.stretches, 2.0, 1.0)
+def _distinct_names(bags: Sequence[Path]) -> dict[str, Path]:
+    """Bags by names that differ: the last part of the path, with as many parents as it takes; each bag once."""
+    paths = list(dict.fromkeys(bag.resolve() for bag in bags))
+    named = {}
+    for path in paths:
+        count = next(
+            count
+            for count in range(1, len(path.parts) + 1)
+            if all(other == path or other.parts[-count:] != path.parts[-count:] for other in paths)
+        )
+        named["/".join(path.parts[-count:])] = path
+    return named
+
+
+def _held_out_table(bag: Path, robot: RobotModel, effects: Effects, terrain: str, topics: Topics) -> dict[str, GapRow]:
+    """Errors without and with the effects on a recording to which nothing was fitted."""
+    evidence, _ = read_evidence(bag, robot, terrain, topics)
+    evidence = corrected_evidence(evidence, robot)
+    smoothed = evidence.smoothed
+    starts = window_starts(smoothed.motion, smoothed.stretches, 2.0, 1.0)
     if not len(starts):
-        raise ValueError(f"{bag}: no windows of 2 s without a gap: it cannot show what was gained")
-    data = drive.cut(starts, np.array([2.0]))
+        raise ValueError(f"{bag}: no gap-free window of 2 s, expected at least one for the comparison")
+    data = evidence.cut(starts, np.array([2.0]))
     parts = [effects, effects] if effects else None
-    return gap_table(compare(robot, data, drive.smoothed, parts, noisy_motions(drive.smoothed), within_blocks=False))
+    return gap_table(compare(robot, data, smoothed, parts, noisy_motions(smoothed), within_blocks=False))

@@ -1,10 +1,11 @@
-"""``diagnose``: find the physical effect that a robot's model lacks, and write it into a copy of its file."""
+"""``diagnose``: find the physical effects that a robot's model lacks, and write them into a copy of its file."""
 
 from __future__ import annotations
 
 import argparse
 import multiprocessing
 import sys
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
@@ -13,10 +14,10 @@ import torch
 from tqdm import tqdm
 
 from monoforce_ros.bags import BagError
-from monoforce_ros.discrepancy.bag_diagnosis import BagDiagnosis, Topics, diagnose_bag, read_drive
+from monoforce_ros.discrepancy.bag_diagnosis import BagDiagnosis, Topics, diagnose_bag, read_evidence
 from monoforce_ros.discrepancy.commissioning import commission
-from monoforce_ros.discrepancy.diagnosis import Settings
-from monoforce_ros.discrepancy.report import summary_lines
+from monoforce_ros.discrepancy.diagnosis import DiagnosisSettings
+from monoforce_ros.discrepancy.report import effect_entry, summary_lines
 from monoforce_ros.effects import EffectError
 from monoforce_ros.robots import RobotFileError, fingerprint, load_robot, shipped_robots, write_robot
 from monoforce_ros.terrain import TerrainError, TerrainFileError
@@ -28,29 +29,39 @@ def build_parser() -> argparse.ArgumentParser:
     """The command line's options."""
     parser = argparse.ArgumentParser(
         prog="diagnose",
-        description="Compare a robot's model with drives, find which physical effect it lacks, and write a copy "
-        "of its file that holds the effect. Each bag gets a folder with report.html and report.json.",
+        description="Compare a robot's model with recordings, find the physical effects that it lacks, and write them "
+        "into a copy of its file. Each bag gets a folder with report.html and report.json.",
     )
     parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 folder or ROS 1 .bag file")
     parser.add_argument("--robot", default="husky", help=f"robot file or one of {', '.join(shipped_robots())}")
     parser.add_argument(
-        "--terrain", default="flat", metavar="flat|lidar|FILE", help="ground of the drive; a file of fit_terrain (flat)"
+        "--terrain",
+        default="flat",
+        metavar="flat|lidar|FILE",
+        help="ground of the recording: level, mapped from the lidar, or a file of fit_terrain (%(default)s)",
     )
     parser.add_argument("--out", type=Path, required=True, help="folder for the reports")
     parser.add_argument(
         "--commission",
         action="store_true",
-        help="fit what every new robot needs (friction, effective track width, servo response) to drives of the "
-        "healthy robot and write OUT/ROBOT.yaml, the nominal model of later runs",
+        help="fit friction, effective track width and servo response to recordings of the healthy robot and write "
+        "OUT/ROBOT.yaml, the nominal model for later runs",
     )
-    parser.add_argument("--effects", type=int, default=4, metavar="N", help="at most (%(default)s)")
-    parser.add_argument("--odometry", metavar="TOPIC", help="(found by type)")
-    parser.add_argument("--commands", metavar="TOPIC", help="(found by type)")
-    parser.add_argument("--cloud", metavar="TOPIC", help="(found by type)")
     parser.add_argument(
-        "--held-out", nargs="+", type=Path, default=[], metavar="BAG", help="compare before and after on these too"
+        "--effects", type=int, default=4, metavar="N", help="largest number of effects to add (%(default)s)"
     )
-    parser.add_argument("--jobs", type=int, default=2, metavar="N", help="bags diagnosed at a time (%(default)s)")
+    parser.add_argument("--odometry", metavar="TOPIC", help="(detected by message type)")
+    parser.add_argument("--commands", metavar="TOPIC", help="(detected by message type)")
+    parser.add_argument("--cloud", metavar="TOPIC", help="(detected by message type)")
+    parser.add_argument(
+        "--held-out",
+        nargs="+",
+        type=Path,
+        default=[],
+        metavar="BAG",
+        help="compare errors before and after on these other recordings too; nothing is fitted to them",
+    )
+    parser.add_argument("--jobs", type=int, default=2, metavar="N", help="bags diagnosed in parallel (%(default)s)")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     return parser
 
@@ -66,7 +77,7 @@ def main(arguments: list[str] | None = None) -> int:
     # Many small operations: one thread is faster than several, and does not collapse on a busy machine.
     torch.set_num_threads(1)
     try:
-        # A wrong name or file is said before a long drive is read.
+        # Report a wrong robot before a long recording is read.
         load_robot(options.robot)
         if options.commission:
             return _commission(options)
@@ -80,7 +91,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def print_finding(found: BagDiagnosis) -> None:
-    """The outcome for people."""
+    """Print the result."""
     for complaint in found.complaints[:3]:
         print(f"diagnose: {found.bag}: {complaint}", file=sys.stderr)
     first, *rest = summary_lines(found.diagnosis)
@@ -94,28 +105,33 @@ def _with_bar(bag: Path, out: Path, options: argparse.Namespace) -> BagDiagnosis
     form = "{desc}: {percentage:3.0f}%|{bar}| [{elapsed}] {postfix}"
     with tqdm(total=100, desc=bag.name, bar_format=form, disable=True if options.quiet else None, leave=False) as bar:
 
-        def progress(share: float, what: str) -> None:
-            bar.set_postfix_str(what, refresh=False)
+        def progress(share: float, step: str) -> None:
+            bar.set_postfix_str(step, refresh=False)
             bar.update(100 * share - bar.n)
 
         return _run(bag, out, options, progress)
 
 
-def _run(bag: Path, out: Path, options: argparse.Namespace, progress=lambda share, what: None) -> BagDiagnosis:
+def _run(
+    bag: Path,
+    out: Path,
+    options: argparse.Namespace,
+    progress: Callable[[float, str], None] = lambda share, step: None,
+) -> BagDiagnosis:
     return diagnose_bag(
         bag,
         options.robot,
         out,
         terrain=options.terrain,
         topics=Topics(options.odometry, options.commands, options.cloud),
-        settings=Settings(most_effects=options.effects),
+        settings=DiagnosisSettings(max_effects=options.effects),
         held_out=options.held_out,
         progress=progress,
     )
 
 
 def _run_alone(bag: Path, out: Path, options: argparse.Namespace) -> BagDiagnosis | str:
-    """In a process of its own; an error comes back as its text."""
+    """Run in a worker process; an error is returned as its text."""
     torch.set_num_threads(1)
     try:
         return _run(bag, out, options).without_arrays()
@@ -124,7 +140,7 @@ def _run_alone(bag: Path, out: Path, options: argparse.Namespace) -> BagDiagnosi
 
 
 def _diagnose_many(options: argparse.Namespace) -> int:
-    """Bags in parallel, each into a folder of its own; one that fails does not stop the others."""
+    """Diagnose bags in parallel, each into a folder of its own; a failure does not stop the others."""
     names = [bag.name.removesuffix(".bag") for bag in options.bags]
     outs = [
         options.out / (name if names.count(name) == 1 else f"{number:02d}_{name}") for number, name in enumerate(names)
@@ -154,22 +170,23 @@ def _diagnose_many(options: argparse.Namespace) -> int:
 def _commission(options: argparse.Namespace) -> int:
     robot = load_robot(options.robot)
     topics = Topics(options.odometry, options.commands, options.cloud)
-    drives = [read_drive(bag, robot, options.terrain, topics)[0] for bag in options.bags]
-    settings = Settings()
-    effects, nominal_residual = commission(drives, robot, samples=settings.samples)
+    recordings = [read_evidence(bag, robot, options.terrain, topics)[0] for bag in options.bags]
+    settings = DiagnosisSettings()
+    effects, nominal_residual = commission(recordings, robot, samples=settings.samples)
     kept = {
         "samples_s": list(settings.samples),
         "residual_rms": [[float(f"{value:.4g}") for value in row] for row in nominal_residual],
     }
+    entries = [effect_entry(effect) for effect in effects]
     out = write_robot(
-        options.robot, options.out / f"{robot.name}.yaml", effects, options.bags, fingerprint(options.bags), kept
+        options.robot, options.out / f"{robot.name}.yaml", entries, options.bags, fingerprint(options.bags), kept
     )
     for effect in effects:
-        for key, entry in effect["parameters"].items():
-            print(f"{effect['name']}: {key} {entry['value']:.3g} {entry['unit']}")
+        for key, parameter in effect.parameters.items():
+            print(f"{effect.name}: {key} {parameter.value:.3g} {parameter.unit}")
     along, across, heading = nominal_residual[-1]
     print(
-        f"left on the healthy robot after {settings.horizon:g} s: {100 * along:.1f} cm along, "
+        f"nominal residual RMS of the healthy robot after {settings.horizon:g} s: {100 * along:.1f} cm along, "
         f"{100 * across:.1f} cm across, {np.degrees(heading):.2f}° in heading"
     )
     print(f"robot file: {out}")

@@ -1,8 +1,12 @@
-"""Comparison: errors before and after at every horizon, on windows that no fit saw."""
+"""Comparison: errors at every horizon without and with the identified effects.
+
+Each window is predicted with parameters fitted to the other fold. Two things are not held out: values that a gyro or
+wheel speeds measure come from the whole recording, and the effects were selected on the same folds.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,16 +23,18 @@ HORIZONS = (1.0, 2.0, 5.0)
 
 @dataclass(frozen=True)
 class Comparison:
-    """Errors of windows at one horizon."""
+    """Residuals of windows at one horizon."""
 
     horizon: float
+    """[s]."""
     starts: np.ndarray
     """``[W]`` [ns]."""
     before: np.ndarray
-    """``[W, 3]`` [m, m, rad]."""
+    """By the nominal model, ``[W, 3]`` [m, m, rad]."""
     after: np.ndarray | None
+    """With the identified effects; None where none was added to the model."""
     floor: np.ndarray
-    """Errors by the noise of the poses alone, ``[any, 3]``."""
+    """Due to pose noise alone, ``[any, 3]``."""
     data: EvidenceWindows
 
     def errors(self, metric: str, which: np.ndarray) -> np.ndarray:
@@ -36,6 +42,49 @@ class Comparison:
         if metric == "position":
             return np.hypot(which[..., 0], which[..., 1])
         return np.degrees(np.abs(which[..., 2]))
+
+
+@dataclass(frozen=True)
+class GapRow:
+    """Median error of one metric at one horizon; ``after`` and the gain are None where no effect was added."""
+
+    horizon: float
+    """[s]; 0 for a comparison of sensors."""
+    before: float
+    after: float | None
+    gain_low: float | None
+    """95 % confidence interval of the mean gain, by a bootstrap over blocks."""
+    gain_high: float | None
+    unit: str
+    noise: float
+    """Median error due to pose noise alone."""
+    closed: float | None = None
+    """Share of the reducible gap, the error above the noise, that is closed."""
+
+
+@dataclass(frozen=True)
+class RegimeRow:
+    """Median errors in one motion regime; those after are None where no effect was added."""
+
+    regime: str
+    share_of_time: float
+    position_before: float
+    """[m]."""
+    position_after: float | None
+    heading_before: float
+    """[deg]."""
+    heading_after: float | None
+
+
+@dataclass(frozen=True)
+class PathComparison:
+    """A measured path and its predictions, ``[K, 3]`` along, across [m], heading [rad] in the frame of its start."""
+
+    start: float
+    """Since the first window [s]."""
+    measured: np.ndarray
+    before: np.ndarray
+    after: np.ndarray | None
 
 
 def compare(
@@ -47,120 +96,131 @@ def compare(
     *,
     within_blocks: bool = True,
 ) -> list[Comparison]:
-    """Errors at 1, 2 and 5 s with and without what was found.
+    """Residuals at 1, 2 and 5 s without and with the identified effects.
 
     Args:
         robot: the nominal model.
-        data: the drive whose windows were cut into folds.
-        smoothed: its motion and noise.
-        parts: what was found with each fold left out, or None.
-        noisy: the motion with other noise, of :func:`noisy_motions`.
-        within_blocks: leave out windows that reach into a block that their fit saw.
+        data: the windows that were split into folds.
+        smoothed: the recording's motion and noise.
+        parts: effects fitted with each fold left out, or None.
+        noisy: the motion with other noise, from :func:`noisy_motions`.
+        within_blocks: leave out windows that reach into a block of the fitted fold.
     """
     prepared = []
     for horizon in HORIZONS:
         starts = window_starts(data.motion, smoothed.stretches, horizon, 1.0)
         if parts is not None and within_blocks:
-            # Only windows that end before the next block begins: that one was seen by the fit.
+            # Only windows that end before the next block begins: that one belongs to the fitted fold.
             starts = starts[starts >= data.starts[0]]
             into = ((starts - data.starts[0]) % round(BLOCK * 1e9)) * 1e-9
             starts = starts[into + horizon <= BLOCK + 0.5]
         if len(starts) >= 6:
             prepared.append(replace(data, starts=starts, horizon=horizon, samples=np.array([horizon])))
     results = []
-    for own in prepared:
-        floor = noise_residuals(data.motion, noisy, own)
-        rolled = Predictions(robot, own)
-        before = rolled.residuals([()])[0][:, 0]
-        after = None if parts is None else _held_out(rolled, data.starts[0], parts)[:, 0]
-        results.append(Comparison(own.horizon, own.starts, before, after, floor[:, 0], own))
+    for windows in prepared:
+        floor = noise_residuals(data.motion, noisy, windows)
+        predictions = Predictions(robot, windows)
+        before = predictions.residuals([()])[0][:, 0]
+        after = None if parts is None else _cross_validated(predictions, data.starts[0], parts)[:, 0]
+        results.append(Comparison(windows.horizon, windows.starts, before, after, floor[:, 0], windows))
     return results
 
 
-def _held_out(rolled: Predictions, first: int, parts: Sequence[Effects]) -> np.ndarray:
-    """Residuals ``[W, K, 3]`` of each window by the effects that were found without its fold."""
-    which = folds_of(np.r_[first, rolled.data.starts])[1:]
-    return rolled.residuals(list(parts))[which, np.arange(len(which))]
+def _cross_validated(predictions: Predictions, first: int, parts: Sequence[Effects]) -> np.ndarray:
+    """Residuals ``[W, K, 3]`` of each window with the effects fitted without its fold."""
+    fold = folds_of(np.r_[first, predictions.data.starts])[1:]
+    return predictions.residuals(list(parts))[fold, np.arange(len(fold))]
 
 
-def gap_table(comparisons: Sequence[Comparison], seed: int = 0) -> dict[str, dict]:
-    """By metric and horizon: medians before and after, the mean gain's interval by whole blocks, and the noise."""
+def gap_table(comparisons: Sequence[Comparison], seed: int = 0) -> dict[str, GapRow]:
+    """By metric and horizon, such as ``position_2s``: median errors, noise, and the confidence interval of the gain."""
     random = np.random.default_rng(seed)
-    table: dict[str, dict] = {}
+    table: dict[str, GapRow] = {}
     for found in comparisons:
-        after = found.before if found.after is None else found.after
         for metric, unit in (("position", "m"), ("heading", "deg")):
-            errors = [found.errors(metric, values) for values in (found.before, after)]
+            before = found.errors(metric, found.before)
+            noise = float(np.median(found.errors(metric, found.floor)))
+            row = GapRow(found.horizon, float(np.median(before)), None, None, None, unit, noise)
             blocks = blocks_of(found.starts)
             numbers = np.unique(blocks)
             picks = random.integers(0, len(numbers), (1000, len(numbers)))
-            differences = [errors[0][blocks == b] - errors[1][blocks == b] for b in numbers]
-            means = np.array([[d.sum(), len(d)] for d in differences])
-            resampled = means[picks, 0].sum(axis=1) / means[picks, 1].sum(axis=1)
-            noise = float(np.median(found.errors(metric, found.floor)))
-            row = {
-                "horizon_s": found.horizon,
-                "before": float(np.median(errors[0])),
-                "after": float(np.median(errors[1])),
-                "low": float(np.quantile(resampled, 0.025)),
-                "high": float(np.quantile(resampled, 0.975)),
-                "unit": unit,
-                "noise": noise,
-            }
-            reducible = row["before"] - noise
-            if found.after is not None and reducible > 0:
-                row["closed"] = float(np.clip((row["before"] - row["after"]) / reducible, -1.0, 1.0))
+            if found.after is not None:
+                after = found.errors(metric, found.after)
+                gains = [before[blocks == b] - after[blocks == b] for b in numbers]
+                sums = np.array([[gain.sum(), len(gain)] for gain in gains])
+                resampled = sums[picks, 0].sum(axis=1) / sums[picks, 1].sum(axis=1)
+                row = replace(
+                    row,
+                    after=float(np.median(after)),
+                    gain_low=float(np.quantile(resampled, 0.025)),
+                    gain_high=float(np.quantile(resampled, 0.975)),
+                    closed=_closed(row.before, float(np.median(after)), noise),
+                )
             table[f"{metric}_{found.horizon:g}s"] = row
     return table
 
 
-def regime_table(comparison: Comparison) -> list[dict]:
-    """Position and heading error at one horizon in each regime, before and after."""
+def _closed(before: float, after: float, noise: float) -> float | None:
+    """Share of the reducible gap that is closed; None where nothing is reducible."""
+    reducible = before - noise
+    return float(np.clip((before - after) / reducible, -1.0, 1.0)) if reducible > 0 else None
+
+
+def improves(gap: Mapping[str, GapRow]) -> bool:
+    """Whether errors at 1 or 2 s get smaller beyond chance in any metric."""
+    return any(
+        row.gain_low is not None and row.gain_low > 0 for metric, row in gap.items() if metric.endswith(("_1s", "_2s"))
+    )
+
+
+def regime_table(comparison: Comparison) -> list[RegimeRow]:
+    """Median errors at one horizon in the whole recording and in each motion regime."""
     rows = []
-    after = comparison.before if comparison.after is None else comparison.after
-    everything = {"the whole drive": np.ones(len(comparison.starts), bool)}
+    everything = {"the whole recording": np.ones(len(comparison.starts), bool)}
     for regime, mask in {**everything, **find_regimes(comparison.data)}.items():
         if mask.sum() < 3:
             continue
+
+        def median(metric: str, values: np.ndarray, mask: np.ndarray = mask) -> float:
+            return float(np.median(comparison.errors(metric, values[mask])))
+
+        after = comparison.after
         rows.append(
-            {"regime": regime, "share_of_time": float(mask.mean())}
-            | {
-                f"{metric}_{when}": float(np.median(comparison.errors(metric, values[mask])))
-                for metric in ("position", "heading")
-                for when, values in (("before", comparison.before), ("after", after))
-            }
+            RegimeRow(
+                regime=regime,
+                share_of_time=float(mask.mean()),
+                position_before=median("position", comparison.before),
+                position_after=None if after is None else median("position", after),
+                heading_before=median("heading", comparison.before),
+                heading_after=None if after is None else median("heading", after),
+            )
         )
     return rows
 
 
 def measured_paths(
     robot: RobotModel, data: EvidenceWindows, parts: Sequence[Effects] | None, count: int = 6
-) -> list[dict]:
-    """Predicted and measured paths of some windows, spread over those with the largest errors before.
-
-    Returns:
-        for each ``start_s``, and ``measured``, ``before``, ``after`` ``[K, 3]`` along, across [m], heading [rad] in the
-        axes of the window's start.
-    """
+) -> list[PathComparison]:
+    """Predicted and measured paths of some windows with errors above the median, the largest error first."""
     horizon = 5.0
     into = ((data.starts - data.starts[0]) % round(BLOCK * 1e9)) * 1e-9
     last = data.motion.stamps[-1] - round((horizon + 0.1) * 1e9)
     starts = data.starts[(into + horizon <= BLOCK + 0.5) & (data.starts < last)]
     if not len(starts):
         return []
-    own = replace(data, starts=starts, horizon=horizon, samples=np.arange(0.25, horizon + 0.01, 0.25))
-    measured = relative_motion(own.motion, own)
-    rolled = Predictions(robot, own)
-    before = rolled.residuals([()])[0]
-    after = None if parts is None else _held_out(rolled, data.starts[0], parts)
+    windows = replace(data, starts=starts, horizon=horizon, samples=np.arange(0.25, horizon + 0.01, 0.25))
+    measured = relative_motion(windows.motion, windows)
+    predictions = Predictions(robot, windows)
+    before = predictions.residuals([()])[0]
+    after = None if parts is None else _cross_validated(predictions, data.starts[0], parts)
     order = np.argsort(np.hypot(before[:, -1, 0], before[:, -1, 1]))
     picked = order[np.unique(np.linspace(0.5 * len(order), len(order) - 1, count).astype(int))]
     return [
-        {
-            "start_s": float(starts[index] - data.starts[0]) * 1e-9,
-            "measured": measured[index],
-            "before": measured[index] + before[index],
-            "after": None if after is None else measured[index] + after[index],
-        }
+        PathComparison(
+            start=float(starts[index] - data.starts[0]) * 1e-9,
+            measured=measured[index],
+            before=measured[index] + before[index],
+            after=None if after is None else measured[index] + after[index],
+        )
         for index in picked[::-1]
     ]

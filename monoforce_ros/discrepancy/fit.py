@@ -1,4 +1,4 @@
-"""Fit: the parameters of effects that bring predictions closest to a drive, by robust least squares."""
+"""Fit: parameters of effects, fitted to a recording by robust least squares."""
 
 from __future__ import annotations
 
@@ -8,21 +8,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from monoforce_ros.core import huber
+from monoforce_ros.discrepancy.estimates import EffectEstimate, ParameterEstimate
 from monoforce_ros.discrepancy.hypothesis import Effects, EvidenceWindows, Predictions
 from monoforce_ros.effects import CATALOGUE, Effect
 
 OUTLIER = 3.0
-"""Scaled residuals beyond this weigh with their size rather than their square."""
+"""Scaled residuals beyond this are weighted linearly instead of quadratically."""
 _DAMPINGS = (1e-3, 1e-1, 3.0)
-_LOST = 1e3
-"""Scaled residual of a prediction that is not finite."""
-_SHARED = 4.0
-"""Length of the blocks that say something on their own [s]."""
+_NOT_FINITE = 1e3
+"""Scaled residual assumed for a prediction that is not finite."""
+_BLOCK = 4.0
+"""Length of the blocks that are taken as independent [s]."""
 
 
 @dataclass(frozen=True)
 class Fit:
-    """Fitted effects and what they explain."""
+    """Fitted effects, their loss and their covariance."""
 
     effects: Effects
     loss: np.ndarray
@@ -37,15 +38,15 @@ class Fit:
 
 
 def robust(scaled: np.ndarray) -> np.ndarray:
-    """Huber's loss of scaled residuals ``[..., W, K, 3]``, averaged over a window, ``[..., W]``.
+    """Huber loss of scaled residuals ``[..., W, K, 3]``, averaged over each window, ``[..., W]``.
 
-    A prediction that is not finite counts as one that is very wrong.
+    A prediction that is not finite gets a large residual.
     """
-    return np.minimum(huber(np.nan_to_num(scaled, nan=_LOST), OUTLIER), 1e6).mean(axis=(-1, -2))
+    return np.minimum(huber(np.nan_to_num(scaled, nan=_NOT_FINITE), OUTLIER), 1e6).mean(axis=(-1, -2))
 
 
 def flat(effects: Effects) -> np.ndarray:
-    """Values of all parameters in a row."""
+    """Values of all parameters as one vector ``[P]``."""
     return np.array([float(value) for _, parameters in effects for value in parameters.values()])
 
 
@@ -63,21 +64,21 @@ def with_values(effects: Effects, values: np.ndarray) -> Effects:
 
 
 def neutral_values(effects: Effects) -> np.ndarray:
-    """Values at which the effects do nothing, in a row."""
+    """Values at which the effects do nothing, ``[P]``."""
     return np.array(
         [{p.name: p for p in CATALOGUE[name].parameters}[key].neutral for name, values in effects for key in values]
     )
 
 
 def scales(effects: Effects) -> np.ndarray:
-    """How far from neutral each parameter is typically found."""
+    """Typical distance of each parameter from its neutral value, ``[P]``."""
     return np.array(
         [{p.name: p for p in CATALOGUE[name].parameters}[key].scale for name, values in effects for key in values]
     )
 
 
 def without(effects: Effects, name: str) -> Effects:
-    """The others."""
+    """The effects except the one named."""
     return tuple(entry for entry in effects if entry[0] != name)
 
 
@@ -93,13 +94,13 @@ def fit_effects(
     """Robust Levenberg-Marquardt from the best of several starts.
 
     Args:
-        predictions: of the drive.
-        starts: the same effects with different values.
-        scale: size of a residual that means nothing, ``[K, 3]``.
-        iterations: at most.
-        free: effects before this one keep their values.
-        prior: weight, beside the mean loss, of half the squared distance of each parameter from neutral in its
-            typical size; what a drive hardly tells then stays near neutral.
+        predictions: of the recording's windows.
+        starts: the same effects with different initial values.
+        scale: expected size of a residual, ``[K, 3]``.
+        iterations: largest number.
+        free: index of the first effect that is fitted; earlier ones keep their values.
+        prior: weight, relative to the mean loss, of half the squared distance of each parameter from neutral in units
+            of its typical distance; parameters that the recording hardly constrains then stay near neutral.
     """
     neutral = neutral_values(starts[0])
 
@@ -147,11 +148,11 @@ def fit_effects(
 def _jacobian(
     predictions: Predictions, current: Effects, residual: np.ndarray, scale: np.ndarray, held: int
 ) -> np.ndarray:
-    """Derivatives of the scaled residuals by each free parameter over its typical size, ``[P, W K 3]``."""
+    """Derivatives of the scaled residuals by each free parameter in units of its typical size, ``[P, W K 3]``."""
     values, typical = flat(current), scales(current)
     steps = 3e-2 * typical
     units = np.eye(len(values))
-    # Away from a bound, and from neutral values beyond which an effect does not exist.
+    # Step away from bounds, and from neutral values beyond which an effect is undefined.
     moved, actual = [], []
     for i in range(held, len(values)):
         there = with_values(current, values + steps * units[i])
@@ -167,22 +168,22 @@ def _jacobian(
 
 
 def _covariance(jacobian: np.ndarray, residual: np.ndarray, typical: np.ndarray, data: EvidenceWindows) -> np.ndarray:
-    """Of the parameters, by what each block of the drive says on its own (sandwich estimate, White 1980).
+    """Covariance of the parameters from the scores of each block of the recording (sandwich estimate, White 1980).
 
-    Windows of a block share motion and the model's other errors; blocks hardly do. So the spread of the blocks' pulls
-    on the parameters says how sure they are, also where the model is wrong in other ways.
+    Blocks are roughly independent, windows within a block are not: they share motion and the model's other errors. The
+    spread of the per-block scores therefore measures the uncertainty even where the model is wrong in other ways.
     """
     used = np.nan_to_num(residual)
     weight = np.minimum(1.0, OUTLIER / np.maximum(np.abs(used), 1e-9))
     count = len(used)
     rows = jacobian.reshape(len(jacobian), count, -1)
-    pulls = np.einsum("pwk,wk->wp", rows, (weight * used).reshape(count, -1))
-    blocks = ((data.starts - data.starts[0]) // round(_SHARED * 1e9)).astype(int)
-    sums = np.array([pulls[blocks == block].sum(axis=0) for block in np.unique(blocks)])
+    scores = np.einsum("pwk,wk->wp", rows, (weight * used).reshape(count, -1))
+    blocks = ((data.starts - data.starts[0]) // round(_BLOCK * 1e9)).astype(int)
+    block_scores = np.array([scores[blocks == block].sum(axis=0) for block in np.unique(blocks)])
     information = np.einsum("pwk,qwk->pq", rows * weight.reshape(1, count, -1), rows)
     inverse = np.linalg.pinv(information + 1e-9 * np.eye(len(information)) * np.trace(information))
-    few = len(sums) / max(1, len(sums) - len(typical))
-    return few * inverse @ (sums.T @ sums) @ inverse * np.outer(typical, typical)
+    small_sample = len(block_scores) / max(1, len(block_scores) - len(typical))
+    return small_sample * inverse @ (block_scores.T @ block_scores) @ inverse * np.outer(typical, typical)
 
 
 def first_values(effect: Effect) -> list[Effects]:
@@ -190,21 +191,26 @@ def first_values(effect: Effect) -> list[Effects]:
     return [((effect.name, values),) for values in effect.first_values()]
 
 
-def described(fit: Fit, rivals: Mapping[str, Sequence[str]]) -> list[dict]:
-    """Effects as in a report: ``name``, ``parameters`` {name: {value, low, high, unit}} with 95 %, ``rivals``."""
+def estimate_effects(fit: Fit, indistinguishable: Mapping[str, Sequence[str]]) -> tuple[EffectEstimate, ...]:
+    """Fitted effects with 95 % confidence intervals.
+
+    Args:
+        fit: its covariance gives the intervals.
+        indistinguishable: by effect, others that explain the recording about as well.
+    """
     deviations = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
-    result, at = [], 0
+    estimates, at = [], 0
     for name, parameters in fit.effects:
         known = {p.name: p for p in CATALOGUE[name].parameters}
         listed = {}
         for key, value in parameters.items():
-            half = 1.96 * float(deviations[at])
-            listed[key] = {
-                "value": float(value),
-                "low": float(max(value - half, known[key].low)),
-                "high": float(min(value + half, known[key].high)),
-                "unit": known[key].unit,
-            }
+            half_width = 1.96 * float(deviations[at])
+            listed[key] = ParameterEstimate(
+                value=float(value),
+                low=float(max(value - half_width, known[key].low)),
+                high=float(min(value + half_width, known[key].high)),
+                unit=known[key].unit,
+            )
             at += 1
-        result.append({"name": name, "parameters": listed, "rivals": list(rivals.get(name, []))})
-    return result
+        estimates.append(EffectEstimate(name, listed, tuple(indistinguishable.get(name, ()))))
+    return tuple(estimates)

@@ -1,9 +1,9 @@
-"""Gap: how far predictions are from the drive, how much of it is noise, and where it lives."""
+"""Gap: prediction errors on a recording, how much of them is noise, and where they are largest."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -16,16 +16,57 @@ from monoforce_ros.terrain import TerrainMap
 
 _NOISE_DRAWS = 3
 _KNOWN_SHAPE = 0.5
-"""Of the ground's influence on the motion: on MuJoCo's hills predictions on the true heights are off by the rest."""
+"""Share of the ground's influence on the motion that predictions reproduce: the rest is their error on the true heights
+of MuJoCo's hills."""
 _SMALLEST = np.array([0.01, 0.01, np.radians(0.3)])
-"""Residuals below this mean nothing however quiet the data [m, m, rad]."""
+"""Residuals below this are insignificant even on noise-free data [m, m, rad]."""
+
+
+@dataclass(frozen=True)
+class NoiseFloor:
+    """Residuals that noise alone leaves at the end of a window."""
+
+    horizon: float
+    """[s]."""
+    along: float
+    """[m]."""
+    across: float
+    """[m]."""
+    heading: float
+    """[rad]."""
+
+
+@dataclass(frozen=True)
+class Localisation:
+    """A motion regime that holds more of the squared error of one component than of the time."""
+
+    axis: str
+    regime: str
+    horizon: float
+    """[s]."""
+    share_of_error: float
+    """Of the squared error of the whole recording."""
+    share_of_time: float
+    rms: float
+    bias: float
+    """Mean of predicted minus measured."""
+    unit: str
+    weight: float
+    """By which entries are ordered."""
+
+    @property
+    def text(self) -> str:
+        """In one sentence."""
+        return (
+            f"{self.regime}: {100 * self.share_of_error:.0f} % of the squared {self.axis} after {self.horizon:g} s in "
+            f"{100 * self.share_of_time:.0f} % of the time"
+        )
 
 
 def noisy_motions(smoothed: SmoothedMotion, seed: int = 0) -> list[MotionTrack]:
-    """The motion as it would have been found from poses with other noise of the same size.
+    """The motion as smoothed from other draws of the pose noise.
 
-    The smooth motion is taken for the truth, noise of the size that was taken out is put back, and it is smoothed once
-    more.
+    The smoothed motion serves as truth; noise of the estimated size is added to it, and the result is smoothed again.
     """
     random = np.random.default_rng(seed)
     motion = smoothed.motion
@@ -43,31 +84,31 @@ def noisy_motions(smoothed: SmoothedMotion, seed: int = 0) -> list[MotionTrack]:
 
 
 def noise_residuals(motion: MotionTrack, noisy: Sequence[MotionTrack], data: EvidenceWindows) -> np.ndarray:
-    """Residuals that a perfect model would have by the noise of the poses alone, ``[draws W, K, 3]``.
+    """Residuals of a perfect model due to pose noise alone, ``[draws W, K, 3]``.
 
     Args:
-        motion: smooth.
-        noisy: the same with other noise, of :func:`noisy_motions`.
-        data: windows of it.
+        motion: smoothed.
+        noisy: the same motion with other noise, from :func:`noisy_motions`.
+        data: its windows.
     """
-    own = relative_motion(motion, data)
-    return np.concatenate([relative_motion(other, data) - own for other in noisy])
+    reference = relative_motion(motion, data)
+    return np.concatenate([relative_motion(other, data) - reference for other in noisy])
 
 
 def noise_floor(motion: MotionTrack, noisy: Sequence[MotionTrack], data: EvidenceWindows) -> np.ndarray:
-    """Size of :func:`noise_residuals`, ``[K, 3]`` [m, m, rad]: two thirds are smaller, as of a standard deviation.
+    """Size of :func:`noise_residuals`, ``[K, 3]`` [m, m, rad]: their 68 % quantile, a robust standard deviation.
 
-    Robust: where a localisation jumps, smoothing other noise gives another motion altogether.
+    Where a localisation jumps, smoothing with other noise gives an entirely different motion.
     """
     return np.quantile(np.abs(noise_residuals(motion, noisy, data)), 0.683, axis=0)
 
 
-def map_floor(robot: RobotModel, data: EvidenceWindows, halves: tuple[TerrainMap, TerrainMap] | None) -> np.ndarray:
-    """What residuals have by the ground's shape, however right the robot's model is, ``[K, 3]`` [m, m, rad].
+def map_floor(robot: RobotModel, data: EvidenceWindows, split_maps: tuple[TerrainMap, TerrainMap] | None) -> np.ndarray:
+    """Residuals that errors of the terrain map cause, even with a perfect robot model, ``[K, 3]`` [m, m, rad].
 
-    Two parts: predictions on the maps of both halves of the sweeps differ by twice what the whole map's own noise does
-    to them; and what hills do to the motion, the difference to predictions on level ground, counts as known to
-    ``_KNOWN_SHAPE``, for a map has cells and tyres deform. Zero on level ground.
+    It has two parts. Predictions on the split maps, from every other sweep each, differ by twice the effect of the
+    whole map's noise. And only the share ``_KNOWN_SHAPE`` of the hills' influence, the difference to predictions on
+    level ground, is taken as known, because a map has cells and tyres deform. Zero on level ground.
     """
     if data.terrain is None:
         return np.zeros((len(data.samples), 3))
@@ -77,15 +118,15 @@ def map_floor(robot: RobotModel, data: EvidenceWindows, halves: tuple[TerrainMap
             np.nan_to_num(Predictions(robot, replace(data, terrain=ground)).residuals([()])[0])
             for ground in (one, other)
         ]
-        # Robust: a window on which one map has a step under a wheel shall not excuse all others.
+        # Robust: a single window with a spurious step under a wheel must not raise the floor of all others.
         return np.quantile(np.abs(moves[0] - moves[1]), 0.68, axis=0)
 
     shape = (1.0 - _KNOWN_SHAPE) * spread(data.terrain, None)
-    return shape if halves is None else np.hypot(shape, 0.5 * spread(*halves))
+    return shape if split_maps is None else np.hypot(shape, 0.5 * spread(*split_maps))
 
 
 def relative_motion(motion: MotionTrack, data: EvidenceWindows) -> np.ndarray:
-    """Motion since the start of each window in the axes of its start, ``[W, K, 3]`` [m, m, rad]."""
+    """Motion since the start of each window, in the frame of the start pose, ``[W, K, 3]`` [m, m, rad]."""
     stamps = data.starts[:, None] + np.rint(np.r_[0.0, data.samples] * 1e9).astype(np.int64)
     positions, rotations, _, _ = sample_motion(motion, stamps)
     headings = np.arctan2(rotations[..., 1, 0], rotations[..., 0, 0])
@@ -96,7 +137,7 @@ def relative_motion(motion: MotionTrack, data: EvidenceWindows) -> np.ndarray:
 
 
 def residual_scale(floor: np.ndarray, nominal_residual: np.ndarray | None) -> np.ndarray:
-    """Size of a residual that means nothing, ``[K, 3]``: noise, and what disagreed on the healthy robot already."""
+    """Expected size of a residual, ``[K, 3]``: noise, and the nominal residual RMS of the healthy robot."""
     squares = floor**2 + _SMALLEST**2
     if nominal_residual is not None:
         squares = squares + nominal_residual**2
@@ -123,17 +164,20 @@ def find_regimes(data: EvidenceWindows) -> dict[str, np.ndarray]:
 
 def localise(
     residuals: np.ndarray, floor: np.ndarray, data: EvidenceWindows, regimes: dict[str, np.ndarray]
-) -> list[dict]:
-    """Where the disagreement lives: shares of the squared error over its floor by axis and regime, strongest first.
+) -> tuple[Localisation, ...]:
+    """Where errors above the floor are largest: shares of the squared error by component and motion regime.
 
     Args:
         residuals: ``[W, K, 3]``.
         floor: ``[K, 3]``.
-        data: the drive.
-        regimes: of :func:`find_regimes`.
+        data: the windows.
+        regimes: from :func:`find_regimes`.
+
+    Returns:
+        the strongest entries, in order.
     """
     horizon = float(data.samples[-1])
-    names = (("error along the way", "m"), ("error across the way", "m"), ("heading error", "rad"))
+    names = (("along-track error", "m"), ("cross-track error", "m"), ("heading error", "rad"))
     squares = residuals[:, -1] ** 2
     scaled = squares.mean(axis=0) / (floor[-1] ** 2 + _SMALLEST**2)
     entries = []
@@ -145,18 +189,17 @@ def localise(
             share, time = float(squares[mask, axis].sum() / total), float(mask.mean())
             lift = share / max(time, 1e-9)
             entries.append(
-                {
-                    "axis": name,
-                    "regime": regime,
-                    "share_of_error": share,
-                    "share_of_time": time,
-                    "rms": float(np.sqrt(squares[mask, axis].mean())),
-                    "bias": float(residuals[mask, -1, axis].mean()),
-                    "unit": unit,
-                    "weight": float(lift * share * min(scaled[axis], 100.0)),
-                    "text": f"{100 * share:.0f} % of the {name} at {horizon:g} s arises in {100 * time:.0f} % of the "
-                    f"time: {regime}",
-                }
+                Localisation(
+                    axis=name,
+                    regime=regime,
+                    horizon=horizon,
+                    share_of_error=share,
+                    share_of_time=time,
+                    rms=float(np.sqrt(squares[mask, axis].mean())),
+                    bias=float(residuals[mask, -1, axis].mean()),
+                    unit=unit,
+                    weight=float(lift * share * min(scaled[axis], 100.0)),
+                )
             )
-    entries = [entry for entry in entries if entry["share_of_error"] > 1.25 * entry["share_of_time"]]
-    return sorted(entries, key=lambda entry: -entry["weight"])[:8]
+    entries = [entry for entry in entries if entry.share_of_error > 1.25 * entry.share_of_time]
+    return tuple(sorted(entries, key=lambda entry: -entry.weight)[:8])

@@ -1,8 +1,8 @@
-"""Hypothesis: a robot with effects, and how far its predictions are from what a drive shows.
+"""Hypothesis: a robot with assumed effects, and the residuals of its predictions on a recording.
 
 Windows start at fixed recorded times. A hypothesis predicts the motion in each from its measured start state and the
-recorded commands; what a measurement effect does to the record is undone first. Many hypotheses are rolled out at
-once: derivatives by differences cost one rollout of a larger batch.
+recorded commands; the recording is first corrected for the hypothesis' measurement effects. Many hypotheses are rolled
+out at once: finite-difference derivatives cost one rollout of a larger batch.
 """
 
 from __future__ import annotations
@@ -22,33 +22,34 @@ from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import Grid, TerrainMap
 
 Effects = tuple[tuple[str, Mapping[str, float]], ...]
+"""Names of effects with the values of their parameters."""
 COMPONENTS = ("along", "across", "heading")
-"""Of a residual: position in the axes of the window's start [m], heading [rad]."""
+"""Of a residual: position in the frame of the window's start pose [m], heading [rad]."""
 HISTORY = 2.0
-"""Commands before a window that delays and lags may reach back to [s]."""
+"""Length of the commands before a window, for delays and lags [s]."""
 _MARGIN = 1.3
-"""Kept free at both ends of a stretch, so that a shifted clock still finds data [s]."""
+"""Margin at both ends of a stretch, so that a shifted clock still finds data [s]."""
 _SHORT = 12.0
-"""Stretches shorter than this start with what they were recorded for, such as a step of the command [s]."""
+"""Stretches shorter than this keep their beginning: it often holds the manoeuvre, such as a step of the command [s]."""
 _LARGEST_BATCH = 1024
 _LEVEL_REACH, _HILLY_REACH = 0.1, 0.3
-"""Height over the lowest point of a robot up to which it may touch the ground [m]."""
+"""Height above a robot's lowest point up to which contact points are kept [m]."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """A recorded drive on its ground."""
+    """What a recording holds: motion, commands, ground, and further sensors."""
 
     smoothed: SmoothedMotion
     commands: CommandTrack
     terrain: TerrainMap | None = None
     """One map in its own frame, or None for level ground."""
     odometry_from_terrain: np.ndarray | None = None
-    """Pose ``[4, 4]`` of the map."""
-    halves: tuple[TerrainMap, TerrainMap] | None = None
-    """Maps that each half of the sweeps gives alone."""
-    turning: AngularVelocityTrack | None = None
-    """What an IMU shows."""
+    """Pose ``[4, 4]`` of the map in the odometry frame; given whenever a map is."""
+    split_maps: tuple[TerrainMap, TerrainMap] | None = None
+    """Maps from the even and from the odd sweeps alone."""
+    gyro: AngularVelocityTrack | None = None
+    """Angular velocity measured by an IMU."""
     wheels: WheelTrack | None = None
     """Measured wheel speeds."""
 
@@ -67,7 +68,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class EvidenceWindows:
-    """What a hypothesis is held against."""
+    """Windows of a recording on which hypotheses are tested."""
 
     motion: MotionTrack
     """Smoothed."""
@@ -84,11 +85,11 @@ class EvidenceWindows:
 
 
 def window_starts(motion: MotionTrack, stretches: Sequence[slice], horizon: float, stride: float) -> np.ndarray:
-    """Starts of windows that lie within stretches of odometry without a gap, ``[W]`` [ns]."""
-    starts = []
+    """Starts of windows within gap-free stretches of odometry, ``[W]`` [ns]."""
+    starts: list[int] = []
     for stretch in stretches:
         first, last = int(motion.stamps[stretch.start]), int(motion.stamps[stretch.stop - 1])
-        # Poses come late rather than early: the end of a short stretch is kept free, its start is not.
+        # Pose clocks are late rather than early: a short stretch keeps its margin at the end only.
         lead = _MARGIN if last - first > round(_SHORT * 1e9) else 0.1
         low, high = first + round(lead * 1e9), last - round((horizon + _MARGIN) * 1e9)
         starts.extend(range(low, high + 1, round(stride * 1e9)))
@@ -96,7 +97,7 @@ def window_starts(motion: MotionTrack, stretches: Sequence[slice], horizon: floa
 
 
 def subsampled(starts: np.ndarray, block: float, most: int) -> np.ndarray:
-    """At most about ``most`` of the windows of a long drive: pairs of blocks [s], evenly over all of it."""
+    """At most about ``most`` windows of a long recording: pairs of blocks [s], spread evenly over it."""
     if len(starts) <= most:
         return starts
     pairs = (starts - starts[0]) // round(2 * block * 1e9)
@@ -106,7 +107,7 @@ def subsampled(starts: np.ndarray, block: float, most: int) -> np.ndarray:
 
 
 def sample_motion(motion: MotionTrack, stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Positions, rotation matrices, and velocities in base axes at stamps ``[...]`` within the track."""
+    """Positions, rotation matrices, linear and angular velocities in the base frame at stamps ``[...]``."""
     shape = stamps.shape
     origin = int(motion.stamps[0])
     times = (motion.stamps - origin) * 1e-9
@@ -119,25 +120,52 @@ def sample_motion(motion: MotionTrack, stamps: np.ndarray) -> tuple[np.ndarray, 
     return blend(motion.positions), rotations, blend(motion.linear_velocities), blend(motion.angular_velocities)
 
 
-def corrected_evidence(drive: Evidence, effects: Effects) -> Evidence:
-    """The drive without what a robot's file says of its sensors and clocks."""
-    motion, commands = correct_measurements(drive.smoothed.motion, drive.commands, effects)
-    return replace(drive, smoothed=replace(drive.smoothed, motion=motion), commands=commands)
+def corrected_evidence(evidence: Evidence, robot: RobotModel) -> Evidence:
+    """The evidence corrected for the sensor and clock errors in a robot's file."""
+    effects = tuple((name, {key: float(value) for key, value in values.items()}) for name, values in robot.effects)
+    motion, commands = correct_measurements(evidence.smoothed.motion, evidence.commands, effects)
+    return replace(evidence, smoothed=replace(evidence.smoothed, motion=motion), commands=commands)
 
 
 def correct_measurements(
     motion: MotionTrack, commands: CommandTrack, effects: Effects
 ) -> tuple[MotionTrack, CommandTrack]:
-    """The record without what measurement effects did to it: each is its own inverse with the opposite sign."""
+    """Motion and commands corrected for measurement effects: each is its own inverse with the opposite sign."""
     return corrected_motion(motion, effects), corrected_commands(commands, effects)
 
 
+_MeasurementKey = tuple[tuple[str, tuple[tuple[str, float], ...]], ...]
+"""Measurement effects with their parameters, hashable."""
+
+
+@dataclass(frozen=True)
+class _Prepared:
+    """Measured motion and start states of all windows under one set of measurement effects."""
+
+    moved: np.ndarray
+    """Measured displacement, ``[W, K, 3]`` [m]."""
+    turned: np.ndarray
+    """Measured change of heading, ``[W, K]`` [rad]."""
+    frames: np.ndarray
+    """Rotation of the start headings, ``[W, 1, 3, 3]``."""
+    places: np.ndarray
+    """Start positions on the terrain, ``[W, 3]`` [m]."""
+    twists: torch.Tensor
+    """Commands with their history, ``[W, HISTORY + T, 2]``."""
+    history: int
+    """Steps of it."""
+    position: torch.Tensor
+    rotation: torch.Tensor
+    velocity: torch.Tensor
+    angular_velocity: torch.Tensor
+
+
 class Predictions:
-    """Rolls out hypotheses over the windows of a drive.
+    """Rolls out hypotheses over the windows of a recording.
 
     Args:
         robot: with the effects of its file.
-        data: the drive.
+        data: the windows.
     """
 
     def __init__(self, robot: RobotModel, data: EvidenceWindows):
@@ -148,17 +176,17 @@ class Predictions:
         else:
             self._terrain = data.terrain
         self._depth = rest_depth(robot, float(self._terrain.stiffness.median()))
-        # The upper halves of the wheels and most of the hull meet no ground: left out, rollouts are twice as fast.
+        # Contact points that never touch the ground are left out, which makes rollouts twice as fast.
         reach = _LEVEL_REACH if data.terrain is None else _HILLY_REACH
         self.robot = robot.with_points(robot.points[:, 2] < reach - robot.ground_clearance)
-        self._prepared: dict = {}
+        self._prepared: dict[_MeasurementKey, _Prepared] = {}
         self._index = np.rint(data.samples / self.options.time_step).astype(int)
 
     def residuals(self, hypotheses: Sequence[Effects]) -> np.ndarray:
-        """Predicted minus measured, ``[H, W, K, 3 (COMPONENTS)]``, under the robot's own effects and each of these."""
-        results: list[np.ndarray | None] = [None] * len(hypotheses)
-        # Hypotheses that differ in how the record is read have other windows; the rest share one batch.
-        groups: dict[tuple, list[int]] = {}
+        """Predicted minus measured, ``[H, W, K, 3 (COMPONENTS)]``, with the robot's own effects and each hypothesis."""
+        results: dict[int, np.ndarray] = {}
+        # Other measurement effects mean other windows; hypotheses that share them share a batch.
+        groups: dict[tuple[_MeasurementKey, tuple[str, ...]], list[int]] = {}
         for number, effects in enumerate(hypotheses):
             key = tuple(
                 (name, tuple(sorted(parameters.items())))
@@ -174,9 +202,9 @@ class Predictions:
                 part = numbers[first : first + count]
                 for number, result in zip(part, self._roll_out(windows, [hypotheses[n] for n in part]), strict=True):
                     results[number] = result
-        return np.stack(results)
+        return np.stack([results[number] for number in range(len(hypotheses))])
 
-    def _windows(self, key: tuple) -> dict:
+    def _windows(self, key: _MeasurementKey) -> _Prepared:
         if key not in self._prepared:
             if len(self._prepared) > 40:
                 self._prepared.clear()
@@ -186,7 +214,7 @@ class Predictions:
             self._prepared[key] = self._prepare(motion, commands)
         return self._prepared[key]
 
-    def _prepare(self, motion: MotionTrack, commands: CommandTrack) -> dict:
+    def _prepare(self, motion: MotionTrack, commands: CommandTrack) -> _Prepared:
         data = self.data
         stamps = data.starts[:, None] + np.rint(np.r_[0.0, data.samples] * 1e9).astype(np.int64)
         positions, rotations, linear, angular = sample_motion(motion, stamps)
@@ -195,88 +223,91 @@ class Predictions:
         moved = np.einsum("wji,wkj->wki", turn, positions[:, 1:] - positions[:, :1])
         turned = wrap_angle(headings[:, 1:] - headings[:, :1])
         steps = np.arange(-round(HISTORY / self.options.time_step), self._index[-1] + 1)
-        asked = data.starts[:, None] + np.rint(steps * self.options.time_step * 1e9).astype(np.int64)
+        command_stamps = data.starts[:, None] + np.rint(steps * self.options.time_step * 1e9).astype(np.int64)
         if data.terrain is None:
-            # On level ground every window starts at the origin, as high as its own wheels ask for.
+            # On level ground every window starts at the origin, at the height at which its wheels stand.
             frame_rotation = rotations[:, 0]
             lowest = np.einsum("wij,nj->wni", frame_rotation, self._underside())[..., 2].mean(axis=1)
             place = np.stack([0 * lowest, 0 * lowest, -lowest - self._depth], axis=1)
         else:
+            if data.odometry_from_terrain is None:
+                raise ValueError("a terrain map needs its pose: odometry_from_terrain is None")
             pose = np.linalg.inv(data.odometry_from_terrain)
             frame_rotation = pose[:3, :3] @ rotations[:, 0]
             place = positions[:, 0] @ pose[:3, :3].T + pose[:3, 3]
             place[:, 2] += self._settling(place, frame_rotation)
         heading = np.arctan2(frame_rotation[:, 1, 0], frame_rotation[:, 0, 0])
-        into = Rotation.from_euler("z", heading[:, None]).as_matrix()
+        frames = Rotation.from_euler("z", heading[:, None]).as_matrix()
 
         def tensor(values: np.ndarray) -> torch.Tensor:
             return torch.as_tensor(np.ascontiguousarray(values), dtype=torch.float32)
 
-        return {
-            "moved": moved,
-            "turned": turned,
-            "into": into,
-            "place": place,
-            "twists": tensor(commands.sample(asked)),
-            "history": round(HISTORY / self.options.time_step),
-            "position": tensor(place),
-            "rotation": tensor(frame_rotation),
-            "velocity": tensor(np.einsum("wij,wj->wi", frame_rotation, linear[:, 0])),
-            "angular": tensor(np.einsum("wij,wj->wi", frame_rotation, angular[:, 0])),
-        }
+        return _Prepared(
+            moved=moved,
+            turned=turned,
+            frames=frames,
+            places=place,
+            twists=tensor(commands.sample(command_stamps)),
+            history=round(HISTORY / self.options.time_step),
+            position=tensor(place),
+            rotation=tensor(frame_rotation),
+            velocity=tensor(np.einsum("wij,wj->wi", frame_rotation, linear[:, 0])),
+            angular_velocity=tensor(np.einsum("wij,wj->wi", frame_rotation, angular[:, 0])),
+        )
 
     def _settling(self, place: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-        """By how much robots at ``place`` ``[W, 3]`` are to be raised to stand on the map, ``[W]`` [m].
+        """Vertical shift that puts robots at ``place`` ``[W, 3]`` onto the map, ``[W]`` [m].
 
-        A map and a localisation agree about heights within centimetres; a start that deep in the ground is a jump.
+        Map and localisation agree on heights only within centimetres; a start that deep in the ground would jump.
         """
         underside = self._underside()
         points = place[:, None] + np.einsum("wij,nj->wni", rotation, underside)
         at = torch.as_tensor(points[..., :2], dtype=torch.float32).transpose(1, 2)
         ground = TerrainLookup(self._terrain, "bilinear", len(points))(at).height.double().numpy()
         gap = points[..., 2] - ground
-        # The lower half carries: on rough ground some wheels hang in the air.
+        # The lower half of the points carries the robot: on rough ground some wheels hang in the air.
         return -np.sort(gap, axis=1)[:, : max(1, gap.shape[1] // 2)].mean(axis=1) - self._depth
 
     def _underside(self) -> np.ndarray:
         robot = self.robot
         return robot.points[robot.point_tangents[:, 0] < -0.97].double().numpy()
 
-    def _roll_out(self, windows: dict, hypotheses: list[Effects]) -> list[np.ndarray]:
+    def _roll_out(self, windows: _Prepared, hypotheses: list[Effects]) -> list[np.ndarray]:
         count, width = len(hypotheses), len(self.data.starts)
         robot = replace(self.robot, effects=self._joined(hypotheses, width))
         with torch.no_grad():
             speeds = drive_speeds(
                 robot,
-                windows["twists"].repeat(count, 1, 1),
+                windows.twists.repeat(count, 1, 1),
                 self.options.time_step,
-                history=windows["history"],
+                history=windows.history,
             )
             state = State(
-                windows["position"].repeat(count, 1),
-                windows["rotation"].repeat(count, 1, 1),
-                windows["velocity"].repeat(count, 1),
-                windows["angular"].repeat(count, 1),
+                windows.position.repeat(count, 1),
+                windows.rotation.repeat(count, 1, 1),
+                windows.velocity.repeat(count, 1),
+                windows.angular_velocity.repeat(count, 1),
             )
             result = rollout(self._terrain, robot, speeds, state, options=self.options, with_forces=False)
         positions = result.position[:, self._index].double().numpy().reshape(count, width, -1, 3)
         rotations = result.rotation[:, self._index].double().numpy().reshape(count, width, -1, 3, 3)
-        start = windows["into"]
-        away = np.einsum("wji,hwkj->hwki", start, positions - windows["place"][None, :, None])
-        forward = np.einsum("wji,hwkj->hwki", start, rotations[..., :, 0])
+        displacement = np.einsum("wji,hwkj->hwki", windows.frames, positions - windows.places[None, :, None])
+        forward = np.einsum("wji,hwkj->hwki", windows.frames, rotations[..., :, 0])
         heading = np.arctan2(forward[..., 1], forward[..., 0])
         error = np.stack(
             [
-                away[..., 0] - windows["moved"][..., 0],
-                away[..., 1] - windows["moved"][..., 1],
-                wrap_angle(heading - windows["turned"]),
+                displacement[..., 0] - windows.moved[..., 0],
+                displacement[..., 1] - windows.moved[..., 1],
+                wrap_angle(heading - windows.turned),
             ],
             axis=-1,
         )
         return list(error)
 
-    def _joined(self, hypotheses: list[Effects], width: int) -> tuple:
-        """The robot's effects with each parameter as a batch: ``width`` trajectories of every hypothesis."""
+    def _joined(
+        self, hypotheses: list[Effects], width: int
+    ) -> tuple[tuple[str, Mapping[str, float | torch.Tensor]], ...]:
+        """The robot's effects with each parameter as a batch: ``width`` trajectories for every hypothesis."""
         names = [name for name, _ in hypotheses[0] if CATALOGUE[name].stage != "measurement"]
         joined = dict(self.robot.effects)
         for name in names:

@@ -1,10 +1,12 @@
-"""Learned: a sparse sum of named features as a body wrench, for what the catalogue does not hold.
+"""Learned: a body wrench as a sparse sum of named features, for effects outside the catalogue.
 
-Orthogonal matching pursuit (Pati et al. 1993) on the derivatives of a drive's residuals by every term, then a fit of
-the chosen terms through the rollout.
+Orthogonal matching pursuit (Pati et al. 1993) on the derivatives of a recording's residuals by every term; the selected
+terms are then fitted through the rollout.
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -14,17 +16,17 @@ from monoforce_ros.effects import CATALOGUE
 
 LEARNED = "learned_term"
 _STEP = 0.02
-"""Force that a derivative is taken over, in parts of the robot's weight."""
+"""Step of the finite differences, as a share of the robot's weight."""
 
 
 def learned_terms(predictions: Predictions, base: Effects, scale: np.ndarray, most: int) -> list[Effects]:
-    """Sums of one to ``most`` terms, each with the one more term that explains most of what is left.
+    """Sums of one to ``most`` terms, each with the further term that explains most of the remaining residuals.
 
     Args:
-        predictions: of the drive.
-        base: effects that act beside it.
-        scale: size of a residual that means nothing, ``[K, 3]``.
-        most: terms.
+        predictions: of the recording's windows.
+        base: effects that act in addition.
+        scale: expected size of a residual, ``[K, 3]``.
+        most: largest number of terms.
     """
     keys = [parameter.name for parameter in CATALOGUE[LEARNED].parameters]
     step = _STEP * 9.81 * float(predictions.robot.mass.mean())
@@ -35,31 +37,31 @@ def learned_terms(predictions: Predictions, base: Effects, scale: np.ndarray, mo
     wanted = -weight * rolled[0].ravel()
     columns = weight * (rolled[1:] - rolled[0]).reshape(len(keys), -1)
     lengths = np.linalg.norm(columns, axis=1)
-    # A feature that the drive hardly has would need a weight without measure.
+    # A feature that hardly occurs in the recording would get an arbitrarily large weight.
     lengths = np.maximum(lengths, 0.1 * lengths.max())
     ridge = 0.03 * lengths.max()
     chosen: list[int] = []
     found = []
-    left = wanted
+    remaining = wanted
     for _ in range(most):
-        match = np.abs(columns @ left) / np.maximum(lengths, 1e-9)
+        match = np.abs(columns @ remaining) / np.maximum(lengths, 1e-9)
         match[chosen] = -1.0
         chosen.append(int(np.argmax(match)))
-        own = columns[chosen]
-        values = np.linalg.solve(own @ own.T + ridge**2 * np.eye(len(chosen)), own @ wanted)
-        left = wanted - values @ columns[chosen]
+        rows = columns[chosen]
+        values = np.linalg.solve(rows @ rows.T + ridge**2 * np.eye(len(chosen)), rows @ wanted)
+        remaining = wanted - values @ rows
         terms = {keys[index]: float(step * value) for index, value in zip(chosen, values, strict=True)}
         effects = (*base, (LEARNED, terms))
         found.append(with_values(effects, flat(effects)))
     return found
 
 
-def formula(terms: dict[str, float]) -> str:
+def formula(terms: Mapping[str, float]) -> str:
     """The sum in symbols, such as ``torque_z = 12.3 vx|vx| - 4 wz``."""
     rows: dict[str, list[str]] = {}
     for key, value in terms.items():
         row, feature = key.split(":")
-        shown = f"{abs(value):.3g}" + ("" if feature == "1" else f" {feature}")
+        term = f"{abs(value):.3g}" + ("" if feature == "1" else f" {feature}")
         parts = rows.setdefault(row, [])
-        parts.append((f"- {shown}" if value < 0 else f"+ {shown}") if parts else (f"-{shown}" if value < 0 else shown))
+        parts.append((f"- {term}" if value < 0 else f"+ {term}") if parts else (f"-{term}" if value < 0 else term))
     return "; ".join(f"{row} = {' '.join(parts)}" for row, parts in rows.items())

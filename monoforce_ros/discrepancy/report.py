@@ -1,14 +1,20 @@
-"""Report of a diagnosis: ``report.json`` for programs, one self-contained HTML page for people."""
+"""Report of a diagnosis: ``report.json`` for programs, and a self-contained HTML page."""
 
 from __future__ import annotations
 
 import base64
 import html
 import json
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 
+from matplotlib.figure import Figure
+
 from monoforce_ros.core import write_text
+from monoforce_ros.discrepancy.comparison import GapRow
 from monoforce_ros.discrepancy.diagnosis import Diagnosis
+from monoforce_ros.discrepancy.estimates import EffectEstimate
 from monoforce_ros.discrepancy.figures import (
     candidates_figure,
     gap_figure,
@@ -17,73 +23,141 @@ from monoforce_ros.discrepancy.figures import (
     regime_figure,
     timeline_figure,
 )
+from monoforce_ros.discrepancy.gap import Localisation, NoiseFloor
+from monoforce_ros.discrepancy.verdict import Losses, Verdict
 from monoforce_ros.effects import CATALOGUE
 from monoforce_ros.reporting import PAGE_STYLE, figure_png
 
 _VERDICTS = {
-    "effect_found": ("Something is missing in the model, and it was named.", "#0b6e4f"),
-    "no_discrepancy": ("Nothing is missing that this drive could show.", "#0b6e4f"),
-    "unknown_effect": ("Something is missing that the catalogue does not hold.", "#b3540e"),
-    "not_identifiable": ("This drive cannot tell.", "#b3540e"),
-    "no_improvement": ("There is a disagreement, but no effect explains enough of it to be added.", "#b3540e"),
+    Verdict.EFFECT_FOUND: ("The model lacks a known effect.", "#0b6e4f"),
+    Verdict.NO_DISCREPANCY: ("The model agrees with this recording.", "#0b6e4f"),
+    Verdict.UNKNOWN_EFFECT: ("Unexplained error: no known effect fits.", "#b3540e"),
+    Verdict.NOT_IDENTIFIABLE: ("This recording is not sufficient for a diagnosis.", "#b3540e"),
+    Verdict.NO_IMPROVEMENT: ("The model has an error, but no effect reduces it reliably.", "#b3540e"),
 }
+_CROSS_VALIDATED = (
+    "Each window is predicted with parameters fitted to other blocks of the recording. Two things are not held out: "
+    "values measured by the gyro or the wheel speeds come from the whole recording, and the effects were selected on "
+    "these same blocks. The improvement is therefore somewhat optimistic; check it on another recording (--held-out)."
+)
 
 
-def report_content(diagnosis: Diagnosis, inputs: dict, robot_file: Path | None) -> dict:
-    """The content of ``report.json``."""
+def effect_entry(effect: EffectEstimate) -> dict:
+    """An effect as in ``report.json`` and for :func:`monoforce_ros.robots.write_robot`.
+
+    ``rivals`` is the former name of ``indistinguishable``; this release writes both.
+    """
+    others = list(effect.indistinguishable)
     return {
-        "verdict": diagnosis.verdict,
-        "effects": list(diagnosis.effects),
-        "localisation": list(diagnosis.localisation),
-        "gap": diagnosis.gap,
-        "noise_floor": diagnosis.floor,
-        "robot_file": None if robot_file is None else str(robot_file),
-        "inputs": inputs,
-        "advice": list(diagnosis.advice),
-        "candidates": list(diagnosis.candidates),
-        "regimes": list(diagnosis.regimes),
-        "remarks": list(diagnosis.remarks),
-        "numbers": diagnosis.numbers,
-        "held_out": diagnosis.held_out,
+        "name": effect.name,
+        "parameters": {key: asdict(parameter) for key, parameter in effect.parameters.items()},
+        "indistinguishable": others,
+        "rivals": others,
     }
 
 
-def write_diagnosis(folder: Path, diagnosis: Diagnosis, inputs: dict, robot_file: Path | None) -> tuple[Path, Path]:
-    """Write ``report.json`` and ``report.html``; returns both."""
+def report_content(diagnosis: Diagnosis, inputs: Mapping[str, object], robot_file: Path | None) -> dict:
+    """The content of ``report.json``."""
+    return {
+        "verdict": str(diagnosis.verdict),
+        "effects": [effect_entry(effect) for effect in diagnosis.effects],
+        "localisation": [_localisation_entry(entry) for entry in diagnosis.localisation],
+        "gap": _gap_entries(diagnosis.gap),
+        "noise_floor": _noise_entries(diagnosis.noise_floor),
+        "robot_file": None if robot_file is None else str(robot_file),
+        "inputs": dict(inputs),
+        "advice": list(diagnosis.advice),
+        "candidates": [asdict(candidate) for candidate in diagnosis.candidates],
+        "regimes": [asdict(row) for row in diagnosis.regimes],
+        "remarks": list(diagnosis.remarks),
+        "numbers": _loss_entries(diagnosis.losses),
+        "held_out": {name: _gap_entries(table) for name, table in diagnosis.held_out.items()},
+    }
+
+
+def _localisation_entry(entry: Localisation) -> dict:
+    return {key: value for key, value in asdict(entry).items() if key != "horizon"} | {"text": entry.text}
+
+
+def _gap_entries(table: Mapping[str, GapRow]) -> dict[str, dict]:
+    """Rows by metric; ``after``, ``low`` and ``high`` are null where no effect was added."""
+    return {
+        metric: {
+            "horizon_s": row.horizon,
+            "before": row.before,
+            "after": row.after,
+            "low": row.gain_low,
+            "high": row.gain_high,
+            "unit": row.unit,
+            "noise": row.noise,
+        }
+        | ({} if row.closed is None else {"closed": row.closed})
+        for metric, row in table.items()
+    }
+
+
+def _noise_entries(floor: NoiseFloor | None) -> dict[str, dict]:
+    if floor is None:
+        return {}
+    values = {"along": (floor.along, "m"), "across": (floor.across, "m"), "heading": (floor.heading, "rad")}
+    return {name: {"horizon_s": floor.horizon, "value": value, "unit": unit} for name, (value, unit) in values.items()}
+
+
+def _loss_entries(losses: Losses | None) -> dict[str, float]:
+    """Losses under their names in the report, those that were not needed left out."""
+    if losses is None:
+        return {}
+    entries = {
+        "loss_before": losses.before,
+        "loss_after": losses.after,
+        "loss_of_a_healthy_robot": losses.healthy,
+        "share_explained": losses.share_explained,
+        "loss_by_formula": losses.by_formula,
+        "share_by_drift": losses.share_by_drift,
+    }
+    return {key: value for key, value in entries.items() if value is not None}
+
+
+def write_diagnosis(
+    folder: Path, diagnosis: Diagnosis, inputs: Mapping[str, object], robot_file: Path | None
+) -> tuple[Path, Path]:
+    """Write ``report.json`` and ``report.html``; returns both paths."""
     content = report_content(diagnosis, inputs, robot_file)
     write_text(folder / "report.json", json.dumps(content, indent=2))
-    write_text(folder / "report.html", _page(diagnosis, content))
+    write_text(folder / "report.html", _page(diagnosis, inputs, robot_file))
     return folder / "report.json", folder / "report.html"
 
 
 def summary_lines(diagnosis: Diagnosis) -> list[str]:
-    """The outcome in a few lines for a terminal."""
+    """The result in a few lines for a terminal."""
     lines = [f"{diagnosis.verdict}: {_VERDICTS[diagnosis.verdict][0]}"]
     lines += [f"  {remark}" for remark in diagnosis.remarks]
     for effect in diagnosis.effects:
         values = ", ".join(
-            f"{key} {entry['value']:.3g} {entry['unit']} ({entry['low']:.3g} to {entry['high']:.3g})"
-            for key, entry in effect["parameters"].items()
+            f"{key} {parameter.value:.3g} {parameter.unit} ({parameter.low:.3g} to {parameter.high:.3g})"
+            for key, parameter in effect.parameters.items()
         )
-        rivals = f"; this data cannot tell it from {', '.join(effect['rivals'])}" if effect["rivals"] else ""
-        lines.append(f"  {effect['name']}: {values}{rivals}")
+        others = ", ".join(effect.indistinguishable)
+        lines.append(f"  {effect.name}: {values}{f'; indistinguishable from {others}' if others else ''}")
     for metric in ("position_2s", "heading_2s"):
-        if metric in diagnosis.gap and diagnosis.fitted:
-            row = diagnosis.gap[metric]
-            change = f"{row['before']:.3g} → {row['after']:.3g} {row['unit']}"
-            if "closed" in row:
-                change += f", {100 * row['closed']:.0f} % of the reducible gap closed"
-            lines.append(f"  {metric.split('_')[0]} error after 2 s, median: {change}")
+        row = diagnosis.gap.get(metric)
+        if row is not None and row.after is not None:
+            change = f"{row.before:.3g} → {row.after:.3g} {row.unit}"
+            if row.closed is not None:
+                change += f", {100 * row.closed:.0f} % of the reducible gap closed"
+            lines.append(f"  {metric.split('_')[0]} error after 2 s, median, cross-validated: {change}")
     for name, table in diagnosis.held_out.items():
         row = table.get("position_2s")
-        if row:
-            lines.append(f"  held out, {name}: position {row['before']:.3g} → {row['after']:.3g} m after 2 s")
-    lines += [f"  {entry['text']}" for entry in diagnosis.localisation[:3]]
-    lines += [f"  hint: {told}" for told in diagnosis.advice]
+        if row is not None and row.after is not None:
+            lines.append(f"  held-out {name}: position error after 2 s {row.before:.3g} → {row.after:.3g} m")
+        elif row is not None:
+            lines.append(f"  held-out {name}: position error after 2 s {row.before:.3g} m, no effect was added")
+    lines += [f"  {entry.text}" for entry in diagnosis.localisation[:3]]
+    lines += [f"  hint: {hint}" for hint in diagnosis.advice]
     return lines
 
 
-def _page(diagnosis: Diagnosis, content: dict) -> str:
+def _page(diagnosis: Diagnosis, inputs: Mapping[str, object], robot_file: Path | None) -> str:
     sentence, colour = _VERDICTS[diagnosis.verdict]
     remarks = "; ".join(diagnosis.remarks)
     parts = [
@@ -91,42 +165,40 @@ def _page(diagnosis: Diagnosis, content: dict) -> str:
         f"<b>{sentence}</b></p>"
         f"<p class='lead'>{html.escape(remarks)}</p>",
     ]
+    details = diagnosis.details
     if diagnosis.effects:
         parts.append(_effects_card(diagnosis))
     if diagnosis.gap:
         parts.append(_gap_card(diagnosis))
     if diagnosis.held_out:
         parts.append(_held_out_card(diagnosis))
-    if diagnosis.details.get("paths"):
+    if details is not None and details.paths:
         parts.append(
             _card(
                 "Predicted and measured paths",
-                f"{_image(paths_figure(diagnosis))}<p class='muted'>Five seconds each, seen from above, ahead is to "
-                "the right; from the largest error down to a middling one.</p>",
+                f"{_image(paths_figure(details.paths))}<p class='muted'>Five seconds each, seen from above, the start "
+                "heading to the right; from the largest error down to the median.</p>",
             )
         )
     if diagnosis.localisation or diagnosis.regimes:
-        items = "".join(
-            f"<li>{html.escape(entry['text'])} (root mean square {entry['rms']:.3g} {entry['unit']}, "
-            f"bias {entry['bias']:+.2g})</li>"
+        items = _list_items(
+            f"{entry.text} (RMS {entry.rms:.3g} {entry.unit}, mean {entry.bias:+.2g} {entry.unit})"
             for entry in diagnosis.localisation[:5]
         )
-        figure = _image(regime_figure(diagnosis)) if diagnosis.regimes else ""
-        parts.append(_card("Where the disagreement lives", f"<ol>{items}</ol>{figure}"))
-    if diagnosis.details.get("compared"):
-        parts.append(_card("On the map", _image(map_figure(diagnosis))))
-        parts.append(_card("In time", _image(timeline_figure(diagnosis))))
+        figure = _image(regime_figure(diagnosis.regimes)) if diagnosis.regimes else ""
+        parts.append(_card("Where the error is largest", f"<ol>{items}</ol>{figure}"))
+    if details is not None and details.compared:
+        parts.append(_card("On the map", _image(map_figure(details))))
+        parts.append(_card("Over time", _image(timeline_figure(details))))
     if diagnosis.candidates:
-        parts.append(_card("What was tried", _image(candidates_figure(diagnosis))))
+        parts.append(_card("Effects tested", _image(candidates_figure(diagnosis))))
     if diagnosis.advice:
-        told = "".join(f"<li>{html.escape(entry)}</li>" for entry in diagnosis.advice)
-        parts.append(_card("What would tell more", f"<ul>{told}</ul>"))
+        parts.append(_card("What to record next", f"<ul>{_list_items(diagnosis.advice)}</ul>"))
     listed = "".join(
-        f"<dt>{html.escape(str(key))}</dt><dd>{html.escape(str(value))}</dd>"
-        for key, value in content["inputs"].items()
+        f"<dt>{html.escape(str(key))}</dt><dd>{html.escape(str(value))}</dd>" for key, value in inputs.items()
     )
-    if content["robot_file"]:
-        listed += f"<dt>robot file with what was found</dt><dd>{html.escape(content['robot_file'])}</dd>"
+    if robot_file is not None:
+        listed += f"<dt>robot file with the added effects</dt><dd>{html.escape(str(robot_file))}</dd>"
     parts.append(_card("Inputs", f"<dl>{listed}</dl>"))
     return (
         "<!doctype html><html lang='en'><head><meta charset='utf-8'><title>Diagnosis</title>"
@@ -137,75 +209,66 @@ def _page(diagnosis: Diagnosis, content: dict) -> str:
 def _effects_card(diagnosis: Diagnosis) -> str:
     rows = []
     for effect in diagnosis.effects:
-        kind = CATALOGUE[effect["name"]]
-        for number, (key, entry) in enumerate(effect["parameters"].items()):
-            name = f"<b>{effect['name']}</b><br><small>{html.escape(kind.summary)}</small>" if number == 0 else ""
-            rivals = html.escape(", ".join(effect["rivals"])) or "–"
+        kind = CATALOGUE[effect.name]
+        for number, (key, parameter) in enumerate(effect.parameters.items()):
+            name = f"<b>{effect.name}</b><br><small>{html.escape(kind.summary)}</small>" if number == 0 else ""
+            others = html.escape(", ".join(effect.indistinguishable)) or "–"
             rows.append(
                 f"<tr><td style='white-space:normal'>{name}</td><td>{key}</td>"
-                f"<td><b>{entry['value']:.3g}</b> {entry['unit']}</td>"
-                f"<td>{entry['low']:.3g} to {entry['high']:.3g}</td>"
-                f"<td>{rivals if number == 0 else ''}</td></tr>"
+                f"<td><b>{parameter.value:.3g}</b> {parameter.unit}</td>"
+                f"<td>{parameter.low:.3g} to {parameter.high:.3g}</td>"
+                f"<td>{others if number == 0 else ''}</td></tr>"
             )
-    unknown = diagnosis.verdict == "unknown_effect"
-    title = "The formula that explains it best" if unknown else "What is missing"
+    unknown = diagnosis.verdict == Verdict.UNKNOWN_EFFECT
+    title = "Best formula for the error" if unknown else "Effects missing in the model"
     return _card(
         title,
-        "<table><tr><th>effect</th><th>parameter</th><th>value</th><th>95 % interval</th><th>cannot be told from</th>"
-        f"</tr>{''.join(rows)}</table>",
+        "<table><tr><th>effect</th><th>parameter</th><th>value</th><th>95 % confidence interval</th>"
+        f"<th>indistinguishable from</th></tr>{''.join(rows)}</table>",
     )
 
 
 def _gap_card(diagnosis: Diagnosis) -> str:
     rows = []
-    for key, row in diagnosis.gap.items():
-        cells = [
-            f"<td>{_metric(key, row)}</td>",
-            f"<td>{row['noise']:.2g} {row['unit']}</td>",
-            f"<td>{row['before']:.3g} {row['unit']}</td>",
-        ]
-        if diagnosis.fitted:
-            closed = f"{100 * row['closed']:.0f} %" if "closed" in row else "–"
-            cells.append(
-                f"<td><b>{row['after']:.3g} {row['unit']}</b></td><td>{row['low']:.2g} to {row['high']:.2g}</td>"
-                f"<td>{closed}</td>"
-            )
-        else:
-            cells.append("<td>–</td><td>–</td><td>–</td>")
-        rows.append(f"<tr>{''.join(cells)}</tr>")
-    told = (
-        "Every window is predicted by a fit that did not see it, nor anything that happens in it. "
-        if (diagnosis.fitted)
-        else ""
-    )
+    for metric, row in diagnosis.gap.items():
+        closed = "–" if row.closed is None else f"{100 * row.closed:.0f} %"
+        rows.append(
+            f"<tr><td>{_metric(metric, row)}</td><td>{row.noise:.2g} {row.unit}</td>"
+            f"<td>{row.before:.3g} {row.unit}</td>{_after_cells(row)}<td>{closed}</td></tr>"
+        )
+    note = f"{_CROSS_VALIDATED} " if diagnosis.fitted else ""
     return _card(
-        "The gap between simulation and measurement",
-        f"{_image(gap_figure(diagnosis))}<table><tr><th>median error</th><th>noise alone</th><th>before</th>"
-        "<th>after</th><th>mean gain, 95 % interval</th><th>of the reducible gap closed</th></tr>"
-        f"{''.join(rows)}</table><p class='muted'>{told}The reducible gap is what is above the noise of the poses.</p>",
+        "Prediction error",
+        f"{_image(gap_figure(diagnosis))}<table><tr><th>median error</th><th>noise floor</th><th>before</th>"
+        "<th>after</th><th>mean gain, 95 % interval</th><th>reducible gap closed</th></tr>"
+        f"{''.join(rows)}</table><p class='muted'>{note}The reducible gap is the error above the noise floor.</p>",
     )
 
 
-def _metric(key: str, row: dict) -> str:
-    if not row["horizon_s"]:
+def _after_cells(row: GapRow) -> str:
+    if row.after is None:
+        return "<td>–</td><td>–</td>"
+    return f"<td><b>{row.after:.3g} {row.unit}</b></td><td>{row.gain_low:.2g} to {row.gain_high:.2g}</td>"
+
+
+def _metric(metric: str, row: GapRow) -> str:
+    if not row.horizon:
         return "yaw rate against the gyro"
-    return f"{key.split('_')[0]} after {row['horizon_s']:g} s"
+    return f"{metric.split('_')[0]} after {row.horizon:g} s"
 
 
 def _held_out_card(diagnosis: Diagnosis) -> str:
     rows = "".join(
-        f"<tr><td>{html.escape(name) if number == 0 else ''}</td>"
-        f"<td>{_metric(key, row)}</td>"
-        f"<td>{row['before']:.3g} {row['unit']}</td><td><b>{row['after']:.3g} {row['unit']}</b></td>"
-        f"<td>{row['low']:.2g} to {row['high']:.2g}</td></tr>"
+        f"<tr><td>{html.escape(name) if number == 0 else ''}</td><td>{_metric(metric, row)}</td>"
+        f"<td>{row.before:.3g} {row.unit}</td>{_after_cells(row)}</tr>"
         for name, table in diagnosis.held_out.items()
-        for number, (key, row) in enumerate(table.items())
+        for number, (metric, row) in enumerate(table.items())
     )
     return _card(
-        "On drives that no fit saw",
-        "<table><tr><th>bag</th><th>median error</th><th>before</th><th>after</th>"
-        "<th>mean gain, 95 % interval</th></tr>"
-        f"{rows}</table>",
+        "On held-out recordings",
+        "<table><tr><th>recording</th><th>median error</th><th>before</th><th>after</th>"
+        f"<th>mean gain, 95 % interval</th></tr>{rows}</table>"
+        "<p class='muted'>Nothing was fitted to or selected on these recordings.</p>",
     )
 
 
@@ -213,5 +276,9 @@ def _card(title: str, content: str) -> str:
     return f"<section class='card'><h2>{title}</h2>{content}</section>"
 
 
-def _image(figure) -> str:
+def _list_items(texts: Iterable[str]) -> str:
+    return "".join(f"<li>{html.escape(text)}</li>" for text in texts)
+
+
+def _image(figure: Figure) -> str:
     return f"<img alt='' src='data:image/png;base64,{base64.b64encode(figure_png(figure)).decode()}'>"

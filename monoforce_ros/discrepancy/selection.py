@@ -1,8 +1,9 @@
-"""Selection: which effects explain a drive, judged on blocks of it that their fits did not see.
+"""Selection: which effects explain a recording, by two-fold cross-validation over blocks.
 
-Every effect is screened by a quick fit; the most promising ones are fitted on every other block and judged on the
-blocks left out. One more effect is added while it pays; then each is put to the test again beside the others, and may
-be dropped or replaced.
+Every effect is screened by a quick fit; the most promising ones are fitted on every other block and judged by their
+loss on the remaining blocks. Effects are added one at a time while they reduce the held-out loss enough; then each is
+tested again in the presence of the others, and may be dropped or replaced. The folds that judge the effects also select
+them, so the loss of the selected effects is somewhat optimistic.
 """
 
 from __future__ import annotations
@@ -20,33 +21,33 @@ from monoforce_ros.effects import CATALOGUE, Effect, identifiable_effects, separ
 from monoforce_ros.robots import RobotModel
 
 HEALTHY_LOSS = 0.5
-"""Robust loss of residuals that are no larger than their scale: half the square of a standard deviation."""
+"""Robust loss of residuals as large as their scale: half the square of a standard deviation."""
 SMALLEST_GAIN = 0.05
-"""Of the loss at the start: what an effect must gain to be added."""
+"""Smallest gain of an added effect, as a share of the loss before."""
 SMALLEST_STEP = 0.15
-"""Loss that an effect must gain, whatever the share: three tenths of what a healthy robot leaves."""
+"""Smallest gain of an added effect, absolute: three tenths of a healthy robot's loss."""
 _FOLDS = 2
 BLOCK = 8.0
-"""Length of the blocks that are left out together [s]: longer than a window."""
+"""Length of the blocks that are held out together [s]: longer than a window."""
 _ALPHA = 0.01
-"""Chance of a gain by one effect where there is none; most of the guard against false alarms is what it must gain."""
+"""Significance level of one effect's gain; most of the guard against false alarms is the smallest gain."""
 _JUDGED = 5
 _ALTERNATIVES = 2
 _LATER_GAIN = 0.1
-"""What a further effect must gain: of what is unexplained while that is much, else of what was to explain at all. A
-small rest is the model's more often than the robot's."""
+"""Smallest gain of a further effect, as a share of the unexplained loss while that is large, else of the loss that was
+to be explained: a small remainder is due to the simulator more often than to the robot."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """Effects that were fitted and judged."""
+    """Effects that were fitted and judged by their held-out loss."""
 
     effects: Effects
-    """By the fit to the part of the drive that explains the rest best."""
+    """With the values of the fold whose fit has the smaller loss."""
     parts: tuple[Effects, ...]
-    """Fits with each fold left out."""
+    """Effects fitted with each fold left out."""
     held_out_loss: np.ndarray
-    """Loss of each window by the fit that did not see it, ``[W]``."""
+    """Loss of each window with the effects fitted without its fold, ``[W]``."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -55,25 +56,39 @@ class Trial:
 
     @property
     def loss(self) -> float:
-        """Mean over windows."""
+        """Mean held-out loss."""
         return float(self.held_out_loss.mean())
 
 
 @dataclass(frozen=True)
+class CandidateScore:
+    """The score of one candidate effect in one round of the search."""
+
+    name: str
+    round: int
+    """From 1 on."""
+    gain: float
+    """Reduction of the loss: held out where ``judged``, else of the screening fit."""
+    p: float
+    """One-sided p-value of the gain over blocks; 1 where it was not judged."""
+    judged: bool
+    """Whether the candidate was cross-validated."""
+
+
+@dataclass(frozen=True)
 class Outcome:
-    """What a search found."""
+    """The result of a search."""
 
     nominal: Trial
     best: Trial
-    """The nominal one where nothing was found."""
-    tried: tuple[dict, ...]
-    """``name``, ``round``, ``gain``, ``p`` of every effect."""
-    rivals: dict[str, list[str]]
-    """By found effect: others that explain the drive about as well in its place."""
+    """The nominal trial where no effect was added."""
+    tried: tuple[CandidateScore, ...]
+    indistinguishable: dict[str, list[str]]
+    """By selected effect: others that explain the recording about as well in its place."""
 
 
 def folds_of(starts: np.ndarray) -> np.ndarray:
-    """Which fold each window belongs to: alternating blocks."""
+    """Fold of each window: alternating blocks."""
     return ((starts - starts[0]) // round(BLOCK * 1e9)).astype(int) % _FOLDS
 
 
@@ -83,29 +98,29 @@ def blocks_of(starts: np.ndarray) -> np.ndarray:
 
 
 def paired(before: np.ndarray, after: np.ndarray, starts: np.ndarray, seed: int = 0) -> tuple[float, float, float]:
-    """Mean gain, its lower bound of 95 %, and the chance of such gains of whole blocks by Wilcoxon's test."""
+    """Mean gain, its one-sided 95 % lower bound, and the p-value of Wilcoxon's signed-rank test over blocks."""
     blocks = blocks_of(starts)
     numbers = np.unique(blocks)
-    # A few windows that nothing explains shall not decide.
+    # Clipped, so that a few windows that no effect explains do not decide.
     difference = np.clip(before - after, -50.0, 50.0)
     sums = np.array([difference[blocks == block].sum() for block in numbers]) / len(starts)
     gain = float(sums.sum())
     picked = np.random.default_rng(seed).integers(0, len(sums), (2000, len(sums)))
-    # By ranks: a few blocks that gain much and others that gain little are a gain in all of them.
+    # By ranks: a gain in all blocks counts, even where it is much larger in a few of them.
     chance = float(wilcoxon(sums, alternative="greater").pvalue) if np.abs(sums).max() > 1e-12 else 1.0
     return gain, float(np.quantile(sums[picked].sum(axis=1), 0.05)), chance
 
 
 class Search:
-    """A search over effects on one drive.
+    """A search over effects on one recording.
 
     Args:
         robot: with the effects of its file.
-        data: the drive.
-        scale: size of a residual that means nothing, ``[K, 3]``.
-        known: effects that another sensor has measured: they act throughout and keep their values.
+        data: the recording's windows.
+        scale: expected size of a residual, ``[K, 3]``.
+        known: effects that another sensor measured: they always act and keep their values.
         excluded: effects that another sensor rules out.
-        progress: called with what is done next.
+        progress: called with a description of the next step.
     """
 
     def __init__(
@@ -116,7 +131,7 @@ class Search:
         *,
         known: Effects = (),
         excluded: Sequence[str] = (),
-        progress: Callable[[str], None] = lambda what: None,
+        progress: Callable[[str], None] = lambda step: None,
     ):
         self.robot, self.data, self.scale = robot, data, scale
         self.known = known
@@ -125,43 +140,43 @@ class Search:
         starts = data.starts
         self._coarse = Predictions(robot, replace(data, starts=starts[::2]))
         folds = folds_of(starts)
-        # A window that reaches into the next block shares motion with windows that judge the fit.
+        # A window that reaches into the next block shares motion with windows of the held-out fold.
         ends = folds_of(np.r_[starts[0], starts + round(data.horizon * 1e9)])[1:]
         self._split = []
-        for left in range(_FOLDS):
-            seen = (folds != left) & (ends != left)
-            if seen.sum() < 4:
-                seen = folds != left
+        for held_out in range(_FOLDS):
+            fitted = (folds != held_out) & (ends != held_out)
+            if fitted.sum() < 4:
+                fitted = folds != held_out
             self._split.append(
                 (
-                    Predictions(robot, replace(data, starts=starts[seen])),
-                    Predictions(robot, replace(data, starts=starts[folds == left])),
-                    folds == left,
+                    Predictions(robot, replace(data, starts=starts[fitted])),
+                    Predictions(robot, replace(data, starts=starts[folds == held_out])),
+                    folds == held_out,
                 )
             )
         self._own = dict(robot.effects)
-        # An offset that the file holds was undone; a second one of its kind would add to it.
+        # The recording is already corrected for measurement effects in the file; a second one would add to them.
         self._taken = {name for name in self._own if CATALOGUE[name].stage == "measurement"} | set(excluded)
 
     def run(self, most_effects: int) -> Outcome:
-        """Add effects while they pay, then test each beside the others."""
+        """Add effects while they reduce the loss enough, then test each in the presence of the others."""
         nominal = Trial((), ((),) * _FOLDS, self.loss_of(()))
         start = nominal
         if self.known:
             start = Trial(self.known, (self.known,) * _FOLDS, self.loss_of(self.known))
             if start.loss > nominal.loss + SMALLEST_STEP:
-                # The motion contradicts the other sensor.
+                # The motion contradicts the measurement of the other sensor.
                 self.known, start = (), nominal
         judged, tried = self._round(start, 1)
         found = self._preferred(judged, start) if judged else None
         if found is None or not self._pays(start, found, nominal):
             return Outcome(nominal, start, tuple(tried), {})
-        rivals = {found.names[-1]: self._rivals(found, judged)}
+        indistinguishable = {found.names[-1]: self._indistinguishable(found, judged)}
         best, listed = self._extended(found, nominal, most_effects)
         tried += listed
         others = [trial for trial in judged if trial is not found and self._pays(start, trial, nominal)]
         for other in others[:_ALTERNATIVES]:
-            # What explains most alone need not be among those that explain most together.
+            # The effect that explains most alone need not be part of the best combination.
             if best.loss < 3 * HEALTHY_LOSS or most_effects < 2:
                 break
             extended, listed = self._extended(other, nominal, most_effects)
@@ -170,15 +185,15 @@ class Search:
             if low > 0 and gain > _LATER_GAIN * (nominal.loss - HEALTHY_LOSS):
                 best = extended
         if len(best.effects) > 1 + len(self.known):
-            best, rivals = self._exchanged(best)
-        return Outcome(nominal, best, tuple(tried), rivals)
+            best, indistinguishable = self._exchanged(best)
+        return Outcome(nominal, best, tuple(tried), indistinguishable)
 
-    def _extended(self, best: Trial, nominal: Trial, most_effects: int) -> tuple[Trial, list[dict]]:
-        """One more effect while it pays."""
-        tried: list[dict] = []
+    def _extended(self, best: Trial, nominal: Trial, most_effects: int) -> tuple[Trial, list[CandidateScore]]:
+        """Add effects one at a time while each reduces the loss enough."""
+        tried: list[CandidateScore] = []
         for step in range(1, most_effects):
             if best.loss < HEALTHY_LOSS:
-                # A healthy robot leaves as much.
+                # The remaining loss is that of a healthy robot.
                 break
             judged, listed = self._round(best, step + 1)
             tried += listed
@@ -191,17 +206,22 @@ class Search:
         return best, tried
 
     def learn(self, base: Effects = (), most: int = 3) -> Trial:
-        """The sparse sum of features that explains best what ``base`` leaves, of as few terms as do about as well."""
-        best: Trial | None = None
+        """The sparse formula that best explains the residuals left by ``base``, with one to ``most`` terms.
+
+        A further term must reduce the held-out loss by a tenth.
+        """
+        trials = []
         for number, effects in enumerate(learned_terms(self.predictions, base or self.known, self.scale, most)):
-            self._progress(f"a formula of {number + 1}")
-            trial = self.judge(effects)
-            if best is None or trial.loss < 0.9 * best.loss:
+            self._progress(f"fitting a formula with {number + 1} terms")
+            trials.append(self.judge(effects))
+        best = trials[0]
+        for trial in trials[1:]:
+            if trial.loss < 0.9 * best.loss:
                 best = trial
         return best
 
     def drifting(self, trial: Trial, pieces: int = 3) -> tuple[float, list[Effects]]:
-        """What fitting each third of the drive on its own would still gain, and these fits."""
+        """Reduction of the loss by fits to each third of the recording alone, and these fits."""
         starts = self.data.starts
         gain, fits = 0.0, []
         for part in np.array_split(np.arange(len(starts)), pieces):
@@ -217,22 +237,22 @@ class Search:
         return robust(self.predictions.residuals([effects])[0] / self.scale)
 
     def judge(self, effects: Effects, iterations: int = 4) -> Trial:
-        """Fit on every fold's complement and judge on the fold."""
+        """Cross-validate: fit without each fold, and judge on it."""
         held_out_loss = np.zeros(len(self.data.starts))
         parts, losses = [], []
-        for seen, other, where in self._split:
-            fit = fit_effects(seen, [effects], self.scale, iterations=iterations, free=self._held(effects))
-            held_out_loss[where] = robust(other.residuals([fit.effects])[0] / self.scale)
+        for fitted, judged, where in self._split:
+            fit = fit_effects(fitted, [effects], self.scale, iterations=iterations, free=self._held(effects))
+            held_out_loss[where] = robust(judged.residuals([fit.effects])[0] / self.scale)
             parts.append(fit.effects)
             losses.append(float(fit.loss.mean()) + float(held_out_loss[where].mean()))
         return Trial(parts[int(np.argmin(losses))], tuple(parts), held_out_loss)
 
     def refit(self, effects: Effects) -> Fit:
-        """Fit to the whole drive."""
+        """Fit to the whole recording."""
         return fit_effects(self.predictions, [effects], self.scale, iterations=6, free=self._held(effects))
 
     def ranked(self, fit: Fit) -> list[int]:
-        """Indices of a fit's effects, that first which the others, fitted anew without it, replace least."""
+        """Indices of a fit's effects, ranked by leave-one-out loss: the loss of the others, fitted again without it."""
         if len(fit.effects) < 2:
             return list(range(len(fit.effects)))
         losses = []
@@ -246,7 +266,7 @@ class Search:
         return len(self.known) if effects[: len(self.known)] == self.known else 0
 
     def _screened(self, base: Effects, number: str) -> tuple[float, list[tuple[str, Effects, float]]]:
-        """Loss of ``base``, and every effect with a quick fit to every other window beside it, best first."""
+        """Loss of ``base``, and a quick fit of every further effect on every other window, best first."""
         results = []
         before = float(robust(self._coarse.residuals([base])[0] / self.scale).mean())
         names = {name for name, _ in base}
@@ -260,7 +280,7 @@ class Search:
             results.append((name, fit.effects, float(fit.loss.mean())))
         return before, sorted(results, key=lambda entry: entry[2])
 
-    def _round(self, best: Trial, number: int) -> tuple[list[Trial], list[dict]]:
+    def _round(self, best: Trial, number: int) -> tuple[list[Trial], list[CandidateScore]]:
         before, screened = self._screened(best.effects, f"{number}: ")
         span = before - screened[0][2]
         judged = []
@@ -271,11 +291,9 @@ class Search:
                 judged.append(self.judge(effects))
         listed = []
         for name, _, loss in screened:
-            own = next((trial for trial in judged if trial.names[-1] == name), None)
-            gain, _, chance = (before - loss, 0, 1.0) if own is None else self._gain(best, own)
-            listed.append(
-                {"name": name, "round": number, "gain": float(gain), "p": float(chance), "judged": own is not None}
-            )
+            trial = next((trial for trial in judged if trial.names[-1] == name), None)
+            gain, _, chance = (before - loss, 0, 1.0) if trial is None else self._gain(best, trial)
+            listed.append(CandidateScore(name, number, float(gain), float(chance), judged=trial is not None))
         return sorted(judged, key=lambda trial: trial.loss), listed
 
     def _gain(self, before: Trial, after: Trial) -> tuple[float, float, float]:
@@ -283,7 +301,7 @@ class Search:
 
     def _pays(self, before: Trial, after: Trial, nominal: Trial) -> bool:
         gain, low, chance = self._gain(before, after)
-        # Where most of the disagreement goes, a dozen blocks need not agree by rank to one in a hundred.
+        # A large gain needs less significance: a dozen blocks rarely agree to one in a hundred.
         large = gain > 0.4 * (nominal.loss - HEALTHY_LOSS) and chance < 5 * _ALPHA
         significant = (chance < _ALPHA or large) and low > 0
         least = max(SMALLEST_GAIN * before.loss, SMALLEST_STEP)
@@ -293,7 +311,7 @@ class Search:
         return significant and gain > least
 
     def _preferred(self, judged: list[Trial], before: Trial) -> Trial:
-        """The best trial, or one as good that asks for fewer parameters."""
+        """The best trial, or one about as good with fewer parameters."""
         best = judged[0]
         for trial in judged[1:]:
             margin, low, _ = self._gain(trial, best)
@@ -303,7 +321,7 @@ class Search:
         return best
 
     def _pruned(self, best: Trial, nominal: Trial) -> Trial:
-        """Without effects that no longer pay beside the others."""
+        """The trial without effects that no longer reduce the loss enough in the presence of the others."""
         for name in best.names[len(self.known) : -1]:
             fewer = self.judge(without(best.effects, name))
             if not self._pays(fewer, best, nominal):
@@ -311,8 +329,8 @@ class Search:
         return best
 
     def _exchanged(self, best: Trial) -> tuple[Trial, dict[str, list[str]]]:
-        """Each effect against all others in its place, and those that explain the drive as well there."""
-        rivals = {}
+        """Test each effect against all others in its place; also those that explain the recording as well there."""
+        indistinguishable = {}
         for name in best.names[len(self.known) :]:
             if name not in best.names:
                 continue
@@ -328,22 +346,22 @@ class Search:
                 gain, low, _ = self._gain(best, judged[0])
                 if low > 0 and gain > 0.02 * best.loss:
                     best = judged[0]
-            own = best.names[-1] if name not in best.names else name
-            rivals[own] = self._rivals(best, [t for t in judged if t is not best], own)
-        return best, rivals
+            kept = best.names[-1] if name not in best.names else name
+            indistinguishable[kept] = self._indistinguishable(best, [t for t in judged if t is not best], kept)
+        return best, indistinguishable
 
-    def _rivals(self, best: Trial, judged: Sequence[Trial], own: str | None = None) -> list[str]:
-        """Effects that explain the drive about as well."""
-        own = own or best.names[-1]
-        rivals = []
+    def _indistinguishable(self, best: Trial, judged: Sequence[Trial], effect: str | None = None) -> list[str]:
+        """Effects that explain the recording about as well in place of ``effect``, by default the last one."""
+        effect = effect or best.names[-1]
+        found = []
         for trial in judged:
             other = next((name for name in trial.names if name not in best.names), None)
             if other is None:
                 continue
             _, low, _ = self._gain(trial, best)
-            if low <= 0 or separating_sensor(other, own):
-                rivals.append(other)
-        return rivals
+            if low <= 0 or separating_sensor(other, effect):
+                found.append(other)
+        return found
 
     def _starts(self, effect: Effect) -> list[Effects]:
         name = effect.name

@@ -1,4 +1,4 @@
-"""Wheels: what measured wheel speeds say of how the drives follow commands, whatever the ground does then."""
+"""Wheels: how the drives follow commands, by measured wheel speeds and so independent of the ground."""
 
 from __future__ import annotations
 
@@ -12,14 +12,16 @@ from monoforce_ros.core import CommandTrack, WheelTrack
 from monoforce_ros.discrepancy.hypothesis import Effects
 from monoforce_ros.robots import RobotModel
 
+_Piece = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Commanded speeds with history ``[2, T]`` [m/s], measured speeds ``[2, n]``, and their indices in T ``[n]``."""
 _STEP = 0.02
 _HISTORY = 2.0
 _LONGEST_GAP = 1.0
 _BLOCK = 6.0
 _MOST = 1500
-"""Samples of each side that are looked at."""
+"""Samples of each side that are used at most."""
 _BETTER = 0.08
-"""Part of the squared error that a model with one more effect must take away on blocks that its fit did not see."""
+"""Share of the squared error on held-out blocks that a model with one more effect must remove."""
 _MODELS: tuple[tuple[str, ...], ...] = (
     (),
     ("delay",),
@@ -41,9 +43,9 @@ _EFFECTS = {
     "lag": ("actuator_lag", "time_constant"),
 }
 _LEAST = {"delay": 0.06, "lag": 0.08, "width": 0.02}
-"""Values below which an effect is none [s, s, m/s]."""
+"""Values below which an effect is not reported [s, s, m/s]."""
 _FASTEST_SHARE = 0.95
-"""Of the fastest command: a limit beyond it is none."""
+"""Share of the fastest command above which a limit is not reported."""
 
 
 @dataclass(frozen=True)
@@ -51,58 +53,60 @@ class WheelFinding:
     """How the drives follow commands."""
 
     effects: Effects
-    """With a parameter each, in the order in which a command meets them; empty where the wheels do as they are told."""
-    halves: tuple[float, ...]
-    """Half of each parameter's 95 % interval."""
+    """One parameter each, in the order in which they act on a command; empty where the wheels follow the commands."""
+    half_widths: tuple[float, ...]
+    """Half-width of each parameter's 95 % confidence interval."""
     error_before: float
-    """Root mean square of wheel minus commanded speed [m/s], at the best constant ratio of the two."""
+    """RMS of measured minus commanded wheel speed [m/s], at the best constant ratio of the two."""
     error_after: float
     ratio: float
     """Measured speed [rad/s] over commanded [m/s]: one over the wheel's radius."""
 
-    def told(self) -> str:
-        """In plain words."""
+    def summary(self) -> str:
+        """In one sentence."""
         words = {
             "command_delay": "{:.2f} s late",
             "actuator_lag": "with a time constant of {:.2f} s",
-            "actuator_saturation": "up to {:.2f} m/s and no faster",
+            "actuator_saturation": "up to {:.2f} m/s",
             "actuator_deadband": "slower by {:.2f} m/s",
         }
         parts = [words[name].format(next(iter(values.values()))) for name, values in self.effects]
-        return "the measured wheel speeds follow the commands " + ", ".join(parts or ["as they are told"])
+        return "the measured wheel speeds follow the commands " + ", ".join(parts or ["without delay or limit"])
 
 
 def compare_with_wheels(commands: CommandTrack, wheels: WheelTrack | None, robot: RobotModel) -> WheelFinding | None:
-    """How measured wheel speeds follow commands; None without wheel speeds that follow them at all.
+    """How measured wheel speeds follow commands; None without wheel speeds, or where they do not follow at all.
 
-    Dead time, dead band, saturation and lag are fitted to both sides in every sensible combination, each on every other
-    block of the drive; the one with the fewest that predicts the other blocks well is taken.
+    Dead time, dead band, saturation and lag are fitted to both sides in every sensible combination on every other block
+    of the recording; of the combinations that predict the held-out blocks well the smallest is selected.
     """
     if wheels is None or len(wheels) < 100 or not len(commands):
         return None
     pieces = _pieces(commands, wheels, robot)
     if not pieces:
         return None
-    top = float(np.quantile(np.concatenate([np.abs(told[:, index]).max(axis=1) for told, _, index in pieces]), 0.995))
+    top = float(
+        np.quantile(np.concatenate([np.abs(commanded[:, index]).max(axis=1) for commanded, _, index in pieces]), 0.995)
+    )
     if top < 0.1:
         return None
     ratio = _ratio(pieces, top)
     if ratio is not None and robot.wheel_radius is not None and 0.4 < ratio * robot.wheel_radius < 2.5:
-        # A wheel's speed times its radius is what was commanded; a drive that does less says so.
+        # With a plausible ratio the known radius is used, so that a drive that is too slow shows as an error.
         ratio = 1.0 / robot.wheel_radius
     if len(pieces) < 2 or ratio is None:
         return None
-    pieces = [(told, speeds / ratio, index) for told, speeds, index in pieces]
+    pieces = [(commanded, speeds / ratio, index) for commanded, speeds, index in pieces]
     block = np.arange(len(pieces)) % 2
     scores: dict[tuple[str, ...], tuple[float, np.ndarray, np.ndarray]] = {}
     for names in _MODELS:
         lost, fits = 0.0, []
-        for left in (0, 1):
-            seen = [piece for piece, own in zip(pieces, block, strict=True) if own != left]
-            other = [piece for piece, own in zip(pieces, block, strict=True) if own == left]
-            fit = _fit(names, seen, top)
+        for held_out in (0, 1):
+            fitted = [piece for piece, number in zip(pieces, block, strict=True) if number != held_out]
+            judged = [piece for piece, number in zip(pieces, block, strict=True) if number == held_out]
+            fit = _fit(names, fitted, top)
             fits.append(fit)
-            lost += float(np.minimum(_residuals(fit, names, other) ** 2, (0.5 * top) ** 2).sum())
+            lost += float(np.minimum(_residuals(fit, names, judged) ** 2, (0.5 * top) ** 2).sum())
         scores[names] = (lost, np.mean(fits, axis=0), np.abs(fits[0] - fits[1]))
     nothing = scores[()][0]
     best: tuple[str, ...] = ()
@@ -111,7 +115,7 @@ def compare_with_wheels(commands: CommandTrack, wheels: WheelTrack | None, robot
         if scores[found][0] < (1.0 - _BETTER) * scores[best][0]:
             best = found
     values, spread = scores[best][1], scores[best][2]
-    effects, halves = [], []
+    effects, half_widths = [], []
     for key in ("delay", "width", "limit", "lag"):
         if key not in best:
             continue
@@ -121,42 +125,46 @@ def compare_with_wheels(commands: CommandTrack, wheels: WheelTrack | None, robot
         if not none:
             name, parameter = _EFFECTS[key]
             effects.append((name, {parameter: value}))
-            # Two halves of the data differ by the square root of two of what each is off.
-            halves.append(float(max(1.4 * spread[index], 0.02 * value)))
+            # The difference of both folds is √2 times the error of each.
+            half_widths.append(float(max(1.4 * spread[index], 0.02 * value)))
     count = sum(len(index) for _, _, index in pieces) * 2
     spreads = [
         float(np.var(np.concatenate([values.ravel() for values in side])))
-        for side in ([speeds for _, speeds, _ in pieces], [told[:, index] for told, _, index in pieces])
+        for side in ([speeds for _, speeds, _ in pieces], [commanded[:, index] for commanded, _, index in pieces])
     ]
     if scores[best][0] / count > 0.5 * min(spreads):
-        # The wheels do something else than what the commands say.
+        # The wheels do not follow the commands.
         return None
     return WheelFinding(
-        tuple(effects), tuple(halves), float(np.sqrt(nothing / count)), float(np.sqrt(scores[best][0] / count)), ratio
+        tuple(effects),
+        tuple(half_widths),
+        float(np.sqrt(nothing / count)),
+        float(np.sqrt(scores[best][0] / count)),
+        ratio,
     )
 
 
-def _ratio(pieces: list, top: float) -> float | None:
-    """Measured [rad/s] over commanded speed [m/s] where a command of middling size has held for a while."""
+def _ratio(pieces: list[_Piece], top: float) -> float | None:
+    """Measured [rad/s] over commanded speed [m/s] where a command of medium size was constant for a while."""
     settled = round(1.5 / _STEP)
     ratios = []
-    for told, speeds, index in pieces:
+    for commanded, speeds, index in pieces:
         for side in range(2):
-            for place, shown in zip(index, speeds[side], strict=True):
-                held = told[side, max(0, place - settled) : place + 1]
+            for place, measured in zip(index, speeds[side], strict=True):
+                held = commanded[side, max(0, place - settled) : place + 1]
                 if np.ptp(held) < 0.02 * top and 0.1 * top < abs(held[-1]) < 0.6 * top:
-                    ratios.append(shown / held[-1])
+                    ratios.append(measured / held[-1])
     if len(ratios) < 20:
-        told = np.concatenate([told[:, index].ravel() for told, _, index in pieces])
-        shown = np.concatenate([speeds.ravel() for _, speeds, _ in pieces])
-        ratio = float(told @ shown) / max(float(told @ told), 1e-9)
+        commanded = np.concatenate([commanded[:, index].ravel() for commanded, _, index in pieces])
+        measured = np.concatenate([speeds.ravel() for _, speeds, _ in pieces])
+        ratio = float(commanded @ measured) / max(float(commanded @ commanded), 1e-9)
     else:
         ratio = float(np.median(ratios))
     return ratio if ratio > 0.1 else None
 
 
-def _pieces(commands: CommandTrack, wheels: WheelTrack, robot: RobotModel) -> list:
-    """Blocks: commanded speeds of both sides with history ``[2, T]`` [m/s], measured ``[2, n]``, their places in T."""
+def _pieces(commands: CommandTrack, wheels: WheelTrack, robot: RobotModel) -> list[_Piece]:
+    """The recording in blocks of about ``_BLOCK``, each with the commands before it."""
     every = max(1, -(-len(wheels) // _MOST))
     stamps, speeds = wheels.stamps[::every], wheels.speeds[::every]
     half = 0.5 * float((robot.drive_offsets.max() - robot.drive_offsets.min()).abs())
@@ -172,47 +180,49 @@ def _pieces(commands: CommandTrack, wheels: WheelTrack, robot: RobotModel) -> li
             first = int(stamps[part[0]]) - round(_HISTORY * 1e9)
             count = round((int(stamps[part[-1]]) - first) * 1e-9 / _STEP) + 1
             twists = commands.sample(first + np.rint(np.arange(count) * _STEP * 1e9).astype(np.int64))
-            told = np.stack([twists[:, 0] - half * twists[:, 1], twists[:, 0] + half * twists[:, 1]])
+            commanded = np.stack([twists[:, 0] - half * twists[:, 1], twists[:, 0] + half * twists[:, 1]])
             index = np.rint((stamps[part] - first) * 1e-9 / _STEP).astype(int)
-            pieces.append((told, speeds[part].T, index))
+            pieces.append((commanded, speeds[part].T, index))
     return pieces
 
 
-def _model(values: np.ndarray, names: tuple[str, ...], told: np.ndarray) -> np.ndarray:
-    """Speeds ``[2, T]`` that drives make of commanded ones."""
+def _model(values: np.ndarray, names: tuple[str, ...], commanded: np.ndarray) -> np.ndarray:
+    """Wheel speeds ``[2, T]`` [m/s] that result from commanded ones."""
     known = dict(zip(names, values, strict=True))
     if "delay" in known:
-        place = np.arange(told.shape[1]) - known["delay"] / _STEP
-        told = np.stack([np.interp(place, np.arange(told.shape[1]), side) for side in told])
+        place = np.arange(commanded.shape[1]) - known["delay"] / _STEP
+        commanded = np.stack([np.interp(place, np.arange(commanded.shape[1]), side) for side in commanded])
     if "width" in known:
-        told = np.sign(told) * np.maximum(np.abs(told) - known["width"], 0.0)
+        commanded = np.sign(commanded) * np.maximum(np.abs(commanded) - known["width"], 0.0)
     if "limit" in known:
-        told = np.clip(told, -known["limit"], known["limit"])
+        commanded = np.clip(commanded, -known["limit"], known["limit"])
     if "lag" in known and known["lag"] > 1e-4:
         kept = np.exp(-_STEP / known["lag"])
-        told = lfilter([1.0 - kept], [1.0, -kept], told, axis=1, zi=kept * told[:, :1])[0]
-    return told
+        commanded = lfilter([1.0 - kept], [1.0, -kept], commanded, axis=1, zi=kept * commanded[:, :1])[0]
+    return commanded
 
 
-def _residuals(values: np.ndarray, names: tuple[str, ...], pieces: list) -> np.ndarray:
-    """Measured minus modelled speed [m/s], all samples of both sides."""
-    return np.concatenate([(speeds - _model(values, names, told)[:, index]).ravel() for told, speeds, index in pieces])
+def _residuals(values: np.ndarray, names: tuple[str, ...], pieces: list[_Piece]) -> np.ndarray:
+    """Measured minus modelled speed of all samples of both sides [m/s]."""
+    return np.concatenate(
+        [(speeds - _model(values, names, commanded)[:, index]).ravel() for commanded, speeds, index in pieces]
+    )
 
 
-def _fit(names: tuple[str, ...], pieces: list, top: float) -> np.ndarray:
+def _fit(names: tuple[str, ...], pieces: list[_Piece], top: float) -> np.ndarray:
     """Parameters by robust least squares from a few starts."""
     starts = {"delay": (0.05, 0.3, 0.7), "lag": (0.1, 0.4), "limit": (0.9 * top, 0.6 * top), "width": (0.05 * top,)}
     low = {"delay": 0.0, "lag": 0.0, "limit": 0.02 * top, "width": 0.0}
     high = {"delay": 1.8, "lag": 2.0, "limit": 1.5 * top, "width": 0.6 * top}
     if not names:
         return np.zeros(0)
-    best = None
+    best, cost = np.zeros(len(names)), np.inf
     for number in range(max(len(starts[name]) for name in names)):
         start = [starts[name][number % len(starts[name])] for name in names]
         fit = least_squares(
             _residuals, start, args=(names, pieces), loss="soft_l1", f_scale=0.05 * top, diff_step=1e-2, max_nfev=20,
             bounds=([low[name] for name in names], [high[name] for name in names]),
         )  # fmt: skip
-        if best is None or fit.cost < best.cost:
-            best = fit
-    return best.x
+        if fit.cost < cost:
+            best, cost = fit.x, fit.cost
+    return best

@@ -20,7 +20,7 @@ class CommandClockOffset(Effect):
     source = "unsynchronised clocks"
     parameters = (Parameter("offset", "s", 0.0, -2.0, 2.0, 0.2, "recorded minus true time"),)
     separated_by_sensor: ClassVar = {
-        "pose_clock_offset": "an IMU's gyro shows whether the poses are late or the base waits: record it"
+        "pose_clock_offset": "record an IMU: its gyro shows whether the poses or the base are late"
     }
 
     def commands(self, commands: CommandTrack, values: Mapping[str, float]) -> CommandTrack:

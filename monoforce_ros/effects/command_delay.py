@@ -31,8 +31,8 @@ class CommandDelay(Effect):
     separated_by: ClassVar = {"actuator_lag": "steps of the speed from standing"}
     # Motion and commands alone do not say which of their clocks is off, or whether the base waits.
     separated_by_sensor: ClassVar = {
-        "pose_clock_offset": "an IMU's gyro shows whether the poses are late or the base waits: record it",
-        "command_clock_offset": "an IMU's gyro shows whether the poses are late or the base waits: record it",
+        "pose_clock_offset": "record an IMU: its gyro shows whether the poses or the base are late",
+        "command_clock_offset": "record an IMU: its gyro shows whether the poses or the base are late",
     }
     wheel_response = WheelResponse(
         parameter="delay",

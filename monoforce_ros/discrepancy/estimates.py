@@ -1,0 +1,30 @@
+"""Estimates: effects that a recording identifies, each parameter with its confidence interval."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+
+@dataclass(frozen=True)
+class ParameterEstimate:
+    """The value of one parameter and its 95 % confidence interval."""
+
+    value: float
+    low: float
+    high: float
+    unit: str
+
+    def with_half_width(self, half_width: float) -> ParameterEstimate:
+        """The same value with a symmetric interval."""
+        return replace(self, low=self.value - half_width, high=self.value + half_width)
+
+
+@dataclass(frozen=True)
+class EffectEstimate:
+    """An effect that was identified."""
+
+    name: str
+    parameters: Mapping[str, ParameterEstimate]
+    indistinguishable: tuple[str, ...] = ()
+    """Other effects that explain the recording about as well in its place."""
