@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.signal import lfilter
 
 from monoforce_ros.core import CommandTrack, WheelTrack
 from monoforce_ros.discrepancy.hypothesis import Effects
+from monoforce_ros.effects import CATALOGUE, WheelResponse, wheel_effects
 from monoforce_ros.robots import RobotModel
 
 _Piece = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -22,30 +23,8 @@ _MOST = 1500
 """Samples of each side that are used at most."""
 _BETTER = 0.08
 """Share of the squared error on held-out blocks that a model with one more effect must remove."""
-_MODELS: tuple[tuple[str, ...], ...] = (
-    (),
-    ("delay",),
-    ("lag",),
-    ("limit",),
-    ("width",),
-    ("delay", "lag"),
-    ("delay", "limit"),
-    ("lag", "limit"),
-    ("delay", "width"),
-    ("lag", "width"),
-    ("delay", "lag", "limit"),
-    ("delay", "lag", "width"),
-)
-_EFFECTS = {
-    "delay": ("command_delay", "delay"),
-    "width": ("actuator_deadband", "width"),
-    "limit": ("actuator_saturation", "limit"),
-    "lag": ("actuator_lag", "time_constant"),
-}
-_LEAST = {"delay": 0.06, "lag": 0.08, "width": 0.02}
-"""Values below which an effect is not reported [s, s, m/s]."""
-_FASTEST_SHARE = 0.95
-"""Share of the fastest command above which a limit is not reported."""
+_LARGEST_MODEL = 3
+"""Effects that a model of the wheels holds at most."""
 
 
 @dataclass(frozen=True)
@@ -64,13 +43,7 @@ class WheelFinding:
 
     def summary(self) -> str:
         """In one sentence."""
-        words = {
-            "command_delay": "{:.2f} s late",
-            "actuator_lag": "with a time constant of {:.2f} s",
-            "actuator_saturation": "up to {:.2f} m/s",
-            "actuator_deadband": "slower by {:.2f} m/s",
-        }
-        parts = [words[name].format(next(iter(values.values()))) for name, values in self.effects]
+        parts = [_response(name).wording.format(next(iter(values.values()))) for name, values in self.effects]
         return "the measured wheel speeds follow the commands " + ", ".join(parts or ["without delay or limit"])
 
 
@@ -99,7 +72,7 @@ def compare_with_wheels(commands: CommandTrack, wheels: WheelTrack | None, robot
     pieces = [(commanded, speeds / ratio, index) for commanded, speeds, index in pieces]
     block = np.arange(len(pieces)) % 2
     scores: dict[tuple[str, ...], tuple[float, np.ndarray, np.ndarray]] = {}
-    for names in _MODELS:
+    for names in _models():
         lost, fits = 0.0, []
         for held_out in (0, 1):
             fitted = [piece for piece, number in zip(pieces, block, strict=True) if number != held_out]
@@ -110,23 +83,17 @@ def compare_with_wheels(commands: CommandTrack, wheels: WheelTrack | None, robot
         scores[names] = (lost, np.mean(fits, axis=0), np.abs(fits[0] - fits[1]))
     nothing = scores[()][0]
     best: tuple[str, ...] = ()
-    for size in (1, 2, 3):
-        found = min((names for names in _MODELS if len(names) == size), key=lambda names: scores[names][0])
-        if scores[found][0] < (1.0 - _BETTER) * scores[best][0]:
+    for size in range(1, _LARGEST_MODEL + 1):
+        found = min((names for names in scores if len(names) == size), key=lambda names: scores[names][0], default=None)
+        if found is not None and scores[found][0] < (1.0 - _BETTER) * scores[best][0]:
             best = found
-    values, spread = scores[best][1], scores[best][2]
     effects, half_widths = [], []
-    for key in ("delay", "width", "limit", "lag"):
-        if key not in best:
-            continue
-        index = best.index(key)
-        value = float(values[index])
-        none = value > _FASTEST_SHARE * top if key == "limit" else value < _LEAST[key]
-        if not none:
-            name, parameter = _EFFECTS[key]
-            effects.append((name, {parameter: value}))
+    for name, value, spread in zip(best, *scores[best][1:], strict=True):
+        response = _response(name)
+        if response.counts(float(value), top):
+            effects.append((name, {response.parameter: float(value)}))
             # The difference of both folds is √2 times the error of each.
-            half_widths.append(float(max(1.4 * spread[index], 0.02 * value)))
+            half_widths.append(float(max(1.4 * spread, 0.02 * value)))
     count = sum(len(index) for _, _, index in pieces) * 2
     spreads = [
         float(np.var(np.concatenate([values.ravel() for values in side])))
@@ -186,19 +153,27 @@ def _pieces(commands: CommandTrack, wheels: WheelTrack, robot: RobotModel) -> li
     return pieces
 
 
+def _response(name: str) -> WheelResponse:
+    response = CATALOGUE[name].wheel_response
+    assert response is not None, name
+    return response
+
+
+def _models() -> list[tuple[str, ...]]:
+    """Sets of effects that wheel speeds show, each in the order in which a command meets them."""
+    names = [effect.name for effect in wheel_effects()]
+    return [
+        chosen
+        for size in range(_LARGEST_MODEL + 1)
+        for chosen in itertools.combinations(names, size)
+        if not any(other in _response(name).excludes for name in chosen for other in chosen)
+    ]
+
+
 def _model(values: np.ndarray, names: tuple[str, ...], commanded: np.ndarray) -> np.ndarray:
-    """Wheel speeds ``[2, T]`` [m/s] that result from commanded ones."""
-    known = dict(zip(names, values, strict=True))
-    if "delay" in known:
-        place = np.arange(commanded.shape[1]) - known["delay"] / _STEP
-        commanded = np.stack([np.interp(place, np.arange(commanded.shape[1]), side) for side in commanded])
-    if "width" in known:
-        commanded = np.sign(commanded) * np.maximum(np.abs(commanded) - known["width"], 0.0)
-    if "limit" in known:
-        commanded = np.clip(commanded, -known["limit"], known["limit"])
-    if "lag" in known and known["lag"] > 1e-4:
-        kept = np.exp(-_STEP / known["lag"])
-        commanded = lfilter([1.0 - kept], [1.0, -kept], commanded, axis=1, zi=kept * commanded[:, :1])[0]
+    """Speeds ``[2, T]`` of the wheels that follow commanded ones under effects."""
+    for name, value in zip(names, values, strict=True):
+        commanded = _response(name).speeds(commanded, float(value), _STEP)
     return commanded
 
 
@@ -211,17 +186,16 @@ def _residuals(values: np.ndarray, names: tuple[str, ...], pieces: list[_Piece])
 
 def _fit(names: tuple[str, ...], pieces: list[_Piece], top: float) -> np.ndarray:
     """Parameters by robust least squares from a few starts."""
-    starts = {"delay": (0.05, 0.3, 0.7), "lag": (0.1, 0.4), "limit": (0.9 * top, 0.6 * top), "width": (0.05 * top,)}
-    low = {"delay": 0.0, "lag": 0.0, "limit": 0.02 * top, "width": 0.0}
-    high = {"delay": 1.8, "lag": 2.0, "limit": 1.5 * top, "width": 0.6 * top}
     if not names:
         return np.zeros(0)
+    starts = {name: _response(name).starts(top) for name in names}
+    bounds = np.array([_response(name).bounds(top) for name in names])
     best, cost = np.zeros(len(names)), np.inf
     for number in range(max(len(starts[name]) for name in names)):
         start = [starts[name][number % len(starts[name])] for name in names]
         fit = least_squares(
             _residuals, start, args=(names, pieces), loss="soft_l1", f_scale=0.05 * top, diff_step=1e-2, max_nfev=20,
-            bounds=([low[name] for name in names], [high[name] for name in names]),
+            bounds=(bounds[:, 0], bounds[:, 1]),
         )  # fmt: skip
         if fit.cost < cost:
             best, cost = fit.x, fit.cost

@@ -32,7 +32,7 @@ class ActuatorSaturation(Effect):
         bounds=lambda top: (0.02 * top, 1.5 * top),
         # A limit just below the fastest command, or above it, changes nothing.
         counts=lambda value, top: value <= 0.95 * top,
-        wording="up to {:.2f} m/s and no faster",
+        wording="up to {:.2f} m/s",
         excludes=("actuator_deadband",),
     )
 
