@@ -100,8 +100,8 @@ def test_a_bag_that_was_cut_off_is_read_as_far_as_it_goes(tmp_path, part):
     file.write_bytes(data[: int(len(data) * part)])
     recording = Recording.open(path)
     assert part * 400 - 40 < len(recording.motion) <= part * 400
-    assert "cut off or damaged" in recording.complaints[0]
-    assert "breaks off" in recording.complaints[1]
+    assert "cut off or damaged" in recording.warnings[0]
+    assert "breaks off" in recording.warnings[1]
     np.testing.assert_allclose(recording.motion.positions[:, 0], 0.05 * np.arange(len(recording.motion)))
     frame = recording.images["/cam/image_raw"][10]
     assert recording.image(frame).shape == (120, 160, 3)
@@ -112,7 +112,7 @@ def test_a_bag_without_metadata_is_read_and_said(tmp_path, storage):
     path = write(tmp_path / "drive", storage)
     (path / "metadata.yaml").unlink()
     recording = Recording.open(path)
-    assert "no usable index (there is no metadata.yaml)" in recording.complaints[0]
+    assert "no usable index (there is no metadata.yaml)" in recording.warnings[0]
     for opened in (recording, Recording.open(storage_file(path))):
         assert len(opened.motion) == 20
         assert opened.cloud(opened.clouds[7])[0][0, 0] == 8.0
@@ -126,7 +126,7 @@ def test_a_real_ros_1_bag_without_its_index_is_read(tmp_path, real_data):
     whole, part = Recording.open(source), Recording.open(cut)
     assert 0.3 * len(whole.motion) < len(part.motion) < 0.7 * len(whole.motion)
     np.testing.assert_array_equal(part.motion.positions, whole.motion.positions[: len(part.motion)])
-    assert "cut off" in part.complaints[0]
+    assert "cut off" in part.warnings[0]
 
 
 @given(st.binary(max_size=400), st.sampled_from([b"\x89MCAP0\r\n", b"#ROSBAG V2.0\n", b"SQLite format 3\x00", b""]))
@@ -222,7 +222,7 @@ def test_single_bad_messages_are_left_out_and_said(tmp_path):
                 "/odom", builders.odometry(at, "odom", "base_link", [i, 0, 0], [0, 0, 0, 1], [speed, 0, 0], [0] * 3), at
             )
     recording = Recording.open(tmp_path / "drive")
-    assert len(recording.motion) == 9 and "not finite" in recording.complaints[0]
+    assert len(recording.motion) == 9 and "not finite" in recording.warnings[0]
 
 
 def test_messages_out_of_order_are_sorted_by_their_stamps(tmp_path):

@@ -64,7 +64,7 @@ def read_drive(bag: Path, robot: RobotModel, terrain: str, topics: Topics = Topi
     """
     recording = Recording.open(bag, odometry=topics.odometry, commands=topics.commands, cloud=topics.cloud)
     smoothed = smooth(recording.motion)
-    drive = Evidence(smoothed, recording.commands, turning=recording.turning, wheels=recording.wheels)
+    drive = Evidence(smoothed, recording.commands, turning=recording.angular_velocity, wheels=recording.wheels)
     if terrain == "flat":
         return drive, recording
     if terrain != "lidar":
@@ -131,7 +131,7 @@ def diagnose_bag(
         "duration_s": round(time.monotonic() - began, 1),
     }
     report, page = write_diagnosis(out, diagnosis, inputs, robot_file)
-    return BagDiagnosis(bag, diagnosis, report, page, robot_file, tuple(recording.complaints))
+    return BagDiagnosis(bag, diagnosis, report, page, robot_file, recording.warnings)
 
 
 def _held_out(bag: Path, robot: RobotModel, effects: Effects, terrain: str, topics: Topics) -> dict[str, dict]:
