@@ -125,11 +125,11 @@ class RoughScene:
         return self.path / folder / f"{stamp // 10**9}_{stamp % 10**9:09d}{suffix}"
 
 
-def interpolate_poses(stamps: np.ndarray, matrices: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Poses ``[n, 4, 4]`` at the stamps ``wanted`` [ns], which must lie within ``stamps``."""
+def interpolate_poses(stamps: np.ndarray, matrices: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """Poses ``[n, 4, 4]`` at the stamps ``targets`` [ns], which must lie within ``stamps``."""
     origin = stamps[0]
-    times, at = (stamps - origin) * NANOSECOND, (wanted - origin) * NANOSECOND
-    result = np.tile(np.eye(4), (len(wanted), 1, 1))
+    times, at = (stamps - origin) * NANOSECOND, (targets - origin) * NANOSECOND
+    result = np.tile(np.eye(4), (len(targets), 1, 1))
     result[:, :3, :3] = Slerp(times, Rotation.from_matrix(matrices[:, :3, :3]))(at).as_matrix()
     for axis in range(3):
         result[:, axis, 3] = np.interp(at, times, matrices[:, axis, 3])
@@ -139,13 +139,13 @@ def interpolate_poses(stamps: np.ndarray, matrices: np.ndarray, wanted: np.ndarr
 def motion_from_poses(stamps: np.ndarray, matrices: np.ndarray, rate: float = 50.0) -> MotionTrack:
     """Motion at a constant rate from sparse poses; velocities are finite differences of the poses, in base axes."""
     count = int((stamps[-1] - stamps[0]) * NANOSECOND * rate)
-    wanted = stamps[0] + np.rint(np.arange(count + 1) / rate * 1e9).astype(np.int64)
-    dense = interpolate_poses(stamps, matrices, np.minimum(wanted, stamps[-1]))
+    targets = stamps[0] + np.rint(np.arange(count + 1) / rate * 1e9).astype(np.int64)
+    dense = interpolate_poses(stamps, matrices, np.minimum(targets, stamps[-1]))
     rotations = Rotation.from_matrix(dense[:, :3, :3])
     world = np.gradient(dense[:, :3, 3], 1.0 / rate, axis=0)
     turns = (rotations[:-1].inv() * rotations[1:]).as_rotvec() * rate
     return MotionTrack(
-        stamps=wanted,
+        stamps=targets,
         positions=dense[:, :3, 3],
         quaternions=rotations.as_quat(),
         linear_velocities=rotations.inv().apply(world),

@@ -118,7 +118,7 @@ def record(out: Path, settings: RecordingSettings, progress: Callable[[float], o
 
     Args:
         out: folder of the bag.
-        settings: what to record.
+        settings: settings of the recording.
         progress: called with the simulated seconds [s] since its last call.
 
     Raises:
