@@ -1,9 +1,9 @@
-"""The rollout against an independent engine: the same Husky, terrain and commands in MuJoCo and here, for 5 s.
+"""Compare the rollout with an independent engine: the same Husky, terrain and commands in MuJoCo and here, for 5 s.
 
     scripts/run.sh python benchmarks/mujoco_check.py [--json FILE] [--figure FILE]
 
-The ground is gentle and bare. Friction and the effective track width are set once for all runs, from the first arc on
-level ground: the tyres of the two engines slip differently when the robot turns.
+The ground is level, or gentle hills without obstacles. Friction and the effective track width are set once for all
+runs, from the first arc on level ground: the tyres of the two engines slip differently in turns.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from monoforce_ros.effects import drive_speeds
 from monoforce_ros.physics import Rollout, State, rollout
 from monoforce_ros.reporting import figure_png
 from monoforce_ros.robots import RobotModel, load_robot
-from monoforce_ros.synthetic import TerrainSettings
-from monoforce_ros.synthetic.random_streams import random_stream
-from monoforce_ros.synthetic.route import Route
-from monoforce_ros.synthetic.scenery import Scenery
-from monoforce_ros.synthetic.simulation import Simulation
-from monoforce_ros.synthetic.terrain_shape import build_ground
-from monoforce_ros.synthetic.vegetation import Grass
-from monoforce_ros.synthetic.vehicle import Vehicle
-from monoforce_ros.synthetic.world import TIME_STEP, build_model
+from monoforce_ros.synthetic import (
+    TIME_STEP,
+    Scenery,
+    Simulation,
+    TerrainSettings,
+    Vehicle,
+    build_model,
+    build_scenery,
+)
 from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap
 
 SECONDS = 5.0
@@ -48,17 +48,14 @@ FRICTION = 0.8
 
 
 def bare_scenery(roughness: float, seed: int) -> Scenery:
-    """Hills without anything on them."""
-    settings = TerrainSettings(roughness=roughness, flat=roughness == 0.0)
-    route = Route(random_stream(seed, "route"))
-    ground = build_ground(settings, route, None, random_stream(seed, "ground"))
-    return Scenery(ground, route, None, (), (), Grass.grow((), ground, random_stream(seed, "grass")))
+    """Hills without obstacles, or level ground for a roughness of 0."""
+    return build_scenery(TerrainSettings(roughness=roughness, flat=roughness == 0.0, bare=True), seed)
 
 
 def drive_in_mujoco(
     scenery: Scenery, twist: tuple[float, float], seed: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Positions ``[T + 1, 3]``, rotations ``[T + 1, 3, 3]`` in the odom frame, and where its origin is in the world."""
+    """Positions ``[T + 1, 3]``, rotations ``[T + 1, 3, 3]`` in the odom frame, and its origin in the world ``[3]``."""
     vehicle = Vehicle.load("husky")
     simulation = Simulation(build_model(scenery, vehicle, seed, {}), scenery, vehicle)
     simulation.drive(*twist)
@@ -72,8 +69,10 @@ def drive_in_mujoco(
     return np.array(positions), np.array(rotations), simulation.odom_origin
 
 
-def drive_here(robot: RobotModel, scenery: Scenery, origin: np.ndarray, start: np.ndarray, twist: tuple) -> Rollout:
-    """The same drive by the rollout, on the heights that MuJoCo's ground has."""
+def drive_in_rollout(
+    robot: RobotModel, scenery: Scenery, origin: np.ndarray, start: np.ndarray, twist: tuple
+) -> Rollout:
+    """The same commands in the rollout, on the heights of MuJoCo's ground."""
     grid = Grid.square(16.0, 0.1)
     x, y = np.meshgrid(grid.x, grid.y)
     heights = scenery.ground.height_at(np.stack([x, y], axis=-1) + origin[:2]) - origin[2]
@@ -86,22 +85,22 @@ def drive_here(robot: RobotModel, scenery: Scenery, origin: np.ndarray, start: n
 
 
 def yaw_of(rotations: np.ndarray) -> float:
-    """Heading turned through over the drive [rad]."""
+    """Change of heading over the run [rad]."""
     headings = np.unwrap(np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0]))
     return float(headings[-1] - headings[0])
 
 
 def fitted_robot(seed: int) -> RobotModel:
-    """The Husky with the effective track width at which one arc on level ground turns as in MuJoCo."""
+    """The Husky with the effective track width for which an arc on level ground turns as in MuJoCo."""
     robot = load_robot("husky")
     scenery = bare_scenery(0.0, seed)
     _, rotations, origin = drive_in_mujoco(scenery, COMMANDS["arc to the left"], seed)
-    wanted, low, high = yaw_of(rotations), 0.5, 2.0
+    target, low, high = yaw_of(rotations), 0.5, 2.0
     for _ in range(12):
         factor = (low + high) / 2
         trial = dataclasses.replace(robot, effects=(("turning_scrub", {"track_width_factor": factor}),))
-        result = drive_here(trial, scenery, origin, rotations[0], COMMANDS["arc to the left"])
-        low, high = (factor, high) if yaw_of(result.rotation[0].numpy()) > wanted else (low, factor)
+        result = drive_in_rollout(trial, scenery, origin, rotations[0], COMMANDS["arc to the left"])
+        low, high = (factor, high) if yaw_of(result.rotation[0].numpy()) > target else (low, factor)
     return trial
 
 
@@ -109,22 +108,22 @@ def compare(robot: RobotModel, roughness: float, seed: int, twist: tuple[float, 
     """Errors after 5 s and the two trajectories."""
     scenery = bare_scenery(roughness, seed)
     positions, rotations, origin = drive_in_mujoco(scenery, twist, seed)
-    result = drive_here(robot, scenery, origin, rotations[0], twist)
-    here, turned = result.position[0].double().numpy(), result.rotation[0].double().numpy()
+    result = drive_in_rollout(robot, scenery, origin, rotations[0], twist)
+    predicted, turned = result.position[0].double().numpy(), result.rotation[0].double().numpy()
     angle = Rotation.from_matrix(turned[-1].T @ rotations[-1]).magnitude()
     return {
-        "position_error_m": float(np.linalg.norm(here[-1] - positions[-1])),
+        "position_error_m": float(np.linalg.norm(predicted[-1] - positions[-1])),
         "rotation_error_deg": float(np.degrees(angle)),
         "yaw_error_deg": float(np.degrees(yaw_of(turned) - yaw_of(rotations))),
         "distance_m": float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()),
         "mujoco": positions,
-        "here": here,
+        "rollout": predicted,
     }
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    parser.add_argument("--json", type=Path, help="write the results to this file")
     parser.add_argument("--figure", type=Path, help="draw the trajectories into this PNG")
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
     options = parser.parse_args()
@@ -132,7 +131,7 @@ def main() -> None:
     robot = fitted_robot(options.seeds[0])
     factor = robot.effects[0][1]["track_width_factor"]
     print(f"set once: friction {FRICTION}, effective track width × {factor:.2f}\n")
-    print("| ground | drive | Δx at 5 s [m] | ΔR at 5 s [deg] | of which yaw [deg] |\n|---|---|---|---|---|")
+    print("| ground | commands | Δx at 5 s [m] | ΔR at 5 s [deg] | Δyaw at 5 s [deg] |\n|---|---|---|---|---|")
     rows, figure = [], Figure(figsize=(9, 5), layout="constrained", dpi=110)
     axes = figure.subplots()
     for roughness, ground in ((0.0, "level"), (0.4, "gentle")):
@@ -141,8 +140,8 @@ def main() -> None:
                 row = compare(robot, roughness, seed, twist)
                 label = {"label": ("MuJoCo", "rollout")} if not rows else {"label": (None, None)}
                 axes.plot(*row.pop("mujoco")[:, :2].T, color="#1a1a1a", linewidth=2.5, label=label["label"][0])
-                axes.plot(*row.pop("here")[:, :2].T, color="#0b84a5", linewidth=1.4, label=label["label"][1])
-                rows.append({"ground": ground, "seed": seed, "drive": name, **row})
+                axes.plot(*row.pop("rollout")[:, :2].T, color="#0b84a5", linewidth=1.4, label=label["label"][1])
+                rows.append({"ground": ground, "seed": seed, "commands": name, **row})
                 print(
                     f"| {ground} {seed if roughness else ''} | {name} | {row['position_error_m']:.3f} | "
                     f"{row['rotation_error_deg']:.1f} | {row['yaw_error_deg']:+.1f} |",
@@ -155,7 +154,7 @@ def main() -> None:
         content = {"friction": FRICTION, "track_width_factor": factor, "rows": rows}
         write_text(options.json, json.dumps(content, indent=2))
     if options.figure:
-        axes.set(xlabel="x [m]", ylabel="y [m]", title="the same drives in two engines, 5 s", aspect="equal")
+        axes.set(xlabel="x [m]", ylabel="y [m]", title="the same commands in two engines, 5 s", aspect="equal")
         axes.legend(frameon=False)
         axes.grid(alpha=0.25)
         options.figure.write_bytes(figure_png(figure))

@@ -1,11 +1,11 @@
-"""From sensor to published path, between real processes: latency, rate, CPU and memory of the installed predictor.
+"""Latency from sensor to published path, rate, CPU and memory of the installed predictor, between processes.
 
     scripts/run.sh python benchmarks/node.py [--seconds 20] [--only NAME ...] [--json FILE] [--docs FILE]
 
-A process like a robot's drivers publishes raw images or clouds at 10 Hz, odometry at 50 Hz and commands at 20 Hz, all
-stamped with the time at which they are published; latency is the time from a stamp until the path that carries it
-arrives back. `overload` sends images at ten times the rate: latency must not grow, and what is dropped is counted.
-`--endurance MINUTES` plays the demo bag in a loop at twice its speed instead and says how memory and threads develop.
+A process publishes raw images or clouds at 10 Hz, odometry at 50 Hz and commands at 20 Hz like a robot's drivers,
+stamped with the time of publication. Latency is the time from a stamp to the arrival of the path with that stamp.
+`overload` sends images at ten times the rate: latency must not grow, and dropped inputs are counted. `--endurance
+MINUTES` instead plays the demo bag in a loop at twice its speed and reports memory and threads over time.
 """
 
 from __future__ import annotations
@@ -14,8 +14,6 @@ import argparse
 import json
 import os
 import platform
-import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -26,7 +24,7 @@ import cv2
 import numpy as np
 import yaml
 from rclpy.qos import QoSProfile
-from ros_peer import Peer
+from ros_peer import Executable, Peer
 
 from monoforce_ros.bags import Recording, builders, type_store
 from monoforce_ros.core import write_text
@@ -43,7 +41,7 @@ _SIDES = ("front", "left", "right", "rear")
 
 @dataclass(frozen=True)
 class Case:
-    """What is sent and how the predictor is set."""
+    """Inputs and parameters of the predictor."""
 
     name: str
     title: str
@@ -66,7 +64,7 @@ CASES = (
 
 
 def four_camera_robot(folder: Path) -> Path:
-    """The Husky with a camera on each side."""
+    """Robot file of a Husky with a camera on each side."""
     content = yaml.safe_load(robot_file("husky").read_text(encoding="utf-8"))
     for index, side in enumerate(_SIDES):
         turn = (0.0, np.pi / 2, -np.pi / 2, np.pi)[index]
@@ -80,18 +78,18 @@ def four_camera_robot(folder: Path) -> Path:
 
 
 class Source(Peer):
-    """Publishes what a robot's drivers would and hears the path; one thread, one process."""
+    """Publishes sensor data like a robot's drivers and receives the path, in one thread."""
 
     def __init__(self, case: Case, robot_frames: list[str]):
-        # Large messages want the segment of the process that publishes them to be large.
+        # Large messages need a large shared-memory segment in the publishing process.
         super().__init__("drivers", ENVIRONMENT | {"FASTRTPS_DEFAULT_PROFILES_FILE": str(PROFILE)})
         self.case, self.frames = case, robot_frames
         newest = QoSProfile(depth=10)
         self.latencies: list[float] = []
         self.arrivals: list[float] = []
-        self.compared: list[float] = []
+        self.candidate_latencies: list[float] = []
         self.dropped = 0
-        self.said: dict[str, str] = {}
+        self.diagnostics: dict[str, str] = {}
         self.node.create_subscription(
             message_class("nav_msgs/msg/Path"), "predicted/path", self._on_path, newest, raw=True
         )
@@ -108,7 +106,7 @@ class Source(Peer):
         camera = recording.cameras[topic]
         scale = 640 / camera.width
         matrix = camera.matrix * np.array([[scale], [scale], [1.0]])
-        # An encoded image differs from the next in its stamp alone.
+        # Consecutive encoded images differ only in their stamps.
         self.images = [self._encode(builders.image(1, frame, image)) for frame in robot_frames]
         self.infos = [
             builders.camera_info(1, frame, 640, 480, matrix, camera.distortion, camera.distortion_model)
@@ -135,7 +133,7 @@ class Source(Peer):
         self.arrivals.append(time.monotonic())
 
     def _on_costs(self, data: bytes) -> None:
-        self.compared.append(self._age(data))
+        self.candidate_latencies.append(self._age(data))
 
     @staticmethod
     def _age(data: bytes) -> float:
@@ -145,13 +143,13 @@ class Source(Peer):
 
     def _on_diagnostics(self, message) -> None:
         for status in message.status:
-            self.said[status.name] = status.message
+            self.diagnostics[status.name] = status.message
             for entry in status.values:
                 if entry.key == "dropped inputs":
                     self.dropped = int(entry.value)
 
     def run(self, seconds: float) -> int:
-        """Publish for a while; returns how many images or clouds were sent."""
+        """Publish for ``seconds``; returns the number of images or clouds sent."""
         begin, sent, small = time.monotonic(), 0, 0
         while (now := time.monotonic() - begin) < seconds:
             if now * 50 >= small:
@@ -177,28 +175,20 @@ class Source(Peer):
         return sent
 
 
-class Predictor:
-    """The installed executable."""
+class Predictor(Executable):
+    """The installed predictor with the parameters of a case."""
 
     def __init__(self, case: Case, folder: Path, frames: list[str]):
-        executable = ROOT / "install" / "monoforce_ros" / "lib" / "monoforce_ros" / "predictor"
         source = "camera" if case.cameras else "lidar"
         parameters = [f"terrain_source:={source}", f"robot:={four_camera_robot(folder)}", *case.parameters]
         if frames:
             parameters.append(f"image_topics:=[{','.join(f'{frame}/image_raw' for frame in frames)}]")
-        command = [str(executable), "--ros-args", *(word for p in parameters for word in ("-p", p))]
-        log = folder / f"{case.name}.log"
-        with log.open("w") as output:
-            environment = os.environ | ENVIRONMENT
-            self.process = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, env=environment)
-        deadline = time.monotonic() + 90
-        while "predicting" not in log.read_text():
-            if self.process.poll() is not None or time.monotonic() > deadline:
-                sys.exit(f"the predictor did not start:\n{log.read_text()}")
-            time.sleep(0.1)
+        arguments = ["--ros-args", *(word for p in parameters for word in ("-p", p))]
+        super().__init__("predictor", arguments, folder / f"{case.name}.log", ENVIRONMENT)
+        self.wait_for("predicting")
 
     def cpu_seconds(self) -> float:
-        """Used so far."""
+        """CPU time used so far [s]."""
         fields = Path(f"/proc/{self.process.pid}/stat").read_text().rpartition(")")[2].split()
         return (int(fields[11]) + int(fields[12])) / _TICK
 
@@ -206,11 +196,6 @@ class Predictor:
         """Resident memory [MB] and number of threads."""
         values = dict(line.split(":", 1) for line in Path(f"/proc/{self.process.pid}/status").read_text().splitlines())
         return int(values["VmRSS"].split()[0]) / 1024, int(values["Threads"])
-
-    def stop(self) -> int:
-        """End it; its exit status."""
-        self.process.send_signal(signal.SIGINT)
-        return self.process.wait(timeout=30)
 
 
 def measure(case: Case, seconds: float, folder: Path) -> dict:
@@ -220,24 +205,26 @@ def measure(case: Case, seconds: float, folder: Path) -> dict:
     source = Source(case, frames)
     source.run(4.0)
     if not source.latencies:
-        sys.exit(f"{case.name}: no path came: {source.said}")
+        sys.exit(f"{case.name}: no path received; diagnostics: {source.diagnostics}")
     source.latencies.clear()
     source.arrivals.clear()
-    source.compared.clear()
+    source.candidate_latencies.clear()
     dropped, cpu, began = source.dropped, predictor.cpu_seconds(), time.monotonic()
     sent = source.run(seconds)
-    lasted = time.monotonic() - began
-    used = (predictor.cpu_seconds() - cpu) / lasted
+    duration = time.monotonic() - began
+    used = (predictor.cpu_seconds() - cpu) / duration
     memory, threads = predictor.state()
     source.spin_once(1.2)
     values = np.array(source.latencies)
     gaps = np.diff(source.arrivals)
     row = {
-        "case": case.name, "title": case.title, "sent_hz": sent / lasted, "paths": len(values),
-        "rate_hz": len(values) / lasted, "longest_gap_s": float(gaps.max()) if len(gaps) else None,
+        "case": case.name, "title": case.title, "sent_hz": sent / duration, "paths": len(values),
+        "rate_hz": len(values) / duration, "longest_gap_s": float(gaps.max()) if len(gaps) else None,
         **{f"p{q}_ms": float(np.percentile(values, q)) for q in (50, 95, 99)},
-        "candidates_hz": len(source.compared) / lasted,
-        "candidates_p95_ms": float(np.percentile(source.compared, 95)) if source.compared else None,
+        "candidates_hz": len(source.candidate_latencies) / duration,
+        "candidates_p95_ms": (
+            float(np.percentile(source.candidate_latencies, 95)) if source.candidate_latencies else None
+        ),
         "cpu_cores": used, "memory_mb": memory, "threads": threads, "dropped": source.dropped - dropped,
     }  # fmt: skip
     source.close()
@@ -258,24 +245,21 @@ class Listener(Peer):
         self.count += 1
 
     def run(self, seconds: float) -> int:
-        """Listen for a while; returns how many paths came."""
+        """Receive for ``seconds``; returns the number of paths."""
         before = self.count
         self.spin(seconds)
         return self.count - before
 
 
 def endure(case: Case, minutes: float, folder: Path) -> dict:
-    """Play the demo bag in a loop at twice its speed; memory and threads at each tenth of the time."""
+    """Play the demo bag in a loop at twice its speed; samples memory and threads ten times."""
     predictor = Predictor(case, folder, [])
-    player = ROOT / "install" / "monoforce_ros" / "lib" / "monoforce_ros" / "bag_player"
-    bag = subprocess.Popen(
-        [str(player), str(ROOT / "bags" / "demo"), "--loop", "--rate", "2"],
-        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=os.environ | ENVIRONMENT,
-    )  # fmt: skip
+    arguments = [str(ROOT / "bags" / "demo"), "--loop", "--rate", "2"]
+    player = Executable("bag_player", arguments, folder / "bag_player.log", ENVIRONMENT)
     listener = Listener()
     samples = []
     try:
-        # Libraries, kernels and caches of the first seconds are no leak.
+        # Memory of libraries, kernels and caches in the first seconds is not a leak.
         listener.run(12.0)
         for part in range(10):
             paths = listener.run(6.0 * minutes)
@@ -286,8 +270,7 @@ def endure(case: Case, minutes: float, folder: Path) -> dict:
             print(f"  {samples[-1]['minute']:.1f} min: {memory:.0f} MB, {threads} threads, {paths} paths", flush=True)
     finally:
         listener.close()
-        bag.send_signal(signal.SIGINT)
-        player_status = bag.wait(timeout=30)
+        player_status = player.stop()
         status = predictor.stop()
     return {"case": case.name, "minutes": minutes, "samples": samples, "exit_status": [status, player_status]}
 
@@ -298,12 +281,12 @@ def endurance_table(found: dict) -> str:
     lines += [
         f"| {s['minute']:.1f} | {s['memory_mb']:.0f} MB | {s['threads']} | {s['paths']} |" for s in found["samples"]
     ]
-    lines += ["", f"Predictor and player ended with {' and '.join(map(str, found['exit_status']))}."]
+    lines += ["", f"Exit statuses of predictor and player: {' and '.join(map(str, found['exit_status']))}."]
     return "\n".join(lines)
 
 
 def _candidates(row: dict) -> str:
-    """Rate and latency of the candidates' costs."""
+    """Rate and latency of the candidate costs."""
     return f"{row['candidates_hz']:.1f} Hz, {row['candidates_p95_ms']:.0f} ms" if row["candidates_p95_ms"] else "–"
 
 
@@ -325,17 +308,19 @@ def table(rows: list[dict]) -> str:
 def main() -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=20.0, help="of each case (%(default)s)")
+    parser.add_argument("--seconds", type=float, default=20.0, help="duration of each case (%(default)s)")
     parser.add_argument("--only", nargs="+", choices=[case.name for case in CASES], metavar="NAME")
     parser.add_argument(
         "--endurance",
         type=float,
         metavar="MINUTES",
-        help="the bag in a loop at 2x for so long instead, with 8 candidates and an ensemble "
-        "of 8; from the sensor of the first case of --only, by default one camera",
+        help="instead play the bag in a loop at double speed for this long, with 8 candidates and an ensemble of 8; "
+        "sensors are those of the first case of --only, by default one camera",
     )
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--docs", type=Path, help="write the table between this document's `<!-- latency -->` marks")
+    parser.add_argument(
+        "--docs", type=Path, help="write the table between the `<!-- latency -->` marks of this document"
+    )
     options = parser.parse_args()
     cases = [case for case in CASES if not options.only or case.name in options.only]
     with tempfile.TemporaryDirectory() as folder:

@@ -1,9 +1,9 @@
-"""Can the encoder say what real cameras and lidar saw? It is fitted to the ROUGH scenes, each from its images alone.
+"""Overfit the encoder to the ROUGH scenes: lidar heights from real images.
 
     scripts/run.sh python benchmarks/overfit_scenes.py SCENES [--steps 150] [--json FILE] [--figure FILE.png]
 
-This shows that images, calibration, lift, splat and heads fit together on real, distorted, turned and portrait cameras.
-It says nothing about scenes that the encoder was not fitted to.
+This checks that images, calibration, lift, splat and heads are consistent on real cameras, including distorted, rotated
+and portrait ones. It does not measure generalisation to other scenes.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from tqdm import tqdm
 
 from monoforce_ros.core import MotionState, transform_points, write_text
 from monoforce_ros.datasets import DatasetError, RoughScene
-from monoforce_ros.datasets.rough import LIDAR_FRAME
 from monoforce_ros.encoder import CameraView, EncoderConfig, EncoderInput, TerrainEncoder, encoder_input
 from monoforce_ros.perception import LidarTerrain, Observation, support_points
 from monoforce_ros.reporting import figure_png
@@ -32,18 +31,18 @@ from monoforce_ros.training.losses import HIGHEST, LOWEST
 
 @dataclass(frozen=True)
 class Scene:
-    """A scene's input and its lidar's height map."""
+    """Encoder input and lidar height map of a scene."""
 
     name: str
     batch: EncoderInput
     heights: Tensor
-    """``[rows, columns]`` [m]; limited as in training."""
+    """``[rows, columns]`` [m]; clamped as in training."""
     observed: Tensor
     views: tuple[CameraView, ...]
 
 
 def read_scene(folder: Path, config: EncoderConfig) -> Scene:
-    """A scene with images; raises ``DatasetError`` where there are none."""
+    """Read a scene; raises ``DatasetError`` if it has no images."""
     scene = RoughScene.open(folder)
     stamp = int(scene.cloud_stamps[0])
     images = scene.images(stamp)
@@ -53,7 +52,7 @@ def read_scene(folder: Path, config: EncoderConfig) -> Scene:
     nearest = int(np.clip(stamp, scene.pose_stamps[0], scene.pose_stamps[-1]))
     pose = scene.pose(nearest)
     motion = MotionState(stamp, pose[:3, 3], pose[:3, :3], np.zeros(3), np.zeros(3))
-    cloud = transform_points(scene.base_from_sensors[LIDAR_FRAME], scene.cloud(stamp))
+    cloud = transform_points(scene.base_from_lidar, scene.cloud(stamp))
     cloud = cloud[np.isfinite(cloud).all(axis=1)]
     terrain = LidarTerrain(robot, config.grid, TerrainDefaults()).terrain(Observation(stamp, cloud=cloud), motion)
     views = tuple(
@@ -69,7 +68,7 @@ def read_scene(folder: Path, config: EncoderConfig) -> Scene:
 def overfit(
     scenes: list[Scene], config: EncoderConfig, steps: int, rate: float = 3e-3, quiet: bool = False
 ) -> tuple[TerrainEncoder, list[float]]:
-    """Fit one encoder to all scenes; returns it with the last step's median error of each scene [m]."""
+    """Fit one encoder to all scenes; returns it and the median error of each scene in the last step [m]."""
     torch.manual_seed(0)
     encoder = TerrainEncoder(config)
     encoder.backbone.load_imagenet()
@@ -93,7 +92,7 @@ def overfit(
 
 
 def figure(scenes: list[Scene], encoder: TerrainEncoder) -> Figure:
-    """Lidar's map, the encoder's, and their difference."""
+    """Image, lidar map, encoder map and their difference, per scene."""
     picture = Figure(figsize=(13.0, 3.4 * len(scenes)), layout="constrained", dpi=90)
     axes = picture.subplots(len(scenes), 4, squeeze=False)
     for row, scene in zip(axes, scenes, strict=True):
@@ -111,21 +110,21 @@ def figure(scenes: list[Scene], encoder: TerrainEncoder) -> Figure:
             (row[2], predicted, "from images [m]", (low, high)),
             (row[3], predicted - measured, "difference [m]", (-0.3, 0.3)),
         ):
-            shown = ax.imshow(
+            image = ax.imshow(
                 values, origin="lower", extent=encoder.config.grid.extent, vmin=span[0], vmax=span[1],
                 cmap="terrain" if title != "difference [m]" else "RdBu",
             )  # fmt: skip
             ax.set_title(title, fontsize=10)
-            picture.colorbar(shown, ax=ax, shrink=0.8)
+            picture.colorbar(image, ax=ax, shrink=0.8)
     return picture
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", type=Path, help="folder of ROUGH scenes")
-    parser.add_argument("--steps", type=int, default=150, help="(%(default)s)")
-    parser.add_argument("--threads", type=int, default=2, help="of PyTorch (%(default)s)")
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    parser.add_argument("--steps", type=int, default=150, help="training steps (%(default)s)")
+    parser.add_argument("--threads", type=int, default=2, help="PyTorch threads (%(default)s)")
+    parser.add_argument("--json", type=Path, help="write the results to this file")
     parser.add_argument("--figure", type=Path, help="draw maps into this PNG")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
@@ -135,7 +134,7 @@ def main() -> None:
         try:
             scenes.append(read_scene(folder, config))
         except DatasetError as error:
-            print(f"left out: {error}")
+            print(f"skipped: {error}")
     encoder, _ = overfit(scenes, config, options.steps)
     encoder.eval()
     found = {}

@@ -101,9 +101,9 @@ def ros_environment() -> dict[str, str]:
 @pytest.fixture(scope="module")
 def peer(ros_environment):
     """A ROS node of the test's own, in the same domain as the executables that it starts."""
-    from ros_peer import Peer
+    from predictor_peer import PredictorPeer
 
-    peer = Peer(ros_environment)
+    peer = PredictorPeer(ros_environment)
     yield peer
     peer.close()
 

@@ -1,4 +1,4 @@
-"""Bags: written whole or not at all; read in either ROS, and refused in one sentence when broken."""
+"""Bags: written atomically, read for either ROS, salvaged when damaged, else rejected with a clear error."""
 
 import numpy as np
 import pytest
@@ -54,7 +54,7 @@ def test_a_recording_that_fails_leaves_nothing_behind(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_existing_bag_is_kept_unless_told_otherwise(tmp_path):
+def test_an_existing_bag_is_kept_unless_overwriting_is_allowed(tmp_path):
     write(tmp_path / "drive", count=3)
     with pytest.raises(FileExistsError, match="exists already"):
         BagWriter(tmp_path / "drive")
@@ -73,7 +73,7 @@ def storage_file(path):
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_a_bag_of_which_nothing_is_left_is_refused_in_one_sentence(tmp_path, storage):
+def test_an_empty_bag_is_rejected_with_one_error(tmp_path, storage):
     path = write(tmp_path / "drive", storage)
     storage_file(path).write_bytes(b"")
     with pytest.raises(BagError, match="drive.*(cannot be read|is gone|damaged)"):
@@ -81,7 +81,7 @@ def test_a_bag_of_which_nothing_is_left_is_refused_in_one_sentence(tmp_path, sto
 
 
 @pytest.mark.parametrize("part", [0.35, 0.6, 0.9])
-def test_a_bag_that_was_cut_off_is_read_as_far_as_it_goes(tmp_path, part):
+def test_a_truncated_bag_is_read_up_to_the_damage(tmp_path, part):
     path = tmp_path / "drive"
     with BagWriter(path) as bag:
         random = np.random.default_rng(1)
@@ -92,7 +92,7 @@ def test_a_bag_that_was_cut_off_is_read_as_far_as_it_goes(tmp_path, part):
                 builders.odometry(at, "odom", "base_link", [0.05 * i, 0, 0], [0, 0, 0, 1], [1, 0, 0], [0] * 3),
                 at,
             )
-            # Noise, which does not compress: the file has many chunks.
+            # Noise does not compress, so the file has many chunks.
             pixels = random.integers(0, 255, (120, 160, 3), np.uint8)
             bag.write("/cam/image_raw", builders.image(at, "cam", pixels), at)
     file = storage_file(path)
@@ -100,19 +100,19 @@ def test_a_bag_that_was_cut_off_is_read_as_far_as_it_goes(tmp_path, part):
     file.write_bytes(data[: int(len(data) * part)])
     recording = Recording.open(path)
     assert part * 400 - 40 < len(recording.motion) <= part * 400
-    assert "cut off or damaged" in recording.complaints[0]
-    assert "breaks off" in recording.complaints[1]
+    assert "cut off or damaged" in recording.warnings[0]
+    assert "breaks off" in recording.warnings[1]
     np.testing.assert_allclose(recording.motion.positions[:, 0], 0.05 * np.arange(len(recording.motion)))
     frame = recording.images["/cam/image_raw"][10]
     assert recording.image(frame).shape == (120, 160, 3)
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_a_bag_without_metadata_is_read_and_said(tmp_path, storage):
+def test_a_bag_without_metadata_is_read_with_a_warning(tmp_path, storage):
     path = write(tmp_path / "drive", storage)
     (path / "metadata.yaml").unlink()
     recording = Recording.open(path)
-    assert "no usable index (there is no metadata.yaml)" in recording.complaints[0]
+    assert "no usable index (there is no metadata.yaml)" in recording.warnings[0]
     for opened in (recording, Recording.open(storage_file(path))):
         assert len(opened.motion) == 20
         assert opened.cloud(opened.clouds[7])[0][0, 0] == 8.0
@@ -126,19 +126,19 @@ def test_a_real_ros_1_bag_without_its_index_is_read(tmp_path, real_data):
     whole, part = Recording.open(source), Recording.open(cut)
     assert 0.3 * len(whole.motion) < len(part.motion) < 0.7 * len(whole.motion)
     np.testing.assert_array_equal(part.motion.positions, whole.motion.positions[: len(part.motion)])
-    assert "cut off" in part.complaints[0]
+    assert "cut off" in part.warnings[0]
 
 
 @given(st.binary(max_size=400), st.sampled_from([b"\x89MCAP0\r\n", b"#ROSBAG V2.0\n", b"SQLite format 3\x00", b""]))
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_any_bytes_are_a_bag_or_one_clear_error(tmp_path, data, magic):
+def test_random_bytes_give_a_clear_error(tmp_path, data, magic):
     file = tmp_path / ("junk.db3" if magic.startswith(b"SQL") else "junk.mcap")
     file.write_bytes(magic + data)
     with pytest.raises(BagError, match="cannot be read"):
         Recording.open(file)
 
 
-def test_a_size_that_the_file_cannot_hold_is_not_believed(tmp_path):
+def test_a_record_larger_than_the_file_is_rejected(tmp_path):
     file = tmp_path / "huge.mcap"
     file.write_bytes(b"\x89MCAP0\r\n" + b"\x06" + (2**62).to_bytes(8, "little") + b"short")
     with pytest.raises(BagError, match="does not fit"):
@@ -157,7 +157,7 @@ def test_missing_bags_are_named(tmp_path):
         Recording.open(tmp_path / "empty")
 
 
-def test_topics_of_unknown_types_are_no_obstacle(tmp_path):
+def test_topics_of_unknown_types_are_ignored(tmp_path):
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -179,7 +179,7 @@ def test_topics_of_unknown_types_are_no_obstacle(tmp_path):
 
 
 def test_large_bags_are_read_in_little_memory(tmp_path):
-    """Half a gigabyte of images, of which a reader never holds more than a chunk."""
+    """Half a gigabyte of images, of which the reader holds one chunk at a time."""
     import subprocess
     import sys
 
@@ -204,7 +204,7 @@ def test_large_bags_are_read_in_little_memory(tmp_path):
     assert grown_kilobytes < 90_000
 
 
-def test_a_bag_without_odometry_says_what_it_has(tmp_path):
+def test_a_bag_without_odometry_lists_its_types(tmp_path):
     with BagWriter(tmp_path / "drive") as bag:
         bag.write("/cmd_vel", builders.twist(1, 0), START)
     with pytest.raises(BagError, match=r"no nav_msgs/msg/Odometry topic; it holds \['geometry_msgs/msg/Twist'\]"):
@@ -213,7 +213,7 @@ def test_a_bag_without_odometry_says_what_it_has(tmp_path):
         Recording.open(tmp_path / "drive", odometry="/cmd_vel")
 
 
-def test_single_bad_messages_are_left_out_and_said(tmp_path):
+def test_single_invalid_messages_are_skipped_with_a_warning(tmp_path):
     with BagWriter(tmp_path / "drive") as bag:
         for i in range(10):
             at = START + i * 10**8
@@ -222,7 +222,7 @@ def test_single_bad_messages_are_left_out_and_said(tmp_path):
                 "/odom", builders.odometry(at, "odom", "base_link", [i, 0, 0], [0, 0, 0, 1], [speed, 0, 0], [0] * 3), at
             )
     recording = Recording.open(tmp_path / "drive")
-    assert len(recording.motion) == 9 and "not finite" in recording.complaints[0]
+    assert len(recording.motion) == 9 and "not finite" in recording.warnings[0]
 
 
 def test_messages_out_of_order_are_sorted_by_their_stamps(tmp_path):
@@ -243,7 +243,7 @@ def test_messages_out_of_order_are_sorted_by_their_stamps(tmp_path):
         ("image", "camera_info"),
     ],
 )
-def test_camera_info_lies_beside_its_image(image, info):
+def test_camera_info_topics_follow_image_transport(image, info):
     assert camera_info_topic(image) == info
 
 

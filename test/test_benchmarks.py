@@ -21,10 +21,10 @@ def husky(check):
 
 
 @pytest.mark.parametrize(
-    ("roughness", "drive"), [(0.0, "straight, fast"), (0.4, "arc to the right"), (0.4, "wide arc")]
+    ("roughness", "commands"), [(0.0, "straight, fast"), (0.4, "arc to the right"), (0.4, "wide arc")]
 )
-def test_the_rollout_follows_an_independent_engine(check, husky, roughness, drive):
-    row = check.compare(husky, roughness, 2, check.COMMANDS[drive])
+def test_the_rollout_follows_an_independent_engine(check, husky, roughness, commands):
+    row = check.compare(husky, roughness, 2, check.COMMANDS[commands])
     assert row["distance_m"] > 2.0
     assert row["position_error_m"] < 0.25
     assert row["rotation_error_deg"] < 8.0

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from predictor_peer import ground_cloud, stamp_in
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
-from ros_peer import ground_cloud, stamp_in
 
 from monoforce_ros.bags import builders
 from monoforce_ros.messages.message_types import message_class

@@ -1,4 +1,4 @@
-"""Other people's folders: read with their traps, converted to bags that the rest of the package takes as they are."""
+"""Public datasets: read with their peculiarities, and converted to bags for the rest of the package."""
 
 import gzip
 
@@ -21,7 +21,7 @@ LIDAR_ON_ROBOT = np.array([0.2, 0.0, 1.0])
 
 
 def windows_file(path, *, delay=0.6, sign=-1.0, runs=30, seed=3):
-    """Windows as DRIVE publishes them: each run holds a command for 6 s, and poses come late and are zeroed."""
+    """Windows as in DRIVE: each run holds a command for 6 s; poses are delayed and start at the origin."""
     random = np.random.default_rng(seed)
     step, fields = 0.05, {}
     time = np.arange(int(runs * 6 / step)) * step
@@ -34,21 +34,21 @@ def windows_file(path, *, delay=0.6, sign=-1.0, runs=30, seed=3):
     heading = np.cumsum(rate) * step
     place = np.cumsum(np.stack([speed * np.cos(heading), speed * np.sin(heading)], axis=1), axis=0) * step
     late = round(delay / step)
-    heading_seen, place_seen = np.roll(heading, late), np.roll(place, late, axis=0)
-    heading_seen[:late], place_seen[:late] = heading[0], place[0]
+    delayed_heading, delayed_place = np.roll(heading, late), np.roll(place, late, axis=0)
+    delayed_heading[:late], delayed_place[:late] = heading[0], place[0]
 
     def cut(values):
         return values.reshape(-1, 40).astype(np.float32)
 
     start = np.arange(0, len(time), 40)
-    turned = Rotation.from_euler("z", -heading_seen[start][:, None]).as_matrix()[:, :2, :2]
-    relative = place_seen.reshape(-1, 40, 2) - place_seen[start][:, None]
+    turned = Rotation.from_euler("z", -delayed_heading[start][:, None]).as_matrix()[:, :2, :2]
+    relative = delayed_place.reshape(-1, 40, 2) - delayed_place[start][:, None]
     local = np.einsum("wij,wkj->wki", turned, relative)
     fields.update(
         dt=np.float32(step), cmd_left=cut(commands[:, 0]), cmd_right=cut(commands[:, 1]),
         left_wheel_vel=cut(wheels[:, 0]), right_wheel_vel=cut(wheels[:, 1]),
         icp_x=local[..., 0].astype(np.float32), icp_y=local[..., 1].astype(np.float32),
-        icp_yaw=(heading_seen.reshape(-1, 40) - heading_seen[start][:, None]).astype(np.float32),
+        icp_yaw=(delayed_heading.reshape(-1, 40) - delayed_heading[start][:, None]).astype(np.float32),
         imu_yaw_rate=cut(sign * rate),
         steady_state_mask=np.tile([0, 1, 1], runs).astype(np.float32),
         transitory_state_mask=np.tile([1, 0, 0], runs).astype(np.float32),
@@ -56,10 +56,10 @@ def windows_file(path, *, delay=0.6, sign=-1.0, runs=30, seed=3):
     for name in ("icp_z", "icp_roll", "icp_pitch"):
         fields[name] = np.zeros((3 * runs, 40), np.float32)
     np.savez(path, **fields)
-    return place_seen, heading_seen
+    return delayed_place, delayed_heading
 
 
-def test_windows_are_joined_and_their_traps_found_in_the_data(tmp_path):
+def test_windows_are_joined_and_their_clocks_estimated(tmp_path):
     place, heading = windows_file(tmp_path / "nameless.npz", delay=0.6, sign=-1.0)
     recording = DriveRecording.open(tmp_path / "nameless.npz")
     assert [len(run.stamps) for run in recording.runs] == [120] * 30
@@ -100,7 +100,7 @@ def test_a_converted_file_of_windows_has_windows_within_its_runs_only(tmp_path):
         ("test_warthog.npz", 1, (0.15, 0.35)),
     ],
 )
-def test_real_recordings_show_their_clocks(real_data, name, sign, delay):
+def test_clocks_of_real_recordings_are_estimated(real_data, name, sign, delay):
     recording = DriveRecording.open(real_data / "drive" / name)
     clocks = recording.clocks()
     assert clocks.gyro_sign == sign
@@ -116,20 +116,20 @@ def test_the_real_continuous_log_becomes_a_bag(tmp_path, real_data):
     assert len(bag.commands) > 7000
     span = (bag.motion.stamps[-1] - bag.motion.stamps[0]) * 1e-9
     assert span == pytest.approx(363, abs=3)
-    # Poses that the log only repeats are no measurements.
+    # Poses that the log repeats are not measurements.
     assert len(bag.motion) < 0.6 * len(bag.commands)
     assert np.diff(bag.motion.stamps).max() * 1e-9 < 0.4
 
 
 @given(st.binary(max_size=200), st.sampled_from(["x.npz", "x.csv", "x.csv.gz", "x.txt"]))
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_any_bytes_are_refused_by_name(tmp_path, data, name):
+def test_random_bytes_are_rejected_by_name(tmp_path, data, name):
     (tmp_path / name).write_bytes(data)
     with pytest.raises(DatasetError, match=name.split(".")[1]):
         DriveRecording.open(tmp_path / name)
 
 
-def test_logs_and_windows_of_another_layout_say_what_is_missing(tmp_path):
+def test_missing_fields_of_logs_and_windows_are_named(tmp_path):
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
     with pytest.raises(DatasetError, match="got no cmd_left"):
         DriveRecording.open(tmp_path / "other.npz")
@@ -220,7 +220,7 @@ def test_a_rellis_bag_has_the_robot_below_its_lidar(tmp_path, capsys):
     state = bag.motion.at(int(bag.motion.stamps[0]))
     np.testing.assert_allclose(state.position, 0.0, atol=1e-9)
     assert state.heading == pytest.approx(0.0, abs=1e-9)
-    # The warthog's lidar is 0.2 m ahead of the base frame, which turns about it.
+    # The Warthog's lidar is 0.2 m ahead of the base frame, which turns about it.
     assert state.linear_velocity[0] > 0.8
     points, frame = bag.cloud(bag.clouds[0])
     pose = bag.base_from(frame, "base_link")
@@ -239,14 +239,14 @@ def test_broken_rellis_files_are_named(tmp_path, broken):
         RellisSequence.open(folder)
 
 
-def test_a_cloud_of_odd_size_is_refused(tmp_path):
+def test_a_cloud_of_odd_size_is_rejected(tmp_path):
     folder = rellis_folder(tmp_path)
     (folder / "os1_cloud_node_kitti_bin" / "000003.bin").write_bytes(b"odd")
     with pytest.raises(DatasetError, match=r"000003\.bin: got 3 bytes"):
         RellisSequence.open(folder).cloud(3)
 
 
-def test_convert_says_what_is_wrong_in_one_line(tmp_path, capsys):
+def test_convert_reports_errors_in_one_line(tmp_path, capsys):
     assert cli.main(["rough", str(tmp_path), str(tmp_path / "bag")]) == 1
     assert cli.main(["drive", str(tmp_path / "none.npz"), str(tmp_path / "bag")]) == 1
     lines = capsys.readouterr().err.splitlines()

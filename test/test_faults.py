@@ -1,4 +1,4 @@
-"""Faults that strike a process from outside: killed, the disk full, files cut in half."""
+"""External failures: killed processes, a full disk, truncated files."""
 
 import os
 import signal
@@ -16,8 +16,8 @@ from monoforce_ros.encoder.checkpoint import shipped_checkpoint
 START = 1_700_000_000_000_000_000
 
 
-def speak(peer, recorder, count: int) -> None:
-    """Publish commands until the recorder hears them, and then so many more."""
+def publish_commands(peer, recorder, count: int) -> None:
+    """Publish commands until the recorder receives them, and then ``count`` more."""
     sent = 0
 
     def publish():
@@ -37,11 +37,11 @@ def speak(peer, recorder, count: int) -> None:
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_a_recording_that_is_killed_is_not_lost(start, peer, tmp_path, storage):
     recorder = start("bag_recorder", tmp_path / "out", "--topics", "/cmd_vel", "--storage", storage)
-    speak(peer, recorder, 60)
+    publish_commands(peer, recorder, 60)
     recorder.stop(signal.SIGKILL)
     (left,) = tmp_path.glob(".out.unfinished-*")
     with BagReader(left) as bag:
-        # What came in the last second may still have been on its way to the disk.
+        # Messages of the last second may not have been written yet.
         assert len(list(bag.messages(["/cmd_vel"]))) >= 30
         assert bag.warnings
     again = start("bag_recorder", tmp_path / "out", "--topics", "/cmd_vel")
@@ -49,8 +49,8 @@ def test_a_recording_that_is_killed_is_not_lost(start, peer, tmp_path, storage):
     again.stop()
 
 
-def test_a_recorder_whose_disk_is_full_keeps_what_it_has_and_says_where(executables, ros_environment, peer, tmp_path):
-    # A limit on the size of files stands for the end of the disk: the same error from the same call.
+def test_a_recorder_with_a_full_disk_keeps_its_messages_and_reports_where(executables, ros_environment, peer, tmp_path):
+    # A limit on file sizes emulates a full disk: the same call fails.
     log = tmp_path / "log"
     with log.open("w") as output:
         recorder = subprocess.Popen(
@@ -68,12 +68,12 @@ def test_a_recorder_whose_disk_is_full_keeps_what_it_has_and_says_where(executab
     assert recorder.wait(timeout=10) == 1
     text = log.read_text()
     (left,) = tmp_path.glob(".out.unfinished-*")
-    assert "too large" in text and f"lies in {left} and can be read as it is" in text and "Traceback" not in text
+    assert "too large" in text and f"lie in {left} and can be read as they are" in text and "Traceback" not in text
     with BagReader(left) as bag:
         assert len(list(bag.messages(["/noise"]))) >= 2
 
 
-def test_a_report_that_the_disk_does_not_hold_leaves_the_old_one(executables, demo_bag, tmp_path):
+def test_a_report_that_does_not_fit_on_the_disk_leaves_the_old_one(executables, demo_bag, tmp_path):
     (tmp_path / "report.html").write_text("the old one")
     command = f"ulimit -f 60; exec {executables / 'evaluate'} {demo_bag} --terrain flat --out {tmp_path} --stride 2"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=120)

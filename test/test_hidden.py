@@ -1,4 +1,4 @@
-"""Hidden effects: each changes the world as its name says, and its truth never gets into the bag."""
+"""Injected faults: each changes the simulation as its name says, and the ground truth never gets into the bag."""
 
 import json
 
@@ -33,36 +33,36 @@ def level():
 
 
 def speeds(robot, scenery, command, *hidden, seconds=4.0):
-    """Forward speed, speed to the left and yaw rate over time, of a command that starts as a step."""
+    """Forward speed, speed to the left and yaw rate over time after a step command."""
     faults = tuple(parse_hidden(text) for text in hidden)
     simulation = Simulation(build_model(scenery, robot, 0, {}, faults), scenery, robot, faults)
     simulation.drive(*command)
-    shown = []
+    measured = []
     for _ in range(round(seconds / TIME_STEP)):
         simulation.step()
         state = simulation.state()
-        shown.append([*state.linear_velocity[:2], state.angular_velocity[2]])
-    return np.array(shown)
+        measured.append([*state.linear_velocity[:2], state.angular_velocity[2]])
+    return np.array(measured)
 
 
 def steady(*arguments, **named):
     return speeds(*arguments, **named)[-500:].mean(axis=0)
 
 
-def rise_time(shown):
-    """When forward speed has reached half of its end [s]."""
-    forward = shown[:, 0]
+def rise_time(measured):
+    """Time at which the forward speed reaches half of its final value [s]."""
+    forward = measured[:, 0]
     return float(np.argmax(forward > 0.5 * forward[-200:].mean())) * TIME_STEP
 
 
-def test_every_name_in_the_catalogue_that_is_hidden_is_an_effect_of_that_name():
+def test_every_fault_in_the_catalogue_has_the_name_of_its_effect():
     hidden = {name for name, fault in FAULTS.items() if fault.in_catalogue}
     assert hidden <= set(catalogue.CATALOGUE)
     assert len(hidden) >= 19
     assert not {name for name in FAULTS if name not in hidden} & set(catalogue.CATALOGUE)
 
 
-def test_delay_and_lag_come_later_by_their_time(husky, level):
+def test_delay_and_lag_postpone_the_motion_by_their_time(husky, level):
     plain = rise_time(speeds(husky, level, (0.6, 0.0), seconds=2.5))
     assert rise_time(speeds(husky, level, (0.6, 0.0), "command_delay:0.3", seconds=2.5)) == pytest.approx(
         plain + 0.3, abs=0.02
@@ -79,7 +79,7 @@ def test_delay_and_lag_come_later_by_their_time(husky, level):
         ("drive_gain:0.8", (0.6, 0.0), 0.48),
     ],
 )
-def test_actuators_reach_other_speeds(husky, level, hidden, command, expected):
+def test_actuator_faults_change_the_speed_reached(husky, level, hidden, command, expected):
     assert steady(husky, level, command, hidden)[0] == pytest.approx(expected, abs=0.035)
 
 
@@ -107,11 +107,11 @@ def test_slippery_tyres_accelerate_slowly(husky, level):
 
 
 @pytest.mark.parametrize("hidden", ["viscous_drag:400", "quadratic_drag:600", "rolling_resistance:0.5"])
-def test_what_resists_slows_as_far_as_stiff_servos_let_it(husky, level, hidden):
+def test_drag_slows_the_robot_as_far_as_stiff_servos_let_it(husky, level, hidden):
     assert steady(husky, level, (0.8, 0.0), hidden)[0] < steady(husky, level, (0.8, 0.0))[0] - 0.008
 
 
-def test_a_force_and_a_leaning_world_push_their_way(husky, level):
+def test_a_force_and_a_tilted_gravity_push_in_their_direction(husky, level):
     plain = steady(husky, level, (0.5, 0.0))[0]
     assert steady(husky, level, (0.5, 0.0), "constant_force:-300")[0] < plain - 0.01
     assert steady(husky, level, (0.5, 0.0), "constant_force:300")[0] > plain + 0.01
@@ -132,7 +132,7 @@ def test_soft_contacts_let_the_robot_sink(husky, level):
     assert sunk[1] > sunk[0] + 0.001
 
 
-def test_outsiders_do_what_no_effect_of_the_catalogue_does(husky, level):
+def test_out_of_catalogue_faults_behave_like_no_effect_of_the_catalogue(husky, level):
     fading = speeds(husky, level, (0.8, 0.0), "fading_drive:10", seconds=8.0)[:, 0]
     assert fading[-1] < 0.85 * fading[1000]
     wind = speeds(husky, level, (0.5, 0.0), "gusting_wind:force=700,period=4", seconds=6.0)[1000:, 0]
@@ -171,7 +171,7 @@ def read(bag):
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """The same short drive with each effect of the record hidden, and with nothing."""
+    """The same short recording with each fault of the recorded data, and without a fault."""
     folder = tmp_path_factory.mktemp("hidden")
     bags = {}
     for name in [None, *sorted(RECORDED_ONLY)]:
@@ -207,14 +207,14 @@ def test_sensors_are_off_by_their_mounting(recorded):
     assert rates[0] - rates[1] == pytest.approx(0.05, abs=1e-9)
 
 
-def test_the_truth_lies_beside_the_bag_and_nowhere_in_it(recorded):
+def test_the_ground_truth_lies_next_to_the_bag_and_not_in_it(recorded):
     folder, bags = recorded
     for name in sorted(RECORDED_ONLY):
         truth = json.loads(truth_file(folder / name).read_text())
         assert truth["hidden"][0]["name"] == name
         assert truth["hidden"][0]["in_catalogue"]
         assert {t: len(m) for t, m in bags[name].items()} == {t: len(m) for t, m in bags[None].items()}
-        # Under another name, to be sure that it is not the folder's that is found.
+        # Without the names of files, which contain the name of the folder.
         metadata = (
             (folder / name / "metadata.yaml").read_text().replace(f"{name}.mcap", "").replace(f"{name}_0.mcap", "")
         )
@@ -222,16 +222,16 @@ def test_the_truth_lies_beside_the_bag_and_nowhere_in_it(recorded):
     assert json.loads(truth_file(folder / "nothing").read_text())["hidden"] == []
 
 
-def test_drawing_lots_covers_everything_and_repeats():
+def test_random_faults_cover_all_kinds_and_are_reproducible():
     drawn = [draw_hidden(seed) for seed in range(400)]
     counts = [len(faults) for faults in drawn]
     assert 0.12 < counts.count(0) / 400 < 0.28
     assert 0.12 < counts.count(2) / 400 < 0.28
     assert {type(fault) for faults in drawn for fault in faults} == set(FAULTS.values())
-    outsiders = [faults for faults in drawn if faults and not faults[0].in_catalogue]
-    assert all(len(faults) == 1 for faults in outsiders)
+    out_of_catalogue = [faults for faults in drawn if any(not fault.in_catalogue for fault in faults)]
+    assert out_of_catalogue and all(len(faults) == 1 for faults in out_of_catalogue)
     first, again = draw_hidden(7), draw_hidden(7)
-    assert [vars(fault) for fault in first] == [vars(fault) for fault in again]
+    assert [fault.values for fault in first] == [fault.values for fault in again]
     level = [draw_hidden(seed, ("vegetation_drag",)) for seed in range(200)]
     assert not any(isinstance(fault, FAULTS["vegetation_drag"]) for faults in level for fault in faults)
 
@@ -241,7 +241,7 @@ def test_drawing_lots_covers_everything_and_repeats():
     | st.sampled_from(sorted(FAULTS)).flatmap(lambda n: st.text(max_size=20).map(f"{n}:{{}}".format))
 )
 @settings(max_examples=150, deadline=None)
-def test_any_text_is_a_plant_or_a_clear_error(text):
+def test_any_text_is_a_fault_or_a_clear_error(text):
     try:
         fault = parse_hidden(text)
     except ValueError as error:
@@ -259,8 +259,8 @@ def test_any_text_is_a_plant_or_a_clear_error(text):
         (["--hide", "payload:weight=3"], "expected one of mass, x, y, z"),
         (["--hide", "vegetation_drag", "--flat"], "without vegetation"),
         (["--odometry", "perfect"], "expected truth, slam"),
-        (["--odometry", "slam:1"], "expected 2 numbers"),
-        (["--distortion", "1,2"], "expected 5 numbers"),
+        (["--odometry", "slam:1"], "expected 2 comma-separated numbers"),
+        (["--distortion", "1,2"], "expected 5 comma-separated numbers"),
         (["--distortion=-0.9,0,0,0,0"], "folds the image"),
         (["--cameras", "5"], "expected 1 to 4"),
         (["--count", "0"], "expected 1 to 10000"),
@@ -272,6 +272,19 @@ def test_wrong_options_are_explained(tmp_path, capsys, arguments, message):
     assert not list(tmp_path.iterdir())
 
 
-def test_effects_are_listed_with_their_ranges(tmp_path, capsys):
+def test_parameters_are_declared_once_and_typed():
+    delay = FAULTS["command_delay"]
+    assert (delay.parameters["delay"].low, delay.parameters["delay"].high) == (0.05, 1.0)
+    assert delay().delay == 0.25
+    assert delay(delay=0.5).delay == 0.5
+    with pytest.raises(TypeError, match="got lag, expected delay"):
+        delay(lag=0.5)
+    for fault in FAULTS.values():
+        assert fault.parameters
+        for entry in fault.parameters.values():
+            assert entry.low <= entry.default <= entry.high
+
+
+def test_faults_are_listed_with_their_ranges(tmp_path, capsys):
     assert cli.main([str(tmp_path / "drive"), "--hide", "list"]) == 0
     assert "payload: mass = 20 (1 to 300)" in capsys.readouterr().out

@@ -4,7 +4,7 @@ import signal
 
 import numpy as np
 import pytest
-from ros_peer import OUTPUTS, ground_cloud
+from predictor_peer import OUTPUTS, ground_cloud
 
 from monoforce_ros.bags import builders
 from monoforce_ros.nodes.inputs import ODOMETRY_LAG

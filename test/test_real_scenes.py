@@ -1,4 +1,4 @@
-"""Real images, calibrations, clouds and poses, played through the installed node in processes of their own."""
+"""Real images, calibrations, clouds and poses, played into the installed predictor."""
 
 from dataclasses import replace
 
@@ -7,8 +7,8 @@ import pytest
 
 from monoforce_ros.bags import BagReader, Recording
 from monoforce_ros.core import MotionTrack, transform_points
-from monoforce_ros.datasets.rough import DatasetError, RoughScene, robot_file_for, scene_to_bag
-from monoforce_ros.messages.decoding import stamp_of
+from monoforce_ros.datasets import DatasetError, RoughScene, robot_file_for, scene_to_bag
+from monoforce_ros.messages import stamp_of
 from monoforce_ros.nodes.inputs import AHEAD
 from monoforce_ros.robots import load_robot
 
@@ -18,11 +18,11 @@ OUTPUTS = ("height_map", "terrain", "path", "contact_forces")
 
 @pytest.fixture(scope="module", params=sorted(SCENES))
 def played(request, real_data, start, tmp_path_factory):
-    """A scene as a bag, played into the predictor; what came out, and the bag that went in."""
+    """Play a scene as a bag into the predictor; returns the recording, the robot and the outputs."""
     folder = tmp_path_factory.mktemp(request.param)
     robot, cameras = SCENES[request.param]
     scene = RoughScene.open(real_data / "rough" / request.param)
-    # Raw images in one, compressed ones in the other: both must get through.
+    # Raw images in one scene, compressed ones in the other: both must work.
     remarks = scene_to_bag(scene, folder / "scene", seconds=3.0, compressed=request.param != "husky_robingas")
     assert "are not the robot's" in remarks[0]
     robot_yaml = robot_file_for(scene, robot, folder / "robot.yaml")
@@ -68,7 +68,7 @@ def test_the_height_map_agrees_with_the_cloud_it_was_made_of(played, record_prop
     cells = np.frombuffer(bytes(terrain.data), "<f4").reshape(-1, len(names)).astype(float)
     observed = cells[cells[:, names.index("observed")] > 0.5]
     assert len(observed) > 3000
-    # Compare in the map's own axes: cells are squares there.
+    # Compare in the axes of the map, where cells are squares.
     to_terrain = np.linalg.inv(motion.odometry_from_terrain)
     cell_xy = np.rint(transform_points(to_terrain, observed[:, :3])[:, :2] / 0.1 - 0.5).astype(int)
     local = transform_points(to_terrain, world)
@@ -77,7 +77,9 @@ def test_the_height_map_agrees_with_the_cloud_it_was_made_of(played, record_prop
     low, high = (bound.numpy() - [0.1, 0.1, 0] for bound in robot.bounds)
     body = ((base[:, :2] > low[:2]) & (base[:, :2] < high[:2] + 0.2)).all(axis=1)
     errors = [
-        abs(height[key] - z) for key, z, own in zip(keys, world[:, 2], body, strict=True) if not own and key in height
+        abs(height[key] - z)
+        for key, z, on_robot in zip(keys, world[:, 2], body, strict=True)
+        if not on_robot and key in height
     ]
     median = float(np.median(errors))
     record_property("median height error [m]", median)
@@ -98,9 +100,9 @@ def test_the_path_starts_at_the_robot_and_keeps_to_the_ground(played):
     motion = track.at(stamp)
     path = outputs["path"][0]
     poses = np.array([[p.pose.position.x, p.pose.position.y, p.pose.position.z] for p in path.poses])
-    # Where the cloud overtook its odometry, the motion is carried on from what had come, at most 30 ms before.
-    come = [i for i, s in enumerate(track.stamps) if stamp - AHEAD <= s < stamp]
-    starts = [motion, *(until(track, i + 1).at(stamp) for i in come)]
+    # If the cloud overtook its odometry, the motion is extrapolated from odometry at most 30 ms older.
+    earlier = [i for i, s in enumerate(track.stamps) if stamp - AHEAD <= s < stamp]
+    starts = [motion, *(until(track, i + 1).at(stamp) for i in earlier)]
     away = [np.abs(poses[0] - start.position).max() for start in starts]
     assert min(away) < 1e-6, away
     terrain = outputs["terrain"][0]
@@ -114,7 +116,7 @@ def test_the_path_starts_at_the_robot_and_keeps_to_the_ground(played):
     assert 1.0 < np.linalg.norm(poses[-1] - poses[0]) < 2.6
 
 
-def test_a_cloud_without_a_pose_of_its_time_is_refused(real_data):
+def test_a_cloud_without_a_pose_of_its_time_is_rejected(real_data):
     scene = RoughScene.open(real_data / "rough" / "husky_robingas")
     with pytest.raises(DatasetError, match="nearest pose is 7.00 s away"):
         scene.pose(int(scene.cloud_stamps[0]))

@@ -1,4 +1,4 @@
-"""The synthetic world: reproducible, plausible in its motion, and true to its own labels."""
+"""Synthetic worlds: reproducible, with plausible motion, and consistent with their labels."""
 
 import subprocess
 import sys
@@ -67,7 +67,7 @@ def messages(bag):
 
 
 def drive(robot, scenery, forward, yaw_rate, seconds):
-    """Body-frame velocities and up-vectors while a steady command is driven, after a second of acceleration."""
+    """Body-frame velocities and up-vectors under a constant command, after a second of acceleration."""
     simulation = Simulation(build_model(scenery, robot, 0, {}), scenery, robot)
     velocities, upright = [], []
     for step in range(round(seconds / TIME_STEP)):
@@ -113,7 +113,7 @@ def test_drives_sensibly(messages):
     assert 1.5 < np.linalg.norm(np.diff(positions, axis=0), axis=1).sum() < 6.0
     assert rotations.as_matrix()[:, 2, 2].min() > np.cos(np.radians(30))
     commands = np.array([message.twist.linear.x for _, message in messages["/cmd_vel"]])
-    # Half a second in, the commanded speed is within the announced range.
+    # After half a second, the commanded speed is within the documented range.
     assert commands[10:].min() > 0.25
     assert commands.max() <= 1.0
     assert abs(linear[50:, 0].mean() / commands[20:].mean() - 1.0) < 0.15
@@ -140,10 +140,10 @@ def test_imu_measures_gravity_at_rest_and_the_turning_rate(messages):
 def test_wheel_speeds_follow_the_commands(messages, husky):
     speeds = np.array([message.velocity for _, message in messages["/joint_states"]])
     commands = [(message.twist.linear.x, message.twist.angular.z) for _, message in messages["/cmd_vel"]]
-    wanted = np.array([husky.wheel_speeds(*command) for command in commands])
-    # 40 ms after every second command, when the servos have settled and the next command has not come.
+    commanded = np.array([husky.wheel_speeds(*command) for command in commands])
+    # 40 ms after every second command, when the servos have settled and the next command has not arrived.
     late = speeds[2::5]
-    assert np.median(np.abs(late - wanted[::2][: len(late)])) < 0.3
+    assert np.median(np.abs(late - commanded[::2][: len(late)])) < 0.3
 
 
 @pytest.mark.parametrize(("forward", "yaw_rate"), [(0.0, 0.8), (0.5, 0.8)])
@@ -192,7 +192,7 @@ def test_lidar_points_lie_on_the_labelled_ground(bag, messages, husky):
         grass_heights.append(points[grass, 2] - support[row, column][grass])
         # A few rays end at a rock or a trunk that shares a cell with grass.
         assert (points[grass, 2] < visible[row, column][grass] + 0.3).mean() > 0.97
-    # The lidar sees the blades, well above what bears the wheels.
+    # The lidar measures the blades, well above the surface that carries the wheels.
     assert np.median(np.concatenate(grass_heights)) > 0.1
 
 
@@ -293,7 +293,7 @@ def test_command_files(tmp_path):
         CommandTable(np.array([1.0, 0.0]), np.zeros((2, 2)))
 
 
-def test_a_drive_that_ends_badly_is_cut(tmp_path):
+def test_a_recording_ends_at_the_edge_of_the_world(tmp_path):
     (tmp_path / "turn.csv").write_text("0.0,1.0,0.0\n")
     summary = record(
         tmp_path / "bag",

@@ -1,4 +1,4 @@
-"""What worlds hold and how they are recorded: kerbs, walls, mud, tracks, lenses, SLAM, many bags at once."""
+"""Contents and recording of worlds: kerbs, walls, mud, tracks, lenses, SLAM, many bags in parallel."""
 
 import subprocess
 
@@ -26,20 +26,20 @@ def scenery():
     return build_scenery(TerrainSettings(), 4)
 
 
-def test_a_world_holds_every_kind_of_thing(scenery):
+def test_a_world_has_every_ground_class(scenery):
     labels = world_labels(scenery, np.zeros(3))
     assert {int(value) for value in np.unique(labels["ground_class"])} == {int(entry) for entry in GroundClass}
     assert 0.2 < labels["friction"].min() < 0.75
     assert len(scenery.kerbs) == 2
 
 
-def test_walls_stand_beside_the_way(scenery):
+def test_walls_are_clear_of_the_route(scenery):
     assert len(scenery.walls) >= 3
     for wall in scenery.walls:
         assert not wall.contains(*scenery.route.points.T, margin=0.9).any()
 
 
-def test_kerbs_rise_at_once_and_fall_slowly(scenery):
+def test_kerbs_rise_abruptly_and_descend_gently(scenery):
     kerb = scenery.kerbs[0]
     forward = np.array([np.cos(kerb.heading), np.sin(kerb.heading)])
     before, edge, behind = (kerb.height_at(*(kerb.centre + s * forward)) for s in (-0.01, 0.01, 3.2))
@@ -47,7 +47,7 @@ def test_kerbs_rise_at_once_and_fall_slowly(scenery):
     assert behind == 0.0
 
 
-def test_a_wall_stops_a_robot_and_a_lidar_sees_it(scenery):
+def test_a_wall_stops_a_robot(scenery):
     robot = Vehicle.load("husky")
     wall = scenery.walls[0]
     simulation = Simulation(build_model(scenery, robot, 0, {}), scenery, robot)
@@ -60,11 +60,11 @@ def test_a_wall_stops_a_robot_and_a_lidar_sees_it(scenery):
     for _ in range(round(3.0 / TIME_STEP)):
         simulation.drive(0.6, 0.0)
         simulation.step()
-    # Half the robot and half the wall away from its middle, though commanded to drive 1.8 m.
+    # Half the robot's length and half the wall's thickness before its centre, although 1.8 m were commanded.
     assert (simulation.data.qpos[:2] - wall.centre) @ across < -0.35
 
 
-def test_mud_is_slippery_and_only_there(scenery):
+def test_friction_is_low_in_mud_only(scenery):
     robot = Vehicle.load("husky")
     simulation = Simulation(build_model(scenery, robot, 0, {}), scenery, robot)
     patch = scenery.patches[0]
@@ -77,7 +77,7 @@ def test_mud_is_slippery_and_only_there(scenery):
         np.testing.assert_allclose(simulation.model.geom_friction[simulation.tyres, 0], friction)
 
 
-def test_hills_alone_have_nothing_on_them():
+def test_bare_hills_have_nothing_on_them():
     bare = build_scenery(TerrainSettings(bare=True), 4)
     assert np.ptp(bare.ground.heights) > 0.3
     assert not (bare.rocks or bare.trees or bare.walls or bare.patches or bare.grass.tiles)
@@ -89,13 +89,13 @@ def test_tracks_and_heavy_robots_drive(name, speed):
     level = build_scenery(TerrainSettings(flat=True), 4)
     simulation = Simulation(build_model(level, robot, 0, {}), level, robot)
     assert abs(simulation.state().position[2]) < 0.01
-    shown = []
+    states = []
     for step in range(round(3.0 / TIME_STEP)):
         simulation.drive(min(1.0, step * TIME_STEP) * speed, 0.0)
         simulation.step()
-        shown.append(simulation.state())
-    assert shown[-1].linear_velocity[0] == pytest.approx(speed, rel=0.03)
-    assert max(np.arccos(state.rotation[2, 2]) for state in shown) < np.radians(4.0)
+        states.append(simulation.state())
+    assert states[-1].linear_velocity[0] == pytest.approx(speed, rel=0.03)
+    assert max(np.arccos(state.rotation[2, 2]) for state in states) < np.radians(4.0)
     simulation.drive(0.0, 0.8)
     for _ in range(round(2.0 / TIME_STEP)):
         simulation.step()
@@ -103,7 +103,7 @@ def test_tracks_and_heavy_robots_drive(name, speed):
 
 
 @pytest.mark.parametrize("name", ["steps", "sweep"])
-def test_drivers_that_try_everything_stay_near_the_start(name):
+def test_excitation_drivers_stay_near_the_start(name):
     robot = Vehicle.load("husky")
     level = build_scenery(TerrainSettings(flat=True), 4)
     simulation = Simulation(build_model(level, robot, 0, {}), level, robot)
@@ -126,7 +126,7 @@ def test_drivers_that_try_everything_stay_near_the_start(name):
         assert ((forward == 0.0) & (turning == 0.0)).any()
 
 
-def test_distorted_pixels_come_from_where_their_rays_point():
+def test_distorted_pixels_are_taken_from_the_direction_of_their_rays():
     settings = CameraSettings(distortion=(-0.25, 0.06, 0.001, -0.002, 0.0), width=160, height=120)
     rng = np.random.default_rng(1)
     rays = np.column_stack([rng.uniform(-0.7, 0.7, 300), rng.uniform(-0.5, 0.5, 300), np.ones(300)])
@@ -162,7 +162,7 @@ def test_four_distorted_cameras_on_tracks(tmp_path):
     np.testing.assert_allclose(front[:2, 2], -rear[:2, 2], atol=1e-6)
 
 
-def test_slam_is_as_noisy_late_and_adrift_as_it_says(tmp_path):
+def test_slam_has_the_configured_noise_latency_and_drift(tmp_path):
     out = tmp_path / "drive"
     odometry = OdometrySettings.slam(0.03, np.radians(1.5))
     flat = TerrainSettings(flat=True)
@@ -174,7 +174,7 @@ def test_slam_is_as_noisy_late_and_adrift_as_it_says(tmp_path):
         for connection, received, data in reader.messages(connections):
             message = reader.deserialize(data, connection.msgtype)
             delays.append(received - (message.header.stamp.sec * 10**9 + message.header.stamp.nanosec))
-    # Messages still under way at the end arrive with it.
+    # Messages delayed beyond the end arrive at the end.
     assert np.median(delays) == pytest.approx(1e8)
     motion = Recording.open(out).motion
     np.testing.assert_array_equal(motion.stamps, truth["true_stamps"])
@@ -187,7 +187,7 @@ def test_slam_is_as_noisy_late_and_adrift_as_it_says(tmp_path):
     assert 0.01 < drift < 0.6
 
 
-def test_many_bags_at_once(tmp_path, executables, ros_environment):
+def test_many_bags_in_parallel(tmp_path, executables, ros_environment):
     command = [executables / "synthesize", tmp_path / "set", "--count", "3", "--jobs", "2", "--duration", "1"]
     command += ["--camera", "none", "--lidar", "none", "--seed", "5", "--hide-random", "2", "--flat"]
     done = subprocess.run(command, env=ros_environment, capture_output=True, text=True, timeout=120, check=False)
@@ -200,7 +200,7 @@ def test_many_bags_at_once(tmp_path, executables, ros_environment):
     assert not np.allclose(ends[0], ends[1])
 
 
-def test_grass_grows_where_the_ground_says(tmp_path):
+def test_the_kind_of_ground_sets_the_amount_of_grass(tmp_path):
     covered = {}
     for ground in ("rigid", "mixed", "grass"):
         world = build_scenery(TerrainSettings(ground=ground), 3)

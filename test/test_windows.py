@@ -1,11 +1,11 @@
-"""Smoothed motion, windows and synchronised samples: what everything offline is made of."""
+"""Smoothed motion, windows and frames by time, the basis of all offline processing."""
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from monoforce_ros.bags import BagWriter, Recording, builders, cut_windows, smooth, synchronise
-from monoforce_ros.core import CommandTrack, MotionTrack
+from monoforce_ros.bags import BagWriter, Frame, Recording, builders, cut_windows, nearest_frame, smooth
+from monoforce_ros.core import CommandTrack, MotionTrack, StaleDataError, nearest_stamp
 
 START = 1_700_000_000_000_000_000
 
@@ -22,7 +22,7 @@ def track(times, positions, rotations, **kinds):
 
 
 def planar(times, speed, rate):
-    """A drive on a plane at changing speed and yaw rate, finely integrated."""
+    """Motion on a plane at changing speed and yaw rate, integrated in fine steps."""
     fine = np.arange(0.0, times[-1] + 1e-9, 1e-3)
     heading = np.concatenate([[0.0], np.cumsum(rate(fine)[:-1]) * 1e-3])
     x = np.concatenate([[0.0], np.cumsum((speed(fine) * np.cos(heading))[:-1]) * 1e-3])
@@ -42,7 +42,7 @@ TIMES = np.arange(0.0, 40.0, 0.05)
 
 
 @pytest.mark.parametrize(("position_noise", "degrees"), [(0.01, 0.5), (0.03, 1.5)])
-def test_noise_is_found_and_taken_out(position_noise, degrees):
+def test_noise_is_estimated_and_removed(position_noise, degrees):
     def speed(t):
         return 0.5 + 0.4 * np.sin(0.6 * t)
 
@@ -60,7 +60,7 @@ def test_noise_is_found_and_taken_out(position_noise, degrees):
     assert (smoothed.motion.angular_velocities[:, 2] - rate(TIMES))[inner].std() < 2.0 * np.radians(degrees)
 
 
-def test_stated_noise_is_what_is_taken_out():
+def test_a_given_noise_is_removed():
     true, rotations = planar(TIMES, lambda t: 0.5 + 0 * t, lambda t: 0.3 * np.sin(0.5 * t))
     positions, turned = noisy(true, rotations, 0.02, 0.01)
     motion = track(TIMES, positions, turned)
@@ -114,7 +114,7 @@ def test_windows_carry_the_commands_before_them():
     fifth = windows.twists[5]  # starts at 5 s: its history reaches back to 3.5 s, across the change at 3.9 s
     assert (fifth[:40, 0] == 0.1).all()
     assert (fifth[40:350, 0] == 0.2).all()
-    assert (windows.twists[0][:150] == 0.0).all()  # before the first command the robot stands
+    assert (windows.twists[0][:150] == 0.0).all()  # before the first command
     np.testing.assert_allclose(windows.positions[5, :, 0], 2.5 + 0.5 * windows.times, atol=1e-3)
 
 
@@ -128,7 +128,34 @@ def test_windows_with_a_gap_are_left_out_and_none_at_all_is_an_error():
         cut_windows(motion, commands, length=30.0)
 
 
-def test_samples_take_the_nearest_within_the_limit_and_nothing_beyond(tmp_path):
+def frames_at(*seconds):
+    return [Frame("/topic", START + round(1e9 * second), 0) for second in seconds]
+
+
+@pytest.mark.parametrize("limit", [0.05, 0.25, np.inf])
+def test_the_nearest_frame_is_taken_within_the_limit_and_none_beyond(limit):
+    frames = frames_at(0.0, 0.2, 0.5, 1.0)
+    for nanoseconds in range(-400_000_000, 1_600_000_000, 10_000_000):
+        stamp = START + nanoseconds + 1
+        distances = [abs(frame.stamp - stamp) for frame in frames]
+        expected = frames[int(np.argmin(distances))] if min(distances) <= limit * 1e9 else None
+        assert nearest_frame(frames, stamp, limit=limit) == expected
+    assert nearest_frame([], START, limit=limit) is None
+
+
+def test_the_limit_itself_counts_and_a_nanosecond_more_does_not():
+    frames = frames_at(0.0, 1.0)
+    assert nearest_frame(frames, START - 50_000_000, limit=0.05) == frames[0]
+    assert nearest_frame(frames, START + 50_000_000, limit=0.05) == frames[0]
+    assert nearest_frame(frames, START - 50_000_001, limit=0.05) is None
+    assert nearest_frame(frames, START + 50_000_001, limit=0.05) is None
+    # Doubles would not resolve differences of 10 ns at stamps of this size.
+    stamps = np.array([START, START + 10], np.int64)
+    assert [nearest_stamp(stamps, START + shift) for shift in (0, 4, 6, 10, 99)] == [0, 0, 1, 1, 1]
+    assert nearest_stamp(stamps[:0], START) is None
+
+
+def test_frames_of_several_topics_are_paired_within_the_limit_and_not_beyond(tmp_path):
     with BagWriter(tmp_path / "drive") as bag:
         for i in range(40):
             at = START + i * 50_000_000
@@ -142,11 +169,21 @@ def test_samples_take_the_nearest_within_the_limit_and_nothing_beyond(tmp_path):
             bag.write("/right/image_raw", builders.image(late, "right", np.full((2, 2, 3), i, np.uint8)), late)
             bag.write("/points", builders.point_cloud(at + 10_000_000, "lidar", np.ones((3, 3))), at + 10_000_000)
     recording = Recording.open(tmp_path / "drive")
-    samples, missing = synchronise(recording, ["/left/image_raw", "/right/image_raw", "/points"])
-    assert len(samples) == 5
-    assert missing == {"/right/image_raw": 5}
-    assert samples[3].frames["/right/image_raw"].stamp - samples[3].stamp == 30_000_000
-    samples, missing = synchronise(recording, ["/left/image_raw"], limit=0.05, maximum_gap=0.1)
-    assert missing == {"odometry": 2}
-    with pytest.raises(ValueError, match="got topic /rear, expected one of"):
-        synchronise(recording, ["/rear"])
+    left, right = recording.images["/left/image_raw"], recording.images["/right/image_raw"]
+    assert len(left) == len(right) == len(recording.clouds) == 10
+    pairs = [nearest_frame(right, frame.stamp, limit=0.05) for frame in left]
+    assert [pair and pair.stamp - frame.stamp for pair, frame in zip(pairs, left, strict=True)] == (
+        5 * [30_000_000] + 5 * [None]
+    )
+    assert all((recording.image(pairs[i]) == i).all() for i in range(5))
+    clouds = [nearest_frame(recording.clouds, frame.stamp, limit=0.05) for frame in left]
+    assert [cloud.stamp - frame.stamp for cloud, frame in zip(clouds, left, strict=True)] == 10 * [10_000_000]
+    assert nearest_frame(recording.clouds, left[0].stamp, limit=0.009) is None
+
+    def has_odometry(frame):
+        try:
+            return recording.motion.at(frame.stamp, maximum_gap=0.1).stamp == frame.stamp
+        except StaleDataError:
+            return False
+
+    assert [has_odometry(frame) for frame in left].count(False) == 2

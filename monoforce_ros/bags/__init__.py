@@ -1,9 +1,19 @@
-"""Reading and writing rosbag files: ROS 2 (sqlite3, mcap) and ROS 1, without a ROS installation."""
+"""Read and write rosbag files of ROS 2 (sqlite3, mcap) and read those of ROS 1, without a ROS installation."""
 
 from monoforce_ros.bags import builders
 from monoforce_ros.bags.reader import BagError, BagReader
-from monoforce_ros.bags.recording import CAMERA_INFO, CLOUD, COMMANDS, IMAGES, ODOMETRY, Recording, camera_info_topic
-from monoforce_ros.bags.samples import Sample, nearest_frame, synchronise
+from monoforce_ros.bags.recording import (
+    CAMERA_INFO,
+    CLOUD,
+    COMMANDS,
+    IMAGES,
+    ODOMETRY,
+    Frame,
+    Recording,
+    camera_info_topic,
+    find_transform,
+    nearest_frame,
+)
 from monoforce_ros.bags.smoothing import SmoothedMotion, smooth
 from monoforce_ros.bags.types import type_store
 from monoforce_ros.bags.windows import Windows, cut_windows
@@ -18,15 +28,15 @@ __all__ = [
     "BagError",
     "BagReader",
     "BagWriter",
+    "Frame",
     "Recording",
-    "Sample",
     "SmoothedMotion",
     "Windows",
     "builders",
     "camera_info_topic",
     "cut_windows",
+    "find_transform",
     "nearest_frame",
     "smooth",
-    "synchronise",
     "type_store",
 ]

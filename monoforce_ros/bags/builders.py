@@ -1,4 +1,4 @@
-"""Arrays → messages of the bag type store. All stamps are nanoseconds, quaternions are x, y, z, w."""
+"""Arrays → messages of the bag type store. Stamps are in nanoseconds, quaternions are x, y, z, w."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from scipy.spatial.transform import Rotation
 from monoforce_ros.bags.types import type_store
 
 Message = Any
+"""A message of the type store, whose classes are generated at run time."""
+Vector = Sequence[float] | np.ndarray
 
 
 def _make(message_type: str, /, *fields: Any, **named: Any) -> Message:
@@ -27,19 +29,19 @@ def header(stamp: int, frame_id: str) -> Message:
     return _make("std_msgs/msg/Header", stamp=time(stamp), frame_id=frame_id)
 
 
-def _vector(values: Sequence[float]) -> Message:
+def _vector(values: Vector) -> Message:
     return _make("geometry_msgs/msg/Vector3", *(float(value) for value in values))
 
 
-def _point(values: Sequence[float]) -> Message:
+def _point(values: Vector) -> Message:
     return _make("geometry_msgs/msg/Point", *(float(value) for value in values))
 
 
-def _quaternion(values: Sequence[float]) -> Message:
+def _quaternion(values: Vector) -> Message:
     return _make("geometry_msgs/msg/Quaternion", *(float(value) for value in values))
 
 
-def _twist(linear: Sequence[float], angular: Sequence[float]) -> Message:
+def _twist(linear: Vector, angular: Vector) -> Message:
     return _make("geometry_msgs/msg/Twist", linear=_vector(linear), angular=_vector(angular))
 
 
@@ -47,10 +49,10 @@ def odometry(
     stamp: int,
     frame_id: str,
     child_frame_id: str,
-    position: Sequence[float],
-    quaternion: Sequence[float],
-    linear_velocity: Sequence[float],
-    angular_velocity: Sequence[float],
+    position: Vector,
+    quaternion: Vector,
+    linear_velocity: Vector,
+    angular_velocity: Vector,
 ) -> Message:
     """``nav_msgs/Odometry``: pose in ``frame_id``, twist [m/s, rad/s] in ``child_frame_id``."""
     pose = _make("geometry_msgs/msg/Pose", position=_point(position), orientation=_quaternion(quaternion))
@@ -67,8 +69,8 @@ def odometry(
     )
 
 
-def imu(stamp: int, frame_id: str, angular_velocity: Sequence[float], linear_acceleration: Sequence[float]) -> Message:
-    """``sensor_msgs/Imu`` without an orientation (its first covariance is -1, as the message asks)."""
+def imu(stamp: int, frame_id: str, angular_velocity: Vector, linear_acceleration: Vector) -> Message:
+    """``sensor_msgs/Imu`` without orientation (its first covariance is -1, as the message definition requires)."""
     unknown = np.zeros(9)
     unknown[0] = -1.0
     return _make(
@@ -93,7 +95,7 @@ def twist_stamped(stamp: int, frame_id: str, linear_x: float, angular_z: float) 
     return _make("geometry_msgs/msg/TwistStamped", header=header(stamp, frame_id), twist=twist(linear_x, angular_z))
 
 
-def joint_state(stamp: int, names: Sequence[str], positions: Sequence[float], velocities: Sequence[float]) -> Message:
+def joint_state(stamp: int, names: Sequence[str], positions: Vector, velocities: Vector) -> Message:
     """``sensor_msgs/JointState`` [rad, rad/s]."""
     return _make(
         "sensor_msgs/msg/JointState",
@@ -111,7 +113,7 @@ def camera_info(
     width: int,
     height: int,
     camera_matrix: np.ndarray,
-    distortion: Sequence[float],
+    distortion: Vector,
     distortion_model: str = "plumb_bob",
 ) -> Message:
     """``sensor_msgs/CameraInfo`` of a single camera; ``camera_matrix`` is ``[3, 3]`` in pixels."""
@@ -183,7 +185,7 @@ def point_cloud(stamp: int, frame_id: str, points: np.ndarray, height: int = 1) 
 
 def static_transforms(stamp: int, parent: str, transforms: Mapping[str, np.ndarray]) -> Message:
     """``tf2_msgs/TFMessage`` of child frames; each matrix is ``[4, 4]``, parent ← child."""
-    listed = []
+    entries = []
     for child, matrix in transforms.items():
         matrix = np.asarray(matrix, np.float64)
         transform = _make(
@@ -191,7 +193,7 @@ def static_transforms(stamp: int, parent: str, transforms: Mapping[str, np.ndarr
             translation=_vector(matrix[:3, 3]),
             rotation=_quaternion(Rotation.from_matrix(matrix[:3, :3]).as_quat()),
         )
-        listed.append(
+        entries.append(
             _make(
                 "geometry_msgs/msg/TransformStamped",
                 header=header(stamp, parent),
@@ -199,7 +201,7 @@ def static_transforms(stamp: int, parent: str, transforms: Mapping[str, np.ndarr
                 transform=transform,
             )
         )
-    return _make("tf2_msgs/msg/TFMessage", transforms=listed)
+    return _make("tf2_msgs/msg/TFMessage", transforms=entries)
 
 
 def string(text: str) -> Message:

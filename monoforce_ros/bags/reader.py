@@ -1,4 +1,4 @@
-"""BagReader: messages of a ROS 2 or ROS 1 bag, one at a time."""
+"""BagReader: read the messages of a ROS 2 or ROS 1 bag one at a time."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from monoforce_ros.bags.types import type_store
 
 
 class BagError(ValueError):
-    """A bag that cannot be read; the message says which file, what is wrong and what to do."""
+    """A bag that cannot be read; the message names the file, the problem and what to do."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class BagMessage:
     _reader: BagReader
 
     def decode(self) -> Any:
-        """The message with the attributes of its ROS type; raises ``BagError`` where its bytes do not fit the type."""
+        """The message with the attributes of its ROS type; raises ``BagError`` if its bytes do not fit the type."""
         try:
             return self._reader._any.deserialize(self.data, self.message_type)
         except Exception as error:
@@ -40,10 +40,10 @@ class BagMessage:
             ) from error
 
     def cdr(self) -> bytes:
-        """The message in ROS 2's encoding, whichever ROS the bag is of."""
+        """The message encoded as CDR (ROS 2), also if the bag is of ROS 1."""
         if self._reader.is_ros2:
             return bytes(self.data)
-        # By the definitions of ROS 2: they tell the converter that headers have lost their sequence number.
+        # With the definitions of ROS 2, so that the converter drops the sequence number of headers.
         try:
             return bytes(type_store().ros1_to_cdr(self.data, self.message_type))
         except Exception as error:
@@ -59,15 +59,15 @@ class BagReader:
         path: a rosbag2 folder, a single ``.mcap`` or ``.db3`` file, or a ROS 1 ``.bag`` file.
 
     Raises:
-        BagError: on opening, where the bag is missing, of an unknown kind, or so damaged that no message can be read.
-            A bag that was cut off is read as far as it goes, and says so in ``warnings``.
+        BagError: on opening, if the bag is missing, of an unknown kind, or so damaged that no message can be read.
+            A truncated bag is read up to the damage and reported in ``warnings``.
     """
 
     def __init__(self, path: str | Path):
         self.path = Path(path)
         self._any: AnyReader | SalvagedBag
         self.warnings: tuple[str, ...] = ()
-        """What is wrong with the bag as a whole, though it can be read in part."""
+        """Defects of a bag that can be read only in part."""
 
     @property
     def is_ros2(self) -> bool:
@@ -85,12 +85,12 @@ class BagReader:
                 raise ValueError("there is no metadata.yaml")
             self._any = AnyReader([path], default_typestore=type_store())
             self._any.open()
-        except Exception as error:  # rosbags lets errors of its parsers through; a user needs one message
+        except Exception as error:  # rosbags raises errors of its parsers as they are
             self._salvage(error)
         return self
 
     def _salvage(self, reason: Exception) -> None:
-        """Read what can be read of a bag without an index, or say why nothing can."""
+        """Read a bag without an index as far as possible; raise ``BagError`` if no message can be read."""
         files = storage_files(self.path)
         salvaged = SalvagedBag(files) if files else None
         if salvaged is None or not salvaged.message_count:
@@ -102,7 +102,7 @@ class BagReader:
         self._any = salvaged
         self.warnings = (
             f"{self.path} has no usable index ({reason}): it was cut off or damaged. "
-            f"{salvaged.message_count} messages were found by reading it from its start",
+            f"{salvaged.message_count} messages were recovered by reading it from the start",
             *salvaged.broken,
         )
 
@@ -150,7 +150,7 @@ class BagReader:
     ) -> Iterator[BagMessage]:
         """Messages in order of reception, of all topics or the named ones, from ``start`` to before ``stop`` [ns].
 
-        Raises ``BagError`` where the file ends or breaks in the middle; what came before has been yielded by then.
+        Raises ``BagError`` where the file is truncated or damaged, after the messages before that point.
         """
         connections: list[Connection] = [
             connection for connection in self._any.connections if topics is None or connection.topic in topics

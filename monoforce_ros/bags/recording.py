@@ -1,16 +1,25 @@
-"""Recording: a bag seen as a drive — motion, commands, cameras, and where its clouds and images are."""
+"""Recording: motion, commands and cameras of a bag, and an index of its clouds and images."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from monoforce_ros.bags.reader import BagError, BagReader
-from monoforce_ros.core import AngularVelocityTrack, CameraModel, CommandTrack, MotionTrack, WheelTrack
+from monoforce_ros.bags.builders import Message
+from monoforce_ros.bags.reader import BagError, BagMessage, BagReader
+from monoforce_ros.core import (
+    AngularVelocityTrack,
+    CameraModel,
+    CommandTrack,
+    MotionState,
+    MotionTrack,
+    WheelTrack,
+    nearest_stamp,
+)
 from monoforce_ros.messages import decoding
 
 ODOMETRY = "nav_msgs/msg/Odometry"
@@ -24,18 +33,18 @@ TRANSFORMS = "tf2_msgs/msg/TFMessage"
 
 @dataclass(frozen=True)
 class Frame:
-    """A cloud or image in a bag, not yet read."""
+    """Reference to a cloud or image in a bag."""
 
     topic: str
     stamp: int
     """Header stamp [ns]."""
     received: int
-    """Time of reception [ns]; finds the message again."""
+    """Time of reception [ns], by which the message is found."""
 
 
 @dataclass(frozen=True)
 class Recording:
-    """What a bag holds of a drive. Motion and commands are in memory, clouds and images are read when asked for."""
+    """Contents of a bag. Motion and commands are in memory; clouds and images are read on demand."""
 
     path: Path
     motion: MotionTrack
@@ -43,16 +52,16 @@ class Recording:
     clouds: tuple[Frame, ...]
     images: dict[str, tuple[Frame, ...]]
     cameras: dict[str, CameraModel]
-    """Camera model of each image topic that has a CameraInfo beside it."""
+    """Camera model of each image topic that has a CameraInfo topic."""
     static_transforms: dict[tuple[str, str], np.ndarray]
     topics: dict[str, str]
-    """The topics chosen: ``odometry``, ``commands``, ``cloud``, ``imu``, ``joints``."""
-    complaints: tuple[str, ...] = field(default=())
-    """What was wrong with single messages; they were left out."""
-    turning: AngularVelocityTrack | None = None
-    """What the IMU shows, where there is one."""
+    """Topic used for each of ``odometry``, ``commands``, ``cloud``, ``imu`` and ``joints``."""
+    warnings: tuple[str, ...] = ()
+    """Defects of the bag and of single messages, which were skipped."""
+    angular_velocity: AngularVelocityTrack | None = None
+    """Measurements of the IMU, if there is one."""
     wheels: WheelTrack | None = None
-    """Measured wheel speeds, where there are."""
+    """Measured wheel speeds, if there are any."""
 
     @classmethod
     def open(
@@ -62,7 +71,7 @@ class Recording:
 
         Args:
             path: the bag (see :class:`BagReader`).
-            odometry, commands, cloud: topics to use; by default the one of the right type with the most messages.
+            odometry, commands, cloud: topics to use; by default the one of the required type with the most messages.
 
         Raises:
             BagError: the bag cannot be read, a named topic is absent or of another type, or there is no odometry.
@@ -78,29 +87,29 @@ class Recording:
             if chosen["odometry"] is None:
                 raise BagError(f"{bag.path} has no {ODOMETRY} topic; it holds {sorted(set(bag.topics.values()))}")
             image_topics = bag.of_type(*IMAGES)
-            wanted = {topic for topic in chosen.values() if topic}
-            wanted.update(image_topics, bag.of_type(CAMERA_INFO), bag.of_type(TRANSFORMS))
+            topics = {topic for topic in chosen.values() if topic}
+            topics.update(image_topics, bag.of_type(CAMERA_INFO), bag.of_type(TRANSFORMS))
             collected = _Collector(bag, chosen)
-            collected.complaints.extend(bag.warnings)
+            collected.warnings.extend(bag.warnings)
             try:
-                for message in bag.messages(wanted):
+                for message in bag.messages(topics):
                     collected.take(message)
             except BagError as error:
-                # What came before the break is a drive too.
+                # Messages before the damage are usable.
                 if not collected.states:
                     raise
-                collected.complaints.append(str(error))
+                collected.warnings.append(str(error))
             return collected.recording(image_topics)
 
     def cloud(self, frame: Frame) -> tuple[np.ndarray, str]:
-        """Points ``[n, 3]`` [m] of a cloud in its sensor frame, and that frame's name."""
+        """Points ``[n, 3]`` [m] of a cloud in its sensor frame, and the name of that frame."""
         message = self._read(frame)
         return decoding.decode_cloud(message), message.header.frame_id
 
     def clouds_between(self, start: int, stop: int) -> Iterator[tuple[Frame, np.ndarray, str]]:
         """Clouds with stamps from ``start`` to ``stop`` [ns] as :meth:`cloud` gives them, in one pass over the bag.
 
-        Clouds that cannot be decoded are left out.
+        Clouds that cannot be decoded are skipped.
         """
         chosen = [frame for frame in self.clouds if start <= frame.stamp <= stop]
         for frame, message in self._decoded(chosen):
@@ -111,7 +120,7 @@ class Recording:
             yield frame, points, message.header.frame_id
 
     def images_of(self, frames: Sequence[Frame]) -> Iterator[tuple[Frame, np.ndarray]]:
-        """Images of one topic as :meth:`image` gives them, in one pass over the bag; undecodable ones are left out."""
+        """Images of one topic as :meth:`image` gives them, in one pass over the bag; undecodable ones are skipped."""
         for frame, message in self._decoded(frames):
             try:
                 yield frame, decoding.decode_image(message)
@@ -130,12 +139,12 @@ class Recording:
         """Pose ``[4, 4]`` of a sensor in the base frame: from the bag's static transforms, else from ``known``.
 
         Args:
-            frame_id: the sensor's frame.
-            base_frame: the robot's.
-            known: poses ``[4, 4]`` of a robot's sensors by frame, as its file gives them.
+            frame_id: frame of the sensor.
+            base_frame: base frame of the robot.
+            known: poses ``[4, 4]`` of the sensors in the robot file, by frame.
 
         Raises:
-            BagError: neither knows the frame.
+            BagError: neither has the frame.
         """
         pose = self.base_from(frame_id, base_frame)
         if pose is not None:
@@ -144,34 +153,40 @@ class Recording:
             return np.asarray(known[frame_id], np.float64)
         raise BagError(
             f"{self.path}: the pose of {frame_id!r} on the robot is neither in the bag's /tf_static nor in the robot "
-            f"file (known there: {sorted(known)})"
+            f"file, which has {sorted(known)}"
         )
 
-    def _decoded(self, frames: Sequence[Frame]) -> Iterator[tuple[Frame, object]]:
-        """Messages of frames of one topic, each once, in the bag's order."""
-        wanted = {frame.received: frame for frame in frames}
-        if not wanted:
+    def _decoded(self, frames: Sequence[Frame]) -> Iterator[tuple[Frame, Message]]:
+        """Messages of frames of one topic, each once, in the order of the bag."""
+        by_reception = {frame.received: frame for frame in frames}
+        if not by_reception:
             return
         with BagReader(self.path) as bag:
-            for message in bag.messages([frames[0].topic], start=min(wanted), stop=max(wanted) + 1):
-                if message.received in wanted:
+            for message in bag.messages([frames[0].topic], start=min(by_reception), stop=max(by_reception) + 1):
+                if message.received in by_reception:
                     try:
                         decoded = message.decode()
                     except ValueError:
                         continue
-                    yield wanted[message.received], decoded
+                    yield by_reception[message.received], decoded
 
-    def _read(self, frame: Frame):
+    def _read(self, frame: Frame) -> Message:
         with BagReader(self.path) as bag:
             for message in bag.messages([frame.topic], start=frame.received, stop=frame.received + 1):
                 decoded = message.decode()
                 if decoding.stamp_of(decoded) == frame.stamp:
                     return decoded
-        raise BagError(f"{self.path}: the message on {frame.topic} at {frame.received} ns is gone: the bag has changed")
+        raise BagError(f"{self.path}: the message on {frame.topic} at {frame.received} ns is gone; the bag has changed")
+
+
+def nearest_frame(frames: Sequence[Frame], stamp: int, *, limit: float = np.inf) -> Frame | None:
+    """The frame nearest to a stamp [ns], at most ``limit`` [s] away; None if there is none."""
+    index = nearest_stamp(np.array([frame.stamp for frame in frames], np.int64), stamp, limit=limit)
+    return None if index is None else frames[index]
 
 
 def find_transform(transforms: dict[tuple[str, str], np.ndarray], parent: str, child: str) -> np.ndarray | None:
-    """``[4, 4]`` parent ← child through any chain of known transforms, or None where they are not connected."""
+    """``[4, 4]`` parent ← child along any chain of transforms, or None if they are not connected."""
     parent, child = parent.lstrip("/"), child.lstrip("/")
     reached = {parent: np.eye(4)}
     frontier = [parent]
@@ -188,7 +203,7 @@ def find_transform(transforms: dict[tuple[str, str], np.ndarray], parent: str, c
 
 
 def camera_info_topic(image_topic: str) -> str:
-    """The CameraInfo topic beside an image topic, by the convention of image_transport.
+    """The CameraInfo topic of an image topic, by the convention of image_transport.
 
     >>> camera_info_topic("/camera/front/image_raw/compressed")
     '/camera/front/camera_info'
@@ -210,40 +225,41 @@ def _choose(bag: BagReader, named: str | None, message_types: tuple[str, ...]) -
 
 
 class _Collector:
-    """Gathers what one pass over a bag yields."""
+    """Collects the messages of one pass over a bag."""
 
     def __init__(self, bag: BagReader, chosen: dict[str, str | None]):
         self.bag = bag
         self.chosen = chosen
-        self.states: list = []
+        self.states: list[tuple[int, MotionState]] = []
         self.frames = ("odom", "base_link")
         self.twists: list[tuple[int, np.ndarray]] = []
-        self.turning: list[tuple[int, np.ndarray]] = []
-        self.turning_frame = ""
+        self.angular_velocities: list[tuple[int, np.ndarray]] = []
+        self.imu_frame = ""
         self.wheels: list[tuple[int, np.ndarray]] = []
         self.indexed: dict[str, list[Frame]] = {}
         self.cameras: dict[str, CameraModel] = {}
         self.transforms: dict[tuple[str, str], np.ndarray] = {}
-        self.complaints: list[str] = []
+        self.warnings: list[str] = []
 
-    def take(self, message) -> None:
+    def take(self, message: BagMessage) -> None:
         try:
             if message.message_type in (*IMAGES, CLOUD) and self.bag.is_ros2:
-                # Their headers suffice: large messages are not unpacked until somebody asks for them.
+                # Large messages are indexed by their headers and decoded on demand.
                 stamp = decoding.stamp_of_cdr(message.data)
                 self.indexed.setdefault(message.topic, []).append(Frame(message.topic, stamp, message.received))
                 return
             decoded = message.decode()
-            # A header stamp of zero means that the driver never set it.
+            # A header stamp of zero means that the driver did not set it.
             stamp = decoding.stamp_of(decoded) or message.received
             if message.topic == self.chosen["odometry"]:
-                state, *self.frames = decoding.decode_odometry(decoded)
+                state, frame_id, child_frame_id = decoding.decode_odometry(decoded)
+                self.frames = (frame_id, child_frame_id)
                 self.states.append((stamp, state))
             elif message.topic == self.chosen["commands"]:
                 self.twists.append((stamp, decoding.decode_command(decoded)))
             elif message.topic == self.chosen["imu"]:
-                rate, self.turning_frame = decoding.decode_angular_velocity(decoded)
-                self.turning.append((stamp, rate))
+                rate, self.imu_frame = decoding.decode_angular_velocity(decoded)
+                self.angular_velocities.append((stamp, rate))
             elif message.topic == self.chosen["joints"]:
                 speeds = decoding.decode_wheel_speeds(decoded)
                 if speeds is not None:
@@ -259,21 +275,19 @@ class _Collector:
                     Frame(message.topic, decoding.stamp_of(decoded), message.received)
                 )
         except ValueError as error:
-            if len(self.complaints) < 20:
-                self.complaints.append(f"{message.topic}: {error}")
+            if len(self.warnings) < 20:
+                self.warnings.append(f"{message.topic}: {error}")
 
     def recording(self, image_topics: list[str]) -> Recording:
         if not self.states:
-            raise BagError(f"{self.bag.path}: no usable message on {self.chosen['odometry']}: {self.complaints[:1]}")
-        self.states.sort(key=lambda entry: entry[0])
-        stamps, first = np.unique([stamp for stamp, _ in self.states], return_index=True)
-        states = [self.states[i][1] for i in first]
+            raise BagError(f"{self.bag.path}: no usable message on {self.chosen['odometry']}: {self.warnings[:1]}")
+        stamps, states = _in_order(self.states)
         self.twists.sort(key=lambda entry: entry[0])
-        cloud_topic = self.chosen["cloud"]
+        cloud_topic = self.chosen["cloud"] or ""
         return Recording(
             path=self.bag.path,
             motion=MotionTrack(
-                stamps=stamps.astype(np.int64),
+                stamps=stamps,
                 positions=np.array([s.position for s in states]),
                 quaternions=Rotation.from_matrix(np.array([s.rotation for s in states])).as_quat(),
                 linear_velocities=np.array([s.linear_velocity for s in states]),
@@ -297,22 +311,25 @@ class _Collector:
             },
             static_transforms=self.transforms,
             topics={role: topic for role, topic in self.chosen.items() if topic},
-            complaints=tuple(self.complaints),
-            turning=self._turning_track(),
+            warnings=tuple(self.warnings),
+            angular_velocity=self._angular_velocity_track(),
             wheels=self._wheel_track(),
         )
 
     def _wheel_track(self) -> WheelTrack | None:
         if not self.wheels:
             return None
-        self.wheels.sort(key=lambda entry: entry[0])
-        stamps, first = np.unique([stamp for stamp, _ in self.wheels], return_index=True)
-        return WheelTrack(stamps.astype(np.int64), np.array([self.wheels[index][1] for index in first]))
+        stamps, speeds = _in_order(self.wheels)
+        return WheelTrack(stamps, np.array(speeds))
 
-    def _turning_track(self) -> AngularVelocityTrack | None:
-        if not self.turning:
+    def _angular_velocity_track(self) -> AngularVelocityTrack | None:
+        if not self.angular_velocities:
             return None
-        self.turning.sort(key=lambda entry: entry[0])
-        stamps, first = np.unique([stamp for stamp, _ in self.turning], return_index=True)
-        rates = np.array([self.turning[index][1] for index in first])
-        return AngularVelocityTrack(stamps.astype(np.int64), rates, self.turning_frame)
+        stamps, rates = _in_order(self.angular_velocities)
+        return AngularVelocityTrack(stamps, np.array(rates), self.imu_frame)
+
+
+def _in_order[Value](samples: list[tuple[int, Value]]) -> tuple[np.ndarray, list[Value]]:
+    """Stamps ``[n]`` int64 [ns], strictly increasing, and the first value of each."""
+    stamps, first = np.unique(np.array([stamp for stamp, _ in samples], np.int64), return_index=True)
+    return stamps, [samples[index][1] for index in first]

@@ -1,8 +1,7 @@
-"""Salvage: messages of bags that were cut off before their index was written, or damaged later.
+"""Salvage: recover the messages of bags that were truncated before their index was written, or damaged later.
 
-A recording that ends with the battery has no index, and readers that begin with the index refuse it. Its messages are
-there none the less, one after the other, and are read up to where the file breaks. Sizes that the file states are
-checked against the file before anything is allocated.
+A recording cut off by a power loss has no index, so readers that start from the index reject it. Its messages are read
+in sequence up to the damage. Sizes stated in the file are checked against its length before memory is allocated.
 """
 
 from __future__ import annotations
@@ -11,6 +10,7 @@ import bz2
 import io
 import sqlite3
 import struct
+from collections import Counter
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,17 +24,17 @@ from monoforce_ros.bags.types import type_store
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
 _ROS1_MAGIC = b"#ROSBAG V2.0\n"
 _LARGEST_RECORD = 1 << 30
-"""Bytes of a chunk or message beyond which the file's statement is not believed."""
+"""Size of a chunk or message beyond which the file is considered damaged [bytes]."""
 _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK = 3, 4, 5, 6
 
 
 class _BrokenError(Exception):
-    """The file ends or makes no sense from here on."""
+    """The file is truncated or damaged at this point."""
 
 
 @dataclass(frozen=True)
 class SalvagedTopic:
-    """A topic with what was found of it."""
+    """A topic and the number of its recovered messages."""
 
     topic: str
     msgtype: str
@@ -42,13 +42,13 @@ class SalvagedTopic:
 
 
 class SalvagedBag:
-    """A bag file read from its start to where it breaks; offers what is used of rosbags' reader.
+    """A bag file read from its start to the damage, with the interface of rosbags' reader that is used here.
 
     Args:
         files: the storage files of the bag, in order.
 
     Attributes:
-        broken: why and where reading ended, of each file.
+        broken: for each damaged file, why reading ended.
     """
 
     def __init__(self, files: list[Path]):
@@ -56,14 +56,15 @@ class SalvagedBag:
         self.broken: list[str] = []
         self._types: Typestore | None = None
         self.is2 = not any(_starts_with(file, _ROS1_MAGIC) for file in files)
-        counts: dict[str, list] = {}
+        kinds: dict[str, str] = {}
+        counts: Counter[str] = Counter()
         self.start_time, self.end_time = 0, 0
         for topic, kind, received, _ in self._scan():
-            entry = counts.setdefault(topic, [kind, 0])
-            entry[1] += 1
+            kinds.setdefault(topic, kind)
+            counts[topic] += 1
             self.start_time = min(self.start_time or received, received)
             self.end_time = max(self.end_time, received + 1)
-        self.connections = [SalvagedTopic(topic, kind, count) for topic, (kind, count) in counts.items()]
+        self.connections = [SalvagedTopic(topic, kind, counts[topic]) for topic, kind in kinds.items()]
         self.topics = {entry.topic: entry for entry in self.connections}
         self.message_count = sum(entry.msgcount for entry in self.connections)
 
@@ -71,10 +72,10 @@ class SalvagedBag:
         self, connections: Collection[SalvagedTopic], start: int | None = None, stop: int | None = None
     ) -> Iterator[tuple[SalvagedTopic, int, bytes]]:
         """Messages in the order of the file."""
-        wanted = {entry.topic: entry for entry in connections}
+        chosen = {entry.topic: entry for entry in connections}
         for topic, _, received, data in self._scan():
-            if topic in wanted and (start is None or received >= start) and (stop is None or received < stop):
-                yield wanted[topic], received, data
+            if topic in chosen and (start is None or received >= start) and (stop is None or received < stop):
+                yield chosen[topic], received, data
 
     def deserialize(self, data: bytes, message_type: str) -> Any:
         """A message with the attributes of its type."""
@@ -83,7 +84,7 @@ class SalvagedBag:
         return self._ros1_types().deserialize_ros1(data, message_type)
 
     def close(self) -> None:
-        """Nothing is kept open."""
+        """Do nothing: no file is kept open."""
 
     def _ros1_types(self) -> Typestore:
         if self._types is None:
@@ -114,7 +115,9 @@ class SalvagedBag:
             else:
                 raise _BrokenError("it is neither an mcap nor a ROS 1 bag file")
 
-    def _scan_ros1(self, stream: BinaryIO, size: int, connections: dict) -> Iterator[tuple[str, str, int, bytes]]:
+    def _scan_ros1(
+        self, stream: BinaryIO, size: int, connections: dict[bytes, tuple[str, str]]
+    ) -> Iterator[tuple[str, str, int, bytes]]:
         while stream.tell() < size:
             header = _ros1_header(_sized(stream, size, "<I"))
             data = _sized(stream, size, "<I")
@@ -143,7 +146,7 @@ class SalvagedBag:
             types.register(
                 {k: v for k, v in get_types_from_msg(definition, message_type).items() if k not in types.types}
             )
-        except Exception:  # an odd definition costs its own topic, not the bag
+        except Exception:  # an invalid definition affects its topic only
             return
 
 
@@ -152,7 +155,7 @@ def storage_files(path: Path) -> list[Path]:
     if path.is_file():
         return [path]
     found = [file for file in path.iterdir() if file.suffix in (".mcap", ".db3", ".bag", ".active")]
-    # Hidden files are somebody's scraps, except in a hidden folder: an unfinished bag of a writer that was killed.
+    # Hidden files are temporary, except in a hidden folder: an unfinished bag of a killed writer.
     return sorted(file for file in found if path.name.startswith(".") or not file.name.startswith("."))
 
 
@@ -171,7 +174,7 @@ def _take(stream: BinaryIO, count: int, left: int) -> bytes:
 
 
 def _sized(stream: BinaryIO, size: int, form: str) -> bytes:
-    """Content behind its length."""
+    """Content of a length-prefixed field."""
     (count,) = struct.unpack(form, _take(stream, struct.calcsize(form), size - stream.tell()))
     return _take(stream, count, size - stream.tell())
 
@@ -214,7 +217,7 @@ def _unpack(compression: str, data: bytes) -> bytes:
 
             return zstd.decompress(data)
         if compression == "lz4":
-            from lz4 import frame
+            from lz4 import frame  # type: ignore[import-untyped]
 
             return frame.decompress(data)
     except Exception as error:
@@ -239,7 +242,7 @@ def _ros1_header(data: bytes) -> dict[bytes, bytes]:
         (count,) = struct.unpack_from("<I", data, at)
         name, equals, value = data[at + 4 : at + 4 + count].partition(b"=")
         if not equals or count > len(data) - at - 4:
-            raise _BrokenError("a record's header makes no sense")
+            raise _BrokenError("a record has an invalid header")
         fields[name] = value
         at += 4 + count
     return fields

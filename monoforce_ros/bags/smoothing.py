@@ -1,4 +1,4 @@
-"""Smoothing: noisy poses → poses, velocities and yaw rates that belong together, with the noise that was taken out."""
+"""Smoothing: noisy poses → consistent poses, velocities and yaw rates, and an estimate of the noise."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from scipy.spatial.transform import Rotation
 from monoforce_ros.core import NANOSECOND, MotionTrack
 
 LARGEST_GAP = 1.0
-"""Poses further apart in time are not smoothed together [s]."""
+"""Time between poses beyond which they are not smoothed together [s]."""
 FASTEST = 15.0
-"""A larger speed between neighbouring poses is a jump of the localisation, not motion [m/s]."""
+"""Speed between neighbouring poses beyond which they are a jump of the localisation [m/s]."""
 _PIECE, _PIECES = 400, 3
 _EXPONENTS = (-9.0, 4.0)
-"""Decimal logarithm of the weight of curvature [m² s³ or rad² s³ per squared residual] that is tried."""
+"""Range of the decimal logarithm of the curvature weight [m² s³ or rad² s³ per squared residual]."""
 SHORTEST = 8
-"""Poses that a stretch needs to be smoothed; shorter ones are left as they are."""
+"""Number of poses below which a stretch is not smoothed."""
 
 
 @dataclass(frozen=True)
 class SmoothedMotion:
-    """Smooth motion and what was taken out of the recorded one."""
+    """Smoothed motion and the estimated noise of the recorded one."""
 
     motion: MotionTrack
-    """At the recorded stamps; velocities are those of the smooth poses, in base axes."""
+    """At the recorded stamps; velocities are derivatives of the smoothed poses, in base axes."""
     position_noise: float
-    """Standard deviation of each recorded coordinate about the smooth path [m]."""
+    """Standard deviation of each recorded coordinate about the smoothed path [m]."""
     rotation_noise: float
     """Standard deviation of the recorded rotation about each axis [rad]."""
     stretches: tuple[slice, ...]
-    """Runs of poses without a gap or a jump between them."""
+    """Ranges of poses without gaps or jumps."""
 
 
 def smooth(
@@ -42,38 +42,38 @@ def smooth(
 ) -> SmoothedMotion:
     """Smooth a recorded motion.
 
-    Each coordinate and each angle becomes a cubic smoothing spline over time (Reinsch 1967); how smooth is found by
-    cross-validation, every other pose against the curve through the rest, unless the noise is stated. Yaw is unwrapped
-    first, so that its rate is right when the robot reverses, stands or turns on the spot, where the direction of its
-    path is not.
+    A cubic smoothing spline over time (Reinsch 1967) is fitted to each coordinate and each angle. Its smoothness
+    follows from the noise if given, else from cross-validation of every other pose against the curve through the rest.
+    The yaw rate is that of the unwrapped heading and not of the path, so it is also valid when the robot reverses,
+    stands or turns on the spot.
 
     Args:
-        motion: recorded poses; their velocities are not used.
+        motion: recorded poses; velocities are ignored.
         position_noise: standard deviation of a recorded coordinate [m], if known.
         rotation_noise: standard deviation about an axis [rad], if known.
 
     Raises:
-        ValueError: a stated noise is negative, or a pose is not finite.
+        ValueError: a given noise is negative, or a pose is not finite.
     """
     for name, value in (("position noise", position_noise), ("rotation noise", rotation_noise)):
         if value is not None and not value >= 0.0:
-            raise ValueError(f"{name}: got {value}, expected 0 or more, or None to find it")
+            raise ValueError(f"{name}: got {value}, expected 0 or more, or None to estimate it")
     if not (np.isfinite(motion.positions).all() and np.isfinite(motion.quaternions).all()):
-        raise ValueError("motion: some poses are not finite; leave them out first")
+        raise ValueError("motion: some poses are not finite; remove them first")
     positions, angles = motion.positions.copy(), _angles(motion.quaternions)
     speeds, turns = np.zeros_like(positions), np.zeros_like(angles)
     stretches = tuple(_stretches(motion))
-    lost = [0.0, 0.0]
-    used = [0, 0]
+    squares = [0.0, 0.0]
+    freedom = [0.0, 0.0]
     for stretch in stretches:
         times = (motion.stamps[stretch] - motion.stamps[stretch.start]) * NANOSECOND
         for kind, (values, rates, noise) in enumerate(
             ((positions, speeds, position_noise), (angles, turns, rotation_noise))
         ):
             for axis in range(3):
-                taken, freedom = _fit(times, values[stretch, axis], rates[stretch, axis], noise)
-                lost[kind] += taken
-                used[kind] += freedom
+                residual, degrees = _fit(times, values[stretch, axis], rates[stretch, axis], noise)
+                squares[kind] += residual
+                freedom[kind] += degrees
     rotations = Rotation.from_euler("ZYX", angles[:, ::-1])
     smoothed = replace(
         motion,
@@ -82,18 +82,18 @@ def smooth(
         linear_velocities=rotations.inv().apply(speeds),
         angular_velocities=_body_rates(angles, turns),
     )
-    found = [float(np.sqrt(lost[kind] / used[kind])) if used[kind] > 0 else 0.0 for kind in range(2)]
+    found = [float(np.sqrt(s / f)) if f > 0 else 0.0 for s, f in zip(squares, freedom, strict=True)]
     return SmoothedMotion(smoothed, found[0], found[1], stretches)
 
 
 def _angles(quaternions: np.ndarray) -> np.ndarray:
-    """Roll, pitch and unwrapped yaw ``[n, 3]`` [rad]; a ground robot stays far from a pitch of 90°."""
+    """Roll, pitch and unwrapped yaw ``[n, 3]`` [rad]; ground robots stay far from a pitch of 90°."""
     yaw, pitch, roll = Rotation.from_quat(quaternions).as_euler("ZYX").T
     return np.stack([np.unwrap(roll), np.unwrap(pitch), np.unwrap(yaw)], axis=1)
 
 
 def _body_rates(angles: np.ndarray, rates: np.ndarray) -> np.ndarray:
-    """Angular velocity ``[n, 3]`` in base axes of roll, pitch and yaw and their rates."""
+    """Angular velocity ``[n, 3]`` in base axes from roll, pitch and yaw and their rates."""
     roll, pitch, _ = angles.T
     roll_rate, pitch_rate, yaw_rate = rates.T
     return np.stack(
@@ -111,14 +111,18 @@ def _stretches(motion: MotionTrack) -> list[slice]:
         return []
     steps = np.diff(motion.stamps) * NANOSECOND
     moved = np.linalg.norm(np.diff(motion.positions, axis=0), axis=1)
-    # A jump must stand out of the noise too: at 100 Hz a centimetre of it looks fast.
+    # A jump must also exceed the noise: at 100 Hz, a centimetre of noise looks fast.
     broken = (steps > LARGEST_GAP) | ((moved > FASTEST * steps) & (moved > 0.5))
     edges = np.r_[0, np.flatnonzero(broken) + 1, len(motion)]
     return [slice(int(low), int(high)) for low, high in itertools.pairwise(edges)]
 
 
 def _fit(times: np.ndarray, values: np.ndarray, rates: np.ndarray, noise: float | None) -> tuple[float, float]:
-    """Replace ``values`` by a smooth curve and ``rates`` by its slope; returns squared residuals and their freedom."""
+    """Replace ``values`` by a smooth curve and ``rates`` by its slope.
+
+    Returns:
+        sum of the squared residuals, and their degrees of freedom.
+    """
     if len(times) < SHORTEST:
         if len(times) > 1:
             rates[:] = np.gradient(values, times)
@@ -134,13 +138,13 @@ def _fit(times: np.ndarray, values: np.ndarray, rates: np.ndarray, noise: float 
     residuals = centred - spline(times)
     values[:] = values - residuals
     rates[:] = spline.derivative()(times)
-    # The residuals of a curve that follows the noise are smaller than it, by the curve's own freedom.
+    # A curve that partly follows the noise has residuals smaller than the noise, by its degrees of freedom.
     freedom = max(len(times) - _degrees(residuals), 0.25 * len(times))
     return float((residuals**2).sum()), freedom
 
 
 def _penalty(times: np.ndarray, values: np.ndarray) -> float:
-    """The weight of curvature that predicts left-out poses best, from a few pieces of the stretch."""
+    """The curvature weight that best predicts left-out poses, from a few pieces of the stretch."""
     count = min(_PIECES, max(1, len(times) // _PIECE))
     starts = np.linspace(0, max(0, len(times) - _PIECE), count).astype(int)
     pieces = [slice(start, start + _PIECE) for start in starts]
@@ -148,10 +152,10 @@ def _penalty(times: np.ndarray, values: np.ndarray) -> float:
     def error(exponent: float) -> float:
         total = 0.0
         for piece in pieces:
-            at, shown = times[piece], values[piece]
+            at, measured = times[piece], values[piece]
             for kept, left in ((slice(0, None, 2), slice(1, -1, 2)), (slice(1, None, 2), slice(2, -1, 2))):
-                curve = make_smoothing_spline(at[kept], shown[kept], lam=10.0**exponent)
-                total += float(((curve(at[left]) - shown[left]) ** 2).sum())
+                curve = make_smoothing_spline(at[kept], measured[kept], lam=10.0**exponent)
+                total += float(((curve(at[left]) - measured[left]) ** 2).sum())
         return total
 
     if len(times) < 2 * SHORTEST:
@@ -161,7 +165,7 @@ def _penalty(times: np.ndarray, values: np.ndarray) -> float:
 
 
 def _with_noise(times: np.ndarray, values: np.ndarray, noise: float) -> BSpline:
-    """The smoothest curve whose residuals have the stated standard deviation."""
+    """The smoothest curve whose residuals have the given standard deviation."""
 
     def excess(exponent: float) -> float:
         return float(np.std(values - make_smoothing_spline(times, values, lam=10.0**exponent)(times)) - noise)
@@ -175,10 +179,10 @@ def _with_noise(times: np.ndarray, values: np.ndarray, noise: float) -> BSpline:
 
 
 def _degrees(residuals: np.ndarray) -> float:
-    """Degrees of freedom that a smoothing spline spends, from how much its residuals correlate with their neighbours.
+    """Degrees of freedom used by a smoothing spline, from the correlation of neighbouring residuals.
 
-    Pure noise about a curve that is too stiff to follow it has uncorrelated residuals; a curve that follows leaves
-    residuals that alternate. The correlation of neighbours is about minus half the share of freedom spent.
+    A curve too stiff to follow white noise leaves uncorrelated residuals; one that follows it leaves alternating ones.
+    The correlation of neighbours is about minus half the fraction of the degrees of freedom used.
     """
     spread = float((residuals**2).sum())
     if spread <= 0.0:

@@ -1,4 +1,4 @@
-"""The message types that bags are read and written with: ROS 2 Jazzy's and those of ``msg_defs/``."""
+"""Message types for reading and writing bags: those of ROS 2 Jazzy and of ``msg_defs/``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Windows: pieces of a drive with the commands before and in them and the motion that followed."""
+"""Windows: sections of a recording with their motion and commands, including the commands before each section."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from monoforce_ros.core import CommandTrack, MotionState, MotionTrack, StaleData
 
 @dataclass(frozen=True)
 class Windows:
-    """Pieces of a drive, all of one length."""
+    """Sections of a recording, all of the same length."""
 
     starts: tuple[MotionState, ...]
     """Measured state at the start of each window, ``[W]``."""
     twists: np.ndarray
-    """Commanded forward speed [m/s] and yaw rate [rad/s] at each physics step from ``history`` before the start on,
-    ``[W, history + T, 2]``."""
+    """Commanded forward speed [m/s] and yaw rate [rad/s] at each physics step, beginning ``history`` steps before the
+    start, ``[W, history + T, 2]``."""
     history: int
     """Physics steps before the start."""
     times: np.ndarray
-    """Times since the start at which motion was sampled [s], ``[K]``."""
+    """Times since the start at which the motion is sampled [s], ``[K]``."""
     positions: np.ndarray
-    """Measured positions at these times in the odometry frame [m], ``[W, K, 3]``; NaN where there was no odometry."""
+    """Measured positions at these times in the odometry frame [m], ``[W, K, 3]``."""
     rotations: np.ndarray
     """Measured rotations odometry ← base, ``[W, K, 3, 3]``."""
     velocities: np.ndarray
@@ -47,23 +47,23 @@ def cut_windows(
     maximum_gap: float = 0.3,
     timeout: float = np.inf,
 ) -> Windows:
-    """Cut a drive into windows.
+    """Cut a recording into windows.
 
-    A window is left out where odometry has a gap within it: nothing is interpolated over more than ``maximum_gap``.
+    Windows with a gap in the odometry are left out: nothing is interpolated over more than ``maximum_gap``.
 
     Args:
-        motion: measured, or smoothed.
-        commands: recorded; before the first one the robot stands.
+        motion: measured or smoothed motion.
+        commands: recorded commands; zero before the first one.
         length: of a window [s].
-        stride: between the starts of windows [s].
-        history: of commands before each start [s], which delays and lags of the drives need.
+        stride: time between the starts of windows [s].
+        history: duration of the commands before each start [s], for delays and lags of the drives.
         time_step: of the physics [s].
-        sample_time: between the samples of the motion [s].
-        maximum_gap: largest distance in time of a sample to the odometry around it [s].
-        timeout: age at which a command no longer holds [s].
+        sample_time: time between samples of the motion [s].
+        maximum_gap: largest time between a sample and the odometry around it [s].
+        timeout: age beyond which a command is ignored [s].
 
     Raises:
-        ValueError: no window is left; the message says how long the odometry is.
+        ValueError: no window is left; the message gives the duration of the odometry.
     """
     steps, before = round(length / time_step), round(history / time_step)
     times = np.arange(round(length / sample_time) + 1) * sample_time

@@ -1,4 +1,4 @@
-"""BagWriter: a rosbag2 folder that appears under its name only when it is complete."""
+"""BagWriter: write a rosbag2 folder that appears under its name only when it is complete."""
 
 from __future__ import annotations
 
@@ -33,15 +33,16 @@ _LATCHED = Qos(
 class BagWriter:
     """Write a rosbag2 bag: ``with BagWriter(path) as bag: bag.write("/odom", message, stamp)``.
 
-    The bag is written beside its target and renamed when the block ends without an error, so that a half-written
-    bag never stands under the final name. After an error the unfinished bag is removed, unless ``keep`` is set: what
-    cannot be made again, such as a recording, is then finished as it is, or left where it lies if even that fails.
+    The bag is written to a hidden folder next to its target and renamed when the block ends without an error, so the
+    target is never half-written. After an error the unfinished bag is removed unless ``keep`` is set, which is meant
+    for data that cannot be recorded again: the bag is then finished as it is, or left in the hidden folder if that
+    fails.
 
     Args:
         path: folder of the bag; must not exist unless ``overwrite``.
         storage: ``mcap`` or ``sqlite3``.
         overwrite: replace an existing bag once the new one is complete.
-        keep: after an error keep what was written.
+        keep: keep the messages written before an error.
 
     Raises:
         ValueError: the storage is unknown.
@@ -58,7 +59,7 @@ class BagWriter:
         self._keep = keep
         self._writer = Writer(self._unfinished, version=9, storage_plugin=_STORAGES[storage])
         if storage == "mcap":
-            # Chunks are compressed inside the file, as ros2 bag's own mcap presets do.
+            # Compressed chunks within the file, like the mcap presets of ros2 bag.
             self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
         self._types = type_store()
         self._connections: dict[str, Connection] = {}
@@ -83,7 +84,7 @@ class BagWriter:
             if not self._keep:
                 raise
             raise OSError(
-                f"{failure}; what was written up to then lies in {self._unfinished} and can be read as it is"
+                f"{failure}; the messages written so far lie in {self._unfinished} and can be read as they are"
             ) from failure
 
     def _finish(self) -> None:
@@ -100,7 +101,7 @@ class BagWriter:
         )
 
     def write_serialized(self, topic: str, message_type: str, data: bytes | memoryview, stamp: int) -> None:
-        """Append a message that is CDR-encoded already; ``stamp`` is its time of reception [ns]."""
+        """Append a CDR-encoded message received at ``stamp`` [ns]."""
         connection = self._connections.get(topic)
         if connection is None:
             latched = topic.rsplit("/", 1)[-1] == "tf_static"
@@ -111,7 +112,7 @@ class BagWriter:
         self._writer.write(connection, stamp, data)
 
     def flush(self) -> None:
-        """Bring to the disk what was written so far: a process that is killed then loses nothing of it."""
+        """Write all messages so far to disk, so that a killed process does not lose them."""
         storage = self._writer.storage
         if isinstance(storage, McapWriter):
             if storage.chunk.msgs:
@@ -122,12 +123,12 @@ class BagWriter:
 
     @staticmethod
     def unfinished(path: str | Path) -> list[Path]:
-        """Folders of bags for ``path`` whose writers were killed; :class:`BagReader` reads them as they are."""
+        """Unfinished bags for ``path`` left by killed writers; :class:`BagReader` reads them as they are."""
         path = Path(path)
         return sorted(path.parent.glob(f".{path.name}.unfinished-*"))
 
     def _name_storage_file(self) -> None:
-        """Name the storage file after the bag, not after the temporary folder it was written in."""
+        """Name the storage file after the bag instead of the temporary folder."""
         metadata = self._unfinished / "metadata.yaml"
         text = metadata.read_text(encoding="utf-8")
         for file in self._unfinished.iterdir():

@@ -1,4 +1,4 @@
-"""``convert``: folders and files of public datasets into bags."""
+"""``convert``: convert public datasets to bags."""
 
 from __future__ import annotations
 
@@ -18,24 +18,30 @@ def build_parser() -> argparse.ArgumentParser:
     """The command line's options."""
     parser = argparse.ArgumentParser(
         prog="convert",
-        description="Write a public dataset's folder or file as a rosbag2 bag. What in the bag is not a measurement is "
-        "printed, and said in the bag's topic /about.",
+        description="Convert a folder or file of a public dataset to a rosbag2 bag. Data in the bag that are not "
+        "measurements are listed in the output and on the bag's topic /about.",
     )
     kinds = parser.add_subparsers(dest="kind", required=True)
-    rough = kinds.add_parser("rough", help="a scene of ROUGH / RobinGas: images, calibration, cloud, poses")
-    rough.add_argument("--twist", nargs=2, type=float, default=(0.5, 0.0), metavar=("M/S", "RAD/S"), help="commands")
-    rough.add_argument("--seconds", type=float, default=10.0, help="of odometry after the cloud (%(default)s)")
-    rellis = kinds.add_parser("rellis", help="a sequence of RELLIS-3D: images, clouds, poses")
-    rellis.add_argument("--first", type=int, default=0, metavar="FRAME", help="(%(default)s)")
-    rellis.add_argument("--count", type=int, metavar="FRAMES", help="(all)")
-    rellis.add_argument("--robot", default="warthog", help="whose lidar pose to take (%(default)s)")
-    drive = kinds.add_parser("drive", help="windows (.npz) or a log (.csv.gz) of DRIVE: commands, poses, wheels, gyro")
-    drive.add_argument("--correct-delay", action="store_true", help="stamp the late poses as early as the gyro says")
+    rough = kinds.add_parser("rough", help="ROUGH / RobinGas scene: images, calibration, cloud, poses")
+    rough.add_argument(
+        "--twist", nargs=2, type=float, default=(0.5, 0.0), metavar=("M/S", "RAD/S"), help="command to write"
+    )
+    rough.add_argument(
+        "--seconds", type=float, default=10.0, help="duration of the odometry after the cloud (%(default)s)"
+    )
+    rellis = kinds.add_parser("rellis", help="RELLIS-3D sequence: images, clouds, poses")
+    rellis.add_argument("--first", type=int, default=0, metavar="FRAME", help="first frame (%(default)s)")
+    rellis.add_argument("--count", type=int, metavar="FRAMES", help="number of frames (all)")
+    rellis.add_argument("--robot", default="warthog", help="robot whose lidar pose is used (%(default)s)")
+    drive = kinds.add_parser("drive", help="DRIVE windows (.npz) or log (.csv.gz): commands, poses, wheel speeds, gyro")
+    drive.add_argument(
+        "--correct-delay", action="store_true", help="correct the pose stamps by the delay relative to the gyro"
+    )
     for kind in (rough, rellis, drive):
         kind.add_argument("source", type=Path, help="folder or file of the dataset")
         kind.add_argument("out", type=Path, help="folder of the bag")
         kind.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap", help="(%(default)s)")
-        kind.add_argument("--force", action="store_true", help="replace OUT if it exists")
+        kind.add_argument("--force", action="store_true", help="overwrite OUT if it exists")
     return parser
 
 
@@ -60,8 +66,8 @@ def main(arguments: list[str] | None = None) -> int:
                 **writing,
             )  # fmt: skip
         else:
-            recording = DriveRecording.open(options.source)
-            remarks = drive_to_bag(recording, options.out, correct_delay=options.correct_delay, **writing)
+            source = DriveRecording.open(options.source)
+            remarks = drive_to_bag(source, options.out, correct_delay=options.correct_delay, **writing)
     except (DatasetError, RobotFileError, ValueError, OSError) as error:
         print(f"convert: {error}", file=sys.stderr)
         return 1

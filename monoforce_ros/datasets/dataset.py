@@ -1,4 +1,4 @@
-"""What loaders of other people's folders share."""
+"""Error and message conversion shared by the dataset loaders."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from monoforce_ros.core import MotionTrack
 
 
 class DatasetError(ValueError):
-    """A dataset folder that lacks something or holds something unusable; the message names the file."""
+    """A dataset with a missing or invalid file; the message names the file."""
 
 
-def odometry_message(motion: MotionTrack, index: int):
+def odometry_message(motion: MotionTrack, index: int) -> builders.Message:
     """``nav_msgs/Odometry`` of one state of a motion."""
     return builders.odometry(
         int(motion.stamps[index]),

@@ -1,9 +1,8 @@
 """DRIVE: commands and measured motion of Clearpath robots (github.com/norlab-ulaval/DRIVE).
 
-Two forms are read: ``.npz`` files of 2 s windows at 20 Hz, three to a command that is held for 6 s, and continuous
-``.csv(.gz)`` logs. Their traps are met by what the data show: the gyro's sign and the delay of the lidar's poses are
-found by comparing both, poses that are only repeated until the next one comes are left out, and windows are joined by
-their order and masks.
+Two formats are read: ``.npz`` files of 2 s windows at 20 Hz, three for each command held for 6 s, and continuous
+``.csv(.gz)`` logs. The gyro's sign and the delay of the lidar's poses are estimated by comparing the two; poses that
+are repeated until the next one arrives are dropped, and windows are joined by their order and masks.
 """
 
 from __future__ import annotations
@@ -22,14 +21,14 @@ from monoforce_ros.core import DelayCorrelation, Delayed, MotionTrack
 from monoforce_ros.datasets.dataset import DatasetError, odometry_message
 
 WHEEL_RADIUS, TRACK_WIDTH = 0.3, 1.08
-"""Of the Warthog that recorded the data [m]."""
+"""Dimensions of the Warthog that recorded the data [m]."""
 BASE_FRAME = "base_link"
 START_STAMP = 1_700_000_000 * 10**9
-"""Stamp of the first sample of windows, which carry no time of their own [ns]."""
+"""Stamp of the first sample of windows, which have no time [ns]."""
 PAUSE = 4.0
-"""Time between runs of windows in a bag [s]: longer than any gap that is interpolated over."""
+"""Time between runs of windows in a bag [s], longer than any gap that is interpolated."""
 LARGEST_FILE = 1_000_000_000
-"""Bytes of unpacked data beyond which a file is not read."""
+"""Size of unpacked data beyond which a file is rejected [bytes]."""
 
 _FIELDS = (
     "cmd_left", "cmd_right", "left_wheel_vel", "right_wheel_vel", "icp_x", "icp_y", "icp_z", "icp_roll", "icp_pitch",
@@ -41,17 +40,17 @@ _COLUMNS = (
 )  # fmt: skip
 _LONGEST_REPEAT = 0.25
 _LAGS = np.arange(-10, 61) * 0.05
-"""Delays that are tried [s]."""
+"""Candidate delays [s]."""
 _LONG_RUN, _TRANSIENT = 20.0, 3.0
-"""Runs shorter than this hold one command, and most of their turning changes within this time [s]."""
+"""Runs shorter than the first hold one command and turn at a changing rate mostly within the second [s]."""
 _FASTEST_TURN = 2.5
 _WEAKEST = 0.5
-"""Correlation below which nothing is concluded."""
+"""Correlation below which the clocks are considered unknown."""
 
 
 @dataclass(frozen=True)
 class DriveRun:
-    """Samples without an interruption."""
+    """Samples without interruption."""
 
     stamps: np.ndarray
     """``[n]`` int64 [ns], evenly spaced."""
@@ -60,7 +59,7 @@ class DriveRun:
     wheels: np.ndarray
     """Measured speeds of the left and right wheels [rad/s], ``[n, 2]``."""
     positions: np.ndarray
-    """By the lidar's localisation, ``[n, 3]`` [m]."""
+    """From lidar localisation, ``[n, 3]`` [m]."""
     quaternions: np.ndarray
     """``[n, 4]`` x, y, z, w."""
     gyro: np.ndarray
@@ -69,14 +68,14 @@ class DriveRun:
 
 @dataclass(frozen=True)
 class ClockFinding:
-    """What comparing the lidar's headings with the gyro shows."""
+    """Result of comparing the lidar's headings with the gyro."""
 
     gyro_sign: int
-    """1, or -1 where the gyro is mounted upside down; 0 where the data do not tell."""
+    """1, or -1 where the gyro is mounted upside down; 0 if unknown."""
     pose_delay: float
-    """How late the poses are against the gyro [s]; NaN where the data do not tell."""
+    """Delay of the poses relative to the gyro [s]; NaN if unknown."""
     correlation: float
-    """Between both yaw rates at this delay, 0 to 1."""
+    """Correlation of the two yaw rates at this delay, 0 to 1."""
 
 
 @dataclass(frozen=True)
@@ -86,11 +85,11 @@ class DriveRecording:
     path: Path
     runs: tuple[DriveRun, ...]
     steady: np.ndarray | None = None
-    """Of windows: which of them are steady, ``[windows]`` bool, in the order of the file."""
+    """For windows: whether each is in steady state, ``[windows]`` bool, in the order of the file."""
 
     @classmethod
     def open(cls, path: str | Path) -> DriveRecording:
-        """Read a file of windows or a continuous log, by its ending.
+        """Read a file of windows or a continuous log, depending on its extension.
 
         Raises:
             DatasetError: the file is missing, too large, damaged, or of another layout.
@@ -102,13 +101,14 @@ class DriveRecording:
             return _open_windows(path)
         if path.name.endswith((".csv", ".csv.gz")):
             return _open_log(path)
-        raise DatasetError(f"{path}: got {path.suffix or 'no ending'}, expected .npz, .csv or .csv.gz")
+        raise DatasetError(f"{path}: got {path.suffix or 'no extension'}, expected .npz, .csv or .csv.gz")
 
     def clocks(self) -> ClockFinding:
-        """Find the gyro's sign and how late the poses are, from the turns of all runs.
+        """Estimate the gyro's sign and the delay of the poses from the turns of all runs.
 
-        All delays are compared over the same samples of the poses; before and after a run the gyro is taken to go on as
-        at its ends, where commands were held. The steady part of a run tells no delay and is left out.
+        All delays are compared over the same pose samples; before and after a run the gyro is assumed to keep its first
+        and last value, as the command is held there. The steady part of a run has no information on the delay and is
+        not used.
         """
         pairs = [pair for pair in map(_yaw_rates, self.runs) if pair is not None]
         found = DelayCorrelation.of(map(_delayed_gyro, pairs), _LAGS)
@@ -131,30 +131,31 @@ def drive_to_bag(
 ) -> list[str]:
     """Write a recording as a bag: commands, odometry, wheel speeds and yaw rate.
 
-    Velocities of the odometry are those of its smoothed poses. Runs of windows follow each other with a pause, and
-    each starts at the origin.
+    Velocities of the odometry are derivatives of the smoothed poses. Runs of windows are separated by a pause, and each
+    starts at the origin.
 
     Args:
-        recording: the file.
+        recording: file of the dataset.
         out: folder of the bag.
-        correct_delay: stamp the poses as early as the gyro says; else they stay as late as they were recorded.
+        correct_delay: correct the pose stamps by the delay relative to the gyro; else they stay as recorded.
         storage: ``mcap`` or ``sqlite3``.
         overwrite: replace an existing bag.
 
     Returns:
-        remarks on what was found and changed.
+        remarks on findings and corrections.
     """
     clocks = recording.clocks()
     remarks = []
     if clocks.gyro_sign == 0:
-        remarks.append("whether the gyro is upside down cannot be told: it does not follow the poses' headings")
+        remarks.append("the gyro's sign is unknown, since it does not correlate with the headings of the poses")
     else:
         remarks.append(
-            f"the poses are {clocks.pose_delay:.2f} s late against the gyro (correlation {clocks.correlation:.2f}); "
+            f"the poses are {clocks.pose_delay:.2f} s late relative to the gyro "
+            f"(correlation {clocks.correlation:.2f}); "
             + ("their stamps are corrected" if correct_delay else "their stamps are left as recorded")
         )
         if clocks.gyro_sign < 0:
-            remarks.append("the gyro turns the other way than the poses: its sign is corrected")
+            remarks.append("the gyro has the opposite sign of the poses' yaw rate: its sign is corrected")
     shift = round(1e9 * clocks.pose_delay) if correct_delay and clocks.gyro_sign else 0
     messages: list[tuple[int, str, object]] = []
     for run in recording.runs:
@@ -170,7 +171,7 @@ def drive_to_bag(
                 child_frame_id=BASE_FRAME,
             )
         ).motion
-        # Poses as they were recorded; only their velocities, which were not, come from the smooth motion.
+        # Poses stay as recorded; velocities, which were not recorded, come from the smoothed motion.
         motion = MotionTrack(
             motion.stamps, run.positions[fresh], run.quaternions[fresh], motion.linear_velocities,
             motion.angular_velocities, "odom", BASE_FRAME,
@@ -184,7 +185,7 @@ def drive_to_bag(
                 rate = np.array([0.0, 0.0, clocks.gyro_sign * run.gyro[index]])
                 messages.append((stamp, "/imu/data", builders.imu(stamp, "imu_link", rate, np.zeros(3))))
     if clocks.gyro_sign:
-        remarks.append("/imu/data holds the yaw rate alone")
+        remarks.append("/imu/data contains only the yaw rate")
     first = min(stamp for stamp, _, _ in messages)
     about = builders.string("; ".join([f"from DRIVE {recording.path.name}", *remarks]))
     with BagWriter(out, storage=storage, overwrite=overwrite) as bag:
@@ -195,12 +196,12 @@ def drive_to_bag(
 
 
 def _fresh_poses(run: DriveRun) -> np.ndarray:
-    """Which samples hold a pose of their own, ``[n]`` bool: the log repeats a pose until the next one comes."""
+    """Whether each sample has a new pose, ``[n]`` bool; the log repeats a pose until the next one arrives."""
     same = (np.diff(run.positions, axis=0) == 0.0).all(axis=1) & (np.diff(run.quaternions, axis=0) == 0.0).all(axis=1)
     fresh = np.r_[True, ~same]
     last = 0
     for index in range(1, len(fresh)):
-        # A robot that stands repeats its pose too: then it is said again now and then.
+        # A robot at rest repeats its pose too, so a repeated pose is accepted at intervals.
         if not fresh[index] and (run.stamps[index] - run.stamps[last]) * 1e-9 >= _LONGEST_REPEAT:
             fresh[index] = True
         if fresh[index]:
@@ -209,9 +210,9 @@ def _fresh_poses(run: DriveRun) -> np.ndarray:
 
 
 def _yaw_rates(run: DriveRun) -> tuple[np.ndarray, np.ndarray, float] | None:
-    """Yaw rates by the poses and by the gyro at the same times, averaged over a third of a second, and their step [s].
+    """Yaw rates of poses and gyro at the same times, averaged over a third of a second, and their time step [s].
 
-    Between poses of their own the headings are interpolated; what no robot turns like is a jump of the localisation.
+    Headings are interpolated between new poses; larger rates than a robot's are jumps of the localisation and clipped.
     """
     if len(run.stamps) < 40:
         return None
@@ -227,7 +228,7 @@ def _yaw_rates(run: DriveRun) -> tuple[np.ndarray, np.ndarray, float] | None:
 
 
 def _delayed_gyro(pair: tuple[np.ndarray, np.ndarray, float]) -> tuple[np.ndarray, Delayed]:
-    """The turning part of a run: yaw rate by the poses, and by the gyro as a function of the delay."""
+    """Yaw rate of the poses in the transient part of a run, and of the gyro as a function of the delay."""
     pose, gyro, step = pair
     reach = int(np.rint(np.abs(_LAGS).max() / step))
     padded = np.pad(gyro, reach, mode="edge")
@@ -262,7 +263,7 @@ def _open_windows(path: Path) -> DriveRecording:
     count = next(iter(shapes))[0]
     steady, transitory = data["steady_state_mask"] > 0.5, data["transitory_state_mask"] > 0.5
     if steady.shape != (count,) or transitory.shape != (count,) or not 0.001 <= float(data["dt"]) <= 1.0:
-        raise DatasetError(f"{path}: its masks or its time step do not fit its {count} windows")
+        raise DatasetError(f"{path}: masks or time step do not fit its {count} windows")
     finite = np.logical_and.reduce([np.isfinite(data[name]).all(axis=1) for name in _FIELDS])
     step = round(1e9 * float(data["dt"]))
     runs, begin = [], START_STAMP
@@ -280,23 +281,23 @@ def _open_windows(path: Path) -> DriveRecording:
 
 
 def _join(data: dict[str, np.ndarray], members: list[int], begin: int, step: int) -> DriveRun:
-    """Windows that follow each other, each zeroed at its start, as one run."""
+    """Join consecutive windows, each of which starts at the origin, to one run."""
     positions, rotations = [], []
-    place, turn = np.zeros(3), Rotation.identity()
+    origin, turn = np.zeros(3), Rotation.identity()
     for k in members:
-        own = np.stack([data[name][k] for name in ("icp_x", "icp_y", "icp_z")], axis=1)
+        window = np.stack([data[name][k] for name in ("icp_x", "icp_y", "icp_z")], axis=1)
         angles = np.stack([data[name][k] for name in ("icp_yaw", "icp_pitch", "icp_roll")], axis=1)
-        own_turn = Rotation.from_euler("ZYX", angles)
-        # Relative to its own first sample, which rounding leaves near zero.
-        relative = own_turn[0].inv() * own_turn
-        moved = own_turn[0].inv().apply(own - own[0])
-        positions.append(place + turn.apply(moved))
+        window_turn = Rotation.from_euler("ZYX", angles)
+        # Relative to the first sample, which is not exactly zero due to rounding.
+        relative = window_turn[0].inv() * window_turn
+        moved = window_turn[0].inv().apply(window - window[0])
+        positions.append(origin + turn.apply(moved))
         rotations.append((turn * relative).as_quat())
-        # On to the next window's start: one step more at the speed of the last half second.
+        # Extrapolate to the start of the next window: one step at the speed of the last half second.
         reach = min(10, len(moved) - 1)
         drift = (relative[-1 - reach].inv() * relative[-1]).as_rotvec() / reach
         ahead = relative[-1].inv().apply(moved[-1] - moved[-1 - reach]) / reach
-        place = positions[-1][-1] + (turn * relative[-1]).apply(ahead)
+        origin = positions[-1][-1] + (turn * relative[-1]).apply(ahead)
         turn = turn * relative[-1] * Rotation.from_rotvec(drift)
 
     def joined(name: str) -> np.ndarray:
@@ -325,16 +326,16 @@ def _open_log(path: Path) -> DriveRecording:
             missing = sorted(set(_COLUMNS) - set(names))
             if missing:
                 raise DatasetError(f"{path}: got no column {', '.join(missing)}; expected a continuous log of DRIVE")
-            places = [names.index(name) for name in _COLUMNS]
+            columns = [names.index(name) for name in _COLUMNS]
             for number, row in enumerate(reader, start=2):
                 read += sum(map(len, row)) + len(row)
                 if read > LARGEST_FILE:
                     raise DatasetError(f"{path}: more than {LARGEST_FILE} bytes of text")
-                if len(row) <= max(places):
+                if len(row) <= max(columns):
                     raise DatasetError(f"{path}, line {number}: got {len(row)} columns, expected {len(names)}")
-                # Nanoseconds of this century do not fit into a double.
-                stamps.append(int(row[places[0]]))
-                rows.append([float(row[place]) for place in places[1:]])
+                # A double cannot represent current stamps in nanoseconds.
+                stamps.append(int(row[columns[0]]))
+                rows.append([float(row[column]) for column in columns[1:]])
     except (OSError, EOFError, UnicodeDecodeError, csv.Error, ValueError) as error:
         if isinstance(error, DatasetError):
             raise
@@ -353,5 +354,5 @@ def _open_log(path: Path) -> DriveRecording:
             row = values[part]
             runs.append(DriveRun(times[part], row[:, 2:4], row[:, 0:2], row[:, 4:7], row[:, 7:11], row[:, 11]))
     if not runs:
-        raise DatasetError(f"{path}: no stretch of 20 samples without a gap")
+        raise DatasetError(f"{path}: no 20 consecutive samples without a gap")
     return DriveRecording(path, tuple(runs))

@@ -3,8 +3,8 @@
 A sequence is a folder ``00000`` to ``00004`` of ``os1_cloud_node_kitti_bin/<frame>.bin`` (float32 x, y, z, intensity),
 ``pylon_camera_node/frame<frame>-<sec>_<msec>.jpg``, ``poses.txt`` (a 3 × 4 matrix map ← lidar for each frame),
 ``camera_info.txt`` (fx fy cx cy) and ``transforms.yaml`` (the camera's pose in the lidar's frame). Splits are lists
-``pt_train.lst``, ``pt_val.lst`` and ``pt_test.lst`` beside the sequences. Clouds carry no time of their own: that of
-the image with their number is theirs.
+``pt_train.lst``, ``pt_val.lst`` and ``pt_test.lst`` next to the sequences. Clouds have no time and take that of the
+image with the same number.
 """
 
 from __future__ import annotations
@@ -37,21 +37,21 @@ class RellisSequence:
 
     path: Path
     stamps: np.ndarray
-    """Of each frame, ``[n]`` int64 [ns]."""
+    """Stamp of each frame, ``[n]`` int64 [ns]."""
     images: dict[int, Path]
     """Image file of each frame that has one."""
     map_from_lidar: np.ndarray
     """``[n, 4, 4]``."""
     camera: CameraModel
     lidar_from_camera: np.ndarray
-    """``[4, 4]``, the camera's frame being optical."""
+    """``[4, 4]``, with the optical frame of the camera."""
 
     @classmethod
     def open(cls, path: str | Path) -> RellisSequence:
         """Read a sequence's calibration, poses and file names.
 
         Raises:
-            DatasetError: something is missing or makes no sense.
+            DatasetError: a file is missing or invalid.
         """
         path = Path(path)
         for part in (CLOUDS, IMAGES, "poses.txt", "camera_info.txt", "transforms.yaml"):
@@ -73,9 +73,9 @@ class RellisSequence:
         known = np.array(sorted(times))
         stamps = np.array([times[frame] for frame in known], np.int64)
         if (np.diff(stamps) <= 0).any():
-            raise DatasetError(f"{path / IMAGES}: the stamps of the images do not grow with their numbers")
+            raise DatasetError(f"{path / IMAGES}: the stamps of the images do not increase with their numbers")
         first = stamps[0]
-        # Frames without an image lie between those with one, and beyond them at the lidar's rate.
+        # Frames without an image are interpolated, and extrapolated at the lidar's rate.
         seconds = np.interp(frames, known, (stamps - first).astype(np.float64))
         seconds = np.where(frames < known[0], (frames - known[0]) * float(_FRAME_TIME), seconds)
         last = float(stamps[-1] - first)
@@ -94,7 +94,7 @@ class RellisSequence:
         return len(self.stamps)
 
     def cloud(self, frame: int) -> np.ndarray:
-        """Returns ``[n, 3]`` float32 [m] in the lidar's frame; raises ``DatasetError`` where there is no such cloud."""
+        """Returns ``[n, 3]`` float32 [m] in the lidar's frame; raises ``DatasetError`` if there is no such cloud."""
         file = self.path / CLOUDS / f"{frame:06d}.bin"
         if not file.is_file():
             raise DatasetError(f"{file}: no such cloud")
@@ -104,7 +104,7 @@ class RellisSequence:
         return np.fromfile(file, np.float32).reshape(-1, 4)[:, :3]
 
     def image(self, frame: int) -> np.ndarray:
-        """RGB pixels ``[height, width, 3]``; raises ``DatasetError`` where there is no such image."""
+        """RGB pixels ``[height, width, 3]``; raises ``DatasetError`` if there is no such image."""
         file = self.images.get(frame)
         pixels = None if file is None else cv2.imread(str(file), cv2.IMREAD_COLOR)
         if pixels is None:
@@ -113,10 +113,10 @@ class RellisSequence:
 
 
 def read_splits(root: str | Path) -> dict[str, list[tuple[str, int]]]:
-    """The published splits: sequence and frame of each cloud, by ``train``, ``val`` and ``test``.
+    """The published splits ``train``, ``val`` and ``test``: sequence and frame of each cloud.
 
     Raises:
-        DatasetError: a list is missing, or a line names no cloud.
+        DatasetError: a list is missing, or a line is not the path of a cloud.
     """
     splits = {}
     for name in SPLITS:
@@ -144,19 +144,19 @@ def sequence_to_bag(
     storage: str = "mcap",
     overwrite: bool = False,
 ) -> list[str]:
-    """Write a sequence, or part of it, as a bag: images as they are, calibration, clouds, and odometry from its poses.
+    """Write a sequence or part of it as a bag: original images, calibration, clouds, and odometry from its poses.
 
     Args:
-        sequence: the folder.
+        sequence: folder of the dataset.
         out: folder of the bag.
-        base_from_lidar: pose ``[4, 4]`` of the lidar on the robot, as from the warthog's file: the dataset's poses are
-            the lidar's, and say nothing of the robot below it.
-        frames: which frames, all by default.
+        base_from_lidar: pose ``[4, 4]`` of the lidar on the robot, for example from the robot file ``warthog``: the
+            dataset's poses are those of the lidar.
+        frames: frames to write, by default all.
         storage: ``mcap`` or ``sqlite3``.
         overwrite: replace an existing bag.
 
     Returns:
-        remarks on what in the bag is not a measurement.
+        remarks on data in the bag that are not measurements.
 
     Raises:
         DatasetError: a cloud or image is damaged, or there are fewer than two frames.
@@ -171,9 +171,9 @@ def sequence_to_bag(
     start = homogeneous(Rotation.from_euler("z", _heading(poses[0])).as_matrix(), poses[0, :3, 3])
     motion = motion_from_poses(stamps, np.linalg.inv(start) @ poses)
     remarks = [
-        "there are no commands: the sequence holds none",
-        "clouds have the stamps of the images of their number",
-        "where the lidar sits on the robot is taken from the robot's file",
+        "there are no commands, since the sequence has none",
+        "clouds have the stamps of the images with the same number",
+        "the pose of the lidar on the robot comes from the robot file",
     ]
     events: list[tuple[int, int]] = [(int(motion.stamps[i]), -1 - i) for i in range(len(motion))]
     events += [(int(sequence.stamps[frame]), frame) for frame in chosen]
@@ -214,7 +214,7 @@ def _poses(file: Path) -> np.ndarray:
         raise DatasetError(f"{file}: got shape {values.shape}, expected at least two rows of twelve finite numbers")
     left, scales, right = np.linalg.svd(values.reshape(-1, 3, 4)[:, :, :3])
     if (np.abs(scales - 1.0) > 0.05).any() or (np.linalg.det(left @ right) < 0).any():
-        raise DatasetError(f"{file}: some matrices are no rotations")
+        raise DatasetError(f"{file}: some matrices are not rotations")
     matrices = np.tile(np.eye(4), (len(values), 1, 1))
     matrices[:, :3, :3] = left @ right
     matrices[:, :3, 3] = values.reshape(-1, 3, 4)[:, :, 3]

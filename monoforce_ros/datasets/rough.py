@@ -23,7 +23,7 @@ from monoforce_ros.robots import robot_file
 LIDAR_FRAME = "os_sensor"
 BASE_FRAME = "base_link"
 MAXIMUM_POSE_GAP = 0.2
-"""Largest distance in time between a cloud and a pose that may be taken for its own [s]."""
+"""Largest time between a cloud and its pose [s]."""
 MAXIMUM_CLOUD_BYTES = 500_000_000
 
 
@@ -42,9 +42,14 @@ class RoughScene:
     cloud_stamps: np.ndarray
     """``[m]`` int64 [ns]."""
 
+    @property
+    def base_from_lidar(self) -> np.ndarray:
+        """Pose ``[4, 4]`` of the lidar in ``base_link``."""
+        return self.base_from_sensors[LIDAR_FRAME]
+
     @classmethod
     def open(cls, path: str | Path) -> RoughScene:
-        """Read a scene's calibration and poses; images and clouds are read when asked for."""
+        """Read the calibration and poses of a scene; images and clouds are read on demand."""
         path = Path(path)
         transforms = path / "calibration" / "transformations.yaml"
         poses = path / "poses" / "lidar_poses.csv"
@@ -70,7 +75,7 @@ class RoughScene:
         )
 
     def cloud(self, stamp: int) -> np.ndarray:
-        """Returns ``[n, 3]`` [m] in ``os_sensor`` of the cloud with this stamp, empty returns included as they are."""
+        """Points ``[n, 3]`` [m] of the cloud with this stamp in ``os_sensor``, including empty returns."""
         file = self._file("clouds", stamp, ".npz")
         if file.stat().st_size > MAXIMUM_CLOUD_BYTES:
             raise DatasetError(f"{file}: {file.stat().st_size} bytes, at most {MAXIMUM_CLOUD_BYTES}")
@@ -82,7 +87,7 @@ class RoughScene:
         return np.stack([cloud[name].astype(np.float32).ravel() for name in "xyz"], axis=1)
 
     def images(self, stamp: int) -> dict[str, np.ndarray]:
-        """RGB images of a stamp by camera, where both the image and its calibration are there."""
+        """RGB images with this stamp by camera, of the cameras that have an image and a calibration."""
         found = {}
         for camera in self.cameras:
             file = self._file("images", stamp, f"_{camera}.png")
@@ -97,7 +102,7 @@ class RoughScene:
         """Pose ``[4, 4]`` map ← base_link at a stamp, interpolated.
 
         Raises:
-            DatasetError: no pose lies within ``maximum_gap`` [s]: a pose from another place would pass for this one.
+            DatasetError: there is no pose within ``maximum_gap`` [s]; one from another time would be wrong.
         """
         gap = np.abs(self.pose_stamps - stamp).min() * NANOSECOND
         if gap > maximum_gap:
@@ -109,7 +114,7 @@ class RoughScene:
         return interpolate_poses(self.pose_stamps, self.map_from_base, np.array([inside]))[0]
 
     def stands_at_start(self, seconds: float = 2.0, tolerance: float = 0.02) -> bool:
-        """Whether the robot does not move during the first ``seconds`` of the poses."""
+        """Whether the robot is at rest during the first ``seconds`` of the poses."""
         early = self.pose_stamps <= self.pose_stamps[0] + seconds * 1e9
         start = self.map_from_base[0, :3, 3]
         return bool(
@@ -120,11 +125,11 @@ class RoughScene:
         return self.path / folder / f"{stamp // 10**9}_{stamp % 10**9:09d}{suffix}"
 
 
-def interpolate_poses(stamps: np.ndarray, matrices: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Poses ``[n, 4, 4]`` at the wanted stamps [ns], which must lie within the given ones."""
+def interpolate_poses(stamps: np.ndarray, matrices: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """Poses ``[n, 4, 4]`` at the stamps ``targets`` [ns], which must lie within ``stamps``."""
     origin = stamps[0]
-    times, at = (stamps - origin) * NANOSECOND, (wanted - origin) * NANOSECOND
-    result = np.tile(np.eye(4), (len(wanted), 1, 1))
+    times, at = (stamps - origin) * NANOSECOND, (targets - origin) * NANOSECOND
+    result = np.tile(np.eye(4), (len(targets), 1, 1))
     result[:, :3, :3] = Slerp(times, Rotation.from_matrix(matrices[:, :3, :3]))(at).as_matrix()
     for axis in range(3):
         result[:, axis, 3] = np.interp(at, times, matrices[:, axis, 3])
@@ -132,15 +137,15 @@ def interpolate_poses(stamps: np.ndarray, matrices: np.ndarray, wanted: np.ndarr
 
 
 def motion_from_poses(stamps: np.ndarray, matrices: np.ndarray, rate: float = 50.0) -> MotionTrack:
-    """Motion at a steady rate from sparse poses: velocities are differences of the poses over time, in base axes."""
+    """Motion at a constant rate from sparse poses; velocities are finite differences of the poses, in base axes."""
     count = int((stamps[-1] - stamps[0]) * NANOSECOND * rate)
-    wanted = stamps[0] + np.rint(np.arange(count + 1) / rate * 1e9).astype(np.int64)
-    dense = interpolate_poses(stamps, matrices, np.minimum(wanted, stamps[-1]))
+    targets = stamps[0] + np.rint(np.arange(count + 1) / rate * 1e9).astype(np.int64)
+    dense = interpolate_poses(stamps, matrices, np.minimum(targets, stamps[-1]))
     rotations = Rotation.from_matrix(dense[:, :3, :3])
     world = np.gradient(dense[:, :3, 3], 1.0 / rate, axis=0)
     turns = (rotations[:-1].inv() * rotations[1:]).as_rotvec() * rate
     return MotionTrack(
-        stamps=wanted,
+        stamps=targets,
         positions=dense[:, :3, 3],
         quaternions=rotations.as_quat(),
         linear_velocities=rotations.inv().apply(world),
@@ -162,32 +167,32 @@ def scene_to_bag(
 ) -> list[str]:
     """Write a scene as a bag: its images, calibration, cloud, and odometry from its poses.
 
-    The scenes hold no commands; the bag's are ``twist`` throughout, on ``/cmd_vel``, and its topic ``/about`` says so.
-    Where the cloud precedes the first pose of a robot that stands still, that pose is held back to it, and said too.
+    The scenes have no commands; the bag has the constant command ``twist`` on ``/cmd_vel``. If the cloud precedes the
+    first pose of a robot at rest, that pose is extended back to the cloud. The topic ``/about`` lists both.
 
     Args:
         scene: the scene.
         out: folder of the bag.
         twist: forward speed [m/s] and yaw rate [rad/s] of the commands.
-        seconds: length of the odometry after the cloud.
+        seconds: duration of the odometry after the cloud [s].
         compressed: JPEG images, else raw ones.
 
     Returns:
-        remarks on what in the bag is not a measurement.
+        remarks on data in the bag that are not measurements.
 
     Raises:
-        DatasetError: there is no cloud, or no pose that can stand for it.
+        DatasetError: there is no cloud, or no pose for it.
     """
     if not len(scene.cloud_stamps):
         raise DatasetError(f"{scene.path}: no cloud")
     stamp = int(scene.cloud_stamps[0])
-    remarks = [f"the commands ({twist[0]:g} m/s, {twist[1]:g} rad/s) are not the robot's: the scene holds none"]
+    remarks = [f"the commands ({twist[0]:g} m/s, {twist[1]:g} rad/s) are not the robot's: the scene has none"]
     stamps, matrices = scene.pose_stamps, scene.map_from_base
     lead = (stamps[0] - stamp) * NANOSECOND
     if lead > -1.0:
         if lead > MAXIMUM_POSE_GAP and not (lead < 10.0 and scene.stands_at_start()):
-            scene.pose(stamp)  # explains
-        remarks.append(f"the first pose, {lead:.1f} s after the cloud, is held back to it: the robot stands still")
+            scene.pose(stamp)  # raises the error
+        remarks.append(f"the first pose, {lead:.1f} s after the cloud, is extended back to it: the robot is at rest")
         stamps = np.r_[stamp - 10**9, stamps]
         matrices = np.concatenate([matrices[:1], matrices])
     scene.pose(max(stamp, int(scene.pose_stamps[0])))
@@ -217,7 +222,7 @@ def scene_to_bag(
 
 
 def robot_file_for(scene: RoughScene, robot: str | Path, out: str | Path) -> Path:
-    """A copy of a robot's file with the scene's sensors, so that the node knows where they sit."""
+    """Write a copy of a robot file with the scene's sensor poses."""
     content = _read_yaml(robot_file(robot))
     content["sensors"] = {
         frame: {
@@ -231,13 +236,13 @@ def robot_file_for(scene: RoughScene, robot: str | Path, out: str | Path) -> Pat
     return out
 
 
-def _camera_info(stamp: int, frame_id: str, camera: CameraModel):
-    # The files say plumb_bob even with eight coefficients; in ROS that is the rational model.
+def _camera_info(stamp: int, frame_id: str, camera: CameraModel) -> builders.Message:
+    # The files state plumb_bob even for eight coefficients, which is the rational model in ROS.
     model = "rational_polynomial" if camera.distortion.size >= 8 else camera.distortion_model
     return builders.camera_info(stamp, frame_id, camera.width, camera.height, camera.matrix, camera.distortion, model)
 
 
-def _image(stamp: int, frame_id: str, pixels: np.ndarray, compressed: bool):
+def _image(stamp: int, frame_id: str, pixels: np.ndarray, compressed: bool) -> builders.Message:
     if not compressed:
         return builders.image(stamp, frame_id, pixels)
     _, data = cv2.imencode(".jpg", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 92])
@@ -289,7 +294,7 @@ def _read_poses(file: Path) -> tuple[np.ndarray, np.ndarray]:
     rows = [[part.strip() for part in line.split(",")] for line in lines]
     if len(rows) < 2 or any(len(row) != 13 for row in rows):
         raise DatasetError(f"{file}: expected at least two rows of a stamp and twelve numbers")
-    # A double holds a stamp of this century to a quarter of a microsecond only, so it is read digit by digit.
+    # A double resolves current stamps only to a quarter of a microsecond, so they are parsed as integers.
     stamps = np.array([_decimal_stamp(row[0], file) for row in rows], np.int64)
     values = _numbers([value for row in rows for value in row[1:]], 12 * len(rows), str(file)).reshape(-1, 3, 4)
     order = np.argsort(stamps)
@@ -302,10 +307,10 @@ def _read_poses(file: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _orthonormal(matrices: np.ndarray, where: str) -> np.ndarray:
-    """The rotations nearest to rounded ones, ``[n, 3, 3]``."""
+    """Nearest rotations of matrices with rounding errors, ``[n, 3, 3]``."""
     left, scales, right = np.linalg.svd(matrices)
     if not (np.abs(scales - 1.0) < 0.05).all() or not (np.linalg.det(matrices) > 0).all():
-        raise DatasetError(f"{where}: some matrices are no rotations")
+        raise DatasetError(f"{where}: some matrices are not rotations")
     return left @ right
 
 

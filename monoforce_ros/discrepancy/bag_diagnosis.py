@@ -65,7 +65,7 @@ def read_evidence(bag: Path, robot: RobotModel, terrain: str, topics: Topics = T
     """
     recording = Recording.open(bag, odometry=topics.odometry, commands=topics.commands, cloud=topics.cloud)
     smoothed = smooth(recording.motion)
-    evidence = Evidence(smoothed, recording.commands, gyro=recording.turning, wheels=recording.wheels)
+    evidence = Evidence(smoothed, recording.commands, gyro=recording.angular_velocity, wheels=recording.wheels)
     if terrain == "flat":
         return evidence, recording
     if terrain != "lidar":
@@ -143,7 +143,7 @@ def diagnose_bag(
         "duration_s": round(time.monotonic() - began, 1),
     }
     report, page = write_diagnosis(out, diagnosis, inputs, robot_file)
-    return BagDiagnosis(bag, diagnosis, report, page, robot_file, tuple(recording.complaints))
+    return BagDiagnosis(bag, diagnosis, report, page, robot_file, recording.warnings)
 
 
 def _distinct_names(bags: Sequence[Path]) -> dict[str, Path]:

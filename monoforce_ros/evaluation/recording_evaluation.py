@@ -166,7 +166,7 @@ def evaluate_recording(
         },
         inside=on_map,
         horizons=tuple(horizons),
-        remarks=(*recording.complaints, *remarks),
+        remarks=(*recording.warnings, *remarks),
     )
 
 

@@ -11,28 +11,34 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
 from monoforce_ros.synthetic.random_streams import DEFAULT_SEED
 from monoforce_ros.synthetic.terrain_shape import GROUNDS
 
+if TYPE_CHECKING:
+    from monoforce_ros.synthetic.recording import RecordingSettings
+
 
 def build_parser() -> argparse.ArgumentParser:
     """The command line's options."""
     parser = argparse.ArgumentParser(
         prog="synthesize",
-        description="Record bags from simulated worlds: hills, ramp, kerbs, rocks, walls, trees, mud, soft tall grass.",
+        description="Record bags in simulated worlds: hills, ramp, kerbs, rocks, walls, trees, mud and tall grass.",
     )
     parser.add_argument("out", type=Path, metavar="OUT", help="folder of the bag")
-    parser.add_argument("--seed", type=int, default=DEFAULT_SEED, help="of world, drive and noise (%(default)s)")
+    parser.add_argument("--seed", type=int, default=DEFAULT_SEED, help="for world, commands and noise (%(default)s)")
     parser.add_argument("--duration", type=float, default=10.0, metavar="SECONDS", help="(%(default)s)")
     parser.add_argument("--robot", default="husky", metavar="NAME|FILE.yaml", help="(%(default)s)")
     parser.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap", help="(%(default)s)")
     parser.add_argument("--camera", default="320x240", metavar="WIDTHxHEIGHT|none", help="(%(default)s)")
-    parser.add_argument("--cameras", type=int, metavar="1-4", help="front, left, right, rear (those of the robot)")
     parser.add_argument(
-        "--distortion", metavar="K1,K2,P1,P2,K3", help="of every camera's lens, as -0.3,0.1,0,0,0 (none)"
+        "--cameras", type=int, metavar="1-4", help="number, in the order front, left, right, rear (the robot's)"
+    )
+    parser.add_argument(
+        "--distortion", metavar="K1,K2,P1,P2,K3", help="lens distortion of every camera, such as -0.3,0.1,0,0,0 (none)"
     )
     parser.add_argument("--camera-rate", type=float, default=10.0, metavar="HZ", help="(%(default)s)")
     parser.add_argument("--lidar", default="16x360", metavar="RINGSxCOLUMNS|none", help="(%(default)s)")
@@ -41,45 +47,56 @@ def build_parser() -> argparse.ArgumentParser:
         "--commands",
         default="random",
         metavar="random|steps|sweep|straight|circle|spin|FILE.csv",
-        help="who drives: random keeps to the world's track, steps tries everything near the start; "
+        help="command profile: random follows the world's track, steps covers all motion regimes near the start; "
         "a file has the columns t,v,w in s, m/s, rad/s (%(default)s)",
     )
     parser.add_argument(
         "--odometry",
         default="truth",
         metavar="truth|slam|slam:METRES,DEGREES",
-        help="slam is noisy, late and drifts; its noise is 0.01 m and 0.5 degrees unless given (%(default)s)",
+        help="slam is noisy, delayed and drifting; default noise 0.01 m and 0.5 degrees (%(default)s)",
     )
     hiding = parser.add_mutually_exclusive_group()
     hiding.add_argument(
         "--hide",
         action="append",
         metavar="NAME[:VALUE|:PARAMETER=VALUE,...]",
-        help="fault a physical effect for `diagnose` to find, as payload:20; may be repeated; `--hide list` lists "
-        "them. The truth goes to OUT.hidden.json and nowhere into the bag",
+        help="inject a fault for `diagnose` to find, such as payload:20; repeatable; `--hide list` lists all faults. "
+        "The ground truth is written to OUT.hidden.json, never into the bag",
     )
     hiding.add_argument(
-        "--hide-random", type=int, metavar="SEED", help="fault by lot: nothing, one, two, or one unknown to diagnose"
+        "--hide-random",
+        type=int,
+        metavar="SEED",
+        help="inject random faults: none, one, two, or one that is not in the catalogue of effects",
     )
     shape = parser.add_mutually_exclusive_group()
     shape.add_argument(
-        "--terrain-roughness", type=float, default=1.0, metavar="FACTOR", help="on the height of hills (%(default)s)"
+        "--terrain-roughness",
+        type=float,
+        default=1.0,
+        metavar="FACTOR",
+        help="scales the height of the hills (%(default)s)",
     )
-    shape.add_argument("--flat", action="store_true", help="level ground with nothing on it")
-    shape.add_argument("--bare", action="store_true", help="hills with nothing on them")
+    shape.add_argument("--flat", action="store_true", help="level ground without obstacles or grass")
+    shape.add_argument("--bare", action="store_true", help="hills without obstacles or grass")
     parser.add_argument(
         "--ground",
         choices=GROUNDS,
         default="mixed",
-        help="some tall grass, none, grass most of the way, or walls and grass around the start (%(default)s)",
+        help="mixed: patches of tall grass; rigid: no grass; grass: along most of the track; yard: walls and grass "
+        "around the start (%(default)s)",
     )
     parser.add_argument(
-        "--count", type=int, metavar="N", help="record N bags OUT/SEED of the seeds from --seed on, in parallel"
+        "--count",
+        type=int,
+        metavar="N",
+        help="record N bags OUT/SEED with the seeds from --seed on",
     )
-    parser.add_argument("--jobs", type=int, default=2, metavar="N", help="bags recorded at a time (%(default)s)")
-    parser.add_argument("--labels", action="store_true", help="write the true heights and classes to OUT.labels.npz")
-    parser.add_argument("--force", action="store_true", help="replace OUT if it exists")
-    parser.add_argument("--quiet", action="store_true", help="no progress and no summary")
+    parser.add_argument("--jobs", type=int, default=2, metavar="N", help="bags recorded in parallel (%(default)s)")
+    parser.add_argument("--labels", action="store_true", help="write true heights, classes and poses to OUT.labels.npz")
+    parser.add_argument("--force", action="store_true", help="overwrite OUT if it exists")
+    parser.add_argument("--quiet", action="store_true", help="print neither progress nor summary")
     return parser
 
 
@@ -88,7 +105,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = build_parser()
     options = parser.parse_args(arguments)
     if options.hide == ["list"]:
-        return _list_hidden()
+        return _list_faults()
     outs = [options.out]
     if options.count is not None:
         if not 1 <= options.count <= 10_000:
@@ -104,18 +121,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return _record_many(outs, options)
 
 
-def _list_hidden() -> int:
+def _list_faults() -> int:
     from monoforce_ros.synthetic.hidden import FAULTS
 
     for name, fault in sorted(FAULTS.items()):
-        values = ", ".join(f"{p} = {v:g} ({low:g} to {high:g})" for p, (v, low, high) in fault.parameters.items())
-        print(f"{name}: {values}\n    {fault.__doc__.splitlines()[0]}")
+        values = ", ".join(f"{n} = {p.default:g} ({p.low:g} to {p.high:g})" for n, p in fault.parameters.items())
+        print(f"{name}: {values}\n    {(fault.__doc__ or '').splitlines()[0]}")
     return 0
 
 
 def _record_many(outs: list[Path], options: argparse.Namespace) -> int:
-    """Record a bag for each seed, several at a time in processes of their own."""
-    # Each process draws with one thread, or they would fight for the cores.
+    """Record a bag for each seed, several at a time in separate processes."""
+    # Each process renders with one thread: more would compete for the cores.
     os.environ.setdefault("LP_NUM_THREADS", "1")
     failed = 0
     tasks = []
@@ -138,7 +155,7 @@ def _record_many(outs: list[Path], options: argparse.Namespace) -> int:
     return int(failed > 0)
 
 
-def _settings(options: argparse.Namespace):
+def _settings(options: argparse.Namespace) -> RecordingSettings:
     from monoforce_ros.synthetic.hidden import draw_hidden, parse_hidden
     from monoforce_ros.synthetic.odometry import OdometrySettings
     from monoforce_ros.synthetic.recording import RecordingSettings
@@ -159,8 +176,8 @@ def _settings(options: argparse.Namespace):
     if options.hide is not None:
         hidden = tuple(parse_hidden(text) for text in options.hide)
     elif options.hide_random is not None:
-        level = options.flat or options.bare
-        hidden = draw_hidden(options.hide_random, ("vegetation_drag",) if level else ())
+        has_grass = not (options.flat or options.bare)
+        hidden = draw_hidden(options.hide_random, () if has_grass else ("vegetation_drag",))
     distortion = tuple(_numbers(options.distortion, 5, "--distortion")) if options.distortion else ()
     return RecordingSettings(
         seed=options.seed,
@@ -183,7 +200,7 @@ def _settings(options: argparse.Namespace):
 
 
 def _record_one(out: Path, options: argparse.Namespace) -> int:
-    # Only now, so that --help and a wrong option answer at once.
+    # Imported late, so that --help and wrong options are answered at once.
     from monoforce_ros.robots import RobotFileError
     from monoforce_ros.synthetic.graphics import DrawingError
     from monoforce_ros.synthetic.hidden import truth_file
@@ -193,8 +210,10 @@ def _record_one(out: Path, options: argparse.Namespace) -> int:
     started = time.monotonic()
     try:
         settings = _settings(options)
-        form = "{desc}: {percentage:3.0f}%|{bar}| {n:.1f}/{total:.1f} s [{elapsed}<{remaining}]"
-        with tqdm(total=options.duration, desc=out.name, bar_format=form, disable=options.quiet, leave=False) as bar:
+        bar_format = "{desc}: {percentage:3.0f}%|{bar}| {n:.1f}/{total:.1f} s [{elapsed}<{remaining}]"
+        with tqdm(
+            total=options.duration, desc=out.name, bar_format=bar_format, disable=options.quiet, leave=False
+        ) as bar:
             summary = record(out, settings, bar.update)
     except (DrawingError, RobotFileError, ValueError, OSError) as error:
         print(f"synthesize: {error}", file=sys.stderr)
@@ -210,7 +229,7 @@ def _record_one(out: Path, options: argparse.Namespace) -> int:
         if options.labels:
             print(f"{labels_file(out)}: true heights, classes and poses")
         if settings.hidden is not None:
-            print(f"{truth_file(out)}: what is hidden")
+            print(f"{truth_file(out)}: injected faults")
     return 0
 
 
@@ -221,7 +240,7 @@ def _numbers(text: str, count: int, option: str) -> list[float]:
     except ValueError:
         numbers = []
     if len(numbers) != count or not all(math.isfinite(number) for number in numbers):
-        raise ValueError(f"{option}: got {text!r}, expected {count} numbers with commas between them")
+        raise ValueError(f"{option}: got {text!r}, expected {count} comma-separated numbers")
     return numbers
 
 

@@ -1,4 +1,4 @@
-"""Command profiles: who drives, from a table or with the route in sight."""
+"""Command profiles: commands over time from a table, a driver that follows the route, or test signals."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ class CommandProfile(Protocol):
     """Gives a command for each instant."""
 
     def command(self, time: float, position: np.ndarray, heading: float) -> tuple[float, float]:
-        """Forward speed [m/s] and yaw rate [rad/s] at ``time`` [s], asked in ascending order.
+        """Forward speed [m/s] and yaw rate [rad/s] at ``time``; calls are in ascending order of time.
 
         Args:
-            time: since the recording's start [s].
+            time: since the start of the recording [s].
             position: ``[2]`` of the robot in the world [m].
             heading: of the robot in the world [rad].
         """
@@ -30,10 +30,10 @@ class CommandProfile(Protocol):
 
 
 class CommandTable:
-    """Commands that change at given times and hold in between.
+    """Commands that change at given times and are held in between.
 
     Args:
-        times: ``[n]`` ascending [s]; before the first one the robot stands.
+        times: ``[n]`` ascending [s]; the command is zero before the first one.
         commands: ``[n, 2]`` forward speed [m/s] and yaw rate [rad/s].
     """
 
@@ -47,12 +47,12 @@ class CommandTable:
 
     @classmethod
     def read(cls, path: Path) -> CommandTable:
-        """Read a CSV file with the columns t [s], v [m/s], w [rad/s]; a line of names at its top is allowed."""
+        """Read a CSV file with the columns t [s], v [m/s], w [rad/s]; a header line is optional."""
         if not path.is_file():
             raise ValueError(f"commands: got {str(path)!r}, expected one of {', '.join(NAMES)} or a CSV file (t,v,w)")
         if path.stat().st_size > _MAXIMUM_FILE_BYTES:
             raise ValueError(f"{path}: got {path.stat().st_size} bytes, expected at most {_MAXIMUM_FILE_BYTES}")
-        rows = []
+        rows: list[tuple[float, float, float]] = []
         with path.open(newline="", encoding="utf-8") as file:
             for number, row in enumerate(csv.reader(file), start=1):
                 if not row or row[0].lstrip().startswith("#") or (not rows and row[0].strip() == "t"):
@@ -73,11 +73,11 @@ class CommandTable:
     def command(self, time: float, position: np.ndarray, heading: float) -> tuple[float, float]:
         """The last command at or before ``time``."""
         index = int(np.searchsorted(self._times, time + 1e-9, side="right")) - 1
-        return tuple(self._commands[index].tolist()) if index >= 0 else (0.0, 0.0)
+        return _pair(self._commands[index]) if index >= 0 else (0.0, 0.0)
 
 
 class SteadyCommand:
-    """One command, reached gently."""
+    """A constant command, ramped up from rest."""
 
     def __init__(self, speed: float, yaw_rate: float, rise_time: float = 1.5):
         self._target = np.array([speed, yaw_rate])
@@ -85,19 +85,19 @@ class SteadyCommand:
 
     def command(self, time: float, position: np.ndarray, heading: float) -> tuple[float, float]:
         """The command, ramped up from rest."""
-        return tuple((self._target * min(1.0, time / self._rise_time)).tolist())
+        return _pair(self._target * min(1.0, time / self._rise_time))
 
 
 class WanderingDriver:
-    """A driver who keeps to the route, more or less, with random steps and ramps of speed and yaw rate.
+    """Follows the route loosely, with random steps and ramps of speed and yaw rate.
 
     Args:
-        route: the drive's line.
-        random: the driver's moods.
+        route: path to follow.
+        random: draws speeds and deviations from the route.
     """
 
-    _AHEAD = 1.7
-    _STEERING = 1.3
+    _LOOKAHEAD = 1.7
+    _STEERING_GAIN = 1.3
     _SLOWEST, _FASTEST = 0.3, 1.0
     _SHARPEST_TURN = 1.3
     _ACCELERATION, _YAW_ACCELERATION = 0.8, 2.5
@@ -112,7 +112,7 @@ class WanderingDriver:
         self._is_step = False
 
     def command(self, time: float, position: np.ndarray, heading: float) -> tuple[float, float]:
-        """The command at ``time``; each call continues from the one before."""
+        """The command at ``time``, continued from the previous call."""
         elapsed, self._time = time - self._time, time
         if time >= self._next_speed:
             self._speed_target = self._random.uniform(self._SLOWEST, self._FASTEST)
@@ -122,28 +122,27 @@ class WanderingDriver:
             self._sway = self._random.uniform(-0.45, 0.45)
             self._next_sway = time + self._random.uniform(0.6, 1.4)
         self._station = self._route.advance(self._station, position)
-        target, _ = self._route.at(self._station + self._AHEAD)
+        target, _ = self._route.at(self._station + self._LOOKAHEAD)
         bearing = math.atan2(*(target - position)[::-1]) - heading
         bearing = math.remainder(bearing, 2 * math.pi)
-        wanted = np.clip(self._STEERING * bearing + self._sway, -self._SHARPEST_TURN, self._SHARPEST_TURN)
+        yaw_rate = np.clip(self._STEERING_GAIN * bearing + self._sway, -self._SHARPEST_TURN, self._SHARPEST_TURN)
         change = math.inf if self._is_step else self._ACCELERATION * elapsed
         self._speed += float(np.clip(self._speed_target - self._speed, -change, change))
         turn = self._YAW_ACCELERATION * elapsed
-        self._yaw_rate += float(np.clip(wanted - self._yaw_rate, -turn, turn))
+        self._yaw_rate += float(np.clip(yaw_rate - self._yaw_rate, -turn, turn))
         return self._speed, self._yaw_rate
 
 
-class TestDriver:
-    """Random steps and ramps of speed and yaw rate, standing and reversing too, that stay near the start.
+class ExcitationDriver:
+    """Random steps and ramps of speed and yaw rate, including stops and reversing, that stay near the start.
 
-    What identification wants: every regime, in no order, whatever the ground.
+    It covers every motion regime in random order, as system identification requires.
 
     Args:
         fastest: largest speed [m/s].
-        random: what comes next.
+        random: draws the commands.
     """
 
-    __test__ = False
     _REACH = 8.0
     _SHARPEST_TURN = 1.3
 
@@ -153,20 +152,20 @@ class TestDriver:
         self._start, self._rise, self._end = 0.0, 0.1, 0.0
 
     def command(self, time: float, position: np.ndarray, heading: float) -> tuple[float, float]:
-        """The command at ``time``; each call continues from the one before."""
+        """The command at ``time``, continued from the previous call."""
         if time >= self._end:
             self._from = self._at(time)
             self._choose(position, heading)
             self._start, self._end = time, time + float(self._random.uniform(1.0, 3.5))
             self._rise = float(self._random.choice([1e-3, 0.5, 1.2]))
-        return tuple(self._at(time).tolist())
+        return _pair(self._at(time))
 
     def _at(self, time: float) -> np.ndarray:
         return self._from + (self._to - self._from) * min(1.0, (time - self._start) / self._rise)
 
     def _choose(self, position: np.ndarray, heading: float) -> None:
         random = self._random
-        kind = random.choice(["stand", "back", "straight", "turn", "spin"], p=[0.08, 0.12, 0.25, 0.45, 0.1])
+        kind = str(random.choice(["stand", "back", "straight", "turn", "spin"], p=[0.08, 0.12, 0.25, 0.45, 0.1]))
         speed = {"stand": 0.0, "spin": 0.0, "back": -0.5 * random.uniform(0.4, 1.0)}.get(kind, random.uniform(0.3, 1.0))
         rate = 0.0 if kind in ("stand", "straight") else random.uniform(-1.0, 1.0) * self._SHARPEST_TURN
         if np.hypot(*position) > self._REACH and kind != "stand":
@@ -177,7 +176,7 @@ class TestDriver:
 
 
 class SweepDriver:
-    """Speed and yaw rate swing ever faster, from 0.05 Hz to 0.5 Hz and back again every minute, about a circle."""
+    """Sweep of speed and yaw rate about a circle, from 0.05 Hz to 0.5 Hz in one minute and back in the next."""
 
     _PERIOD = 60.0
     _SLOW, _FAST = 0.05, 0.5
@@ -195,16 +194,20 @@ class SweepDriver:
         return ramp * self._fastest * (0.55 - 0.35 * math.cos(0.7 * phase)), ramp * (0.35 + 0.85 * math.sin(phase))
 
 
+def _pair(command: np.ndarray) -> tuple[float, float]:
+    return float(command[0]), float(command[1])
+
+
 def make_profile(
     name_or_file: str, route: Route, random: np.random.Generator, maximum_speed: float = 1.0
 ) -> CommandProfile:
     """The profile of a name (``NAMES``) or of a CSV file (t,v,w).
 
     Args:
-        name_or_file: which.
-        route: for a driver that keeps to it.
-        random: the driver's moods.
-        maximum_speed: of the robot [m/s]; nobody drives faster than 1.5 m/s for want of space.
+        name_or_file: name or path.
+        route: path that ``random`` follows.
+        random: generator of random commands.
+        maximum_speed: of the robot [m/s]; profiles stay below 1.5 m/s, since the world is small.
 
     Raises:
         ValueError: there is neither such a profile nor such a file, or the file is not a table of commands.
@@ -213,7 +216,7 @@ def make_profile(
         return WanderingDriver(route, random)
     fastest = min(maximum_speed, 1.5)
     if name_or_file == "steps":
-        return TestDriver(fastest, random)
+        return ExcitationDriver(fastest, random)
     if name_or_file == "sweep":
         return SweepDriver(fastest)
     if name_or_file == "straight":

@@ -1,4 +1,4 @@
-"""Course: a small test track ahead of the robot, with a wall in the way and a band of tall grass behind it."""
+"""Course: an obstacle course ahead of the robot, with a wall and behind it a band of tall grass."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from monoforce_ros.synthetic.vegetation import Grass, GrassPatch
 
 _WALL_HEIGHT = 0.9
 WALL_THICKNESS = 0.25
-"""Of the wall across the way [m]."""
+"""Thickness of the wall [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CourseSettings:
-    """What stands ahead of a robot that starts at the origin and looks along x; distances in metres.
+    """Obstacles ahead of a robot that starts at the origin and faces along x; distances in metres.
 
     Attributes:
-        wall: distance of a wall across the way; None leaves it out.
-        wall_width: its length to both sides together.
-        wall_side: how far its middle lies to the left.
-        grass: distance of the near edge of a band of tall grass that no way leads around; None leaves it out.
-        grass_depth: how far the band reaches along the way.
-        roughness: factor on the hills around.
+        wall: distance of a wall across the robot's path; None for no wall.
+        wall_width: length of the wall.
+        wall_side: offset of the wall's centre to the left.
+        grass: distance of the near edge of a band of tall grass that cannot be bypassed; None for no grass.
+        grass_depth: extent of the band along x.
+        roughness: factor on the height of the hills.
     """
 
     wall: float | None = 3.0
@@ -48,7 +48,7 @@ class CourseSettings:
 
     @classmethod
     def draw(cls, seed: int) -> CourseSettings:
-        """A course that differs from seed to seed."""
+        """A random course."""
         random = random_stream(seed, "course")
         return cls(
             wall=random.uniform(2.6, 3.4), wall_width=random.uniform(1.6, 2.6), wall_side=random.uniform(-0.5, 0.5),
@@ -57,21 +57,21 @@ class CourseSettings:
 
 
 def build_course(settings: CourseSettings, seed: int) -> Scenery:
-    """Lay out a course in hills of their own seed."""
+    """Lay out a course on hills of a seed."""
     route = Route(random_stream(seed, "route"))
     terrain = TerrainSettings(bare=True, roughness=settings.roughness)
     ground = build_ground(terrain, route, None, random_stream(seed, "ground"))
-    patches = ()
+    patches: tuple[GrassPatch, ...] = ()
     if settings.grass is not None:
         middle = np.array([settings.grass + settings.grass_depth / 2, 0.0])
-        # An ellipse so wide that its edges are straight as far as the robot's map reaches.
+        # The ellipse is so wide that its edges are straight within the robot's map.
         patches = (GrassPatch(middle, 0.0, settings.grass_depth / 2, 12.0),)
     grass = Grass.grow(patches, ground, random_stream(seed, "grass"))
-    walls = () if settings.wall is None else (_wall(settings, ground),)
+    walls = () if settings.wall is None else (_wall(settings, settings.wall, ground),)
     return Scenery(ground, route, None, (), (), grass, walls=walls)
 
 
-def _wall(settings: CourseSettings, ground: HeightField) -> Wall:
-    centre = np.array([settings.wall + WALL_THICKNESS / 2, settings.wall_side])
+def _wall(settings: CourseSettings, distance: float, ground: HeightField) -> Wall:
+    centre = np.array([distance + WALL_THICKNESS / 2, settings.wall_side])
     size = np.array([settings.wall_width, WALL_THICKNESS, _WALL_HEIGHT])
     return standing_wall(ground, centre, np.pi / 2, size)

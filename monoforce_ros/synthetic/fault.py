@@ -1,79 +1,97 @@
-"""Fault: something hidden in a simulated world, and what it may touch there."""
+"""Fault: physics injected into a simulated world that the prediction model does not know."""
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, ClassVar, Self, overload
 
 import numpy as np
 
 from monoforce_ros.synthetic.graphics import mujoco
 from monoforce_ros.synthetic.vehicle import Vehicle
 
+if TYPE_CHECKING:
+    from monoforce_ros.synthetic.simulation import Simulation
 
-class Subject(Protocol):
-    """What a fault sees of a simulation; see ``Simulation``."""
 
-    model: mujoco.MjModel
-    data: mujoco.MjData
-    robot: Vehicle
-    base: int
-    wheel_bodies: list[int]
-    tyres: list[int]
-    tyre_friction: np.ndarray
+class Parameter:
+    """A parameter of a fault, declared as a class attribute: ``delay = Parameter(0.25, 0.05, 1.0)``.
 
-    @property
-    def time(self) -> float:
-        """Since the robot came to rest [s]."""
+    On a fault it is a float; on the class it is this declaration.
 
-    def state(self) -> Any:
-        """The present pose and twist of the base frame."""
+    Args:
+        default: value unless one is given, in SI units.
+        low, high: smallest and largest value.
+        neutral: value at which the fault has no effect; random values scale the distance from it.
+    """
 
-    def heading(self) -> float:
-        """Direction of the chassis' x axis in the horizontal plane [rad]."""
+    def __init__(self, default: float, low: float, high: float, *, neutral: float = 0.0):
+        self.default, self.low, self.high, self.neutral = default, low, high, neutral
 
-    def wheel_states(self) -> tuple[np.ndarray, np.ndarray]:
-        """Angle [rad] and speed [rad/s] of each wheel."""
+    def __set_name__(self, owner: type[Fault], name: str) -> None:
+        self._name = name
 
-    def wheel_velocities(self) -> np.ndarray:
-        """Velocity of each wheel's centre in world axes ``[wheels, 3]`` [m/s]."""
-
-    def grass_forces(self) -> np.ndarray | None:
-        """Force of the grass on each wheel ``[wheels, 3]`` [N], or None."""
+    @overload
+    def __get__(self, fault: None, owner: type[Fault]) -> Self: ...
+    @overload
+    def __get__(self, fault: Fault, owner: type[Fault]) -> float: ...
+    def __get__(self, fault: Fault | None, owner: type[Fault]) -> Self | float:
+        return self if fault is None else fault.values[self._name]
 
 
 class Fault:
-    """Something hidden. The methods below do nothing; a fault overrides those through which it works."""
+    """An injected fault. The methods below do nothing; a fault overrides those through which it acts.
+
+    Args:
+        values: parameters that differ from their defaults.
+
+    Raises:
+        TypeError: the fault has no such parameter.
+    """
 
     in_catalogue: ClassVar[bool] = True
     """Whether the catalogue of effects has an effect of this name."""
-    parameters: ClassVar[dict[str, tuple[float, float, float]]]
-    """Default value, smallest and largest value of each parameter in SI units; the first is the one that
-    ``NAME:VALUE`` sets."""
+    parameters: ClassVar[dict[str, Parameter]] = {}
+    """Declared parameters by name; ``NAME:VALUE`` sets the first one."""
+
+    def __init_subclass__(cls) -> None:
+        declared = {name: entry for name, entry in vars(cls).items() if isinstance(entry, Parameter)}
+        cls.parameters = cls.parameters | declared
 
     def __init__(self, **values: float):
-        for name, value in values.items():
-            setattr(self, name, value)
+        unknown = sorted(set(values) - set(self.parameters))
+        if unknown:
+            raise TypeError(f"{type(self).__name__}: got {', '.join(unknown)}, expected {', '.join(self.parameters)}")
+        self.values = {name: values.get(name, entry.default) for name, entry in self.parameters.items()}
+        """Value of each parameter."""
 
-    def shape(self, spec: mujoco.MjSpec, robot: Vehicle) -> None:
+    def modify_spec(self, spec: mujoco.MjSpec, robot: Vehicle) -> None:
         """Change the model before it is compiled."""
 
-    def prepare(self, simulation: Subject) -> None:
-        """Change the compiled model."""
+    def modify_model(self, simulation: Simulation) -> None:
+        """Change the compiled model once the robot has settled."""
 
     def wheel_speeds(self, time: float, speeds: np.ndarray) -> np.ndarray:
-        """What becomes of commanded wheel speeds ``[wheels]`` [rad/s]; called at every step."""
+        """Wheel speeds that the servos receive, given the commanded ones ``[wheels]`` [rad/s]; called at every step."""
         return speeds
 
-    def push(self, simulation: Subject) -> None:
+    def apply_forces(self, simulation: Simulation) -> None:
         """Add forces to ``data.xfrc_applied``, which has been cleared for this step."""
 
-    command_stamp_offset: float = 0.0
-    """Recorded minus true time of commands [s]."""
-    pose_stamp_offset: float = 0.0
-    """Recorded minus true time of poses [s]."""
-    gyro_offset: float = 0.0
-    """Added to recorded yaw rates [rad/s]."""
+    @property
+    def command_stamp_offset(self) -> float:
+        """Recorded minus true time of commands [s]."""
+        return 0.0
+
+    @property
+    def pose_stamp_offset(self) -> float:
+        """Recorded minus true time of poses [s]."""
+        return 0.0
+
+    @property
+    def gyro_offset(self) -> float:
+        """Added to recorded yaw rates [rad/s]."""
+        return 0.0
 
     def sensor_pose(self) -> tuple[np.ndarray, float]:
-        """Place ``[3]`` [m] and yaw [rad], in the base frame, of what is recorded as the base frame."""
+        """True position ``[3]`` [m] and yaw [rad], in the base frame, of the frame recorded as the base frame."""
         return np.zeros(3), 0.0

@@ -1,32 +1,35 @@
-"""Plants: physics that is hidden in a simulated world for a workflow to find.
+"""Faults to inject into a simulated world.
 
-Each works by a mechanism of the simulator — another wheel, another servo, another mass, a force at a place — rather
-than by a formula of the model that is to be found wanting, and shares no code with it.
+Each uses a mechanism of the simulator, such as a different wheel, servo, mass or external force, instead of the formula
+of the effect that the diagnosis fits, and shares no code with it.
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from typing import ClassVar, override
+from typing import TYPE_CHECKING, override
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from monoforce_ros.synthetic.fault import Fault, Subject
+from monoforce_ros.synthetic.fault import Fault, Parameter
 from monoforce_ros.synthetic.graphics import mujoco
 from monoforce_ros.synthetic.vehicle import Vehicle
 
+if TYPE_CHECKING:
+    from monoforce_ros.synthetic.simulation import Simulation
+
 
 class CommandDelay(Fault):
-    """Commands wait in a queue before the servos see them."""
+    """Commands wait in a queue before they reach the servos."""
 
-    parameters: ClassVar = {"delay": (0.25, 0.05, 1.0)}
+    delay = Parameter(0.25, 0.05, 1.0)
 
     @override
-    def prepare(self, simulation: Subject) -> None:
+    def modify_model(self, simulation: Simulation) -> None:
         self._queue: deque[tuple[float, np.ndarray]] = deque()
-        self._acting = None
+        self._acting: np.ndarray | None = None
 
     @override
     def wheel_speeds(self, time: float, speeds: np.ndarray) -> np.ndarray:
@@ -37,45 +40,45 @@ class CommandDelay(Fault):
 
 
 class ActuatorLag(Fault):
-    """The simulator's own first-order filter between command and servo."""
+    """First-order filter between command and servo, built into the simulator's actuator."""
 
-    parameters: ClassVar = {"time_constant": (0.3, 0.05, 1.5)}
+    time_constant = Parameter(0.3, 0.05, 1.5)
 
     @override
-    def shape(self, spec: mujoco.MjSpec, robot: Vehicle) -> None:
+    def modify_spec(self, spec: mujoco.MjSpec, robot: Vehicle) -> None:
         for servo in spec.actuators:
             servo.dyntype = mujoco.mjtDyn.mjDYN_FILTEREXACT
             servo.dynprm[0] = self.time_constant
 
 
 class ActuatorSaturation(Fault):
-    """Motors whose torque falls along a line to nothing at their largest speed."""
+    """Motor torque that falls linearly to zero at the largest speed."""
 
-    parameters: ClassVar = {"limit": (0.5, 0.1, 5.0)}
+    limit = Parameter(0.5, 0.1, 5.0)
 
     @override
-    def prepare(self, simulation: Subject) -> None:
+    def modify_model(self, simulation: Simulation) -> None:
         robot = simulation.robot
         simulation.model.actuator_forcelimited[:] = 1
         self._largest = self.limit / np.array([wheel.radius for wheel in robot.wheels])
         self._stall = 6.0 * robot.mass * 9.81 * robot.wheels[0].radius / len(robot.wheels)
-        self.push(simulation)
+        self.apply_forces(simulation)
 
     @override
-    def push(self, simulation: Subject) -> None:
-        share = simulation.wheel_states()[1] / self._largest
+    def apply_forces(self, simulation: Simulation) -> None:
+        fraction = simulation.wheel_states()[1] / self._largest
         limits = simulation.model.actuator_forcerange
-        limits[:, 1] = self._stall * np.clip(1.0 - share, 0.0, 1.0)
-        limits[:, 0] = -self._stall * np.clip(1.0 + share, 0.0, 1.0)
+        limits[:, 1] = self._stall * np.clip(1.0 - fraction, 0.0, 1.0)
+        limits[:, 0] = -self._stall * np.clip(1.0 + fraction, 0.0, 1.0)
 
 
 class ActuatorDeadband(Fault):
-    """Static friction: a drive starts to turn above the band, turns slower by it, and stops within half of it."""
+    """Static friction: a drive starts above 1.15 times the width, turns slower by the width, and stops below it."""
 
-    parameters: ClassVar = {"width": (0.1, 0.02, 0.5)}
+    width = Parameter(0.1, 0.02, 0.5)
 
     @override
-    def prepare(self, simulation: Subject) -> None:
+    def modify_model(self, simulation: Simulation) -> None:
         self._radii = np.array([wheel.radius for wheel in simulation.robot.wheels])
         self._turning = np.zeros(len(self._radii), bool)
 
@@ -87,80 +90,81 @@ class ActuatorDeadband(Fault):
 
 
 class DriveGain(Fault):
-    """Wheels of another radius than the base controller believes."""
+    """Wheels whose radius differs from the one that the base controller assumes."""
 
-    parameters: ClassVar = {"gain": (0.85, 0.5, 1.3)}
+    gain = Parameter(0.85, 0.5, 1.3, neutral=1.0)
 
     @override
-    def shape(self, spec: mujoco.MjSpec, robot: Vehicle) -> None:
-        _scale_wheels(spec, robot, lambda wheel: self.gain)
+    def modify_spec(self, spec: mujoco.MjSpec, robot: Vehicle) -> None:
+        for wheel in robot.wheels:
+            spec.geom(wheel.surface).size[0] = wheel.radius * self.gain
 
 
 class DriveAsymmetry(Fault):
-    """Motor controllers that were calibrated differently: one side runs faster than told, the other slower."""
+    """Unequal calibration of the motor controllers: one side runs faster than commanded, the other slower."""
 
-    parameters: ClassVar = {"difference": (0.1, -0.4, 0.4)}
+    difference = Parameter(0.1, -0.4, 0.4)
 
     @override
-    def shape(self, spec: mujoco.MjSpec, robot: Vehicle) -> None:
+    def modify_spec(self, spec: mujoco.MjSpec, robot: Vehicle) -> None:
         for servo, wheel in zip(spec.actuators, robot.wheels, strict=True):
             servo.gainprm[0] *= 1.0 - 0.5 * self.difference * np.sign(wheel.centre[1])
 
 
 class FrictionScale(Fault):
-    """Tyres of another rubber, whose friction wins over the ground's."""
+    """Tyres with another friction coefficient."""
 
-    parameters: ClassVar = {"factor": (0.4, 0.1, 1.0)}
+    factor = Parameter(0.4, 0.1, 1.0, neutral=1.0)
 
     @override
-    def prepare(self, simulation: Subject) -> None:
+    def modify_model(self, simulation: Simulation) -> None:
         simulation.tyre_friction *= self.factor
 
 
 class TurningScrub(Fault):
-    """Axles further apart: the wheels scrub more in a turn, and drive straight as before."""
+    """A longer wheelbase: the wheels scrub more in turns; straight driving is unchanged."""
 
-    parameters: ClassVar = {"wheelbase_factor": (1.5, 1.0, 2.5)}
+    wheelbase_factor = Parameter(1.5, 1.0, 2.5, neutral=1.0)
 
     @override
-    def shape(self, spec: mujoco.MjSpec, robot: Vehicle) -> None:
+    def modify_spec(self, spec: mujoco.MjSpec, robot: Vehicle) -> None:
         for wheel in robot.wheels:
             spec.body(wheel.joint).pos[0] = wheel.centre[0] * self.wheelbase_factor
 
 
 class RollingResistance(Fault):
-    """A force at each wheel against its rolling, as a part of the weight that it carries at rest."""
+    """A force against the motion of each wheel, proportional to its static load."""
 
-    parameters: ClassVar = {"coefficient": (0.15, 0.02, 0.6)}
+    coefficient = Parameter(0.15, 0.02, 0.6)
 
     @override
-    def push(self, simulation: Subject) -> None:
+    def apply_forces(self, simulation: Simulation) -> None:
         robot, bodies = simulation.robot, simulation.wheel_bodies
-        ahead = Rotation.from_euler("z", simulation.heading()).apply([1.0, 0.0, 0.0])
-        speed = simulation.wheel_velocities() @ ahead
+        forward = Rotation.from_euler("z", simulation.heading()).apply([1.0, 0.0, 0.0])
+        speed = simulation.wheel_velocities() @ forward
         load = robot.mass * 9.81 / len(robot.wheels)
-        held = self.coefficient * load * np.clip(speed / 0.03, -1.0, 1.0)
-        simulation.data.xfrc_applied[bodies, :3] -= held[:, None] * ahead
+        resistance = self.coefficient * load * np.clip(speed / 0.03, -1.0, 1.0)
+        simulation.data.xfrc_applied[bodies, :3] -= resistance[:, None] * forward
 
 
 class TerrainSoftness(Fault):
-    """Contacts that give way."""
+    """Compliant contacts between tyres and ground."""
 
-    parameters: ClassVar = {"factor": (9.0, 2.0, 50.0)}
+    factor = Parameter(9.0, 2.0, 50.0, neutral=1.0)
 
     @override
-    def prepare(self, simulation: Subject) -> None:
-        # The stiffness of a MuJoCo contact goes with the inverse square of its time constant.
+    def modify_model(self, simulation: Simulation) -> None:
+        # The stiffness of a MuJoCo contact is proportional to the inverse square of its time constant.
         simulation.model.geom_solref[simulation.tyres, 0] *= math.sqrt(self.factor)
 
 
 class VegetationDrag(Fault):
-    """Grass that holds the wheels back harder."""
+    """Grass with a larger drag on the wheels."""
 
-    parameters: ClassVar = {"strength": (3.0, 1.0, 10.0)}
+    strength = Parameter(3.0, 1.0, 10.0, neutral=1.0)
 
     @override
-    def push(self, simulation: Subject) -> None:
+    def apply_forces(self, simulation: Simulation) -> None:
         forces = simulation.grass_forces()
         if forces is not None:
             forces[:, 2] = 0.0
@@ -168,17 +172,15 @@ class VegetationDrag(Fault):
 
 
 class Payload(Fault):
-    """A box fixed to the robot."""
+    """A box mounted on the robot."""
 
-    parameters: ClassVar = {
-        "mass": (20.0, 1.0, 300.0),
-        "x": (-0.25, -1.0, 1.0),
-        "y": (0.1, -1.0, 1.0),
-        "z": (0.35, 0.0, 1.5),
-    }
+    mass = Parameter(20.0, 1.0, 300.0)
+    x = Parameter(-0.25, -1.0, 1.0)
+    y = Parameter(0.1, -1.0, 1.0)
+    z = Parameter(0.35, 0.0, 1.5)
 
     @override
-    def shape(self, spec: mujoco.MjSpec, robot: Vehicle) -> None:
+    def modify_spec(self, spec: mujoco.MjSpec, robot: Vehicle) -> None:
         box = spec.body("base").add_body(name="payload", pos=[self.x, self.y, self.z])
         box.explicitinertial = True
         box.mass = self.mass
@@ -186,45 +188,47 @@ class Payload(Fault):
 
 
 class ViscousDrag(Fault):
-    """Damping of the base's translation, as in a liquid."""
+    """Linear damping of the base's translation, as in a liquid."""
 
-    parameters: ClassVar = {"coefficient": (150.0, 10.0, 1000.0)}
+    coefficient = Parameter(150.0, 10.0, 1000.0)
 
     @override
-    def prepare(self, simulation: Subject) -> None:
+    def modify_model(self, simulation: Simulation) -> None:
         simulation.model.dof_damping[:3] = self.coefficient
 
 
 class QuadraticDrag(Fault):
-    """The air's resistance on the hull, at its middle."""
+    """Air resistance that acts on the centre of the hull."""
 
-    parameters: ClassVar = {"coefficient": (200.0, 10.0, 1000.0)}
+    coefficient = Parameter(200.0, 10.0, 1000.0)
 
     @override
-    def push(self, simulation: Subject) -> None:
+    def apply_forces(self, simulation: Simulation) -> None:
         velocity = simulation.data.qvel[:3].copy()
         velocity[2] = 0.0
         _push_hull(simulation, -self.coefficient * np.linalg.norm(velocity) * velocity)
 
 
 class GravityTilt(Fault):
-    """A world that leans."""
+    """A tilted direction of gravity."""
 
-    parameters: ClassVar = {"about_y": (0.08, -0.3, 0.3), "about_x": (0.0, -0.3, 0.3)}
+    about_y = Parameter(0.08, -0.3, 0.3)
+    about_x = Parameter(0.0, -0.3, 0.3)
 
     @override
-    def prepare(self, simulation: Subject) -> None:
+    def modify_model(self, simulation: Simulation) -> None:
         turn = Rotation.from_rotvec([self.about_x, self.about_y, 0.0])
         simulation.model.opt.gravity[:] = turn.apply([0.0, 0.0, -9.81])
 
 
 class ConstantForce(Fault):
-    """A tether that pulls at the hull, not quite evenly."""
+    """A tether that pulls at the hull with a slightly varying force."""
 
-    parameters: ClassVar = {"x": (-80.0, -800.0, 800.0), "y": (0.0, -800.0, 800.0)}
+    x = Parameter(-80.0, -800.0, 800.0)
+    y = Parameter(0.0, -800.0, 800.0)
 
     @override
-    def push(self, simulation: Subject) -> None:
+    def apply_forces(self, simulation: Simulation) -> None:
         ripple = 1.0 + 0.1 * math.sin(2.0 * simulation.time)
         _push_hull(
             simulation, Rotation.from_euler("z", simulation.heading()).apply([self.x * ripple, self.y * ripple, 0])
@@ -232,29 +236,31 @@ class ConstantForce(Fault):
 
 
 class PoseClockOffset(Fault):
-    """Poses carry the stamp of another clock."""
+    """Poses are stamped by an offset clock."""
 
-    parameters: ClassVar = {"offset": (0.2, -1.0, 1.0)}
+    offset = Parameter(0.2, -1.0, 1.0)
 
+    @property
     @override
-    def prepare(self, simulation: Subject) -> None:
-        self.pose_stamp_offset = self.offset
+    def pose_stamp_offset(self) -> float:
+        return self.offset
 
 
 class CommandClockOffset(Fault):
-    """Commands carry the stamp of another clock."""
+    """Commands are stamped by an offset clock."""
 
-    parameters: ClassVar = {"offset": (0.2, -1.0, 1.0)}
+    offset = Parameter(0.2, -1.0, 1.0)
 
+    @property
     @override
-    def prepare(self, simulation: Subject) -> None:
-        self.command_stamp_offset = self.offset
+    def command_stamp_offset(self) -> float:
+        return self.offset
 
 
 class SensorYawOffset(Fault):
-    """The pose sensor is mounted askew."""
+    """The pose sensor is mounted with a yaw offset."""
 
-    parameters: ClassVar = {"angle": (0.15, -1.0, 1.0)}
+    angle = Parameter(0.15, -1.0, 1.0)
 
     @override
     def sensor_pose(self) -> tuple[np.ndarray, float]:
@@ -262,9 +268,10 @@ class SensorYawOffset(Fault):
 
 
 class SensorLeverArm(Fault):
-    """The pose sensor sits elsewhere."""
+    """The pose sensor is mounted away from the base frame."""
 
-    parameters: ClassVar = {"x": (0.4, -1.5, 1.5), "y": (0.0, -1.5, 1.5)}
+    x = Parameter(0.4, -1.5, 1.5)
+    y = Parameter(0.0, -1.5, 1.5)
 
     @override
     def sensor_pose(self) -> tuple[np.ndarray, float]:
@@ -272,20 +279,21 @@ class SensorLeverArm(Fault):
 
 
 class GyroBias(Fault):
-    """The gyro shows a rate at rest."""
+    """The gyro reports a constant yaw rate at rest."""
 
-    parameters: ClassVar = {"bias": (0.05, -0.3, 0.3)}
+    bias = Parameter(0.05, -0.3, 0.3)
 
+    @property
     @override
-    def prepare(self, simulation: Subject) -> None:
-        self.gyro_offset = self.bias
+    def gyro_offset(self) -> float:
+        return self.bias
 
 
 class FadingDrive(Fault):
-    """Not in the catalogue: drives that slow down as they warm up."""
+    """Out of catalogue: drives that slow down as they warm up."""
 
-    in_catalogue: ClassVar = False
-    parameters: ClassVar = {"time_constant": (60.0, 10.0, 600.0)}
+    in_catalogue = False
+    time_constant = Parameter(60.0, 10.0, 600.0)
 
     @override
     def wheel_speeds(self, time: float, speeds: np.ndarray) -> np.ndarray:
@@ -293,70 +301,66 @@ class FadingDrive(Fault):
 
 
 class GustingWind(Fault):
-    """Not in the catalogue: a wind from one direction of the world that comes and goes."""
+    """Out of catalogue: wind that oscillates along one direction of the world."""
 
-    in_catalogue: ClassVar = False
-    parameters: ClassVar = {"force": (200.0, 20.0, 800.0), "period": (9.0, 2.0, 60.0)}
+    in_catalogue = False
+    force = Parameter(200.0, 20.0, 800.0)
+    period = Parameter(9.0, 2.0, 60.0)
 
     @override
-    def push(self, simulation: Subject) -> None:
+    def apply_forces(self, simulation: Simulation) -> None:
         strength = math.sin(2 * math.pi * simulation.time / self.period)
         _push_hull(simulation, self.force * strength * np.array([0.5, 0.87, 0.0]))
 
 
 class EccentricWheel(Fault):
-    """Not in the catalogue: front left wheel not centred on its axle."""
+    """Out of catalogue: the front left wheel is not centred on its axle."""
 
-    in_catalogue: ClassVar = False
-    parameters: ClassVar = {"offset": (0.03, 0.005, 0.08)}
+    in_catalogue = False
+    offset = Parameter(0.03, 0.005, 0.08)
 
     @override
-    def shape(self, spec: mujoco.MjSpec, robot: Vehicle) -> None:
+    def modify_spec(self, spec: mujoco.MjSpec, robot: Vehicle) -> None:
         spec.geom(robot.wheels[0].surface).pos = [self.offset, 0.0, 0.0]
 
 
 class StickyTurn(Fault):
-    """Not in the catalogue: play in the steering, so that the turning rate follows only after a change of the width."""
+    """Out of catalogue: backlash in the steering; the yaw rate follows a command only beyond the width."""
 
-    in_catalogue: ClassVar = False
-    parameters: ClassVar = {"width": (0.4, 0.05, 1.5)}
+    in_catalogue = False
+    width = Parameter(0.4, 0.05, 1.5)
 
     @override
-    def prepare(self, simulation: Subject) -> None:
+    def modify_model(self, simulation: Simulation) -> None:
         self._side = np.sign([wheel.centre[1] for wheel in simulation.robot.wheels])
         self._arm = abs(simulation.robot.wheels[0].centre[1]) / simulation.robot.wheels[0].radius
-        self._held = 0.0
+        self._output = 0.0
 
     @override
     def wheel_speeds(self, time: float, speeds: np.ndarray) -> np.ndarray:
         turning = -(speeds * self._side).mean()
         half = 0.5 * self.width * self._arm
-        self._held = float(np.clip(self._held, turning - half, turning + half))
-        return speeds + self._side * (turning - self._held)
+        self._output = float(np.clip(self._output, turning - half, turning + half))
+        return speeds + self._side * (turning - self._output)
 
 
 class SpeedPull(Fault):
-    """Not in the catalogue: a torque that turns the robot to the left and grows with the square of its speed."""
+    """Out of catalogue: a torque to the left that grows with the square of the speed."""
 
-    in_catalogue: ClassVar = False
-    parameters: ClassVar = {"torque": (200.0, 5.0, 600.0)}
+    in_catalogue = False
+    torque = Parameter(200.0, 5.0, 600.0)
 
     @override
-    def push(self, simulation: Subject) -> None:
+    def apply_forces(self, simulation: Simulation) -> None:
         speed = float(simulation.state().linear_velocity[0])
         simulation.data.xfrc_applied[simulation.base, 5] += self.torque * speed * abs(speed)
 
 
-def _scale_wheels(spec: mujoco.MjSpec, robot: Vehicle, factor) -> None:
-    for wheel in robot.wheels:
-        spec.geom(wheel.surface).size[0] = wheel.radius * factor(wheel)
-
-
-def _push_hull(simulation: Subject, force: np.ndarray) -> None:
-    """A force in world axes [N] at the middle of the hull, by its effect at the base body's centre of mass."""
+def _push_hull(simulation: Simulation, force: np.ndarray) -> None:
+    """Apply a force in world axes [N] at the hull's centre, as a wrench at the base body's centre of mass."""
     data, base = simulation.data, simulation.base
     hull = simulation.robot.hull
     middle = hull[0][0] if hull else np.zeros(3)
-    place = data.xpos[base] + data.xmat[base].reshape(3, 3) @ middle
+    position = data.xpos[base] + data.xmat[base].reshape(3, 3) @ middle
     data.xfrc_applied[base, :3] += force
-    data.xfrc_applied[base, 3:] += np.cross(place - data.xipos[base], force)
+    data.xfrc_applied[base, 3:] += np.cross(position - data.xipos[base], force)

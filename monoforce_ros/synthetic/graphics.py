@@ -1,6 +1,6 @@
-"""MuJoCo, imported with a graphics library that this machine has.
+"""MuJoCo, imported with a graphics library that is installed on this machine.
 
-MuJoCo decides at its import which library draws; every module here therefore takes ``mujoco`` from this one.
+MuJoCo selects its graphics library on import, so every module here imports ``mujoco`` from this one.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _LIBRARIES = {"osmesa": ("OSMesa",), "egl": ("EGL", "OpenGL")}
 
 
 class DrawingError(RuntimeError):
-    """Camera images were asked for, and no graphics library can draw them; the message says what to do."""
+    """No graphics library can render the requested camera images; the message says what to install."""
 
 
 def _is_usable(backend: str) -> bool:
@@ -25,7 +25,7 @@ def _is_usable(backend: str) -> bool:
 
 def _choose_backend() -> None:
     chosen = os.environ.get("MUJOCO_GL", "")
-    # Without its library, a backend that the environment asks for would make the import fail, drawing or not.
+    # A backend requested by the environment without its library would make the import fail, rendering or not.
     if "mujoco" in sys.modules or (chosen and _is_usable(chosen)):
         return
     os.environ["MUJOCO_GL"] = next((name for name in _LIBRARIES if _is_usable(name)), "disable")
@@ -33,11 +33,11 @@ def _choose_backend() -> None:
 
 _choose_backend()
 if os.environ.get("MUJOCO_GL") == "osmesa":
-    # OSMesa and Triton (which torch imports when it pleases) each bring an LLVM; the process crashes unless Triton's
-    # is loaded first.
+    # OSMesa and Triton (imported by torch at any time) each bring an LLVM; the process crashes unless Triton's is
+    # loaded first.
     with contextlib.suppress(ImportError):
-        import triton  # noqa: F401
+        import triton  # type: ignore[import-untyped]  # noqa: F401
 
-import mujoco  # noqa: E402
+import mujoco  # type: ignore[import-untyped]  # noqa: E402
 
 __all__ = ["HOW_TO_DRAW", "DrawingError", "mujoco"]

@@ -1,4 +1,4 @@
-"""Hidden: which physics is injected in a world, by name or by lot, and the file that keeps the truth."""
+"""Hidden faults: chosen by name or at random, and the ground-truth file that records them."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
+
+import numpy as np
 
 from monoforce_ros.core import write_text
 from monoforce_ros.synthetic import faults
@@ -24,23 +26,23 @@ def _catalogue() -> dict[str, type[Fault]]:
 
 
 FAULTS: dict[str, type[Fault]] = _catalogue()
-"""Everything that can be hidden, by name: that of the catalogue's effect where it has one."""
+"""Every fault by name, which is that of the catalogue's effect where there is one."""
 
-# Chances of a drawn world: nothing hidden, one effect, two, one that the catalogue does not hold.
-_KINDS = (("nothing", 0.2), ("single", 0.45), ("pair", 0.2), ("outsider", 0.15))
+# Probability of each kind of random world.
+_KINDS = (("nothing", 0.2), ("single", 0.45), ("pair", 0.2), ("out_of_catalogue", 0.15))
 
 
 def parse_hidden(text: str) -> Fault:
     """The fault of ``NAME``, ``NAME:VALUE`` or ``NAME:PARAMETER=VALUE,PARAMETER=VALUE``.
 
     Raises:
-        ValueError: there is none of that name, no such parameter, or a value is out of range.
+        ValueError: there is no fault of this name, no such parameter, or a value is out of range.
     """
     name, _, rest = text.partition(":")
     if name not in FAULTS:
         raise ValueError(f"--hide: got {name!r}, expected one of {', '.join(sorted(FAULTS))}")
     kind = FAULTS[name]
-    values = {parameter: default for parameter, (default, _, _) in kind.parameters.items()}
+    values = {name: entry.default for name, entry in kind.parameters.items()}
     for number, part in enumerate(filter(None, rest.split(","))):
         parameter, equals, value = part.partition("=")
         if not equals:
@@ -49,49 +51,51 @@ def parse_hidden(text: str) -> Fault:
                 raise ValueError(f"--hide {text}: got {part!r}, expected PARAMETER=VALUE after the first comma")
         if parameter not in values:
             raise ValueError(f"--hide {text}: got parameter {parameter!r}, expected one of {', '.join(values)}")
-        low, high = kind.parameters[parameter][1:]
+        declared = kind.parameters[parameter]
         try:
             values[parameter] = float(value)
         except ValueError:
             raise ValueError(f"--hide {text}: got {value!r}, expected a number") from None
-        if not (math.isfinite(values[parameter]) and low <= values[parameter] <= high):
-            raise ValueError(f"--hide {text}: got {parameter} = {value}, expected {low:g} to {high:g}")
+        if not (math.isfinite(values[parameter]) and declared.low <= values[parameter] <= declared.high):
+            raise ValueError(
+                f"--hide {text}: got {parameter} = {value}, expected {declared.low:g} to {declared.high:g}"
+            )
     return kind(**values)
 
 
-def draw_hidden(seed: int, without: Sequence[str] = ()) -> tuple[Fault, ...]:
-    """Hidden effects by lot: none, one, two of different names, or one that is not in the catalogue.
+def draw_hidden(seed: int, excluded: Sequence[str] = ()) -> tuple[Fault, ...]:
+    """Random faults: none, one, two of different names, or one that is not in the catalogue of effects.
 
-    Values are spread over the middle of their range about the default.
+    Parameters deviate from their neutral value by 0.6 to 1.4 times as much as the default does, within their range.
 
     Args:
-        seed: decides all.
-        without: names never drawn, such as ``vegetation_drag`` in a world without vegetation.
+        seed: of the random draw.
+        excluded: names never drawn, such as ``vegetation_drag`` in a world without vegetation.
     """
     random = random_stream(seed, "hidden")
-    kind = random.choice([name for name, _ in _KINDS], p=[chance for _, chance in _KINDS])
+    kind = str(random.choice([name for name, _ in _KINDS], p=[probability for _, probability in _KINDS]))
     count = {"nothing": 0, "pair": 2}.get(kind, 1)
-    names = [n for n, p in sorted(FAULTS.items()) if p.in_catalogue == (kind != "outsider") and n not in without]
+    in_catalogue = kind != "out_of_catalogue"
+    names = [n for n, f in sorted(FAULTS.items()) if f.in_catalogue == in_catalogue and n not in excluded]
     drawn = []
     for name in random.choice(names, count, replace=False):
         values = {}
-        for parameter, (default, low, high) in FAULTS[name].parameters.items():
-            sign = random.choice([-1.0, 1.0]) if low < 0.0 < high and low == -high else 1.0
-            # Parameters that mean nothing at 1 keep their distance from it, the others from 0.
-            neutral = 1.0 if parameter in ("gain", "factor", "wheelbase_factor", "strength") else 0.0
-            value = neutral + sign * (default - neutral) * random.uniform(0.6, 1.4)
-            values[parameter] = float(min(max(value, low), high))
+        for parameter, declared in FAULTS[name].parameters.items():
+            is_symmetric = declared.low == -declared.high
+            sign = random.choice([-1.0, 1.0]) if is_symmetric else 1.0
+            deviation = sign * (declared.default - declared.neutral) * random.uniform(0.6, 1.4)
+            values[parameter] = float(np.clip(declared.neutral + deviation, declared.low, declared.high))
         drawn.append(FAULTS[name](**values))
     return tuple(drawn)
 
 
 def describe(hidden: Sequence[Fault]) -> list[dict]:
-    """Name, parameters and whether the catalogue holds it, of each fault."""
+    """Name and parameters of each fault, and whether the catalogue of effects has it."""
     names = {kind: name for name, kind in FAULTS.items()}
     return [
         {
             "name": names[type(fault)],
-            "parameters": {parameter: getattr(fault, parameter) for parameter in fault.parameters},
+            "parameters": fault.values,
             "in_catalogue": fault.in_catalogue,
         }
         for fault in hidden
@@ -99,12 +103,12 @@ def describe(hidden: Sequence[Fault]) -> list[dict]:
 
 
 def truth_file(bag: Path) -> Path:
-    """Where the truth of a bag lies: beside it, never in it."""
+    """Path of a bag's ground-truth file, which lies next to the bag and not in it."""
     return bag.with_name(f"{bag.name}.hidden.json")
 
 
 def write_truth(bag: Path, hidden: Sequence[Fault], seed: int) -> Path:
-    """Write what is hidden in a bag beside it; returns the file, which appears only when it is complete."""
+    """Write the faults hidden in a bag to its ground-truth file, atomically; returns the file."""
     target = truth_file(bag)
     write_text(target, json.dumps({"hidden": describe(hidden), "seed": seed}, indent=2) + "\n")
     return target

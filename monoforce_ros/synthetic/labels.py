@@ -1,4 +1,4 @@
-"""Labels: what the world truly is, for tests; kept beside a bag and never in it."""
+"""Labels: ground truth of a world, for tests and training; kept next to a bag and not in it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _GRASS_FROM = 0.05
 
 
 class GroundClass(IntEnum):
-    """What a cell of the class map is."""
+    """Class of a cell of the class map."""
 
     GROUND = 0
     RAMP = 1
@@ -34,8 +34,8 @@ def world_labels(scenery: Scenery, odom_origin: np.ndarray) -> dict[str, np.ndar
         odom_origin: ``[3]`` position of the odom frame's origin in the world [m].
 
     Returns:
-        ``support_height``: of what bears a wheel, that is ground and rocks [m], float32;
-        ``visible_height``: with the grass on top [m], float32; crowns of trees hang above both and are in neither;
+        ``support_height``: surface that carries a wheel, that is ground, rocks and walls [m], float32;
+        ``visible_height``: the same including grass [m], float32; neither includes crowns of trees;
         ``friction``: factor on the friction of ordinary ground [-], float32;
         ``ground_class``: a ``GroundClass`` for each cell, uint8;
         ``resolution`` [m], ``origin`` ``[2]`` position of cell (0, 0) [m], and ``class_names``.
@@ -80,13 +80,14 @@ def world_labels(scenery: Scenery, odom_origin: np.ndarray) -> dict[str, np.ndar
 
 
 def labels_file(bag: Path) -> Path:
-    """Where a bag's labels lie: beside it."""
+    """Path of a bag's labels, next to the bag."""
     return bag.with_name(f"{bag.name}.labels.npz")
 
 
 def write_labels(bag: Path, labels: dict[str, np.ndarray]) -> Path:
-    """Write labels beside a bag; returns their file, which appears only when it is complete."""
+    """Write labels next to a bag, atomically; returns their file."""
     target = labels_file(bag)
     with atomic_path(target) as unfinished, unfinished.open("wb") as file:
-        np.savez_compressed(file, **labels)
+        # The stubs take every keyword for allow_pickle.
+        np.savez_compressed(file, **labels)  # type: ignore[arg-type]
     return target

@@ -1,4 +1,4 @@
-"""LiveWorld: a simulated robot that obeys commands as they come, and what its sensors say meanwhile."""
+"""LiveWorld: a simulated robot and its sensors, stepped and commanded by the caller."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ from monoforce_ros.synthetic.world import build_model
 
 @dataclass(frozen=True, kw_only=True)
 class LiveSettings:
-    """What is simulated."""
+    """Settings of a live simulation."""
 
     seed: int = DEFAULT_SEED
     robot: str = "husky"
     terrain: TerrainSettings = field(default_factory=TerrainSettings)
     course: CourseSettings | None = None
-    """A test track in place of the terrain's world."""
+    """An obstacle course instead of the terrain's world."""
     camera: CameraSettings | None = None
-    """None draws no images."""
+    """None renders no images."""
     lidar: LidarSettings | None = field(default_factory=LidarSettings)
-    """None casts no rays."""
+    """None simulates no lidar."""
     odometry: OdometrySettings = field(default_factory=OdometrySettings)
 
 
 class LiveWorld:
-    """A world that goes on as long as it is asked to.
+    """A simulation that runs as far as :meth:`advance` is called.
 
     Raises:
         RobotFileError, DrawingError, ValueError: as :func:`monoforce_ros.synthetic.recording.record`.
@@ -50,9 +50,11 @@ class LiveWorld:
             scenery = build_course(settings.course, settings.seed)
         else:
             scenery = build_scenery(settings.terrain, settings.seed)
-        frames = [frame for frame in self.robot.sensors if frame.startswith(CAMERA_PREFIX)] if settings.camera else []
-        view = {frame: settings.camera.vertical_field_of_view for frame in frames} if settings.camera else {}
-        model = build_model(scenery, self.robot, settings.seed, view, ())
+        fields_of_view: dict[str, float] = {}
+        if settings.camera is not None:
+            frames = [frame for frame in self.robot.sensors if frame.startswith(CAMERA_PREFIX)]
+            fields_of_view = dict.fromkeys(frames, settings.camera.vertical_field_of_view)
+        model = build_model(scenery, self.robot, settings.seed, fields_of_view, ())
         self.simulation = Simulation(model, scenery, self.robot, ())
         self.route = scenery.route.points - self.simulation.odom_origin[:2]
         """The world's track in the odometry frame ``[n, 2]`` [m]."""
@@ -61,7 +63,9 @@ class LiveWorld:
         if settings.lidar is not None:
             pose = self.robot.sensor(LIDAR_FRAME, "--lidar none")
             self._lidar = Lidar(model, pose, settings.lidar, random_stream(settings.seed, "lidar"))
-        self._cameras = [Camera(model, frame, settings.camera) for frame in view]
+        self._cameras: list[Camera] = []
+        if settings.camera is not None:
+            self._cameras = [Camera(model, frame, settings.camera) for frame in fields_of_view]
 
     def close(self) -> None:
         """Free the cameras' graphics library."""
@@ -70,7 +74,7 @@ class LiveWorld:
 
     @property
     def time(self) -> float:
-        """Simulated [s]."""
+        """Simulated time [s]."""
         return self.simulation.time
 
     def advance(self, until: float) -> None:
@@ -79,13 +83,13 @@ class LiveWorld:
             self.simulation.step()
 
     def odometry(self, stamp: int) -> object:
-        """``nav_msgs/Odometry`` of now."""
+        """Current ``nav_msgs/Odometry``."""
         state = self._odometry.read(self.simulation.state())
         motion = (state.position, state.quaternion, state.linear_velocity, state.angular_velocity)
         return builders.odometry(stamp, ODOM_FRAME, self.robot.base_frame, *motion)
 
     def cloud(self, stamp: int) -> object | None:
-        """``sensor_msgs/PointCloud2`` of now; None without a lidar."""
+        """Current ``sensor_msgs/PointCloud2``; None without a lidar."""
         if self._lidar is None:
             return None
         self.simulation.update_kinematics()
@@ -93,11 +97,11 @@ class LiveWorld:
         return builders.point_cloud(stamp, LIDAR_FRAME, np.asarray(points))
 
     def images(self, stamp: int) -> Iterator[tuple[str, object, object]]:
-        """Frame, image and ``CameraInfo`` of every camera, now."""
+        """Frame, current image and ``CameraInfo`` of every camera."""
         self.simulation.update_kinematics()
         for camera in self._cameras:
-            view, frame = camera.settings, camera.frame
-            data = encode_jpeg(camera.capture(self.simulation.data).copy(), view.quality)
-            lens = view.distortion or [0.0] * 5
-            info = builders.camera_info(stamp, frame, view.width, view.height, view.matrix, lens)
+            settings, frame = camera.settings, camera.frame
+            data = encode_jpeg(camera.capture(self.simulation.data).copy(), settings.quality)
+            distortion = settings.distortion or [0.0] * 5
+            info = builders.camera_info(stamp, frame, settings.width, settings.height, settings.matrix, distortion)
             yield frame, builders.compressed_image(stamp, frame, "jpeg", data), info

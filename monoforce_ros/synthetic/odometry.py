@@ -1,4 +1,4 @@
-"""Odometry: what a localisation says of the robot's motion, the truth or an estimate such as SLAM's."""
+"""Odometry: ground-truth or noisy estimate of the robot's motion, such as by SLAM."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from monoforce_ros.synthetic.simulation import BaseState
 
 @dataclass(frozen=True, kw_only=True)
 class OdometrySettings:
-    """How good the odometry is. Without arguments it is the truth, at once.
+    """Errors of the odometry. The defaults give the ground truth without latency.
 
     Attributes:
-        rate: [Hz].
+        rate: poses per second [Hz].
         position_noise: standard deviation of each coordinate [m].
         rotation_noise: standard deviation about each axis [rad].
-        speed_noise: standard deviation of each component of the velocity [m/s].
-        turning_noise: standard deviation of each component of the turning rate [rad/s].
-        position_drift: of the position, as a random walk [m per square root of a driven metre].
-        heading_drift: of the heading, as a random walk [rad per square root of a driven metre].
-        latency: between a pose's stamp and its arrival [s].
+        velocity_noise: standard deviation of each component of the linear velocity [m/s].
+        angular_velocity_noise: standard deviation of each component of the angular velocity [rad/s].
+        position_drift: random walk of the position [m per square root of a driven metre].
+        heading_drift: random walk of the heading [rad per square root of a driven metre].
+        latency: time from a pose's stamp to its arrival [s].
     """
 
     rate: float = 50.0
     position_noise: float = 0.0
     rotation_noise: float = 0.0
-    speed_noise: float = 0.0
-    turning_noise: float = 0.0
+    velocity_noise: float = 0.0
+    angular_velocity_noise: float = 0.0
     position_drift: float = 0.0
     heading_drift: float = 0.0
     latency: float = 0.0
@@ -46,16 +46,16 @@ class OdometrySettings:
 
     @classmethod
     def slam(cls, position_noise: float = 0.01, rotation_noise: float = math.radians(0.5)) -> OdometrySettings:
-        """As lidar SLAM: 20 Hz, noisy, a tenth of a second late, drifting a centimetre and 0.06° in the first metre.
+        """Like lidar SLAM: 20 Hz, noisy, 0.1 s of latency, a drift of 1 cm and 0.06° in the first metre.
 
-        Twists are those of its motion filter: noise in proportion to the poses'.
+        Noise of the twists is proportional to that of the poses.
         """
         return cls(
             rate=20.0,
             position_noise=position_noise,
             rotation_noise=rotation_noise,
-            speed_noise=3.0 * position_noise,
-            turning_noise=2.0 * rotation_noise,
+            velocity_noise=3.0 * position_noise,
+            angular_velocity_noise=2.0 * rotation_noise,
             position_drift=position_noise,
             heading_drift=0.12 * rotation_noise,
             latency=0.1,
@@ -63,7 +63,7 @@ class OdometrySettings:
 
 
 class Odometry:
-    """Turns true states into recorded ones."""
+    """Adds noise, drift and sensor faults to true states."""
 
     def __init__(self, settings: OdometrySettings, random: np.random.Generator, hidden: Sequence[Fault] = ()):
         self.settings = settings
@@ -72,7 +72,7 @@ class Odometry:
         self._drift, self._turn = np.zeros(3), 0.0
 
     def read(self, state: BaseState) -> BaseState:
-        """What is recorded of a state; each call goes on from the one before."""
+        """The recorded state of a true one; drift accumulates from call to call."""
         settings, draw = self.settings, self._random.standard_normal
         driven = 0.0 if self._last is None else float(np.linalg.norm(state.position - self._last))
         self._last = state.position
@@ -91,6 +91,6 @@ class Odometry:
         return BaseState(
             position=drifted.apply(position) + self._drift + settings.position_noise * draw(3),
             quaternion=(drifted * rotation * noise).as_quat(),
-            linear_velocity=linear + settings.speed_noise * draw(3),
-            angular_velocity=angular + settings.turning_noise * draw(3),
+            linear_velocity=linear + settings.velocity_noise * draw(3),
+            angular_velocity=angular + settings.angular_velocity_noise * draw(3),
         )

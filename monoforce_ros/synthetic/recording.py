@@ -1,4 +1,4 @@
-"""Recording: drives a robot through a world and writes what its sensors say into a bag."""
+"""Recording: simulate a robot in a world and write its sensor data to a bag."""
 
 from __future__ import annotations
 
@@ -45,24 +45,25 @@ _LONGEST_OUTBOX = 500
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingSettings:
-    """What to record.
+    """Settings of a recording.
 
     Attributes:
-        seed: of the world, the drive and the sensors' noise; each has its own random stream, so that the trajectory
-            does not depend on which sensors record it.
+        seed: for world, commands and sensor noise; each has its own random stream, so that the trajectory does not
+            depend on the recorded sensors.
         duration: [s].
         robot: name or YAML file.
-        commands: ``random``, ``steps``, ``sweep``, ``straight``, ``circle`` or a CSV file with the columns t,v,w.
+        commands: ``random``, ``steps``, ``sweep``, ``straight``, ``circle``, ``spin`` or a CSV file with the columns
+            t,v,w.
         terrain: the ground.
         camera: settings of every camera, or None to record no images.
-        cameras: how many, one to four: front, left, right and rear; those that the robot's file lacks look out of the
-            front camera's place on the other sides. By default those of the robot's file.
+        cameras: number of cameras, one to four: front, left, right and rear. A camera that the robot file lacks is the
+            front camera turned about the base frame's z axis. By default those of the robot file.
         lidar: settings, or None to record no clouds.
         imu: settings.
         odometry: settings.
-        hidden: physics injected for a workflow to find; the truth goes to a file beside the bag, and nowhere into it.
+        hidden: injected faults; the ground truth goes to a file next to the bag and not into it. None writes no file.
         storage: ``mcap`` or ``sqlite3``.
-        labels: write the world's truth beside the bag.
+        labels: write the world's ground truth next to the bag.
         overwrite: replace an existing bag.
     """
 
@@ -94,12 +95,12 @@ class RecordingSettings:
 
 @dataclass(frozen=True)
 class Summary:
-    """What came of a recording.
+    """Result of a recording.
 
     Attributes:
         duration: recorded [s].
         distance: driven [m].
-        mishap: why the drive ended early, or None.
+        mishap: why the recording ended early, or None.
         messages: number of messages by topic.
     """
 
@@ -109,68 +110,67 @@ class Summary:
     messages: dict[str, int]
 
 
-def record(out: Path, settings: RecordingSettings, progress: Callable[[float], None] = lambda seconds: None) -> Summary:
-    """Simulate a drive and write it as a bag.
+def record(out: Path, settings: RecordingSettings, progress: Callable[[float], object] | None = None) -> Summary:
+    """Simulate a robot and write its sensor data as a bag.
 
-    Poses are those of the base frame in the odom frame, which is the world frame shifted to where the robot starts; see
+    Poses are those of the base frame in the odom frame, which is the world frame shifted to the robot's start; see
     ``Simulation``. Stamps start at ``START_STAMP`` and follow the simulated time.
 
     Args:
         out: folder of the bag.
-        settings: what to record.
+        settings: settings of the recording.
         progress: called with the simulated seconds [s] since its last call.
 
     Raises:
         FileExistsError: the bag exists and ``overwrite`` is off.
-        DrawingError: images are asked for and nothing can draw them.
-        RobotFileError: the robot's file is unusable.
-        ValueError: a setting is.
+        DrawingError: images are recorded and no graphics library can render them.
+        RobotFileError: the robot file is invalid.
+        ValueError: a setting is invalid.
     """
     robot = Vehicle.load(settings.robot)
     if settings.camera is not None and settings.cameras is not None:
         robot = dataclasses.replace(robot, sensors=_with_cameras(robot, settings.cameras))
     with BagWriter(out, storage=settings.storage, overwrite=settings.overwrite) as bag:
         scenery = build_scenery(settings.terrain, settings.seed)
-        moods = random_stream(settings.seed, "commands")
-        profile = make_profile(settings.commands, scenery.route, moods, robot.maximum_speed)
-        drive = _Drive(bag, settings, robot, scenery, profile)
+        random = random_stream(settings.seed, "commands")
+        profile = make_profile(settings.commands, scenery.route, random, robot.maximum_speed)
+        session = _Session(bag, settings, robot, scenery, profile)
         try:
-            summary = drive.run(progress)
+            summary = session.run(progress or (lambda seconds: None))
         finally:
-            drive.close()
+            session.close()
         if settings.labels:
-            write_labels(out, world_labels(scenery, drive.simulation.odom_origin) | drive.truth())
+            write_labels(out, world_labels(scenery, session.simulation.odom_origin) | session.truth())
         if settings.hidden is not None:
             write_truth(out, settings.hidden, settings.seed)
     return summary
 
 
-class _Drive:
-    """One recording: a simulation and the sensors that watch it."""
+class _Session:
+    """One recording: a simulation and its sensors."""
 
     def __init__(
         self, bag: BagWriter, settings: RecordingSettings, robot: Vehicle, scenery: Scenery, profile: CommandProfile
     ):
         self._bag, self._settings, self._robot, self._profile = bag, settings, robot, profile
-        view, lidar_pose = {}, None
+        fields_of_view: dict[str, float] = {}
         if settings.camera is not None:
             frames = [frame for frame in robot.sensors if frame.startswith(CAMERA_PREFIX)]
             if not frames:
                 robot.sensor(f"{CAMERA_PREFIX}_front", "--camera none")
-            view = dict.fromkeys(frames, settings.camera.vertical_field_of_view)
-        if settings.lidar is not None:
-            lidar_pose = robot.sensor(LIDAR_FRAME, "--lidar none")
+            fields_of_view = dict.fromkeys(frames, settings.camera.vertical_field_of_view)
+        lidar_pose = None if settings.lidar is None else robot.sensor(LIDAR_FRAME, "--lidar none")
         hidden = settings.hidden or ()
-        model = build_model(scenery, robot, settings.seed, view, hidden)
+        model = build_model(scenery, robot, settings.seed, fields_of_view, hidden)
         self.simulation = Simulation(model, scenery, robot, hidden)
         self._odometry = Odometry(settings.odometry, random_stream(settings.seed, "odometry"), hidden)
         self._command_offset = round(1e9 * sum(fault.command_stamp_offset for fault in hidden))
         self._pose_offset = round(1e9 * sum(fault.pose_stamp_offset for fault in hidden))
         self._gyro_offset = np.array([0.0, 0.0, sum(fault.gyro_offset for fault in hidden)])
-        # Clouds and images are made in other threads; what follows them waits, so that the bag is in order.
+        # Clouds and images are made in other threads; later messages wait for them, so that the bag is in order.
         self._workers = ThreadPoolExecutor(2, thread_name_prefix="recording")
         self._outbox: deque[tuple[str, int, object]] = deque()
-        self._scan: Future | None = None
+        self._scan: Future[object] | None = None
         self._delayed: deque[tuple[int, str, object]] = deque()
         self._truth: list[tuple[int, np.ndarray, np.ndarray]] = []
         self._imu = Imu(settings.imu, random_stream(settings.seed, "imu"))
@@ -181,11 +181,12 @@ class _Drive:
             (_WHEEL_RATE, self._write_wheels),
             (settings.imu.rate, self._write_imu),
         ]
-        if settings.lidar is not None:
+        if settings.lidar is not None and lidar_pose is not None:
             self._lidar = Lidar(model, lidar_pose, settings.lidar, random_stream(settings.seed, "lidar"))
             self._tasks.append((settings.lidar.rate, self._write_cloud))
-        self._cameras = [Camera(model, frame, settings.camera) for frame in view]
-        if self._cameras:
+        self._cameras: list[Camera] = []
+        if settings.camera is not None:
+            self._cameras = [Camera(model, frame, settings.camera) for frame in fields_of_view]
             self._tasks.append((settings.camera.rate, self._write_images))
         self._messages: dict[str, int] = {}
 
@@ -199,8 +200,8 @@ class _Drive:
         for camera in self._cameras:
             camera.close()
 
-    def run(self, progress: Callable[[float], None]) -> Summary:
-        """Drive until the end, or until something goes wrong, which is not recorded any more."""
+    def run(self, progress: Callable[[float], object]) -> Summary:
+        """Record to the end, or until the simulation fails; the failure itself is not recorded."""
         simulation = self.simulation
         written = [0] * len(self._tasks)
         distance, last_position, reported, mishap = 0.0, np.zeros(3), 0.0, None
@@ -238,7 +239,7 @@ class _Drive:
         }
 
     def _deliver(self, now: int | None) -> None:
-        """Write what was delayed and has arrived by ``now``, or everything."""
+        """Write delayed messages that have arrived by ``now`` [ns], or all."""
         while self._delayed and (now is None or self._delayed[0][0] <= now):
             arrival, topic, message = self._delayed.popleft()
             self._write(topic, message, arrival)
@@ -249,7 +250,7 @@ class _Drive:
         self._flush(wait=len(self._outbox) > _LONGEST_OUTBOX)
 
     def _flush(self, *, wait: bool) -> None:
-        """Write messages in order as far as they are there, or all."""
+        """Write finished messages in order, or wait for all."""
         while self._outbox:
             topic, stamp, message = self._outbox[0]
             if isinstance(message, Future):
@@ -286,7 +287,7 @@ class _Drive:
         self._write("/imu/data", builders.imu(self._stamp, IMU_FRAME, turning + self._gyro_offset, force))
 
     def _write_cloud(self) -> None:
-        # Scans follow each other: they share the lidar's memory and its noise.
+        # Scans run one after the other: they share the lidar's memory and its noise.
         if self._scan is not None:
             self._scan.result()
         self.simulation.update_kinematics()
@@ -298,21 +299,21 @@ class _Drive:
         self.simulation.update_kinematics()
         stamp = self._stamp
         for camera in self._cameras:
-            view, frame = camera.settings, camera.frame
+            settings, frame = camera.settings, camera.frame
             pixels = camera.capture(self.simulation.data).copy()
 
-            def encode(pixels: np.ndarray = pixels, frame: str = frame, quality: int = view.quality) -> object:
+            def encode(pixels: np.ndarray = pixels, frame: str = frame, quality: int = settings.quality) -> object:
                 return builders.compressed_image(stamp, frame, "jpeg", encode_jpeg(pixels, quality))
 
             info = builders.camera_info(
-                stamp, frame, view.width, view.height, view.matrix, view.distortion or [0.0] * 5
+                stamp, frame, settings.width, settings.height, settings.matrix, settings.distortion or [0.0] * 5
             )
             self._write(f"/{frame}/image_raw/compressed", self._workers.submit(encode))
             self._write(f"/{frame}/camera_info", info)
 
 
 def _with_cameras(robot: Vehicle, count: int) -> Mapping[str, np.ndarray]:
-    """The robot's sensors with this many cameras."""
+    """The robot's sensors with ``count`` cameras."""
     front = robot.sensor(f"{CAMERA_PREFIX}_front", "--camera none")
     sensors = {frame: pose for frame, pose in robot.sensors.items() if not frame.startswith(CAMERA_PREFIX)}
     for side, yaw in list(_SIDES.items())[:count]:

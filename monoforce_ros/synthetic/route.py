@@ -1,4 +1,4 @@
-"""Route: the closed path that the simulated driver follows and that the world is laid out around."""
+"""Route: the closed path that the simulated driver follows; the world is laid out around it."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from scipy.spatial import cKDTree
 
 _SPACING = 0.05
 
-# World coordinates [m]. The first points put the start at the origin, heading along x; the curve after them leaves
-# room for the ramp in the left half of the first camera image.
+# World coordinates [m]. The first points put the start at the origin, heading along x; the next ones leave room for
+# the ramp in the left half of the first camera image.
 _CONTROL_POINTS = np.array(
     [
         [0.0, 0.0], [3.0, 0.0], [5.8, 0.3], [8.0, 1.8], [9.0, 4.2], [9.0, 7.2], [7.2, 10.4], [3.5, 12.2],
@@ -25,13 +25,13 @@ class Route:
     Attributes:
         points: ``[n, 2]`` positions [m], first one at the origin.
         headings: ``[n]`` direction of travel [rad].
-        length: length of one round [m].
+        length: of one lap [m].
     """
 
     def __init__(self, random: np.random.Generator):
         control = _CONTROL_POINTS.copy()
         control[_FIXED_POINTS:] += random.uniform(-0.5, 0.5, control[_FIXED_POINTS:].shape)
-        # The last point before the start stays: it sets the heading there.
+        # The last point before the start is fixed, since it sets the heading at the start.
         control[-1] = _CONTROL_POINTS[-1] * [1.0, 0.0]
         knots = np.vstack([control, control[:1]])
         chords = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(knots, axis=0), axis=1))])
@@ -56,7 +56,7 @@ class Route:
         return self._tree.query(positions, workers=-1)[0]
 
     def advance(self, station: float, position: np.ndarray, window: float = 2.0) -> float:
-        """Station [m] of the point closest to ``position``, sought from ``station`` to ``window`` metres further."""
+        """Station [m] of the point closest to ``position``, between ``station`` and ``window`` metres further."""
         first = round(station / _SPACING)
         indices = (first + np.arange(round(window / _SPACING))) % len(self.points)
         offsets = self.points[indices] - position

@@ -1,4 +1,4 @@
-"""Scenery: where rocks, trees and grass stand, and which shapes they have."""
+"""Scenery: positions and shapes of the rocks, trees, walls and grass of a world."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _GRASS_PATCHES = (
     (31.0, -0.2, 1.7, 1.7),
     (41.5, 0.3, 1.4, 1.9),
 )
-# What a world of grass has beside them.
+# Additional patches of a world with ground ``grass``.
 _MORE_GRASS = (
     (8.3, 0.3, 1.5, 1.7),
     (14.6, -0.3, 1.5, 1.8),
@@ -32,19 +32,19 @@ _MORE_GRASS = (
     (34.4, -0.3, 1.7, 1.8),
     (37.9, 0.2, 1.5, 1.7),
 )
-# Along the route [m], beyond what a short drive sees.
+# Along the route [m], out of sight in short recordings.
 _KERB_STATIONS = (20.5, 38.0)
 _PATCH_STATIONS = (14.5, 22.5, 27.5, 34.5)
 _YARD_SECTORS = 6
-_HIDING = 0.1
-"""Height of grass through which the ground is not seen [m]."""
+_OPAQUE_HEIGHT = 0.1
+"""Height of grass that hides the ground [m]."""
 _WALLS = 5
 _BOULDERS, _STONES, _TREES, _RIM_TREES = 26, 46, 30, 26
 
 
 @dataclass(frozen=True)
 class Tree:
-    """A tree that stands at ``base`` ``[3]`` [m] (world); ``foliage`` is ``broad`` or ``conifer``."""
+    """A tree at world position ``base`` ``[3]`` [m]; ``foliage`` is ``broad`` or ``conifer``."""
 
     foliage: str
     base: np.ndarray
@@ -55,10 +55,10 @@ class Tree:
 
 @dataclass(frozen=True)
 class GroundPatch:
-    """An elliptic patch of other ground.
+    """An elliptic patch of ground with lower friction.
 
     Attributes:
-        area: its outline.
+        area: outline.
         friction: factor on the friction of ordinary ground [-].
         kind: ``mud`` or ``gravel``.
     """
@@ -87,7 +87,7 @@ class Wall:
     size: np.ndarray
     shape: shapes.Shape
 
-    def contains(self, x: np.ndarray, y: np.ndarray, margin: float = 0.0) -> np.ndarray:
+    def contains(self, x: np.ndarray, y: np.ndarray, *, margin: float = 0.0) -> np.ndarray:
         """Whether world positions lie in its footprint, grown by ``margin`` [m]."""
         offset_x, offset_y = x - self.centre[0], y - self.centre[1]
         cosine, sine = np.cos(self.heading), np.sin(self.heading)
@@ -97,7 +97,7 @@ class Wall:
 
 @dataclass(frozen=True)
 class Scenery:
-    """Everything in a world but the robot; positions in world coordinates [m]."""
+    """Everything in a world except the robot; positions in world coordinates [m]."""
 
     ground: HeightField
     route: Route
@@ -111,7 +111,7 @@ class Scenery:
 
 
 def build_scenery(settings: TerrainSettings, seed: int) -> Scenery:
-    """Lay out a world: each kind of thing has its own random stream."""
+    """Lay out a world; each kind of object has its own random stream."""
     route = Route(random_stream(seed, "route"))
     if settings.flat or settings.bare:
         ground = build_ground(settings, route, None, random_stream(seed, "ground"))
@@ -135,28 +135,28 @@ def build_scenery(settings: TerrainSettings, seed: int) -> Scenery:
 
 
 def _build_yard(settings: TerrainSettings, route: Route, seed: int) -> Scenery:
-    """Walls and tall grass all around the start, near and far: what a robot that turns on the spot has before it."""
+    """Walls and tall grass at various distances all around the start, where the robot turns on the spot."""
     random = random_stream(seed, "yard")
     ground = build_ground(settings, route, None, random_stream(seed, "ground"))
     walls, patches = [], []
     for sector in range(_YARD_SECTORS):
         bearing = 2.0 * np.pi * (sector + random.uniform(0.2, 0.8)) / _YARD_SECTORS
-        there = np.array([np.cos(bearing), np.sin(bearing)])
+        direction = np.array([np.cos(bearing), np.sin(bearing)])
         kind = random.choice(["wall", "grass", "nothing"], p=[0.5, 0.3, 0.2])
         if kind == "wall":
             size = np.array([random.uniform(1.2, 3.6), 0.25, random.uniform(0.5, 1.3)])
             facing = bearing + np.pi / 2 + random.uniform(-0.6, 0.6)
-            walls.append(standing_wall(ground, random.uniform(1.5, 4.5) * there, facing, size))
+            walls.append(standing_wall(ground, random.uniform(1.5, 4.5) * direction, facing, size))
         elif kind == "grass":
             length, width = random.uniform(0.8, 1.6), random.uniform(1.0, 2.2)
-            centre = (length + random.uniform(0.8, 3.5)) * there
+            centre = (length + random.uniform(0.8, 3.5)) * direction
             patches.append(GrassPatch(centre, bearing, length, width))
     grass = Grass.grow(tuple(patches), ground, random_stream(seed, "grass"))
     return Scenery(ground, route, None, (), (), grass, walls=tuple(walls))
 
 
 def standing_wall(ground: HeightField, centre: np.ndarray, heading: float, size: np.ndarray) -> Wall:
-    """A wall of a length, thickness and height [m] that reaches into the ground."""
+    """A wall of ``size`` length, thickness and height [m] that extends below the ground."""
     bottom = float(ground.height_at(centre)) - 0.3
     shape = shapes.box(size + np.array([0.0, 0.0, 0.3]), heading).moved(np.array([*centre, bottom]))
     return Wall(centre, float(heading), size, shape)
@@ -169,7 +169,7 @@ def _place_kerbs(route: Route, random: np.random.Generator) -> tuple[Kerb, ...]:
 
 
 def _place_patches(route: Route, grass: Grass, random: np.random.Generator) -> tuple[GroundPatch, ...]:
-    """Patches that can be seen: mud under tall grass would hold a robot for the rest of its drive, unforeseeably."""
+    """Patches that tall grass does not hide: a robot could get stuck in invisible mud, which is unpredictable."""
     patches = []
     for station in _PATCH_STATIONS:
         centre, heading = route.at(station + random.uniform(-0.5, 0.5), random.uniform(-0.3, 0.3))
@@ -178,7 +178,7 @@ def _place_patches(route: Route, grass: Grass, random: np.random.Generator) -> t
         friction = random.uniform(0.25, 0.4) if kind == "mud" else random.uniform(0.55, 0.7)
         patch = GroundPatch(area, float(friction), str(kind))
         x, y = grass.canopy.grid()
-        hidden = patch.contains(np.stack([x, y], axis=-1)) & (grass.canopy.heights > _HIDING)
+        hidden = patch.contains(np.stack([x, y], axis=-1)) & (grass.canopy.heights > _OPAQUE_HEIGHT)
         if not hidden.any():
             patches.append(patch)
     return tuple(patches)
@@ -192,9 +192,9 @@ def _place_walls(
     trees: tuple[Tree, ...],
     random: np.random.Generator,
 ) -> tuple[Wall, ...]:
-    """Walls beside the route, along it or facing it, that never stand on it nor in anything else."""
+    """Walls next to the route, parallel or perpendicular to it, clear of the route and of other objects."""
     walls: list[Wall] = []
-    things = np.array([rock.vertices[:, :2].mean(axis=0) for rock in rocks] + [tree.base[:2] for tree in trees])
+    obstacles = np.array([rock.vertices[:, :2].mean(axis=0) for rock in rocks] + [tree.base[:2] for tree in trees])
     for _ in range(400):
         if len(walls) == _WALLS:
             break
@@ -205,7 +205,7 @@ def _place_walls(
         wall = standing_wall(ground, centre, heading, size)
         blocked = (
             wall.contains(*route.points.T, margin=1.0).any()
-            or wall.contains(*things.T, margin=0.9).any()
+            or wall.contains(*obstacles.T, margin=0.9).any()
             or wall.contains(*ramp.centre, margin=2.5)
             or any(np.linalg.norm(other.centre - centre) < 4.0 for other in walls)
         )
@@ -217,7 +217,7 @@ def _place_walls(
 def _place_rocks(
     ground: HeightField, route: Route, ramp: Ramp, grass: Grass, random: np.random.Generator
 ) -> tuple[shapes.Shape, ...]:
-    rocks = []
+    rocks: list[shapes.Shape] = []
     while len(rocks) < _BOULDERS + _STONES:
         is_boulder = len(rocks) < _BOULDERS
         # Boulders line the route, small stones lie on it.
@@ -225,7 +225,7 @@ def _place_rocks(
         lateral = random.choice([-1, 1]) * random.uniform(1.5, 5.0) if is_boulder else random.uniform(-1.3, 1.3)
         centre, _ = route.at(random.uniform(0.0, route.length), lateral)
         size = width * np.array([1.0, random.uniform(0.65, 1.0), random.uniform(0.55, 0.85)])
-        # A stone under the belly must be lower than the robot's clearance.
+        # Stones on the route must be lower than the robot's ground clearance.
         protrusion = size[2] * 0.62 if is_boulder else min(0.5 * size[2], random.uniform(0.03, 0.085))
         clearance = 1.0 + width / 2 if is_boulder else 0.0
         blocked = (
@@ -273,7 +273,7 @@ def _place_trees(
 def _grow_tree(base: np.ndarray, random: np.random.Generator) -> Tree:
     height = random.uniform(3.6, 6.5)
     radius = height * random.uniform(0.022, 0.032)
-    # The stem starts below the ground, so that no slope shows its end.
+    # The stem starts below the ground, so that its end is not visible on a slope.
     sunk = base - np.array([0.0, 0.0, 0.3])
     if random.uniform() < 0.5:
         crown = shapes.conifer_crown(height * random.uniform(0.22, 0.28), 0.86 * height, random)

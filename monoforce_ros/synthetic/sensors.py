@@ -17,17 +17,17 @@ from monoforce_ros.synthetic.graphics import HOW_TO_DRAW, DrawingError, mujoco
 
 @dataclass(frozen=True, kw_only=True)
 class CameraSettings:
-    """A pinhole camera, with distortion if asked for.
+    """A pinhole camera with optional lens distortion.
 
     Attributes:
-        width: [pixels].
-        height: [pixels].
-        field_of_view: horizontal [rad].
+        width: of the image [pixels].
+        height: of the image [pixels].
+        field_of_view: horizontal field of view [rad].
         rate: images per second [Hz].
         quality: of the JPEG files, 1 to 100.
         distortion: k1, k2, p1, p2, k3 of OpenCV's plumb-bob model; empty for none.
-        oversampling: pixels drawn per pixel kept, along each side; drawing costs triangles more than pixels.
-            By default two for small images.
+        oversampling: rendered pixels per image pixel along each side, for anti-aliasing; 0 selects 2 for images up to
+            400 pixels wide and 1 for larger ones.
     """
 
     width: int = 320
@@ -36,7 +36,7 @@ class CameraSettings:
     rate: float = 10.0
     quality: int = 85
     distortion: tuple[float, ...] = ()
-    oversampling: int | None = None
+    oversampling: int = 0
 
     def __post_init__(self):
         for name in ("width", "height"):
@@ -48,7 +48,7 @@ class CameraSettings:
             raise ValueError(f"camera rate: got {self.rate}, expected 0.1 to 100 Hz")
         if not 1 <= self.quality <= 100:
             raise ValueError(f"camera quality: got {self.quality}, expected 1 to 100")
-        if self.oversampling is None:
+        if self.oversampling == 0:
             object.__setattr__(self, "oversampling", 2 if self.width <= 400 else 1)
         if not 1 <= self.oversampling <= 4:
             raise ValueError(f"camera oversampling: got {self.oversampling}, expected 1 to 4")
@@ -65,7 +65,7 @@ class CameraSettings:
 
     @property
     def drawn_size(self) -> tuple[int, int]:
-        """Width and height [pixels] of the image without distortion that is drawn."""
+        """Width and height [pixels] of the rendered image, which has no distortion."""
         reach = np.abs(self._rays()).reshape(-1, 2).max(axis=0) if self.distortion else None
         size = np.array([self.width, self.height])
         if reach is not None:
@@ -75,11 +75,11 @@ class CameraSettings:
 
     @property
     def vertical_field_of_view(self) -> float:
-        """Of the drawn image [rad]."""
+        """Of the rendered image [rad]."""
         return 2 * math.atan(self.drawn_size[1] / self.oversampling / 2 / self.matrix[1, 1])
 
     def drawn_pixels(self) -> np.ndarray | None:
-        """Where in the drawn image each pixel lies, ``[height, width, 2]`` float32; None without distortion."""
+        """Where each pixel lies in the rendered image, ``[height, width, 2]`` float32; None without distortion."""
         if not self.distortion:
             return None
         middle = (np.array(self.drawn_size) - 1) / 2
@@ -102,21 +102,21 @@ class CameraSettings:
         error = np.abs(back.reshape(self.height, self.width, 2) - np.stack([columns, rows], axis=-1)).max()
         if not error < 0.2 or np.abs(rays).max() > 4.0:
             raise ValueError(
-                f"camera distortion: got {self.distortion}, which folds the image over itself; expected less of it"
+                f"camera distortion: got {self.distortion}, which folds the image; expected a weaker distortion"
             )
 
 
 class Camera:
-    """Draws what one of the robot's cameras sees.
+    """Renders the images of one of the robot's cameras.
 
     Raises:
-        DrawingError: no graphics library can draw.
+        DrawingError: no graphics library can render.
     """
 
     def __init__(self, model: mujoco.MjModel, frame: str, settings: CameraSettings):
         self.frame = frame
         self.settings = settings
-        # The camera hides what lies behind it, in a model of its own that the rays of a lidar do not see.
+        # A copy of the model, in which geometry outside the view is hidden without affecting the lidar.
         self._model = copy.copy(model)
         self._groups = model.geom_group.copy()
         self._static = np.flatnonzero(model.geom_bodyid == 0)
@@ -136,8 +136,8 @@ class Camera:
         self._options.geomgroup[list(world.DRAWN_GROUPS)] = 1
 
     def capture(self, data: mujoco.MjData) -> np.ndarray:
-        """The image ``[height, width, 3]`` uint8 RGB of the present state, whose kinematics are up to date."""
-        self._hide_what_lies_behind(data)
+        """RGB image ``[height, width, 3]`` uint8 of a state whose kinematics are up to date."""
+        self._hide_outside_view(data)
         self._renderer.update_scene(data, self.frame, self._options)
         flags = self._renderer.scene.flags
         flags[mujoco.mjtRndFlag.mjRND_FOG] = 1
@@ -146,14 +146,15 @@ class Camera:
         pixels = self._renderer.render()
         size = (self.settings.width, self.settings.height)
         if self._pixels is not None:
-            return cv2.remap(pixels, self._pixels, None, cv2.INTER_LINEAR)
+            # The stubs do not know that the second map may be None.
+            return cv2.remap(pixels, self._pixels, None, cv2.INTER_LINEAR)  # type: ignore[call-overload]
         return pixels if self.settings.oversampling == 1 else cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
 
     def close(self) -> None:
         """Free the graphics library."""
         self._renderer.close()
 
-    def _hide_what_lies_behind(self, data: mujoco.MjData) -> None:
+    def _hide_outside_view(self, data: mujoco.MjData) -> None:
         position, axes = data.cam_xpos[self._id], data.cam_xmat[self._id].reshape(3, 3)
         centres = data.geom_xpos[self._static] - position
         radii = self._model.geom_rbound[self._static]
@@ -178,18 +179,18 @@ def encode_jpeg(pixels: np.ndarray, quality: int) -> bytes:
 
 @dataclass(frozen=True, kw_only=True)
 class LidarSettings:
-    """A spinning lidar whose clouds are corrected for its own motion: all points of a turn belong to one instant.
+    """A spinning lidar with motion-compensated clouds: all points of a revolution are taken at one instant.
 
     Attributes:
-        rings: rays above each other.
-        columns: rays around.
+        rings: number of rings.
+        columns: rays per ring.
         lowest: angle of the lowest ring [rad].
         highest: angle of the highest ring [rad].
         minimum_range: [m].
         maximum_range: [m].
-        rate: turns per second [Hz].
+        rate: revolutions per second [Hz].
         range_noise: standard deviation [m].
-        step: coordinates are rounded to this [m], as lidar drivers do.
+        step: resolution of the coordinates [m].
     """
 
     rings: int = 16
@@ -235,7 +236,7 @@ class Lidar:
         self._rays = np.stack(rays, axis=-1).reshape(-1, 3)
         self._groups = np.zeros(mujoco.mjNGROUP, np.uint8)
         self._groups[list(world.RAY_GROUPS)] = 1
-        # Casting works on scratch memory of the state, so each thread has a state of its own.
+        # Ray casting uses scratch memory of the state, so each thread has its own.
         self._states = (mujoco.MjData(model), mujoco.MjData(model))
         self._threads = ThreadPoolExecutor(2, thread_name_prefix="lidar")
 
@@ -247,7 +248,7 @@ class Lidar:
         return self.start(data, base_pose)()
 
     def start(self, data: mujoco.MjData, base_pose: np.ndarray) -> Callable[[], np.ndarray]:
-        """Begin a scan of the present state in other threads; the result's call waits for its points.
+        """Begin a scan in other threads; calling the result waits for the points.
 
         Args:
             data: the state, whose kinematics are up to date.
@@ -269,12 +270,12 @@ class Lidar:
             )  # fmt: skip
             ranges[rows] = found
 
-        halves = (slice(0, count // 2), slice(count // 2, count))
-        casting = [self._threads.submit(cast, part) for part in zip(self._states, halves, strict=True)]
+        parts = (slice(0, count // 2), slice(count // 2, count))
+        jobs = [self._threads.submit(cast, part) for part in zip(self._states, parts, strict=True)]
 
         def points() -> np.ndarray:
-            for half in casting:
-                half.result()
+            for job in jobs:
+                job.result()
             return self._points(ranges)
 
         return points
@@ -292,12 +293,12 @@ class Lidar:
 
 @dataclass(frozen=True, kw_only=True)
 class ImuSettings:
-    """An inertial unit without bias.
+    """An IMU without bias.
 
     Attributes:
         rate: [Hz].
         acceleration_noise: standard deviation [m/s²].
-        rate_noise: standard deviation of the turning rate [rad/s].
+        rate_noise: standard deviation of the angular velocity [rad/s].
     """
 
     rate: float = 100.0
@@ -313,7 +314,7 @@ class ImuSettings:
 
 
 class Imu:
-    """Averages specific force and turning rate since its last reading, as real units do."""
+    """Averages specific force and angular velocity between readings, as real IMUs do."""
 
     def __init__(self, settings: ImuSettings, random: np.random.Generator):
         self.settings = settings
@@ -322,12 +323,12 @@ class Imu:
         self._count = 0
 
     def add(self, data: mujoco.MjData) -> None:
-        """Take in a simulation step."""
+        """Accumulate a simulation step."""
         self._sum += data.sensordata[:6]
         self._count += 1
 
     def read(self) -> tuple[np.ndarray, np.ndarray]:
-        """Turning rate ``[3]`` [rad/s] and specific force ``[3]`` [m/s²] in the IMU's frame since the last reading."""
+        """Mean angular velocity ``[3]`` [rad/s] and specific force ``[3]`` [m/s²] since the last reading, IMU frame."""
         mean = self._sum / max(self._count, 1)
         self._sum, self._count = np.zeros(6), 0
         turning = mean[3:] + self._random.normal(0.0, self.settings.rate_noise, 3)

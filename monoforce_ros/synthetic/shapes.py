@@ -36,7 +36,7 @@ EMPTY = Shape(np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros((0, 3)), np.zero
 
 
 def merge(shapes: list[Shape]) -> Shape:
-    """One mesh of many: thousands of small meshes draw slowly, one large mesh does not."""
+    """Merge meshes: one large mesh renders faster than thousands of small ones."""
     starts = np.cumsum([0] + [len(shape.vertices) for shape in shapes[:-1]])
     return Shape(
         np.concatenate([shape.vertices for shape in shapes]),
@@ -47,14 +47,14 @@ def merge(shapes: list[Shape]) -> Shape:
 
 
 def rock(size: np.ndarray, random: np.random.Generator) -> Shape:
-    """An angular boulder: the convex hull of a sphere that was dented and stretched.
+    """An angular boulder: the convex hull of a dented and stretched sphere.
 
     Args:
-        size: ``[3]`` edge lengths of its bounding box, roughly [m].
-        random: shapes this rock.
+        size: ``[3]`` approximate edge lengths of its bounding box [m].
+        random: generator of its shape.
     """
     directions = _even_directions(70)
-    # A few flat cuts give the facets of broken stone; noise keeps them from being perfect.
+    # A few flat cuts give the facets of broken stone; noise makes them irregular.
     cuts = _random_directions(7, random)
     depths = random.uniform(0.62, 0.95, len(cuts))
     reach = np.max(np.maximum(directions @ cuts.T, 1e-3) / depths, axis=1)
@@ -69,7 +69,7 @@ def rock(size: np.ndarray, random: np.random.Generator) -> Shape:
     rounded = corners.reshape(-1, 3) / np.linalg.norm(corners.reshape(-1, 3), axis=1, keepdims=True)
     normals = _unit(0.75 * vertex_normals + 0.25 * rounded)
     vertices = corners.reshape(-1, 3)
-    # The texture repeats every metre, seen along the steepest axis of each facet.
+    # The texture repeats every metre, projected along the main axis of each facet.
     axis = np.argmax(np.abs(face_normals), axis=1).repeat(3)
     planes = np.array([[1, 2], [0, 2], [0, 1]])[axis]
     coordinates = np.take_along_axis(vertices, planes, axis=1) + random.uniform(0, 1, 2)
@@ -77,13 +77,16 @@ def rock(size: np.ndarray, random: np.random.Generator) -> Shape:
 
 
 def box(size: np.ndarray, heading: float) -> Shape:
-    """A box that stands on the origin, its length along ``heading``; its texture repeats every metre.
+    """A box standing at the origin, its length along ``heading``; the texture repeats every metre.
 
     Args:
         size: length, width and height ``[3]`` [m].
         heading: about the vertical [rad].
     """
-    corners, faces, normals, coordinates = [], [], [], []
+    corners: list[np.ndarray] = []
+    normals: list[np.ndarray] = []
+    faces: list[list[int]] = []
+    coordinates: list[list[float]] = []
     for axis in range(3):
         for side in (-1.0, 1.0):
             normal = side * np.eye(3)[axis]
@@ -105,7 +108,7 @@ def box(size: np.ndarray, heading: float) -> Shape:
 
 
 def trunk(radius: float, height: float) -> Shape:
-    """A tapered stem that stands on the origin and is closed at both ends (convex)."""
+    """A tapered stem standing at the origin, closed at both ends (convex)."""
     sides = 10
     angles = np.arange(sides + 1) / sides * 2 * math.pi
     rim = np.stack([np.cos(angles), np.sin(angles), np.zeros(sides + 1)], axis=1)
@@ -135,7 +138,7 @@ def trunk(radius: float, height: float) -> Shape:
 
 
 def broad_crown(radius: float, height: float, random: np.random.Generator) -> Shape:
-    """Foliage in clumps around the origin: single leaves that are shaded as the clump they belong to."""
+    """Foliage in clumps around the origin: single leaves with the shading of their clump."""
     clumps = []
     size = np.array([radius, radius, height / 2])
     for direction in _random_directions(9, random):
@@ -145,7 +148,7 @@ def broad_crown(radius: float, height: float, random: np.random.Generator) -> Sh
 
 
 def conifer_crown(radius: float, height: float, random: np.random.Generator) -> Shape:
-    """Foliage in a cone whose base lies at the origin: twigs that hang outwards and down."""
+    """Foliage in a cone with its base at the origin: twigs that hang outwards and down."""
     count = 850
     # The lateral area of a cone grows with the distance from its tip.
     level = 1.0 - np.sqrt(random.uniform(0.0, 1.0, count))
@@ -165,14 +168,14 @@ def conifer_crown(radius: float, height: float, random: np.random.Generator) -> 
 def blades(
     roots: np.ndarray, heights: np.ndarray, width: float, lean: np.ndarray, random: np.random.Generator
 ) -> Shape:
-    """Blades of grass, each a bent strip of three triangles that ends in a point.
+    """Blades of grass, each a bent, pointed strip of three triangles.
 
     Args:
-        roots: ``[n, 3]`` where they leave the ground [m].
+        roots: ``[n, 3]`` positions on the ground [m].
         heights: ``[n]`` height of the tips above the roots [m].
         width: width at the root [m].
         lean: ``[n, 2]`` horizontal offset of the tip per height [-].
-        random: turns and colours the blades.
+        random: generator of directions and colours.
     """
     count = len(roots)
     turn = random.uniform(0.0, math.pi, count)
@@ -182,7 +185,7 @@ def blades(
     middle = roots + 0.3 * bend + (0.55 * heights)[:, None] * _UP
     tip = roots + bend + heights[:, None] * _UP
     vertices = np.stack([roots - across, roots + across, middle - 0.75 * across, middle + 0.75 * across, tip], axis=1)
-    # Shading of a meadow, not of single strips: normals lean with the blade but mostly point up.
+    # Shaded as a meadow instead of single strips: normals lean with the blade but mostly point up.
     normal = _unit(_UP + 0.55 * _unit(random.standard_normal((count, 3))) + 0.8 * bend)
     tone = np.clip(random.normal(0.5, 0.2, count), 0.01, 0.99)
     levels = np.array([0.04, 0.04, 0.55, 0.55, 0.97])
@@ -193,7 +196,7 @@ def blades(
 
 
 def upper_surface(vertices: np.ndarray, positions: np.ndarray) -> np.ndarray:
-    """Height [m] of a convex body's upper side at horizontal positions ``[n, 2]``; NaN beside the body."""
+    """Height [m] of a convex body's upper side at horizontal positions ``[n, 2]``; NaN outside the body."""
     hull = ConvexHull(vertices)
     upper = hull.equations[hull.equations[:, 2] > 1e-6]
     planes = -(positions @ upper[:, :2].T + upper[:, 3]) / upper[:, 2]

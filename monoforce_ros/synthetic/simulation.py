@@ -1,4 +1,4 @@
-"""Simulation: steps a robot through a world and says where it is."""
+"""Simulation: step a robot through a world and read its state."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _EDGE_MARGIN = 1.5
 
 @dataclass(frozen=True)
 class BaseState:
-    """Where the base frame is and how it moves.
+    """Pose and twist of the base frame.
 
     Attributes:
         position: ``[3]`` in the odom frame [m].
@@ -49,18 +49,18 @@ class BaseState:
 
 
 class Simulation:
-    """A robot that stands in a world, settled, and is driven by wheel speeds.
+    """A robot in a world, at rest on the ground and driven by wheel speeds.
 
-    The odom frame is the world frame, shifted to where the base frame comes to rest before the drive: its z axis points
-    against gravity, and the robot starts at its origin with a heading of 0.
+    The odom frame is the world frame, shifted to where the base frame comes to rest before the start: its z axis points
+    up, and the robot starts at its origin with a heading of 0.
 
     Attributes:
-        model, data: MuJoCo's.
+        model, data: MuJoCo's model and state.
         odom_origin: ``[3]`` position of the odom frame's origin in the world [m].
-        steps: of ``world.TIME_STEP`` since the robot came to rest.
-        base: the chassis' body.
-        wheel_bodies: bodies of the wheels.
-        tyres: geometries of the wheels that touch the ground.
+        steps: number of steps of ``world.TIME_STEP`` since the robot came to rest.
+        base: id of the chassis body.
+        wheel_bodies: ids of the wheel bodies.
+        tyres: ids of the wheel geometries that touch the ground.
         tyre_friction: friction coefficient of each tyre on ordinary ground ``[wheels]``.
     """
 
@@ -73,67 +73,69 @@ class Simulation:
         self.wheel_bodies = [model.body(wheel.joint).id for wheel in robot.wheels]
         self.tyres = [model.geom(wheel.surface).id for wheel in robot.wheels]
         self.tyre_friction = model.geom_friction[self.tyres, 0].copy()
-        self._wanted = np.zeros(len(robot.wheels))
-        # Most steps are taken on ordinary ground: looking up one cell is all that they cost.
+        self._commanded = np.zeros(len(robot.wheels))
+        # Most steps are on ordinary ground, where one look-up in these masks suffices.
         x, y = scenery.ground.grid()
-        places = np.stack([x, y], axis=-1)
+        positions = np.stack([x, y], axis=-1)
         reach = 2 * round((np.linalg.norm([w.centre[:2] for w in robot.wheels], axis=1).max() + 0.3) / self._cell) + 1
         self._near_grass = maximum_filter(scenery.grass.canopy.heights > 0.0, reach)
-        other = np.zeros(x.shape, bool)
+        in_patch = np.zeros(x.shape, bool)
         for patch in scenery.patches:
-            other |= patch.contains(places)
-        self._near_patch = maximum_filter(other, reach)
+            in_patch |= patch.contains(positions)
+        self._near_patch = maximum_filter(in_patch, reach)
         self._radii = np.array([wheel.radius for wheel in robot.wheels])
-        # The grass is as hard on a robot of many small wheels as on one of four.
+        # The total force of the grass does not depend on the number of wheels.
         self._grass_share = 4.0 / len(robot.wheels)
         joints = [model.joint(wheel.joint) for wheel in robot.wheels]
         self._wheel_positions = [joint.qposadr[0] for joint in joints]
         self._wheel_velocities = [joint.dofadr[0] for joint in joints]
         mujoco.mj_forward(model, self.data)
         self.steps = 0
+        self._faults_active = False
         for _ in range(round(_SETTLING_TIME / world.TIME_STEP)):
             self.step()
         self.steps = 0
         self.odom_origin = self.data.qpos[:3].copy()
-        # Only now: the robot settles as it would with nothing hidden.
+        # Faults act once the robot has settled, so that it starts as without them.
         for fault in hidden:
-            fault.prepare(self)
+            fault.modify_model(self)
+        self._faults_active = True
         self._on_patch = True
         self._set_friction()
 
     @property
     def time(self) -> float:
-        """Since the robot came to rest [s]."""
+        """Time since the robot came to rest [s]."""
         return self.steps * world.TIME_STEP
 
     def drive(self, forward: float, yaw_rate: float) -> None:
-        """Command a forward speed [m/s] and a yaw rate [rad/s] from now on."""
-        self._wanted = self.robot.wheel_speeds(forward, yaw_rate)
+        """Command a forward speed [m/s] and a yaw rate [rad/s], held until the next call."""
+        self._commanded = self.robot.wheel_speeds(forward, yaw_rate)
 
     def step(self) -> None:
         """Advance by ``world.TIME_STEP``."""
-        speeds = self._wanted
+        speeds = self._commanded
         self.data.xfrc_applied[:] = 0.0
         grass = self.grass_forces()
         if grass is not None:
             self.data.xfrc_applied[self.wheel_bodies, :3] = grass
-        if hasattr(self, "odom_origin"):
+        if self._faults_active:
             for fault in self._hidden:
                 speeds = fault.wheel_speeds(self.time, speeds)
-                fault.push(self)
+                fault.apply_forces(self)
             self._set_friction()
         self.data.ctrl[:] = speeds
         mujoco.mj_step(self.model, self.data)
         self.steps += 1
 
     def update_kinematics(self) -> None:
-        """Bring what sensors look at up to the present positions; after a step it is one step behind."""
+        """Update the geometry that sensors see to the current state; after a step it lags by one step."""
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
 
     def state(self) -> BaseState:
-        """The present pose and twist of the base frame."""
+        """Current pose and twist of the base frame."""
         quaternion = self.data.qpos[[4, 5, 6, 3]] / np.linalg.norm(self.data.qpos[3:7])
         return BaseState(
             position=self.data.qpos[:3] - self.odom_origin,
@@ -144,7 +146,7 @@ class Simulation:
         )
 
     def world_pose(self) -> np.ndarray:
-        """Present pose ``[4, 4]``, world ← base."""
+        """Current pose ``[4, 4]``, world ← base."""
         pose = np.eye(4)
         pose[:3, :3] = self.state().rotation
         pose[:3, 3] = self.data.qpos[:3]
@@ -155,7 +157,7 @@ class Simulation:
         return self.data.qpos[self._wheel_positions].copy(), self.data.qvel[self._wheel_velocities].copy()
 
     def mishap(self) -> str | None:
-        """Why the drive cannot go on, or None."""
+        """Why the simulation cannot continue, or None."""
         if not np.isfinite(self.data.qpos).all():
             return "the simulation became unstable"
         if self.state().rotation[2, 2] < math.cos(_LARGEST_TILT):
@@ -176,7 +178,7 @@ class Simulation:
         return self.data.qvel[:3] + np.cross(turning, centres - self.data.xpos[self.base])
 
     def grass_forces(self) -> np.ndarray | None:
-        """Force of the grass on each wheel ``[wheels, 3]`` [N], or None where no wheel stands in grass."""
+        """Force of the grass on each wheel ``[wheels, 3]`` [N], or None where no wheel touches grass."""
         if not self._is_near(self._near_grass):
             return None
         centres = self.data.xpos[self.wheel_bodies]
@@ -193,7 +195,7 @@ class Simulation:
         return bool(cells[min(max(int(row), 0), last), min(max(int(column), 0), last)])
 
     def _set_friction(self) -> None:
-        """Give each tyre the friction of the ground below it."""
+        """Set the friction of each tyre to that of the ground below it."""
         near = self._is_near(self._near_patch)
         if not near and not self._on_patch:
             return

@@ -1,4 +1,4 @@
-"""Terrain shape: the ground's height field, with hills, a ramp and a rim that hides the world's edge."""
+"""Terrain shape: height field of the ground, with hills, a ramp, kerbs and a rim that hides the world's edge."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ GROUNDS = ("mixed", "rigid", "grass", "yard")
 
 @dataclass(frozen=True, kw_only=True)
 class TerrainSettings:
-    """How the ground looks.
+    """Settings of the ground.
 
     Attributes:
         size: edge length of the square world [m].
-        resolution: distance of neighbouring heights [m].
+        resolution: spacing of the heights [m].
         roughness: factor on the height of the hills [-].
-        flat: level ground with nothing on it: no hills, ramp, rocks, trees or grass.
-        bare: hills with nothing on them.
-        ground: ``mixed`` (patches of tall grass here and there), ``rigid`` (no grass), ``grass`` (most of the way),
-            or ``yard`` (hills with walls and grass around the start).
+        flat: level ground without hills, ramp, rocks, trees, walls or grass.
+        bare: hills without anything on them.
+        ground: ``mixed`` (some patches of tall grass), ``rigid`` (no grass), ``grass`` (along most of the route), or
+            ``yard`` (hills with walls and grass around the start).
     """
 
     size: float = 40.0
@@ -52,11 +52,11 @@ class TerrainSettings:
 
 @dataclass(frozen=True)
 class Ramp:
-    """A flat-topped mound to drive over: ascent, plateau, descent, and sides that slope as well.
+    """A flat-topped mound: ascent, plateau and descent, with sloping sides.
 
     Attributes:
         centre: ``[2]`` world position [m].
-        heading: direction in which it is driven over [rad].
+        heading: driving direction across it [rad].
     """
 
     centre: np.ndarray
@@ -79,11 +79,11 @@ class Ramp:
 
 @dataclass(frozen=True)
 class Kerb:
-    """A step up across the way, level behind its edge, that sinks back to the ground.
+    """A step up across the route, level behind its edge, then descending to the ground.
 
     Attributes:
         centre: ``[2]`` world position of the middle of the edge [m].
-        heading: direction in which it is climbed [rad].
+        heading: driving direction up the step [rad].
         height: [m].
     """
 
@@ -107,11 +107,11 @@ class Kerb:
 
 @dataclass(frozen=True)
 class HeightField:
-    """Heights on a square grid, triangulated as MuJoCo does it.
+    """Heights on a square grid, triangulated like MuJoCo's height fields.
 
     Attributes:
         heights: ``[row = y, column = x]`` [m].
-        resolution: distance of neighbouring heights [m].
+        resolution: spacing of the heights [m].
         origin: ``[2]`` world position of ``heights[0, 0]`` [m].
     """
 
@@ -173,7 +173,7 @@ def build_ground(
     random: np.random.Generator,
     kerbs: Sequence[Kerb] = (),
 ) -> HeightField:
-    """Shape the ground around a route; it is level and at height 0 where the route starts."""
+    """Shape the ground around a route; it is level at height 0 where the route starts."""
     count = 2 * round(settings.size / settings.resolution / 2) + 1
     middle = (route.points.min(axis=0) + route.points.max(axis=0)) / 2
     # Whole cells, so that the start lies on a vertex.
@@ -193,7 +193,7 @@ def build_ground(
     heights *= np.clip((from_start - _LEVEL_RADIUS) / 1.5, 0.0, 1.0)
     if ramp is not None:
         added = ramp.height_at(x, y)
-        # Hills under a built ramp would tilt and buckle it.
+        # Hills under the ramp would deform it.
         near = gaussian_filter((added > 0.0).astype(float), 0.5 / settings.resolution)
         heights = heights * (1.0 - 0.8 * near) + gaussian_filter(added, 0.06 / settings.resolution)
     for kerb in kerbs:

@@ -1,4 +1,4 @@
-"""Textures: colours painted with noise, and the shadows that the sun would cast (drawn once, not per frame)."""
+"""Textures: noise-based colours, and shadows of the sun that are painted once instead of rendered per frame."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _SAND = np.array([0.70, 0.58, 0.42], np.float32)
 
 
 def noise(pixels: int, coarsest: int, random: np.random.Generator, fall_off: float = 0.6) -> np.ndarray:
-    """Fractal noise in -1..1, roughly, ``[pixels, pixels]``; its largest spots span 1 / ``coarsest`` of it."""
+    """Fractal noise of about -1..1, ``[pixels, pixels]``; its largest features span 1 / ``coarsest`` of the image."""
     total, weight, cells = np.zeros((pixels, pixels), np.float32), 1.0, coarsest
     while cells <= pixels:
         layer = random.standard_normal((cells, cells), np.float32)
@@ -45,10 +45,10 @@ def paint_ground(scenery: Scenery, random: np.random.Generator) -> tuple[np.ndar
     x, y = np.meshgrid(field.origin[0] + steps, field.origin[1] + steps)
     fine, broad = noise(count, 128, random, 0.75), noise(count, 12, random, 0.55)
 
-    # Vegetation thins out along the worn path and where the broad noise says so.
-    beside = scenery.route.distance(np.stack([x, y], axis=-1)).astype(np.float32)
-    rut = np.exp(-(((beside - 0.29) / 0.13) ** 2))
-    bare = _step(0.55 * broad + 0.25 * fine + 0.95 * np.exp(-((beside / 0.75) ** 2)) + 0.25 * rut, 0.45, 0.95)
+    # Vegetation is sparse along the worn path and where the broad noise is high.
+    distance = scenery.route.distance(np.stack([x, y], axis=-1)).astype(np.float32)
+    rut = np.exp(-(((distance - 0.29) / 0.13) ** 2))
+    bare = _step(0.55 * broad + 0.25 * fine + 0.95 * np.exp(-((distance / 0.75) ** 2)) + 0.25 * rut, 0.45, 0.95)
     dry = _step(noise(count, 20, random, 0.6) + 0.3 * fine, -0.1, 0.9)
     moss = _step(noise(count, 30, random, 0.6) + 0.3 * fine, 0.3, 0.8)
     colours = np.broadcast_to(_MEADOW, (count, count, 3)).copy()
@@ -66,14 +66,14 @@ def paint_ground(scenery: Scenery, random: np.random.Generator) -> tuple[np.ndar
     colours = _blend(colours, 0.75 * _MOSS, np.clip(_resized(scenery.grass.canopy.heights, count) / 0.25, 0.0, 1.0))
     colours *= ((1.0 - 0.52 * _shadows(scenery, 2 * count)[::2, ::2]) * (1.0 + 0.15 * fine))[..., None]
 
-    image = np.clip(255 * colours, 0, 255).astype(np.uint8)
-    image = cv2.resize(image, (_GROUND_PIXELS, _GROUND_PIXELS), interpolation=cv2.INTER_CUBIC)
+    coarse = np.clip(255 * colours, 0, 255).astype(np.uint8)
+    image = cv2.resize(coarse, (_GROUND_PIXELS, _GROUND_PIXELS), interpolation=cv2.INTER_CUBIC)
     _scatter_marks(image, bare, random)
     return cv2.GaussianBlur(image, (0, 0), 0.6), 1.0 - bare
 
 
 def _scatter_marks(image: np.ndarray, bare: np.ndarray, random: np.random.Generator) -> None:
-    """Draw what the eye expects close by: pebbles on soil, blades and litter on meadow. Changes ``image``."""
+    """Draw close-up details into ``image``: pebbles on soil, blades and litter on meadow."""
     places = random.integers(8, _GROUND_PIXELS - 8, (_MARKS, 2))
     on_soil = bare[places[:, 1] // 4, places[:, 0] // 4] > random.uniform(0.2, 0.8, _MARKS)
     reach = random.integers(-6, 7, (_MARKS, 2))
@@ -116,11 +116,11 @@ def bark_texture(random: np.random.Generator) -> np.ndarray:
 
 
 def tone_palette(tones: np.ndarray, dark: float, bright: float) -> np.ndarray:
-    """A palette to look colours up in: tones ``[k, 3]`` from left to right, dark (top) to bright, uint8."""
+    """A colour palette: tones ``[k, 3]`` from left to right, dark (top) to bright, uint8."""
     places = np.linspace(0, 1, len(tones))
     columns = np.stack([np.interp(np.linspace(0, 1, 64), places, tones[:, channel]) for channel in range(3)], axis=-1)
     levels = np.linspace(dark, bright, 16)[:, None, None]
-    # Shade is cooler than light.
+    # Shaded colours are cooler.
     tint = 1.0 + (1.0 - np.linspace(0, 1, 16))[:, None, None] * np.array([-0.10, 0.0, 0.06])
     return np.clip(255 * columns * levels * tint, 0, 255).astype(np.uint8)
 
@@ -173,7 +173,7 @@ def sky_texture(random: np.random.Generator, pixels: int = 256) -> np.ndarray:
 
 
 def _shadows(scenery: Scenery, count: int) -> np.ndarray:
-    """How much sunlight is missing on the ground, 0..1, ``[count, count]``."""
+    """Shadow on the ground, 0 (lit) to 1 (dark), ``[count, count]``."""
     field = scenery.ground
     shift = -TO_SUN[:2] / TO_SUN[2]
     scale = count / (2 * field.half_size)
@@ -196,7 +196,7 @@ def _shadows(scenery: Scenery, count: int) -> np.ndarray:
         pixels = np.round((cast - field.origin) * scale).astype(np.int32).reshape(-1, 4, 2)
         for leaf in pixels:
             cv2.fillConvexPoly(crowns, leaf, 1.0)
-    # Light that falls between leaves blurs with their height; stones cast sharp shadows.
+    # Shadows of leaves are blurred by their height; those of stones are sharp.
     shade = np.maximum(cv2.GaussianBlur(shade, (0, 0), 0.02 * scale), cv2.GaussianBlur(crowns, (0, 0), 0.05 * scale))
     canopy = _resized(scenery.grass.canopy.heights, count)
     ahead = shift * 0.2 * scale

@@ -1,4 +1,4 @@
-"""Vegetation: patches of tall grass that look solid and are soft."""
+"""Vegetation: patches of tall grass, which look solid to sensors and are soft."""
 
 from __future__ import annotations
 
@@ -44,16 +44,16 @@ class GrassPatch:
 
 @dataclass(frozen=True, kw_only=True)
 class GrassSettings:
-    """How tall, dense and stiff the grass is.
+    """Height, density and stiffness of grass.
 
     Attributes:
         height: height of the canopy inside a patch [m].
-        edge: width over which the canopy rises from nothing to its full height [m].
+        edge: width over which the canopy rises from zero to its full height [m].
         density: blades per area [1/m²].
         blade_width: [m].
         spring: upward force on a wheel per depth below the canopy [N/m].
-        drag: resistance of a wheel that stands in full height and hardly moves [N].
-        viscous_drag: what its speed adds [N s/m].
+        drag: resistance at low speed on a wheel in grass of full height [N].
+        viscous_drag: additional resistance per speed [N s/m].
     """
 
     height: float = 0.42
@@ -75,7 +75,7 @@ class GrassSettings:
 
 @dataclass(frozen=True)
 class Grass:
-    """The canopy over a ground, and what it does to wheels.
+    """The canopy over a ground, and its forces on wheels.
 
     Attributes:
         settings: height, density and stiffness.
@@ -121,14 +121,14 @@ class Grass:
         velocities: np.ndarray,
         share: float = 1.0,
     ) -> np.ndarray | None:
-        """Force of the grass on wheels.
+        """Forces of the grass on wheels.
 
         Args:
             ground: the ground below the grass.
             centres: ``[n, 3]`` world positions of the wheels' centres [m].
             radii: ``[n]`` [m].
             velocities: ``[n, 3]`` of the centres, in the world frame [m/s].
-            share: of a wheel in the forces, 1 for a robot on four.
+            share: factor on the forces, 1 for a robot with four wheels.
 
         Returns:
             ``[n, 3]`` forces in the world frame [N], or None if no wheel touches grass.
@@ -152,14 +152,14 @@ class Grass:
 def short_grass(
     ground: HeightField, route: Route, cover: np.ndarray, tile: HeightField, random: np.random.Generator
 ) -> shapes.Shape:
-    """Tufts of short grass beside a route: for the eye alone, too low to be felt or to reflect a ray.
+    """Tufts of short grass along a route, only for images: wheels and lidar rays ignore them.
 
     Args:
-        ground: where they stand.
-        route: tufts stand within a few metres of it.
-        cover: share of grass in 0..1, ``[rows, columns]`` over the extent of ``ground``.
+        ground: the ground below them.
+        route: tufts grow within a few metres of it.
+        cover: density of grass in 0..1, ``[rows, columns]`` over the extent of ``ground``.
         tile: the part of the ground to cover.
-        random: places and shapes them.
+        random: generator of positions and shapes.
     """
     size = 2 * tile.half_size
     tufts = tile.origin + random.uniform(0.0, size, (round(_TUFTS_PER_AREA * size**2), 2))
@@ -187,7 +187,7 @@ def _blades_of(
     heights = canopy.height_at(positions)
     tall = heights > 0.06
     positions, heights = positions[tall], heights[tall]
-    # A wind that changes from place to place, and a spread from blade to blade.
+    # A wind direction that varies over the patch, and random variation of each blade.
     swirl = 1.7 * np.sin(1.1 * positions[:, 0] + 0.6) + 1.3 * np.cos(0.9 * positions[:, 1])
     lean = 0.22 * np.stack([np.cos(swirl), np.sin(swirl)], axis=1) + 0.2 * random.standard_normal(positions.shape)
     heights = heights * random.uniform(0.6, 1.15, len(heights))

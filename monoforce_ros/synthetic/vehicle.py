@@ -16,18 +16,18 @@ from monoforce_ros.synthetic.graphics import mujoco
 BODY = "base"
 IMU_SITE = "imu"
 GROUP = 5
-"""Geometry group of the robot, which its own sensors' rays pass through."""
+"""Geometry group of the robot, which lidar rays ignore."""
 
-# Tyres and servos of a robot of this mass on four wheels, as measured to turn like the real one and not to hop on its
-# diagonals; they grow with the robot's mass and are shared by its wheels.
+# Tyres and servos of a robot of this mass with four wheels, tuned to turn like the real one without hopping. They scale
+# with the robot's mass and are divided among its wheels.
 _REFERENCE_MASS = 50.0
 _TYRE_STIFFNESS = 60_000.0
 _TYRE_DAMPING = 2_800.0
 _SERVO_GAIN = 1_200.0
-# Inertia of motors and gears as the wheels feel it [kg m²]; without it a standing robot trembles.
+# Inertia of motors and gears reflected to the wheels [kg m²]; without it a robot at rest vibrates.
 _GEAR_INERTIA = 0.4
 _WHEELS_MASS_FRACTION = 0.12
-# Distance of the small wheels that stand for a track, in their radii: close enough to climb what a belt climbs.
+# Spacing of the small wheels that model a track, in wheel radii; close enough to climb like a belt.
 _TRACK_WHEEL_DISTANCE = 1.1
 _GRAVITY = 9.81
 
@@ -37,7 +37,7 @@ class Wheel:
     """A driven wheel; lengths in metres, in the base frame.
 
     Attributes:
-        side: lateral offset that turns a twist into this wheel's speed [m].
+        side: lateral offset that maps a twist to this wheel's speed [m].
         centre: ``[3]``.
     """
 
@@ -54,13 +54,13 @@ class Wheel:
 
     @property
     def surface(self) -> str:
-        """Name of the geometry that touches the ground."""
+        """Name of its contact geometry."""
         return f"{self.name}_surface"
 
 
 @dataclass(frozen=True)
 class Vehicle:
-    """What a robot file says, as numpy arrays in the base frame.
+    """Contents of a robot file as numpy arrays in the base frame.
 
     Attributes:
         inertia: ``[3, 3]`` about the centre of mass [kg m²].
@@ -81,10 +81,10 @@ class Vehicle:
 
     @classmethod
     def load(cls, name_or_file: str | Path) -> Vehicle:
-        """Read a robot by name or file; each of its tracks becomes a row of small wheels that turn together.
+        """Read a robot by name or file; each track becomes a row of small wheels that turn together.
 
         Raises:
-            RobotFileError: the file cannot be used, or has flippers.
+            RobotFileError: the file is invalid or has flippers.
         """
         robot: RobotModel = load_robot(name_or_file)
         path = robot_file(name_or_file)
@@ -115,7 +115,7 @@ class Vehicle:
         return max(wheel.radius - float(wheel.centre[2]) for wheel in self.wheels)
 
     def sensor(self, frame: str, option: str) -> np.ndarray:
-        """Pose ``[4, 4]`` of a sensor; raises a ``RobotFileError`` that names the option to do without it."""
+        """Pose ``[4, 4]`` of a sensor; raises a ``RobotFileError`` that names the option to run without it."""
         if frame not in self.sensors:
             raise RobotFileError(
                 f"robot {self.name}: sensors: got {sorted(self.sensors)}, expected one named {frame!r}; "
@@ -154,7 +154,7 @@ class Vehicle:
         )
 
     def _set_inertia(self, base: mujoco.MjsBody, wheel_mass: float) -> None:
-        """Give the chassis what the wheels leave over of the robot's mass, centre of mass and inertia."""
+        """Set the chassis inertia so that chassis and wheels add up to the robot's mass, centre of mass and inertia."""
         chassis_mass = self.mass - wheel_mass * len(self.wheels)
         centres = np.array([wheel.centre for wheel in self.wheels])
         centre = (self.mass * self.centre_of_mass - wheel_mass * centres.sum(axis=0)) / chassis_mass
@@ -177,13 +177,13 @@ class Vehicle:
         stiffness = share * _TYRE_STIFFNESS
         tyre.stiffness = [stiffness, 0.0, 0.0]
         tyre.damping = [share * _TYRE_DAMPING, 0.0, 0.0]
-        # At rest on level ground the tyre neither lifts nor lowers the base frame.
+        # Preload: at rest on level ground the base frame keeps its height.
         tyre.springref = -self.mass * _GRAVITY / len(self.wheels) / stiffness
         axle = body.add_joint(name=wheel.joint, type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 1, 0])
         axle.armature = share * _GEAR_INERTIA
         lying = Rotation.from_euler("x", 90, degrees=True).as_quat(scalar_first=True)
         size = [wheel.radius, wheel.width / 2, 0.0]
-        # Its friction wins over the ground's, so that it can change with the place.
+        # The tyre's friction takes priority over the ground's, so that it can vary with position.
         body.add_geom(
             name=wheel.surface, type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=size, quat=lying,
             rgba=[0.08, 0.08, 0.09, 1], priority=1, **_collides(),
@@ -205,21 +205,21 @@ def _wheel(entry: Mapping, offsets: Mapping[str, float]) -> Wheel:
 
 
 def _track_wheels(track: Mapping, offsets: Mapping[str, float]) -> list[Wheel]:
-    """Wheels along the bottom of a track, its two rollers the first and the last of them."""
+    """Wheels along the bottom of a track; the first and last are its rollers."""
     centre, radius, length = np.array(track["centre"], float), float(track["radius"]), float(track["length"])
     count = max(2, 1 + round(length / (_TRACK_WHEEL_DISTANCE * radius)))
-    places = np.linspace(length / 2, -length / 2, count)
+    offsets_x = np.linspace(length / 2, -length / 2, count)
     return [
         Wheel(
-            f"{track['name']}_{index}", offsets[str(track["drive"])], centre + np.array([place, 0.0, 0.0]), radius,
+            f"{track['name']}_{index}", offsets[str(track["drive"])], centre + np.array([offset, 0.0, 0.0]), radius,
             float(track["width"]),
         )
-        for index, place in enumerate(places)
+        for index, offset in enumerate(offsets_x)
     ]  # fmt: skip
 
 
 def _collides() -> dict[str, object]:
-    """The robot touches the world, not itself: a wheel would collide with the chassis above it."""
+    """Collisions with the world but not with the robot itself: wheels overlap the chassis."""
     return {"contype": 2, "conaffinity": 1, "group": GROUP, "friction": [1.0, 0.005, 0.0001], "solref": [0.02, 1.0]}
 
 
@@ -233,7 +233,7 @@ def _point_inertia(mass: float, offset: np.ndarray) -> np.ndarray:
 
 
 def _rigid(pose: np.ndarray) -> np.ndarray:
-    """The pose with an exact rotation, which single precision is not."""
+    """The pose with its single-precision rotation made orthonormal."""
     pose = pose.copy()
     pose[:3, :3] = Rotation.from_matrix(pose[:3, :3]).as_matrix()
     return pose

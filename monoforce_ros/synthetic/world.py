@@ -20,7 +20,7 @@ from monoforce_ros.synthetic.vehicle import Vehicle
 
 TIME_STEP = 0.002
 
-# Geometry groups: who sees what.
+# Geometry groups, which select what rays and cameras see.
 SOLID_GROUP = 0
 DRAWN_GROUND_GROUP = 1
 GRASS_GROUP = 2
@@ -31,7 +31,7 @@ RAY_GROUPS = (SOLID_GROUP, GRASS_GROUP, RAY_GROUND_GROUP)
 DRAWN_GROUPS = (SOLID_GROUP, DRAWN_GROUND_GROUP, GRASS_GROUP, ROBOT_GROUP)
 
 _SPAWN_HEIGHT = 0.05
-# Drawing costs triangles: the drawn ground is this much coarser than the one that is driven on.
+# The rendered ground is coarser than the collision ground by this factor, to save triangles.
 _DRAWN_STEP = 2
 _TILE_SIZE = 5.0
 
@@ -41,15 +41,15 @@ def build_model(
 ) -> mujoco.MjModel:
     """Compile a world.
 
-    The ground exists three times: as a height field for contacts, as a mesh for rays (a height field casts forty times
-    slower), and as a coarser mesh with a texture for cameras.
+    The ground is modelled three times: as a height field for contacts, as a mesh for rays (forty times faster than a
+    height field), and as a coarser textured mesh for cameras.
 
     Args:
         scenery: ground, rocks, trees and grass.
-        robot: stands at the origin, heading along x.
+        robot: placed at the origin, heading along x.
         seed: of the colours.
-        cameras: vertical field of view [rad] by sensor frame; without any, what only cameras need is left out.
-        hidden: changes the model for a workflow to find out.
+        cameras: vertical field of view [rad] by sensor frame; if empty, geometry for images is left out.
+        hidden: faults to inject.
     """
     spec = mujoco.MjSpec()
     spec.option.timestep = TIME_STEP
@@ -75,7 +75,7 @@ def build_model(
     for frame, field_of_view in cameras.items():
         _add_camera(spec, frame, robot.sensors[frame], field_of_view)
     for fault in hidden:
-        fault.shape(spec, robot)
+        fault.modify_spec(spec, robot)
     return spec.compile()
 
 
@@ -90,7 +90,7 @@ def _add_camera(spec: mujoco.MjSpec, frame: str, pose: np.ndarray, field_of_view
 def _add_ground(spec: mujoco.MjSpec, scenery: Scenery) -> None:
     ground = scenery.ground
     lowest = float(ground.heights.min())
-    # MuJoCo divides by the range of heights, which level ground does not have.
+    # MuJoCo divides by the range of heights, which is zero for level ground.
     span = max(float(np.ptp(ground.heights)), 1e-3)
     spec.add_hfield(
         name="ground",
@@ -120,7 +120,7 @@ def _add_ground(spec: mujoco.MjSpec, scenery: Scenery) -> None:
 
 
 def _add_drawn_ground(spec: mujoco.MjSpec, scenery: Scenery, cover: np.ndarray, random: np.random.Generator) -> None:
-    """Add what cameras see of the ground, in tiles, so that a camera can leave out those behind it."""
+    """Add the ground for images in tiles, so that a camera can skip those out of view."""
     ground = scenery.ground
     count = ground.heights.shape[0]
     tile = _DRAWN_STEP * round(_TILE_SIZE / ground.resolution / _DRAWN_STEP)
@@ -206,7 +206,7 @@ def _add_light(spec: mujoco.MjSpec) -> None:
     spec.visual.headlight.ambient = [0.40, 0.43, 0.47]
     spec.visual.headlight.diffuse = [0.06, 0.06, 0.06]
     spec.visual.headlight.specular = [0.0, 0.0, 0.0]
-    # Cameras draw more pixels than they keep, which smooths edges at a third of the cost.
+    # Cameras oversample instead, which smooths edges at a third of the cost.
     spec.visual.quality.offsamples = 0
     spec.visual.rgba.fog = [*textures.HAZE_COLOUR, 1.0]
     spec.stat.extent = 1.0

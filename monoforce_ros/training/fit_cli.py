@@ -88,7 +88,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _fit_bag(bag: Path, robot: RobotModel, settings: FitSettings, options: argparse.Namespace) -> list[dict]:
     recording = Recording.open(bag, odometry=options.odometry, commands=options.commands, cloud=options.cloud)
-    for complaint in recording.complaints[:3]:
+    for complaint in recording.warnings[:3]:
         print(f"fit_terrain: {complaint}", file=sys.stderr)
     if not len(recording.commands):
         raise BagError(f"{bag}: no commands (Twist or TwistStamped): the physics needs them")

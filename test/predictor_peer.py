@@ -1,18 +1,14 @@
-"""A ROS node of the tests: feeds a predictor in another process and collects what it publishes."""
+"""A ROS node of the tests that feeds a predictor in another process and collects its outputs."""
 
-import os
 import time
 
 import numpy as np
-import rclpy
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
+from ros_peer import Peer
 
-from monoforce_ros.bags import builders
-from monoforce_ros.bags.types import type_store
-from monoforce_ros.messages.decoding import stamp_of
-from monoforce_ros.messages.message_types import message_class
+from monoforce_ros.bags import builders, type_store
+from monoforce_ros.messages import message_class, stamp_of
 
 OUTPUTS = {
     "/predicted/height_map": "nav_msgs/msg/GridCells",
@@ -22,21 +18,16 @@ OUTPUTS = {
     "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
 }
 
-
 _LATE = 20_000_000_000
-"""How long ago the data of an output that comes late may have been sent [ns]."""
+"""Largest age of the input data of a delayed output [ns]."""
 
 
-class Peer:
-    """Publishes messages of the bag builders and keeps what comes back."""
+class PredictorPeer(Peer):
+    """Publishes messages of the bag builders and keeps the predictor's outputs."""
 
     def __init__(self, environment: dict[str, str]):
-        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = environment["ROS_AUTOMATIC_DISCOVERY_RANGE"]
-        self.context = rclpy.Context()
-        rclpy.init(context=self.context, domain_id=int(environment["ROS_DOMAIN_ID"]))
-        self.node = rclpy.create_node("peer", context=self.context)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
+        variables = ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE")
+        super().__init__("peer", {name: environment[name] for name in variables})
         self.received: dict[str, list] = {topic: [] for topic in OUTPUTS}
         quality = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
         for topic, name in OUTPUTS.items():
@@ -53,11 +44,6 @@ class Peer:
         self.now = 1_700_000_000_000_000_000
         self.clouds_sent: list[int] = []
 
-    def close(self) -> None:
-        self.executor.shutdown()
-        self.node.destroy_node()
-        rclpy.shutdown(context=self.context)
-
     def publish(self, topic: str, message) -> None:
         name = message.__msgtype__
         if topic not in self._publishers:
@@ -65,54 +51,49 @@ class Peer:
             self._publishers[topic] = self.node.create_publisher(message_class(name), topic, quality)
         self._publishers[topic].publish(bytes(type_store().serialize_cdr(message, name)))
 
-    def spin(self, seconds: float) -> None:
-        end = time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0:
-            self.executor.spin_once(timeout_sec=left)
-
     def until(self, condition, seconds: float = 15.0) -> bool:
         end = time.monotonic() + seconds
         while not condition():
             if time.monotonic() > end:
                 return False
-            self.executor.spin_once(timeout_sec=0.05)
+            self.spin_once(0.05)
         return True
 
     def _keep(self, topic: str, message) -> None:
-        # Diagnostics are stamped by the node's own clock, everything else by the data it was made from. A stamp that
-        # no data had lately, as zero, is kept: it is wrong, and tests look for that.
+        # Diagnostics carry the time of the node's clock, other outputs the stamp of their input data. Outputs with a
+        # stamp that no recent input had, such as zero, are kept, so that tests can detect wrong stamps.
         if topic == "/diagnostics" or not self._since - _LATE <= stamp_in(message) < self._since:
             self.received[topic].append(message)
 
     def clear(self) -> None:
-        """Forget what has come; what was made from data sent before may still come."""
+        """Forget all outputs; outputs of earlier data may still arrive."""
         self._since = 0
         for messages in self.received.values():
             messages.clear()
 
     def begin(self) -> None:
-        """Forget what has come, and from now on drop every output made from data sent before."""
+        """Forget all outputs, and from now on ignore outputs of data sent before."""
         self.clear()
         self._since = self.now
 
     def settle(self, seconds: float = 0.5) -> None:
-        """Wait until no prediction has come for a while: a busy machine makes the last ones late."""
+        """Wait until no output has arrived for ``seconds``: a busy machine delays the last ones."""
 
-        def heard() -> int:
+        def count() -> int:
             return sum(len(messages) for topic, messages in self.received.items() if topic != "/diagnostics")
 
         for _ in range(20):
-            before = heard()
+            before = count()
             self.spin(seconds)
-            if heard() == before:
+            if count() == before:
                 return
-        raise AssertionError("predictions do not cease although nothing is sent")
+        raise AssertionError("predictions continue although nothing is sent")
 
     def stamps(self, topic: str) -> list[int]:
         return [stamp_in(message) for message in self.received[topic]]
 
     def status(self, part: str) -> tuple[int, str] | None:
-        """Level and text that the last diagnostics give for a part."""
+        """Level and message of a part in the latest diagnostics."""
         for array in reversed(self.received["/diagnostics"]):
             for status in array.status:
                 if status.name == f"predictor: {part}":
@@ -120,10 +101,10 @@ class Peer:
         return None
 
     def drive(self, seconds: float, *, cloud=None, odometry=None, command=None, speed: float = 0.5) -> None:
-        """Feed a drive along x in real time: odometry at 50 Hz, commands at 20 Hz, a cloud at 5 Hz.
+        """Publish a drive along x in real time: odometry at 50 Hz, commands at 25 Hz, clouds at 5 Hz.
 
-        ``cloud``, ``odometry`` and ``command`` take a stamp and return another message in place of the healthy one, or
-        None to keep silent.
+        ``cloud``, ``odometry`` and ``command`` take a stamp and return a message that replaces the default one, or None
+        for no message.
         """
         cloud = cloud or (lambda stamp: builders.point_cloud(stamp, "lidar", ground_cloud()))
         odometry = odometry or (
@@ -133,7 +114,7 @@ class Peer:
         begin, start = time.monotonic(), self.now
         for step in range(round(seconds * 50)):
             self.now = start + step * 20_000_000
-            # Like a robot's drivers: the cloud is stamped when it was taken and arrives before newer odometry.
+            # As on a robot, the cloud has the stamp of its measurement and arrives before newer odometry.
             if step % 10 == 0 and (message := cloud(self.now)) is not None:
                 self.publish("/points", message)
                 self.clouds_sent.append(self.now)
@@ -146,12 +127,12 @@ class Peer:
 
 
 def stamp_in(message) -> int:
-    """Stamp of a message that has one, or whose first marker has [ns]."""
+    """Stamp [ns] of a message, or of its first marker."""
     return stamp_of(message.markers[0] if hasattr(message, "markers") else message)
 
 
 def ground_cloud(seed: int = 0) -> np.ndarray:
-    """Returns of level ground 0.13 m below base_link, seen by a lidar 0.65 m above it."""
+    """Lidar points of level ground 0.13 m below base_link, from a lidar 0.65 m above base_link."""
     generator = np.random.default_rng(seed)
     radius, angle = generator.uniform(0.8, 8.0, 6000), generator.uniform(-np.pi, np.pi, 6000)
     ground = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(6000, -0.1323 - 0.65)], axis=1)
