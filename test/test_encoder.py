@@ -233,7 +233,7 @@ def test_material_that_nothing_taught_is_the_one_configured(sensor):
 
 
 def test_an_image_that_is_not_the_calibrated_size_is_named():
-    with pytest.raises(ValueError, match="got 64 × 48 px, but its CameraInfo says 128 × 96 px"):
+    with pytest.raises(ValueError, match="got 64 × 48 px, expected 128 × 96 px as in its CameraInfo"):
         view(np.zeros((48, 64, 3), np.uint8))
 
 
@@ -251,7 +251,7 @@ def test_the_shipped_checkpoint_is_small_and_for_cameras():
     assert shipped_checkpoint().stat().st_size < 12e6
     encoder = load_encoder("", "camera")
     assert encoder.config.sensor == "camera" and encoder.config.decreases
-    with pytest.raises(CheckpointError, match="is an encoder for camera, expected one for lidar"):
+    with pytest.raises(CheckpointError, match="got an encoder for camera, expected one for lidar"):
         load_encoder("", "lidar")
 
 
@@ -268,16 +268,16 @@ def test_unusable_checkpoints_are_named_and_never_replaced_by_random_weights(tmp
     config = json.loads(path.with_suffix(".json").read_text())
     for change, message in (
         ({"image_width": 130}, "multiples of 16"),
-        ({"map_features": 16}, "not the weights of the network"),
+        ({"map_features": 16}, "the weights do not match the network"),
         ({"backbone": "resnet"}, "got 'resnet'"),
-        ({"colour": "red"}, "not the configuration"),
+        ({"colour": "red"}, "not an encoder configuration"),
         ({"depth_bins": 1e9}, "depth_bins"),
     ):
         path.with_suffix(".json").write_text(json.dumps(config | change))
         with pytest.raises(CheckpointError, match=message):
             load_encoder(path)
     path.with_suffix(".json").write_text("{")
-    with pytest.raises(CheckpointError, match="not the configuration"):
+    with pytest.raises(CheckpointError, match="not an encoder configuration"):
         load_encoder(path)
     broken = TerrainEncoder(SMALL)
     torch.nn.init.constant_(broken.heads.bias, float("nan"))
@@ -304,5 +304,5 @@ def test_encoders_are_averaged_by_their_shares(tmp_path):
         with pytest.raises(ValueError, match="expected a number above 0 for each"):
             averaged(paths, shares)
     save_encoder(TerrainEncoder(replace(SMALL, map_features=SMALL.map_features + 8)), paths[1])
-    with pytest.raises(CheckpointError, match="is of another network than"):
+    with pytest.raises(CheckpointError, match="its network differs from that of"):
         averaged(paths, [1.0, 1.0])
