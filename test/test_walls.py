@@ -1,4 +1,8 @@
-"""A wall ahead (paper, figure 9): the shipped encoder predicts the crash by heights, and none where none stands."""
+"""A wall ahead (paper, figure 9), in scenes on which nothing was tuned or selected: the first twelve from seed 93000.
+
+The shipped encoder predicts 6 of 7 crashes there and none without a wall. On all 32 scenes from there it
+is 16 of 21.
+"""
 
 import pytest
 import torch
@@ -9,6 +13,9 @@ from monoforce_ros.perception import CameraTerrain
 from monoforce_ros.prediction import Predictor
 from monoforce_ros.robots import load_robot
 
+SEEDS = range(93000, 93012)
+WALLS, PREDICTED = 7, 6
+
 
 @pytest.fixture(scope="module")
 def predictor():
@@ -16,13 +23,18 @@ def predictor():
     return Predictor(robot, CameraTerrain(fused(load_encoder("", "camera")), robot), horizon=wall.HORIZON)
 
 
-@pytest.mark.parametrize(
-    ("seed", "stands"), [(80000, False), (80006, False), (80004, True), (80005, True), (80010, True), (80019, True)]
-)
-def test_the_shipped_encoder_predicts_where_the_simulated_robot_stops(predictor, seed, stands):
-    found = wall.scene(seed)
-    least = wall.STOPPED * wall.SPEED * wall.HORIZON
-    assert (found.wall is not None) == stands == (found.driven < least)
-    driven, by_heights, prediction = wall.predicted(predictor, found)
-    assert (driven < least) == (by_heights < least) == stands
-    assert bool(torch.isfinite(prediction.terrain.height).all())
+def test_the_shipped_encoder_predicts_crashes_and_no_false_ones(predictor):
+    threshold = wall.STOPPED * wall.SPEED * wall.HORIZON
+    walls = crashes = crashes_by_height = 0
+    for seed in SEEDS:
+        found = wall.scene(seed)
+        is_wall = found.wall is not None
+        assert (found.driven < threshold) == is_wall, seed
+        driven, by_height, prediction = wall.predicted(predictor, found)
+        assert torch.isfinite(prediction.terrain.height).all(), seed
+        assert is_wall or min(driven, by_height) >= threshold, f"seed {seed}: false crash"
+        walls += is_wall
+        crashes += driven < threshold
+        crashes_by_height += by_height < threshold
+    assert walls == WALLS
+    assert crashes >= PREDICTED and crashes_by_height >= PREDICTED

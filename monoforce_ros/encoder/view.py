@@ -55,8 +55,8 @@ class EncoderInput:
     ground: Tensor
     """Height of the ground under the robot in its terrain frame ``[B]`` [m]."""
     sweep: Tensor
-    """Lowest and highest lidar hit of each cell relative to ``ground`` [m], and the hit mask; ``[B, 3, rows, columns]``,
-    or ``[B, 0, rows, columns]`` without a lidar."""
+    """Lowest and highest lidar hit of each cell relative to ``ground`` [m], and the hit mask;
+    ``[B, 3, rows, columns]``, or ``[B, 0, rows, columns]`` without a lidar."""
 
     @property
     def maps(self) -> int:
