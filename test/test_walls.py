@@ -1,7 +1,7 @@
-"""A wall ahead (paper, figure 9), in scenes on which nothing was tuned or selected: the first twelve from seed 93000.
+"""A wall ahead (paper, figure 9), in scenes on which nothing was tuned or selected: the first nine from seed 93000.
 
-The shipped encoder predicts 6 of 7 crashes there and none without a wall. On all 32 scenes from there it
-is 16 of 21.
+The shipped encoder predicts 6 of their 7 crashes and none without a wall. In the first 32 scenes it is
+16 of 21 crashes, and none in the 11 scenes without a wall.
 """
 
 import pytest
@@ -13,8 +13,8 @@ from monoforce_ros.perception import CameraTerrain
 from monoforce_ros.prediction import Predictor
 from monoforce_ros.robots import load_robot
 
-SEEDS = range(93000, 93012)
-WALLS, PREDICTED = 7, 6
+THRESHOLD = wall.STOPPED * wall.SPEED * wall.HORIZON
+MISSED = {93006: "the wall 3.04 m ahead is not detected"}
 
 
 @pytest.fixture(scope="module")
@@ -23,18 +23,12 @@ def predictor():
     return Predictor(robot, CameraTerrain(fused(load_encoder("", "camera")), robot), horizon=wall.HORIZON)
 
 
-def test_the_shipped_encoder_predicts_crashes_and_no_false_ones(predictor):
-    threshold = wall.STOPPED * wall.SPEED * wall.HORIZON
-    walls = crashes = crashes_by_height = 0
-    for seed in SEEDS:
-        found = wall.scene(seed)
-        is_wall = found.wall is not None
-        assert (found.driven < threshold) == is_wall, seed
-        driven, by_height, prediction = wall.predicted(predictor, found)
-        assert torch.isfinite(prediction.terrain.height).all(), seed
-        assert is_wall or min(driven, by_height) >= threshold, f"seed {seed}: false crash"
-        walls += is_wall
-        crashes += driven < threshold
-        crashes_by_height += by_height < threshold
-    assert walls == WALLS
-    assert crashes >= PREDICTED and crashes_by_height >= PREDICTED
+@pytest.mark.parametrize(("seed", "crash"), [(seed, seed not in (93001, 93003)) for seed in range(93000, 93009)])
+def test_the_shipped_encoder_predicts_crashes_and_no_false_ones(predictor, seed, crash):
+    found = wall.scene(seed)
+    assert (found.wall is not None) == crash == (found.driven < THRESHOLD)
+    driven, driven_by_height, prediction = wall.predicted(predictor, found)
+    assert torch.isfinite(prediction.terrain.height).all()
+    if seed in MISSED and driven >= THRESHOLD:
+        pytest.xfail(MISSED[seed])
+    assert (driven < THRESHOLD) == (driven_by_height < THRESHOLD) == crash
