@@ -53,27 +53,27 @@ def truth(labels, grid, pose):
 def test_the_supporting_terrain_in_grass_is_recovered_where_the_lidar_measures_the_tips(world, husky):
     recording, labels = Recording.open(world), np.load(labels_file(world))
     motion = smooth(recording.motion).motion
-    hard, grass, seen_in_grass = [], [], []
+    hard, grass, visible_in_grass = [], [], []
     for index in range(2):
         start = int(recording.motion.stamps[0]) + index * 10**10
         pose, grid = trajectory_frame(motion, start), trajectory_grid(motion, start, 10.0, FitSettings())
-        seen = visible_terrain(recording, motion, husky, grid, pose, start=start - 2 * 10**9, stop=start + 10**10)
-        fit = fit_terrain(motion, recording.commands, husky, start=start, visible=seen)
+        visible = visible_terrain(recording, motion, husky, grid, pose, start=start - 2 * 10**9, stop=start + 10**10)
+        fit = fit_terrain(motion, recording.commands, husky, start=start, visible=visible)
         support, classes = truth(labels, grid, pose)
         away = np.abs(fit.terrain.height.numpy() - support)
         ordinary = (classes == GroundClass.GROUND) | (classes == GroundClass.RAMP)
         hard.append(away[fit.contact_mask & ordinary])
         grass.append(away[fit.contact_mask & (classes == GroundClass.GRASS)])
-        off = np.abs(seen.geometric_height.numpy() - support)
-        seen_in_grass.append(off[fit.contact_mask & (classes == GroundClass.GRASS)])
+        off = np.abs(visible.geometric_height.numpy() - support)
+        visible_in_grass.append(off[fit.contact_mask & (classes == GroundClass.GRASS)])
         assert fit.losses[-1] < 0.5 * fit.losses[0]
         assert np.median(fit.after) < 0.6 * np.median(fit.before)
-    hard, grass, seen_in_grass = (np.concatenate(parts) for parts in (hard, grass, seen_in_grass))
+    hard, grass, visible_in_grass = (np.concatenate(parts) for parts in (hard, grass, visible_in_grass))
     assert len(hard) > 300
     assert len(grass) > 60
     assert np.median(hard) <= 0.02
     assert np.median(grass) <= 0.04
-    assert np.median(seen_in_grass) > 0.15
+    assert np.median(visible_in_grass) > 0.15
 
 
 def recorded(robot, terrain, twist, seconds, height):
@@ -109,7 +109,7 @@ def test_the_descent_corrects_a_wrong_initial_terrain(husky):
 
 
 def trajectory_like(grid, motion, height):
-    """The grid as seen from the trajectory's frame, which here is only shifted."""
+    """The grid in the trajectory's frame, which is only shifted here."""
     x, y = motion.positions[0, :2]
     return dataclasses.replace(grid, origin=(grid.origin[0] - x, grid.origin[1] - y))
 

@@ -1,4 +1,4 @@
-"""Training: augmentations keep the calibration, losses count what was measured, and the installed executable trains."""
+"""Training: augmentation preserves the calibration, losses count measured cells only, and the executable trains."""
 
 import json
 import os
@@ -215,15 +215,15 @@ def test_the_decrease_is_supervised_where_both_surfaces_are_known(recording):
     observed = torch.zeros_like(targets.observed)
     observed[:, :, observed.shape[2] // 2 :] = True
     targets = replace(targets, geometric=targets.supporting + 0.4, observed=observed)
-    said = torch.full_like(targets.supporting, 0.1).requires_grad_()
-    loss = measured_decrease_loss(maps_of(targets, decrease=said), targets)
+    decrease = torch.full_like(targets.supporting, 0.1).requires_grad_()
+    loss = measured_decrease_loss(maps_of(targets, decrease=decrease), targets)
     assert float(loss.detach()) == pytest.approx(0.3 - 0.025, abs=1e-4)
-    (gradient,) = torch.autograd.grad(loss, said)
+    (gradient,) = torch.autograd.grad(loss, decrease)
     known = targets.contact_mask & observed
     assert bool(known.any()) and bool((gradient[known] < 0).all()) and float(gradient[~known].abs().max()) == 0.0
     # Only cells with both surfaces count; the supporting terrain is never above the visible one.
     higher = replace(targets, geometric=targets.supporting - 0.4)
-    assert float(measured_decrease_loss(maps_of(targets, decrease=said * 0.0), higher)) == 0.0
+    assert float(measured_decrease_loss(maps_of(targets, decrease=decrease * 0.0), higher)) == 0.0
 
 
 def test_the_decrease_of_prominent_cells_without_contact_is_penalised(recording):

@@ -148,7 +148,7 @@ class TerrainEncoder(nn.Module):
 def map_heads(features: int) -> nn.Conv2d:
     """Untrained heads for H_g, H_d, stiffness, damping and friction.
 
-    Material heads start at zero, which stands for the configuration's material: without a loss they stay there.
+    Material heads start at zero, which encodes the configuration's material; without a loss they stay there.
     """
     heads = nn.Conv2d(features, 5, kernel_size=1)
     assert heads.bias is not None
