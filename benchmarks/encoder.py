@@ -1,9 +1,9 @@
-"""Speed of the terrain encoder: images to terrain, one and four cameras, and where the time goes.
+"""Speed of the terrain encoder: time from images to terrain with one and four cameras, in total and per stage.
 
     scripts/run.sh python benchmarks/encoder.py [--json FILE] [--threads 2] [--compile] [--quick]
 
-The encoder as trained, with folded norms, with weights laid out for the processor and in bfloat16 (where it multiplies
-that) run side by side; every figure is the median of several runs.
+Compares the encoder as trained, with folded norms, with packed weights, and in bfloat16 if the processor supports it.
+Every figure is the median of several runs.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ SUPPORT = np.array([[0.3, 0.3, -0.1], [0.3, -0.3, -0.1], [-0.3, 0.3, -0.1], [-0.
 
 
 def views(count: int, width: int = 320, height: int = 240) -> list[CameraView]:
-    """Cameras on all sides of a robot, that look a little downwards."""
+    """Cameras on all sides of a robot, tilted slightly downwards."""
     random = np.random.default_rng(0)
     matrix = np.array([[0.6 * width, 0, width / 2 - 0.5], [0, 0.6 * width, height / 2 - 0.5], [0, 0, 1]])
     camera = CameraModel(width, height, matrix, np.array([-0.2, 0.05, 0.0, 0.0, 0.0]))
@@ -55,38 +55,38 @@ def timed(work: Callable[[], object], repeats: int) -> float:
     return 1e3 * statistics.median(durations)
 
 
-def stages(encoder: TerrainEncoder, seen: list[CameraView], repeats: int) -> dict[str, float]:
-    """Durations of the parts [ms]."""
+def stages(encoder: TerrainEncoder, cameras: list[CameraView], repeats: int) -> dict[str, float]:
+    """Duration of each stage [ms]."""
     config = encoder.config
     size = config.grid.rows * config.grid.columns
-    batch = encoder_input(seen, SUPPORT, config)
+    batch = encoder_input(cameras, SUPPORT, config)
     with torch.no_grad():
         depth, features = encoder._lift(batch)
         points = lifted_points(batch.rays, batch.origins, encoder.depths)
         cells = map_cells(points, config)
-        kind = encoder.lift.weight.dtype
-        images = (batch.images.float() / 127.5 - 1.0).to(kind)
+        dtype = encoder.lift.weight.dtype
+        images = (batch.images.float() / 127.5 - 1.0).to(dtype)
         maps = torch.zeros(1, config.image_features + 5, config.grid.rows, config.grid.columns)
         maps = maps.contiguous(memory_format=torch.channels_last)
         encoded = encoder(batch)
         return {
-            "geometry and resizing": timed(lambda: encoder_input(seen, SUPPORT, config), repeats),
+            "geometry and resizing": timed(lambda: encoder_input(cameras, SUPPORT, config), repeats),
             "backbone": timed(lambda: encoder.backbone(images), repeats),
             "backbone, neck and depths": timed(lambda: encoder._lift(batch), repeats),
             "points and cells": timed(
                 lambda: map_cells(lifted_points(batch.rays, batch.origins, encoder.depths), config), repeats
             ),
             "splat": timed(lambda: splat(depth, features, cells, points[..., 2], size), repeats),
-            "bird's-eye-view network": timed(lambda: encoder.heads(encoder.bird(maps.to(kind)).float()), repeats),
+            "bird's-eye-view network": timed(lambda: encoder.heads(encoder.bird(maps.to(dtype)).float()), repeats),
             "edges and terrain map": timed(lambda: terrain_maps(with_edges(encoded, config), config), repeats),
         }
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--threads", type=int, default=2, help="of PyTorch (%(default)s)")
-    parser.add_argument("--compile", action="store_true", help="torch.compile beside it (needs a C++ compiler)")
-    parser.add_argument("--quick", action="store_true", help="few runs, for a test")
+    parser.add_argument("--threads", type=int, default=2, help="threads of PyTorch (default: %(default)s)")
+    parser.add_argument("--compile", action="store_true", help="also measure torch.compile (needs a C++ compiler)")
+    parser.add_argument("--quick", action="store_true", help="few repeats, for a test")
     parser.add_argument("--json", type=Path, help="write the figures to this file")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
@@ -104,17 +104,17 @@ def main() -> None:
                 kinds[kind].compile(options={"freezing": True})
     figures: dict = {"threads": options.threads, "processor": platform.processor(), "torch": torch.__version__}
     for count in (1, 4):
-        seen = views(count)
-        before = timed(lambda: plain.terrain(seen, SUPPORT), repeats)  # noqa: B023
+        cameras = views(count)
+        before = timed(lambda: plain.terrain(cameras, SUPPORT), repeats)  # noqa: B023
         times = {}
         for kind, encoder in kinds.items():
             began = time.perf_counter()
-            encoder.terrain(seen, SUPPORT)
+            encoder.terrain(cameras, SUPPORT)
             if kind.startswith("compiled"):
                 print(f"torch.compile, {kind}: {time.perf_counter() - began:.0f} s")
-            times[kind] = timed(lambda e=encoder: e.terrain(seen, SUPPORT), repeats)  # noqa: B023
+            times[kind] = timed(lambda e=encoder: e.terrain(cameras, SUPPORT), repeats)  # noqa: B023
         after = times[best]
-        parts = stages(quick, seen, repeats)
+        parts = stages(quick, cameras, repeats)
         figures[f"{count} cameras"] = {
             "plain_ms": before,
             **{f"{kind.replace(' ', '_')}_ms": duration for kind, duration in times.items()},

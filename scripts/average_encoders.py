@@ -1,4 +1,4 @@
-"""Averages the weights of encoders that were trained on from the same start, into a checkpoint of its own.
+"""Averages the weights of encoders that were fine-tuned from the same checkpoint.
 
 scripts/run.sh python scripts/average_encoders.py OUT.safetensors FILE.safetensors=SHARE...
 """
@@ -11,10 +11,10 @@ from monoforce_ros.encoder import CheckpointError, averaged, save_encoder
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description="Average the weights of encoders trained on from the same start.")
+    parser = argparse.ArgumentParser(description="Average the weights of encoders fine-tuned from the same checkpoint.")
     parser.add_argument("out", type=Path, metavar="OUT.safetensors")
     parser.add_argument(
-        "encoders", nargs="+", metavar="FILE=SHARE", help="checkpoint, and by how much it counts (without =SHARE: 1)"
+        "encoders", nargs="+", metavar="FILE=SHARE", help="checkpoint and its weight in the mean (default: 1)"
     )
     options = parser.parse_args()
     paths, shares = [], []
@@ -24,7 +24,7 @@ def main() -> int:
         try:
             shares.append(float(share) if given else 1.0)
         except ValueError:
-            parser.error(f"{text}: got the share {share!r}, expected a number, as {path}=2")
+            parser.error(f"{text}: got share {share!r}, expected a number as in {path}=2")
     try:
         save_encoder(averaged(paths, shares), options.out)
     except (CheckpointError, ValueError, OSError) as error:

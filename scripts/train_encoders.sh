@@ -1,19 +1,19 @@
 #!/usr/bin/env bash
-# Makes the shipped terrain encoder, or all that the tables compare, from nothing: worlds, training, comparison.
+# Trains the shipped terrain encoder, or everything for the tables, from scratch: worlds, training, comparison.
 #   scripts/train_encoders.sh checkpoint | tables
-# Worlds and what has been trained are kept in out/; an interrupted run goes on where it was.
+# Worlds and encoders are kept in out/; run it again to resume an interrupted run.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-what=${1:?checkpoint or tables}
+target=${1:?checkpoint or tables}
 worlds=out/worlds
 cameras="--camera 320x240 --camera-rate 4 --lidar-rate 4"
-# One thread for each training: two at a time, each to its core, are faster than one with two.
+# Two trainings with one thread each are faster than one after the other with two.
 threads="--threads 1"
 mkdir -p "$worlds" out/encoders models
 
 run() { scripts/run.sh "$@"; }
 
-# A folder of worlds that is complete is marked; one that is not is made again.
+# Complete folders of worlds are marked; others are recorded again.
 worlds() { # name, ground, first seed, count, options
   local folder=$worlds/$1 ground=$2 seed=$3 count=$4
   shift 4
@@ -27,12 +27,12 @@ train() { # name, steps, options
   local out=out/encoders/$1 steps=$2
   shift 2
   [ -f "$out/training.json" ] && return
-  run train "$worlds"/{mixed,grass,rigid,yard}/* --held-out $held_out --cut "$worlds/cut" \
+  run train "$worlds"/{mixed,grass,rigid,yard}/* --held-out $held_out --samples "$worlds/cut" \
     --out "$out" --steps "$steps" --seed 1 $threads "$@"
 }
 
-# Runs beside what follows; its output goes to a file, shown if it fails.
-beside() { # log, command...
+# Runs a command with its output in a log file, which is printed if the command fails.
+logged() { # log, command...
   local log=$1
   shift
   "$@" >"$log" 2>&1 || { cat "$log" >&2; return 1; }
@@ -41,33 +41,33 @@ beside() { # log, command...
 worlds mixed mixed 50000 20
 worlds grass grass 51000 16
 worlds rigid rigid 52000 6
-# Walls and grass close ahead, which no drive along a track shows: the robot turns on the spot among them.
+# Walls and grass close ahead, which runs along a track do not contain: the robot turns on the spot among them.
 worlds yard yard 53000 16 --commands spin --duration 16
 held_out="$worlds/mixed/50018 $worlds/mixed/50019 $worlds/grass/51015 $worlds/rigid/52005 $worlds/yard/53015"
-# All drives are cut before the first step; two trainings at once would both cut them.
-run train "$worlds"/{mixed,grass,rigid,yard}/* --held-out $held_out --cut "$worlds/cut" --cut-only
+# Samples are extracted first: two trainings started together would both do it.
+run train "$worlds"/{mixed,grass,rigid,yard}/* --held-out $held_out --samples "$worlds/cut" --samples-only
 
-if [ "$what" = tables ]; then
+if [ "$target" = tables ]; then
   worlds test_rigid rigid 60000 8
   worlds test_grass grass 61000 8
   others() {
     train no_geometric 1200 --losses terrain trajectory --no-edges &&
       train lidar_network 400 --sensor lidar --losses geometric
   }
-  beside out/encoders/others.log others &
+  logged out/encoders/others.log others &
   other=$!
 fi
-# What is seen first, which is lift-splat-shoot, then what carries. The second step goes more slowly and with more weight on
-# what is seen and stands out, or the walls that were learnt in the first are forgotten. The longer it is, the better it
-# knows the ground under grass, and the worse walls; the mean of the weights of a short and a long one is good at both.
+# First the geometric loss only, which gives lift-splat-shoot, then all losses. Fine-tuning has a lower learning rate and more
+# weight on the geometric loss and on prominent cells, or it forgets walls. Longer fine-tuning improves the ground under
+# grass and worsens walls; the mean of the weights of a short and a long one is good at both.
 train geometric 800 --losses geometric
 train lss 400 --losses geometric --start-from out/encoders/geometric/encoder.safetensors
-carrying() { # name, steps
-  train "$1" "$2" --start-from out/encoders/lss/encoder.safetensors --rate 0.0007 --geometric 3 --standing 8 --seed 2
+fine_tune() { # name, steps
+  train "$1" "$2" --start-from out/encoders/lss/encoder.safetensors --rate 0.0007 --geometric 3 --prominence 8 --seed 2
 }
-beside out/encoders/short.log carrying short 320 &
+logged out/encoders/short.log fine_tune short 320 &
 short=$!
-carrying long 1200
+fine_tune long 1200
 wait "$short"
 run python scripts/average_encoders.py out/encoders/monoforce/encoder.safetensors \
   out/encoders/long/encoder.safetensors=2 out/encoders/short/encoder.safetensors
@@ -79,7 +79,7 @@ done
 cp out/encoders/monoforce/robot.yaml models/.husky_in_grass.yaml
 mv models/.husky_in_grass.yaml models/husky_in_grass.yaml
 ls -l models
-[ "$what" = tables ] || exit 0
+[ "$target" = tables ] || exit 0
 
 wait "$other"
 run evaluate --tables --rigid "$worlds/test_rigid" --grass "$worlds/test_grass" --out out/tables --docs docs/training.md \

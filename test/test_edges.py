@@ -1,4 +1,4 @@
-"""Edges that an encoder blurred: restored where heights rise too steeply, left alone elsewhere."""
+"""Edges blurred by an encoder are restored where heights rise too steeply, and other heights are unchanged."""
 
 from dataclasses import replace
 
@@ -19,14 +19,14 @@ WALL = 2.0
 
 
 def rise(grid: Grid, height: float, width: float, heading: float = 0.0) -> torch.Tensor:
-    """Heights ``[1, rows, columns]`` that rise by ``height`` over ``width``, ``WALL`` ahead towards a heading [m]."""
+    """Heights ``[1, rows, columns]`` [m] that rise by ``height`` over ``width``, ``WALL`` ahead along a heading."""
     x, y = np.meshgrid(np.asarray(grid.x), np.asarray(grid.y))
     ahead = torch.from_numpy(np.cos(heading) * x + np.sin(heading) * y)
     return (height * ((ahead - WALL) / width + 0.5).clamp(0.0, 1.0)).float()[None]
 
 
 def driven(heights: torch.Tensor, grid: Grid) -> float:
-    """How far a Husky gets that is told to drive 4 m ahead."""
+    """Distance that a Husky covers when commanded to drive 4 m ahead [m]."""
     robot = load_robot("husky")
     speeds = robot.drive_speeds(torch.tensor([0.8, 0.0]).expand(1, 500, 2))
     with torch.no_grad():
@@ -36,7 +36,7 @@ def driven(heights: torch.Tensor, grid: Grid) -> float:
 
 @pytest.mark.parametrize("resolution", [0.05, 0.1, 0.2])
 @pytest.mark.parametrize(("height", "width"), [(0.5, 0.6), (0.4, 0.5), (0.9, 0.6)])
-def test_a_wall_blurred_to_a_slope_is_a_step_again_where_its_middle_was(resolution, height, width):
+def test_a_blurred_wall_becomes_a_step_at_the_middle_of_its_slope(resolution, height, width):
     grid = Grid.square(8.0, resolution)
     restored = restore_edges(rise(grid, height, width), resolution)[0, 0].double()
     x = torch.from_numpy(np.asarray(grid.x))
@@ -63,33 +63,33 @@ def test_a_robot_climbs_the_blurred_wall_and_stops_at_the_restored_one():
         pytest.param(0.0, 1.0, id="level ground"),
     ],
 )
-def test_ground_that_is_no_wall_is_returned_as_it_was_whichever_way_it_lies(height, width, heading):
+def test_gentle_ground_is_unchanged_in_any_direction(height, width, heading):
     heights = rise(Grid.square(), height, width, heading=np.radians(heading))
     assert torch.equal(restore_edges(heights, 0.1), heights)
 
 
 @pytest.mark.parametrize("heading", [0.0, 20.0, 45.0, 90.0])
-def test_walls_are_restored_whichever_way_they_face(heading):
+def test_walls_are_restored_in_any_direction(heading):
     grid = Grid.square()
     blurred, sharp = (rise(grid, 0.5, width, heading=np.radians(heading)) for width in (0.6, 1e-3))
     off = [float((heights - sharp).abs().mean()) for heights in (blurred, restore_edges(blurred, 0.1))]
     assert off[1] < 0.5 * off[0]
 
 
-def test_a_long_steep_slope_stays_a_slope_between_its_ends():
+def test_the_middle_of_a_long_steep_slope_is_unchanged():
     grid = Grid.square()
     slope = rise(grid, 2.0, 2.0 / np.tan(np.radians(40)))
     middle = np.abs(np.asarray(grid.x) - WALL) < 0.8
     torch.testing.assert_close(restore_edges(slope, 0.1)[0, :, middle], slope[0, :, middle])
 
 
-def test_a_sharp_wall_stays_where_it_is():
+def test_a_sharp_wall_is_unchanged():
     step = rise(Grid.square(), 0.6, 1e-3)
     torch.testing.assert_close(restore_edges(step, 0.1), step)
 
 
 @given(seed=st.integers(0, 2**31), roughness=st.floats(0.0, 2.0), offset=st.floats(-50.0, 50.0))
-def test_heights_stay_within_their_surroundings_wherever_the_map_lies_and_however_it_is_turned(seed, roughness, offset):
+def test_heights_stay_within_their_neighbourhood_and_results_follow_offsets_and_symmetries(seed, roughness, offset):
     heights = roughness * torch.from_numpy(np.random.default_rng(seed).normal(size=(2, 24, 31)))
     restored = restore_edges(heights, 0.1)
     around, below = (sign * torch.nn.functional.max_pool2d(sign * heights[:, None], 7, 1, 3)[:, 0] for sign in (1, -1))
@@ -99,18 +99,18 @@ def test_heights_stay_within_their_surroundings_wherever_the_map_lies_and_howeve
         torch.testing.assert_close(restore_edges(turned(heights), 0.1), turned(restored))
 
 
-def test_small_changes_of_a_prediction_change_the_restored_map_little():
+def test_restored_heights_are_stable_under_small_changes():
     blurred = rise(Grid.square(), 0.5, 0.6).double()
     other = blurred + 1e-3 * torch.from_numpy(np.random.default_rng(0).normal(size=blurred.shape))
     assert float((restore_edges(other, 0.1) - restore_edges(blurred, 0.1)).abs().max()) < 0.1
 
 
-def test_gradients_reach_every_height_and_are_those_of_the_ground_where_nothing_changes():
+def test_gradients_are_correct_and_the_identity_on_unchanged_ground():
     level = torch.zeros(1, 20, 20, dtype=torch.float64, requires_grad=True)
     (gradient,) = torch.autograd.grad(restore_edges(level, 0.1).sum(), level)
     torch.testing.assert_close(gradient, torch.ones_like(level))
     blurred = rise(Grid.square(6.0), 0.5, 0.6).double()
-    # Away from ties, at which a highest cell is another one.
+    # Noise avoids ties, at which the maximum is not differentiable.
     blurred = (blurred + 1e-3 * torch.from_numpy(np.random.default_rng(1).normal(size=blurred.shape))).requires_grad_()
     weight = torch.from_numpy(np.random.default_rng(2).normal(size=blurred.shape))
     (gradient,) = torch.autograd.grad((weight * restore_edges(blurred, 0.1)).sum(), blurred)
@@ -123,7 +123,7 @@ def test_gradients_reach_every_height_and_are_those_of_the_ground_where_nothing_
         assert float(gradient[0, row, column]) == pytest.approx((up - down) / 2e-6, rel=1e-4, abs=1e-6)
 
 
-def test_an_encoder_restores_what_carries_and_keeps_how_much_gives_way():
+def test_an_encoder_restores_edges_of_h_t_and_keeps_h_d():
     config = EncoderConfig(
         image_width=128, image_height=96, map_size=6.4, resolution=0.1, depth_bins=12, map_features=8
     )
@@ -137,7 +137,7 @@ def test_an_encoder_restores_what_carries_and_keeps_how_much_gives_way():
         CameraView(image, CameraModel(128, 96, matrix, np.array([])), homogeneous(forward, np.array([0.2, 0, 0.5])))
     ]
     with torch.no_grad():
-        # An untrained encoder's map is all but level.
+        # The map of an untrained encoder is almost level: amplify it.
         encoder.heads.weight[:2] *= 0.3 / float(encoder(encoder_input(seen, None, config)).height.std())
         encoder.config = replace(config, edges=False)
         raw = encoder(encoder_input(seen, None, config))

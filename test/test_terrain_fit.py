@@ -1,4 +1,4 @@
-"""Terrain from data: sweeps joined along a drive, maps in files, and the ground fitted to how a robot moved on it."""
+"""Terrain from data: accumulated sweeps, map files, and terrain fitted to recorded motion."""
 
 import dataclasses
 import json
@@ -21,6 +21,7 @@ from monoforce_ros.synthetic.recording import RecordingSettings, record
 from monoforce_ros.terrain import Grid, TerrainFileError, TerrainMap, accumulate, load_terrain, save_terrain
 from monoforce_ros.terrain.accumulation import company
 from monoforce_ros.training import FitSettings, fit_terrain
+from monoforce_ros.training.fit_cli import FitFigures, existing_figures
 from monoforce_ros.training.terrain_fit import trajectory_frame, trajectory_grid
 from monoforce_ros.training.visible import visible_terrain
 
@@ -49,34 +50,34 @@ def truth(labels, grid, pose):
     return labels["support_height"][row, column] - pose[2, 3], labels["ground_class"][row, column]
 
 
-def test_the_ground_under_the_wheels_is_found_in_grass_where_the_lidar_sees_the_tips(world, husky):
+def test_the_supporting_terrain_in_grass_is_recovered_where_the_lidar_measures_the_tips(world, husky):
     recording, labels = Recording.open(world), np.load(labels_file(world))
     motion = smooth(recording.motion).motion
-    hard, grass, seen_in_grass = [], [], []
+    hard, grass, visible_in_grass = [], [], []
     for index in range(2):
         start = int(recording.motion.stamps[0]) + index * 10**10
         pose, grid = trajectory_frame(motion, start), trajectory_grid(motion, start, 10.0, FitSettings())
-        seen = visible_terrain(recording, motion, husky, grid, pose, start=start - 2 * 10**9, stop=start + 10**10)
-        fit = fit_terrain(motion, recording.commands, husky, start=start, visible=seen)
+        visible = visible_terrain(recording, motion, husky, grid, pose, start=start - 2 * 10**9, stop=start + 10**10)
+        fit = fit_terrain(motion, recording.commands, husky, start=start, visible=visible)
         support, classes = truth(labels, grid, pose)
         away = np.abs(fit.terrain.height.numpy() - support)
         ordinary = (classes == GroundClass.GROUND) | (classes == GroundClass.RAMP)
-        hard.append(away[fit.felt & ordinary])
-        grass.append(away[fit.felt & (classes == GroundClass.GRASS)])
-        off = np.abs(seen.geometric_height.numpy() - support)
-        seen_in_grass.append(off[fit.felt & (classes == GroundClass.GRASS)])
+        hard.append(away[fit.contact_mask & ordinary])
+        grass.append(away[fit.contact_mask & (classes == GroundClass.GRASS)])
+        off = np.abs(visible.geometric_height.numpy() - support)
+        visible_in_grass.append(off[fit.contact_mask & (classes == GroundClass.GRASS)])
         assert fit.losses[-1] < 0.5 * fit.losses[0]
         assert np.median(fit.after) < 0.6 * np.median(fit.before)
-    hard, grass, seen_in_grass = (np.concatenate(parts) for parts in (hard, grass, seen_in_grass))
+    hard, grass, visible_in_grass = (np.concatenate(parts) for parts in (hard, grass, visible_in_grass))
     assert len(hard) > 300
     assert len(grass) > 60
     assert np.median(hard) <= 0.02
     assert np.median(grass) <= 0.04
-    assert np.median(seen_in_grass) > 0.15
+    assert np.median(visible_in_grass) > 0.15
 
 
-def drive(robot, terrain, twist, seconds, height):
-    """A drive in our own physics as a recorded track with commands."""
+def recorded(robot, terrain, twist, seconds, height):
+    """Motion simulated by the rollout, as a recorded track with commands."""
     steps = round(seconds / 0.01)
     twists = torch.tensor(twist, dtype=torch.float32).expand(1, steps, 2)
     still = rollout(terrain, robot, torch.zeros(1, 150, 2), State.at_rest(height), with_forces=False)
@@ -95,41 +96,41 @@ def drive(robot, terrain, twist, seconds, height):
     return motion, CommandTrack(stamps[:1] - 1, np.array([twist], float))
 
 
-def test_the_descent_through_the_physics_finds_a_ground_that_the_first_guess_lacks(husky):
+def test_the_descent_corrects_a_wrong_initial_terrain(husky):
     grid = Grid.square(12.8, 0.1)
     x, _ = np.meshgrid(grid.x, grid.y)
     height = torch.from_numpy((0.05 * np.sin(1.4 * x)).astype(np.float32))
-    motion, commands = drive(husky, TerrainMap.from_height(height, grid), (0.6, 0.0), 6.0, 0.14)
+    motion, commands = recorded(husky, TerrainMap.from_height(height, grid), (0.6, 0.0), 6.0, 0.14)
     wrong = TerrainMap.from_height(height + 0.12, trajectory_like(grid, motion, height))
     fit = fit_terrain(motion, commands, husky, start=int(motion.stamps[0]), length=5.5, visible=wrong)
     expected = height.numpy() - motion.positions[0, 2]
-    assert np.median(np.abs(fit.terrain.height.numpy() - expected)[fit.felt]) < 0.008
+    assert np.median(np.abs(fit.terrain.height.numpy() - expected)[fit.contact_mask]) < 0.008
     assert np.median(fit.after) < 0.004 < 0.05 < np.median(fit.before)
 
 
 def trajectory_like(grid, motion, height):
-    """The grid as seen from the trajectory's frame, which here is only shifted."""
+    """The grid in the trajectory's frame, which is only shifted here."""
     x, y = motion.positions[0, :2]
     return dataclasses.replace(grid, origin=(grid.origin[0] - x, grid.origin[1] - y))
 
 
-def test_friction_is_fitted_where_the_robot_slipped(husky):
+def test_friction_is_fitted_where_the_robot_slips(husky):
     grid = Grid.square(12.8, 0.1)
     slope = torch.from_numpy((np.tile(grid.x, (grid.rows, 1)) * 0.25).astype(np.float32))
     slippery = dataclasses.replace(TerrainMap.from_height(slope, grid), friction=torch.full_like(slope, 0.28))
-    motion, commands = drive(husky, slippery, (0.5, 0.3), 5.0, 0.2)
+    motion, commands = recorded(husky, slippery, (0.5, 0.3), 5.0, 0.2)
     start = int(motion.stamps[0])
     plain, fitted = (
         fit_terrain(motion, commands, husky, start=start, length=4.5, settings=FitSettings(friction=friction))
         for friction in (False, True)
     )
     assert float(plain.terrain.friction.min()) == pytest.approx(0.8)
-    friction = fitted.terrain.friction.numpy()[fitted.felt]
+    friction = fitted.terrain.friction.numpy()[fitted.contact_mask]
     assert np.median(friction) == pytest.approx(0.28, abs=0.1)
     assert fitted.losses.min() < plain.losses.min()
 
 
-def test_sweeps_are_joined_where_they_belong_and_dust_is_left_out():
+def test_sweeps_are_accumulated_at_their_poses_without_dust():
     random = np.random.default_rng(1)
     ground = np.column_stack([random.uniform(-4, 4, (6000, 2)), np.zeros(6000)])
     sweeps = []
@@ -167,7 +168,7 @@ def test_maps_survive_a_file(tmp_path):
 
 @given(st.binary(max_size=300))
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_any_bytes_are_no_map_and_it_says_so(tmp_path, data):
+def test_arbitrary_bytes_are_refused_as_a_map(tmp_path, data):
     (tmp_path / "map.npz").write_bytes(data)
     with pytest.raises(TerrainFileError, match=r"map\.npz"):
         load_terrain(tmp_path / "map.npz")
@@ -181,7 +182,7 @@ def test_maps_with_pickles_or_without_channels_are_refused(tmp_path):
         load_terrain(tmp_path / "missing.npz")
 
 
-def test_the_executable_fits_shows_and_goes_on(world, tmp_path, executables, ros_environment):
+def test_the_executable_fits_draws_and_resumes(world, tmp_path, executables, ros_environment):
     command = [executables / "fit_terrain", world, "--out", tmp_path / "maps", "--iterations", "15", "--quiet"]
 
     def run():
@@ -196,6 +197,10 @@ def test_the_executable_fits_shows_and_goes_on(world, tmp_path, executables, ros
     assert all(row["height_error_m"] < row["height_error_seen_m"] for row in rows)
     terrain, _ = load_terrain(tmp_path / "maps" / "drive_000.npz")
     assert terrain.observed.any()
+    with np.load(tmp_path / "maps" / "drive_000.npz") as content:
+        mask = content["contact_mask"]
+    # felt_cells is the name of contact_cells in earlier releases.
+    assert rows[0]["contact_cells"] == rows[0]["felt_cells"] == mask.sum() > 0
     before = (tmp_path / "maps" / "drive_000.npz").stat().st_mtime_ns
     (tmp_path / "maps" / "drive_001.npz").unlink()
     run()
@@ -203,7 +208,17 @@ def test_the_executable_fits_shows_and_goes_on(world, tmp_path, executables, ros
     assert (tmp_path / "maps" / "drive_001.npz").is_file()
 
 
-def test_what_cannot_be_fitted_is_said(tmp_path, executables, ros_environment, real_data):
+def test_figures_with_the_old_name_of_the_contact_mask_are_read_with_a_warning(tmp_path):
+    figures = FitFigures(0.2, 0.01, 3.0, 1.0, 25)
+    old = dataclasses.asdict(figures)
+    old["felt_cells"] = old.pop("contact_cells")
+    np.savez(tmp_path / "map.npz", fingerprint=np.array("abc"), figures=np.array(json.dumps(old)))
+    with pytest.warns(FutureWarning, match="'felt' is now 'contact_mask'"):
+        assert existing_figures(tmp_path / "map.npz", "abc") == figures
+    assert existing_figures(tmp_path / "map.npz", "other") is None
+
+
+def test_an_unusable_bag_is_reported(tmp_path, executables, ros_environment, real_data):
     bag = next((real_data / "husky_outdoor").glob("*.bag"))
     done = subprocess.run(
         [executables / "fit_terrain", bag, "--out", tmp_path / "maps"],

@@ -1,4 +1,4 @@
-"""Training: variations keep the calibration, losses count what was measured, and the installed executable trains."""
+"""Training: augmentation preserves the calibration, losses count measured cells only, and the executable trains."""
 
 import json
 import os
@@ -13,10 +13,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 
 from monoforce_ros.core import CameraModel
-from monoforce_ros.encoder import EncodedMaps, EncoderConfig, load_encoder
+from monoforce_ros.encoder import EncodedMaps, EncoderConfig, load_encoder, new_encoder
 from monoforce_ros.encoder.lift import feature_rays
 from monoforce_ros.physics import PhysicsOptions
 from monoforce_ros.robots import load_robot
@@ -24,13 +25,16 @@ from monoforce_ros.training.losses import (
     LossWeights,
     geometric_loss,
     measured_decrease_loss,
+    prominent_decrease_loss,
     slope_loss,
-    standing_decrease_loss,
     terrain_loss,
     trajectory_loss,
 )
-from monoforce_ros.training.recording_samples import SamplesError, SampleSettings, cut_recording, read_samples
-from monoforce_ros.training.samples import MIRROR, Targets, Variation, sample
+from monoforce_ros.training.recording_samples import SamplesError, read_samples
+from monoforce_ros.training.sample_extraction import SampleSettings, extract_samples
+from monoforce_ros.training.samples import MIRROR, Augmentation, Targets, sample
+from monoforce_ros.training.train_cli import build_parser
+from monoforce_ros.training.trainer import Process, Trainer, TrainingSettings
 
 TINY = EncoderConfig(image_width=128, image_height=96, map_size=6.4, resolution=0.2)
 OPTIONS = ["--size", "128x96", "--map-size", "6.4", "--resolution", "0.2", "--batch", "4", "--device", "cpu",
@@ -43,103 +47,109 @@ def husky():
 
 
 @pytest.fixture(scope="module")
-def cut(tmp_path_factory, demo_bag, husky):
-    """Folder of the demo drive's samples, which every training below reads."""
-    folder = tmp_path_factory.mktemp("cut")
-    cut_recording(demo_bag, husky, TINY, folder)
+def sample_folder(tmp_path_factory, demo_bag, husky):
+    """Folder with the samples of the demo recording, shared by all trainings below."""
+    folder = tmp_path_factory.mktemp("samples")
+    extract_samples(demo_bag, husky, TINY, folder)
     return folder
 
 
 @pytest.fixture(scope="module")
-def drive(cut):
-    return read_samples(next(cut.glob("*.safetensors")))
+def recording(sample_folder):
+    return read_samples(next(sample_folder.glob("*.safetensors")))
 
 
 @pytest.mark.parametrize("lens", [[], [-0.22, 0.065, 0, 0, 0]])
 @pytest.mark.parametrize(
-    "variation",
+    "augmentation",
     [
-        Variation(mirrored=True),
-        Variation(zoom=1.25, shift=(0.8, -0.6)),
-        Variation(tilt=0.04, zoom=1.1, shift=(-1.0, 1.0)),
-        Variation(mirrored=True, tilt=-0.03, zoom=1.2, shift=(0.3, 0.5)),
+        Augmentation(mirrored=True),
+        Augmentation(zoom=1.25, shift=(0.8, -0.6)),
+        Augmentation(tilt=0.04, zoom=1.1, shift=(-1.0, 1.0)),
+        Augmentation(mirrored=True, tilt=-0.03, zoom=1.2, shift=(0.3, 0.5)),
     ],
 )
-def test_a_varied_image_shows_a_point_where_its_ray_says(variation, lens):
+def test_a_ray_of_an_augmented_image_passes_through_the_point_at_its_pixel(augmentation, lens):
     matrix = np.array([[180.0, 0, 159.5], [0, 185.0, 121.0], [0, 0, 1]])
     camera = CameraModel(320, 240, matrix, np.array(lens))
     x, y = 190.0, 130.0
     image = np.zeros((240, 320, 3), np.uint8)
     cv2.circle(image, (int(x), int(y)), 4, (255, 255, 255), -1)
-    varied = variation.image(image)[..., 0].astype(float)
-    v, u = (np.array(np.nonzero(varied > 100)) * varied[varied > 100]).sum(1) / varied[varied > 100].sum()
-    # Rays of single pixels of the varied image: a feature map as fine as the image.
-    rays = feature_rays(camera, 240, 320, variation.image_from_view())
+    augmented = augmentation.image(image)[..., 0].astype(float)
+    bright = augmented > 100
+    v, u = (np.array(np.nonzero(bright)) * augmented[bright]).sum(1) / augmented[bright].sum()
+    # Rays of single pixels of the augmented image: a feature map as fine as the image.
+    rays = feature_rays(camera, 240, 320, augmentation.image_from_view())
     np.testing.assert_allclose(rays[round(v), round(u)], camera.rays(np.array([x, y])), atol=0.012)
-    # The whole varied image lies within the original one.
-    corners = variation.image_from_view() @ np.array([[0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 1, 1.0]]).T
+    # The whole augmented image lies within the original one.
+    corners = augmentation.image_from_view() @ np.array([[0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 1, 1.0]]).T
     assert corners.min() > -1e-9 and corners.max() < 1 + 1e-9
 
 
 def maps_of(targets: Targets, **changes) -> EncodedMaps:
-    """What an encoder without error would say."""
+    """The maps of an encoder without error."""
     shape = targets.geometric
     return EncodedMaps(
         **{
             "geometric_height": targets.supporting.clone(), "decrease": torch.zeros_like(shape),
             "stiffness": torch.full_like(shape, TINY.stiffness), "damping": torch.full_like(shape, TINY.damping),
             "friction": torch.full_like(shape, TINY.friction), "covered": torch.ones_like(shape, dtype=torch.bool),
-            "seen": torch.ones_like(shape), **changes,
+            "evidence": torch.ones_like(shape), **changes,
         }
     )  # fmt: skip
 
 
-def test_a_mirrored_and_turned_sample_moves_as_the_original(drive, husky):
+def test_a_mirrored_and_turned_sample_moves_as_the_original(recording, husky):
     losses = []
-    for variation in (Variation(), Variation(mirrored=True), Variation(turn=0.3), Variation(mirrored=True, turn=-0.3)):
-        _, targets = sample(drive, 4, TINY, variation)
+    for augmentation in (
+        Augmentation(),
+        Augmentation(mirrored=True),
+        Augmentation(turn=0.3),
+        Augmentation(mirrored=True, turn=-0.3),
+    ):
+        _, targets = sample(recording, 4, TINY, augmentation)
         losses.append(float(trajectory_loss(maps_of(targets), targets, husky, TINY, PhysicsOptions())))
         assert torch.linalg.det(targets.rotations).sub(1).abs().max() < 1e-4
-        # The wheels stand on the ground that was felt under them: the frame's origin is the robot.
+        # The origin of the terrain frame is at the robot.
         assert float(targets.positions[0, 0, :2].norm()) < 0.5
     assert losses[0] < 0.1
     assert losses[1] == pytest.approx(losses[0], rel=0.02)
-    # A turned map is sampled anew, hence small differences; a wrong sign anywhere costs many times as much.
+    # Resampling the rotated map causes small differences; a wrong sign costs many times as much.
     np.testing.assert_allclose(losses, losses[0], rtol=0.6)
-    _, targets = sample(drive, 4, TINY, Variation(mirrored=True))
+    _, targets = sample(recording, 4, TINY, Augmentation(mirrored=True))
     wrong = replace(targets, twists=targets.twists * torch.tensor([1.0, -1.0]))
     assert float(trajectory_loss(maps_of(wrong), wrong, husky, TINY, PhysicsOptions())) > 5 * losses[1]
 
 
-def test_a_mirrored_sample_mirrors_its_maps(drive):
-    (batch, plain), (other, mirrored) = (sample(drive, 3, TINY, Variation(mirrored=m)) for m in (False, True))
+def test_a_mirrored_sample_mirrors_its_maps(recording):
+    (batch, plain), (other, mirrored) = (sample(recording, 3, TINY, Augmentation(mirrored=m)) for m in (False, True))
     both = plain.observed & mirrored.observed.flip(1)
     difference = (plain.geometric - mirrored.geometric.flip(1)).abs()[both]
     assert float(difference.median()) < 1e-4
-    assert float((plain.felt ^ mirrored.felt.flip(1)).float().mean()) < 0.02
+    assert float((plain.contact_mask ^ mirrored.contact_mask.flip(1)).float().mean()) < 0.02
     np.testing.assert_allclose(other.origins[0], MIRROR @ batch.origins[0].numpy(), atol=1e-5)
     assert float(batch.ground[0]) == pytest.approx(float(other.ground[0]), abs=1e-6)
 
 
-def test_a_wall_that_is_left_out_costs_more_the_more_what_stands_counts(drive):
-    batch, targets = sample(drive, 3, TINY)
+def test_a_missing_wall_costs_more_with_a_larger_prominence_weight(recording):
+    batch, targets = sample(recording, 3, TINY)
     ground = batch.ground[:, None, None].expand_as(targets.geometric)
     wall = torch.zeros_like(targets.observed)
     wall[:, 10, 5:15] = True
     targets = replace(targets, geometric=ground + 0.9 * wall, observed=torch.ones_like(wall))
     level = maps_of(targets, geometric_height=ground.clone())
-    plain, more = (float(geometric_loss(level, targets, batch.ground, standing)) for standing in (0.0, 8.0))
+    plain, more = (float(geometric_loss(level, targets, batch.ground, prominence)) for prominence in (0.0, 8.0))
     cells = wall.float().mean() / (1.0 + 8.0 * wall.float().mean())
     assert more == pytest.approx(9.0 * float(cells) * (0.9 - 0.025), rel=0.05) and more > 6.0 * plain
-    with pytest.raises(ValueError, match="loss weight standing: got -1"):
-        LossWeights(standing=-1.0)
+    with pytest.raises(ValueError, match="loss weight prominence: got -1"):
+        LossWeights(prominence=-1.0)
 
 
-def test_losses_are_means_over_measured_cells(drive):
-    batch, targets = sample(drive, 3, TINY)
+def test_losses_are_means_over_measured_cells(recording):
+    batch, targets = sample(recording, 3, TINY)
     off = maps_of(targets, geometric_height=targets.geometric + 0.3)
     whole = geometric_loss(off, targets, batch.ground)
-    # A sparse mask does not shrink the loss, and what is not measured does not count.
+    # A sparse mask does not shrink the loss, and cells without measurement do not count.
     sparse = targets.observed.clone()
     sparse[:, ::3] = False
     assert float(geometric_loss(off, replace(targets, observed=sparse), batch.ground)) == pytest.approx(
@@ -147,42 +157,44 @@ def test_losses_are_means_over_measured_cells(drive):
     )
     elsewhere = off.geometric_height + torch.where(targets.observed, 0.0, 5.0)
     assert float(geometric_loss(replace(off, geometric_height=elsewhere), targets, batch.ground)) == float(whole)
-    felt = terrain_loss(maps_of(targets, decrease=torch.full_like(targets.felt.float(), 0.2)), targets)
-    assert float(felt) == pytest.approx(0.2 - 0.025, abs=1e-4)
-    nothing = replace(targets, felt=torch.zeros_like(targets.felt))
+    loss = terrain_loss(maps_of(targets, decrease=torch.full_like(targets.supporting, 0.2)), targets)
+    assert float(loss) == pytest.approx(0.2 - 0.025, abs=1e-4)
+    nothing = replace(targets, contact_mask=torch.zeros_like(targets.contact_mask))
     assert float(terrain_loss(maps_of(targets), nothing)) == 0.0
 
 
-def test_slopes_count_beside_heights(drive):
-    _, targets = sample(drive, 3, TINY)
-    felt = torch.zeros_like(targets.felt)
-    felt[:, 5:20, 5:20] = True
-    targets = replace(targets, felt=felt)
-    up, right = (steps.to(torch.float32) for steps in torch.meshgrid(*map(torch.arange, felt.shape[1:]), indexing="ij"))
+def test_the_slope_loss_penalises_relative_height_errors(recording):
+    _, targets = sample(recording, 3, TINY)
+    contact_mask = torch.zeros_like(targets.contact_mask)
+    contact_mask[:, 5:20, 5:20] = True
+    targets = replace(targets, contact_mask=contact_mask)
+    up, right = (
+        steps.to(torch.float32) for steps in torch.meshgrid(*map(torch.arange, contact_mask.shape[1:]), indexing="ij")
+    )
 
     def loss_of(error):
         return float(
             slope_loss(maps_of(targets, geometric_height=targets.supporting + error), targets, TINY.resolution)
         )
 
-    # All heights wrong by as much tilt nobody, and neither do those that nobody touched.
+    # A common height error does not tilt the robot, and neither do errors on cells without contact.
     assert loss_of(0.3 * torch.ones_like(up)) == pytest.approx(0.0, abs=1e-6)
-    assert loss_of(torch.where(felt[0], 0.0, 1.0)) == 0.0
+    assert loss_of(torch.where(contact_mask[0], 0.0, 1.0)) == 0.0
     # Planes: 60 cm apart are 3, 0, 2 and 2 rows of 20 cm; rows and columns together 3, 3, 4 and 0.
     grade = 0.1
     expected = grade * (3 + 2 + 2) / 4 - 3 * 0.025 / 4
     assert loss_of(grade * up) == pytest.approx(expected, rel=1e-4)
     assert loss_of(-grade * right) == pytest.approx(expected, rel=1e-4)
     assert loss_of(grade * (up + right)) == pytest.approx(grade * (3 + 3 + 4) / 4 - 3 * 0.025 / 4, rel=1e-4)
-    nothing = replace(targets, felt=torch.zeros_like(felt))
+    nothing = replace(targets, contact_mask=torch.zeros_like(contact_mask))
     assert (
         float(slope_loss(maps_of(targets, geometric_height=targets.supporting + grade * up), nothing, TINY.resolution))
         == 0.0
     )
 
 
-def test_what_stands_out_counts_more(drive):
-    batch, targets = sample(drive, 3, TINY)
+def test_prominent_cells_weigh_more(recording):
+    batch, targets = sample(recording, 3, TINY)
     measured = targets.geometric.clone()
     rows, columns = measured.shape[1:]
     wall = torch.zeros_like(targets.observed)
@@ -198,44 +210,44 @@ def test_what_stands_out_counts_more(drive):
     assert loss_of(wall) == pytest.approx(4 * loss_of(level), rel=1e-3)
 
 
-def test_the_decrease_is_learnt_where_both_surfaces_are_known(drive):
-    _, targets = sample(drive, 3, TINY)
+def test_the_decrease_is_supervised_where_both_surfaces_are_known(recording):
+    _, targets = sample(recording, 3, TINY)
     observed = torch.zeros_like(targets.observed)
     observed[:, :, observed.shape[2] // 2 :] = True
     targets = replace(targets, geometric=targets.supporting + 0.4, observed=observed)
-    said = torch.full_like(targets.supporting, 0.1).requires_grad_()
-    loss = measured_decrease_loss(maps_of(targets, decrease=said), targets)
+    decrease = torch.full_like(targets.supporting, 0.1).requires_grad_()
+    loss = measured_decrease_loss(maps_of(targets, decrease=decrease), targets)
     assert float(loss.detach()) == pytest.approx(0.3 - 0.025, abs=1e-4)
-    (gradient,) = torch.autograd.grad(loss, said)
-    known = targets.felt & observed
+    (gradient,) = torch.autograd.grad(loss, decrease)
+    known = targets.contact_mask & observed
     assert bool(known.any()) and bool((gradient[known] < 0).all()) and float(gradient[~known].abs().max()) == 0.0
-    # What is not known of both does not count; a surface never gives way upwards.
+    # Only cells with both surfaces count; the supporting terrain is never above the visible one.
     higher = replace(targets, geometric=targets.supporting - 0.4)
-    assert float(measured_decrease_loss(maps_of(targets, decrease=said * 0.0), higher)) == 0.0
+    assert float(measured_decrease_loss(maps_of(targets, decrease=decrease * 0.0), higher)) == 0.0
 
 
-def test_what_stands_and_nobody_drove_over_does_not_give_way(drive):
-    batch, targets = sample(drive, 3, TINY)
+def test_the_decrease_of_prominent_cells_without_contact_is_penalised(recording):
+    batch, targets = sample(recording, 3, TINY)
     wall, patch, level = (torch.zeros_like(targets.observed) for _ in range(3))
     wall[:, 10, 5:15], patch[:, 20, 5:15], level[:, 2, 2:8] = True, True, True
     targets = replace(
         targets,
         geometric=batch.ground[:, None, None] + 0.9 * (wall | patch),
         observed=torch.ones_like(wall),
-        felt=patch,
+        contact_mask=patch,
     )
 
     def loss_of(where):
-        return float(standing_decrease_loss(maps_of(targets, decrease=0.2 * where), targets, batch.ground))
+        return float(prominent_decrease_loss(maps_of(targets, decrease=0.2 * where), targets, batch.ground))
 
-    # Neither what was driven over counts, nor what does not stand; other cells do not thin out a wall.
+    # Contact cells and level cells do not count, nor do they dilute the loss on a wall.
     assert loss_of(wall) == pytest.approx(0.2**2, rel=1e-4) and loss_of(patch) == loss_of(level) == 0.0
     nothing = replace(targets, observed=torch.zeros_like(wall))
-    assert float(standing_decrease_loss(maps_of(targets, decrease=0.2 * wall), nothing, batch.ground)) == 0.0
+    assert float(prominent_decrease_loss(maps_of(targets, decrease=0.2 * wall), nothing, batch.ground)) == 0.0
 
 
-def test_the_trajectory_loss_reaches_heights_and_material(drive, husky):
-    _, targets = sample(drive, 4, TINY)
+def test_the_trajectory_loss_reaches_heights_and_material(recording, husky):
+    _, targets = sample(recording, 4, TINY)
     heights = (targets.supporting + 0.02).requires_grad_()
     friction = torch.full_like(heights, 0.6).requires_grad_()
     stiffness = torch.full_like(heights, TINY.stiffness).requires_grad_()
@@ -243,14 +255,14 @@ def test_the_trajectory_loss_reaches_heights_and_material(drive, husky):
     loss = trajectory_loss(maps, targets, husky, TINY, PhysicsOptions())
     gradients = torch.autograd.grad(loss, (heights, friction, stiffness))
     assert all(bool(g.isfinite().all()) and float(g.abs().sum()) > 0 for g in gradients)
-    # What no wheel touched, such as a wall beside the way, is not learnt as lower because a prediction ran into it.
-    assert float(gradients[0][~targets.felt].abs().max()) == 0.0
+    # Cells without contact, such as a wall near the path, get no gradient from a predicted collision.
+    assert float(gradients[0][~targets.contact_mask].abs().max()) == 0.0
 
 
-def test_a_sweep_lies_where_the_map_of_many_sweeps_does(drive):
+def test_a_sweep_agrees_with_the_map_of_many_sweeps(recording):
     config = replace(TINY, sensor="lidar")
-    for variation in (Variation(), Variation(mirrored=True, turn=0.2)):
-        batch, targets = sample(drive, 4, config, variation)
+    for augmentation in (Augmentation(), Augmentation(mirrored=True, turn=0.2)):
+        batch, targets = sample(recording, 4, config, augmentation)
         low, _, hit = batch.sweep[0]
         both = (hit > 0) & targets.observed[0]
         assert int(both.sum()) > 100
@@ -258,18 +270,69 @@ def test_a_sweep_lies_where_the_map_of_many_sweeps_does(drive):
         assert float(away.abs().median()) < 0.05
 
 
-def test_samples_are_cut_once_and_damage_is_named(tmp_path, demo_bag, husky, cut, drive):
-    file = next(cut.glob("*.safetensors"))
+def test_samples_are_extracted_once_and_damage_is_reported(tmp_path, demo_bag, husky, sample_folder, recording):
+    file = next(sample_folder.glob("*.safetensors"))
     before = file.stat().st_mtime_ns
-    assert cut_recording(demo_bag, husky, TINY, cut) == file
-    assert file.stat().st_mtime_ns == before and len(read_samples(file)) == len(drive)
-    assert len(list(cut.iterdir())) == 1
+    assert extract_samples(demo_bag, husky, TINY, sample_folder) == file
+    assert file.stat().st_mtime_ns == before and len(read_samples(file)) == len(recording)
+    assert len(list(sample_folder.iterdir())) == 1
     broken = tmp_path / "broken.safetensors"
     broken.write_bytes(file.read_bytes()[:4000])
     with pytest.raises(SamplesError, match="damaged"):
         read_samples(broken)
     with pytest.raises(ValueError, match="samples period: got 0"):
         SampleSettings(period=0.0)
+
+
+def test_samples_with_the_old_name_of_the_contact_mask_are_read_with_a_warning(tmp_path, sample_folder, recording):
+    old = tmp_path / "old.safetensors"
+    file = next(sample_folder.glob("*.safetensors"))
+    with safe_open(str(file), framework="pt") as content:
+        metadata = content.metadata()
+    tensors = {name.replace("contact_mask", "felt"): value for name, value in load_file(str(file)).items()}
+    assert any(name.endswith(".felt") for name in tensors)
+    save_file(tensors, str(old), metadata=metadata)
+    with pytest.warns(FutureWarning, match="'felt' is now 'contact_mask'") as caught:
+        samples = read_samples(old)
+    assert len(caught) == 1
+    for renamed, segment in zip(samples.segments, recording.segments, strict=True):
+        np.testing.assert_array_equal(renamed.contact_mask, segment.contact_mask)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (["--cut", "folder"], ["--samples", "folder"]),
+        (["--cut-only"], ["--samples-only"]),
+        (["--standing", "8"], ["--prominence", "8"]),
+        (["--no-variation"], ["--no-augmentation"]),
+    ],
+)
+def test_old_names_of_options_are_accepted_with_a_warning(old, new, capsys):
+    parser = build_parser()
+    assert parser.parse_args(["bag", *old]) == parser.parse_args(["bag", *new]) != parser.parse_args(["bag"])
+    warning = f"train: {old[0]} is now {new[0]}; the old name will be removed"
+    assert capsys.readouterr().err.splitlines() == [warning]
+    assert old[0] + " " not in parser.format_help()
+
+
+def test_a_state_with_old_names_of_settings_is_resumed(tmp_path, husky, recording):
+    def trainer():
+        return Trainer(new_encoder(TINY), husky, [recording], [], tmp_path, TrainingSettings(steps=5), Process("cpu"))
+
+    saved = trainer()
+    saved.step = 3
+    saved.save()
+    file = tmp_path / "state" / "state.safetensors"
+    with safe_open(str(file), framework="pt") as content:
+        description = json.loads(content.metadata()["training"])
+    settings = description["settings"]
+    settings["vary"] = settings.pop("augment")
+    weights = settings["weights"]
+    weights["standing"], weights["standing_decrease"] = weights.pop("prominence"), weights.pop("prominent_decrease")
+    save_file(load_file(str(file)), str(file), metadata={"training": json.dumps(description)})
+    resumed = trainer()
+    assert resumed.resume() and resumed.step == 3
 
 
 def run(executables, *arguments, check=True, **environment):
@@ -282,9 +345,9 @@ def run(executables, *arguments, check=True, **environment):
 
 
 @pytest.fixture(scope="module")
-def trained(executables, demo_bag, cut, tmp_path_factory):
+def trained(executables, demo_bag, sample_folder, tmp_path_factory):
     out = tmp_path_factory.mktemp("trained")
-    run(executables, demo_bag, "--out", out, "--cut", cut, "--steps", 24, "--save-every", 8, *OPTIONS)
+    run(executables, demo_bag, "--out", out, "--samples", sample_folder, "--steps", 24, "--save-every", 8, *OPTIONS)
     return out
 
 
@@ -300,12 +363,16 @@ def test_the_loss_falls_and_the_checkpoint_loads(trained):
     encoder = load_encoder(trained / "encoder.safetensors")
     assert encoder.config == TINY
     described = json.loads((trained / "training.json").read_text())
-    assert described["settings"]["steps"] == 24 and list(described["drives"]) == ["demo"]
+    assert described["settings"]["steps"] == 24 and list(described["recordings"]) == ["demo"]
+    # The name in earlier releases is still written.
+    assert described["drives"] == described["recordings"]
 
 
 @pytest.mark.unhurried
-def test_training_goes_on_after_a_kill_as_if_nothing_had_been(executables, demo_bag, cut, trained, tmp_path, start):
-    command = [demo_bag, "--out", tmp_path, "--cut", cut, "--steps", 24, "--save-every", 8, *OPTIONS]
+def test_training_resumes_after_a_kill_with_the_same_result(
+    executables, demo_bag, sample_folder, trained, tmp_path, start
+):
+    command = [demo_bag, "--out", tmp_path, "--samples", sample_folder, "--steps", 24, "--save-every", 8, *OPTIONS]
     process = start("train", *command)
     state = tmp_path / "state" / "state.safetensors"
     deadline = time.monotonic() + 120
@@ -313,30 +380,31 @@ def test_training_goes_on_after_a_kill_as_if_nothing_had_been(executables, demo_
         time.sleep(0.02)
     process.stop(signal.SIGKILL)
     done = run(executables, *command)
-    assert "going on from step" in done.stdout
+    assert "resuming from step" in done.stdout
     once, twice = (load_file(str(folder / "encoder.safetensors")) for folder in (trained, tmp_path))
     for name, value in once.items():
         torch.testing.assert_close(twice[name], value, rtol=1e-4, atol=1e-5)
-    # Other options are not quietly mixed with what was trained.
+    # Resuming with other options is an error.
     refused = run(executables, *command, "--rate", "0.1", check=False)
-    assert refused.returncode == 1 and "other rate" in refused.stderr and "another --out" in refused.stderr
+    assert refused.returncode == 1 and "different rate" in refused.stderr and "another --out" in refused.stderr
     state.write_bytes(state.read_bytes()[:1000])
     refused = run(executables, *command, check=False)
     assert refused.returncode == 1 and "damaged" in refused.stderr and "Traceback" not in refused.stderr
 
 
-def test_two_processes_train_together(executables, demo_bag, cut, tmp_path):
+def test_two_processes_train_together(executables, demo_bag, sample_folder, tmp_path):
     command = [
         sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m",
-        "monoforce_ros.training.train_cli", demo_bag, "--out", tmp_path, "--cut", cut, "--steps", "3", *OPTIONS,
+        "monoforce_ros.training.train_cli", demo_bag, "--out", tmp_path, "--samples", sample_folder, "--steps", "3",
+        *OPTIONS,
     ]  # fmt: skip
     done = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
     assert load_encoder(tmp_path / "encoder.safetensors").config == TINY
-    assert done.stdout.count("samples of 1 drives") == 1
+    assert done.stdout.count("samples from 1 recordings") == 1
 
 
-def test_what_cannot_be_trained_on_is_said_in_one_line(executables, tmp_path, demo_bag):
+def test_unusable_input_is_reported_in_one_line(executables, tmp_path, demo_bag):
     missing = run(executables, tmp_path / "no", "--out", tmp_path / "o", *OPTIONS, check=False)
     assert missing.returncode == 1 and "does not exist" in missing.stderr and "Traceback" not in missing.stderr
     wrong = run(executables, demo_bag, "--out", tmp_path / "o", "--size", "130x96", check=False)

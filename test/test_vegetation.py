@@ -1,4 +1,4 @@
-"""Vegetation: how hard it holds is recovered from drives through it, and no mud hides below it."""
+"""Vegetation: its drag is recovered from motion through it, and no mud lies below it."""
 
 from dataclasses import replace
 
@@ -23,11 +23,11 @@ from monoforce_ros.training.vegetation_fit import EFFECT, fit_vegetation
 pytestmark = pytest.mark.usefixtures("one_thread")
 GRID = Grid.square(30.0, 0.1)
 COUNT, HISTORY = 200, 50
-PLANTED = {"coefficient": 2.0e4, "yield_speed": 0.3}
+INJECTED = {"coefficient": 2.0e4, "yield_speed": 0.3}
 
 
-def drive(robot, height: float) -> RecordingSamples:
-    """Pieces of motion on level ground under vegetation, as the robot's own physics brings them about."""
+def recording(robot, height: float) -> RecordingSamples:
+    """Simulated chunks of motion on level ground under vegetation."""
     random = np.random.default_rng(3)
     ground = torch.zeros(GRID.rows, GRID.columns)
     terrain = TerrainMap.from_height(ground, GRID, geometric_height=ground + height)
@@ -38,7 +38,7 @@ def drive(robot, height: float) -> RecordingSamples:
     state = State.at_rest(rest, batch=COUNT)
     speeds = drive_speeds(robot, held, options.time_step, history=HISTORY)
     found = rollout(terrain, robot, speeds, state, options=options, with_forces=False)
-    # The first second brings it to speed; the second one is what is recorded.
+    # The robot accelerates in the first second; the second one is recorded.
     every = np.arange(steps, 2 * steps + 1, 10)
     rotation = found.rotation[:, steps].numpy()
     pose = np.tile(np.eye(4), (COUNT, 1, 1))
@@ -66,32 +66,32 @@ def husky():
     return load_robot("husky")
 
 
-def test_a_planted_drag_is_recovered(husky):
-    injected = replace(husky, effects=((EFFECT, PLANTED),))
-    found = fit_vegetation([drive(injected, 0.35)], husky, EncoderConfig())
-    assert found is not None and found.pieces >= 30
-    # What counts is the drag at the speeds that were driven.
+def test_an_injected_drag_is_recovered(husky):
+    injected = replace(husky, effects=((EFFECT, INJECTED),))
+    found = fit_vegetation([recording(injected, 0.35)], husky, EncoderConfig())
+    assert found is not None and found.chunks >= 30
+    # Coefficient and yield speed are correlated: compare the drag at the speeds driven.
     for speed in (0.2, 0.6):
         drag = found.coefficient * (speed + found.yield_speed)
-        assert drag == pytest.approx(PLANTED["coefficient"] * (speed + PLANTED["yield_speed"]), rel=0.15)
+        assert drag == pytest.approx(INJECTED["coefficient"] * (speed + INJECTED["yield_speed"]), rel=0.15)
     assert found.after < 0.1 * found.before
 
 
-def test_nothing_is_fitted_where_nothing_holds_or_nothing_grows(husky):
-    assert fit_vegetation([drive(husky, 0.35)], husky, EncoderConfig()) is None
-    assert fit_vegetation([drive(husky, 0.05)], husky, EncoderConfig()) is None
+def test_nothing_is_fitted_without_drag_or_without_vegetation(husky):
+    assert fit_vegetation([recording(husky, 0.35)], husky, EncoderConfig()) is None
+    assert fit_vegetation([recording(husky, 0.05)], husky, EncoderConfig()) is None
 
 
-def test_the_robot_file_that_is_written_predicts_with_it(husky, tmp_path):
-    injected = replace(husky, effects=((EFFECT, PLANTED),))
-    found = fit_vegetation([drive(injected, 0.35)], husky, EncoderConfig())
+def test_the_written_robot_file_has_the_drag(husky, tmp_path):
+    injected = replace(husky, effects=((EFFECT, INJECTED),))
+    found = fit_vegetation([recording(injected, 0.35)], husky, EncoderConfig())
     file = write_robot("husky", tmp_path / "robot.yaml", [found.effect], [], "none", found_by="train")
     written = load_robot(file)
     assert dict(written.effects)[EFFECT]["coefficient"] == pytest.approx(found.coefficient, rel=1e-4)
 
 
 @pytest.mark.parametrize("seed", [12, 50000, 50004, 51000, 61004])
-def test_mud_is_never_hidden_under_tall_grass(seed):
+def test_there_is_no_mud_under_tall_grass(seed):
     for ground in ("mixed", "grass"):
         scenery = build_scenery(TerrainSettings(ground=ground), seed)
         x, y = scenery.grass.canopy.grid()

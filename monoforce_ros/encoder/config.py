@@ -1,4 +1,4 @@
-"""EncoderConfig: the shape of a terrain encoder, stored beside its weights."""
+"""EncoderConfig: architecture and map of a terrain encoder, stored as JSON with its weights."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ SENSORS = ("camera", "lidar")
 BACKBONES = ("efficientnet_lite0",)
 
 FEATURE_STRIDE = 8
-"""Pixels of the resized image per feature that is lifted."""
+"""Stride of the lifted features in pixels of the resized image."""
 
 
 @dataclass(frozen=True)
 class EncoderConfig:
-    """Everything that fixes an encoder's tensors and their meaning."""
+    """Everything that determines an encoder's tensors and their meaning."""
 
     sensor: str = "camera"
-    """``camera``, or ``lidar`` for the network that completes a sweep."""
+    """``camera``, or ``lidar`` for the network that densifies a sweep."""
     backbone: str = "efficientnet_lite0"
     image_width: int = 320
     image_height: int = 240
-    """Images are resized to this before the backbone; multiples of 16."""
+    """Input size of the backbone, to which images are resized; multiples of 16 [px]."""
     map_size: float = 12.8
     """Edge of the square map [m]."""
     resolution: float = 0.1
@@ -30,22 +30,22 @@ class EncoderConfig:
     depth_minimum: float = 0.6
     depth_maximum: float = 10.0
     depth_bins: int = 48
-    """Depths at which a pixel's features may lie [m]; bins are spaced evenly in the logarithm."""
+    """Range [m] and number of depth bins, evenly spaced in the logarithm of depth."""
     image_features: int = 32
-    """Channels lifted to the map."""
+    """Channels lifted into the map."""
     map_features: int = 24
     """Channels of the bird's-eye-view network at its finest level."""
     lowest: float = -3.0
     highest: float = 3.0
-    """Lifted points further below or above the ground under the robot are left out [m]."""
+    """Lifted points outside these heights, relative to the ground under the robot, are discarded [m]."""
     decreases: bool = True
-    """Whether the ground may carry lower than it looks; without it H_t = H_g, which is lift-splat-shoot alone."""
+    """Whether H_d is predicted; if not, H_t = H_g, which is plain lift-splat-shoot."""
     edges: bool = True
-    """Whether slopes that uncertainty makes of steps become steps again; for cameras."""
+    """Whether steps that uncertainty blurred into slopes are restored (camera encoders only)."""
     stiffness: float = TerrainDefaults.stiffness
     damping: float = TerrainDefaults.damping
     friction: float = TerrainDefaults.friction
-    """Material at which the heads start [N/m³, N s/m³, -]."""
+    """Material predicted by untrained heads [N/m³, N s/m³, -]."""
 
     def __post_init__(self):
         if self.sensor not in SENSORS:
@@ -80,12 +80,12 @@ class EncoderConfig:
 
     @property
     def feature_rows(self) -> int:
-        """Of the feature map that is lifted."""
+        """Of the lifted feature map."""
         return self.image_height // FEATURE_STRIDE
 
     @property
     def feature_columns(self) -> int:
-        """Of the feature map that is lifted."""
+        """Of the lifted feature map."""
         return self.image_width // FEATURE_STRIDE
 
     @property

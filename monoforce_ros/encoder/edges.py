@@ -1,4 +1,4 @@
-"""Edges: steps in a predicted height map, restored from the slopes that uncertainty makes of them."""
+"""Edges: restores steps that uncertainty has blurred into slopes in a predicted height map."""
 
 from __future__ import annotations
 
@@ -9,26 +9,27 @@ from torch import Tensor
 from torch.nn import functional
 
 _REACH = 0.3
-"""How far to each side an edge may be off where images tell of it [m]: its blur is twice as wide."""
+"""Uncertainty of an edge's position in an image, to each side [m]; the blur is twice as wide."""
 _SLOPE, _STEP = 0.25, 0.3
-"""Differences in height within the reach: up to the first, a slope of 23°, nothing changes; from the second on it is an
-edge [m]."""
+"""Height differences within the reach [m]: below the first, a slope of 23°, heights are kept; above the second they are
+an edge; in between the two are blended."""
 _GAIN = 6.0
-"""By how much more sharply heights change between the two sides of an edge."""
+"""Factor by which an edge is steepened."""
 
 
 def restore_edges(heights: Tensor, resolution: float) -> Tensor:
-    """Heights ``[B, rows, columns]`` [m] with steps where they rise too steeply to be ground that was only blurred.
+    """Heights ``[B, rows, columns]`` [m] in which slopes too steep for ground are steps.
 
-    Where a wall stands an image tells to a few decimetres. The middle of all the places where it may stand is a slope
-    that a robot can climb, and none of them is. So what lies between a low and a high side nearby goes to the nearer
-    of them, the more sharply the higher the difference (contrast enhancement between local extremes: Kramer and
-    Bruckner, "Iterations of a non-linear transformation for enhancement of digital images", 1975). Gentler ground and
-    the middle of long slopes stay as they are, and no height leaves the range of its surroundings.
+    The position of a wall is uncertain by a few decimetres in an image. The mean over its possible positions is a
+    slope that a robot can climb, although none of these walls can be climbed. Cells between a low and a high
+    neighbourhood therefore move towards the nearer of the two, the more the larger the height difference (contrast
+    enhancement between local extremes: Kramer and Bruckner, "Iterations of a non-linear transformation for enhancement
+    of digital images", 1975). Gentler ground and the middle of long slopes are unchanged; no height leaves the range
+    of its neighbourhood.
 
     Args:
         heights: predicted.
-        resolution: edge of a cell [m].
+        resolution: of the map [m].
     """
     high, low = _extremes(heights, max(1, round(_REACH / resolution)))
     difference = high - low
@@ -39,11 +40,11 @@ def restore_edges(heights: Tensor, resolution: float) -> Tensor:
 
 
 def _extremes(heights: Tensor, reach: int) -> tuple[Tensor, Tensor]:
-    """Highest and lowest cell in a disc of so many cells around each; a square sees further along its diagonals."""
+    """Maximum and minimum over a disc of radius ``reach`` [cells] around each cell; unlike a square it is isotropic."""
     both = torch.stack([heights, -heights])
     highest, rows = both, heights.shape[1]
     for half in range(reach + 1):
-        # A little wider than the reach: the disc would else end in single cells.
+        # Slightly larger than the reach, so that the disc does not end in single cells.
         away = [row for row in range(reach + 1) if math.floor(math.sqrt((reach + 0.4) ** 2 - row**2)) == half]
         if not away:
             continue

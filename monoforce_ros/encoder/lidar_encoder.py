@@ -1,4 +1,4 @@
-"""LidarEncoder: one sparse sweep → dense map of what is visible; the learned lidar baseline (paper IV-B, [22])."""
+"""LidarEncoder: one sparse sweep → dense map of the visible surface; the learned lidar baseline (paper IV-B, [22])."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from monoforce_ros.terrain import TerrainMap
 
 
 class LidarEncoder(nn.Module):
-    """Completes a sweep's heights where it hit nothing, with the network and heads of the camera's encoder."""
+    """Densifies the heights of a sweep, with the bird's-eye-view network and heads of the camera encoder."""
 
     def __init__(self, config: EncoderConfig):
         super().__init__()
         self.config = config
-        # Lowest and highest hit, whether there is one, the support plane and where it holds.
+        # Lowest and highest hit, hit mask, support plane and its mask.
         self.bird = BirdsEyeNetwork(5, config.map_features)
         self.heads = map_heads(config.map_features)
 
@@ -34,7 +34,7 @@ class LidarEncoder(nn.Module):
 
     @torch.no_grad()
     def terrain(self, points: np.ndarray, support: np.ndarray | None = None) -> TerrainMap:
-        """Terrain map from a sweep ``[n, 3]`` in the terrain frame; cells that it hit count as observed."""
+        """Terrain map from a sweep ``[n, 3]`` in the terrain frame [m]; cells with a hit count as observed."""
         if self.training:
             self.eval()
         batch = sweep_input(points, support, self.config).to(self.heads.weight.device)

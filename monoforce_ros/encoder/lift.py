@@ -19,16 +19,16 @@ def depth_values(config: EncoderConfig) -> np.ndarray:
 
 
 def feature_rays(camera: CameraModel, rows: int, columns: int, image_from_view: np.ndarray | None = None) -> np.ndarray:
-    """Ray of the middle of each feature cell, distortion removed.
+    """Undistorted ray through the centre of each feature cell.
 
     Args:
         camera: model of the original image.
         rows, columns: size of the feature map that covers the whole image.
-        image_from_view: affine map ``[2, 3]`` from what the network sees to the original image, both in 0..1; for
+        image_from_view: affine map ``[2, 3]`` from the network's view to the original image, both in 0..1; for
             training on crops.
 
     Returns:
-        ``[rows, columns, 3]`` in camera axes with z = 1; a ray times a depth is a point.
+        ``[rows, columns, 3]`` in camera axes with z = 1: a ray times a depth is a point.
     """
     if image_from_view is None:
         matrix, distortion = (np.asarray(v, np.float64) for v in (camera.matrix, camera.distortion))
@@ -43,7 +43,7 @@ def feature_rays(camera: CameraModel, rows: int, columns: int, image_from_view: 
 def _whole_image_rays(
     width: int, height: int, matrix: bytes, distortion: bytes, model: str, rows: int, columns: int
 ) -> np.ndarray:
-    """Rays of a camera that stays the same from image to image: removing distortion takes a millisecond."""
+    """Rays of an uncropped image, cached per camera because undistortion takes a millisecond."""
     camera = CameraModel(width, height, np.frombuffer(matrix).reshape(3, 3), np.frombuffer(distortion), model)
     u = (np.arange(columns) + 0.5) / columns * width - 0.5
     v = (np.arange(rows) + 0.5) / rows * height - 0.5
@@ -53,11 +53,11 @@ def _whole_image_rays(
 
 
 def lifted_points(rays: Tensor, origins: Tensor, depths: Tensor) -> Tensor:
-    """Points that feature cells may show.
+    """Points at each depth along the ray of each feature cell.
 
     Args:
-        rays: in axes of the terrain frame ``[N, rows, columns, 3]``.
-        origins: the cameras' places in it ``[N, 3]`` [m].
+        rays: in terrain axes ``[N, rows, columns, 3]``.
+        origins: camera positions in the terrain frame ``[N, 3]`` [m].
         depths: ``[bins]`` [m].
 
     Returns:
@@ -67,7 +67,7 @@ def lifted_points(rays: Tensor, origins: Tensor, depths: Tensor) -> Tensor:
 
 
 def map_cells(points: Tensor, config: EncoderConfig) -> Tensor:
-    """Flat index of the map cell of each point ``[..., 3]`` in the terrain frame; -1 outside the map or its heights."""
+    """Flat cell index of each point ``[..., 3]`` in the terrain frame [m]; -1 outside the map or its height range."""
     grid = config.grid
     columns = torch.round((points[..., 0] - grid.origin[0]) / grid.resolution)
     rows = torch.round((points[..., 1] - grid.origin[1]) / grid.resolution)
@@ -79,26 +79,26 @@ def map_cells(points: Tensor, config: EncoderConfig) -> Tensor:
 def splat(depth: Tensor, features: Tensor, cells: Tensor, heights: Tensor, size: int) -> tuple[Tensor, Tensor]:
     """Sum depth-weighted features into map cells.
 
-    The products of depth and feature are never stored: points are sorted by cell, and each cell's features are summed
-    where they lie, weighted by the depth's probability.
+    The products of depth probability and feature are never stored: points are sorted by cell, and features are gathered
+    and summed per cell with the probabilities as weights.
 
     Args:
         depth: probabilities ``[N, bins, rows, columns]``.
         features: ``[N, C, rows, columns]``.
-        cells: map cells ``[N, bins, rows, columns]`` int64, counted through all maps; -1 is left out.
-        heights: of the points [m], shaped as ``cells``.
-        size: number of map cells, all maps together.
+        cells: cell indices over all maps ``[N, bins, rows, columns]`` int64; -1 is ignored.
+        heights: of the points [m], shaped like ``cells``.
+        size: number of cells of all maps.
 
     Returns:
-        the summed features ``[size, C]``, and ``[size, 3]``: the summed probability (how much was seen there), the
-        probability times height, and times its square.
+        the summed features ``[size, C]``, and the sums of probability, probability × height and probability × height²
+        ``[size, 3]``.
     """
     count, channels, rows, columns = features.shape
     flat = cells.flatten()
     kept = torch.nonzero(flat >= 0)[:, 0]
     order = kept[torch.sort(flat[kept], stable=True).indices]
     target = flat[order]
-    # Which pixel's features a point carries: points are numbered (image, bin, row, column).
+    # Feature of each point: points are numbered (image, bin, row, column).
     patch = rows * columns
     pixel = order // (patch * depth.shape[1]) * patch + order % patch
     table = features.permute(0, 2, 3, 1).reshape(count * patch, channels)

@@ -1,4 +1,4 @@
-"""CameraView and EncoderInput: images and the geometry that goes with them, ready for the network."""
+"""CameraView and EncoderInput: images and their geometry as network input."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from monoforce_ros.encoder.lift import feature_rays
 from monoforce_ros.terrain import Grid
 
 _SUPPORT_REACH = 1.0
-"""Beyond this distance from the robot's middle what its wheels stand on says nothing of the ground [m]."""
+"""Distance from the robot's centre up to which the plane under its wheels describes the ground [m]."""
 
 
 @dataclass(frozen=True)
 class CameraView:
-    """An image, its camera and where the camera stood."""
+    """An image, its camera model and the camera's pose."""
 
     image: np.ndarray
-    """RGB pixels ``[height, width, 3]`` uint8, as the camera delivers them."""
+    """Raw RGB pixels ``[height, width, 3]`` uint8."""
     camera: CameraModel
     terrain_from_camera: np.ndarray
     """Pose ``[4, 4]`` of the camera in the terrain frame."""
@@ -35,32 +35,32 @@ class CameraView:
             raise ValueError(f"image: got shape {self.image.shape}, expected [height, width, 3]")
         if self.image.shape[:2] != size:
             raise ValueError(
-                f"image: got {self.image.shape[1]} × {self.image.shape[0]} px, but its CameraInfo says "
-                f"{size[1]} × {size[0]} px"
+                f"image: got {self.image.shape[1]} × {self.image.shape[0]} px, expected "
+                f"{size[1]} × {size[0]} px as in its CameraInfo"
             )
 
 
 @dataclass(frozen=True)
 class EncoderInput:
-    """A batch of ``B`` maps to predict, each from the same number of cameras; heights count from ``ground``."""
+    """Input for a batch of ``B`` maps with the same number of cameras each; heights are relative to ``ground``."""
 
     images: Tensor
     """RGB uint8 ``[B · cameras, 3, image_height, image_width]``."""
     rays: Tensor
-    """In terrain axes, one metre along the optical axis long, ``[B · cameras, feature rows, feature columns, 3]``."""
+    """In terrain axes, scaled to 1 m along the optical axis, ``[B · cameras, feature rows, feature columns, 3]``."""
     origins: Tensor
-    """The cameras' places in the terrain frame, z from ``ground``, ``[B · cameras, 3]`` [m]."""
+    """Camera positions in the terrain frame, z relative to ``ground``, ``[B · cameras, 3]`` [m]."""
     support: Tensor
-    """Plane under the robot's wheels from ``ground`` [m], and where it holds (0 or 1); ``[B, 2, rows, columns]``."""
+    """Plane under the wheels relative to ``ground`` [m], and its mask; ``[B, 2, rows, columns]``."""
     ground: Tensor
     """Height of the ground under the robot in its terrain frame ``[B]`` [m]."""
     sweep: Tensor
-    """What a lidar sweep hit: lowest and highest hit of each cell from ``ground`` [m], and whether there is one;
+    """Lowest and highest lidar hit of each cell relative to ``ground`` [m], and the hit mask;
     ``[B, 3, rows, columns]``, or ``[B, 0, rows, columns]`` without a lidar."""
 
     @property
     def maps(self) -> int:
-        """How many maps."""
+        """Number of maps."""
         return len(self.ground)
 
     def to(self, device: torch.device | str) -> EncoderInput:
@@ -78,8 +78,8 @@ def encoder_input(views: Sequence[CameraView], support: np.ndarray | None, confi
 
     Args:
         views: one of each camera, in one terrain frame.
-        support: points that the robot's wheels stand on ``[m, 3]`` in that frame; without them the frame's origin is
-            taken for the ground's height.
+        support: contact points of the wheels ``[m, 3]`` in that frame [m]; without them the ground is taken to be at
+            the height of the frame's origin.
         config: of the encoder.
     """
     images = np.stack([network_image(view.image, config) for view in views])
@@ -92,7 +92,7 @@ def encoder_input(views: Sequence[CameraView], support: np.ndarray | None, confi
 
 
 def sweep_input(points: np.ndarray, support: np.ndarray | None, config: EncoderConfig) -> EncoderInput:
-    """Input for one map from a lidar sweep ``[n, 3]`` in the terrain frame [m], the robot's own body left out."""
+    """Input for one map from a lidar sweep ``[n, 3]`` in the terrain frame [m], without points on the robot."""
     none = np.zeros((0, config.image_height, config.image_width, 3), np.uint8)
     rays = np.zeros((0, config.feature_rows, config.feature_columns, 3))
     return assemble(none, rays, np.zeros((0, 3)), support, config, points)
@@ -106,7 +106,7 @@ def assemble(
     config: EncoderConfig,
     sweep: np.ndarray | None = None,
 ) -> EncoderInput:
-    """Input for one map from resized images ``[cameras, height, width, 3]``, their rays and places, and a sweep."""
+    """Input for one map from resized images ``[cameras, height, width, 3]``, their rays and origins, and a sweep."""
     ground, plane, known = support_plane(support, config.grid)
     hits = np.zeros((0, *plane.shape)) if sweep is None else sweep_heights(sweep, ground, config)
     return EncoderInput(
@@ -120,7 +120,7 @@ def assemble(
 
 
 def sweep_heights(points: np.ndarray, ground: float, config: EncoderConfig) -> np.ndarray:
-    """Lowest and highest hit of each cell from ``ground`` [m], 0 without one, and whether there is; ``[3, …]``."""
+    """Lowest and highest hit of each cell relative to ``ground`` [m], 0 without a hit, and the hit mask; ``[3, …]``."""
     grid = config.grid
     heights = points[:, 2] - ground
     rows, columns, inside = grid.cells(points[:, :2])
@@ -135,7 +135,7 @@ def sweep_heights(points: np.ndarray, ground: float, config: EncoderConfig) -> n
 
 
 def network_image(image: np.ndarray, config: EncoderConfig) -> np.ndarray:
-    """The image in the network's size."""
+    """The image resized for the network."""
     size = (config.image_width, config.image_height)
     if (image.shape[1], image.shape[0]) == size:
         return np.ascontiguousarray(image)
@@ -143,7 +143,7 @@ def network_image(image: np.ndarray, config: EncoderConfig) -> np.ndarray:
 
 
 def support_plane(support: np.ndarray | None, grid: Grid) -> tuple[float, np.ndarray, np.ndarray]:
-    """Height of the ground under the robot [m], the plane under its wheels counted from it, and where that holds."""
+    """Height of the ground under the robot [m], the plane under its wheels relative to it [m], and the plane's mask."""
     shape = (grid.rows, grid.columns)
     if support is None or len(support) < 3:
         return 0.0, np.zeros(shape), np.zeros(shape)

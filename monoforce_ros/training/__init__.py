@@ -1,4 +1,4 @@
-"""Training: terrain that explains how the robot moved, and encoders that learn to see it."""
+"""Training: terrain fitted to recorded motion, and the terrain encoders trained on it."""
 
 from monoforce_ros.training.terrain_fit import FitSettings, TerrainFit, fit_terrain
 from monoforce_ros.training.visible import split_maps

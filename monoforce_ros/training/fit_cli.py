@@ -1,4 +1,4 @@
-"""``fit_terrain``: the ground under recorded drives, from how the robot moved on it."""
+"""``fit_terrain``: fits the terrain under a robot to recordings of its motion."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import argparse
 import hashlib
 import json
 import sys
+import warnings
 import zipfile
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,36 +21,89 @@ from monoforce_ros.reporting import figure_png
 from monoforce_ros.robots import RobotFileError, RobotModel, load_robot, shipped_robots
 from monoforce_ros.terrain import TerrainDefaults, TerrainError, save_terrain
 from monoforce_ros.training.fit_figure import fit_figure
-from monoforce_ros.training.terrain_fit import FitSettings, fit_terrain, trajectory_frame, trajectory_grid
+from monoforce_ros.training.terrain_fit import FitSettings, TerrainFit, fit_terrain, trajectory_frame, trajectory_grid
 from monoforce_ros.training.visible import visible_terrain
 
-_SEEN_BEFORE = 2.0
-"""Sweeps from this long before a trajectory count for it too [s]."""
+_SWEEPS_BEFORE = 2.0
+"""Sweeps this long before a trajectory belong to its map too [s]."""
+
+
+@dataclass(frozen=True)
+class FitFigures:
+    """Figures of one fit, as in ``fit_terrain.json``."""
+
+    height_error_seen_m: float
+    """Median height error at the end of a chunk on the visible terrain."""
+    height_error_m: float
+    """The same on the fitted terrain."""
+    loss_first: float
+    loss_last: float
+    contact_cells: int
+
+    @classmethod
+    def of(cls, fit: TerrainFit) -> FitFigures:
+        """The figures of a fit."""
+        return cls(
+            height_error_seen_m=float(np.median(fit.before)),
+            height_error_m=float(np.median(fit.after)),
+            loss_first=float(fit.losses[0]) if len(fit.losses) else 0.0,
+            loss_last=float(fit.losses[-1]) if len(fit.losses) else 0.0,
+            contact_cells=int(fit.contact_mask.sum()),
+        )
+
+
+@dataclass(frozen=True)
+class FittedTrajectory:
+    """A row of ``fit_terrain.json``: the figures of a trajectory, or the reason why there are none."""
+
+    name: str
+    file: str
+    start_ns: int
+    length_s: float
+    figures: FitFigures | None = None
+    error: str = ""
+
+    @property
+    def row(self) -> dict[str, str | float]:
+        """As written to the file."""
+        row: dict[str, str | float] = {
+            "name": self.name, "file": self.file, "start_ns": self.start_ns, "length_s": self.length_s,
+        }  # fmt: skip
+        if self.figures is None:
+            return row | {"error": self.error}
+        # felt_cells: the name of contact_cells in earlier releases.
+        return row | asdict(self.figures) | {"felt_cells": self.figures.contact_cells}
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The command line's options."""
+    """The parser of the command line."""
     parser = argparse.ArgumentParser(
         prog="fit_terrain",
-        description="Fit the terrain that carried a robot (H_t*) to recorded drives by gradient descent through the "
-        "physics, and map what its lidar saw (H_g*). Writes a map, a picture and figures for each trajectory. "
-        "An interrupted run goes on where it stopped.",
+        description="Fit the supporting terrain (H_t*) to recorded motion by gradient descent through the physics, and "
+        "map the visible terrain (H_g*) from lidar sweeps. Writes a map, a figure and metrics for each trajectory. "
+        "The same command resumes an interrupted run.",
     )
-    parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 folder or ROS 1 .bag file")
+    parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 folders or ROS 1 .bag files")
     parser.add_argument("--out", type=Path, required=True, help="folder for the maps")
     parser.add_argument("--robot", default="husky", help=f"robot file or one of {', '.join(shipped_robots())}")
-    parser.add_argument("--length", type=float, default=10.0, metavar="S", help="of a trajectory (%(default)s)")
-    parser.add_argument("--stride", type=float, metavar="S", help="between starts of trajectories (the length)")
-    parser.add_argument("--chunk", type=float, default=FitSettings.chunk, metavar="S", help="rolled out (%(default)s)")
-    parser.add_argument("--iterations", type=int, default=FitSettings.iterations, help="(%(default)s)")
-    parser.add_argument("--no-lidar", action="store_true", help="from the motion alone")
+    parser.add_argument("--length", type=float, default=10.0, metavar="S", help="length of a trajectory (default: "
+                        "%(default)s)")  # fmt: skip
+    parser.add_argument("--stride", type=float, metavar="S", help="interval between the starts of trajectories "
+                        "(default: the length)")  # fmt: skip
+    parser.add_argument("--chunk", type=float, default=FitSettings.chunk, metavar="S", help="length of the "
+                        "chunks that are rolled out (default: %(default)s)")  # fmt: skip
+    parser.add_argument("--iterations", type=int, default=FitSettings.iterations, help="steps of the descent "
+                        "(default: %(default)s)")  # fmt: skip
+    parser.add_argument("--no-lidar", action="store_true", help="fit to the motion only")
     parser.add_argument("--friction", action="store_true", help="fit friction too")
-    parser.add_argument("--position-noise", type=float, metavar="M", help="of the odometry (found from the data)")
-    parser.add_argument("--rotation-noise", type=float, metavar="DEG", help="of the odometry (found from the data)")
-    parser.add_argument("--odometry", metavar="TOPIC", help="(found by type)")
-    parser.add_argument("--commands", metavar="TOPIC", help="(found by type)")
-    parser.add_argument("--cloud", metavar="TOPIC", help="(found by type)")
-    parser.add_argument("--force", action="store_true", help="fit again what is there already")
+    parser.add_argument("--position-noise", type=float, metavar="M", help="standard deviation of the "
+                        "odometry's position (default: estimated)")  # fmt: skip
+    parser.add_argument("--rotation-noise", type=float, metavar="DEG", help="standard deviation of the "
+                        "odometry's rotation (default: estimated)")  # fmt: skip
+    parser.add_argument("--odometry", metavar="TOPIC", help="(default: detected by type)")
+    parser.add_argument("--commands", metavar="TOPIC", help="(default: detected by type)")
+    parser.add_argument("--cloud", metavar="TOPIC", help="(default: detected by type)")
+    parser.add_argument("--force", action="store_true", help="fit existing maps again")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     return parser
 
@@ -60,7 +114,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if not 1.0 <= options.length <= 120.0 or (options.stride is not None and not 0.1 <= options.stride <= 3600.0):
         parser.error("--length: expected 1 to 120 s; --stride: 0.1 to 3600 s")
-    # Many small operations: one thread is faster than several, and does not collapse on a busy machine.
+    # For many small operations one thread is faster than several, and robust to other load.
     torch.set_num_threads(1)
     try:
         settings = FitSettings(chunk=options.chunk, iterations=options.iterations, friction=options.friction)
@@ -69,43 +123,49 @@ def main(arguments: list[str] | None = None) -> int:
     except (BagError, RobotFileError, ValueError, OSError) as error:
         print(f"fit_terrain: {error}", file=sys.stderr)
         return 1
-    rows = [row for listed in done for row in listed]
+    trajectories = [trajectory for of_bag in done for trajectory in of_bag]
+    rows = [trajectory.row for trajectory in trajectories]
     write_text(options.out / "fit_terrain.json", json.dumps({"trajectories": rows}, indent=2))
-    fitted = [row for row in rows if "error" not in row]
-    for row in rows:
-        if "error" in row:
-            print(f"fit_terrain: {row['name']} left out: {row['error']}", file=sys.stderr)
+    for trajectory in trajectories:
+        if trajectory.figures is None:
+            print(f"fit_terrain: {trajectory.name} skipped: {trajectory.error}", file=sys.stderr)
+    fitted = [trajectory.figures for trajectory in trajectories if trajectory.figures is not None]
     if not fitted:
-        print("fit_terrain: nothing could be fitted", file=sys.stderr)
+        print("fit_terrain: no trajectory could be fitted", file=sys.stderr)
         return 1
-    before, after = (np.median([row[which] for row in fitted]) for which in ("height_error_seen_m", "height_error_m"))
+    before = np.median([figures.height_error_seen_m for figures in fitted])
+    after = np.median([figures.height_error_m for figures in fitted])
     print(
         f"{len(fitted)} trajectories in {options.out}: median height error after {options.chunk:g} s "
-        f"{100 * before:.1f} cm on what was seen, {100 * after:.1f} cm on what was fitted"
+        f"{100 * before:.1f} cm on visible, {100 * after:.1f} cm on fitted terrain"
     )
     return 0
 
 
-def _fit_bag(bag: Path, robot: RobotModel, settings: FitSettings, options: argparse.Namespace) -> list[dict]:
+def _fit_bag(
+    bag: Path, robot: RobotModel, settings: FitSettings, options: argparse.Namespace
+) -> list[FittedTrajectory]:
     recording = Recording.open(bag, odometry=options.odometry, commands=options.commands, cloud=options.cloud)
     for complaint in recording.warnings[:3]:
         print(f"fit_terrain: {complaint}", file=sys.stderr)
     if not len(recording.commands):
-        raise BagError(f"{bag}: no commands (Twist or TwistStamped): the physics needs them")
+        raise BagError(f"{bag}: no commands (Twist or TwistStamped), which the physics needs")
     noise = None if options.rotation_noise is None else np.radians(options.rotation_noise)
     smoothed = smooth(recording.motion, position_noise=options.position_noise, rotation_noise=noise)
     stride = round(1e9 * (options.stride or options.length))
     first, last = int(recording.motion.stamps[0]), int(recording.motion.stamps[-1])
     starts = range(first, last - round(1e9 * options.length) + 1, stride)
     if not starts:
-        raise BagError(f"{bag}: {(last - first) * 1e-9:.1f} s of odometry, expected at least {options.length:g} s")
-    rows = []
+        raise BagError(f"{bag}: got {(last - first) * 1e-9:.1f} s of odometry, expected {options.length:g} s or more")
+    trajectories = []
     bar = tqdm(starts, desc=bag.name, unit="trajectory", disable=True if options.quiet else None)
     for index, start in enumerate(bar):
         name = f"{bag.name.removesuffix('.bag')}_{index:03d}"
-        rows.append(_fit_one(name, recording, smoothed, robot, start, settings, options))
-        bar.set_postfix({"height error": f"{100 * rows[-1].get('height_error_m', float('nan')):.1f} cm"})
-    return rows
+        trajectories.append(_fit_one(name, recording, smoothed, robot, start, settings, options))
+        figures = trajectories[-1].figures
+        error = figures.height_error_m if figures is not None else np.nan
+        bar.set_postfix({"height error": f"{100 * error:.1f} cm"})
+    return trajectories
 
 
 def _fit_one(
@@ -116,13 +176,13 @@ def _fit_one(
     start: int,
     settings: FitSettings,
     options: argparse.Namespace,
-) -> dict:
+) -> FittedTrajectory:
     file = options.out / f"{name}.npz"
     fingerprint = _fingerprint(recording, robot, start, settings, options)
-    row: dict = {"name": name, "file": file.name, "start_ns": start, "length_s": options.length}
-    kept = None if options.force else _kept(file, fingerprint)
-    if kept is not None:
-        return row | kept
+    trajectory = FittedTrajectory(name, file.name, start, options.length)
+    existing = None if options.force else existing_figures(file, fingerprint)
+    if existing is not None:
+        return replace(trajectory, figures=existing)
     motion = smoothed.motion
     try:
         material = TerrainDefaults()
@@ -130,51 +190,44 @@ def _fit_one(
         visible = None
         if recording.clouds and not options.no_lidar:
             stop = start + round(1e9 * options.length)
-            seen_from = start - round(1e9 * _SEEN_BEFORE)
+            first_sweep = start - round(1e9 * _SWEEPS_BEFORE)
             visible = visible_terrain(
-                recording, motion, robot, grid, pose, start=seen_from, stop=stop, material=material
+                recording, motion, robot, grid, pose, start=first_sweep, stop=stop, material=material
             )
         fit = fit_terrain(
             motion, recording.commands, robot, start=start, length=options.length, visible=visible, settings=settings
         )
     except (TerrainError, ValueError) as error:
-        return row | {"error": str(error)}
-    figures = {
-        "height_error_seen_m": float(np.median(fit.before)),
-        "height_error_m": float(np.median(fit.after)),
-        "loss_first": float(fit.losses[0]) if len(fit.losses) else 0.0,
-        "loss_last": float(fit.losses[-1]) if len(fit.losses) else 0.0,
-        "felt_cells": int(fit.felt.sum()),
-    }
-    title = f"{name}, {(start - recording.motion.stamps[0]) * 1e-9:.1f} s into the drive"
-    picture = options.out / f"{name}.png"
-    write_bytes(picture, figure_png(fit_figure(fit, title)))
-    # The map comes last: where it is, the picture is too.
+        return replace(trajectory, error=str(error))
+    figures = FitFigures.of(fit)
+    title = f"{name}, {(start - recording.motion.stamps[0]) * 1e-9:.1f} s into the recording"
+    write_bytes(options.out / f"{name}.png", figure_png(fit_figure(fit, title)))
+    # The map is written last: it marks the trajectory as complete.
     save_terrain(
         file,
         fit.terrain,
         fit.odometry_from_terrain,
-        felt=fit.felt,
+        contact_mask=fit.contact_mask,
         start_ns=np.array(start),
         fingerprint=np.array(fingerprint),
-        figures=np.array(json.dumps(figures)),
+        figures=np.array(json.dumps(asdict(figures))),
     )
-    return row | figures
+    return replace(trajectory, figures=figures)
 
 
 def _fingerprint(
     recording: Recording, robot: RobotModel, start: int, settings: FitSettings, options: argparse.Namespace
 ) -> str:
-    said = [
+    content = [
         str(recording.path.name), len(recording.motion), len(recording.commands), len(recording.clouds), start,
         robot.name, [round(float(v), 9) for v in robot.points.flatten()[:60]], float(robot.mass), str(robot.effects),
         asdict(settings), options.length, options.no_lidar, options.position_noise, options.rotation_noise,
     ]  # fmt: skip
-    return hashlib.sha256(json.dumps(said, default=str).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(content, default=str).encode()).hexdigest()
 
 
-def _kept(file: Path, fingerprint: str) -> dict | None:
-    """Figures of a map that was fitted from the same data in the same way, or None."""
+def existing_figures(file: Path, fingerprint: str) -> FitFigures | None:
+    """Figures of an existing map, or None unless it was fitted to the same data with the same settings."""
     if not file.is_file():
         return None
     try:
@@ -182,8 +235,12 @@ def _kept(file: Path, fingerprint: str) -> dict | None:
             if str(content["fingerprint"]) != fingerprint:
                 return None
             figures = json.loads(str(content["figures"]))
-            return {name: float(value) for name, value in figures.items()}
-    except (OSError, ValueError, KeyError, AttributeError, zipfile.BadZipFile):
+        if "felt_cells" in figures:
+            figures["contact_cells"] = figures.pop("felt_cells")
+            text = f"{file}: 'felt' is now 'contact_mask'; fit it again with --force to rename it"
+            warnings.warn(text, FutureWarning, stacklevel=2)
+        return FitFigures(**figures)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile):
         return None
 
 

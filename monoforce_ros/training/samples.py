@@ -1,4 +1,4 @@
-"""Samples: one image's network input and what it should have predicted, varied without breaking the calibration."""
+"""Samples: network input and targets for one image, with data augmentation that preserves the calibration."""
 
 from __future__ import annotations
 
@@ -18,46 +18,47 @@ MIRROR = np.diag([1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
-class Variation:
-    """A change of a sample that leaves true what the calibration says.
+class Augmentation:
+    """Data augmentation of a sample that stays consistent with the calibration.
 
-    The whole scene is mirrored, or turned about the robot; images are cut and tilted with their rays, and recoloured.
+    The whole scene is mirrored or rotated about the robot; images are cropped and tilted together with their rays, and
+    their colours change.
     """
 
     mirrored: bool = False
     turn: float = 0.0
-    """Of the map about the robot [rad]."""
+    """Rotation of the map about the robot [rad]."""
     zoom: float = 1.0
-    """Of the image, 1 or more."""
+    """Of the image crop, at least 1."""
     shift: tuple[float, float] = (0.0, 0.0)
-    """Of the cut within what the zoom leaves, each -1 to 1."""
+    """Position of the crop in the image, each -1 to 1."""
     tilt: float = 0.0
-    """Of the image about its middle [rad]."""
+    """Rotation of the image about its centre [rad]."""
     gain: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """On red, green and blue."""
+    """Of red, green and blue."""
     contrast: float = 1.0
     blur: float = 0.0
-    """Standard deviation [px]."""
+    """Standard deviation of the Gaussian blur [px]."""
 
     @classmethod
-    def draw(cls, random: np.random.Generator) -> Variation:
-        """A random one."""
-        bright = random.uniform(0.7, 1.35)
+    def draw(cls, random: np.random.Generator) -> Augmentation:
+        """A random augmentation."""
+        brightness = random.uniform(0.7, 1.35)
         return cls(
             mirrored=bool(random.integers(2)),
             turn=random.uniform(-0.35, 0.35),
             zoom=random.uniform(1.0, 1.25),
             shift=(random.uniform(-1, 1), random.uniform(-1, 1)),
             tilt=random.uniform(-0.04, 0.04),
-            gain=tuple(bright * random.uniform(0.9, 1.1, 3)),
+            gain=tuple(brightness * random.uniform(0.9, 1.1, 3)),
             contrast=random.uniform(0.75, 1.3),
             blur=max(0.0, random.uniform(-1.0, 0.9)),
         )
 
     def image_from_view(self) -> np.ndarray:
-        """Affine map ``[2, 3]`` from the varied image to the original one, both in 0..1."""
+        """Affine map ``[2, 3]`` from the augmented image to the original one, both in 0..1."""
         cosine, sine = np.cos(self.tilt), np.sin(self.tilt)
-        # A tilted cut stays within the image if it is smaller by so much.
+        # A tilted crop must be smaller by this factor to stay within the image.
         inner = max(0.0, 1.0 - abs(sine) - (1.0 - cosine)) if self.tilt else 1.0
         size = inner / self.zoom
         free = (1.0 - size * (cosine + abs(sine))) / 2
@@ -66,7 +67,7 @@ class Variation:
         return np.column_stack([linear, middle - linear @ np.array([0.5, 0.5])])
 
     def image(self, image: np.ndarray) -> np.ndarray:
-        """The varied image."""
+        """The augmented image."""
         if self.is_none:
             return image
         height, width = image.shape[:2]
@@ -86,30 +87,33 @@ class Variation:
     @property
     def is_none(self) -> bool:
         """Whether it changes nothing."""
-        return self == Variation()
+        return self == Augmentation()
 
 
 @dataclass(frozen=True)
 class Targets:
-    """What a batch of ``B`` maps should be, and how the robot moved on them, in the varied terrain frames."""
+    """Target maps of a batch of ``B`` samples and the measured motion on them, in the augmented terrain frames."""
 
     geometric: Tensor
     """H_g* ``[B, rows, columns]`` [m]."""
     observed: Tensor
+    """Cells measured by the lidar (bool)."""
     supporting: Tensor
     """H_t* [m]."""
-    felt: Tensor
+    contact_mask: Tensor
+    """Cells that wheels or tracks touched (bool), where H_t* is known."""
     map_of: Tensor
-    """Which map each of the ``W`` pieces of motion happened on."""
+    """Index of the map of each of the ``W`` chunks of motion."""
     positions: Tensor
-    """``[W, K, 3]``."""
+    """``[W, K, 3]`` [m]."""
     rotations: Tensor
     """``[W, K, 3, 3]``."""
     velocity: Tensor
-    """At the start, in terrain axes ``[W, 3]``."""
+    """At the start, in terrain axes ``[W, 3]`` [m/s]."""
     angular_velocity: Tensor
+    """At the start, in terrain axes ``[W, 3]`` [rad/s]."""
     twists: Tensor
-    """``[W, history + T, 2]``."""
+    """Commands ``[W, history + T, 2]`` [m/s, rad/s]."""
 
     def to(self, device: torch.device | str) -> Targets:
         """The same on another device."""
@@ -117,7 +121,7 @@ class Targets:
 
     @classmethod
     def stack(cls, targets: Sequence[Targets]) -> Targets:
-        """Of several batches."""
+        """Concatenate several batches."""
         joined = {f.name: torch.cat([getattr(t, f.name) for t in targets]) for f in fields(cls) if f.name != "map_of"}
         starts = np.cumsum([0, *(len(t.geometric) for t in targets[:-1])])
         map_of = torch.cat([t.map_of + int(start) for t, start in zip(targets, starts, strict=True)])
@@ -125,114 +129,118 @@ class Targets:
 
 
 def sample(
-    drive: RecordingSamples,
+    recording: RecordingSamples,
     index: int,
     config: EncoderConfig,
-    variation: Variation = Variation(),
+    augmentation: Augmentation = Augmentation(),
     *,
     chunks: int = 4,
     horizon: float = 5.0,
 ) -> tuple[EncoderInput, Targets]:
-    """Input and targets of one sample of a drive.
+    """Input and targets of one sample of a recording.
 
     Args:
-        drive: its samples.
+        recording: its samples.
         index: of the sample.
         config: of the encoder.
-        variation: of the sample.
-        chunks: pieces of motion to roll out, spread over ``horizon`` [s] after the image.
+        augmentation: of the sample.
+        chunks: largest number of chunks of motion to roll out.
+        horizon: time after the image over which they are spread [s].
     """
-    terrain_from_odometry = np.linalg.inv(_odometry_from_terrain(drive, index, variation))
-    affine = None if variation.is_none else variation.image_from_view()
+    terrain_from_odometry = np.linalg.inv(_odometry_from_terrain(recording, index, augmentation))
+    affine = None if augmentation.is_none else augmentation.image_from_view()
     rays, origins, images = [], [], []
     for camera, pose, image in zip(
-        drive.cameras, drive.odometry_from_cameras[index], drive.images[index].numpy(), strict=True
+        recording.cameras, recording.odometry_from_cameras[index], recording.images[index].numpy(), strict=True
     ):
         placed = terrain_from_odometry @ pose
         rays.append(feature_rays(camera, config.feature_rows, config.feature_columns, affine) @ placed[:3, :3].T)
         origins.append(placed[:3, 3])
-        images.append(variation.image(image))
-    support = transform_points(terrain_from_odometry, drive.support[index])
-    sweep = transform_points(terrain_from_odometry, drive.sweep(index)) if config.sensor == "lidar" else None
+        images.append(augmentation.image(image))
+    support = transform_points(terrain_from_odometry, recording.support[index])
+    sweep = transform_points(terrain_from_odometry, recording.sweep(index)) if config.sensor == "lidar" else None
     batch = assemble(np.stack(images), np.stack(rays), np.stack(origins), support, config, sweep)
-    return batch, targets(drive, index, config, variation, chunks=chunks, horizon=horizon)
+    return batch, targets(recording, index, config, augmentation, chunks=chunks, horizon=horizon)
 
 
 def targets(
-    drive: RecordingSamples,
+    recording: RecordingSamples,
     index: int,
     config: EncoderConfig,
-    variation: Variation = Variation(),
+    augmentation: Augmentation = Augmentation(),
     *,
     chunks: int = 4,
     horizon: float = 5.0,
 ) -> Targets:
     """Targets of one sample, without its images; see :func:`sample`."""
-    pose = _odometry_from_terrain(drive, index, variation)
-    maps = _maps(drive.segments[drive.segment_of[index]], pose, config)
-    motion = _motion(drive, index, np.linalg.inv(pose), variation.mirrored, chunks, horizon)
+    pose = _odometry_from_terrain(recording, index, augmentation)
+    maps = _maps(recording.segments[recording.segment_of[index]], pose, config)
+    motion = _motion(recording, index, np.linalg.inv(pose), augmentation.mirrored, chunks, horizon)
     return Targets(**{name: torch.from_numpy(value) for name, value in (maps | motion).items()})
 
 
-def _odometry_from_terrain(drive: RecordingSamples, index: int, variation: Variation) -> np.ndarray:
-    """Pose of a sample's varied terrain frame ``[4, 4]``.
-
-    It is left-handed where the scene is mirrored: everything that happens in it is mirrored too.
-    """
-    base = drive.odometry_from_base[index]
-    heading = np.arctan2(base[1, 0], base[0, 0]) + variation.turn
+def _odometry_from_terrain(recording: RecordingSamples, index: int, augmentation: Augmentation) -> np.ndarray:
+    """Pose of a sample's augmented terrain frame ``[4, 4]``, left-handed if the scene is mirrored."""
+    base = recording.odometry_from_base[index]
+    heading = np.arctan2(base[1, 0], base[0, 0]) + augmentation.turn
     cosine, sine = np.cos(heading), np.sin(heading)
-    mirror = MIRROR if variation.mirrored else np.eye(3)
+    mirror = MIRROR if augmentation.mirrored else np.eye(3)
     level = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
     return homogeneous(level @ mirror, base[:3, 3])
 
 
 def _maps(segment: Segment, odometry_from_terrain: np.ndarray, config: EncoderConfig) -> dict[str, np.ndarray]:
-    """The segment's maps, on the sample's grid."""
+    """The segment's maps resampled on the sample's grid."""
     grid = config.grid
     x, y = np.meshgrid(grid.x, grid.y)
     centres = np.stack([x, y, np.zeros_like(x)], axis=-1)
     turn = np.linalg.inv(segment.odometry_from_map) @ odometry_from_terrain
-    there = transform_points(turn, centres)
-    columns = ((there[..., 0] - segment.grid.origin[0]) / segment.grid.resolution).astype(np.float32)
-    rows = ((there[..., 1] - segment.grid.origin[1]) / segment.grid.resolution).astype(np.float32)
+    in_segment = transform_points(turn, centres)
+    columns = ((in_segment[..., 0] - segment.grid.origin[0]) / segment.grid.resolution).astype(np.float32)
+    rows = ((in_segment[..., 1] - segment.grid.origin[1]) / segment.grid.resolution).astype(np.float32)
 
     def heights(values: np.ndarray) -> np.ndarray:
-        found = cv2.remap(values, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return (found - turn[2, 3]).astype(np.float32)[None]
+        resampled = cv2.remap(values, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return (resampled - turn[2, 3]).astype(np.float32)[None]
 
     def mask(values: np.ndarray) -> np.ndarray:
-        known = values.astype(np.uint8)
-        found = cv2.remap(known, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
-        return (found > 0)[None]
+        resampled = cv2.remap(
+            values.astype(np.uint8), columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0
+        )
+        return (resampled > 0)[None]
 
     return {
         "geometric": heights(segment.geometric),
         "observed": mask(segment.observed),
         "supporting": heights(segment.supporting),
-        "felt": mask(segment.felt),
+        "contact_mask": mask(segment.contact_mask),
     }
 
 
 def _motion(
-    drive: RecordingSamples, index: int, terrain_from_odometry: np.ndarray, mirrored: bool, count: int, horizon: float
+    recording: RecordingSamples,
+    index: int,
+    terrain_from_odometry: np.ndarray,
+    mirrored: bool,
+    count: int,
+    horizon: float,
 ) -> dict[str, np.ndarray]:
-    """Pieces of motion after the image, in the varied frame."""
-    chunks = drive.chunks
-    after = (chunks.stamps - drive.stamps[index]) * 1e-9
+    """Chunks of motion after the image, in the augmented frame."""
+    chunks = recording.chunks
+    after = (chunks.stamps - recording.stamps[index]) * 1e-9
     usable = np.flatnonzero((after >= 0) & (after <= horizon - chunks.times[-1]))
     if len(usable) > count:
         usable = usable[np.linspace(0, len(usable) - 1, count).round().astype(int)]
     turn, mirror = terrain_from_odometry[:3, :3], MIRROR if mirrored else np.eye(3)
     rotations = turn @ chunks.rotations[usable] @ mirror
-    # An angular velocity is a pseudovector: mirrored, it turns the other way about the axes in the mirror's plane.
-    handed = -1.0 if mirrored else 1.0
-    spun = chunks.angular_velocities[usable] @ mirror * handed
+    # Angular velocity is a pseudovector: a reflection also flips its sign.
+    handedness = -1.0 if mirrored else 1.0
+    angular_velocities = chunks.angular_velocities[usable] @ mirror * handedness
     return {
         "map_of": np.zeros(len(usable), np.int64),
         "positions": transform_points(terrain_from_odometry, chunks.positions[usable]).astype(np.float32),
         "rotations": rotations.astype(np.float32),
         "velocity": np.einsum("wij,wj->wi", rotations[:, 0], chunks.velocities[usable] @ mirror).astype(np.float32),
-        "angular_velocity": np.einsum("wij,wj->wi", rotations[:, 0], spun).astype(np.float32),
-        "twists": chunks.twists[usable] * np.array([1.0, handed], np.float32),
+        "angular_velocity": np.einsum("wij,wj->wi", rotations[:, 0], angular_velocities).astype(np.float32),
+        "twists": chunks.twists[usable] * np.array([1.0, handedness], np.float32),
     }

@@ -1,4 +1,4 @@
-"""Terrain fit: the ground that explains a driven trajectory, by gradient descent through the rollout (paper III-F)."""
+"""Terrain fit: the terrain that explains a driven trajectory, by gradient descent through the rollout (paper III-F)."""
 
 from __future__ import annotations
 
@@ -21,37 +21,37 @@ from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap, fill_holes
 from monoforce_ros.training.trajectory_residual import robust_loss, trajectory_residual
 
 _SAMPLE_TIME = 0.1
-# How far a prediction may be off before it weighs: along the ground, where slip decides, up, and in rotation.
-_ACROSS, _UP, _TURN = 0.15, 0.01, np.radians(0.7)
+_HORIZONTAL_SCALE, _VERTICAL_SCALE, _TILT_SCALE = 0.15, 0.01, np.radians(0.7)
+"""Scales of pose residuals [m, m, rad]; horizontally wider because slip decides there."""
 _FRICTION_TRUST = 0.3
 """Weight of the square of local changes in the logarithm of friction."""
 _BLEND = 0.6
-"""Distance from the wheels' track at which what is seen takes over from what was felt [m]."""
+"""Distance from the wheel tracks beyond which the visible terrain replaces the traced one [m]."""
 
 
 @dataclass(frozen=True)
 class FitSettings:
-    """How terrain is fitted."""
+    """Settings of the terrain fit."""
 
     chunk: float = 1.0
-    """Length of the pieces that are predicted from measured states [s]."""
+    """Length of the chunks that are rolled out from measured states [s]."""
     iterations: int = 60
     """Steps of the descent."""
     step: float = 0.004
-    """First step in height [m]; it falls to a tenth."""
+    """Initial step in height [m]; it decays to a tenth."""
     margin: float = 2.0
-    """Of the map around the trajectory [m]."""
+    """Margin of the map around the trajectory [m]."""
     resolution: float = 0.1
-    """[m]."""
+    """Of the map [m]."""
     smoothness: float = 0.3
-    """Weight of the fitted change's curvature."""
+    """Weight of the squared curvature of the height change."""
     trust: float = 0.3
-    """Weight of the fitted change's square: how far the traced surface is trusted where the motion has other reasons
-    than the ground's shape, such as slipping."""
+    """Weight of the squared height change: trust in the traced surface, since motion also depends on effects other than
+    the terrain's shape, such as slip."""
     friction: bool = False
-    """Fit friction too."""
+    """Whether to fit friction too."""
     friction_step: float = 0.03
-    """First step in the logarithm of friction."""
+    """Initial step in the logarithm of friction."""
 
     def __post_init__(self):
         for name, low, high in (
@@ -70,35 +70,35 @@ class FitSettings:
 
 @dataclass(frozen=True)
 class TerrainFit:
-    """Fitted terrain and how well it explains the motion."""
+    """Fitted terrain and how well it predicts the motion."""
 
     terrain: TerrainMap
-    """``height`` is H_t*, ``geometric_height`` what was seen (or H_t* again), ``friction`` fitted if asked for."""
-    felt: np.ndarray
-    """Cells that wheels or tracks stood on, ``[rows, columns]`` bool: where H_t* is known."""
+    """``height`` is H_t*, ``geometric_height`` is H_g* (H_t* without a visible terrain), ``friction`` as fitted."""
+    contact_mask: np.ndarray
+    """Cells that wheels or tracks touched, ``[rows, columns]`` bool: where H_t* is known."""
     odometry_from_terrain: np.ndarray
     """Pose ``[4, 4]`` of the map."""
     losses: np.ndarray
-    """Of each step of the descent."""
+    """Loss of each step of the descent."""
     times: np.ndarray
-    """Of the samples within a chunk [s], ``[K]``."""
+    """Times of the poses within a chunk ``[K]`` [s]."""
     measured: np.ndarray
-    """Positions in the map's frame [m], ``[chunks, K, 3]``."""
+    """Positions in the map's frame ``[chunks, K, 3]`` [m]."""
     predicted: np.ndarray
-    """By the fitted terrain, ``[chunks, K, 3]``."""
+    """Positions predicted on the fitted terrain ``[chunks, K, 3]`` [m]."""
     before: np.ndarray
-    """Height error of predictions on the visible terrain at the end of each chunk [m], ``[chunks]``."""
+    """Height error at the end of each chunk on the visible terrain ``[chunks]`` [m]."""
     after: np.ndarray
-    """The same on the fitted terrain, ``[chunks]``."""
+    """Height error at the end of each chunk on the fitted terrain ``[chunks]`` [m]."""
 
 
 def trajectory_frame(motion: MotionTrack, start: int) -> np.ndarray:
-    """Pose ``[4, 4]`` odometry ← map: at the robot at ``start`` [ns], x along its heading, z against gravity."""
+    """Pose ``[4, 4]`` odometry ← map: at the robot's position at ``start`` [ns], x along its heading, z up."""
     return motion.at(start).odometry_from_terrain
 
 
 def trajectory_grid(motion: MotionTrack, start: int, length: float, settings: FitSettings) -> Grid:
-    """A grid in the trajectory's frame that holds it and a margin."""
+    """Grid in the trajectory's frame that covers the trajectory and a margin."""
     local = _positions(motion, start, length)[:, :2]
     low = np.floor((local.min(axis=0) - settings.margin) / settings.resolution)
     high = np.ceil((local.max(axis=0) + settings.margin) / settings.resolution)
@@ -120,26 +120,26 @@ def fit_terrain(
     backend: str = "auto",
     progress: Callable[[], None] = lambda: None,
 ) -> TerrainFit:
-    """Fit heights, and friction if asked for, to a driven trajectory.
+    """Fit heights, and optionally friction, to a driven trajectory.
 
-    The map starts as the surface that the wheels' tracks trace, joined to what is visible beside them. Chunks of the
-    trajectory are rolled out from measured states, all at once; the map moves against the gradient of how far they
-    end from what was measured. The change is smooth over neighbouring cells and touches the tracks' surroundings only.
+    The map is initialised with the surface traced by the undersides of the wheels, blended into the visible terrain
+    elsewhere. Chunks of the trajectory are rolled out in one batch from measured states, and gradient descent reduces
+    their distance to the measured poses. The height change is smooth and limited to the surroundings of the tracks.
 
     Args:
-        motion: measured, best smoothed (:func:`monoforce_ros.bags.smooth`).
+        motion: measured, preferably smoothed (:func:`monoforce_ros.bags.smooth`).
         commands: recorded.
-        robot: what drove.
+        robot: that was driven.
         start: of the trajectory [ns].
         length: of the trajectory [s].
-        visible: what was seen, on :func:`trajectory_grid`; without it only the tracks shape the map.
-        material: stiffness, damping and first friction of the ground.
-        settings: of the descent.
+        visible: visible terrain on :func:`trajectory_grid`; without it the map depends on the wheel tracks alone.
+        material: stiffness, damping and initial friction of the ground.
+        settings: of the fit.
         backend: of the rollout.
         progress: called after each step of the descent.
 
     Raises:
-        ValueError: there is no odometry for one chunk, or ``visible`` lies on another grid.
+        ValueError: there is no odometry for a single chunk.
     """
     grid = trajectory_grid(motion, start, length, settings) if visible is None else visible.grid
     pose = trajectory_frame(motion, start)
@@ -147,26 +147,26 @@ def fit_terrain(
     windows = cut_windows(
         local, commands, length=settings.chunk, stride=settings.chunk, sample_time=_SAMPLE_TIME, maximum_gap=0.5
     )
-    traced, felt = _trace(local, robot, pose, grid, material.stiffness)
-    first = _first_guess(traced, felt, visible)
-    seen = first if visible is None else visible.geometric_height.numpy()
+    traced, contact_mask = _trace(local, robot, pose, grid, material.stiffness)
+    initial = _initial_heights(traced, contact_mask, visible)
+    geometric = initial if visible is None else visible.geometric_height.numpy()
     chunks = _Chunks(windows, robot, pose)
     terrain = TerrainMap.from_height(
-        torch.from_numpy(first.astype(np.float32)),
+        torch.from_numpy(initial.astype(np.float32)),
         grid,
-        geometric_height=torch.from_numpy(np.asarray(seen, np.float32)),
-        observed=torch.from_numpy(felt),
+        geometric_height=torch.from_numpy(np.asarray(geometric, np.float32)),
+        observed=torch.from_numpy(contact_mask),
         material=material,
     )
     if visible is not None:
         terrain = replace(terrain, observed=terrain.observed | visible.observed)
     before = chunks.roll_out(visible if visible is not None else terrain, backend)
-    terrain, losses = _descend(terrain, chunks, felt, settings, backend, progress)
+    terrain, losses = _descend(terrain, chunks, contact_mask, settings, backend, progress)
     after = chunks.roll_out(terrain, backend)
     measured = chunks.positions.numpy()
     return TerrainFit(
         terrain=terrain,
-        felt=felt,
+        contact_mask=contact_mask,
         odometry_from_terrain=pose,
         losses=np.array(losses),
         times=windows.times,
@@ -178,7 +178,7 @@ def fit_terrain(
 
 
 class _Chunks:
-    """Pieces of a trajectory in the map's frame, ready to be rolled out."""
+    """Chunks of a trajectory in the map's frame, ready to be rolled out."""
 
     def __init__(self, windows: Windows, robot: RobotModel, pose: np.ndarray):
         turn = pose[:3, :3].T
@@ -202,20 +202,27 @@ class _Chunks:
             self.speeds = drive_speeds(robot, tensor(windows.twists), self.options.time_step, history=windows.history)
 
     def roll_out(self, terrain: TerrainMap, backend: str) -> tuple[Tensor, Tensor]:
-        """Positions ``[chunks, K, 3]`` and rotations ``[chunks, K, 3, 3]`` at the sampled times."""
+        """Positions ``[chunks, K, 3]`` [m] and rotations ``[chunks, K, 3, 3]`` at the sampled times."""
         result = rollout(
             terrain, self.robot, self.speeds, self.state, options=self.options, with_forces=False, backend=backend
         )
         return result.position[:, self.index], result.rotation[:, self.index]
 
     def loss(self, terrain: TerrainMap, backend: str) -> Tensor:
-        """How far predictions are from what was measured, in units of what may be ignored; robust to slips."""
+        """Huber loss of scaled residuals between predicted and measured poses; robust to slip."""
         positions, rotations = self.roll_out(terrain, backend)
-        away, turns = trajectory_residual(
+        translation, rotation = trajectory_residual(
             positions[:, 1:], rotations[:, 1:], self.positions[:, 1:], self.rotations[:, 1:]
         )
-        # Headings say nothing of heights.
-        scaled = torch.cat([away[..., :2] / _ACROSS, away[..., 2:] / _UP, turns[..., :2] / _TURN], dim=-1)
+        # Heading is left out: it hardly depends on heights.
+        scaled = torch.cat(
+            [
+                translation[..., :2] / _HORIZONTAL_SCALE,
+                translation[..., 2:] / _VERTICAL_SCALE,
+                rotation[..., :2] / _TILT_SCALE,
+            ],
+            dim=-1,
+        )
         per_sample = robust_loss(scaled, 3.0)
         finite = torch.isfinite(per_sample)
         return torch.where(finite, per_sample, 0.0).sum() / finite.sum().clamp_min(1)
@@ -224,15 +231,15 @@ class _Chunks:
 def _descend(
     terrain: TerrainMap,
     chunks: _Chunks,
-    felt: np.ndarray,
+    contact_mask: np.ndarray,
     settings: FitSettings,
     backend: str,
     progress: Callable[[], None],
 ) -> tuple[TerrainMap, list[float]]:
-    near = torch.from_numpy((distance_transform_edt(~felt) * settings.resolution < _BLEND).astype(np.float32))
+    near = torch.from_numpy((distance_transform_edt(~contact_mask) * settings.resolution < _BLEND).astype(np.float32))
     change = torch.zeros_like(terrain.height, requires_grad=True)
     groups = [{"params": [change], "lr": settings.step}]
-    # Friction changes as a whole, and from place to place where the motion asks for it.
+    # Friction has a global factor, and local changes where the motion requires them.
     logarithm, local = torch.zeros((), requires_grad=True), torch.zeros_like(terrain.height, requires_grad=True)
     if settings.friction:
         groups.append({"params": [logarithm, local], "lr": settings.friction_step})
@@ -241,10 +248,11 @@ def _descend(
     kernel, wide = _kernel(1.2), _kernel(4.0)
 
     def current() -> TerrainMap:
-        changed = {"height": terrain.height + near * _spread(change, kernel)}
-        if settings.friction:
-            changed["friction"] = terrain.friction * torch.exp(logarithm + near * _spread(local, wide)).clamp(0.1, 3.0)
-        return replace(terrain, **changed)
+        height = terrain.height + near * _blurred(change, kernel)
+        if not settings.friction:
+            return replace(terrain, height=height)
+        factor = torch.exp(logarithm + near * _blurred(local, wide)).clamp(0.1, 3.0)
+        return replace(terrain, height=height, friction=terrain.friction * factor)
 
     losses: list[float] = []
     best, least = current(), np.inf
@@ -253,8 +261,8 @@ def _descend(
         candidate = current()
         data = chunks.loss(candidate, backend)
         added = candidate.height - terrain.height
-        curvature = functional.conv2d(added[None, None] / _UP, _LAPLACE)[0, 0]
-        prior = settings.smoothness * (curvature**2).sum() + settings.trust * ((added / _UP) ** 2).sum()
+        curvature = functional.conv2d(added[None, None] / _VERTICAL_SCALE, _LAPLACE)[0, 0]
+        prior = settings.smoothness * (curvature**2).sum() + settings.trust * ((added / _VERTICAL_SCALE) ** 2).sum()
         prior = prior + _FRICTION_TRUST * (local**2).sum()
         loss = data + prior / max(1.0, float(near.sum()))
         loss.backward()
@@ -276,8 +284,8 @@ def _kernel(deviation: float) -> Tensor:
     return weights / weights.sum()
 
 
-def _spread(values: Tensor, kernel: Tensor) -> Tensor:
-    """A map blurred by a Gaussian: gradients of single cells move their neighbours along."""
+def _blurred(values: Tensor, kernel: Tensor) -> Tensor:
+    """A map blurred by a Gaussian, so that gradients of single cells act on their neighbours too."""
     reach = len(kernel) // 2
     rows = functional.conv2d(values[None, None], kernel[None, None, None], padding=(0, reach))
     return functional.conv2d(rows, kernel[None, None, :, None], padding=(reach, 0))[0, 0]
@@ -308,15 +316,15 @@ def _positions(motion: MotionTrack, start: int, length: float) -> np.ndarray:
 def _trace(
     motion: MotionTrack, robot: RobotModel, pose: np.ndarray, grid: Grid, stiffness: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Heights that the undersides of wheels and tracks pass over ``[rows, columns]`` [m], and which cells they do."""
+    """Heights traced by the undersides of wheels and tracks ``[rows, columns]`` [m], and the contact mask."""
     underside = robot.points[robot.point_tangents[:, 0] < -0.97].double().numpy()
     inverse = np.linalg.inv(pose)
     rotations = Rotation.from_quat(motion.quaternions).as_matrix()
-    places = [
+    underside_points = [
         transform_points(inverse @ homogeneous(rotation, position), underside)
         for rotation, position in zip(rotations, motion.positions, strict=True)
     ]
-    points = np.concatenate(places)
+    points = np.concatenate(underside_points)
     rows, columns, inside = grid.cells(points[:, :2])
     flat, heights = (rows * grid.columns + columns)[inside], points[inside, 2]
     order = np.lexsort((heights, flat))
@@ -324,17 +332,17 @@ def _trace(
     starts = np.flatnonzero(np.r_[True, flat[1:] != flat[:-1]])
     counts = np.diff(np.r_[starts, len(flat)])
     traced = np.zeros((grid.rows, grid.columns))
-    # A wheel may hang in the air over a cell that another one stands on: the ground is where the lower ones were.
+    # A low quantile: a wheel may hang above a cell that another wheel touches.
     traced.ravel()[flat[starts]] = heights[starts + counts // 4] + rest_depth(robot, stiffness)
-    felt = np.zeros((grid.rows, grid.columns), bool)
-    felt.ravel()[flat[starts]] = True
-    return traced, felt
+    contact_mask = np.zeros((grid.rows, grid.columns), bool)
+    contact_mask.ravel()[flat[starts]] = True
+    return traced, contact_mask
 
 
-def _first_guess(traced: np.ndarray, felt: np.ndarray, visible: TerrainMap | None) -> np.ndarray:
-    """The traced surface, and away from it what is visible."""
+def _initial_heights(traced: np.ndarray, contact_mask: np.ndarray, visible: TerrainMap | None) -> np.ndarray:
+    """The traced surface, and the visible terrain away from it."""
     if visible is None:
-        return fill_holes(traced, felt)
-    away = distance_transform_edt(~felt) * visible.grid.resolution > _BLEND
-    known = felt | (away & visible.observed.numpy())
-    return fill_holes(np.where(felt, traced, visible.geometric_height.numpy()), known)
+        return fill_holes(traced, contact_mask)
+    distant = distance_transform_edt(~contact_mask) * visible.grid.resolution > _BLEND
+    known = contact_mask | (distant & visible.observed.numpy())
+    return fill_holes(np.where(contact_mask, traced, visible.geometric_height.numpy()), known)

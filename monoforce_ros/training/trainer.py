@@ -1,4 +1,4 @@
-"""Trainer: encoder, samples and losses → checkpoint, in steps that a kill does not lose."""
+"""Trainer: encoder, samples and losses → checkpoint, resumable after an interruption."""
 
 from __future__ import annotations
 
@@ -28,34 +28,34 @@ from monoforce_ros.training.losses import (
     decrease_loss,
     geometric_loss,
     measured_decrease_loss,
+    prominent_decrease_loss,
     slope_loss,
-    standing_decrease_loss,
     terrain_loss,
     trajectory_loss,
 )
 from monoforce_ros.training.recording_samples import RecordingSamples
-from monoforce_ros.training.samples import Targets, Variation, sample
+from monoforce_ros.training.samples import Augmentation, Targets, sample
 
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """How an encoder is trained."""
+    """Settings of the training."""
 
     steps: int = 2000
     batch: int = 8
-    """Samples a step and process."""
+    """Samples per step and process."""
     rate: float = 1.5e-3
-    """Largest learning rate; the pretrained backbone's is a third of it."""
+    """Peak learning rate; a third of it for the pretrained backbone."""
     warm_up: int = 50
-    """Steps in which the rate rises."""
+    """Steps of linear warm-up of the learning rate."""
     weights: LossWeights = field(default_factory=LossWeights)
     seed: int = 1
-    vary: bool = True
-    """Vary samples (mirror, turn, cut, recolour)."""
+    augment: bool = True
+    """Whether to augment samples (mirror, rotate, crop, change colours)."""
     validate_every: int = 250
     save_every: int = 50
     precision: str = "auto"
-    """``auto`` (half precision on CUDA), ``float32`` or ``bfloat16``."""
+    """``auto`` (bfloat16 on CUDA), ``float32`` or ``bfloat16``."""
 
     def __post_init__(self):
         for name, low, high in (
@@ -69,30 +69,30 @@ class TrainingSettings:
 
 
 class TrainingError(RuntimeError):
-    """Training that cannot go on; the message says why."""
+    """Training cannot start or continue; the message says why."""
 
 
 @dataclass(frozen=True)
 class Validation:
-    """How far an encoder is off on drives that it did not see; medians over cells that cameras look at."""
+    """Errors of an encoder on held-out recordings; medians over cells in view."""
 
     geometric: float
     """|H_g - H_g*| [m]."""
     supporting: float
-    """|H_t - H_t*| where the robot drove [m]."""
+    """|H_t - H_t*| on contact cells [m]."""
     loss: float
-    """The criterion of the paper (IV-A): terrain and geometric loss."""
+    """Held-out loss, by which the checkpoint is selected (paper IV-A): terrain plus geometric loss."""
 
 
 class Process:
-    """This process among those that train together under ``torchrun``; alone without it."""
+    """This process and its device, one of several under ``torchrun``."""
 
     def __init__(self, device: str = "auto"):
         self.count = int(os.environ.get("WORLD_SIZE", "1"))
         self.rank = int(os.environ.get("RANK", "0"))
         cuda = device == "cuda" or (device == "auto" and torch.cuda.is_available())
         if device == "cuda" and not torch.cuda.is_available():
-            raise TrainingError("device: got cuda, but PyTorch sees no CUDA GPU; use --device cpu")
+            raise TrainingError("device: got cuda, but PyTorch finds no CUDA GPU; use --device cpu")
         self.device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0"))) if cuda else torch.device("cpu")
         if self.count > 1 and not torch.distributed.is_initialized():
             if cuda:
@@ -111,7 +111,7 @@ class Process:
 
 
 class _Losses(nn.Module):
-    """Encoder and losses as one module, so that a distributed wrapper sees one forward pass."""
+    """Encoder and losses as one module, as DistributedDataParallel requires a single forward pass."""
 
     def __init__(self, encoder: Encoder, robot: RobotModel, weights: LossWeights):
         super().__init__()
@@ -122,7 +122,7 @@ class _Losses(nn.Module):
         maps = self.encoder(batch)
         weights, losses = self.weights, {}
         if weights.geometric:
-            losses["geometric"] = weights.geometric * geometric_loss(maps, targets, batch.ground, weights.standing)
+            losses["geometric"] = weights.geometric * geometric_loss(maps, targets, batch.ground, weights.prominence)
         if weights.terrain:
             losses["terrain"] = weights.terrain * terrain_loss(maps, targets)
             losses["slope"] = weights.slope * slope_loss(maps, targets, self.encoder.config.resolution)
@@ -135,48 +135,48 @@ class _Losses(nn.Module):
         if self.encoder.config.decreases and weights.geometric and weights.terrain:
             losses["measured decrease"] = weights.measured_decrease * measured_decrease_loss(maps, targets)
         if self.encoder.config.decreases and weights.geometric:
-            losses["standing decrease"] = weights.standing_decrease * standing_decrease_loss(
+            losses["prominent decrease"] = weights.prominent_decrease * prominent_decrease_loss(
                 maps, targets, batch.ground
             )
         losses["total"] = torch.stack(list(losses.values())).sum()
-        # Heads without a loss get a gradient of zero: processes that train together expect one for each weight.
+        # A zero gradient for heads without a loss: distributed training expects one for each parameter.
         unused = maps.decrease.sum() + maps.stiffness.sum() + maps.damping.sum() + maps.friction.sum()
         losses["total"] = losses["total"] + 0.0 * (unused + maps.geometric_height.sum())
         return losses
 
 
 class Trainer:
-    """Trains an encoder on drives and keeps its state in a folder.
+    """Trains an encoder on recordings and saves its state in a folder.
 
     Args:
-        encoder: to train, its backbone with the weights that it starts from.
-        robot: that drove.
-        drives: to train on.
-        held_out: whole drives to validate on.
-        out: folder of ``encoder.safetensors``, ``training.json``, ``state/`` and logs.
+        encoder: to train, with initial weights.
+        robot: that was driven.
+        recordings: to train on.
+        held_out: recordings to validate on.
+        out: folder for ``encoder.safetensors``, ``training.json``, ``state/`` and logs.
         settings: of the training.
-        process: this one, among others.
+        process: this process and its device.
     """
 
     def __init__(
         self,
         encoder: Encoder,
         robot: RobotModel,
-        drives: Sequence[RecordingSamples],
+        recordings: Sequence[RecordingSamples],
         held_out: Sequence[RecordingSamples],
         out: Path,
         settings: TrainingSettings,
         process: Process,
     ):
         self.out, self.settings, self.process = out, settings, process
-        self.encoder = encoder.to(process.device, memory_format=torch.channels_last)
-        self.drives, self.held_out = list(drives), list(held_out)
-        self.index = [(d, i) for d, drive in enumerate(self.drives) for i in range(len(drive))]
+        self.encoder = encoder.to(process.device).to(memory_format=torch.channels_last)
+        self.recordings, self.held_out = list(recordings), list(held_out)
+        self.index = [(r, i) for r, recording in enumerate(self.recordings) for i in range(len(recording))]
         if not self.index:
             raise TrainingError("no samples to train on")
         losses = _Losses(self.encoder, robot, settings.weights)
         self.losses = nn.parallel.DistributedDataParallel(losses) if process.count > 1 else losses
-        backbone = list(self.encoder.backbone.parameters()) if isinstance(encoder, TerrainEncoder) else []
+        backbone = list(encoder.backbone.parameters()) if isinstance(encoder, TerrainEncoder) else []
         pretrained = set(backbone)
         groups = [
             {"params": backbone, "lr": settings.rate / 3},
@@ -185,16 +185,17 @@ class Trainer:
         self.optimiser = torch.optim.AdamW(groups, weight_decay=1e-2)
         self.step = 0
         self.best = float("inf")
-        self.history: list[dict] = []
+        self.history: list[tuple[int, Validation]] = []
+        """Step and result of each validation."""
 
     def run(self, report: Callable[[int, dict[str, float]], None] = lambda step, losses: None) -> None:
-        """Train to the last step.
+        """Train until the last step.
 
         Raises:
-            TrainingError: the loss is not finite for many steps in a row.
+            TrainingError: the loss is not finite for 20 steps in a row.
         """
         settings = self.settings
-        lost = 0
+        not_finite = 0
         self.encoder.train()
         with ThreadPoolExecutor(1) as pool:
             prepared = pool.submit(self._batch, self.step)
@@ -204,23 +205,23 @@ class Trainer:
                     prepared = pool.submit(self._batch, self.step + 1)
                 losses = self._descend(batch.to(self.process.device), targets.to(self.process.device))
                 self.step += 1
-                lost = 0 if np.isfinite(losses["total"]) else lost + 1
-                if lost >= 20:
+                not_finite = 0 if np.isfinite(losses["total"]) else not_finite + 1
+                if not_finite >= 20:
                     raise TrainingError(
-                        f"the loss was not finite in {lost} steps in a row, up to step {self.step}; what was saved "
-                        "before is kept; try a smaller --rate"
+                        f"the loss was not finite for {not_finite} steps in a row, up to step {self.step}; earlier "
+                        "checkpoints are kept; try a smaller --rate"
                     )
                 report(self.step, losses)
                 done = self.step == settings.steps
                 if done or self.step % settings.validate_every == 0:
-                    self._validated()
+                    self._validate()
                 if self.process.first and (done or self.step % settings.save_every == 0):
                     self.save()
 
     def _descend(self, batch: EncoderInput, targets: Targets) -> dict[str, float]:
         fraction = self.step / max(1, self.settings.steps)
-        rise = min(1.0, (self.step + 1) / max(1, self.settings.warm_up))
-        factor = rise * (0.02 + 0.98 * 0.5 * (1 + np.cos(np.pi * fraction)))
+        warm_up = min(1.0, (self.step + 1) / max(1, self.settings.warm_up))
+        factor = warm_up * (0.02 + 0.98 * 0.5 * (1 + np.cos(np.pi * fraction)))
         for group, share in zip(self.optimiser.param_groups, (1 / 3, 1.0), strict=True):
             group["lr"] = self.settings.rate * share * factor
         self.optimiser.zero_grad(set_to_none=True)
@@ -230,58 +231,58 @@ class Trainer:
         if torch.isfinite(total.detach()):
             total.backward()
             norm = nn.utils.clip_grad_norm_(self.encoder.parameters(), 2.0)
-            # One sample that sends a robot tumbling must not spoil the weights.
+            # A single rollout in which the robot tumbles must not corrupt the weights.
             if torch.isfinite(norm):
                 self.optimiser.step()
         return {name: float(value.detach()) for name, value in losses.items()}
 
     def _cast(self) -> torch.autocast:
         kind = self.process.device.type
-        on = self.settings.precision == "bfloat16" or (self.settings.precision == "auto" and kind == "cuda")
-        return torch.autocast(kind, dtype=torch.bfloat16, enabled=on)
+        enabled = self.settings.precision == "bfloat16" or (self.settings.precision == "auto" and kind == "cuda")
+        return torch.autocast(kind, dtype=torch.bfloat16, enabled=enabled)
 
     def _batch(self, step: int) -> tuple[EncoderInput, Targets]:
-        """Samples of a step, the same for the same seed however often training was interrupted."""
+        """Samples of a step, determined by seed and step alone, so that resuming does not change them."""
         settings, process = self.settings, self.process
-        each = settings.batch * process.count
+        total = settings.batch * process.count
         random = np.random.default_rng([settings.seed, step])
-        # Every sample once in each round through the drives.
-        rounds, first = divmod(step * each, len(self.index))
-        order = np.random.default_rng([settings.seed, 7, rounds]).permutation(len(self.index))
+        # Each epoch uses every sample once.
+        epoch, first = divmod(step * total, len(self.index))
+        order = np.random.default_rng([settings.seed, 7, epoch]).permutation(len(self.index))
         first += process.rank * settings.batch
         chosen = np.take(order, range(first, first + settings.batch), mode="wrap")
-        variations = [Variation.draw(random) if settings.vary else Variation() for _ in range(each)]
-        mine = variations[process.rank * settings.batch :]
+        drawn = [Augmentation.draw(random) if settings.augment else Augmentation() for _ in range(total)]
+        augmentations = drawn[process.rank * settings.batch :]
         samples = [
-            sample(self.drives[self.index[i][0]], self.index[i][1], self.encoder.config, variation)
-            for i, variation in zip(chosen, mine, strict=False)
+            sample(self.recordings[self.index[i][0]], self.index[i][1], self.encoder.config, augmentation)
+            for i, augmentation in zip(chosen, augmentations, strict=False)
         ]
         return EncoderInput.stack([s[0] for s in samples]), Targets.stack([s[1] for s in samples])
 
-    def _validated(self) -> None:
-        """Validate; keep the encoder where it is the best so far."""
+    def _validate(self) -> None:
+        """Validate, and save the encoder if it has the lowest held-out loss so far."""
         if not self.process.first:
             return
         if not self.held_out:
             save_encoder(self.encoder, self.out / "encoder.safetensors")
             return
         found = validate(self.encoder, self.held_out, self.process.device)
-        self.history.append({"step": self.step, **asdict(found)})
+        self.history.append((self.step, found))
         if found.loss < self.best:
             self.best = found.loss
             save_encoder(self.encoder, self.out / "encoder.safetensors")
         self.encoder.train()
 
     def save(self) -> None:
-        """Keep weights, the optimiser's moments and the step, so that training goes on from here."""
+        """Save weights, the optimiser's moments and the step, from which :meth:`resume` continues."""
         folder = self.out / "state"
         tensors = {f"encoder.{name}": value for name, value in self.encoder.state_dict().items()}
-        names = {parameter: name for name, parameter in self.encoder.named_parameters()}
+        names: dict[Tensor, str] = {parameter: name for name, parameter in self.encoder.named_parameters()}
         for parameter, moments in self.optimiser.state.items():
             for key, value in moments.items():
                 tensors[f"optimiser.{names[parameter]}.{key}"] = torch.as_tensor(value)
         description = {
-            "step": self.step, "best": self.best, "history": self.history, "settings": asdict(self.settings),
+            "step": self.step, "best": self.best, "history": self.described_history, "settings": asdict(self.settings),
             "config": asdict(self.encoder.config), "written": time.time(),
         }  # fmt: skip
         with atomic_path(folder / "state.safetensors") as unfinished:
@@ -290,11 +291,16 @@ class Trainer:
                 metadata={"training": json.dumps(description)},
             )  # fmt: skip
 
+    @property
+    def described_history(self) -> list[dict[str, float]]:
+        """:attr:`history` as in JSON files."""
+        return [{"step": step, **asdict(found)} for step, found in self.history]
+
     def resume(self) -> bool:
-        """Go on from the folder's state; False where there is none.
+        """Continue from the saved state in the folder; False if there is none.
 
         Raises:
-            TrainingError: the state is damaged or of another network or other settings.
+            TrainingError: the state is damaged, or its network or settings differ.
         """
         file = self.out / "state" / "state.safetensors"
         if not file.is_file():
@@ -306,14 +312,14 @@ class Trainer:
                 description = json.loads((content.metadata() or {})["training"])
             tensors = load_file(str(file))
         except (SafetensorError, KeyError, ValueError, OSError) as error:
-            raise TrainingError(f"{file}: damaged ({error}); delete {file.parent} to start anew") from error
-        wanted = json.loads(json.dumps(asdict(self.settings)))
-        different = [name for name, value in wanted.items() if description["settings"].get(name) != value]
+            raise TrainingError(f"{file}: damaged ({error}); delete {file.parent} to start over") from error
+        expected, saved = json.loads(json.dumps(asdict(self.settings))), _renamed(description["settings"])
+        different = [name for name, value in expected.items() if saved.get(name) != value]
         if description["config"] != asdict(self.encoder.config):
-            different.append("the network's configuration")
+            different.append("network configuration")
         if different:
             raise TrainingError(
-                f"{file}: was trained with other {', '.join(different)}; give the same options, or another --out"
+                f"{file}: saved with different {', '.join(different)}; use the same options, or another --out"
             )
         self.encoder.load_state_dict(
             {name.removeprefix("encoder."): v for name, v in tensors.items() if name.startswith("encoder.")}
@@ -325,25 +331,39 @@ class Trainer:
                 self.optimiser.state[parameter] = {
                     key: v if key == "step" else v.to(self.process.device) for key, v in moments.items()
                 }
-        self.step, self.best, self.history = description["step"], description["best"], description["history"]
+        self.step, self.best = description["step"], description["best"]
+        self.history = [
+            (e["step"], Validation(e["geometric"], e["supporting"], e["loss"])) for e in description["history"]
+        ]
         return True
 
 
+def _renamed(settings: dict) -> dict:
+    """Saved settings of an earlier release under their names of today."""
+    settings = {"augment" if name == "vary" else name: value for name, value in settings.items()}
+    old = {"standing": "prominence", "standing_decrease": "prominent_decrease"}
+    weights = settings.get("weights")
+    if isinstance(weights, dict):
+        settings["weights"] = {old.get(name, name): value for name, value in weights.items()}
+    return settings
+
+
 @torch.no_grad()
-def validate(encoder: Encoder, drives: Sequence[RecordingSamples], device: torch.device) -> Validation:
-    """Measure an encoder on whole drives, without variations."""
+def validate(encoder: Encoder, recordings: Sequence[RecordingSamples], device: torch.device) -> Validation:
+    """Evaluate an encoder on whole recordings, without augmentation."""
     encoder.eval()
     geometric, supporting, losses = [], [], []
-    for drive in drives:
-        for start in range(0, len(drive), 8):
-            samples = [sample(drive, i, encoder.config, chunks=1) for i in range(start, min(start + 8, len(drive)))]
+    for recording in recordings:
+        for start in range(0, len(recording), 8):
+            indices = range(start, min(start + 8, len(recording)))
+            samples = [sample(recording, i, encoder.config, chunks=1) for i in indices]
             batch = EncoderInput.stack([s[0] for s in samples]).to(device)
             targets = Targets.stack([s[1] for s in samples]).to(device)
             maps: EncodedMaps = encoder(batch)
             ground = batch.ground[:, None, None]
-            seen = (targets.geometric - ground).clamp(LOWEST, HIGHEST) + ground
-            geometric.append((maps.geometric_height - seen).abs()[targets.observed & maps.covered].cpu())
-            supporting.append((maps.height - targets.supporting).abs()[targets.felt & maps.covered].cpu())
+            measured = (targets.geometric - ground).clamp(LOWEST, HIGHEST) + ground
+            geometric.append((maps.geometric_height - measured).abs()[targets.observed & maps.covered].cpu())
+            supporting.append((maps.height - targets.supporting).abs()[targets.contact_mask & maps.covered].cpu())
             losses.append(float(terrain_loss(maps, targets) + geometric_loss(maps, targets, batch.ground)))
 
     def median(parts: list[Tensor]) -> float:
@@ -353,10 +373,12 @@ def validate(encoder: Encoder, drives: Sequence[RecordingSamples], device: torch
     return Validation(median(geometric), median(supporting), float(np.mean(losses)))
 
 
-def describe(config: EncoderConfig, settings: TrainingSettings, drives: Sequence[RecordingSamples]) -> dict:
-    """What stands beside a checkpoint: how it came to be."""
+def describe(config: EncoderConfig, settings: TrainingSettings, recordings: Sequence[RecordingSamples]) -> dict:
+    """Content of ``training.json``: configuration, settings and number of samples of each recording."""
+    counts = {recording.name: len(recording) for recording in recordings}
     return {
         "config": asdict(config),
         "settings": asdict(settings),
-        "drives": {drive.name: len(drive) for drive in drives},
+        "recordings": counts,
+        "drives": counts,  # the name in earlier releases
     }

@@ -1,4 +1,4 @@
-"""Visible terrain of a drive: its lidar sweeps, joined along the measured poses, as a height map."""
+"""Visible terrain H_g*: height maps from the lidar sweeps of a recording, accumulated along its measured poses."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import Grid, LidarSettings, TerrainDefaults, TerrainMap, accumulate, terrain_from_cloud
 
 _LARGEST_GAP = 0.2
+"""Between poses around a sweep [s]; others are skipped."""
 
 
 def visible_terrain(
@@ -26,21 +27,21 @@ def visible_terrain(
     material: TerrainDefaults = TerrainDefaults(),  # noqa: B008
     settings: LidarSettings = LidarSettings(),  # noqa: B008
 ) -> TerrainMap:
-    """H_g*: what the lidar saw of the ground between two times.
+    """H_g*: the surface measured by the lidar between two times.
 
     Args:
-        recording: the drive; only its clouds are read, one at a time.
-        motion: measured, best smoothed: a sweep is placed where the robot was.
-        robot: whose own body is taken out of the sweeps.
+        recording: of which only the clouds are read, one at a time.
+        motion: measured poses at which sweeps are placed, preferably smoothed.
+        robot: whose points on its own body are removed from the sweeps.
         grid: of the map.
         odometry_from_terrain: pose ``[4, 4]`` of the map's frame.
         start, stop: times of the sweeps [ns].
-        material: of the map.
-        settings: of the map.
+        material: stiffness, damping and friction of the map.
+        settings: of the mapping.
 
     Raises:
         TerrainError: no sweep hit the grid.
-        BagError: a cloud cannot be read or the lidar's pose is unknown.
+        BagError: a cloud cannot be read or the pose of the lidar is unknown.
     """
     sweeps = _placed_sweeps(recording, motion, robot, grid, odometry_from_terrain, start, stop)
     return terrain_from_cloud(accumulate(sweeps), grid, settings=settings, material=material)
@@ -49,9 +50,9 @@ def visible_terrain(
 def split_maps(
     recording: Recording, motion: MotionTrack, robot: RobotModel, grid: Grid
 ) -> tuple[TerrainMap, tuple[TerrainMap, TerrainMap]]:
-    """A drive's map in the odometry frame, and two more from every other sweep alone.
+    """Map of a whole recording in the odometry frame, and two maps from alternate sweeps only.
 
-    The halves saw the same ground with noise of their own: how much they differ says how sure the map is.
+    The split maps show the same ground with independent noise, so their difference measures the map's uncertainty.
     """
     start, stop = int(motion.stamps[0]), int(motion.stamps[-1])
     sweeps = list(_placed_sweeps(recording, motion, robot, grid, np.eye(4), start, stop))
@@ -70,7 +71,7 @@ def _placed_sweeps(
     start: int,
     stop: int,
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Points of each sweep that fall on the grid, in the base frame, and its pose on the map."""
+    """Points of each sweep that fall on the grid, in the base frame, and the base's pose on the map."""
     inverse = np.linalg.inv(odometry_from_terrain)
     low, high = grid.extent[0::2], grid.extent[1::2]
     for frame, points, frame_id in recording.clouds_between(start, stop):
@@ -82,6 +83,6 @@ def _placed_sweeps(
         points = points[np.isfinite(points).all(axis=1)] @ pose[:3, :3].T + pose[:3, 3]
         points = points[~robot.covers(points)]
         placed = inverse @ state.odometry_from_base
-        there = points @ placed[:3, :3].T + placed[:3, 3]
-        on_map = (there[:, 0] > low[0]) & (there[:, 0] < high[0]) & (there[:, 1] > low[1]) & (there[:, 1] < high[1])
+        xy = (points @ placed[:3, :3].T + placed[:3, 3])[:, :2]
+        on_map = (xy[:, 0] > low[0]) & (xy[:, 0] < high[0]) & (xy[:, 1] > low[1]) & (xy[:, 1] < high[1])
         yield points[on_map], placed

@@ -1,0 +1,265 @@
+"""Sample extraction: a bag with images, odometry, commands and lidar → the samples of a recording."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from monoforce_ros.bags import BagError, Recording, cut_windows, nearest_frame, smooth
+from monoforce_ros.core import CommandTrack, MotionTrack, StaleDataError, nearest_stamp, transform_points
+from monoforce_ros.effects import corrected_commands, corrected_motion
+from monoforce_ros.encoder import EncoderConfig, network_image
+from monoforce_ros.perception import support_points
+from monoforce_ros.robots import RobotModel
+from monoforce_ros.terrain import TerrainError
+from monoforce_ros.training.recording_samples import (
+    CHUNK,
+    SAMPLES_VERSION,
+    Chunks,
+    RecordingSamples,
+    SamplesError,
+    Segment,
+    save_samples,
+)
+from monoforce_ros.training.terrain_fit import FitSettings, fit_terrain, trajectory_frame, trajectory_grid
+from monoforce_ros.training.visible import visible_terrain
+
+_LENGTH, _STRIDE = 10.0, 5.0
+"""Length of the trajectories to which terrain is fitted (paper IV-A), and interval between their starts [s]."""
+_SWEEPS_BEFORE, _SWEEPS_AFTER = 2.0, 2.0
+"""Sweeps this long before and after a trajectory belong to its map too [s]."""
+_MATCH = 0.1
+"""Largest difference between stamps of images that belong to one sample [s]."""
+_SWEEP_MATCH = 0.15
+"""Largest difference between the stamps of a sample and its lidar sweep [s]."""
+
+
+@dataclass(frozen=True)
+class SampleSettings:
+    """How samples are extracted from a recording."""
+
+    period: float = 0.5
+    """Interval between samples [s]."""
+    chunk_period: float = 0.5
+    """Interval between the starts of chunks of motion [s]."""
+    iterations: int = 40
+    """Steps of each terrain fit."""
+
+    def __post_init__(self):
+        for name, low, high in (("period", 0.02, 60.0), ("chunk_period", 0.1, 10.0), ("iterations", 0, 10_000)):
+            if not low <= getattr(self, name) <= high:
+                raise ValueError(f"samples {name}: got {getattr(self, name)}, expected {low:g} to {high:g}")
+
+
+def extract_samples(
+    bag: Path,
+    robot: RobotModel,
+    config: EncoderConfig,
+    folder: Path,
+    *,
+    settings: SampleSettings = SampleSettings(),
+    image_topics: Sequence[str] = (),
+) -> Path:
+    """Extract a bag's samples into a file, unless there is one for the same bag, robot and settings; return its path.
+
+    Raises:
+        SamplesError: the recording has no calibrated images, no commands, or is too short.
+        BagError: the bag cannot be read.
+    """
+    fingerprint = _fingerprint(bag, robot, config, settings, image_topics)
+    file = folder / f"{bag.name.removesuffix('.bag')}-{fingerprint[:8]}.safetensors"
+    if file.is_file():
+        return file
+    save_samples(_samples(bag, robot, config, settings, image_topics), file)
+    return file
+
+
+def _samples(
+    bag: Path,
+    robot: RobotModel,
+    config: EncoderConfig,
+    settings: SampleSettings,
+    image_topics: Sequence[str],
+) -> RecordingSamples:
+    recording = Recording.open(bag)
+    topics = tuple(image_topics) or tuple(topic for topic in recording.images if topic in recording.cameras)
+    unknown = [topic for topic in topics if topic not in recording.images or topic not in recording.cameras]
+    if unknown or not topics:
+        raise SamplesError(
+            f"{bag}: no images with a CameraInfo on {unknown or 'any topic'}; images are on "
+            f"{sorted(recording.images)}, CameraInfo is available for {sorted(recording.cameras)}"
+        )
+    if not len(recording.commands):
+        raise SamplesError(f"{bag}: no commands (Twist or TwistStamped), which the physics needs")
+    motion = smooth(corrected_motion(recording.motion, robot.effects)).motion
+    commands = corrected_commands(recording.commands, robot.effects)
+    segments = _segments(recording, motion, commands, robot, settings)
+    arrays = _read_images(recording, motion, robot, config, settings, topics, [start for start, _ in segments])
+    windows = cut_windows(motion, commands, length=CHUNK, stride=settings.chunk_period)
+    chunks = Chunks(
+        stamps=np.array([state.stamp for state in windows.starts]),
+        times=windows.times,
+        positions=windows.positions,
+        rotations=windows.rotations,
+        velocities=windows.velocities[:, 0],
+        angular_velocities=windows.angular_velocities[:, 0],
+        twists=windows.twists.astype(np.float32),
+        history=windows.history,
+    )
+    return RecordingSamples(
+        name=bag.name,
+        cameras=tuple(recording.cameras[topic] for topic in topics),
+        images=torch.from_numpy(arrays.pop("images")),
+        segments=tuple(segment for _, segment in segments),
+        chunks=chunks,
+        **arrays,
+    )
+
+
+def _segments(
+    recording: Recording,
+    motion: MotionTrack,
+    commands: CommandTrack,
+    robot: RobotModel,
+    settings: SampleSettings,
+) -> list[tuple[int, Segment]]:
+    """Segments along the recording, with the start of each [ns]."""
+    # The margin covers the map of any sample on the trajectory.
+    fitting = FitSettings(margin=7.5, iterations=settings.iterations)
+    first, last = int(motion.stamps[0]), int(motion.stamps[-1])
+    starts = range(first, max(first + 1, last - round(1e9 * _LENGTH) + 1), round(1e9 * _STRIDE))
+    segments: list[tuple[int, Segment]] = []
+    reason = ""
+    for start in starts:
+        try:
+            grid, pose = trajectory_grid(motion, start, _LENGTH, fitting), trajectory_frame(motion, start)
+            visible = None
+            if recording.clouds:
+                first_sweep = start - round(1e9 * _SWEEPS_BEFORE)
+                last_sweep = start + round(1e9 * (_LENGTH + _SWEEPS_AFTER))
+                visible = visible_terrain(recording, motion, robot, grid, pose, start=first_sweep, stop=last_sweep)
+            fit = fit_terrain(motion, commands, robot, start=start, length=_LENGTH, visible=visible, settings=fitting)
+        except (TerrainError, ValueError) as error:
+            reason = str(error)
+            continue
+        terrain = fit.terrain
+        observed = visible.observed.numpy() if visible is not None else np.zeros_like(fit.contact_mask)
+        segments.append(
+            (
+                start,
+                Segment(
+                    grid, pose, terrain.geometric_height.numpy().astype(np.float32), observed,
+                    terrain.height.numpy().astype(np.float32), fit.contact_mask,
+                ),
+            )
+        )  # fmt: skip
+    if not segments:
+        raise SamplesError(f"{recording.path}: no terrain could be fitted: {reason}")
+    return segments
+
+
+def _read_images(
+    recording: Recording,
+    motion: MotionTrack,
+    robot: RobotModel,
+    config: EncoderConfig,
+    settings: SampleSettings,
+    topics: Sequence[str],
+    starts: list[int],
+) -> dict[str, np.ndarray]:
+    """Images, poses, contact points of the wheels and sweeps of every sample."""
+    end = min(int(motion.stamps[-1]) - round(1e9 * CHUNK), starts[-1] + round(1e9 * _LENGTH))
+    matched = []
+    previous: int | None = None
+    for frame in recording.images[topics[0]]:
+        due = previous is None or frame.stamp - previous >= settings.period * 1e9 - 1e6
+        if not (starts[0] <= frame.stamp <= end and due):
+            continue
+        previous = frame.stamp
+        others = [nearest_frame(recording.images[topic], frame.stamp, limit=_MATCH) for topic in topics[1:]]
+        frames = [frame, *(other for other in others if other is not None)]
+        if len(frames) == len(topics):
+            matched.append(frames)
+    pixels = [
+        {f.stamp: network_image(p, config) for f, p in recording.images_of([row[i] for row in matched])}
+        for i in range(len(topics))
+    ]
+    mounted = [
+        recording.sensor_pose(recording.cameras[topic].frame_id, robot.base_frame, robot.sensors) for topic in topics
+    ]
+    rows: dict[str, list] = {name: [] for name in (
+        "images", "stamps", "odometry_from_base", "odometry_from_cameras", "support", "segment_of"
+    )}  # fmt: skip
+    for frames in matched:
+        if any(frame.stamp not in pixels[i] for i, frame in enumerate(frames)):
+            continue
+        try:
+            states = [motion.at(frame.stamp, maximum_gap=0.3) for frame in frames]
+        except StaleDataError:
+            continue
+        state = states[0]
+        under = support_points(robot, state, config.stiffness)
+        placed = state.odometry_from_terrain
+        rows["images"].append(np.stack([pixels[i][frame.stamp] for i, frame in enumerate(frames)]))
+        rows["stamps"].append(state.stamp)
+        rows["odometry_from_base"].append(state.odometry_from_base)
+        rows["odometry_from_cameras"].append(
+            np.stack([s.odometry_from_base @ pose for s, pose in zip(states, mounted, strict=True)])
+        )
+        rows["support"].append(under @ placed[:3, :3].T + placed[:3, 3])
+        rows["segment_of"].append(max(i for i, start in enumerate(starts) if start <= state.stamp))
+    if not rows["stamps"]:
+        raise SamplesError(f"{recording.path}: no image is within the odometry and followed by one second of motion")
+    arrays = {name: np.array(values) for name, values in rows.items()}
+    sweeps = _sweeps_near(recording, motion, robot, arrays["stamps"])
+    joined = np.concatenate(sweeps) if sweeps else np.zeros((0, 3))
+    return {
+        **arrays,
+        "sweeps": joined.astype(np.float32),
+        "sweep_ends": np.cumsum([len(points) for points in sweeps], dtype=np.int64),
+    }
+
+
+def _sweeps_near(recording: Recording, motion: MotionTrack, robot: RobotModel, stamps: np.ndarray) -> list[np.ndarray]:
+    """Sweep nearest to each stamp, in the odometry frame, empty if there is none."""
+    clouds = np.array([frame.stamp for frame in recording.clouds], np.int64)
+    nearest: dict[int, list[int]] = {}
+    for index, stamp in enumerate(stamps):
+        match = nearest_stamp(clouds, int(stamp), limit=_SWEEP_MATCH)
+        if match is not None:
+            nearest.setdefault(int(clouds[match]), []).append(index)
+    found = [np.zeros((0, 3))] * len(stamps)
+    first, last = (min(nearest), max(nearest)) if nearest else (0, -1)
+    for frame, points, frame_id in recording.clouds_between(first, last):
+        if frame.stamp not in nearest:
+            continue
+        try:
+            state = motion.at(frame.stamp, maximum_gap=0.3)
+        except StaleDataError:
+            continue
+        pose = recording.sensor_pose(frame_id, robot.base_frame, robot.sensors)
+        points = points[np.isfinite(points).all(axis=1)] @ pose[:3, :3].T + pose[:3, 3]
+        points = transform_points(state.odometry_from_base, points[~robot.covers(points)])
+        for index in nearest[frame.stamp]:
+            found[index] = points
+    return found
+
+
+def _fingerprint(
+    bag: Path, robot: RobotModel, config: EncoderConfig, settings: SampleSettings, image_topics: Sequence[str]
+) -> str:
+    """Hash of everything that determines the samples."""
+    files = sorted(p for p in bag.rglob("*") if p.is_file()) if bag.is_dir() else [bag]
+    if not bag.exists():
+        raise BagError(f"{bag} does not exist")
+    content = [SAMPLES_VERSION, [(p.name, p.stat().st_size, p.stat().st_mtime_ns) for p in files], robot.name]
+    shape = hashlib.sha256(robot.points.numpy().tobytes()).hexdigest()
+    content += [shape, robot.mass, robot.effects, asdict(settings), list(image_topics)]
+    content += [config.image_width, config.image_height]
+    return hashlib.sha256(json.dumps(content, default=str).encode()).hexdigest()
