@@ -1,7 +1,7 @@
 """Reading and writing rosbag files: ROS 2 (sqlite3, mcap) and ROS 1, without a ROS installation."""
 
 from monoforce_ros.bags import builders
-from monoforce_ros.bags.reader import BagError, BagReader
+from monoforce_ros.bags.reader import BagError, BagMessage, BagReader
 from monoforce_ros.bags.recording import CAMERA_INFO, CLOUD, COMMANDS, IMAGES, ODOMETRY, Recording, camera_info_topic
 from monoforce_ros.bags.samples import Sample, nearest_frame, synchronise
 from monoforce_ros.bags.smoothing import SmoothedMotion, smooth
@@ -16,6 +16,7 @@ __all__ = [
     "IMAGES",
     "ODOMETRY",
     "BagError",
+    "BagMessage",
     "BagReader",
     "BagWriter",
     "Recording",

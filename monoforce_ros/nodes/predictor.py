@@ -152,7 +152,7 @@ class PredictorNode(ManagedNode):
             device="cuda" if cuda else "cpu",
             precision=settings.encoder_precision,
             threads=min(settings.encoder_threads, os.cpu_count() or 1),
-            memory=settings.camera_memory,
+            retention_time=settings.camera_memory,
         )
 
     def _sensor_topics(self) -> dict[str, str]:
