@@ -60,7 +60,9 @@ def _parser() -> argparse.ArgumentParser:
         "and figures.",
     )
     parser.add_argument("bag", nargs="?", help="rosbag2 folder or ROS 1 .bag file (default: the demo bag)")
-    parser.add_argument("--robot", default="husky", help=f"robot file or one of {', '.join(shipped_robots())}")
+    parser.add_argument(
+        "--robot", default="husky", help=f"robot file or one of {', '.join(shipped_robots())} (default: husky)"
+    )
     parser.add_argument("--out", default="evaluation", help="output folder (default: evaluation)")
     parser.add_argument("--terrain", choices=SOURCES, default="lidar", help="terrain source (default: lidar)")
     parser.add_argument(
@@ -107,13 +109,13 @@ def _parser() -> argparse.ArgumentParser:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the evaluation; see ``--help``. Returns 0, or 1 after an error message of one line."""
-    given = sys.argv[1:] if arguments is None else arguments
-    if "--tables" in given:
+    words = sys.argv[1:] if arguments is None else arguments
+    if "--tables" in words:
         from monoforce_ros.evaluation.tables_cli import main as compare
 
-        return compare(given)
+        return compare(words)
     parser = _parser()
-    options = parser.parse_args(given)
+    options = parser.parse_args(words)
     if any(not 0.1 <= h <= 30 for h in options.horizons):
         parser.error(f"--horizons: got {options.horizons}, expected 0.1 to 30 s")
     if not 0 <= options.friction <= 3:

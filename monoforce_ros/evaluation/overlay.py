@@ -85,7 +85,7 @@ def _draw_surface(
     drawable = np.all([usable[c] & (depth[c] > _NEAREST) for c in corners], axis=0)
     distance = np.mean([depth[c] for c in corners], axis=0)
     mean_height = np.mean([z[c] for c in corners], axis=0)
-    seen = np.mean([terrain.observed.numpy()[c] for c in corners], axis=0) >= 0.5
+    observed = np.mean([terrain.observed.numpy()[c] for c in corners], axis=0) >= 0.5
     low, high = colour_range
     colours = colormaps[SURFACE_COLOURS](np.clip((mean_height - low) / (high - low), 0, 1))[..., :3]
     # Shading by slope makes shape visible where the colour hardly changes.
@@ -100,7 +100,7 @@ def _draw_surface(
         row, column = rows[index], columns[index]
         quad = np.rint(quads[row, column] * 8).astype(np.int32)
         cv2.fillConvexPoly(layer, quad, colours[row, column].tolist(), cv2.LINE_AA, shift=3)
-        cv2.fillConvexPoly(weight, quad, 0.5 if seen[row, column] else 0.28, cv2.LINE_8, shift=3)
+        cv2.fillConvexPoly(weight, quad, 0.5 if observed[row, column] else 0.28, cv2.LINE_8, shift=3)
         if row % 5 == 0 or column % 5 == 0:
             edge = quad[[0, 1]] if row % 5 == 0 else quad[[0, 3]]
             cv2.polylines(layer, [edge], False, (colours[row, column] * 0.45).tolist(), 1, cv2.LINE_AA, shift=3)

@@ -133,10 +133,10 @@ def _sequence(name: str, evaluation: RecordingEvaluation, method: str, chosen: n
 def _on_map(measured: Poses) -> np.ndarray:
     """Whether the measured robot is on the map at its window's start, ``[W, T]``."""
     heading = np.arctan2(measured.rotations[:, 0, 1, 0], measured.rotations[:, 0, 0, 0])
-    away = measured.positions[..., :2] - measured.positions[:, :1, :2]
+    offset = measured.positions[..., :2] - measured.positions[:, :1, :2]
     cosine, sine = np.cos(heading)[:, None], np.sin(heading)[:, None]
-    along = cosine * away[..., 0] + sine * away[..., 1]
-    across = cosine * away[..., 1] - sine * away[..., 0]
+    along = cosine * offset[..., 0] + sine * offset[..., 1]
+    across = cosine * offset[..., 1] - sine * offset[..., 0]
     return (np.abs(along) < _HALF_MAP) & (np.abs(across) < _HALF_MAP)
 
 

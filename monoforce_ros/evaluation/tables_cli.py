@@ -46,7 +46,7 @@ def build_parser() -> argparse.ArgumentParser:
         parser.add_argument(
             f"--{key.replace('_', '-')}", type=Path, metavar="FILE.safetensors", help=f"checkpoint: {title}"
         )
-    parser.add_argument("--robot", default="husky", help=f"robot file or one of {', '.join(shipped_robots())}")
+    parser.add_argument("--robot", default="husky", help=f"robot file or one of {', '.join(shipped_robots())} (husky)")
     parser.add_argument("--out", type=Path, default=Path("tables"), help="output folder (%(default)s)")
     parser.add_argument("--docs", type=Path, metavar="FILE", help="also write the tables into this document, between "
                         "the comments `<!-- tables -->` and `<!-- end of tables -->`")  # fmt: skip

@@ -128,7 +128,7 @@ class _Memory:
         self._corner = np.zeros(2, np.int64)
         """Column and row of the first cell in the odometry frame."""
         self._values = np.zeros((len(CHANNELS), self._size, self._size), np.float32)
-        self._seen = np.zeros((self._size, self._size), np.int64)
+        self._observed_at = np.zeros((self._size, self._size), np.int64)
         """Time of the last observation of each cell [ns]; 0 without any."""
         self._odometer = np.zeros((self._size, self._size))
         """Distance travelled at the last observation [m]."""
@@ -137,15 +137,16 @@ class _Memory:
         """Centre the map on a position ``[2]`` in the odometry frame; cells that leave it are forgotten."""
         corner = np.rint(place / self._grid.resolution).astype(np.int64) - self._size // 2
         if (shift := corner - self._corner).any():
-            gone = np.zeros((self._size, self._size), bool)
+            unknown = np.zeros((self._size, self._size), bool)
             for axis, by in ((1, int(shift[0])), (0, int(shift[1]))):
                 by = int(np.clip(by, -self._size, self._size))
                 self._values = np.roll(self._values, -by, axis + 1)
-                self._seen, self._odometer = np.roll(self._seen, -by, axis), np.roll(self._odometer, -by, axis)
-                gone = np.roll(gone, -by, axis)
+                self._observed_at = np.roll(self._observed_at, -by, axis)
+                self._odometer = np.roll(self._odometer, -by, axis)
+                unknown = np.roll(unknown, -by, axis)
                 entered = slice(self._size - by, None) if by > 0 else slice(0, -by)
-                gone[(slice(None), entered) if axis else (entered, slice(None))] = True
-            self._seen[gone] = 0
+                unknown[(slice(None), entered) if axis else (entered, slice(None))] = True
+            self._observed_at[unknown] = 0
         self._corner = corner
 
     def write(self, terrain: TerrainMap, motion: MotionState) -> None:
@@ -157,10 +158,10 @@ class _Memory:
         cells = ((local - np.array(grid.origin)) / grid.resolution).astype(np.float32)
         channels = np.stack([getattr(terrain, name).numpy() for name in CHANNELS])
         values, weight = _sampled(channels, terrain.observed.numpy(), cells)
-        seen = weight > 0.5
+        observed = weight > 0.5
         values[:2] += np.float32(pose[2, 3])
-        self._values[:, seen] = values[:, seen]
-        self._seen[seen], self._odometer[seen] = motion.stamp, self.travelled
+        self._values[:, observed] = values[:, observed]
+        self._observed_at[observed], self._odometer[observed] = motion.stamp, self.travelled
 
     def read(self, motion: MotionState) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Stored values in the terrain frame of a motion.
@@ -172,11 +173,11 @@ class _Memory:
         grid, pose = self._grid, motion.odometry_from_terrain
         places = np.stack(np.meshgrid(grid.x, grid.y), axis=-1) @ pose[:2, :2].T + pose[:2, 3]
         cells = (places / grid.resolution - self._corner).astype(np.float32)
-        values, weight = _sampled(self._values, self._seen > 0, cells)
+        values, weight = _sampled(self._values, self._observed_at > 0, cells)
         values[:2] -= np.float32(pose[2, 3])
         column, row = np.moveaxis(np.clip(np.rint(cells).astype(np.int64), 0, self._size - 1), -1, 0)
-        known = (weight > 0.5) & (self._seen[row, column] > 0)
-        age = np.where(known, (motion.stamp - self._seen[row, column]) * NANOSECOND, np.inf)
+        known = (weight > 0.5) & (self._observed_at[row, column] > 0)
+        age = np.where(known, (motion.stamp - self._observed_at[row, column]) * NANOSECOND, np.inf)
         return values, age, np.where(known, self.travelled - self._odometer[row, column], np.inf)
 
 

@@ -191,9 +191,9 @@ def _unobserved(rollout: Rollout, terrain: TerrainMap) -> Tensor:
     row = ((place[..., 1] - grid.origin[1]) / grid.resolution).round().clamp(0, grid.rows - 1).nan_to_num(0.0)
     nearby = torch.from_numpy(terrain.measured_nearby()).to(place.device)
     known = nearby[row.long(), column.long()] & rollout.inside
-    away = (place - place[:, :1]).norm(dim=-1)
+    distance = (place - place[:, :1]).norm(dim=-1)
     # No sensor sees the ground below the robot, but it is known to support it.
-    moved = away > 1.0
+    moved = distance > 1.0
     return ((~known) & moved).sum(dim=1) / moved.sum(dim=1).clamp_min(1)
 
 

@@ -168,13 +168,13 @@ def _varied_robot(robot: RobotModel, drawn: torch.Tensor, settings: EnsembleSett
             value = torch.as_tensor(varied[key], dtype=torch.float32)
             varied[key] = (value + unit * (high - low) / 3.92).clamp(low, high)
         effects[name] = varied
-    friction = torch.exp(settings.friction * drawn[:, 5])
-    known = effects.setdefault("friction_scale", {"factor": 1.0})
-    known["factor"] = (torch.as_tensor(known["factor"], dtype=torch.float32) * friction).clamp(0.02, 3.0)
-    gain = effects.setdefault("drive_gain", {"gain": 1.0})
-    drives = torch.as_tensor(gain["gain"], dtype=torch.float32) * (1.0 + settings.gain * drawn[:, 6])
-    gain["gain"] = drives.clamp(0.2, 2.0)
-    uneven = effects.setdefault("drive_asymmetry", {"difference": 0.0})
-    sides = torch.as_tensor(uneven["difference"], dtype=torch.float32) + settings.gain * drawn[:, 7]
-    uneven["difference"] = sides.clamp(-1.0, 1.0)
+    friction_scale = effects.setdefault("friction_scale", {"factor": 1.0})
+    factor = torch.as_tensor(friction_scale["factor"], dtype=torch.float32) * torch.exp(settings.friction * drawn[:, 5])
+    friction_scale["factor"] = factor.clamp(0.02, 3.0)
+    drive_gain = effects.setdefault("drive_gain", {"gain": 1.0})
+    gain = torch.as_tensor(drive_gain["gain"], dtype=torch.float32) * (1.0 + settings.gain * drawn[:, 6])
+    drive_gain["gain"] = gain.clamp(0.2, 2.0)
+    asymmetry = effects.setdefault("drive_asymmetry", {"difference": 0.0})
+    difference = torch.as_tensor(asymmetry["difference"], dtype=torch.float32) + settings.gain * drawn[:, 7]
+    asymmetry["difference"] = difference.clamp(-1.0, 1.0)
     return replace(robot, effects=tuple(effects.items()))

@@ -126,14 +126,14 @@ class RobotModel:
 
         Raises ``ValueError`` if the robot has another number of flippers.
         """
-        present = self.flipper_angles if self.flipper_angles is not None else self.points.new_zeros(0)
+        current = self.flipper_angles if self.flipper_angles is not None else self.points.new_zeros(0)
         if angles.shape != (len(self.flippers),):
             raise ValueError(f"flipper angles: got shape {tuple(angles.shape)}, expected [{len(self.flippers)}]")
         angles = angles.to(self.points)
         points, tangents = self.points.clone(), self.point_tangents.clone()
         mass, centre, inertia = self.mass, self.centre_of_mass, self.inertia
         for index, flipper in enumerate(self.flippers):
-            before, after = flipper.turned(present[index]), flipper.turned(angles[index])
+            before, after = flipper.turned(current[index]), flipper.turned(angles[index])
             turn = after @ before.T
             joint = points.new_tensor(flipper.joint)
             on_flipper = self.point_flippers == index

@@ -126,8 +126,8 @@ class TerrainMap:
         observed = self.observed.cpu().numpy()
         if not observed.any():
             return observed
-        away = cv2.distanceTransform((~observed).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-        return away * self.grid.resolution <= reach + 1e-6
+        distance = cv2.distanceTransform((~observed).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        return distance * self.grid.resolution <= reach + 1e-6
 
     @property
     def batch_size(self) -> int | None:
