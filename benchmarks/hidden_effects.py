@@ -18,12 +18,11 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
 import numpy as np
-from docs_section import replace_section
 from hidden_drives import SEED, SINGLES, Case, all_cases, record_case
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
-from monoforce_ros.reporting import figure_png
+from monoforce_ros.reporting import figure_png, write_between
 
 STRONG = 2.0
 """RMS residual over its scale (noise and nominal residual) from which on an effect counts as strong. The corresponding
@@ -395,7 +394,7 @@ def main() -> None:
     if options.docs:
         picture = options.docs.with_name("hidden_effects.png")
         picture.write_bytes(figure_png(confusion_figure(rows)))
-        replace_section(options.docs, "hidden effects", section(rows, found, picture, options.folder))
+        write_between(options.docs, "hidden effects", section(rows, found, picture, options.folder))
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""How often what happened lies within the predicted 90 % band: drives → coverage at 1, 2 and 5 s.
+"""Coverage of the predicted 90 % band at 1, 2 and 5 s: share of measured positions within it, over recordings.
 
     scripts/run.sh python benchmarks/uncertainty.py BAG... [--terrain lidar|camera|flat] [--json FILE]
 
-Each drive is predicted every second under the commands that were really given. A band that is right holds 90 % of the
-outcomes; the factor that would make it so on these drives is printed beside (`ensemble_scale` of the predictor).
+Predictions start every second and use the recorded commands. A calibrated band contains 90 % of the outcomes; the
+factor that would calibrate it on these recordings (`ensemble_scale` of the predictor) is printed as well.
 """
 
 from __future__ import annotations
@@ -14,21 +14,20 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from monoforce_ros.bags import Recording
 from monoforce_ros.core import StaleDataError, write_text
-from monoforce_ros.evaluation.recording_evaluation import corrected_recording, observe
+from monoforce_ros.evaluation import corrected_recording, observe
 from monoforce_ros.perception import SOURCES, choose_terrain_source
-from monoforce_ros.prediction import EnsembleSettings, Prediction, Predictor, spread
-from monoforce_ros.prediction.ensemble import COVERAGE
+from monoforce_ros.prediction import COVERAGE, EnsembleSettings, Prediction, Predictor, spread
+from monoforce_ros.reporting import progress
 from monoforce_ros.robots import load_robot
 
 HORIZONS = (1.0, 2.0, 5.0)
 
 
-def drive_ratios(bag: Path, predictor: Predictor, settings: EnsembleSettings) -> tuple[np.ndarray, np.ndarray]:
-    """Error over band radius, and the radius [m], of each window at each horizon ``[W, 3]``; NaN off the map."""
+def recording_ratios(bag: Path, predictor: Predictor, settings: EnsembleSettings) -> tuple[np.ndarray, np.ndarray]:
+    """Position error over band radius, and the radius [m], of each window and horizon ``[W, 3]``; NaN off the map."""
     recording = corrected_recording(Recording.open(bag), predictor.robot)
     sensors = predictor.source.sensors
     topics = tuple(recording.images) if "camera" in sensors else ()
@@ -65,7 +64,7 @@ def main() -> None:
     parser.add_argument("bags", nargs="+", type=Path)
     parser.add_argument("--robot", default="husky")
     parser.add_argument("--terrain", choices=SOURCES, default="lidar")
-    parser.add_argument("--checkpoint", default="", help="terrain encoder (the shipped one)")
+    parser.add_argument("--checkpoint", default="", help="checkpoint of the terrain encoder (default: the shipped one)")
     parser.add_argument("--members", type=int, default=EnsembleSettings.members)
     parser.add_argument("--scale", type=float, default=EnsembleSettings.scale)
     parser.add_argument("--json", type=Path)
@@ -75,19 +74,19 @@ def main() -> None:
     predictor = Predictor(robot, choose_terrain_source(options.terrain, robot, checkpoint=options.checkpoint))
     settings = EnsembleSettings(members=options.members, scale=options.scale)
     rows, sizes = zip(
-        *(drive_ratios(bag, predictor, settings) for bag in tqdm(options.bags, unit="drive")), strict=True
+        *(recording_ratios(bag, predictor, settings) for bag in progress(options.bags, unit="recording")), strict=True
     )
     ratios, radii = np.concatenate(rows), np.concatenate(sizes)
-    result = {"drives": len(rows), "windows": len(ratios), "members": options.members, "scale": options.scale}
-    print(f"{len(rows)} drives, {len(ratios)} windows, {options.members} members, scale {options.scale:g}")
+    result = {"recordings": len(rows), "windows": len(ratios), "members": options.members, "scale": options.scale}
+    print(f"{len(rows)} recordings, {len(ratios)} windows, {options.members} members, scale {options.scale:g}")
     for i, horizon in enumerate(HORIZONS):
         known = ratios[np.isfinite(ratios[:, i]), i]
         inside, factor = float(np.mean(known <= 1.0)), float(np.quantile(known, COVERAGE))
         radius = float(np.median(radii[:, i]))
         result[f"{horizon:g} s"] = {"windows": len(known), "inside": inside, "median_radius": radius, "factor": factor}
         print(
-            f"  {horizon:g} s: {100 * inside:.0f} % of {len(known)} inside (asked {100 * COVERAGE:.0f}), median radius "
-            f"{radius:.2f} m, factor for {100 * COVERAGE:.0f} % {factor:.2f}"
+            f"  {horizon:g} s: {100 * inside:.0f} % of {len(known)} inside (nominal {100 * COVERAGE:.0f} %), "
+            f"median radius {radius:.2f} m, factor for {100 * COVERAGE:.0f} % {factor:.2f}"
         )
     if options.json:
         write_text(options.json, json.dumps(result, indent=1))

@@ -14,10 +14,10 @@ import time
 from pathlib import Path
 
 import torch
-from docs_section import replace_section
 
 from monoforce_ros.datasets import DriveRecording, drive_to_bag
 from monoforce_ros.discrepancy import diagnose_bag
+from monoforce_ros.reporting import write_between
 
 GROUNDS = {
     "asphalt": "warthog_wheels_asphalt.npz",
@@ -112,7 +112,7 @@ def main() -> None:
         options.json.parent.mkdir(parents=True, exist_ok=True)
         options.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
     if options.docs:
-        replace_section(options.docs, "real drives", text)
+        write_between(options.docs, "real drives", text)
 
 
 if __name__ == "__main__":

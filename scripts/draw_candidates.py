@@ -1,4 +1,4 @@
-"""Draws what a planner gets: candidates by cost on the predicted map, the best one refined, and how sure that is.
+"""Draws the planner's view: candidates by cost on the predicted map, the refined best one, and its uncertainty.
 
 scripts/run.sh python scripts/draw_candidates.py [BAG] [--at SECONDS] [--out docs/candidates.png]
 """
@@ -14,7 +14,7 @@ from matplotlib import colormaps
 from matplotlib.figure import Figure
 
 from monoforce_ros.bags import Recording
-from monoforce_ros.evaluation.recording_evaluation import observe
+from monoforce_ros.evaluation import observe
 from monoforce_ros.perception import LidarTerrain
 from monoforce_ros.planning import CandidateSettings, assess, fan_of_arcs, force_every, occupancy, over_horizon, refine
 from monoforce_ros.prediction import EnsembleSettings, Prediction, Predictor, spread
@@ -25,7 +25,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def draw(recording: Recording, seconds: float) -> Figure:
-    """The figure of one moment of a drive."""
+    """The figure of one time of a recording."""
     robot = load_robot("husky")
     predictor = Predictor(robot, LidarTerrain(robot, Grid.square(), TerrainDefaults()))
     stamp = int(recording.motion.stamps[0] + 1e9 * seconds)
@@ -38,38 +38,39 @@ def draw(recording: Recording, seconds: float) -> Figure:
     every = force_every(predictor.options.time_step)
     rolled = predictor.roll_out(terrain, [motion] * len(fan), twists, with_contact=True, force_every=every)
     found = assess(rolled, terrain, robot, torch.from_numpy(twists[:, predictor.history :]).float())
-    # The figure shows the cheapest of those that go somewhere.
+    # The cheapest of the fast candidates.
     moving = torch.from_numpy(np.abs(fan[:, 0, 0]) > 0.6) & found.feasible
     best = int(torch.where(moving, found.cost, torch.inf).argmin())
     chosen = Prediction(motion, terrain, predictor.roll_out(terrain, [motion], twists[best : best + 1]))
-    better = refine(predictor, chosen, before, fan[best], seconds=5.0)
-    again = over_horizon(better.sequence[None], before, predictor.steps)
-    refined = Prediction(motion, terrain, predictor.roll_out(terrain, [motion], again))
-    sure = spread(predictor, refined, again[0], EnsembleSettings())
+    refinement = refine(predictor, chosen, before, fan[best], seconds=5.0)
+    commands = over_horizon(refinement.sequence[None], before, predictor.steps)
+    refined = Prediction(motion, terrain, predictor.roll_out(terrain, [motion], commands))
+    uncertainty = spread(predictor, refined, commands[0], EnsembleSettings())
     figure = Figure(figsize=(13, 6.2), layout="constrained")
     left, right = figure.subplots(1, 2)
     x, y = np.asarray(terrain.grid.x), np.asarray(terrain.grid.y)
     heights = terrain.height.numpy()
-    shown = left.pcolormesh(x, y, heights, cmap="bone", vmin=-1.0, vmax=1.0, shading="nearest", rasterized=True)
-    figure.colorbar(shown, ax=left, label="height [m]", shrink=0.8)
+    mesh = left.pcolormesh(x, y, heights, cmap="bone", vmin=-1.0, vmax=1.0, shading="nearest", rasterized=True)
+    figure.colorbar(mesh, ax=left, label="height [m]", shrink=0.8)
     cost = found.cost.numpy()
     low, high = cost[found.feasible.numpy()].min(), cost[found.feasible.numpy()].max()
     for n in range(len(fan)):
-        way = rolled.position[n].numpy()[rolled.inside[n].numpy()]
-        good = bool(found.feasible[n])
-        colour = colormaps["RdYlGn_r"]((cost[n] - low) / max(high - low, 1e-6)) if good else (0.25, 0.25, 0.25, 0.6)
-        left.plot(way[:, 0], way[:, 1], color=colour, linewidth=1.8 if good else 1.0)
-    way = refined.rollout.position[0].numpy()
-    left.plot(way[:, 0], way[:, 1], color="white", linewidth=4.0)
-    said = f"the best of the fast ones, refined: cost {better.cost_before:.2f} → {better.cost:.2f}"
-    left.plot(way[:, 0], way[:, 1], color="#1454c8", linewidth=2.5, label=said)
-    for step in range(100, len(way), 100):
+        path = rolled.position[n].numpy()[rolled.inside[n].numpy()]
+        feasible = bool(found.feasible[n])
+        colour = colormaps["RdYlGn_r"]((cost[n] - low) / max(high - low, 1e-6)) if feasible else (0.25, 0.25, 0.25, 0.6)
+        left.plot(path[:, 0], path[:, 1], color=colour, linewidth=1.8 if feasible else 1.0)
+    path = refined.rollout.position[0].numpy()
+    left.plot(path[:, 0], path[:, 1], color="white", linewidth=4.0)
+    label = f"best fast candidate, refined: cost {refinement.cost_before:.2f} → {refinement.cost:.2f}"
+    left.plot(path[:, 0], path[:, 1], color="#1454c8", linewidth=2.5, label=label)
+    for step in range(100, len(path), 100):
         circle = np.linspace(0, 2 * np.pi, 60)
-        left.plot(way[step, 0] + sure.radius[step] * np.cos(circle), way[step, 1] + sure.radius[step] * np.sin(circle),
+        radius = uncertainty.radius[step]
+        left.plot(path[step, 0] + radius * np.cos(circle), path[step, 1] + radius * np.sin(circle),
                   color="#1454c8", linewidth=1.2, linestyle="--",
-                  label="holds 90 % of what may happen" if step == 100 else None)  # fmt: skip
+                  label="contains 90 % of the outcomes" if step == 100 else None)  # fmt: skip
     left.set(xlim=(-1.5, 6.0), ylim=(-4.2, 4.2), aspect="equal", xlabel="ahead [m]", ylabel="to the left [m]")
-    left.set_title("candidates: green cheap, red costly, grey not feasible")
+    left.set_title("candidates: green low cost, red high cost, grey infeasible")
     left.legend(loc="lower left", fontsize=8)
     grid = occupancy(terrain, np.eye(4), slope_limit=0.5, step_limit=0.15)
     rows, columns = grid.data.shape
@@ -78,7 +79,7 @@ def draw(recording: Recording, seconds: float) -> Figure:
     values = np.where(grid.data < 0, np.nan, grid.data.astype(float))
     right.set_facecolor("#9aa7b5")
     right.imshow(values, origin="lower", extent=extent, cmap="gray_r", vmin=0, vmax=100)
-    right.plot(way[:, 0], way[:, 1], color="#1454c8", linewidth=2.5)
+    right.plot(path[:, 0], path[:, 1], color="#1454c8", linewidth=2.5)
     right.set(xlim=(-1.5, 6.0), ylim=(-4.2, 4.2), aspect="equal", xlabel="ahead [m]")
     right.set_title("occupancy for Nav2: black lethal, blue-grey unknown")
     return figure

@@ -1,4 +1,4 @@
-"""Cameras: pixels and rays belong together, for every lens."""
+"""Cameras: consistency of pixels and rays for every lens model."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def test_a_ray_projects_back_to_its_pixel(lens, u, v, depth):
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_points_behind_or_far_beside_the_camera_have_no_pixel(lens):
+def test_points_behind_or_far_to_the_side_of_the_camera_have_no_pixel(lens):
     points = np.array([[0, 0, -3.0], [30.0, 0, 1.0], [0, -40.0, 0.9], [0.0, 0.0, 0.0]])
     pixels, inside = camera(lens).project(points)
     assert not inside.any() and np.isnan(pixels).all()
@@ -54,7 +54,7 @@ def test_a_resized_image_keeps_its_rays():
         ({"matrix": np.full((3, 3), np.nan)}, "finite"),
     ],
 )
-def test_unusable_calibrations_are_named(change, message):
+def test_invalid_calibrations_are_refused(change, message):
     fields = {"width": 640, "height": 480, "matrix": MATRIX, "distortion": np.zeros(5)} | change
     with pytest.raises(ValueError, match=message):
         CameraModel(**fields)

@@ -1,4 +1,4 @@
-"""`evaluate --check`: what is there, what is missing, and what is odd, each in a sentence."""
+"""`evaluate --check`: contents, missing data and faults of a bag, each in one sentence."""
 
 import re
 import subprocess
@@ -8,7 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import BagWriter, builders
-from monoforce_ros.evaluation.check import check_bag, check_text
+from monoforce_ros.evaluation.check import BagCheck, check_bag, check_text
+from monoforce_ros.evaluation.findings import Level
 from monoforce_ros.robots import load_robot
 
 START = 1_700_000_000_000_000_000
@@ -20,14 +21,14 @@ def husky():
 
 
 def write(path, *, delay=0.2, commands=True, clock=0.0, gap=False, info=True, frame="base_link", sign=1.0, camera=True):
-    """Twenty seconds of a drive in which motion follows commands by ``delay``."""
+    """Twenty seconds of a recording in which motion follows commands by ``delay``."""
     times = np.arange(0.0, 20.0, 0.05)
 
-    def told(t):
+    def commanded(t):
         return 0.5 + 0.3 * np.sin(0.9 * t), 0.5 * np.sin(1.7 * t)
 
-    heading = np.cumsum(told(times - delay)[1]) * 0.05
-    speed = told(times - delay)[0]
+    heading = np.cumsum(commanded(times - delay)[1]) * 0.05
+    speed = commanded(times - delay)[0]
     place = np.cumsum(np.stack([speed * np.cos(heading), speed * np.sin(heading)], axis=1), axis=0) * 0.05
     with BagWriter(path) as bag:
         bag.write("/tf_static", builders.static_transforms(START, "base_link", {"lidar": np.eye(4)}), START)
@@ -37,11 +38,17 @@ def write(path, *, delay=0.2, commands=True, clock=0.0, gap=False, info=True, fr
                 turn = Rotation.from_euler("z", heading[i]).as_quat()
                 stamp = at - round(1e9 * clock)
                 odometry = builders.odometry(
-                    stamp, "odom", frame, [*place[i], 0], turn, [sign * speed[i], 0, 0], [0, 0, told(time - delay)[1]]
+                    stamp,
+                    "odom",
+                    frame,
+                    [*place[i], 0],
+                    turn,
+                    [sign * speed[i], 0, 0],
+                    [0, 0, commanded(time - delay)[1]],
                 )
                 bag.write("/odom", odometry, at)
             if commands:
-                bag.write("/cmd_vel", builders.twist_stamped(at, "base_link", *told(time)), at)
+                bag.write("/cmd_vel", builders.twist_stamped(at, "base_link", *commanded(time)), at)
             if i % 4 == 0:
                 bag.write("/points", builders.point_cloud(at, "lidar", np.ones((5, 3))), at)
                 if camera:
@@ -53,17 +60,17 @@ def write(path, *, delay=0.2, commands=True, clock=0.0, gap=False, info=True, fr
     return path
 
 
-def said(check, level):
-    return " | ".join(text for kind, text in check.findings if kind == level)
+def texts(check: BagCheck, level: Level) -> str:
+    return " | ".join(finding.text for finding in check.findings if finding.level is level)
 
 
-def test_a_good_bag_has_everything_and_tells_its_rates(tmp_path, husky):
+def test_a_good_bag_is_complete_and_its_rates_are_reported(tmp_path, husky):
     check = check_bag(write(tmp_path / "drive"), husky)
     assert check.usable
-    assert not said(check, "missing")
-    assert not said(check, "warning")
-    assert re.search(r"motion follows commands 0\.(15|18|2.) s later", said(check, "note"))
-    assert "images /camera_front/image_raw: 100, 6 × 4" in said(check, "ok")
+    assert not texts(check, Level.MISSING)
+    assert not texts(check, Level.WARNING)
+    assert re.search(r"motion follows commands 0\.(15|18|2.) s later", texts(check, Level.NOTE))
+    assert "images /camera_front/image_raw: 100, 6 × 4" in texts(check, Level.OK)
     topics = {topic.topic: topic for topic in check.topics}
     assert topics["/odom"].rate == pytest.approx(20.0, rel=0.01)
     assert topics["/points"].rate == pytest.approx(5.0, rel=0.01)
@@ -76,22 +83,26 @@ def test_a_good_bag_has_everything_and_tells_its_rates(tmp_path, husky):
 @pytest.mark.parametrize(
     ("fault", "level", "message"),
     [
-        ({"commands": False}, "missing", "record what the base controller is told"),
-        ({"clock": 1.3}, "warning", r"\+1.30 s away from when it was received"),
-        ({"clock": 100.0}, "missing", "do not overlap in time"),
-        ({"gap": True}, "warning", "silent for 3"),
-        ({"info": False}, "warning", "no CameraInfo on /camera_front/camera_info"),
-        ({"frame": "imu"}, "warning", "odometry is of 'imu', the robot's base frame is 'base_link'"),
-        ({"sign": -1.0}, "warning", "the other sign than its poses"),
+        ({"commands": False}, Level.MISSING, "record the commands of the base controller"),
+        ({"clock": 1.3}, Level.WARNING, r"received \+1.30 s after their stamps"),
+        ({"clock": 100.0}, Level.MISSING, "do not overlap in time"),
+        ({"gap": True}, Level.WARNING, "no messages for 3"),
+        ({"info": False}, Level.WARNING, "no CameraInfo on /camera_front/camera_info"),
+        (
+            {"frame": "imu"},
+            Level.WARNING,
+            "odometry describes the frame 'imu', but the robot's base frame is 'base_link'",
+        ),
+        ({"sign": -1.0}, Level.WARNING, "the opposite sign of its poses"),
     ],
 )
-def test_each_fault_is_said(tmp_path, husky, fault, level, message):
+def test_each_fault_is_reported(tmp_path, husky, fault, level, message):
     check = check_bag(write(tmp_path / "drive", **fault), husky)
-    assert re.search(message, said(check, level))
-    assert check.usable == (level != "missing")
+    assert re.search(message, texts(check, level))
+    assert check.usable == (level is not Level.MISSING)
 
 
-def test_the_executable_tells_by_its_status(tmp_path, executables, ros_environment, real_data):
+def test_the_exit_status_is_1_for_an_unusable_bag(tmp_path, executables, ros_environment, real_data):
     def run(bag):
         return subprocess.run(
             [executables / "evaluate", "--check", bag], env=ros_environment, capture_output=True, text=True,

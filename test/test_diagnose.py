@@ -262,7 +262,7 @@ def test_an_injected_delay_is_named_added_and_closes_the_gap(
     errors = []
     for robot in (load_robot("husky"), found):
         predictor = Predictor(robot, FlatTerrain(robot, Grid.square(), TerrainDefaults()), horizon=2.0)
-        evaluation = evaluate_recording(recording, predictor, horizons=(1.0, 2.0), stride=1.0, progress=False)
+        evaluation = evaluate_recording(recording, predictor, horizons=(1.0, 2.0), stride=1.0, quiet=True)
         errors.append(evaluation.summary(PHYSICS)[2.0][0].median)
     assert errors[1] < 0.5 * errors[0]
 

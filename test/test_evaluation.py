@@ -1,4 +1,4 @@
-"""The evaluation: metrics in closed form, and the installed command on a recorded drive."""
+"""The evaluation: metrics in closed form, and the installed command on a recording."""
 
 import json
 import subprocess
@@ -7,10 +7,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from monoforce_ros.bags import BagWriter, builders
+from monoforce_ros.bags import BagWriter, Recording, builders
 from monoforce_ros.core import MotionState
+from monoforce_ros.evaluation import observe
+from monoforce_ros.evaluation.cli import main
 from monoforce_ros.evaluation.metrics import Poses, bootstrap_interval, position_errors, rotation_errors, summarise
-from monoforce_ros.evaluation.recording_evaluation import constant_velocity
+from monoforce_ros.evaluation.recording_evaluation import MAXIMUM_SPREAD, constant_velocity
+from monoforce_ros.reporting import card, definition_list, folded_list, page, write_between
+from monoforce_ros.robots import load_robot
 
 
 def test_errors_are_metres_and_degrees():
@@ -78,7 +82,7 @@ def test_the_report_compares_with_the_baseline_at_every_horizon(report):
     assert "Δx 5 s [m]" in printed and "report.html" in printed
 
 
-def test_physics_beats_constant_velocity_on_the_demo_drive(report):
+def test_physics_beats_constant_velocity_on_the_demo_recording(report):
     methods = report[1]["methods"]
     for horizon in ("2", "5"):
         physics = methods["physics"][horizon]["position_error_m"]["mean"]
@@ -110,7 +114,7 @@ def test_errors_are_one_line(executables, demo_bag, tmp_path, arguments, message
     assert message in done.stderr and done.stderr.count("\n") == 1 and done.stderr.startswith("error: ")
 
 
-def test_a_bag_without_camera_info_or_clouds_says_what_it_lacks(executables, tmp_path):
+def test_missing_sensor_data_of_a_bag_is_named(executables, tmp_path):
     with BagWriter(tmp_path / "drive") as bag:
         for i in range(100):
             at = 10**18 + i * 20_000_000
@@ -125,7 +129,7 @@ def test_a_bag_without_camera_info_or_clouds_says_what_it_lacks(executables, tmp
         timeout=60,
     )
     assert done.returncode == 1
-    assert "no point clouds to predict from; with `--terrain flat`" in done.stderr
+    assert "no point clouds to predict from; `--terrain flat`" in done.stderr
     done = subprocess.run(
         [str(executables / "evaluate"), str(tmp_path / "drive"), "--terrain", "flat", "--horizons", "0.5", "1",
          "--out", str(tmp_path / "out"), "--quiet"],
@@ -136,3 +140,60 @@ def test_a_bag_without_camera_info_or_clouds_says_what_it_lacks(executables, tmp
     assert done.returncode == 0, done.stderr
     content = json.loads((tmp_path / "out" / "report.json").read_text())
     assert content["methods"]["physics"]["1"]["position_error_m"]["mean"] < 0.01
+
+
+def test_images_further_from_the_stamp_than_the_limit_are_left_out(tmp_path):
+    robot, start = load_robot("husky"), 10**18
+    with BagWriter(tmp_path / "recording") as bag:
+        for i in range(100):
+            at = start + i * 20_000_000
+            bag.write(
+                "/odom", builders.odometry(at, "odom", "base_link", [0, 0, 0], [0, 0, 0, 1], [0] * 3, [0] * 3), at
+            )
+            bag.write("/cmd_vel", builders.twist(0.0, 0.0), at)
+        bag.write("/points", builders.point_cloud(start, "lidar", np.ones((5, 3))), start)
+        image = builders.image(start, "camera_front", np.full((4, 6, 3), 9, np.uint8))
+        bag.write("/camera_front/image_raw", image, start)
+        calibration = builders.camera_info(start, "camera_front", 6, 4, np.diag([5.0, 5, 1]), [0] * 5)
+        bag.write("/camera_front/camera_info", calibration, start)
+    recording = Recording.open(tmp_path / "recording")
+    topics = ("/camera_front/image_raw",)
+    near, far = (start + round(share * MAXIMUM_SPREAD * 1e9) for share in (0.9, 1.5))
+    both = observe(recording, robot, near, ("lidar", "camera"), topics)
+    assert both.cloud is not None and list(both.images) == list(topics)
+    neither = observe(recording, robot, far, ("lidar", "camera"), topics)
+    assert neither.cloud is None and not neither.images
+    # A cloud that is not combined with images may be as old as the only one is.
+    assert observe(recording, robot, far, ("lidar",)).cloud is not None
+
+
+def test_the_former_name_of_the_retention_time_works_and_warns(demo_bag, capsys):
+    for option in ("--memory", "--retention-time"):
+        with pytest.raises(SystemExit):
+            main([str(demo_bag), option, "700"])
+        stderr = capsys.readouterr().err
+        assert "--retention-time: got 700.0, expected 0 to 600 s" in stderr
+        assert ("warning: --memory is deprecated and will be removed; use --retention-time" in stderr) == (
+            option == "--memory"
+        )
+
+
+def test_pages_escape_plain_text():
+    text = page(
+        "a < b", card(definition_list({"<key>": "<b>"}) + folded_list("two & more", ["x > y"]), caption="1 < 2")
+    )
+    assert "<title>a &lt; b</title>" in text and "<h1>a &lt; b</h1>" in text
+    assert "<dt>&lt;key&gt;</dt><dd>&lt;b&gt;</dd>" in text and "<li>x &gt; y</li>" in text and "1 &lt; 2" in text
+    assert folded_list("nothing", []) == ""
+
+
+def test_a_section_of_a_document_is_replaced_between_its_comments(tmp_path):
+    document = tmp_path / "page.md"
+    document.write_text("before\n<!-- results -->\nold\n<!-- end of results -->\nafter\n")
+    write_between(document, "results", "\nnew\n\n")
+    assert document.read_text() == "before\n<!-- results -->\nnew\n<!-- end of results -->\nafter\n"
+    with pytest.raises(ValueError, match="expected the comments <!-- other -->"):
+        write_between(document, "other", "new")
+    document.write_text(document.read_text() * 2)
+    with pytest.raises(ValueError, match="once each"):
+        write_between(document, "results", "new")

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from monoforce_ros.terrain import Grid, LidarSettings, terrain_from_cloud
-from monoforce_ros.terrain.lidar import TerrainError, cell_heights, fill_holes
+from monoforce_ros.terrain import Grid, LidarSettings, TerrainError, fill_holes, terrain_from_cloud
+from monoforce_ros.terrain.lidar import cell_heights
 
 GRID = Grid.square(6.4, 0.1)
 
@@ -14,7 +14,7 @@ def surface(count: int, height, seed: int = 0) -> np.ndarray:
     return np.column_stack([xy, height(*xy.T)])
 
 
-def test_a_smooth_surface_is_recovered_where_seen_and_between():
+def test_a_smooth_surface_is_recovered_in_observed_cells_and_between():
     def height(x, y):
         return 0.3 * np.sin(x) + 0.2 * y
 
@@ -35,14 +35,14 @@ def test_map_rows_are_y_and_columns_are_x():
     assert height[row, column] == pytest.approx(1.0) and height[column, row] == pytest.approx(0.0)
 
 
-def test_branches_that_hang_over_the_ground_are_left_out():
+def test_overhanging_branches_are_ignored():
     ground = surface(20_000, lambda x, y: 0.0 * x)
     branch = np.column_stack([np.random.default_rng(1).uniform(-1, 1, (2000, 2)), np.full(2000, 1.8)])
     terrain = terrain_from_cloud(np.concatenate([ground, branch]), GRID)
     assert float(terrain.height.abs().max()) < 0.01
 
 
-def test_a_crown_whose_ground_was_not_seen_is_left_out():
+def test_a_crown_above_unobserved_ground_is_ignored():
     ground = surface(20_000, lambda x, y: 0.0 * x)
     hidden = ground[np.abs(ground[:, :2]).max(axis=1) > 0.3]
     crown = np.column_stack([np.random.default_rng(1).uniform(-0.3, 0.3, (500, 2)), np.full(500, 2.2)])
@@ -64,7 +64,7 @@ def test_walls_and_rocks_stay():
     assert np.median(height[np.abs(GRID.y) < 0.9][:, column]) > 1.0
 
 
-def test_support_fixes_the_ground_under_the_robot_and_nothing_else():
+def test_support_points_determine_the_ground_under_the_robot_only():
     points = surface(20_000, lambda x, y: 0.0 * x)
     points = points[np.hypot(*points[:, :2].T) > 0.6]
     support = np.array([[0.2, 0.2, -0.1], [0.2, -0.2, -0.1], [-0.2, 0.2, -0.1], [-0.2, -0.2, -0.1]])
@@ -84,7 +84,7 @@ def test_known_cells_keep_their_value_when_holes_are_filled():
     assert filled.min() >= heights[known].min() - 1e-5 and filled.max() <= heights[known].max() + 1e-5
 
 
-def test_hardly_any_return_is_said():
+def test_too_few_returns_are_an_error():
     with pytest.raises(TerrainError, match="hit 1 cells"):
         terrain_from_cloud(np.array([[0.0, 0.0, 0.0], [50.0, 0.0, 0.0]]), GRID)
     heights, observed = cell_heights(np.zeros((0, 3)), GRID, LidarSettings())

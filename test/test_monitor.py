@@ -1,4 +1,4 @@
-"""The live gap: injected errors of the model show with their size and regime, and noise alone shows as noise."""
+"""The live gap: injected model errors are measured with their size and regime, and noise is recognised as noise."""
 
 from dataclasses import replace
 
@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from monoforce_ros.core import CommandTrack, MotionState, MotionTrack
 from monoforce_ros.perception import FlatTerrain, Observation
-from monoforce_ros.prediction import Predictor
-from monoforce_ros.prediction.monitor import HORIZONS, LiveGap, odometry_noise
+from monoforce_ros.prediction import HORIZONS, LiveGap, Predictor
+from monoforce_ros.prediction.monitor import odometry_noise
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainDefaults
 
@@ -29,15 +29,15 @@ def predictor_of(robot) -> Predictor:
 def drive(
     robot, twists: np.ndarray, noise: float = 0.0, heading_noise: float = 0.0
 ) -> tuple[MotionTrack, CommandTrack]:
-    """What a robot does that is as its model says, on level ground; 50 Hz."""
+    """Motion of a robot that behaves exactly as its model, on level ground, at 50 Hz."""
     predictor = Predictor(
         robot, FlatTerrain(robot, Grid.square(200.0, 1.0), TerrainDefaults()), horizon=len(twists) / 100
     )
 
     still = MotionState(START, np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3))
-    led = np.concatenate([np.zeros((predictor.history, 2)), twists])
+    commanded = np.concatenate([np.zeros((predictor.history, 2)), twists])
     terrain = predictor.source.terrain(Observation(START), still)
-    rolled = predictor.roll_out(terrain, [still], led[None])
+    rolled = predictor.roll_out(terrain, [still], commanded[None])
     every = slice(None, None, 2)
     rotations = rolled.rotation[0, every].double()
     random = np.random.default_rng(0)
@@ -62,12 +62,12 @@ def drive(
 
 
 def watched(robot, motion: MotionTrack, commands: CommandTrack) -> LiveGap:
-    """The gap after a drive, predicted once a second."""
+    """The gap after a recording with two predictions a second."""
     predictor = predictor_of(robot)
     gap = LiveGap(predictor)
     for stamp in range(START + 2_000_000_000, int(motion.stamps[-1]), 500_000_000):
         state = motion.at(stamp)
-        # As the node does: the command of now is held, whatever follows.
+        # As the node does: the current command is held, whatever follows.
         held = commands.sample(np.minimum(predictor.command_stamps(stamp), stamp))
         gap.remember(predictor.predict(Observation(stamp), state, held))
         now = motion.stamps <= stamp
@@ -89,7 +89,7 @@ def weaving(seconds: float) -> np.ndarray:
     return np.column_stack([np.full(len(steps), 0.6), np.where(turning, 0.7, 0.0)])
 
 
-def test_a_model_that_is_right_has_no_gap_though_commands_change(husky):
+def test_an_exact_model_has_no_gap_although_commands_change(husky):
     motion, commands = drive(husky, weaving(40.0))
     found = watched(husky, motion, commands).summary()
     assert found.count >= 30
@@ -97,11 +97,11 @@ def test_a_model_that_is_right_has_no_gap_though_commands_change(husky):
     assert not found.excessive and found.floor[1] < 0.01
 
 
-def test_a_weaker_drive_shows_with_its_size(husky):
+def test_the_gap_of_a_weak_drive_has_the_expected_size(husky):
     weak = replace(husky, effects=(("drive_gain", {"gain": 0.7}),))
     motion, commands = drive(weak, np.column_stack([np.full(3000, 0.8), np.zeros(3000)]))
     found = watched(husky, motion, commands).summary()
-    # Three tenths of 0.8 m/s are missing.
+    # The speed is three tenths of 0.8 m/s too low.
     for i, horizon in enumerate(HORIZONS):
         assert found.position[i] == pytest.approx(0.3 * 0.8 * horizon, rel=0.1)
     assert found.excessive
@@ -117,7 +117,7 @@ def test_the_regime_with_the_error_is_named(husky):
     assert watched(scrubbing, motion, commands).summary().worst == ""
 
 
-def test_noise_is_known_for_what_it_is(husky):
+def test_noise_is_recognised_as_noise(husky):
     motion, commands = drive(husky, weaving(40.0), noise=0.03, heading_noise=0.02)
     spread, turn = odometry_noise(motion)
     assert spread == pytest.approx(0.03, rel=0.15) and turn == pytest.approx(0.02, rel=0.15)
@@ -126,7 +126,7 @@ def test_noise_is_known_for_what_it_is(husky):
     assert not found.excessive
 
 
-def test_nothing_is_compared_before_it_is_known_or_after_time_began_anew(husky):
+def test_nothing_is_compared_before_the_horizon_has_passed_or_after_a_time_jump(husky):
     motion, commands = drive(husky, weaving(8.0))
     predictor = predictor_of(husky)
     gap = LiveGap(predictor)

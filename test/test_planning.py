@@ -1,4 +1,4 @@
-"""Candidates, their costs and where a robot can drive: terms that say what they are called after."""
+"""Candidates, their costs, occupancy, cost-to-go and selection."""
 
 from dataclasses import replace
 
@@ -17,9 +17,9 @@ from monoforce_ros.planning import (
     cost_to_go,
     fan_of_arcs,
     occupancy,
+    over_horizon,
     select_candidate,
 )
-from monoforce_ros.planning.candidates import over_horizon
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainMap
 
@@ -38,7 +38,7 @@ def terrain_of(height: np.ndarray, **changes) -> TerrainMap:
 
 
 def assessed(husky, terrain, fan, **how):
-    """Costs of commands held for 3 s from standing on the middle of a map."""
+    """Costs of commands held for 3 s from standstill in the middle of a map."""
     fan = np.array(fan, float)
     fan = fan if fan.ndim == 3 else np.atleast_2d(fan)[:, None]
     twists = torch.from_numpy(over_horizon(fan, np.zeros((0, 2)), STEPS)).float()
@@ -50,14 +50,14 @@ def assessed(husky, terrain, fan, **how):
     return assess(result, terrain, husky, twists, **how), result
 
 
-def test_a_fan_holds_every_speed_from_right_to_left_and_a_stop():
+def test_a_fan_contains_every_speed_from_right_to_left_and_standing():
     fan = fan_of_arcs(CandidateSettings(count=11, speeds=(0.5, 1.0), yaw_rate=0.6))
     assert fan.shape == (11, 4, 2) and not fan[-1].any() and (fan == fan[:, :1]).all()
     for speed in (0.5, 1.0):
         rates = fan[fan[:, 0, 0] == speed, 0, 1]
         assert rates.tolist() == pytest.approx([-0.6, -0.3, 0.0, 0.3, 0.6])
     assert fan_of_arcs(CandidateSettings(count=1, speeds=(0.5,))).tolist() == [[[0.5, 0.0]] * 4]
-    # Fewer arcs than speeds: the last ones are driven.
+    # With fewer arcs than speeds, the last speeds are used.
     assert fan_of_arcs(CandidateSettings(count=2, speeds=(0.0, 0.4, 0.8)))[:, 0].tolist() == [[0.8, 0.0], [0.0, 0.0]]
     twists = over_horizon(fan, np.full((20, 2), 0.3), 50)
     assert twists.shape == (11, 70, 2) and (twists[:, :20] == 0.3).all() and (twists[3, 20:] == fan[3, 0]).all()
@@ -66,22 +66,22 @@ def test_a_fan_holds_every_speed_from_right_to_left_and_a_stop():
             CandidateSettings(**wrong)
 
 
-def test_turns_on_the_spot_lead_somewhere():
+def test_turns_in_place_continue_straight():
     fan = fan_of_arcs(CandidateSettings(count=11, speeds=(0.0, 1.0), yaw_rate=0.6))
     turns = fan[:5]
     assert turns[:, 0] == pytest.approx(np.array([[0.0, rate] for rate in (-0.6, -0.3, 0.0, 0.3, 0.6)]))
     on = [1.0, 0.0]
     assert turns[1, 2:].tolist() == [turns[1, 0].tolist(), on] and turns[2, 2:].tolist() == [on, on]
     assert (turns[[0, 4]] == turns[[0, 4], :1]).all()
-    # What is on the right is on the left.
+    # The fan is symmetric.
     assert turns[::-1, :, 1] == pytest.approx(-turns[..., 1])
-    # Where nothing is faster than a turn, a turn is all that there is.
+    # Without forward speeds there are only turns.
     only = fan_of_arcs(CandidateSettings(count=6, speeds=(0.0,), yaw_rate=0.6))
     assert (only == only[:, :1]).all()
 
 
-def test_a_robot_right_before_a_wall_has_a_way_out(husky):
-    """Every arc ahead runs into the wall; only turning first and driving then leads anywhere."""
+def test_a_robot_right_before_a_wall_has_a_feasible_candidate(husky):
+    """Every forward arc hits the wall; only turning first and then driving makes progress."""
     settings = CandidateSettings(count=20, speeds=(0.0, 0.8), yaw_rate=1.5)
     # The husky's nose is 0.5 m ahead of its middle.
     found, result = assessed(husky, terrain_of(np.where(X > 0.75, 1.0, 0.0)), fan_of_arcs(settings))
@@ -93,35 +93,35 @@ def test_a_robot_right_before_a_wall_has_a_way_out(husky):
 
 def test_level_ground_is_feasible_and_standing_costs_least(husky):
     found, _ = assessed(husky, terrain_of(np.zeros_like(X)), [[0.5, 0.0], [0.5, 0.5], [0.0, 0.0]])
-    assert bool(found.feasible.all()) and found.best == 2 and found.why_not(0) == ""
+    assert bool(found.feasible.all()) and found.best == 2 and found.violations(0) == ""
     assert all(float(value.max()) < 0.6 for value in found.terms.values())
     assert float(found.terms["collision"].max()) < 0.05
 
 
-def test_a_side_slope_rolls_unloads_one_side_and_forbids_what_is_too_steep(husky):
+def test_a_side_slope_causes_roll_and_load_loss_and_is_infeasible_if_too_steep(husky):
     gentle, _ = assessed(husky, terrain_of(0.2 * Y), [[0.5, 0.0]])
-    # It starts level, drops onto the slope and rolls somewhat beyond it.
+    # The robot starts level, drops onto the slope and overshoots.
     assert 1.0 < float(gentle.terms["roll"][0]) / (np.arctan(0.2) / Limits().roll) < 1.5
     assert 0.1 < float(gentle.terms["wheel_load"][0]) < 1.0 and bool(gentle.feasible[0])
     steep, _ = assessed(husky, terrain_of(0.8 * Y), [[0.5, 0.0]])
-    assert not bool(steep.feasible[0]) and "roll" in steep.why_not(0) and "times its limit" in steep.why_not(0)
+    assert not bool(steep.feasible[0]) and "roll" in steep.violations(0) and "times its limit" in steep.violations(0)
     assert steep.best is None
     uphill, _ = assessed(husky, terrain_of(0.2 * X), [[0.5, 0.0]])
     assert float(uphill.terms["pitch"][0]) > 3 * float(uphill.terms["roll"][0])
 
 
-def test_a_wall_is_a_collision_and_the_way_past_it_is_not(husky):
+def test_a_wall_is_a_collision_and_the_path_past_it_is_not(husky):
     wall = np.where((X > 1.2) & (X < 1.6) & (np.abs(Y) < 0.8), 1.0, 0.0)
     found, result = assessed(husky, terrain_of(wall), [[0.8, 0.0], [0.8, 0.9], [-0.5, 0.0]])
     assert float(result.position[0, -1, 0]) < 1.2
-    assert float(found.terms["collision"][0]) > 1.0 and "collision" in found.why_not(0)
+    assert float(found.terms["collision"][0]) > 1.0 and "collision" in found.violations(0)
     assert float(found.terms["slip"][0]) > 2 * float(found.terms["slip"][2])
     assert float(found.terms["collision"][2]) < 0.1 and bool(found.feasible[2]) and found.best == 2
-    # The cost says the same as the flag.
+    # The cost agrees with feasibility.
     assert float(found.cost[0]) > float(found.cost[2])
 
 
-def test_rough_ground_varies_the_load_and_slippery_ground_slips(husky):
+def test_rough_ground_varies_the_load_and_slippery_ground_causes_slip(husky):
     smooth, _ = assessed(husky, terrain_of(np.zeros_like(X)), [[0.8, 0.0]])
     rough, _ = assessed(husky, terrain_of(0.05 * np.sin(9 * X) * np.cos(7 * Y)), [[0.8, 0.0]])
     assert float(rough.terms["force_variation"][0]) > 3 * float(smooth.terms["force_variation"][0])
@@ -133,21 +133,21 @@ def test_rough_ground_varies_the_load_and_slippery_ground_slips(husky):
     assert float(firm.terms["effort"][0]) > 3 * float(level.terms["effort"][0])
 
 
-def test_what_nothing_measured_costs(husky):
+def test_unobserved_ground_has_a_cost(husky):
     ahead = torch.from_numpy(X < 1.2)
     found, _ = assessed(husky, terrain_of(np.zeros_like(X), observed=ahead), [[0.9, 0.0], [-0.9, 0.0], [0.0, 0.0]])
     assert float(found.terms["unobserved"][0]) > 0.5 and float(found.terms["unobserved"][1]) == 0.0
     assert float(found.terms["unobserved"][2]) == 0.0
 
 
-def test_weights_and_limits_do_what_they_say(husky):
+def test_weights_and_limits_scale_the_terms(husky):
     terrain = terrain_of(0.2 * Y)
     found, result = assessed(husky, terrain, [[0.5, 0.0]])
     weights = CostWeights(**dict.fromkeys(found.terms, 0.0) | {"roll": 2.0})
     alone, _ = assessed(husky, terrain, [[0.5, 0.0]], weights=weights)
     assert float(alone.cost[0]) == pytest.approx(2 * float(found.terms["roll"][0]), rel=1e-5)
     strict, _ = assessed(husky, terrain, [[0.5, 0.0]], limits=Limits(roll=0.1))
-    assert not bool(strict.feasible[0]) and strict.why_not(0).startswith("roll")
+    assert not bool(strict.feasible[0]) and strict.violations(0).startswith("roll")
     with pytest.raises(ValueError, match="has no contact forces"):
         assess(replace(result, contact=None), terrain, husky, torch.zeros(1, STEPS, 2))
     with pytest.raises(ValueError, match="limit of roll: got 0"):
@@ -156,18 +156,18 @@ def test_weights_and_limits_do_what_they_say(husky):
         CostWeights(slip=-1.0)
 
 
-def test_a_diverged_candidate_is_never_chosen(husky):
+def test_a_diverged_candidate_is_never_selected(husky):
     terrain = terrain_of(np.zeros_like(X))
     _, result = assessed(husky, terrain, [[0.5, 0.0], [0.4, 0.0]])
     lost = result.position.clone()
     lost[0] = torch.nan
     broken = replace(result, valid=torch.tensor([False, True]), position=lost)
     found = assess(broken, terrain, husky, torch.full((2, STEPS, 2), 0.4))
-    assert found.best == 1 and not bool(found.feasible[0]) and found.why_not(0) == "the rollout diverged"
+    assert found.best == 1 and not bool(found.feasible[0]) and found.violations(0) == "the rollout diverged"
 
 
 @pytest.mark.parametrize("heading", [0.0, 0.7, -2.0])
-def test_occupancy_lies_where_the_terrain_does_whichever_way_the_robot_looks(heading):
+def test_occupancy_matches_the_terrain_for_any_heading(heading):
     wall = np.where((X > 2.0) & (X < 2.6) & (np.abs(Y - 1.0) < 0.5), 1.0, 0.1 * X)
     terrain = terrain_of(wall, observed=torch.from_numpy(Y > -3.0))
     pose = np.eye(4)
@@ -182,14 +182,14 @@ def test_occupancy_lies_where_the_terrain_does_whichever_way_the_robot_looks(hea
 
     assert at(2.0, 1.0) == at(2.6, 1.0) == 100
     assert at(0.0, -4.0) == -1
-    # A tenth of a slope is a fifth of the limit.
+    # A slope of 0.1 is a fifth of the limit.
     assert at(-3.0, 2.0) == pytest.approx(100 * np.arctan(0.1) / 0.5, abs=3)
     assert found.data.dtype == np.int8 and found.data.min() == -1 and found.data.max() == 100
     with pytest.raises(ValueError, match="occupancy limits"):
         occupancy(terrain, pose, slope_limit=0.0, step_limit=0.1)
 
 
-def test_the_choice_weighs_cost_against_the_way_left():
+def test_selection_weighs_cost_against_the_remaining_distance():
     candidates = {
         "x": np.array([3.0, 2.5, 0.0, 3.0]), "y": np.array([0.0, 1.5, 0.0, -1.0]),
         "heading": np.array([0.0, 0.6, 0.0, -0.4]), "speed": np.array([0.8, 0.8, 0.0, 0.8]),
@@ -200,12 +200,13 @@ def test_the_choice_weighs_cost_against_the_way_left():
     robot = np.zeros(2)
     assert select_candidate(candidates, robot, np.array([8.0, 0.0])) == 0
     assert select_candidate(candidates, robot, np.array([5.0, 6.0])) == 1
-    # Where the robot is already, standing is best; what is not feasible is never chosen, however near it ends.
+    # At the goal, standing is best.
     assert select_candidate(candidates, robot, np.array([0.0, 0.0])) == 2
-    # A goal nearer than any candidate ends is passed, not stopped before.
+    # A goal closer than the end of any candidate is passed.
     assert select_candidate(candidates, robot, np.array([1.2, 0.0])) == 0
-    barred = candidates | {"feasible": np.array([0.0, 1.0, 1.0, 1.0])}
-    assert select_candidate(barred, robot, np.array([8.0, 0.0])) in (1, 3)
+    # An infeasible candidate is never selected, however close to the goal it ends.
+    restricted = candidates | {"feasible": np.array([0.0, 1.0, 1.0, 1.0])}
+    assert select_candidate(restricted, robot, np.array([8.0, 0.0])) in (1, 3)
     costly = candidates | {"cost": np.array([5.0, 0.1, 0.1, 5.0])}
     assert select_candidate(costly, robot, np.array([8.0, 0.0]), SelectionWeights(cost=10.0)) == 1
     assert select_candidate(candidates | {"feasible": np.zeros(4)}, robot, np.array([8.0, 0.0])) is None
@@ -214,13 +215,13 @@ def test_the_choice_weighs_cost_against_the_way_left():
         select_candidate({k: v for k, v in candidates.items() if k != "cost"}, robot, np.zeros(2))
 
 
-def test_the_way_to_a_goal_leads_around_a_wall():
+def test_the_cost_to_go_leads_around_a_wall():
     data = np.zeros((100, 100), np.int8)
     # Cells of 0.1 m from (-5, -5): a wall at x = 1 from y = -3 to the upper border.
     data[20:, 60:63] = 100
     goal = np.array([3.0, 1.0])
-    ways = cost_to_go(data, 0.1, np.array([-5.0, -5.0]), goal, radius=0.3)
-    behind, before = float(ways.at(np.array([2.0, 1.0]))), float(ways.at(np.array([0.0, 1.0])))
+    to_goal = cost_to_go(data, 0.1, np.array([-5.0, -5.0]), goal, radius=0.3)
+    behind, before = float(to_goal.at(np.array([2.0, 1.0]))), float(to_goal.at(np.array([0.0, 1.0])))
     assert behind == pytest.approx(1.0, abs=0.2)
     # Around the wall's lower end, not through it.
     around = np.hypot(1.0, 4.3) + np.hypot(2.0, 4.3)
@@ -231,14 +232,14 @@ def test_the_way_to_a_goal_leads_around_a_wall():
     far = cost_to_go(np.zeros_like(data), 0.1, np.array([-5.0, -5.0]), np.array([9.0, 0.0]), radius=0.3)
     assert float(far.at(np.array([0.0, 0.0]))) == pytest.approx(9.0, abs=0.4)
     assert float(far.at(np.array([8.0, 0.0]))) == pytest.approx(1.0)
-    # A robot that stands too near to the wall still finds away from it.
-    assert np.isfinite(ways.length).all()
-    assert float(ways.at(np.array([0.85, 0.0]))) > float(ways.at(np.array([0.5, 0.0])))
+    # A robot too close to the wall still finds a path away from it.
+    assert np.isfinite(to_goal.cost).all()
+    assert float(to_goal.at(np.array([0.85, 0.0]))) > float(to_goal.at(np.array([0.5, 0.0])))
     with pytest.raises(ValueError, match="costmap"):
         cost_to_go(np.zeros((0, 4)), 0.1, np.zeros(2), goal, radius=0.3)
 
 
-def test_the_way_to_a_goal_prefers_the_wider_gap_a_little_further_on():
+def test_the_cost_to_go_prefers_a_wider_gap_a_little_further_away():
     data = np.zeros((100, 100), np.int8)
     # A wall across; straight ahead a gap of 0.9 m, 1.5 m to its side one of 2 m.
     data[:, 60:62] = 100
@@ -256,12 +257,12 @@ def test_the_way_to_a_goal_prefers_the_wider_gap_a_little_further_on():
     assert np.isfinite(narrow) and narrow > wide
 
 
-def test_the_choice_goes_around_what_lies_between():
-    """Straight on ends nearer to the goal, but before a wall; to the right leads around it."""
+def test_selection_goes_around_an_obstacle():
+    """Straight ahead ends closer to the goal, but in front of a wall; the path to the right leads around it."""
     data = np.zeros((100, 100), np.int8)
     data[30:, 70:73] = 100
     goal = np.array([4.0, 0.0])
-    ways = cost_to_go(data, 0.1, np.array([-5.0, -5.0]), goal, radius=0.3)
+    to_goal = cost_to_go(data, 0.1, np.array([-5.0, -5.0]), goal, radius=0.3)
     ends = {"x": [1.2, 0.9], "y": [0.0, -0.9], "heading": [0.0, -0.8], "speed": [0.5, 0.5], "yaw_rate": [0.0, -0.5],
             "cost": [0.2, 0.2], "feasible": [1.0, 1.0]}  # fmt: skip
     for share in (25, 50, 75):
@@ -269,11 +270,11 @@ def test_the_choice_goes_around_what_lies_between():
     candidates = {name: np.array(values) for name, values in ends.items()}
     weights = SelectionWeights(heading=0.0)
     assert select_candidate(candidates, np.zeros(2), goal, weights) == 0
-    assert select_candidate(candidates, np.zeros(2), goal, weights, ways) == 1
+    assert select_candidate(candidates, np.zeros(2), goal, weights, to_goal) == 1
 
 
-def test_standing_is_chosen_only_where_nothing_leads_nearer():
-    """However dear the ways are: a robot that stands before an obstacle would stand there for ever."""
+def test_standing_is_selected_only_if_nothing_makes_progress():
+    """However expensive the other candidates are: otherwise a robot in front of an obstacle would never leave it."""
     ends = {"x": [1.0, 0.8, 0.0], "y": [0.5, -0.5, 0.0], "heading": [0.5, -0.5, 0.0], "speed": [0.5, 0.4, 0.0],
             "yaw_rate": [0.4, -0.4, 0.0], "cost": [9.0, 8.0, 0.0], "feasible": [1.0, 1.0, 1.0]}  # fmt: skip
     for share in (25, 50, 75):
@@ -286,30 +287,30 @@ def test_standing_is_chosen_only_where_nothing_leads_nearer():
     )
 
 
-def test_the_choice_keeps_room_to_a_wall():
-    """Two candidates come equally near to the goal; one skims a wall that stands along the way."""
+def test_selection_keeps_clearance_to_a_wall():
+    """Two candidates end equally close to the goal; one passes close to a wall."""
     data = np.zeros((100, 100), np.int8)
     data[57:59, 40:80] = 100  # at y = 0.7 to 0.9
     goal = np.array([4.0, 0.0])
-    ways = cost_to_go(data, 0.1, np.array([-5.0, -5.0]), goal, radius=0.3)
-    assert ways.near(np.array([[1.0, 0.5], [1.0, -0.6], [9.0, 0.5]])).tolist() == [1.0, 0.0, 0.0]
+    to_goal = cost_to_go(data, 0.1, np.array([-5.0, -5.0]), goal, radius=0.3)
+    assert to_goal.proximity_at(np.array([[1.0, 0.5], [1.0, -0.6], [9.0, 0.5]])).tolist() == [1.0, 0.0, 0.0]
     ends = {"x": [1.5, 1.5], "y": [0.4, -0.45], "heading": [0.0, 0.0], "speed": [0.5, 0.5], "yaw_rate": [0.1, -0.1],
             "cost": [0.2, 0.25], "feasible": [1.0, 1.0]}  # fmt: skip
     for share in (25, 50, 75):
         ends |= {f"{axis}_{share}": [share / 100 * v for v in ends[axis]] for axis in "xy"}
     candidates = {name: np.array(values) for name, values in ends.items()}
-    # By way and heading alone they are as good as each other; the wall decides.
+    # Distance and heading are equal; the wall decides.
     assert (
         select_candidate(
-            candidates, np.zeros(2), goal, SelectionWeights(distance=0.0, heading=0.0, clearance=0.0), ways
+            candidates, np.zeros(2), goal, SelectionWeights(distance=0.0, heading=0.0, clearance=0.0), to_goal
         )
         == 0
     )
-    assert select_candidate(candidates, np.zeros(2), goal, SelectionWeights(distance=0.0, heading=0.0), ways) == 1
+    assert select_candidate(candidates, np.zeros(2), goal, SelectionWeights(distance=0.0, heading=0.0), to_goal) == 1
 
 
-def test_the_choice_keeps_to_one_of_two_ways_that_are_about_as_good():
-    """A robot before the middle of a wall would turn left and right for ever by what is left of noise."""
+def test_selection_does_not_alternate_between_similar_paths():
+    """Otherwise noise would make a robot in front of the middle of a wall turn left and right forever."""
     ends = {"x": [1.0, 1.0], "y": [1.0, -1.0], "heading": [0.8, -0.8], "speed": [0.0, 0.0], "yaw_rate": [0.8, -0.8],
             "cost": [0.5, 0.5], "feasible": [1.0, 1.0]}  # fmt: skip
     for share in (25, 50, 75):
@@ -319,8 +320,8 @@ def test_the_choice_keeps_to_one_of_two_ways_that_are_about_as_good():
     for noise in (0.1, -0.1):
         noisy = candidates | {"cost": candidates["cost"] + [noise, -noise]}
         assert select_candidate(noisy, np.zeros(2), goal) == int(noise > 0.0)
-        assert select_candidate(noisy, np.zeros(2), goal, former=(0.0, 0.8)) == 0
-        assert select_candidate(noisy, np.zeros(2), goal, former=(0.0, -0.7)) == 1
-    # A way that is much better is taken all the same.
+        assert select_candidate(noisy, np.zeros(2), goal, previous_command=(0.0, 0.8)) == 0
+        assert select_candidate(noisy, np.zeros(2), goal, previous_command=(0.0, -0.7)) == 1
+    # A much better path is taken nevertheless.
     better = candidates | {"cost": np.array([2.0, 0.5])}
-    assert select_candidate(better, np.zeros(2), goal, former=(0.0, 0.8)) == 1
+    assert select_candidate(better, np.zeros(2), goal, previous_command=(0.0, 0.8)) == 1

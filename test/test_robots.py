@@ -1,4 +1,4 @@
-"""Robot files: what they become, and what is said of those that are wrong."""
+"""Robot files: the models read from them, and the errors of invalid ones."""
 
 import math
 
@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from monoforce_ros.physics import State, rollout
-from monoforce_ros.robots import RobotFileError, load_robot, robot_file, shipped_robots
+from monoforce_ros.robots import RobotFileError, load_robot, robot_file, shipped_robots, write_robot
 from monoforce_ros.robots.belt import belt_outline
 from monoforce_ros.terrain import Grid, TerrainMap
 
@@ -50,7 +50,7 @@ def test_belts_are_closed_and_run_backwards_at_the_bottom(length, rear, front, s
         return
     positions, tangents, lengths = belt_outline(length, rear, front, spacing)
     np.testing.assert_allclose(np.linalg.norm(tangents, axis=1), 1.0, atol=1e-9)
-    # Walking along the belt leads back to where it began.
+    # The belt is closed.
     np.testing.assert_allclose((tangents * lengths[:, None]).sum(axis=0), 0.0, atol=0.03 * lengths.sum())
     assert tangents[np.argmin(positions[:, 1]), 0] < -0.7
     tilt = math.asin((rear - front) / length)
@@ -64,7 +64,7 @@ def test_flippers_move_their_points_and_the_inertia():
     front = (marv.point_flippers == 0) | (marv.point_flippers == 1)
     assert float(raised.points[front][:, 2].max()) > float(marv.points[front][:, 2].max()) + 0.2
     assert torch.equal(raised.points[~front], marv.points[~front])
-    # Raised to the front only: mass moves up and back, none is lost.
+    # With the front flippers raised, mass moves up and back; the total is unchanged.
     assert float(raised.mass) == pytest.approx(float(marv.mass))
     shift = raised.centre_of_mass - marv.centre_of_mass
     lift = 2 * 4.0 * 0.18 * (math.sin(0.8) - math.sin(-0.14)) / 60.0
@@ -117,7 +117,7 @@ CHANGES = [
 
 
 @pytest.mark.parametrize(("change", "message"), CHANGES)
-def test_wrong_files_are_named_with_file_and_field(tmp_path, change, message):
+def test_errors_name_the_file_and_the_field(tmp_path, change, message):
     content = yaml.safe_load(robot_file("husky").read_text())
     change(content)
     file = tmp_path / "robot.yaml"
@@ -127,7 +127,7 @@ def test_wrong_files_are_named_with_file_and_field(tmp_path, change, message):
     assert str(file) in str(caught.value)
 
 
-def test_unknown_names_list_what_there_is():
+def test_the_error_of_an_unknown_name_lists_the_shipped_robots():
     with pytest.raises(RobotFileError, match=r"no robot named 'huskey'.*husky"):
         load_robot("huskey")
     with pytest.raises(RobotFileError, match="does not exist"):
@@ -141,3 +141,13 @@ def test_any_text_as_a_robot_file_is_refused_in_one_sentence(tmp_path_factory, t
     file.write_text(text, encoding="utf-8")
     with pytest.raises(RobotFileError):
         load_robot(file)
+
+
+@pytest.mark.parametrize("key", ["indistinguishable", "rivals"])
+def test_indistinguishable_effects_are_written_under_the_new_and_the_former_name(tmp_path, key):
+    parameters = {"gain": {"value": 0.9, "low": 0.85, "high": 0.95, "unit": "-"}}
+    effect = {"name": "drive_gain", "parameters": parameters, key: ["turning_scrub"]}
+    file = write_robot("husky", tmp_path / "husky.yaml", [effect], [tmp_path / "bag"], "0")
+    (written,) = yaml.safe_load(file.read_text())["effects"]
+    assert written["provenance"]["indistinguishable"] == written["provenance"]["rivals"] == ["turning_scrub"]
+    assert dict(load_robot(file).effects) == {"drive_gain": {"gain": 0.9}}

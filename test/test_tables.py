@@ -1,4 +1,4 @@
-"""Tables of terrain sources: what is averaged over what, and the installed executable on a real bag."""
+"""Tables of terrain sources: means, ratios and their intervals, and the installed executable on a bag."""
 
 import json
 import subprocess
@@ -37,17 +37,17 @@ def test_errors_count_as_long_as_the_measured_robot_is_on_the_map():
     evaluation.predicted[PHYSICS].positions[:, 33:, 1] += 100.0
     errors = _sequence("drive", evaluation, PHYSICS, np.array([True, True]))
     assert errors.position == pytest.approx(0.3) and errors.rotation == pytest.approx(0.0) and errors.windows == 2
-    # The start is the same for all and does not dilute the mean; a window left out does not count.
+    # The start is the same for all and does not enter the mean; neither does a window that is not selected.
     evaluation.predicted[PHYSICS].positions[1] += 50.0
     assert _sequence("drive", evaluation, PHYSICS, np.array([True, False])).position == pytest.approx(0.3)
-    # A robot that leaves at once leaves nothing to compare.
+    # A robot that leaves the map at once provides no poses to compare.
     assert np.isnan(_sequence("drive", straight(0.3, speed=40.0), PHYSICS, np.array([True, True])).position)
 
 
-def test_means_and_ratios_are_over_drives():
+def test_means_and_ratios_are_over_recordings():
     mean = mean_over([1.0, 2.0, 3.0, float("nan")])
     assert mean.value == 2.0 and 1.0 <= mean.low < 2.0 < mean.high <= 3.0
-    # Drives differ by more than the systems do: resampled together, the ratio is still sure.
+    # Recordings differ more than systems do: with paired resampling, the ratio is nevertheless certain.
     ratio = ratio_over([0.5, 5.0, 50.0], [1.0, 10.0, 100.0])
     assert ratio.value == ratio.low == ratio.high == 0.5
     assert np.isnan(mean_over([]).value) and np.isnan(ratio_over([], []).value)
@@ -63,7 +63,7 @@ def checkpoints(tmp_path_factory):
     return folder
 
 
-def test_the_executable_compares_and_shows(executables, demo_bag, checkpoints, tmp_path):
+def test_the_executable_writes_json_markdown_and_html(executables, demo_bag, checkpoints, tmp_path):
     docs = tmp_path / "page.md"
     docs.write_text("before\n<!-- tables -->\nold\n<!-- end of tables -->\nafter\n")
     done = subprocess.run(
@@ -76,13 +76,13 @@ def test_the_executable_compares_and_shows(executables, demo_bag, checkpoints, t
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     found = json.loads((tmp_path / "out" / "tables.json").read_text())["grass"]
-    assert found["drives"] == 1 and found["windows"] >= 5
+    assert found["recordings"] == found["drives"] == 1 and found["windows"] >= 5
     assert set(found["systems"]) == {"lidar", "lss", "lidar_network", "flat", "constant"}
-    # The same numbers as by hand, and none is a copy of another.
-    by_hand = evaluate_sequence(demo_bag, load_robot("husky"), [LIDAR, FLAT])
+    # The same numbers as computed directly, and all different.
+    direct = evaluate_sequence(demo_bag, load_robot("husky"), [LIDAR, FLAT])
     for key in ("lidar", "flat"):
         value = found["systems"][key]["position"]["value"]
-        assert value == pytest.approx(by_hand[key].position, rel=0.05)
+        assert value == pytest.approx(direct[key].position, rel=0.05)
     values = [entry["position"]["value"] for entry in found["systems"].values()]
     assert len({round(v, 9) for v in values}) == 5 and all(np.isfinite(values))
     page = (tmp_path / "out" / "tables.html").read_text()
@@ -92,7 +92,7 @@ def test_the_executable_compares_and_shows(executables, demo_bag, checkpoints, t
     assert "| images | images → H_g, LSS [9] |" in text
 
 
-def test_what_cannot_be_compared_is_said_in_one_line(executables, demo_bag, tmp_path):
+def test_errors_are_reported_in_one_line(executables, demo_bag, tmp_path):
     def run(*arguments):
         return subprocess.run(
             [executables / "evaluate", "--tables", *arguments, "--out", tmp_path],

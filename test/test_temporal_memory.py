@@ -1,4 +1,4 @@
-"""What a terrain source saw a moment ago fills what it does not see now, as long as that is to be trusted."""
+"""Earlier observations of a terrain source fill cells that it does not observe now, while they can be trusted."""
 
 from dataclasses import dataclass, field, replace
 
@@ -16,8 +16,8 @@ from monoforce_ros.terrain import Grid, TerrainMap
 GRID = Grid.square(6.4, 0.1)
 X, Y = np.meshgrid(GRID.x, GRID.y)
 WHEELS = -0.131
-UNSEEN = -0.2
-"""What it guesses elsewhere: somewhat below the robot."""
+UNOBSERVED = -0.2
+"""Height in cells without an observation, somewhat below the robot."""
 
 
 def ground(x, y):
@@ -27,7 +27,7 @@ def ground(x, y):
 
 @dataclass
 class Ahead:
-    """A source that sees, exactly, what lies more than a metre ahead and within 45 degrees."""
+    """A source that observes, without error, cells more than a metre ahead and within 45 degrees."""
 
     block: bool = True
     sensors: tuple[str, ...] = ()
@@ -38,12 +38,12 @@ class Ahead:
         height = ground(places[:, 0], places[:, 1]) if self.block else 0.1 * places[:, 0]
         height = (height - motion.position[2]).reshape(X.shape)
         seen = (X > 1.0) & (np.abs(Y) < X)
-        height = torch.from_numpy(np.where(seen, height, UNSEEN).astype(np.float32))
+        height = torch.from_numpy(np.where(seen, height, UNOBSERVED).astype(np.float32))
         return TerrainMap.from_height(height, GRID, observed=torch.from_numpy(seen))
 
 
 def at(seconds, x, y=0.0, heading=0.0, speed=0.0):
-    """A robot that stands on the slope."""
+    """A robot on the slope."""
     slope = Rotation.from_euler("y", -np.arctan(0.1))
     rotation = (slope * Rotation.from_euler("z", heading)).as_matrix()
     place = np.array([x, y, ground(x, y) - WHEELS])
@@ -51,7 +51,7 @@ def at(seconds, x, y=0.0, heading=0.0, speed=0.0):
 
 
 def remembering(source=None, **settings):
-    settings = {"seconds": 10.0} | settings
+    settings = {"retention_time": 10.0} | settings
     return TemporalMemory(source or Ahead(), load_robot("husky"), stiffness=2e6, **settings)
 
 
@@ -60,7 +60,7 @@ def see(memory, motion):
 
 
 def height_at(terrain, motion, x, y):
-    """Of the map in the odometry frame, at a place there; None where nothing was seen."""
+    """Height of the map at a position in the odometry frame; None in an unobserved cell."""
     local = transform_points(np.linalg.inv(motion.odometry_from_terrain), np.array([[x, y, 0.0]]))
     rows, columns, inside = terrain.grid.cells(local[:, :2])
     assert inside.all()
@@ -78,20 +78,20 @@ def drive(memory, seconds=0.0):
     return terrain, motion
 
 
-def test_what_was_seen_before_the_turn_is_still_there_at_its_height():
+def test_observations_from_before_a_turn_are_kept_with_their_height():
     terrain, motion = drive(memory := remembering())
     for place in ((2.5, 1.0), (2.5, 0.2), (3.0, 0.4), (2.4, 0.1)):
         assert height_at(terrain, motion, *place) == pytest.approx(ground(*place), abs=0.03)
-    # Never seen, beside and behind: nobody claims to know.
+    # Cells to the side and behind were never observed.
     assert height_at(terrain, motion, 1.0, 2.0) is None
     assert memory.grid == GRID and memory.sensors == ()
     alone = Ahead().terrain(Observation(0), motion)
     assert height_at(alone, motion, 2.5, 1.0) is None, "without memory it is gone"
 
 
-def test_what_is_remembered_for_long_does_not_melt():
-    """The robot turns to and fro, ten images a second; the block has lost nothing of its height and edges."""
-    drive(memory := remembering(seconds=60.0))
+def test_kept_observations_are_not_smoothed_away():
+    """The robot turns back and forth at ten images a second; the block keeps its height and edges."""
+    drive(memory := remembering(retention_time=60.0))
     for index in range(200):
         motion = at(7.0 + 0.1 * index, 1.5, heading=-1.5 - 0.3 * np.sin(0.2 * index))
         terrain = see(memory, motion)
@@ -99,7 +99,7 @@ def test_what_is_remembered_for_long_does_not_melt():
     assert height_at(terrain, motion, 2.5, 0.45) == pytest.approx(0.25, abs=0.06)
 
 
-def test_it_goes_along_over_any_distance():
+def test_the_memory_moves_with_the_robot_over_any_distance():
     memory = remembering()
     for index in range(120):
         motion = at(0.5 * index, 0.25 * index, speed=0.5)
@@ -109,7 +109,7 @@ def test_it_goes_along_over_any_distance():
         assert height_at(terrain, motion, *place) == pytest.approx(ground(*place), abs=0.03)
 
 
-def test_what_is_seen_now_replaces_what_was_seen_before():
+def test_new_observations_replace_earlier_ones():
     source = Ahead()
     memory = remembering(source)
     motion = at(0.0, 0.0)
@@ -120,42 +120,42 @@ def test_what_is_seen_now_replaces_what_was_seen_before():
     assert height_at(*drive(memory, 1.0), 2.5, 1.0) == pytest.approx(0.25, abs=0.02)
 
 
-def test_what_stood_out_is_not_believed_to_be_gone_from_nearby():
-    """An encoder that sees no more than a piece of a wall takes it for ground; the robot would drive into it."""
+def test_an_obstacle_nearby_is_kept_although_it_seems_to_disappear():
+    """An encoder that sees only a part of a wall takes it for ground; the robot would drive into it."""
     source = Ahead()
-    memory = remembering(source, seconds=3.0)
+    memory = remembering(source, retention_time=3.0)
     motion = at(1.0, 1.0)
     assert height_at(see(memory, motion), motion, 2.5, 1.0) == pytest.approx(0.65, abs=0.02)
     source.block = False
     for seconds in (1.5, 2.0, 2.5):
         terrain = see(memory, motion := at(seconds, 0.9 + 0.1 * seconds, speed=0.1))
         assert height_at(terrain, motion, 2.5, 1.0) == pytest.approx(0.65, abs=0.03)
-        # What does not stand out is taken as it is seen now.
+        # Cells without an obstacle take the new observation.
         assert height_at(terrain, motion, 2.4, -0.5) == pytest.approx(0.24, abs=0.02)
-    # It is not seen again either, and forgotten after its time.
+    # Without a new observation it is forgotten after the retention time.
     terrain = see(memory, motion := at(4.5, 1.15))
     assert height_at(terrain, motion, 2.5, 1.0) == pytest.approx(0.25, abs=0.02)
 
 
-def test_it_is_forgotten_after_its_time_and_after_a_way():
-    memory = remembering(seconds=4.0)
+def test_cells_are_forgotten_after_the_retention_time_and_distance():
+    memory = remembering(retention_time=4.0)
     _, motion = drive(memory)
     for _ in range(7):
         motion = at(motion.stamp * 1e-9 + 0.5, 1.5, heading=-1.5)
         terrain = see(memory, motion)
     assert height_at(terrain, motion, 2.5, 1.0) is None
-    memory = remembering(distance=1.2)
+    memory = remembering(retention_distance=1.2)
     terrain, motion = drive(memory)
     assert height_at(terrain, motion, 2.5, 0.2) is not None
     for index in range(1, 15):
-        # To and fro on the spot where it stands: odometry has had its chances to drift.
+        # Moving back and forth over a few centimetres also lets odometry drift.
         motion = at(motion.stamp * 1e-9 + 0.2, 1.5 + 0.1 * (index % 2), heading=-1.5)
         terrain = see(memory, motion)
     assert height_at(terrain, motion, 2.5, 0.2) is None
 
 
 @pytest.mark.parametrize("elsewhere", [{"seconds": 6.5, "x": 1.5, "y": 3.0}, {"seconds": 1.0, "x": 1.5}])
-def test_a_jump_of_odometry_or_of_time_ends_it(elsewhere):
+def test_a_jump_of_odometry_or_of_time_clears_the_memory(elsewhere):
     memory = remembering()
     drive(memory)
     motion = at(**elsewhere, heading=-1.5)
@@ -163,8 +163,8 @@ def test_a_jump_of_odometry_or_of_time_ends_it(elsewhere):
     assert terrain.observed.sum() == Ahead().terrain(Observation(0), motion).observed.sum()
 
 
-def test_it_stays_clear_of_the_robot_that_drives_where_it_saw_something():
-    """An encoder that took grass for a wall, or odometry that slipped: no map may throw the robot."""
+def test_the_footprint_of_the_robot_stays_clear_where_an_obstacle_was_observed():
+    """Grass taken for a wall, or odometry errors, must not put a surface inside the robot."""
     memory = remembering()
     for index in range(13):
         motion = at(0.5 * index, 0.2 * index, y=0.8, speed=0.4)
@@ -173,7 +173,7 @@ def test_it_stays_clear_of_the_robot_that_drives_where_it_saw_something():
     assert (terrain.height[rows, columns] < 0.05).all()
 
 
-def test_another_calibration_ends_it():
+def test_another_calibration_clears_the_memory():
     memory = remembering()
     drive(memory)
     wide = CameraModel(100, 80, np.array([[50.0, 0, 50], [0, 50, 40], [0, 0, 1]]), np.zeros(5))
@@ -185,6 +185,6 @@ def test_another_calibration_ends_it():
         assert (terrain.observed.sum() > alone) == remembers
 
 
-def test_a_memory_of_no_length_is_refused():
-    with pytest.raises(ValueError, match="memory: got 0"):
-        remembering(seconds=0.0)
+def test_a_retention_time_of_zero_is_refused():
+    with pytest.raises(ValueError, match="temporal memory: got a retention time of 0"):
+        remembering(retention_time=0.0)

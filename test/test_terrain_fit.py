@@ -19,7 +19,7 @@ from monoforce_ros.synthetic.labels import GroundClass, labels_file
 from monoforce_ros.synthetic.odometry import OdometrySettings
 from monoforce_ros.synthetic.recording import RecordingSettings, record
 from monoforce_ros.terrain import Grid, TerrainFileError, TerrainMap, accumulate, load_terrain, save_terrain
-from monoforce_ros.terrain.accumulation import company
+from monoforce_ros.terrain.accumulation import count_neighbours
 from monoforce_ros.training import FitSettings, fit_terrain
 from monoforce_ros.training.fit_cli import FitFigures, existing_figures
 from monoforce_ros.training.terrain_fit import trajectory_frame, trajectory_grid
@@ -145,9 +145,9 @@ def test_sweeps_are_accumulated_at_their_poses_without_dust():
     assert accumulate([]).shape == (0, 3)
 
 
-def test_company_counts_neighbours_across_cubes():
+def test_neighbours_are_counted_across_voxels():
     points = np.array([[0.01, 0, 0], [0.09, 0, 0], [0.11, 0, 0], [0.35, 0, 0], [5.0, 5.0, 5.0]])
-    assert company(points, 0.1).tolist() == [3, 3, 3, 1, 1]
+    assert count_neighbours(points, 0.1).tolist() == [3, 3, 3, 1, 1]
 
 
 def test_maps_survive_a_file(tmp_path):

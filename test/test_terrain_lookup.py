@@ -1,4 +1,4 @@
-"""Terrain lookup against closed forms; each case is a mistake that is easily made."""
+"""Terrain lookup compared with closed forms; each test covers an easy mistake."""
 
 import numpy as np
 import pytest
@@ -41,7 +41,7 @@ def test_cells_have_their_values_at_their_centres_in_row_and_column():
 
 @pytest.mark.parametrize("kind", ["bilinear", "constant"])
 @pytest.mark.parametrize("where", [(-9.0, 0.2), (9.0, 0.2), (0.2, -9.0), (0.2, 9.0), (9.0, 9.0)])
-def test_beyond_the_edge_the_border_goes_on_and_never_wraps(kind, where):
+def test_beyond_the_edge_the_border_value_is_extended(kind, where):
     grid = Grid(5, 7, 0.1, (0.0, 0.0))
     height = torch.arange(35, dtype=torch.float64).reshape(5, 7)
     lookup = TerrainLookup(TerrainMap.from_height(height, grid), kind, 1)

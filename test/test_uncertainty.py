@@ -1,4 +1,4 @@
-"""Spread and refinement: bands that hold what happens, and candidates that cost less than before."""
+"""Spread and refinement: bands that contain the outcomes, and candidates with lower cost."""
 
 from dataclasses import replace
 
@@ -7,11 +7,8 @@ import pytest
 import torch
 
 from monoforce_ros.core import MotionState
-from monoforce_ros.planning import CostWeights, Limits, assess, refine
-from monoforce_ros.planning.candidates import over_horizon
-from monoforce_ros.planning.costs import force_every
-from monoforce_ros.prediction import Prediction, Predictor
-from monoforce_ros.prediction.ensemble import EnsembleSettings, spread
+from monoforce_ros.planning import CostWeights, Limits, assess, force_every, over_horizon, refine
+from monoforce_ros.prediction import EnsembleSettings, Prediction, Predictor, spread
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainMap
 
@@ -41,7 +38,7 @@ def predicted(predictor: Predictor, height=0.0 * X, command=(0.6, 0.2)) -> tuple
     return Prediction(STILL, terrain, predictor.roll_out(terrain, [STILL], twists)), twists[0]
 
 
-def test_nothing_varied_is_no_spread(predictor):
+def test_without_variation_there_is_no_spread(predictor):
     prediction, twists = predicted(predictor)
     found = spread(predictor, prediction, twists, EnsembleSettings(members=4, **NOTHING))
     for name in ("along", "across", "up", "heading", "radius"):
@@ -49,7 +46,7 @@ def test_nothing_varied_is_no_spread(predictor):
     assert found.valid == 4
 
 
-def test_each_thing_spreads_what_it_should(predictor):
+def test_each_variation_has_the_expected_spread(predictor):
     prediction, twists = predicted(predictor, command=(0.6, 0.0))
     driven = prediction.positions()[-1, 0]
     only = {**NOTHING, "gain": 0.05}
@@ -68,7 +65,7 @@ def test_each_thing_spreads_what_it_should(predictor):
     np.testing.assert_allclose(wide.radius, 2 * drift.radius, rtol=1e-6)
 
 
-def test_the_interval_of_an_effect_spreads_and_an_exact_value_does_not(predictor):
+def test_the_interval_of_an_effect_adds_spread_and_an_exact_value_does_not(predictor):
     robot = replace(predictor.robot, effects=(("command_delay", {"delay": 0.3}),))
     sure = Predictor(robot, None, horizon=4.0)
     unsure = Predictor(replace(robot, effect_intervals=(("command_delay", {"delay": (0.1, 0.5)}),)), None, horizon=4.0)
@@ -79,51 +76,51 @@ def test_the_interval_of_an_effect_spreads_and_an_exact_value_does_not(predictor
     assert spread(unsure, prediction, twists, settings).along[-1] == pytest.approx(0.06, rel=0.4)
 
 
-def test_the_band_holds_what_its_own_variations_bring_about(predictor):
-    """Of members drawn with another seed about 90 % lie within the band."""
+def test_the_band_contains_members_of_another_seed(predictor):
+    """About 90 % of the members drawn with another seed lie within the band."""
     prediction, twists = predicted(predictor, BUMPS)
     settings = EnsembleSettings(members=64, drift=0.0, position=0.0, scale=1.0)
     found = spread(predictor, prediction, twists, settings)
     other = spread(predictor, prediction, twists, replace(settings, seed=5))
     assert other.radius[-1] == pytest.approx(found.radius[-1], rel=0.5)
-    # Members of that other draw end within the circle as often as it says.
+    # The radius agrees with the deviation of the other members.
     inside = np.hypot(other.along[-1], other.across[-1]) * np.sqrt(np.log(10))
     assert inside == pytest.approx(found.radius[-1], rel=0.5)
 
 
-def test_settings_of_an_ensemble_are_checked():
+def test_ensemble_settings_are_validated():
     for wrong in ({"members": 1}, {"friction": -1.0}, {"scale": 0.0}, {"drift": float("nan")}):
         with pytest.raises(ValueError, match="got"):
             EnsembleSettings(**wrong)
 
 
-def test_refinement_costs_less_and_ends_where_it_did(predictor):
+def test_refinement_lowers_the_cost_and_keeps_the_end(predictor):
     prediction, _ = predicted(predictor, BUMPS)
     before, best = np.zeros((predictor.history, 2)), np.array([[0.6, 0.0]])
     found = refine(predictor, prediction, before, best, seconds=30.0)
     assert found.rounds >= 2 and found.cost < 0.9 * found.cost_before
     assert found.sequence.shape == (predictor.steps, 2)
-    # What it says of the cost is what a rollout of the commands costs.
+    # The reported cost is that of a rollout of the commands.
     ends = []
     for sequence, cost in ((best, found.cost_before), (found.sequence, found.cost)):
         twists = over_horizon(sequence[None], before, predictor.steps)
-        asked = torch.from_numpy(twists[:, predictor.history :]).float()
+        commanded = torch.from_numpy(twists[:, predictor.history :]).float()
         costs = []
         for every in (force_every(predictor.options.time_step), 1):
             rolled = predictor.roll_out(
                 prediction.terrain, [STILL], twists, with_forces=False, with_contact=True, force_every=every
             )
-            assessed = assess(rolled, prediction.terrain, predictor.robot, asked)
+            assessed = assess(rolled, prediction.terrain, predictor.robot, commanded)
             assert bool(assessed.feasible[0])
             costs.append(float(assessed.cost[0]))
-        # Every fifth step's forces cost what those of all steps do.
+        # Forces of every fifth step give the same cost as those of all steps.
         assert costs[0] == pytest.approx(cost, rel=1e-3) and costs[1] == pytest.approx(cost, rel=0.1)
         ends.append(rolled.position[0, -1].numpy())
     assert np.linalg.norm(ends[1] - ends[0]) < 0.35 * np.linalg.norm(ends[0])
     assert np.abs(found.sequence[:, 0]).max() <= predictor.robot.maximum_speed
 
 
-def test_refinement_leaves_what_comes_before_the_candidate_begins(predictor):
+def test_refinement_leaves_commands_before_the_candidate_unchanged(predictor):
     prediction, _ = predicted(predictor, BUMPS)
     held = predictor.steps // 4
     before = np.concatenate([np.zeros((predictor.history, 2)), np.full((held, 2), [0.3, 0.2])])
@@ -133,12 +130,12 @@ def test_refinement_leaves_what_comes_before_the_candidate_begins(predictor):
     twists = over_horizon(found.sequence[None], before, predictor.steps - held)
     assert twists.shape == (1, predictor.history + predictor.steps, 2)
     rolled = predictor.roll_out(prediction.terrain, [STILL], twists, with_forces=False, with_contact=True)
-    asked = torch.from_numpy(twists[:, predictor.history :]).float()
-    cost = float(assess(rolled, prediction.terrain, predictor.robot, asked).cost[0])
+    commanded = torch.from_numpy(twists[:, predictor.history :]).float()
+    cost = float(assess(rolled, prediction.terrain, predictor.robot, commanded).cost[0])
     assert cost == pytest.approx(found.cost, rel=0.1)
 
 
-def test_refinement_keeps_to_its_budget_and_leaves_what_is_not_feasible(predictor):
+def test_refinement_keeps_its_budget_and_leaves_infeasible_candidates_unchanged(predictor):
     prediction, _ = predicted(predictor, BUMPS)
     before, best = np.zeros((predictor.history, 2)), np.array([[0.6, 0.0]])
     none = refine(predictor, prediction, before, best, seconds=0.05, round_seconds=0.5)

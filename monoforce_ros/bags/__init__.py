@@ -1,7 +1,7 @@
 """Read and write rosbag files of ROS 2 (sqlite3, mcap) and read those of ROS 1, without a ROS installation."""
 
 from monoforce_ros.bags import builders
-from monoforce_ros.bags.reader import BagError, BagReader
+from monoforce_ros.bags.reader import BagError, BagMessage, BagReader
 from monoforce_ros.bags.recording import (
     CAMERA_INFO,
     CLOUD,
@@ -26,6 +26,7 @@ __all__ = [
     "IMAGES",
     "ODOMETRY",
     "BagError",
+    "BagMessage",
     "BagReader",
     "BagWriter",
     "Frame",

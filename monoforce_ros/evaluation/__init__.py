@@ -1,8 +1,19 @@
-"""How good predictions are: metrics, baselines, figures and reports over recorded drives."""
+"""Evaluation: predictions along recordings compared with the measured motion and with baselines."""
 
-from monoforce_ros.evaluation.recording_evaluation import RecordingEvaluation, evaluate_recording
+from monoforce_ros.evaluation.recording_evaluation import (
+    EvaluationError,
+    RecordingEvaluation,
+    corrected_recording,
+    evaluate_recording,
+    observe,
+    predict_at,
+)
 
 __all__ = [
+    "EvaluationError",
     "RecordingEvaluation",
+    "corrected_recording",
     "evaluate_recording",
+    "observe",
+    "predict_at",
 ]

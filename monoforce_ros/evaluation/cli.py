@@ -1,11 +1,13 @@
-"""``evaluate``: predictions along a bag against the measured motion."""
+"""``evaluate``: compare predictions along a bag with the measured motion."""
 
 from __future__ import annotations
 
 import argparse
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
+from typing import override
 
 import numpy as np
 import torch
@@ -20,78 +22,106 @@ from monoforce_ros.evaluation.recording_evaluation import (
     CONSTANT_VELOCITY,
     PHYSICS,
     EvaluationError,
+    RecordingEvaluation,
     evaluate_recording,
     predict_at,
 )
-from monoforce_ros.evaluation.report import terminal_table, write_reports
+from monoforce_ros.evaluation.report import Picture, terminal_table, write_reports
 from monoforce_ros.evaluation.view import PredictionView
 from monoforce_ros.messages import MessageError
 from monoforce_ros.perception import SOURCES, choose_terrain_source
 from monoforce_ros.physics import PhysicsOptions
 from monoforce_ros.prediction import Predictor
 from monoforce_ros.reporting import figure_png
-from monoforce_ros.robots import RobotFileError, RobotModel, load_robot, shipped_robots
+from monoforce_ros.robots import RobotFileError, load_robot, shipped_robots
 from monoforce_ros.terrain import TerrainDefaults
+
+
+class _FormerOption(argparse.Action):
+    """An option under its former name: works, and prints a warning with the new one."""
+
+    @override
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: str | Sequence[object] | None,
+        option_string: str | None = None,
+    ) -> None:
+        new = f"--{self.dest.replace('_', '-')}"
+        print(f"warning: {option_string} is deprecated and will be removed; use {new}", file=sys.stderr)
+        setattr(namespace, self.dest, values)
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="evaluate",
-        description="Predict along a recorded drive and compare with the motion that was measured. Writes report.html, "
-        "report.json and pictures.",
+        description="Predict along a recording and compare with the measured motion. Writes report.html, report.json "
+        "and figures.",
     )
     parser.add_argument("bag", nargs="?", help="rosbag2 folder or ROS 1 .bag file (default: the demo bag)")
-    parser.add_argument("--robot", default="husky", help=f"robot file or one of {', '.join(shipped_robots())}")
-    parser.add_argument("--out", default="evaluation", help="folder for the report (default: evaluation)")
+    parser.add_argument(
+        "--robot", default="husky", help=f"robot file or one of {', '.join(shipped_robots())} (default: husky)"
+    )
+    parser.add_argument("--out", default="evaluation", help="output folder (default: evaluation)")
     parser.add_argument("--terrain", choices=SOURCES, default="lidar", help="terrain source (default: lidar)")
     parser.add_argument(
-        "--checkpoint", default="", help="terrain encoder weights, for --terrain camera (default: the shipped ones)"
+        "--checkpoint",
+        default="",
+        help="terrain encoder weights, for camera terrain sources (default: the shipped ones)",
     )
     parser.add_argument(
-        "--memory",
+        "--retention-time",
         type=float,
         default=0.0,
         metavar="S",
-        help="for so long what cameras saw is remembered (default: not at all, as in the node)",
+        help="how long terrain seen by cameras is kept after it leaves the images (default: 0, as in the node)",
     )
+    parser.add_argument("--memory", type=float, dest="retention_time", action=_FormerOption, help=argparse.SUPPRESS)
     parser.add_argument("--images", nargs="+", default=None, metavar="TOPIC", help="image topics (default: all)")
-    parser.add_argument("--odometry", default=None, metavar="TOPIC", help="odometry topic (default: found by type)")
-    parser.add_argument("--commands", default=None, metavar="TOPIC", help="command topic (default: found by type)")
-    parser.add_argument("--cloud", default=None, metavar="TOPIC", help="point cloud topic (default: found by type)")
-    parser.add_argument("--horizons", nargs="+", type=float, default=[1.0, 2.0, 5.0], metavar="S", help="seconds")
-    parser.add_argument("--stride", type=float, default=0.4, help="least seconds between windows (default 0.4)")
+    parser.add_argument("--odometry", default=None, metavar="TOPIC", help="odometry topic (default: detected by type)")
+    parser.add_argument("--commands", default=None, metavar="TOPIC", help="command topic (default: detected by type)")
+    parser.add_argument("--cloud", default=None, metavar="TOPIC", help="point cloud topic (default: detected by type)")
+    parser.add_argument("--horizons", nargs="+", type=float, default=[1.0, 2.0, 5.0], metavar="S",
+                        help="times at which errors are reported [s] (default: 1 2 5)")  # fmt: skip
     parser.add_argument(
-        "--friction", type=float, default=TerrainDefaults.friction, help="ground friction (default 0.8)"
+        "--stride", type=float, default=0.4, help="smallest time between predictions [s] (default: 0.4)"
+    )
+    parser.add_argument(
+        "--friction",
+        type=float,
+        default=TerrainDefaults.friction,
+        help="friction coefficient of the ground (default: 0.8)",
     )
     parser.add_argument(
         "--check",
         action="store_true",
-        help="only say what the bag holds, what is missing, its rates, gaps, clocks and frames; status 1 if unusable",
+        help="only report the bag's contents, missing data, rates, gaps, clocks and frames; exit status 1 if unusable",
     )
     parser.add_argument(
         "--tables",
         action="store_true",
-        help="compare terrain sources over many drives instead; see `evaluate --tables --help`",
+        help="compare terrain sources over many recordings instead; see `evaluate --tables --help`",
     )
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     return parser
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the evaluation; see ``--help``. Returns 0, or 1 with one line that says what is wrong."""
-    given = sys.argv[1:] if arguments is None else arguments
-    if "--tables" in given:
+    """Run the evaluation; see ``--help``. Returns 0, or 1 after an error message of one line."""
+    words = sys.argv[1:] if arguments is None else arguments
+    if "--tables" in words:
         from monoforce_ros.evaluation.tables_cli import main as compare
 
-        return compare(given)
+        return compare(words)
     parser = _parser()
-    options = parser.parse_args(given)
+    options = parser.parse_args(words)
     if any(not 0.1 <= h <= 30 for h in options.horizons):
         parser.error(f"--horizons: got {options.horizons}, expected 0.1 to 30 s")
     if not 0 <= options.friction <= 3:
         parser.error(f"--friction: got {options.friction}, expected 0 to 3")
-    if not 0 <= options.memory <= 600:
-        parser.error(f"--memory: got {options.memory}, expected 0 to 600 s")
+    if not 0 <= options.retention_time <= 600:
+        parser.error(f"--retention-time: got {options.retention_time}, expected 0 to 600 s")
     try:
         if options.check:
             check = check_bag(options.bag or share_directory() / "bags" / "demo", load_robot(options.robot))
@@ -107,14 +137,18 @@ def main(arguments: list[str] | None = None) -> int:
 def run(options: argparse.Namespace) -> None:
     """Evaluate and write the reports."""
     began = time.monotonic()
-    # Many small operations: one thread is faster than several, and does not collapse on a busy machine.
+    # Operations are many and small: one thread is faster than several, above all on a busy machine.
     torch.set_num_threads(1)
     bag = options.bag or share_directory() / "bags" / "demo"
     robot = load_robot(options.robot)
     recording = Recording.open(bag, odometry=options.odometry, commands=options.commands, cloud=options.cloud)
     material = TerrainDefaults(friction=options.friction)
     source = choose_terrain_source(
-        options.terrain, robot, material=material, checkpoint=options.checkpoint, memory=options.memory
+        options.terrain,
+        robot,
+        material=material,
+        checkpoint=options.checkpoint,
+        retention_time=options.retention_time,
     )
     predictor = Predictor(robot, source, horizon=max(options.horizons), options=PhysicsOptions())
     topics = tuple(options.images or recording.images) if "camera" in source.sensors else ()
@@ -124,24 +158,24 @@ def run(options: argparse.Namespace) -> None:
         image_topics=topics,
         horizons=sorted(options.horizons),
         stride=options.stride,
-        progress=not options.quiet,
+        quiet=options.quiet,
     )
     folder = Path(options.out)
     pictures = [
-        (
-            "Error against the horizon",
-            "Line: median over the windows. Band: the middle half of them.",
+        Picture(
+            "Error over the horizon",
+            "Line: median over the windows. Band: interquartile range.",
             figure_png(figures.error_figure(evaluation)),
         ),
-        (
-            "The drive from above",
-            "Black: what was measured. Each dot starts a prediction of "
-            f"{max(options.horizons):g} s ({PHYSICS}: solid, {CONSTANT_VELOCITY}: dotted).",
-            figure_png(figures.drive_figure(evaluation, recording.motion.positions)),
+        Picture(
+            "Top view of the recording",
+            "Black: measured path. A prediction of "
+            f"{max(options.horizons):g} s starts at each dot ({PHYSICS}: solid, {CONSTANT_VELOCITY}: dotted).",
+            figure_png(figures.recording_figure(evaluation, recording.motion.positions)),
         ),
     ]
     folder.mkdir(parents=True, exist_ok=True)
-    for name, number in _moments(evaluation):
+    for name, number in _example_windows(evaluation):
         stamp = int(evaluation.stamps[number])
         prediction = predict_at(recording, predictor, stamp, topics)
         later = recording.motion.stamps - stamp
@@ -149,14 +183,18 @@ def run(options: argparse.Namespace) -> None:
         figure = figures.prediction_figure(
             PredictionView.of_prediction(prediction, robot),
             robot,
-            picture=camera_picture(recording, robot, stamp),
+            picture=figures.CameraPicture.nearest(recording, robot, stamp),
             measured=recording.motion.positions[ahead],
-            title=f"{(stamp - recording.motion.stamps[0]) * 1e-9:.1f} s into the drive, terrain from {options.terrain}",
+            title=f"{(stamp - recording.motion.stamps[0]) * 1e-9:.1f} s into the recording, terrain: {options.terrain}",
         )
         png = figure_png(figure)
         (folder / f"prediction_{name}.png").write_bytes(png)
         pictures.append(
-            (f"The {name} prediction", "Predicted path in orange, measured path dashed, forces in red.", png)
+            Picture(
+                f"{name.capitalize()} prediction",
+                "Orange: predicted path. Dashed: measured path. Red: contact forces.",
+                png,
+            )
         )
     settings = {
         "bag": str(bag),
@@ -171,11 +209,11 @@ def run(options: argparse.Namespace) -> None:
     }
     report_json, report_html = write_reports(folder, evaluation, settings, pictures)
     print(terminal_table(evaluation))
-    print(f"report: {report_html}\ndata:   {report_json}\npictures: {folder}/prediction_*.png")
+    print(f"report: {report_html}\ndata:   {report_json}\nfigures: {folder}/prediction_*.png")
 
 
-def _moments(evaluation) -> list[tuple[str, int]]:
-    """A typical window and the worst one, by the position error at the longest horizon that any window reaches."""
+def _example_windows(evaluation: RecordingEvaluation) -> list[tuple[str, int]]:
+    """The median and the worst window, by position error at the longest time that any window reaches on the map."""
     errors, _ = evaluation.errors(PHYSICS)
     usable = np.logical_and.accumulate(evaluation.inside, axis=1) & np.isfinite(errors)
     reached = np.flatnonzero(usable.any(axis=0))
@@ -184,25 +222,6 @@ def _moments(evaluation) -> list[tuple[str, int]]:
     final = np.where(usable[:, reached[-1]], errors[:, reached[-1]], np.nan)
     order = np.argsort(final)[: int(np.isfinite(final).sum())]
     return [("typical", int(order[len(order) // 2])), ("worst", int(order[-1]))]
-
-
-def camera_picture(recording: Recording, robot: RobotModel, stamp: int) -> figures.CameraPicture | None:
-    """The image of a forward-looking camera near a stamp, if the bag has one with its calibration and pose."""
-    best = None
-    for topic, camera in recording.cameras.items():
-        frame = min(recording.images[topic], key=lambda entry: abs(entry.stamp - stamp), default=None)
-        if frame is None or abs(frame.stamp - stamp) > 200_000_000:
-            continue
-        try:
-            pose = recording.sensor_pose(camera.frame_id, robot.base_frame, robot.sensors)
-        except BagError:
-            continue
-        if best is None or pose[0, 2] > best[0]:
-            best = pose[0, 2], frame, camera, pose
-    if best is None or best[0] < 0.5:
-        return None
-    _, frame, camera, pose = best
-    return figures.CameraPicture(recording.image(frame), camera, pose)
 
 
 if __name__ == "__main__":

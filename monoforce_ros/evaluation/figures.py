@@ -1,4 +1,4 @@
-"""Figures: a prediction seen from the camera and from above, errors over the horizon, and a drive's trajectories."""
+"""Figures: a prediction in the camera image and from above, errors over the horizon, trajectories of a recording."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from matplotlib.patheffects import withStroke
 
+from monoforce_ros.bags import BagError, Recording, nearest_frame
 from monoforce_ros.core import CameraModel, transform_points
 from monoforce_ros.evaluation.overlay import SURFACE_COLOURS, draw_prediction
 from monoforce_ros.evaluation.recording_evaluation import CONSTANT_VELOCITY, FLAT_PHYSICS, PHYSICS, RecordingEvaluation
@@ -20,8 +21,10 @@ from monoforce_ros.robots import RobotModel
 
 COLOURS = {PHYSICS: "#0b84a5", FLAT_PHYSICS: "#9b59b6", CONSTANT_VELOCITY: "#e08214", "measured": "#1a1a1a"}
 _PATH = "#ffb020"
-_STEERED = "#5ad1ff"
+_RECORDED_COMMANDS = "#5ad1ff"
 _FORCE = "#e8285a"
+_IMAGE_LIMIT = 0.2
+"""Largest time between a prediction and the image that it is drawn into [s]."""
 
 matplotlib.rcParams.update(
     {
@@ -40,8 +43,32 @@ class CameraPicture:
     """A camera image to draw a prediction into."""
 
     image: np.ndarray
+    """RGB ``[height, width, 3]``."""
     camera: CameraModel
     base_from_camera: np.ndarray
+    """Pose of the camera on the robot ``[4, 4]``."""
+
+    @classmethod
+    def nearest(cls, recording: Recording, robot: RobotModel, stamp: int) -> CameraPicture | None:
+        """The image nearest to a stamp [ns] of the camera that points most forward.
+
+        None if no calibrated camera with a known pose points forward, or without an image within 0.2 s.
+        """
+        best = None
+        for topic, camera in recording.cameras.items():
+            frame = nearest_frame(recording.images[topic], stamp, limit=_IMAGE_LIMIT)
+            if frame is None:
+                continue
+            try:
+                pose = recording.sensor_pose(camera.frame_id, robot.base_frame, robot.sensors)
+            except BagError:
+                continue
+            if best is None or pose[0, 2] > best[0]:
+                best = pose[0, 2], frame, camera, pose
+        if best is None or best[0] < 0.5:
+            return None
+        _, frame, camera, pose = best
+        return cls(recording.image(frame), camera, pose)
 
 
 def prediction_figure(
@@ -50,18 +77,18 @@ def prediction_figure(
     *,
     picture: CameraPicture | None = None,
     measured: np.ndarray | None = None,
-    as_steered: np.ndarray | None = None,
+    under_recorded_commands: np.ndarray | None = None,
     title: str = "",
 ) -> Figure:
-    """The prediction in the camera image beside its map from above.
+    """The prediction in the camera image, next to its map from above.
 
     Args:
         view: the prediction to show.
-        robot: whose prediction it is.
-        picture: the camera image of the same moment, if there is one.
-        measured: where the robot went, ``[n, 3]`` in the odometry frame [m].
-        as_steered: where it is predicted to go under the commands that followed, ``[n, 3]`` in the terrain frame [m];
-            the prediction itself then holds the command of its start.
+        robot: the model that the prediction used.
+        picture: the camera image of the same time, if there is one.
+        measured: measured positions ``[n, 3]`` in the odometry frame [m].
+        under_recorded_commands: positions ``[n, 3]`` in the terrain frame [m] that are predicted under the commands
+            recorded afterwards; ``view`` then holds a prediction under the command at its start.
         title: a line above the figure.
     """
     colour_range = _colour_range(view)
@@ -78,15 +105,15 @@ def prediction_figure(
         )
         axes[0].imshow(drawn, interpolation="lanczos")
         axes[0].set_axis_off()
-        axes[0].set_title("from the camera: predicted ground, path and contact forces")
-    _draw_map(axes[-1], view, robot, measured, as_steered, colour_range)
+        axes[0].set_title("camera: predicted ground, path and contact forces")
+    _draw_map(axes[-1], view, robot, measured, under_recorded_commands, colour_range)
     if title:
         figure.suptitle(title, x=0.01, ha="left", fontsize=13, fontweight="bold")
     return figure
 
 
 def _colour_range(view: PredictionView) -> tuple[float, float]:
-    """Heights for the ends of the colour scale: what lies around the path fills it, trees may exceed it."""
+    """Heights at the ends of the colour scale: it spans the ground near the path; trees may exceed it."""
     x, y = np.meshgrid(view.terrain.grid.x, view.terrain.grid.y)
     offsets = np.stack([x, y], axis=-1)[None] - view.positions[:: max(1, len(view.positions) // 10), None, None, :2]
     near = np.linalg.norm(offsets, axis=-1).min(axis=0) < 3.0
@@ -100,7 +127,7 @@ def _draw_map(
     view: PredictionView,
     robot: RobotModel,
     measured: np.ndarray | None,
-    as_steered: np.ndarray | None,
+    under_recorded_commands: np.ndarray | None,
     colour_range: tuple[float, float],
 ) -> None:
     terrain = view.terrain
@@ -110,9 +137,9 @@ def _draw_map(
     shaded = LightSource(azdeg=315, altdeg=50).shade_rgb(
         colours(scaled)[..., :3], height, blend_mode="soft", dx=terrain.grid.resolution, dy=terrain.grid.resolution
     )
-    # What no sensor saw is greyer.
-    seen = terrain.observed.numpy()[..., None]
-    shaded = np.where(seen, shaded, 0.6 * shaded + 0.4 * shaded.mean(axis=2, keepdims=True))
+    # Unobserved cells are less saturated.
+    observed = terrain.observed.numpy()[..., None]
+    shaded = np.where(observed, shaded, 0.6 * shaded + 0.4 * shaded.mean(axis=2, keepdims=True))
     axes.imshow(np.clip(shaded, 0, 1), origin="lower", extent=terrain.grid.extent, interpolation="nearest")
     axes.contour(terrain.grid.x, terrain.grid.y, height, levels=12, colors="k", linewidths=0.4, alpha=0.35)
     to_terrain = np.linalg.inv(view.motion.odometry_from_terrain)
@@ -122,18 +149,25 @@ def _draw_map(
         axes.plot(
             track[:, 0], track[:, 1], color="black", linewidth=1.8, linestyle=(0, (4, 2)), label="measured", zorder=7
         )
-    label = "predicted" if as_steered is None else "predicted, the command held"
+    label = "predicted" if under_recorded_commands is None else "predicted, command held"
     axes.plot(view.positions[:, 0], view.positions[:, 1], color=_PATH, linewidth=3.5, label=label, zorder=6)
-    if as_steered is not None:
-        label = "predicted, as steered later"
-        axes.plot(as_steered[:, 0], as_steered[:, 1], color=_STEERED, linewidth=3.5, label=label, zorder=6.2)
+    if under_recorded_commands is not None:
+        label = "predicted, recorded commands"
+        axes.plot(
+            under_recorded_commands[:, 0],
+            under_recorded_commands[:, 1],
+            color=_RECORDED_COMMANDS,
+            linewidth=3.5,
+            label=label,
+            zorder=6.2,
+        )
     for second in range(int(view.times[-1] + 1e-6) + 1):
         index = int(np.argmin(np.abs(view.times - second)))
         _draw_robot(axes, robot, view.positions[index], view.rotations[index], filled=second == 0)
         if second:
             axes.annotate(
                 f"{second} s",
-                view.positions[index, :2],
+                (view.positions[index, 0], view.positions[index, 1]),
                 xytext=(9, 9),
                 textcoords="offset points",
                 fontsize=9,
@@ -146,10 +180,10 @@ def _draw_map(
     axes.set(xlabel="forward x [m]", ylabel="left y [m]", aspect="equal")
     axes.set_xlim(terrain.grid.extent[:2])
     axes.set_ylim(terrain.grid.extent[2:])
-    axes.set_title("from above: height, robot each second, ground forces")
+    axes.set_title("top view: height, robot every second, contact forces")
     axes.legend(loc="upper left", framealpha=0.9)
     scale = matplotlib.cm.ScalarMappable(matplotlib.colors.Normalize(*colour_range), colours)
-    axes.figure.colorbar(scale, ax=axes, label="height over the robot's base [m]", shrink=0.8, pad=0.01)
+    axes.figure.colorbar(scale, ax=axes, label="height relative to the robot's base [m]", shrink=0.8, pad=0.01)
 
 
 def _draw_robot(axes: Axes, robot: RobotModel, position: np.ndarray, rotation: np.ndarray, *, filled: bool) -> None:
@@ -164,16 +198,17 @@ def _draw_robot(axes: Axes, robot: RobotModel, position: np.ndarray, rotation: n
 
 
 def _draw_forces(axes: Axes, view: PredictionView) -> None:
-    """Points that carry load, sized by it, and the horizontal part of the forces as arrows."""
+    """Loaded contact points, sized by the load, and the horizontal part of the forces as arrows."""
     load = np.linalg.norm(view.contact_forces, axis=1)
     axes.scatter(
-        *view.contact_points[:, :2].T,
+        view.contact_points[:, 0],
+        view.contact_points[:, 1],
         s=260 * load,
         color=_FORCE,
         alpha=0.55,
         linewidths=0,
         zorder=4,
-        label="load on the ground",
+        label="contact force",
     )
     axes.quiver(
         *view.contact_points[:, :2].T,
@@ -188,7 +223,7 @@ def _draw_forces(axes: Axes, view: PredictionView) -> None:
 
 
 def error_figure(evaluation: RecordingEvaluation) -> Figure:
-    """Position and rotation error against the horizon: median and middle half of the windows, per method."""
+    """Position and rotation errors over the horizon: median and interquartile range of the windows, by method."""
     figure = Figure(figsize=(11, 3.8), layout="constrained", dpi=110)
     axes = figure.subplots(1, 2)
     for method in evaluation.predicted:
@@ -202,8 +237,12 @@ def error_figure(evaluation: RecordingEvaluation) -> Figure:
             times = evaluation.times[counted]
             panel.plot(times, middle, color=COLOURS[method], linewidth=2.2, label=method)
             panel.fill_between(times, low, high, color=COLOURS[method], alpha=0.15, linewidth=0)
-    axes[0].set(title="position error Δx", xlabel="time since the prediction [s]", ylabel="[m]", ylim=(0, None))
-    axes[1].set(title="rotation error ΔR", xlabel="time since the prediction [s]", ylabel="[deg]", ylim=(0, None))
+    axes[0].set(
+        title="position error Δx", xlabel="time since the start of the prediction [s]", ylabel="[m]", ylim=(0, None)
+    )
+    axes[1].set(
+        title="rotation error ΔR", xlabel="time since the start of the prediction [s]", ylabel="[deg]", ylim=(0, None)
+    )
     if axes[0].lines:
         axes[0].legend(frameon=False)
     for panel in axes:
@@ -212,18 +251,18 @@ def error_figure(evaluation: RecordingEvaluation) -> Figure:
     return figure
 
 
-def drive_figure(evaluation: RecordingEvaluation, track: np.ndarray, *, most: int = 12) -> Figure:
-    """The measured drive from above with some of the predictions that were made along it.
+def recording_figure(evaluation: RecordingEvaluation, track: np.ndarray, *, windows: int = 12) -> Figure:
+    """Top view of the measured path with some of the predictions along it.
 
     Args:
         evaluation: the windows.
-        track: measured positions of the whole drive ``[n, 3]`` [m].
-        most: number of windows to draw.
+        track: measured positions of the whole recording ``[n, 3]`` [m].
+        windows: largest number of windows to draw.
     """
     figure = Figure(figsize=(11, 5.5), layout="constrained", dpi=110)
     axes = figure.subplots()
     axes.plot(track[:, 0], track[:, 1], color=COLOURS["measured"], linewidth=2.5, label="measured", zorder=2)
-    chosen = np.unique(np.linspace(0, len(evaluation.stamps) - 1, most).astype(int))
+    chosen = np.unique(np.linspace(0, len(evaluation.stamps) - 1, windows).astype(int))
     for number, window in enumerate(chosen):
         for method, style in ((CONSTANT_VELOCITY, ":"), (PHYSICS, "-")):
             positions = evaluation.predicted[method].positions[window]
@@ -236,7 +275,7 @@ def drive_figure(evaluation: RecordingEvaluation, track: np.ndarray, *, most: in
                 zorder=3,
             )
         axes.plot(*evaluation.predicted[PHYSICS].positions[window, 0, :2], "o", color="black", markersize=4, zorder=4)
-    axes.set(title="predictions along the drive", xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    axes.set(title="predictions along the recording", xlabel="x [m]", ylabel="y [m]", aspect="equal")
     axes.legend(frameon=False)
     axes.grid(alpha=0.25)
     axes.set_aspect("equal", adjustable="datalim")

@@ -36,20 +36,21 @@ def rotation_errors(predicted: Poses, measured: Poses) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Summary:
-    """An error over windows, at one horizon."""
+    """Statistics of an error over windows at one horizon."""
 
     windows: int
     median: float
     mean: float
     low: float
-    """Lower end of the 95 % interval of the mean."""
+    """Lower end of the 95 % confidence interval of the mean."""
     high: float
+    """Upper end."""
     mean_along: float
     """Mean over the trajectory up to the horizon and over windows: Δx or ΔR as the paper defines them."""
 
 
 def summarise(errors: np.ndarray, usable: np.ndarray, index: int) -> Summary:
-    """Summary of errors ``[W, T]`` at time index ``index`` over the windows that are ``usable`` ``[W, T]`` up to it."""
+    """Statistics at time ``index`` of the errors ``[W, T]`` of windows that are ``usable`` ``[W, T]`` until then."""
     chosen = usable[:, : index + 1].all(axis=1) & np.isfinite(errors[:, : index + 1]).all(axis=1)
     values = errors[chosen, index]
     if not len(values):
@@ -66,7 +67,7 @@ def summarise(errors: np.ndarray, usable: np.ndarray, index: int) -> Summary:
 
 
 def bootstrap_interval(values: np.ndarray, *, level: float = 0.95, block: int = 5) -> tuple[float, float]:
-    """Interval of the mean by a moving-block bootstrap: neighbouring windows overlap and are not independent."""
+    """Confidence interval of the mean by a moving-block bootstrap, since consecutive windows overlap and correlate."""
     count = len(values)
     block = max(1, min(block, count // 3))
     generator = np.random.default_rng(0)

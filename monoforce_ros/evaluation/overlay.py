@@ -1,4 +1,4 @@
-"""Drawing predictions into camera images: the height map as a surface, the path as a ribbon, forces as arrows."""
+"""Overlay of a prediction on a camera image: height map as a surface, path as a ribbon, forces as arrows."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SURFACE_COLOURS = "viridis"
 PATH_COLOUR = (255, 176, 32)
 FORCE_COLOUR = (232, 40, 90)
 _NEAREST = 0.35
-"""Cells closer to the camera than this are not drawn [m]."""
+"""Smallest distance of drawn cells from the camera [m]."""
 
 
 def draw_prediction(
@@ -51,8 +51,8 @@ def draw_prediction(
 
 
 def _project(camera: CameraModel, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels of points in the camera frame, also somewhat outside the image, and which of them are usable."""
-    # A wider virtual sensor keeps polygons whole that reach over the image's border.
+    """Pixels ``[n, 2]`` of points in the camera frame, including a margin around the image, and which are valid."""
+    # A larger virtual sensor keeps polygons complete that cross the border of the image.
     margin = 0.5
     wide = CameraModel(
         int(camera.width * (1 + 2 * margin)),
@@ -85,27 +85,27 @@ def _draw_surface(
     drawable = np.all([usable[c] & (depth[c] > _NEAREST) for c in corners], axis=0)
     distance = np.mean([depth[c] for c in corners], axis=0)
     mean_height = np.mean([z[c] for c in corners], axis=0)
-    seen = np.mean([terrain.observed.numpy()[c] for c in corners], axis=0) >= 0.5
+    observed = np.mean([terrain.observed.numpy()[c] for c in corners], axis=0) >= 0.5
     low, high = colour_range
     colours = colormaps[SURFACE_COLOURS](np.clip((mean_height - low) / (high - low), 0, 1))[..., :3]
-    # Shading by the slope towards the light shows shape where colour alone is flat.
+    # Shading by slope makes shape visible where the colour hardly changes.
     slope_y, slope_x = np.gradient(z, terrain.grid.resolution)
     light = (1.0 - 0.6 * slope_x - 0.4 * slope_y)[:-1, :-1] / np.sqrt(1 + slope_x**2 + slope_y**2)[:-1, :-1]
     colours = np.clip(colours * np.clip(0.35 + 0.65 * light, 0.25, 1.15)[..., None], 0, 1) * 255
     layer = canvas.copy()
     weight = np.zeros(canvas.shape[:2], np.float32)
     rows, columns = np.nonzero(drawable)
-    # Far cells first: nearer ground covers what it hides.
+    # Painter's algorithm: far cells first.
     for index in np.argsort(-distance[rows, columns]):
         row, column = rows[index], columns[index]
         quad = np.rint(quads[row, column] * 8).astype(np.int32)
         cv2.fillConvexPoly(layer, quad, colours[row, column].tolist(), cv2.LINE_AA, shift=3)
-        cv2.fillConvexPoly(weight, quad, 0.5 if seen[row, column] else 0.28, cv2.LINE_8, shift=3)
+        cv2.fillConvexPoly(weight, quad, 0.5 if observed[row, column] else 0.28, cv2.LINE_8, shift=3)
         if row % 5 == 0 or column % 5 == 0:
             edge = quad[[0, 1]] if row % 5 == 0 else quad[[0, 3]]
             cv2.polylines(layer, [edge], False, (colours[row, column] * 0.45).tolist(), 1, cv2.LINE_AA, shift=3)
-    weight = cv2.GaussianBlur(weight, (5, 5), 0)[..., None]
-    return np.rint(layer * weight + canvas * (1 - weight)).astype(np.uint8)
+    opacity = cv2.GaussianBlur(weight, (5, 5), 0)[..., None]
+    return np.rint(layer * opacity + canvas * (1 - opacity)).astype(np.uint8)
 
 
 def _draw_path(
@@ -113,9 +113,9 @@ def _draw_path(
 ) -> np.ndarray:
     stride = max(1, round(0.05 / (view.times[1] - view.times[0]))) if len(view.times) > 1 else 1
     times, positions, rotations = (values[::stride] for values in (view.times, view.positions, view.rotations))
-    half = float(robot.points[:, 1].abs().max())
+    half_width = float(robot.points[:, 1].abs().max())
     edges = []
-    for side in (half, 0.0, -half):
+    for side in (half_width, 0.0, -half_width):
         offset = np.array([0.0, side, -robot.ground_clearance])
         pixels, usable = _project(camera, transform_points(camera_from_terrain, positions + rotations @ offset))
         edges.append((pixels, usable))
@@ -127,9 +127,9 @@ def _draw_path(
             cv2.fillConvexPoly(layer, quad, PATH_COLOUR, cv2.LINE_AA, shift=3)
     canvas = cv2.addWeighted(layer, 0.35, canvas, 0.65, 0)
     for pixels, usable in ((left, left_ok), (right, right_ok), (centre, centre_ok)):
-        line = [np.rint(p * 8).astype(np.int32) for p, ok in zip(pixels, usable, strict=True) if ok]
+        line = np.rint(pixels[usable] * 8).astype(np.int32)
         if len(line) > 1:
-            cv2.polylines(canvas, [np.array(line)], False, PATH_COLOUR, 3, cv2.LINE_AA, shift=3)
+            cv2.polylines(canvas, [line], False, PATH_COLOUR, 3, cv2.LINE_AA, shift=3)
     for second in range(1, int(times[-1] + 1e-6) + 1):
         index = int(np.argmin(np.abs(times - second)))
         if centre_ok[index]:
@@ -151,6 +151,6 @@ def _draw_forces(
     lower, lower_ok = _project(camera, transform_points(camera_from_terrain, view.contact_points))
     upper, upper_ok = _project(camera, transform_points(camera_from_terrain, tips))
     for start, end in zip(lower[lower_ok & upper_ok], upper[lower_ok & upper_ok], strict=True):
-        ends = [tuple(int(v) for v in np.rint(p)) for p in (start, end)]
-        cv2.arrowedLine(canvas, *ends, FORCE_COLOUR, 2, cv2.LINE_AA, tipLength=0.2)
+        tail, tip = ((int(x), int(y)) for x, y in np.rint([start, end]))
+        cv2.arrowedLine(canvas, tail, tip, FORCE_COLOUR, 2, cv2.LINE_AA, tipLength=0.2)
     return canvas

@@ -1,13 +1,12 @@
-"""Evaluation of a recorded drive: predictions along it against what the robot did."""
+"""RecordingEvaluation: predictions along a recording compared with the measured motion."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from tqdm import tqdm
 
 from monoforce_ros.bags import Recording, nearest_frame
 from monoforce_ros.core import MotionState, StaleDataError, transform_points
@@ -16,39 +15,44 @@ from monoforce_ros.evaluation.metrics import Poses, Summary, position_errors, ro
 from monoforce_ros.messages import MessageError
 from monoforce_ros.perception import FlatTerrain, Observation
 from monoforce_ros.prediction import Prediction, Predictor
+from monoforce_ros.reporting import progress
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import TerrainDefaults, TerrainMap
 
 SAMPLE_TIME = 0.1
 """Time between the poses that are compared [s]."""
 PHYSICS, FLAT_PHYSICS, CONSTANT_VELOCITY = "physics", "physics, flat ground", "constant velocity, flat ground"
+"""Names of the methods in reports: the prediction, and two baselines."""
 BATCH = 16
-_TOGETHER = 100_000_000
-"""Largest difference between the stamps of what is used together [ns]."""
+"""Windows that are rolled out together."""
+MAXIMUM_SPREAD = 0.1
+"""Largest time between the sensor data of one observation [s]."""
 MAXIMUM_GAP = 0.3
-"""Largest distance in time between a compared pose and the odometry around it [s]."""
+"""Largest time between a compared pose and the nearest odometry [s]."""
 
 
 class EvaluationError(ValueError):
-    """A recording from which nothing can be evaluated; the message says what is missing."""
+    """The recording cannot be evaluated; the message says what is missing."""
 
 
 @dataclass(frozen=True)
 class RecordingEvaluation:
-    """Predicted and measured trajectories of the windows of a drive, in the odometry frame."""
+    """Predicted and measured trajectories of the windows of a recording, in the odometry frame."""
 
     times: np.ndarray
     """Time since the start of a window [s], ``[T]``."""
     stamps: np.ndarray
     """Start of each window [ns], ``[W]``."""
     measured: Poses
-    """``[W, T]``; NaN where odometry ends or has a gap."""
+    """``[W, T]``; NaN after the end of the odometry and in its gaps."""
     predicted: dict[str, Poses]
-    """Per method, ``[W, T]``."""
+    """``[W, T]`` of each method."""
     inside: np.ndarray
-    """Whether the measured and the predicted robot are on the predicted map, ``[W, T]``."""
+    """Whether the measured and the predicted pose are both on the predicted map, ``[W, T]``."""
     horizons: tuple[float, ...]
-    remarks: tuple[str, ...] = field(default=())
+    """Times at which errors are summarised [s]."""
+    remarks: tuple[str, ...] = ()
+    """Faults of the recording, and windows that were skipped."""
 
     def errors(self, method: str) -> tuple[np.ndarray, np.ndarray]:
         """Position [m] and rotation errors [deg] of a method, each ``[W, T]``."""
@@ -58,7 +62,7 @@ class RecordingEvaluation:
         )
 
     def summary(self, method: str) -> dict[float, tuple[Summary, Summary]]:
-        """Δx and ΔR of a method at each horizon, over the part inside the map."""
+        """Δx and ΔR of a method at each horizon, over the windows that stay on the map until then."""
         position, rotation = self.errors(method)
         result = {}
         for horizon in self.horizons:
@@ -77,29 +81,29 @@ def evaluate_recording(
     image_topics: Sequence[str] = (),
     horizons: Sequence[float] = (1.0, 2.0, 5.0),
     stride: float = 0.4,
-    shortest: float | None = None,
-    progress: bool = True,
+    minimum_duration: float | None = None,
+    quiet: bool = False,
 ) -> RecordingEvaluation:
-    """Predict from moments along a drive and compare with the motion that followed.
+    """Predict from many times of a recording and compare with the motion measured afterwards.
 
-    A window starts at each cloud or image (at least ``stride`` [s] apart; on flat ground, at odometry) and uses the
-    commands that were recorded during it.
+    A window starts at each cloud or image (for flat terrain, at each odometry message), at least ``stride`` apart, and
+    uses the commands recorded during it.
 
     Args:
-        recording: the drive.
-        predictor: robot, terrain source and horizon; the horizon must cover ``horizons``.
-        image_topics: cameras to use with a camera terrain source; the first one sets the times.
-        horizons: at which errors are summed up [s].
-        stride: least time between windows [s].
-        shortest: odometry that a window needs after its start [s]; by default the shortest horizon.
-        progress: show a bar.
+        recording: the recording.
+        predictor: robot, terrain source and horizon; the horizon must be at least the largest of ``horizons``.
+        image_topics: cameras of a camera terrain source; windows start at images of the first one.
+        horizons: times at which errors are summarised [s].
+        stride: smallest time between the starts of windows [s].
+        minimum_duration: odometry required after the start of a window [s]; by default the smallest horizon.
+        quiet: show no progress bar.
 
     Raises:
-        EvaluationError: there is nothing to predict from, or no window with odometry after it.
+        EvaluationError: sensor data or commands are missing, or no window has enough odometry after it.
     """
     recording = corrected_recording(recording, predictor.robot)
     sensors = predictor.source.sensors
-    stamps = _window_stamps(recording, sensors, image_topics, stride, shortest or min(horizons))
+    stamps = _window_stamps(recording, sensors, image_topics, stride, minimum_duration or min(horizons))
     count = round(max(horizons) / SAMPLE_TIME) + 1
     times = np.arange(count) * SAMPLE_TIME
     remarks: list[str] = []
@@ -107,11 +111,11 @@ def evaluate_recording(
     terrains: list[TerrainMap] = []
     collected: dict[str, list[Poses]] = {PHYSICS: [], FLAT_PHYSICS: [], CONSTANT_VELOCITY: []}
     inside: list[np.ndarray] = []
-    level = FlatTerrain(predictor.robot, predictor.source.grid, TerrainDefaults())
+    flat = FlatTerrain(predictor.robot, predictor.source.grid, TerrainDefaults())
 
-    def finish_batch(batch: list[MotionState], maps: list[TerrainMap]) -> None:
+    def roll_out_batch(batch: list[MotionState], maps: list[TerrainMap]) -> None:
         twists = np.stack([recording.commands.sample(predictor.command_stamps(m.stamp)) for m in batch])
-        for method, batch_maps in ((PHYSICS, maps), (FLAT_PHYSICS, [level.terrain(Observation(0), m) for m in batch])):
+        for method, batch_maps in ((PHYSICS, maps), (FLAT_PHYSICS, [flat.terrain(Observation(0), m) for m in batch])):
             if method == FLAT_PHYSICS and not sensors:
                 continue
             result = predictor.roll_out(TerrainMap.stack(batch_maps), batch, twists)
@@ -124,28 +128,27 @@ def evaluate_recording(
                 if method == PHYSICS:
                     inside.append(result.inside[row].numpy()[index])
 
-    bar = tqdm(stamps, desc="predicting", unit="window", disable=None if progress else True)
     pending: list[MotionState] = []
     pending_maps: list[TerrainMap] = []
-    for stamp in bar:
+    for stamp in progress(stamps, label="predicting", unit="window", quiet=quiet):
         try:
             motion = recording.motion.at(int(stamp), maximum_gap=MAXIMUM_GAP)
             observation = observe(recording, predictor.robot, int(stamp), sensors, image_topics)
             pending_maps.append(predictor.source.terrain(observation, motion))
         except (StaleDataError, MessageError, ValueError) as error:
-            remarks.append(f"window at {(stamp - recording.motion.stamps[0]) * 1e-9:.1f} s left out: {error}")
+            remarks.append(f"window at {(stamp - recording.motion.stamps[0]) * 1e-9:.1f} s skipped: {error}")
             continue
         pending.append(motion)
         terrains.append(pending_maps[-1])
         motions.append(motion)
         if len(pending) == BATCH:
-            finish_batch(pending, pending_maps)
+            roll_out_batch(pending, pending_maps)
             pending, pending_maps = [], []
     if pending:
-        finish_batch(pending, pending_maps)
+        roll_out_batch(pending, pending_maps)
     if not motions:
         raise EvaluationError(
-            f"{recording.path}: no prediction could be made: {remarks[0] if remarks else 'no sensor data'}"
+            f"{recording.path}: every prediction failed: {remarks[0] if remarks else 'no sensor data'}"
         )
     measured = measured_poses(recording, motions, times)
     collected[CONSTANT_VELOCITY] = [constant_velocity(motion, times) for motion in motions]
@@ -171,7 +174,7 @@ def evaluate_recording(
 
 
 def predict_at(recording: Recording, predictor: Predictor, stamp: int, image_topics: Sequence[str] = ()) -> Prediction:
-    """One prediction with all its forces, from the data at ``stamp`` [ns] and the commands recorded after it."""
+    """A prediction with contact forces from the data at ``stamp`` [ns], under the commands recorded after it."""
     recording = corrected_recording(recording, predictor.robot)
     return predictor.predict(
         observe(recording, predictor.robot, stamp, predictor.source.sensors, image_topics),
@@ -181,7 +184,7 @@ def predict_at(recording: Recording, predictor: Predictor, stamp: int, image_top
 
 
 def corrected_recording(recording: Recording, robot: RobotModel) -> Recording:
-    """The drive without what the robot's file says its clocks and sensors do to the record."""
+    """The recording corrected for the measurement effects (clocks, sensors) in the robot's file."""
     return replace(
         recording,
         motion=corrected_motion(recording.motion, robot.effects),
@@ -192,36 +195,37 @@ def corrected_recording(recording: Recording, robot: RobotModel) -> Recording:
 def observe(
     recording: Recording, robot: RobotModel, stamp: int, sensors: Sequence[str], image_topics: Sequence[str] = ()
 ) -> Observation:
-    """What sensors (``lidar``, ``camera``) saw nearest to a stamp [ns], seen from where the robot was then.
+    """The data of ``sensors`` (``lidar``, ``camera``) nearest to a stamp [ns], moved to the robot's pose at that stamp.
 
-    With cameras and a lidar, or several cameras, what is further away than 0.1 s is left out.
+    Images more than :data:`MAXIMUM_SPREAD` away from the stamp are left out; so are clouds used together with images.
     """
     cloud, images, cameras, poses = None, {}, {}, {}
     if "lidar" in sensors:
-        frame = nearest_frame(recording.clouds, stamp, limit=_TOGETHER if "camera" in sensors else np.inf)
+        frame = nearest_frame(recording.clouds, stamp, limit=MAXIMUM_SPREAD if "camera" in sensors else np.inf)
         if frame is not None:
             points, frame_id = recording.cloud(frame)
             pose = recording.sensor_pose(frame_id, robot.base_frame, robot.sensors)
-            cloud = transform_points(_moved(recording, frame.stamp, stamp) @ pose, points).astype(np.float32)
+            cloud = transform_points(_base_motion(recording, frame.stamp, stamp) @ pose, points).astype(np.float32)
     for topic in image_topics if "camera" in sensors else ():
-        frame = nearest_frame(recording.images[topic], stamp, limit=_TOGETHER)
+        frame = nearest_frame(recording.images[topic], stamp, limit=MAXIMUM_SPREAD)
         if frame is None:
             continue
         if topic not in recording.cameras:
-            raise EvaluationError(f"{recording.path}: no CameraInfo beside {topic}")
+            raise EvaluationError(f"{recording.path}: no CameraInfo for the images on {topic}")
         images[topic] = recording.image(frame)
         cameras[topic] = recording.cameras[topic]
         pose = recording.sensor_pose(cameras[topic].frame_id, robot.base_frame, robot.sensors)
-        poses[topic] = _moved(recording, frame.stamp, stamp) @ pose
+        poses[topic] = _base_motion(recording, frame.stamp, stamp) @ pose
     return Observation(stamp, cloud, images, cameras, poses)
 
 
-def _moved(recording: Recording, start: int, end: int) -> np.ndarray:
+def _base_motion(recording: Recording, start: int, end: int) -> np.ndarray:
+    """Pose ``[4, 4]`` of the base at ``start`` [ns] relative to the base at ``end`` [ns]."""
     return recording.motion.base_between(start, end, maximum_gap=MAXIMUM_GAP)
 
 
 def measured_poses(recording: Recording, motions: list[MotionState], times: np.ndarray) -> Poses:
-    """Measured poses ``[W, T]`` after each motion; NaN beyond the odometry's end and within its gaps."""
+    """Measured poses ``[W, T]`` after each motion; NaN after the end of the odometry and in its gaps."""
     stamps = np.array([m.stamp for m in motions])[:, None] + np.rint(times * 1e9).astype(np.int64)
     positions = np.full((*stamps.shape, 3), np.nan)
     rotations = np.full((*stamps.shape, 3, 3), np.nan)
@@ -237,10 +241,10 @@ def measured_poses(recording: Recording, motions: list[MotionState], times: np.n
 
 
 def constant_velocity(motion: MotionState, times: np.ndarray) -> Poses:
-    """The baseline: forward speed and yaw rate of the start go on, at the start's height, roll and pitch."""
+    """Baseline: the forward speed and yaw rate of the start are held, as are its height, roll and pitch."""
     speed, rate = motion.linear_velocity[0], motion.angular_velocity[2]
     angles = rate * times
-    # ∫ cos(ωt) and ∫ sin(ωt), exact for ω → 0 too.
+    # ∫ cos(ωt) and ∫ sin(ωt) without dividing by ω, so that ω = 0 is no special case.
     along = speed * times * np.sinc(angles / np.pi)
     across = speed * times * np.sin(angles / 2) * np.sinc(angles / 2 / np.pi)
     heading = motion.heading
@@ -256,7 +260,7 @@ def constant_velocity(motion: MotionState, times: np.ndarray) -> Poses:
 
 
 def _window_stamps(
-    recording: Recording, sensors: Sequence[str], image_topics: Sequence[str], stride: float, shortest: float
+    recording: Recording, sensors: Sequence[str], image_topics: Sequence[str], stride: float, minimum_duration: float
 ) -> np.ndarray:
     if not sensors:
         candidates = recording.motion.stamps
@@ -271,18 +275,18 @@ def _window_stamps(
     if not len(candidates):
         missing = "images" if "camera" in sensors else "point clouds"
         raise EvaluationError(
-            f"{recording.path}: no {missing} to predict from; with `--terrain flat` odometry and commands suffice"
+            f"{recording.path}: no {missing} to predict from; `--terrain flat` needs only odometry and commands"
         )
     if not len(recording.commands):
-        raise EvaluationError(f"{recording.path}: no commands (Twist or TwistStamped): the prediction needs them")
-    end = recording.motion.stamps[-1] - int(shortest * 1e9)
+        raise EvaluationError(f"{recording.path}: no commands (Twist or TwistStamped), which predictions need")
+    end = recording.motion.stamps[-1] - int(minimum_duration * 1e9)
     candidates = candidates[(candidates >= recording.motion.stamps[0]) & (candidates <= end)]
     chosen: list[int] = []
     for stamp in candidates:
         if not chosen or stamp - chosen[-1] >= stride * 1e9 - 1e6:
             chosen.append(int(stamp))
     if not chosen:
-        raise EvaluationError(f"{recording.path}: no sensor data with {shortest:g} s of odometry after it")
+        raise EvaluationError(f"{recording.path}: no sensor data with {minimum_duration:g} s of odometry after it")
     return np.array(chosen, np.int64)
 
 

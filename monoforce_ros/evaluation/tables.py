@@ -1,4 +1,4 @@
-"""Tables: terrain sources compared over whole drives, as the paper's Tables I to III do (IV-B)."""
+"""Tables: errors of terrain sources over whole recordings, as in the paper's Tables I to III (IV-B)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from monoforce_ros.bags import Recording
-from monoforce_ros.encoder import fused, load_encoder
+from monoforce_ros.encoder import LidarEncoder, fused, load_encoder
 from monoforce_ros.evaluation.metrics import Poses, position_errors, rotation_errors
 from monoforce_ros.evaluation.recording_evaluation import (
     CONSTANT_VELOCITY,
@@ -23,27 +23,31 @@ from monoforce_ros.prediction import Predictor
 from monoforce_ros.robots import RobotModel
 
 HORIZON = 5.0
+"""Length of a window [s]."""
 STRIDE = 1.0
-SHORTEST = 5
-"""Compared poses that a window needs inside the map; the start is not one of them."""
+"""Time between the starts of windows [s]."""
+MINIMUM_POSES = 5
+"""Number of compared poses on the map, without the start, that a window needs."""
 _RESAMPLES = 4000
+_HALF_MAP = 6.4
+"""Half the edge length of the encoder's map [m]."""
 
 
 @dataclass(frozen=True)
 class System:
-    """A way to know the ground, and what it is called."""
+    """A terrain source of the comparison, and its names."""
 
     key: str
     title: str
     input: str
     checkpoint: Path | None = None
     with_lidar: bool = False
-    """Whether the encoder of images lowers a lidar's surfaces, rather than to predict heights itself."""
+    """Combine the lidar's heights with the compliance that the encoder predicts, instead of using its heights."""
 
 
 @dataclass(frozen=True)
 class SequenceErrors:
-    """Mean errors over the windows of one drive."""
+    """Mean errors over the windows of one recording."""
 
     sequence: str
     position: float
@@ -55,7 +59,7 @@ class SequenceErrors:
 
 @dataclass(frozen=True)
 class Mean:
-    """A mean over drives, or a ratio of two, with its 95 % interval."""
+    """A mean over recordings, or a ratio of two means, with its 95 % confidence interval."""
 
     value: float
     low: float
@@ -68,29 +72,29 @@ CONSTANT = System("constant", "constant velocity", "odometry")
 
 
 def evaluate_sequence(bag: Path, robot: RobotModel, systems: Sequence[System]) -> dict[str, SequenceErrors]:
-    """Errors of each system on one drive, from the same moments and over the same stretches.
+    """Errors of each system on one recording, over the same windows.
 
-    A window counts up to where the measured robot leaves the map; windows of all systems start together.
+    Windows of all systems start at the same times, and end where the measured robot leaves the map.
 
     Raises:
         BagError, CheckpointError, EvaluationError: the bag or a checkpoint cannot be used.
     """
     recording = Recording.open(bag)
-    poses: dict[str, RecordingEvaluation] = {}
+    evaluations: dict[str, RecordingEvaluation] = {}
     for system in systems:
         if system.key in (FLAT.key, CONSTANT.key):
             continue
         source = terrain_source(system, robot)
         topics = tuple(recording.images) if "camera" in source.sensors else ()
-        poses[system.key] = evaluate_recording(
+        evaluations[system.key] = evaluate_recording(
             recording, Predictor(robot, source, horizon=HORIZON), image_topics=topics,
-            horizons=(HORIZON,), stride=STRIDE, progress=False, shortest=1.0,
+            horizons=(HORIZON,), stride=STRIDE, quiet=True, minimum_duration=1.0,
         )  # fmt: skip
-    common = set.intersection(*(set(e.stamps.tolist()) for e in poses.values()))
-    first = next(iter(poses.values()))
+    common = set.intersection(*(set(e.stamps.tolist()) for e in evaluations.values()))
+    first = next(iter(evaluations.values()))
     errors = {}
     for system in systems:
-        evaluation = poses.get(system.key, first)
+        evaluation = evaluations.get(system.key, first)
         method = {FLAT.key: FLAT_PHYSICS, CONSTANT.key: CONSTANT_VELOCITY}.get(system.key, PHYSICS)
         chosen = np.isin(evaluation.stamps, sorted(common))
         errors[system.key] = _sequence(bag.name, evaluation, method, chosen)
@@ -98,13 +102,13 @@ def evaluate_sequence(bag: Path, robot: RobotModel, systems: Sequence[System]) -
 
 
 def terrain_source(system: System, robot: RobotModel) -> TerrainSource:
-    """The terrain source of a system that has one."""
+    """The terrain source of a system."""
     if system.checkpoint is None:
         return choose_terrain_source("lidar", robot)
     if system.with_lidar:
         return choose_terrain_source("lidar_camera", robot, checkpoint=system.checkpoint)
     encoder = fused(load_encoder(system.checkpoint))
-    if encoder.config.sensor == "lidar":
+    if isinstance(encoder, LidarEncoder):
         return LidarNetworkTerrain(encoder, robot)
     return CameraTerrain(encoder, robot)
 
@@ -117,7 +121,7 @@ def _sequence(name: str, evaluation: RecordingEvaluation, method: str, chosen: n
     position, rotation = position_errors(predicted, measured), rotation_errors(predicted, measured)
     usable &= np.isfinite(position) & np.isfinite(rotation)
     usable[:, 0] = False
-    counted = usable.sum(axis=1) >= SHORTEST
+    counted = usable.sum(axis=1) >= MINIMUM_POSES
 
     def mean(errors: np.ndarray) -> float:
         inside = np.where(usable[counted], errors[counted], 0.0).sum(axis=1) / usable[counted].sum(axis=1)
@@ -126,18 +130,18 @@ def _sequence(name: str, evaluation: RecordingEvaluation, method: str, chosen: n
     return SequenceErrors(name, mean(position), mean(rotation), int(counted.sum()))
 
 
-def _on_map(measured: Poses, half: float = 6.4) -> np.ndarray:
-    """Whether the measured robot is on the map of its window's start, ``[W, T]``."""
+def _on_map(measured: Poses) -> np.ndarray:
+    """Whether the measured robot is on the map at its window's start, ``[W, T]``."""
     heading = np.arctan2(measured.rotations[:, 0, 1, 0], measured.rotations[:, 0, 0, 0])
-    away = measured.positions[..., :2] - measured.positions[:, :1, :2]
+    offset = measured.positions[..., :2] - measured.positions[:, :1, :2]
     cosine, sine = np.cos(heading)[:, None], np.sin(heading)[:, None]
-    along = cosine * away[..., 0] + sine * away[..., 1]
-    across = cosine * away[..., 1] - sine * away[..., 0]
-    return (np.abs(along) < half) & (np.abs(across) < half)
+    along = cosine * offset[..., 0] + sine * offset[..., 1]
+    across = cosine * offset[..., 1] - sine * offset[..., 0]
+    return (np.abs(along) < _HALF_MAP) & (np.abs(across) < _HALF_MAP)
 
 
 def mean_over(values: Sequence[float]) -> Mean:
-    """Mean over drives with its bootstrap interval: drives are independent, windows of one are not."""
+    """Mean over recordings with its bootstrap interval: recordings are independent, windows of one are not."""
     array = np.array([value for value in values if np.isfinite(value)])
     if not len(array):
         return Mean(float("nan"), float("nan"), float("nan"))
@@ -146,7 +150,7 @@ def mean_over(values: Sequence[float]) -> Mean:
 
 
 def ratio_over(values: Sequence[float], others: Sequence[float]) -> Mean:
-    """Ratio of two systems' means over the same drives, resampled together."""
+    """Ratio of two systems' means over the same recordings, with an interval by paired resampling."""
     both = np.array([(a, b) for a, b in zip(values, others, strict=True) if np.isfinite(a) and np.isfinite(b)])
     if not len(both):
         return Mean(float("nan"), float("nan"), float("nan"))

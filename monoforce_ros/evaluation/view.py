@@ -1,4 +1,4 @@
-"""PredictionView: what is drawn of a prediction, whether it comes from this process or from a node's messages."""
+"""PredictionView: the parts of a prediction that figures show, from this process or from a node's messages."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from monoforce_ros.terrain import Grid, TerrainMap
 
 @dataclass(frozen=True)
 class PredictionView:
-    """A prediction in its terrain frame: at the robot, x along its heading, z up."""
+    """A prediction in its terrain frame (origin at the robot, x along its heading, z up)."""
 
     motion: MotionState
     terrain: TerrainMap
@@ -30,13 +30,13 @@ class PredictionView:
     rotations: np.ndarray
     """``[n, 3, 3]``."""
     contact_points: np.ndarray
-    """Points that carry load, at some moments along the path, ``[k, 3]`` [m]."""
+    """Loaded contact points at some times along the path, ``[k, 3]`` [m]."""
     contact_forces: np.ndarray
-    """Forces on them as parts of the robot's weight, ``[k, 3]``."""
+    """Contact forces over the robot's weight, ``[k, 3]`` [-]."""
 
     @classmethod
     def of_prediction(cls, prediction: Prediction, robot: RobotModel) -> PredictionView:
-        """View of a prediction made here."""
+        """View of a prediction made in this process."""
         steps = usable_steps(prediction)
         to_terrain = np.linalg.inv(prediction.motion.odometry_from_terrain)
         contacts = [contact_points(prediction, robot, step) for step in force_steps(prediction)]
@@ -53,7 +53,7 @@ class PredictionView:
 
     @classmethod
     def of_messages(cls, terrain: Any, path: Any, contact_forces: Any, motion: MotionState) -> PredictionView:
-        """View of what a predictor node published for one stamp.
+        """View of the messages that a predictor node published for one stamp.
 
         Args:
             terrain: PointCloud2 of ``predicted/terrain``.
@@ -62,14 +62,14 @@ class PredictionView:
             motion: measured state at the messages' stamp.
 
         Raises:
-            MessageError: the messages are not of one prediction.
+            MessageError: a message lacks the expected content.
         """
         to_terrain = np.linalg.inv(motion.odometry_from_terrain)
         poses = [entry.pose for entry in path.poses]
         orientations = np.array([[p.orientation.x, p.orientation.y, p.orientation.z, p.orientation.w] for p in poses])
         lines = next((m for m in contact_forces.markers if m.ns == "contact_forces"), None)
         if lines is None:
-            raise MessageError("contact forces: no marker of the namespace contact_forces")
+            raise MessageError("contact forces: no marker in the namespace contact_forces")
         ends = transform_points(to_terrain, _points(lines.points)).reshape(-1, 2, 3)
         return cls(
             motion=motion,
@@ -87,15 +87,15 @@ def _points(vectors: Iterable[Any]) -> np.ndarray:
 
 
 def _terrain_of_cloud(cloud: Any, to_terrain: np.ndarray) -> TerrainMap:
-    """The map whose cells a node published as a cloud, row by row."""
+    """The map that a node published as a cloud of its cells, row by row."""
     names = [entry.name for entry in cloud.fields]
     values = np.frombuffer(bytes(cloud.data), "<f4").reshape(-1, len(names)).astype(np.float64)
     column = dict(zip(names, values.T, strict=True))
     local = transform_points(to_terrain, values[:, :3])
-    # The first cells lie along a row; where x falls back, the next row begins.
+    # x increases along a row and jumps back at the start of the next one.
     columns = int(np.argmax(np.diff(local[:, 0]) < 0)) + 1
     if columns < 2 or len(values) % columns:
-        raise MessageError(f"terrain: {len(values)} points are not the rows of a grid")
+        raise MessageError(f"terrain: {len(values)} points do not form the rows of a grid")
     rows = len(values) // columns
     resolution = float(local[columns - 1, 0] - local[0, 0]) / (columns - 1)
     grid = Grid(rows, columns, round(resolution, 4), (float(local[0, 0]), float(local[0, 1])))

@@ -162,7 +162,7 @@ class PredictorNode(ManagedNode):
             device="cuda" if cuda else "cpu",
             precision=settings.encoder_precision,
             threads=min(settings.encoder_threads, os.cpu_count() or 1),
-            memory=settings.camera_retention_time,
+            retention_time=settings.camera_retention_time,
         )
 
     def _sensor_topics(self) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""Footing: what is known of the ground because the robot stands on it, put into maps that sensors made."""
+"""Ground alignment: corrections of terrain maps by the ground contact of the robot, whose pose is known."""
 
 from __future__ import annotations
 
@@ -13,74 +13,80 @@ from monoforce_ros.physics import rest_depth
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import TerrainMap
 
-_LAID_FROM, _LAID_TO = 0.15, 0.7
-"""Distances from the wheels up to which a map is shifted to where the robot stands, and beyond which not [m]."""
+_FULL_WITHIN, _NONE_BEYOND = 0.15, 0.7
+"""Distances from the support points up to which heights are fully corrected, and beyond which not at all [m]."""
 
-_ALLOWED = 0.03
+_TOLERANCE = 0.03
 """How far ground may reach above the lowest point of a wheel or track within a cell [m]."""
 
 
 def support_points(robot: RobotModel, motion: MotionState, stiffness: float) -> np.ndarray:
-    """Where the ground must be under the wheels of a robot that stands or drives on it, ``[m, 3]`` in terrain axes."""
+    """Points ``[m, 3]`` [m] on the ground under the wheels of a robot at rest on it, in terrain axes.
+
+    Args:
+        robot: its wheels or tracks.
+        motion: the robot's pose.
+        stiffness: of the ground [N/m³]; the wheels sink in by the rest depth.
+    """
     lowest = robot.points[robot.point_tangents[:, 0] < -0.97].numpy()
     points = transform_points(motion.terrain_from_base, lowest.astype(np.float64))
     points[:, 2] += rest_depth(robot, stiffness)
     return points
 
 
-def aligned_to_ground(terrain: TerrainMap, support: np.ndarray) -> TerrainMap:
-    """A predicted map that meets the ground under the robot's wheels, which is known better than any image tells.
+def align_to_ground(terrain: TerrainMap, support: np.ndarray) -> TerrainMap:
+    """A predicted map, shifted near the robot so that it passes through the support points.
 
-    Heights are shifted to where those that carry meet the points ``[m, 3]`` on which the robot stands, less so with the
-    distance from them. What stands above the ground is shifted along: its height is what vegetation holds the robot by.
-    A robot that starts below a predicted surface would be thrown off it.
+    The ground under the wheels is known better than an encoder predicts it; a robot that starts below a predicted
+    surface would be thrown off it. The shift fades out with the distance from the support points ``[m, 3]``. The
+    geometric height shifts along, because the resistance of vegetation depends on its height above the ground.
     """
     grid = terrain.grid
     rows, columns, inside = grid.cells(support[:, :2])
     if not inside.any():
         return terrain
     points = support[inside]
-    short = points[:, 2] - terrain.height.numpy()[rows[inside], columns[inside]]
-    # Nothing moves beyond this window; most of the map need not be looked at.
-    (left, bottom), (right, top) = points[:, :2].min(axis=0) - _LAID_TO, points[:, :2].max(axis=0) + _LAID_TO
+    error = points[:, 2] - terrain.height.numpy()[rows[inside], columns[inside]]
+    # Cells outside of this window do not change.
+    (left, bottom), (right, top) = points[:, :2].min(axis=0) - _NONE_BEYOND, points[:, :2].max(axis=0) + _NONE_BEYOND
     across = slice(*np.searchsorted(grid.x, (left, right)))
     up = slice(*np.searchsorted(grid.y, (bottom, top)))
     x, y = np.meshgrid(grid.x[across], grid.y[up])
-    away = np.hypot(x[..., None] - points[:, 0], y[..., None] - points[:, 1])
-    nearness = 1.0 / (away + 0.05) ** 2
-    shift = (nearness * short).sum(axis=-1) / nearness.sum(axis=-1)
-    share = np.clip((_LAID_TO - away.min(axis=-1)) / (_LAID_TO - _LAID_FROM), 0.0, 1.0)
+    distance = np.hypot(x[..., None] - points[:, 0], y[..., None] - points[:, 1])
+    weight = 1.0 / (distance + 0.05) ** 2
+    shift = (weight * error).sum(axis=-1) / weight.sum(axis=-1)
+    share = np.clip((_NONE_BEYOND - distance.min(axis=-1)) / (_NONE_BEYOND - _FULL_WITHIN), 0.0, 1.0)
+    change = torch.from_numpy((shift * share).astype(np.float32))
     height = terrain.height.clone()
-    moved = torch.from_numpy((shift * share).astype(np.float32))
-    height[up, across] += moved
-    visible = terrain.geometric_height.clone()
-    visible[up, across] += moved
-    return replace(terrain, height=height, geometric_height=visible)
+    height[up, across] += change
+    geometric_height = terrain.geometric_height.clone()
+    geometric_height[up, across] += change
+    return replace(terrain, height=height, geometric_height=geometric_height)
 
 
-def clear_of(terrain: TerrainMap, robot: RobotModel, motion: MotionState) -> TerrainMap:
-    """A map of which nothing reaches into the robot that stands on it.
+def clear_footprint(terrain: TerrainMap, robot: RobotModel, motion: MotionState) -> TerrainMap:
+    """A map whose surface does not reach into the robot.
 
-    No sensor sees the ground below a robot; what is filled in there from a wall nearby would push it from the start.
-    Cells below it are lowered to its lower side; so are those next to it of which nothing was measured.
+    No sensor sees the ground below the robot; heights interpolated there from a wall nearby would push the robot from
+    the start. Cells below the robot are lowered to its underside; so are neighbouring cells without a measurement.
     """
     grid, pose = terrain.grid, motion.terrain_from_base
     (rear, right), (front, left) = (bound.cpu().double().numpy()[:2] for bound in robot.bounds)
     hull = robot.points[robot.point_drives < 0]
-    belly = float(hull[:, 2].min()) if len(hull) else 0.0
-    if abs(np.linalg.det(pose[:2, :2])) < 0.1:  # it lies on its side
+    underside = float(hull[:, 2].min()) if len(hull) else 0.0
+    if abs(np.linalg.det(pose[:2, :2])) < 0.1:  # the robot lies on its side
         return terrain
-    # Where each cell's vertical meets the plane of the hull's lower side, in the robot's axes.
-    cells = np.stack(np.meshgrid(grid.x, grid.y), axis=-1) - pose[:2, 2] * belly
-    along, aside = np.moveaxis(cells @ np.linalg.inv(pose[:2, :2]).T, -1, 0)
-    inside = (along > rear) & (along < front) & (aside > right) & (aside < left)
-    limit = np.where(inside, pose[2, 0] * along + pose[2, 1] * aside + pose[2, 2] * belly, np.inf)
+    # Where the vertical through each cell meets the plane of the hull's underside, in base axes.
+    cells = np.stack(np.meshgrid(grid.x, grid.y), axis=-1) - pose[:2, 2] * underside
+    ahead, lateral = np.moveaxis(cells @ np.linalg.inv(pose[:2, :2]).T, -1, 0)
+    inside = (ahead > rear) & (ahead < front) & (lateral > right) & (lateral < left)
+    limit = np.where(inside, pose[2, 0] * ahead + pose[2, 1] * lateral + pose[2, 2] * underside, np.inf)
     # Wheels and tracks reach lower; between their points and the cells' centres the ground may slope.
     points = transform_points(pose, robot.points.cpu().double().numpy())
     rows, columns, on_grid = grid.cells(points[:, :2])
-    np.minimum.at(limit, (rows[on_grid], columns[on_grid]), points[on_grid, 2] + _ALLOWED)
-    beside = cv2.erode(limit.astype(np.float32), np.ones((3, 3), np.uint8), borderValue=np.inf)
-    limit = torch.from_numpy(np.where(terrain.observed.numpy(), limit, beside)).to(terrain.height)
-    if not bool((terrain.height > limit).any()):
+    np.minimum.at(limit, (rows[on_grid], columns[on_grid]), points[on_grid, 2] + _TOLERANCE)
+    widened = cv2.erode(limit.astype(np.float32), np.ones((3, 3), np.uint8), borderValue=np.inf)
+    highest = torch.from_numpy(np.where(terrain.observed.numpy(), limit, widened)).to(terrain.height)
+    if not bool((terrain.height > highest).any()):
         return terrain
-    return replace(terrain, height=torch.minimum(terrain.height, limit))
+    return replace(terrain, height=torch.minimum(terrain.height, highest))

@@ -1,4 +1,4 @@
-"""TemporalMemory: what a terrain source saw a moment ago, where it sees nothing now."""
+"""TemporalMemory: fills cells that a terrain source does not observe now with what it observed shortly before."""
 
 from __future__ import annotations
 
@@ -9,92 +9,95 @@ import numpy as np
 import torch
 
 from monoforce_ros.core import NANOSECOND, CameraModel, MotionState
-from monoforce_ros.perception.ground_alignment import aligned_to_ground, clear_of, support_points
+from monoforce_ros.perception.ground_alignment import align_to_ground, clear_footprint, support_points
 from monoforce_ros.perception.observation import Observation, TerrainSource
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import CHANNELS, Grid, TerrainMap
 
-_LOST_WITHIN, _STANDS = 2.0, 0.25
-"""What stood out by so much [m] is not believed to be gone from within this distance of the robot [m]: an encoder that
-sees no more than a piece of a wall does not know it for one."""
+_KEPT_WITHIN, _OBSTACLE_HEIGHT = 2.0, 0.25
+"""An obstacle at least this high [m] that disappears within this distance of the robot [m] is kept: an encoder that
+sees only a part of a wall does not recognise it."""
 _JUMP = 1.0
-"""A robot that is further than this from where its velocity would have taken it has been moved, or its odometry [m]."""
+"""Largest distance between the measured position and the one extrapolated from the last velocity [m]; beyond it, the
+robot was moved or its odometry jumped."""
 
 
 class TemporalMemory:
-    """Fills what a source does not see with what it saw before, carried along by odometry.
+    """A terrain source that adds earlier observations, moved along by odometry, to the current map.
 
-    A camera that looks ahead sees neither the ground under the robot's nose nor the wall that it has just turned away
-    from, and has seen both as the robot came. What is seen now replaces what was seen before, unless something that
-    stood out nearby seems to be gone; and what was not seen again for a while is forgotten: people walk away.
+    A forward-looking camera sees neither the ground under the robot's front nor a wall that the robot has just turned
+    away from, but saw both on the way. New observations replace earlier ones, except where an obstacle nearby seems to
+    have disappeared. Cells are forgotten some time after they were last observed, because people walk away.
 
     Args:
-        source: that sees.
-        robot: that stands on the ground.
+        source: source of the current maps.
+        robot: the robot on the ground.
         stiffness: of the ground under its wheels [N/m³].
-        seconds: for which a cell is remembered.
-        distance: that the robot may move until a cell is forgotten: odometry drifts [m].
+        retention_time: how long a cell is kept after it was last observed [s].
+        retention_distance: how far the robot may travel until a cell is forgotten, since odometry drifts [m].
     """
 
     def __init__(
-        self, source: TerrainSource, robot: RobotModel, *, stiffness: float, seconds: float, distance: float = 6.0
+        self,
+        source: TerrainSource,
+        robot: RobotModel,
+        *,
+        stiffness: float,
+        retention_time: float,
+        retention_distance: float = 6.0,
     ):
-        if not (seconds > 0.0 and distance > 0.0):
-            raise ValueError(f"memory: got {seconds} s and {distance} m, expected more than 0")
+        if not (retention_time > 0.0 and retention_distance > 0.0):
+            raise ValueError(
+                f"temporal memory: got a retention time of {retention_time} s and a distance of {retention_distance} "
+                "m, expected more than 0"
+            )
         self._source, self._robot, self._stiffness = source, robot, stiffness
-        self._seconds, self._distance = seconds, distance
-        self._near = np.hypot(*np.meshgrid(source.grid.x, source.grid.y)) < _LOST_WITHIN
-        self._memory: _Memory | None = None
-        self._before: MotionState | None = None
+        self._retention_time, self._retention_distance = retention_time, retention_distance
+        self._near = np.hypot(*np.meshgrid(source.grid.x, source.grid.y)) < _KEPT_WITHIN
+        self._memory = _Memory(source.grid)
+        self._previous: MotionState | None = None
         self._cameras: dict[str, CameraModel] = {}
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """The source's."""
+        """Sensors of the source."""
         return self._source.sensors
 
     @property
     def grid(self) -> Grid:
-        """The source's."""
+        """Grid of the source."""
         return self._source.grid
 
     def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
-        """Map of what is seen now and what was seen before; errors are the source's."""
+        """The source's current map with earlier observations; raises the source's errors."""
         now = self._source.terrain(observation, motion)
-        changed = any(
-            not _same(camera, self._cameras.get(name, camera)) for name, camera in observation.cameras.items()
+        recalibrated = any(
+            not _equal(camera, self._cameras.get(name, camera)) for name, camera in observation.cameras.items()
         )
         self._cameras |= observation.cameras
-        # What was seen through a calibration that turned out wrong was seen in the wrong place.
-        if self._before is None or changed or not _follows(motion, self._before):
+        # A wrong calibration put earlier observations in the wrong place.
+        if self._previous is None or recalibrated or not _continues(motion, self._previous):
             self._memory = _Memory(now.grid)
         else:
-            self._memory.travelled += float(np.linalg.norm(motion.position - self._before.position))
-        self._before = motion
+            self._memory.travelled += float(np.linalg.norm(motion.position - self._previous.position))
+        self._previous = motion
         memory = self._memory
         memory.move_to(motion.position[:2])
-        values, age, since = memory.read(motion)
-        fresh = (age < self._seconds) & (since < self._distance)
-        lost = fresh & now.observed.numpy() & self._near & (values[0] - now.height.numpy() > _STANDS)
-        kept = (fresh & ~now.observed.numpy()) | lost
-        memory.write(replace(now, observed=now.observed & ~torch.from_numpy(lost)), motion)
+        values, age, distance = memory.read(motion)
+        fresh = (age < self._retention_time) & (distance < self._retention_distance)
+        disappeared = values[0] - now.height.numpy() > _OBSTACLE_HEIGHT
+        obstacle = fresh & now.observed.numpy() & self._near & disappeared
+        kept = (fresh & ~now.observed.numpy()) | obstacle
+        memory.write(replace(now, observed=now.observed & ~torch.from_numpy(obstacle)), motion)
         if not kept.any():
             return now
-        known = torch.from_numpy(kept)
-        joined = replace(
-            now,
-            observed=now.observed | known,
-            **{
-                name: torch.where(known, torch.from_numpy(value).to(now.height), getattr(now, name))
-                for name, value in zip(CHANNELS, values, strict=True)
-            },
-        )
+        joined = now.with_cells(torch.from_numpy(kept), dict(zip(CHANNELS, torch.from_numpy(values), strict=True)))
         support = support_points(self._robot, motion, self._stiffness)
-        return clear_of(aligned_to_ground(joined, support), self._robot, motion)
+        return clear_footprint(align_to_ground(joined, support), self._robot, motion)
 
 
-def _same(camera: CameraModel, other: CameraModel) -> bool:
-    """Whether two calibrations see the same."""
+def _equal(camera: CameraModel, other: CameraModel) -> bool:
+    """Whether two calibrations are equal."""
     return (
         (camera.width, camera.height, camera.distortion_model) == (other.width, other.height, other.distortion_model)
         and np.array_equal(camera.matrix, other.matrix)
@@ -102,50 +105,52 @@ def _same(camera: CameraModel, other: CameraModel) -> bool:
     )
 
 
-def _follows(motion: MotionState, before: MotionState) -> bool:
-    """Whether a robot can have come from one place to the other."""
-    elapsed = (motion.stamp - before.stamp) * NANOSECOND
-    expected = before.position + before.rotation @ before.linear_velocity * elapsed
+def _continues(motion: MotionState, previous: MotionState) -> bool:
+    """Whether the robot can have moved from the previous pose to this one in the time between."""
+    elapsed = (motion.stamp - previous.stamp) * NANOSECOND
+    expected = previous.position + previous.rotation @ previous.linear_velocity * elapsed
     return elapsed >= 0.0 and float(np.linalg.norm(motion.position - expected)) < _JUMP * max(1.0, elapsed)
 
 
 class _Memory:
-    """A map that stands still in the odometry frame and covers what is around the robot.
+    """A map fixed in the odometry frame that covers the surroundings of the robot.
 
-    Cells keep their place, so that a value is resampled once when it is written and once when it is read, however long
-    it is kept: resampled with each image, walls would melt.
+    Cells do not move, so that a value is resampled only when it is written and when it is read: resampling with every
+    image would smooth walls away.
     """
 
     def __init__(self, grid: Grid):
         self.travelled = 0.0
-        """By the robot, all in all [m]."""
+        """Distance travelled by the robot so far [m]."""
         self._grid = grid
-        # Whichever way the map around the robot is turned, it lies within.
+        # Contains the map around the robot for any heading.
         self._size = 2 * int(np.ceil(np.hypot(grid.rows, grid.columns) / 2.0)) + 2
-        self._corner: np.ndarray | None = None
+        self._corner = np.zeros(2, np.int64)
+        """Column and row of the first cell in the odometry frame."""
         self._values = np.zeros((len(CHANNELS), self._size, self._size), np.float32)
-        self._seen = np.zeros((self._size, self._size), np.int64)
-        """When each cell was seen last [ns]; 0 where it never was."""
+        self._observed_at = np.zeros((self._size, self._size), np.int64)
+        """Time of the last observation of each cell [ns]; 0 without any."""
         self._odometer = np.zeros((self._size, self._size))
-        """How far the robot had travelled then [m]."""
+        """Distance travelled at the last observation [m]."""
 
     def move_to(self, place: np.ndarray) -> None:
-        """Cover what is around a place ``[2]`` in the odometry frame; what falls off is forgotten."""
+        """Centre the map on a position ``[2]`` in the odometry frame; cells that leave it are forgotten."""
         corner = np.rint(place / self._grid.resolution).astype(np.int64) - self._size // 2
-        if self._corner is not None and (shift := corner - self._corner).any():
-            gone = np.zeros((self._size, self._size), bool)
+        if (shift := corner - self._corner).any():
+            unknown = np.zeros((self._size, self._size), bool)
             for axis, by in ((1, int(shift[0])), (0, int(shift[1]))):
                 by = int(np.clip(by, -self._size, self._size))
                 self._values = np.roll(self._values, -by, axis + 1)
-                self._seen, self._odometer = np.roll(self._seen, -by, axis), np.roll(self._odometer, -by, axis)
-                gone = np.roll(gone, -by, axis)
+                self._observed_at = np.roll(self._observed_at, -by, axis)
+                self._odometer = np.roll(self._odometer, -by, axis)
+                unknown = np.roll(unknown, -by, axis)
                 entered = slice(self._size - by, None) if by > 0 else slice(0, -by)
-                gone[(slice(None), entered) if axis else (entered, slice(None))] = True
-            self._seen[gone] = 0
+                unknown[(slice(None), entered) if axis else (entered, slice(None))] = True
+            self._observed_at[unknown] = 0
         self._corner = corner
 
     def write(self, terrain: TerrainMap, motion: MotionState) -> None:
-        """Keep the observed cells of a map in the terrain frame of a motion."""
+        """Store the observed cells of a map in the terrain frame of a motion."""
         grid, pose = terrain.grid, motion.odometry_from_terrain
         index = np.arange(self._size)
         places = (np.stack(np.meshgrid(index, index), axis=-1) + self._corner) * grid.resolution
@@ -153,27 +158,32 @@ class _Memory:
         cells = ((local - np.array(grid.origin)) / grid.resolution).astype(np.float32)
         channels = np.stack([getattr(terrain, name).numpy() for name in CHANNELS])
         values, weight = _sampled(channels, terrain.observed.numpy(), cells)
-        seen = weight > 0.5
+        observed = weight > 0.5
         values[:2] += np.float32(pose[2, 3])
-        self._values[:, seen] = values[:, seen]
-        self._seen[seen], self._odometer[seen] = motion.stamp, self.travelled
+        self._values[:, observed] = values[:, observed]
+        self._observed_at[observed], self._odometer[observed] = motion.stamp, self.travelled
 
     def read(self, motion: MotionState) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Channels in the terrain frame of a motion ``[5, rows, columns]``, how long ago each cell was seen [s] and how
-        far the robot has travelled since [m], ``[rows, columns]``; both infinite where it never was."""
+        """Stored values in the terrain frame of a motion.
+
+        Returns:
+            channels ``[5, rows, columns]``; time since each cell was observed [s] and distance travelled since then
+            [m], each ``[rows, columns]`` and infinite without an observation.
+        """
         grid, pose = self._grid, motion.odometry_from_terrain
         places = np.stack(np.meshgrid(grid.x, grid.y), axis=-1) @ pose[:2, :2].T + pose[:2, 3]
         cells = (places / grid.resolution - self._corner).astype(np.float32)
-        values, weight = _sampled(self._values, self._seen > 0, cells)
+        values, weight = _sampled(self._values, self._observed_at > 0, cells)
         values[:2] -= np.float32(pose[2, 3])
         column, row = np.moveaxis(np.clip(np.rint(cells).astype(np.int64), 0, self._size - 1), -1, 0)
-        known = (weight > 0.5) & (self._seen[row, column] > 0)
-        age = np.where(known, (motion.stamp - self._seen[row, column]) * NANOSECOND, np.inf)
+        known = (weight > 0.5) & (self._observed_at[row, column] > 0)
+        age = np.where(known, (motion.stamp - self._observed_at[row, column]) * NANOSECOND, np.inf)
         return values, age, np.where(known, self.travelled - self._odometer[row, column], np.inf)
 
 
 def _sampled(channels: np.ndarray, known: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Channels ``[C, H, W]`` at fractional columns and rows ``[h, w, 2]`` from ``known`` cells alone; their weight."""
+    """Channels ``[C, H, W]`` interpolated between ``known`` cells at fractional columns and rows ``[h, w, 2]``, and the
+    weight of known cells ``[h, w]``."""
 
     def at(values: np.ndarray) -> np.ndarray:
         return cv2.remap(

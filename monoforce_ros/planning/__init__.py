@@ -1,4 +1,4 @@
-"""What a planner needs: candidate commands, what each would cost the robot, and where it can drive at all."""
+"""Planning: candidate commands, their costs and feasibility, occupancy, cost-to-go, and selection."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""Candidates: command sequences to choose from."""
+"""Candidates: command sequences for a planner to select from."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ _QUARTERS = 4
 
 @dataclass(frozen=True)
 class CandidateSettings:
-    """A fan of arcs, and of turns on the spot that lead elsewhere."""
+    """Settings of a fan of arcs and of turns in place followed by driving straight."""
 
     count: int = 32
     speeds: tuple[float, ...] = (0.4, 0.8)
-    """Forward speeds [m/s]; candidates are shared out among them. At 0 a robot turns on the spot."""
+    """Forward speeds [m/s], among which the candidates are divided. At 0 the robot turns in place."""
     yaw_rate: float = 0.8
-    """Largest yaw rate of an arc [rad/s]."""
+    """Largest yaw rate [rad/s]."""
     stop: bool = True
-    """Standing still is a candidate too, the last one."""
+    """Add standing still as the last candidate."""
 
     def __post_init__(self):
         if not 1 <= self.count <= 4096:
@@ -33,37 +33,37 @@ class CandidateSettings:
 def fan_of_arcs(settings: CandidateSettings) -> np.ndarray:
     """Forward speed [m/s] and yaw rate [rad/s] of each candidate over four quarters of the horizon, ``[count, 4, 2]``.
 
-    Yaw rates are spread evenly from right to left and held; straight on is among them where a speed has an odd number
-    of arcs. A robot that stands before a wall must turn first and drive then: turns on the spot last half the horizon
-    or three quarters of it, every other one, and go straight on at the largest speed; the fastest to either side go on
-    turning.
+    Each arc holds one yaw rate; the rates are evenly spaced from right to left, and include 0 for a speed with an odd
+    number of arcs. A robot in front of a wall must first turn and then drive: turns in place last half or three
+    quarters of the horizon, alternately, and continue straight at the largest speed; the fastest turns to either side
+    last the whole horizon.
     """
     arcs = settings.count - int(settings.stop and settings.count > 1)
-    # What does not come out even goes to the speeds named last: a single arc must not be a turn on the spot.
+    # A remainder goes to the last speeds: a single arc must not be a turn in place.
     shares = np.array_split(np.arange(arcs), len(settings.speeds))[::-1]
-    onward = max(settings.speeds)
+    fastest = max(settings.speeds)
     fan = []
     for speed, share in zip(settings.speeds, shares, strict=True):
         last = len(share) - 1
         for index, rate in enumerate(np.linspace(-settings.yaw_rate, settings.yaw_rate, last + 1) if last else [0.0]):
             rank = min(index, last - index)
-            turning = _QUARTERS if speed or onward <= 0.0 or not rank else 2 + rank % 2
-            fan.append([[speed, rate]] * turning + [[onward, 0.0]] * (_QUARTERS - turning))
+            turning = _QUARTERS if speed or fastest <= 0.0 or not rank else 2 + rank % 2
+            fan.append([[speed, rate]] * turning + [[fastest, 0.0]] * (_QUARTERS - turning))
     fan += [[[0.0, 0.0]] * _QUARTERS] * (settings.count - arcs)
     return np.array(fan)
 
 
 def over_horizon(sequences: np.ndarray, before: np.ndarray, steps: int) -> np.ndarray:
-    """Commands of candidates over a horizon, after the commands that led there.
+    """Commands of candidates over the horizon, with the commands before it.
 
     Args:
-        sequences: commands that each candidate holds one after another, for equal shares of the horizon ``[N, K, 2]``.
-        before: commands of the steps before the candidates begin ``[history, 2]``.
-        steps: of the horizon from there on.
+        sequences: commands that each candidate holds in turn, for equal shares of the horizon ``[N, K, 2]``.
+        before: commands of the steps before the candidates start ``[history, 2]``.
+        steps: number of steps after that.
 
     Returns:
         ``[N, history + steps, 2]``.
     """
-    led = np.broadcast_to(before, (len(sequences), *before.shape))
-    share = np.arange(steps) * sequences.shape[1] // steps
-    return np.concatenate([led, sequences[:, share]], axis=1)
+    history = np.broadcast_to(before, (len(sequences), *before.shape))
+    index = np.arange(steps) * sequences.shape[1] // steps
+    return np.concatenate([history, sequences[:, index]], axis=1)

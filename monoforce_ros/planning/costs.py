@@ -1,4 +1,4 @@
-"""Costs: what a predicted motion would ask of the robot, as named terms of which 1 is the limit."""
+"""Costs of a predicted motion, as named terms that are 1 at their limit."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from monoforce_ros.terrain import TerrainMap
 
 _GRAVITY = 9.81
 _FORCE_INTERVAL = 0.06
-"""Time between the steps whose forces decide [s]: enough for what is averaged below."""
+"""Time between the steps at which forces are evaluated [s]; short compared with the averaging below."""
 _SMOOTHED = 0.2
-"""Forces of single steps are averaged over this time [s]: a tyre's bounce is not a lost wheel."""
+"""Averaging time of forces [s]: a bouncing tyre does not count as an unloaded wheel."""
 
 
 @dataclass(frozen=True)
 class CostWeights:
-    """Weights of the terms of a candidate's cost."""
+    """Weights of the cost terms."""
 
     roll: float = 1.0
     pitch: float = 1.0
@@ -40,24 +40,24 @@ class CostWeights:
 
 @dataclass(frozen=True)
 class Limits:
-    """Where a term is 1; beyond it a candidate is not feasible."""
+    """Values at which the cost terms are 1; a candidate beyond any of them is infeasible."""
 
     roll: float = 0.5
-    """Largest roll, either side [rad]."""
+    """Largest absolute roll [rad]."""
     pitch: float = 0.6
-    """[rad]."""
+    """Largest absolute pitch [rad]."""
     force_variation: float = 1.0
-    """Standard deviation of the load on the ground over the robot's weight."""
+    """Standard deviation of the total ground load over the robot's weight [-]."""
     wheel_load: float = 0.95
-    """Share of half the load that one side may lose; at 1 it hangs in the air."""
+    """Relative loss of load on one side, compared with half the total; at 1 the side is unloaded [-]."""
     slip: float = 0.6
-    """Mean difference of commanded and driven speed over the commanded one."""
+    """Mean difference of commanded and achieved forward speed over the mean commanded drive speed [-]."""
     effort: float = 0.6
-    """Mean power at the ground over weight times 1 m/s."""
+    """Mean power at the ground over weight times 1 m/s [-]."""
     unobserved: float = 0.8
-    """Share of the way over ground that nothing has measured nearby, or off the map."""
+    """Share of the path over ground without measurements nearby, or off the map [-]."""
     collision: float = 0.25
-    """Push of steep contacts over the robot's weight."""
+    """Horizontal force of steep contacts over the robot's weight [-]."""
 
     def __post_init__(self):
         for name, value in asdict(self).items():
@@ -69,35 +69,35 @@ TERMS = tuple(entry.name for entry in fields(CostWeights))
 
 
 def force_every(time_step: float) -> int:
-    """Steps of ``time_step`` [s] of which one's forces are needed to assess a rollout."""
+    """Interval, in steps of ``time_step`` [s], at which :func:`assess` needs contact forces."""
     return max(1, round(_FORCE_INTERVAL / time_step))
 
 
 @dataclass(frozen=True)
 class Assessment:
-    """What each of ``N`` candidates costs."""
+    """Costs and feasibility of ``N`` candidates."""
 
     terms: dict[str, Tensor]
-    """Each ``[N]``, 1 at its limit."""
+    """Cost terms, each ``[N]`` and 1 at its limit."""
     cost: Tensor
-    """Weighted sum ``[N]``; infinite for a rollout that diverged."""
+    """Weighted sum of the terms ``[N]``; infinite for a diverged rollout."""
     feasible: Tensor
-    """Whether every term keeps its limit ``[N]`` bool."""
+    """Whether no term exceeds its limit ``[N]`` bool."""
 
     @property
     def best(self) -> int | None:
-        """The cheapest feasible candidate; None where there is none."""
+        """Index of the feasible candidate with the lowest cost; None without a feasible one."""
         if not bool(self.feasible.any()):
             return None
         return int(torch.where(self.feasible, self.cost, torch.inf).argmin())
 
     def joined(self, other: Assessment) -> Assessment:
-        """These candidates and others after them."""
+        """These candidates followed by others."""
         terms = {name: torch.cat([value, other.terms[name]]) for name, value in self.terms.items()}
         return Assessment(terms, torch.cat([self.cost, other.cost]), torch.cat([self.feasible, other.feasible]))
 
-    def why_not(self, index: int) -> str:
-        """What keeps a candidate from being feasible, in words; empty where nothing does."""
+    def violations(self, index: int) -> str:
+        """The limits that a candidate exceeds, in words; empty for a feasible one."""
         if not bool(torch.isfinite(self.cost[index])):
             return "the rollout diverged"
         over = {name: float(value[index]) for name, value in self.terms.items() if not float(value[index]) <= 1.0}
@@ -113,18 +113,19 @@ def assess(
     weights: CostWeights = CostWeights(),
     limits: Limits = Limits(),
 ) -> Assessment:
-    """Terms, cost and feasibility of rolled out candidates. Differentiable in the rollout.
+    """Terms, cost and feasibility of candidates. Differentiable in the rollout.
 
     Args:
-        rollout: with the sums of its contact forces, ``[N]``.
-        terrain: the map that all rolled on.
-        robot: what rolled.
+        rollout: of all candidates ``[N]``, with contact force sums.
+        terrain: the map of the rollout.
+        robot: the robot of the rollout.
         twists: commanded forward speed [m/s] and yaw rate [rad/s] of each step ``[N, T, 2]``.
 
     Raises:
-        ValueError: the rollout has no sums of forces, or shapes do not fit.
+        ValueError: the rollout has no contact force sums, or the shape of ``twists`` does not match it.
     """
-    if rollout.contact is None:
+    contact = rollout.contact
+    if contact is None:
         raise ValueError("costs: the rollout has no contact forces; roll out with `with_contact=True`")
     expected = (rollout.position.shape[0], rollout.position.shape[1] - 1, 2)
     if tuple(twists.shape) != expected:
@@ -134,16 +135,16 @@ def assess(
     rotation = rollout.rotation[:, 1:]
     roll = torch.atan2(rotation[..., 2, 1], rotation[..., 2, 2]).abs().amax(dim=1)
     pitch = torch.asin(rotation[..., 2, 0].clamp(-1.0, 1.0)).abs().amax(dim=1)
-    load = _smoothed(rollout.contact.load.sum(dim=2), step)
+    load = _smoothed(contact.load.sum(dim=2), step)
     raw = {
         "roll": roll,
         "pitch": pitch,
         "force_variation": load.std(dim=1) / weight,
-        "wheel_load": _unloaded(rollout, step),
+        "wheel_load": _load_loss(contact.sides, step),
         "slip": _slip(rollout, robot, twists),
-        "effort": _effort(rollout, robot, twists) / weight,
+        "effort": _effort(contact.traction, robot, twists[:, :: rollout.force_every]) / weight,
         "unobserved": _unobserved(rollout, terrain),
-        "collision": _push(rollout, step) / weight,
+        "collision": _push(contact.push, step) / weight,
     }
     terms = {name: torch.nan_to_num(raw[name] / getattr(limits, name), nan=torch.inf) for name in TERMS}
     cost = sum(getattr(weights, name) * terms[name] for name in TERMS)
@@ -158,45 +159,44 @@ def _smoothed(values: Tensor, step: float) -> Tensor:
     return functional.avg_pool1d(values[:, None], width, stride=1)[:, 0]
 
 
-def _unloaded(rollout: Rollout, step: float) -> Tensor:
-    """Of half the load, the largest share that either side loses ``[N]``."""
-    left, right = (_smoothed(side, step) for side in rollout.contact.sides.unbind(-1))
+def _load_loss(sides: Tensor, step: float) -> Tensor:
+    """Largest share of half the load that either side loses ``[N]``, from the loads of both ``[N, S, 2]`` [N]."""
+    left, right = (_smoothed(side, step) for side in sides.unbind(-1))
     lighter = torch.minimum(left, right) / (left + right).clamp_min(1e-6)
     return 1.0 - 2.0 * lighter.amin(dim=1)
 
 
 def _slip(rollout: Rollout, robot: RobotModel, twists: Tensor) -> Tensor:
-    """Mean difference of commanded and driven forward speed, over how fast the drives were asked to run ``[N]``.
+    """Mean difference of commanded and achieved forward speed over the mean commanded drive speed ``[N]``.
 
-    Yaw does not count: a skid-steered robot scrubs part of it away on the best of grounds.
+    Yaw does not count: a skid-steered robot loses part of it to scrubbing on any ground.
     """
     ahead = (rollout.velocity[:, 1:] * rollout.rotation[:, 1:, :, 0]).sum(-1)
-    reach = float(robot.drive_offsets.abs().max())
-    asked = (twists[..., 0].abs() + reach * twists[..., 1].abs()).mean(dim=1)
-    return (twists[..., 0] - ahead).abs().mean(dim=1) / asked.clamp_min(0.1)
+    arm = float(robot.drive_offsets.abs().max())
+    commanded = (twists[..., 0].abs() + arm * twists[..., 1].abs()).mean(dim=1)
+    return (twists[..., 0] - ahead).abs().mean(dim=1) / commanded.clamp_min(0.1)
 
 
-def _effort(rollout: Rollout, robot: RobotModel, twists: Tensor) -> Tensor:
-    """Mean power that the drives bring to the ground [W] ``[N]``."""
-    twists = twists[:, :: rollout.force_every]
+def _effort(traction: Tensor, robot: RobotModel, twists: Tensor) -> Tensor:
+    """Mean power of the drives at the ground [W] ``[N]``, from their traction ``[N, S, D]`` [N]."""
     speed = twists[..., :1] - robot.drive_offsets.to(twists) * twists[..., 1:]
-    return (rollout.contact.traction * speed).sum(dim=2).abs().mean(dim=1)
+    return (traction * speed).sum(dim=2).abs().mean(dim=1)
 
 
 def _unobserved(rollout: Rollout, terrain: TerrainMap) -> Tensor:
-    """Share of the way over cells without a measurement, or off the map ``[N]``."""
+    """Share of the path over cells without a measurement nearby, or off the map ``[N]``."""
     grid = terrain.grid
     place = rollout.position.detach()[..., :2]
     column = ((place[..., 0] - grid.origin[0]) / grid.resolution).round().clamp(0, grid.columns - 1).nan_to_num(0.0)
     row = ((place[..., 1] - grid.origin[1]) / grid.resolution).round().clamp(0, grid.rows - 1).nan_to_num(0.0)
     nearby = torch.from_numpy(terrain.measured_nearby()).to(place.device)
     known = nearby[row.long(), column.long()] & rollout.inside
-    away = (place - place[:, :1]).norm(dim=-1)
-    # Where the robot stands nothing sees the ground, and it is known to carry.
-    moved = away > 1.0
+    distance = (place - place[:, :1]).norm(dim=-1)
+    # No sensor sees the ground below the robot, but it is known to support it.
+    moved = distance > 1.0
     return ((~known) & moved).sum(dim=1) / moved.sum(dim=1).clamp_min(1)
 
 
-def _push(rollout: Rollout, step: float) -> Tensor:
-    """Largest horizontal push of steep contacts [N] ``[N]``."""
-    return _smoothed(rollout.contact.push.norm(dim=-1), step).amax(dim=1)
+def _push(push: Tensor, step: float) -> Tensor:
+    """Largest horizontal force of steep contacts [N] ``[N]``, from those of each step ``[N, S, 2]``."""
+    return _smoothed(push.norm(dim=-1), step).amax(dim=1)

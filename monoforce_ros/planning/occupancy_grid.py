@@ -1,4 +1,4 @@
-"""Occupancy: where a robot cannot drive, as Nav2 takes it: 0 free to 100 lethal, -1 unknown."""
+"""Occupancy: traversability costs of a terrain map as in Nav2: 0 free to 100 lethal, -1 unknown."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from monoforce_ros.planning.goal_planner import LETHAL, UNKNOWN
 from monoforce_ros.terrain import TerrainMap
 
 _SLOPE_BASE = 0.5
-"""Length over which a slope counts as one [m]."""
+"""Length over which slopes are measured [m]."""
 
 
 @dataclass(frozen=True)
 class Occupancy:
-    """A map whose axes are those of the odometry frame, for costmaps know no others."""
+    """A grid of costs, aligned with the axes of the odometry frame as costmaps require."""
 
     resolution: float
     """Edge of a cell [m]."""
     origin: tuple[float, float]
     """x and y of the corner of cell (0, 0) in the odometry frame [m]."""
     height: float
-    """Of the robot's base [m]."""
+    """z of the robot's base in the odometry frame [m]."""
     data: np.ndarray
-    """``[rows, columns]`` int8."""
+    """Costs ``[rows, columns]`` int8."""
 
 
 def occupancy(
@@ -34,10 +34,13 @@ def occupancy(
     """Costs of a terrain map's cells.
 
     Args:
-        terrain: one map, whose height carries.
+        terrain: a single map.
         odometry_from_terrain: its pose ``[4, 4]``, level.
-        slope_limit: steepest slope [rad]; cells are the costlier the nearer they come to it.
-        step_limit: highest step between neighbouring cells that wheels or tracks climb [m].
+        slope_limit: steepest feasible slope [rad]; the cost grows in proportion to the slope.
+        step_limit: highest feasible step between neighbouring cells [m]; the cost grows in proportion to the step.
+
+    Raises:
+        ValueError: a limit is out of its range.
     """
     if not (0.01 <= slope_limit < 1.5 and 0.001 <= step_limit <= 5.0):
         raise ValueError(
@@ -48,7 +51,7 @@ def occupancy(
     height = terrain.height.detach().cpu().double().numpy()
     smooth = uniform_filter(height, max(1, round(_SLOPE_BASE / grid.resolution)), mode="nearest")
     slope = np.arctan(np.hypot(*np.gradient(smooth, grid.resolution)))
-    # Half the span over three cells: the slope within a cell is not a step.
+    # The height range over three cells, less what the slope contributes to it.
     span = maximum_filter(height, 3, mode="nearest") - minimum_filter(height, 3, mode="nearest")
     step = np.maximum(0.0, span - 2.0 * grid.resolution * np.tan(np.minimum(slope, 1.4)))
     share = np.maximum(slope / slope_limit, step / step_limit)
@@ -58,7 +61,7 @@ def occupancy(
 
 
 def _aligned(cost: np.ndarray, terrain: TerrainMap, pose: np.ndarray) -> Occupancy:
-    """The map turned into the odometry frame's axes; each new cell takes the old one that it lies in."""
+    """The map resampled along the axes of the odometry frame by nearest neighbour."""
     grid = terrain.grid
     left, right, bottom, top = grid.extent
     corners = np.array([[left, bottom], [left, top], [right, bottom], [right, top]]) @ pose[:2, :2].T + pose[:2, 3]

@@ -1,4 +1,4 @@
-"""Choice: which of the assessed candidates leads to a goal."""
+"""Selection: which of the assessed candidates to execute on the way to a goal."""
 
 from __future__ import annotations
 
@@ -11,32 +11,33 @@ from monoforce_ros.core import wrap_angle
 from monoforce_ros.planning.goal_planner import CostToGo
 
 WAYPOINTS = (25, 50, 75)
-"""Shares of the horizon at which a candidate's place is known beside its end [%]."""
-_LOOK = 0.5
-"""Length of a look ahead [m]."""
-_NEARER = 0.1
-"""What a candidate must gain of the way to be better than standing [m]."""
+"""Shares of the horizon at which candidates report their position, besides its end [%]."""
+_LOOKAHEAD = 0.5
+"""Lookahead distance [m]."""
+_PROGRESS = 0.1
+"""Progress towards the goal that makes a candidate better than standing [m]."""
 FIELDS = (
     *("x", "y", "heading", "speed", "yaw_rate", "cost", "feasible"),
     *(f"{axis}_{share}" for share in WAYPOINTS for axis in "xy"),
 )
-"""What must be known of each candidate."""
+"""Required fields of the candidates."""
 
 
 @dataclass(frozen=True)
 class SelectionWeights:
-    """What counts how much."""
+    """Weights of the criteria of a selection."""
 
     cost: float = 1.0
+    """Weight of the candidate's own cost."""
     distance: float = 3.0
-    """Of how near to the goal a candidate comes, over how far any comes."""
+    """Weight of the remaining path length to the goal, over the largest distance that a candidate covers."""
     heading: float = 1.0
-    """Of the angle between the last heading and the goal, over half a turn."""
+    """Weight of the angle between the final heading and the goal, over half a turn."""
     clearance: float = 1.0
-    """Of how near to what is lethal a candidate comes, 0 to 1, on the average of the places where it is looked at."""
+    """Weight of the proximity of lethal cells, 0 to 1, averaged over the waypoints."""
     change: float = 0.5
-    """Of how far a candidate's command is from the former one, over the largest among the candidates: of two ways that
-    are about as good a robot must keep to one."""
+    """Weight of the difference from the previous command, over the largest command of all candidates. It keeps the
+    robot from alternating between two similarly good paths."""
 
 
 def select_candidate(
@@ -44,18 +45,18 @@ def select_candidate(
     robot: np.ndarray,
     goal: np.ndarray,
     weights: SelectionWeights = SelectionWeights(),
-    ways: CostToGo | None = None,
-    former: tuple[float, float] | None = None,
+    cost_to_go: CostToGo | None = None,
+    previous_command: tuple[float, float] | None = None,
 ) -> int | None:
-    """Index of the best feasible candidate; None where there is none.
+    """Index of the best feasible candidate; None without a feasible one.
 
     Args:
-        candidates: :data:`FIELDS`, each ``[N]``; places and headings in the odometry frame.
-        robot: where the robot is ``[2]`` [m].
-        goal: where it shall go ``[2]`` [m].
-        weights: of cost, distance, heading and clearance.
-        ways: to the goal around obstacles; without them distances are straight.
-        former: forward speed [m/s] and yaw rate [rad/s] that the robot was told last.
+        candidates: :data:`FIELDS`, each ``[N]``; positions and headings in the odometry frame.
+        robot: position of the robot ``[2]`` [m].
+        goal: position of the goal ``[2]`` [m].
+        weights: of the criteria.
+        cost_to_go: path lengths to the goal around obstacles; without it, straight distances are used.
+        previous_command: forward speed [m/s] and yaw rate [rad/s] of the last command.
 
     Raises:
         ValueError: a field is missing.
@@ -67,43 +68,48 @@ def select_candidate(
     if not feasible.any():
         return None
     end = np.column_stack([candidates["x"], candidates["y"]])
-    way = [np.broadcast_to(robot, end.shape)]
-    way += [np.column_stack([candidates[f"x_{share}"], candidates[f"y_{share}"]]) for share in WAYPOINTS]
-    nearest, at_end = _nearest(np.stack([*way, end], axis=1), goal)
-    if ways is not None:
-        # How far it still is from the best place on the way; a candidate that reaches the goal itself keeps its own.
-        left = np.stack([ways.at(place) for place in way[1:]] + [ways.at(end)], axis=1)
-        nearest, at_end = np.minimum(left.min(axis=1), np.where(nearest < _LOOK, nearest, np.inf)), nearest >= _LOOK
-    reach = max(float(np.linalg.norm(end - robot, axis=1).max()), 0.1)
+    path = [np.broadcast_to(robot, end.shape)]
+    path += [np.column_stack([candidates[f"x_{share}"], candidates[f"y_{share}"]]) for share in WAYPOINTS]
+    path.append(end)
+    remaining, nearest_at_end = _nearest(np.stack(path, axis=1), goal)
     towards = np.arctan2(goal[1] - end[:, 1], goal[0] - end[:, 0])
-    off = np.abs(wrap_angle(candidates["heading"] - towards)) / np.pi
-    if ways is not None:
-        # Where the way is not straight, looking along it counts: by how much half a metre ahead would shorten it.
-        ahead = end + _LOOK * np.column_stack([np.cos(candidates["heading"]), np.sin(candidates["heading"])])
-        off = np.clip(0.5 * (1.0 - (ways.at(end) - ways.at(ahead)) / _LOOK), 0.0, 1.0)
-    # A candidate that passes the goal may look anywhere.
-    off = np.where(at_end, off, 0.0)
-    close = 0.0 if ways is None else np.mean([ways.near(place) for place in (*way[1:], end)], axis=0)
-    # To stand leads nowhere, and tomorrow as little as today: only where nothing feasible leads nearer.
-    here = float(np.linalg.norm(robot - goal)) if ways is None else float(ways.at(robot))
+    misalignment = np.abs(wrap_angle(candidates["heading"] - towards)) / np.pi
+    proximity = np.zeros(len(end))
+    start = float(np.linalg.norm(robot - goal))
+    if cost_to_go is not None:
+        # The remaining path length from the best waypoint; a candidate that reaches the goal keeps its distance.
+        from_waypoints = np.stack([cost_to_go.at(place) for place in path[1:]], axis=1)
+        reaches_goal = remaining < _LOOKAHEAD
+        remaining = np.minimum(from_waypoints.min(axis=1), np.where(reaches_goal, remaining, np.inf))
+        nearest_at_end = ~reaches_goal
+        # Paths may bend: instead of the direction of the goal, use the progress that moving straight on would make.
+        heading = np.column_stack([np.cos(candidates["heading"]), np.sin(candidates["heading"])])
+        progress = (cost_to_go.at(end) - cost_to_go.at(end + _LOOKAHEAD * heading)) / _LOOKAHEAD
+        misalignment = np.clip(0.5 * (1.0 - progress), 0.0, 1.0)
+        proximity = np.mean([cost_to_go.proximity_at(place) for place in path[1:]], axis=0)
+        start = float(cost_to_go.at(robot))
+    # The final heading of a candidate that passes the goal does not matter.
+    misalignment = np.where(nearest_at_end, misalignment, 0.0)
+    # Standing makes no progress; allow it only if no feasible candidate makes any.
     standing = (np.abs(candidates["speed"]) < 1e-6) & (np.abs(candidates["yaw_rate"]) < 1e-6)
-    if (feasible & ~standing & (here - nearest > _NEARER)).any():
+    if (feasible & ~standing & (start - remaining > _PROGRESS)).any():
         feasible = feasible & ~standing
-    score = weights.cost * candidates["cost"] + weights.distance * nearest / reach + weights.heading * off
-    score = score + weights.clearance * close
-    if former is not None:
-        asked = np.column_stack([candidates["speed"], candidates["yaw_rate"]])
-        largest = np.maximum(np.abs(asked).max(axis=0), 1e-6)
-        score = score + weights.change * (np.abs(asked - former) / largest).mean(axis=1)
+    reach = max(float(np.linalg.norm(end - robot, axis=1).max()), 0.1)
+    score = weights.cost * candidates["cost"] + weights.distance * remaining / reach
+    score = score + weights.heading * misalignment + weights.clearance * proximity
+    if previous_command is not None:
+        commands = np.column_stack([candidates["speed"], candidates["yaw_rate"]])
+        largest = np.maximum(np.abs(commands).max(axis=0), 1e-6)
+        score = score + weights.change * (np.abs(commands - previous_command) / largest).mean(axis=1)
     return int(np.where(feasible, score, np.inf).argmin())
 
 
-def _nearest(ways: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Least distance of each polyline ``[N, K, 2]`` to the goal [m], and whether that is at its end; each ``[N]``."""
-    start, step = ways[:, :-1], np.diff(ways, axis=1)
+def _nearest(paths: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Smallest distance of each polyline ``[N, K, 2]`` to the goal [m], and whether it is at the end; each ``[N]``."""
+    start, step = paths[:, :-1], np.diff(paths, axis=1)
     length = np.maximum((step**2).sum(axis=2), 1e-12)
     along = np.clip(((goal - start) * step).sum(axis=2) / length, 0.0, 1.0)
-    away = np.linalg.norm(start + along[..., None] * step - goal, axis=2)
-    nearest = away.min(axis=1)
-    end = np.linalg.norm(ways[:, -1] - goal, axis=1)
-    return nearest, end <= nearest + 1e-6
+    distance = np.linalg.norm(start + along[..., None] * step - goal, axis=2)
+    nearest = distance.min(axis=1)
+    at_end = np.linalg.norm(paths[:, -1] - goal, axis=1)
+    return nearest, at_end <= nearest + 1e-6

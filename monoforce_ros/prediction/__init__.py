@@ -1,6 +1,7 @@
-"""One observation → terrain and rollout: what the node and the evaluation have in common."""
+"""Prediction: from an observation to the robot's motion and contact forces, its uncertainty, and its measured error."""
 
-from monoforce_ros.prediction.contact_view import (
+from monoforce_ros.prediction.ensemble import COVERAGE, EnsembleSettings, Spread, spread
+from monoforce_ros.prediction.geometry import (
     FORCE_INTERVAL,
     FORCE_LENGTH,
     cell_points,
@@ -8,11 +9,11 @@ from monoforce_ros.prediction.contact_view import (
     force_steps,
     usable_steps,
 )
-from monoforce_ros.prediction.ensemble import EnsembleSettings, Spread, spread
 from monoforce_ros.prediction.monitor import HORIZONS, GapSummary, LiveGap
 from monoforce_ros.prediction.predictor import Prediction, Predictor, start_states
 
 __all__ = [
+    "COVERAGE",
     "FORCE_INTERVAL",
     "FORCE_LENGTH",
     "HORIZONS",

@@ -1,4 +1,4 @@
-"""Spread: how far a prediction may be off, from an ensemble over what is not known exactly."""
+"""Spread: uncertainty of a prediction, from an ensemble of rollouts with varied parameters."""
 
 from __future__ import annotations
 
@@ -13,33 +13,34 @@ from monoforce_ros.prediction.predictor import Prediction, Predictor, start_stat
 from monoforce_ros.robots import RobotModel
 
 COVERAGE = 0.9
-"""Share of outcomes that the band shall hold."""
+"""Share of outcomes that the band should contain."""
 _RAYLEIGH = float(np.sqrt(-2.0 * np.log(1.0 - COVERAGE)))
-"""Radius that holds that share of a normal distribution in two dimensions, in standard deviations of each."""
+"""Radius, in standard deviations of each axis, that contains this share of a normal distribution in two dimensions."""
 
 
 @dataclass(frozen=True)
 class EnsembleSettings:
-    """What is varied, as standard deviations."""
+    """Standard deviations of the varied quantities."""
 
     members: int = 24
+    """Number of rollouts."""
     friction: float = 0.15
-    """Of the logarithm of the ground's friction."""
+    """Of the logarithm of the ground's friction [-]."""
     speed: float = 0.03
-    """Of each component of the start's velocity [m/s]."""
+    """Of each horizontal component of the initial velocity [m/s]."""
     yaw_rate: float = 0.03
-    """Of the start's angular velocities [rad/s]."""
+    """Of the initial yaw rate [rad/s]."""
     heading: float = 0.01
-    """Of the start's heading [rad]."""
+    """Of the initial heading [rad]."""
     gain: float = 0.03
-    """Of the drives' gain, each side on its own: what a model of the drives leaves out."""
+    """Of the gain of the drives, common and differential [-]; covers unmodelled drive dynamics."""
     drift: float = 0.08
-    """Of the position along and across, per metre driven [-]: what maps and physics get wrong beside all this; measured
-    on synthetic drives with a lidar (benchmarks/uncertainty.py)."""
+    """Of the position along and across the heading, per metre driven [-]; covers the remaining errors of maps and
+    physics, and was measured on synthetic recordings with a lidar (benchmarks/uncertainty.py)."""
     position: float = 0.05
-    """Of the start's position [m]: odometry jumps about, and a wheel on the edge of a stone may slip off it or not."""
+    """Of the position at any time [m]: odometry is noisy, and a wheel may or may not slip off the edge of a stone."""
     scale: float = 1.4
-    """On the whole band; set so that it held :data:`COVERAGE` of what happened on ten synthetic drives with a lidar."""
+    """Factor on the whole band, calibrated for :data:`COVERAGE` on ten synthetic recordings with a lidar [-]."""
     seed: int = 0
 
     def __post_init__(self):
@@ -62,75 +63,84 @@ class EnsembleSettings:
 
 @dataclass(frozen=True)
 class Spread:
-    """Of one prediction at each time of its rollout ``[T + 1]``, about its own path."""
+    """Uncertainty of one prediction about its path, at each time of its rollout ``[T + 1]``."""
 
     along: np.ndarray
     """Standard deviation along the heading [m]."""
     across: np.ndarray
-    """To the side [m]."""
+    """Standard deviation across the heading [m]."""
     up: np.ndarray
-    """[m]."""
+    """Standard deviation of the height [m]."""
     heading: np.ndarray
-    """[rad]."""
+    """Standard deviation of the heading [rad]."""
     radius: np.ndarray
-    """Of the circle about the predicted position that holds :data:`COVERAGE` of the outcomes [m]."""
+    """Radius of the circle about the predicted position that contains :data:`COVERAGE` of the outcomes [m]."""
     valid: int
-    """Members whose rollout stayed finite."""
+    """Number of members whose rollout stayed finite."""
 
 
 def spread(predictor: Predictor, prediction: Prediction, twists: np.ndarray, settings: EnsembleSettings) -> Spread:
-    """Roll out variants of a prediction on its own map, all at once.
+    """Uncertainty of a prediction, from a batch of variants rolled out on its map.
 
-    Varied are friction, the start's velocities and heading, the gain of each side's drives, and each parameter of the
-    robot's effects within its interval. The same members are drawn each time, so that bands do not flicker.
+    The members vary friction, initial velocities and heading, the gain of each side's drives, and each parameter of the
+    robot's effects within its confidence interval. They are the same in each call, so that bands do not flicker.
 
     Args:
-        predictor: rolls out.
-        prediction: whose map and start are varied.
-        twists: its commands ``[history + T, 2]``.
-        settings: what is varied.
+        predictor: robot and physics of the rollouts.
+        prediction: provides the map, the start state and the nominal path.
+        twists: commands of the prediction ``[history + T, 2]``.
+        settings: standard deviations of the varied quantities.
 
     Raises:
         ValueError: fewer than half of the members stayed finite.
     """
     count = settings.members
     random = np.random.default_rng(settings.seed)
-    # Antithetic pairs: the mean of what is drawn is zero however few there are.
-    drawn = random.standard_normal(((count + 1) // 2, 8))
-    drawn = torch.from_numpy(np.concatenate([drawn, -drawn])[:count]).float()
+    drawn = _antithetic(random, count, 8)
     robot = _varied_robot(predictor.robot, drawn, settings)
     motions = [prediction.motion] * count
     start = _varied_start(start_states([prediction.motion]), drawn, settings)
     terrain = prediction.terrain
-    given = torch.as_tensor(twists, dtype=torch.float32).expand(count, -1, -1)
+    commands = torch.as_tensor(twists, dtype=torch.float32).expand(count, -1, -1)
     with torch.no_grad():
-        rolled = predictor.differentiable_roll_out(terrain, motions, given, start, robot, with_forces=False)
+        rolled = predictor.differentiable_roll_out(terrain, motions, commands, start, robot, with_forces=False)
     finite = (rolled.valid & torch.isfinite(rolled.position).all(dim=(1, 2))).numpy()
     if finite.sum() < max(2, count // 2):
         raise ValueError(f"{count - int(finite.sum())} of {count} members of the ensemble diverged")
-    nominal, turned = prediction.rollout.position[0].double().numpy(), prediction.rollout.rotation[0].double().numpy()
-    away = rolled.position.double().numpy()[finite] - nominal
-    heading = np.arctan2(turned[:, 1, 0], turned[:, 0, 0])
+    nominal = prediction.rollout.position[0].double().numpy()
+    attitude = prediction.rollout.rotation[0].double().numpy()
+    offset = rolled.position.double().numpy()[finite] - nominal
+    heading = np.arctan2(attitude[:, 1, 0], attitude[:, 0, 0])
     cosine, sine = np.cos(heading), np.sin(heading)
-    along = cosine * away[..., 0] + sine * away[..., 1]
-    across = cosine * away[..., 1] - sine * away[..., 0]
+    along = cosine * offset[..., 0] + sine * offset[..., 1]
+    across = cosine * offset[..., 1] - sine * offset[..., 0]
     rotation = rolled.rotation.double().numpy()[finite]
-    turn = np.arctan2(rotation[..., 1, 0], rotation[..., 0, 0]) - heading
-    turn = wrap_angle(turn)
+    turn = wrap_angle(np.arctan2(rotation[..., 1, 0], rotation[..., 0, 0]) - heading)
     driven = np.linalg.norm(np.diff(nominal[:, :2], axis=0, prepend=nominal[:1, :2]), axis=1).cumsum()
     drift = np.hypot(settings.drift * driven, settings.position)
     radius = np.hypot(np.quantile(np.hypot(along, across), COVERAGE, axis=0), _RAYLEIGH * drift)
 
-    def deviation(values: np.ndarray, beside: np.ndarray | float = 0.0) -> np.ndarray:
-        return settings.scale * np.sqrt((values**2).mean(axis=0) + np.square(beside))
+    def deviation(values: np.ndarray, added: np.ndarray | float = 0.0) -> np.ndarray:
+        return settings.scale * np.sqrt((values**2).mean(axis=0) + np.square(added))
 
     return Spread(
-        deviation(along, drift), deviation(across, drift), deviation(away[..., 2], settings.position), deviation(turn),
-        settings.scale * radius, int(finite.sum()),
-    )  # fmt: skip
+        along=deviation(along, drift),
+        across=deviation(across, drift),
+        up=deviation(offset[..., 2], settings.position),
+        heading=deviation(turn),
+        radius=settings.scale * radius,
+        valid=int(finite.sum()),
+    )
+
+
+def _antithetic(random: np.random.Generator, count: int, *size: int) -> torch.Tensor:
+    """Standard normal numbers ``[count, *size]`` in pairs of opposite sign: for even counts their mean is zero."""
+    half = random.standard_normal(((count + 1) // 2, *size))
+    return torch.from_numpy(np.concatenate([half, -half])[:count]).float()
 
 
 def _varied_start(state: State, drawn: torch.Tensor, settings: EnsembleSettings) -> State:
+    """Start states of the members."""
     count = len(drawn)
     angle = settings.heading * drawn[:, 0]
     cosine, sine, zero = angle.cos(), angle.sin(), torch.zeros(count)
@@ -146,27 +156,25 @@ def _varied_start(state: State, drawn: torch.Tensor, settings: EnsembleSettings)
 
 
 def _varied_robot(robot: RobotModel, drawn: torch.Tensor, settings: EnsembleSettings) -> RobotModel:
-    """The robot with effects that have a value of their own in each trajectory."""
+    """The robot with one value of each effect parameter per member."""
     intervals = dict(robot.effect_intervals)
     random = np.random.default_rng(settings.seed + 1)
-    effects = {}
+    effects: dict[str, dict[str, float | torch.Tensor]] = {}
     for name, parameters in robot.effects:
         varied = dict(parameters)
         for key, (low, high) in intervals.get(name, {}).items():
-            half = len(drawn) // 2 + len(drawn) % 2
-            unit = random.standard_normal(half)
-            unit = torch.from_numpy(np.concatenate([unit, -unit])[: len(drawn)]).float()
-            # The interval holds 95 %; what is drawn stays within it, as bounds of parameters do.
-            middle = torch.as_tensor(varied[key], dtype=torch.float32)
-            varied[key] = (middle + unit * (high - low) / 3.92).clamp(low, high)
+            unit = _antithetic(random, len(drawn))
+            # A 95 % interval is 3.92 standard deviations wide; values stay within it, as parameters have bounds.
+            value = torch.as_tensor(varied[key], dtype=torch.float32)
+            varied[key] = (value + unit * (high - low) / 3.92).clamp(low, high)
         effects[name] = varied
-    friction = torch.exp(settings.friction * drawn[:, 5])
-    known = effects.setdefault("friction_scale", {"factor": 1.0})
-    known["factor"] = (torch.as_tensor(known["factor"], dtype=torch.float32) * friction).clamp(0.02, 3.0)
-    gain = effects.setdefault("drive_gain", {"gain": 1.0})
-    drives = torch.as_tensor(gain["gain"], dtype=torch.float32) * (1.0 + settings.gain * drawn[:, 6])
-    gain["gain"] = drives.clamp(0.2, 2.0)
-    uneven = effects.setdefault("drive_asymmetry", {"difference": 0.0})
-    sides = torch.as_tensor(uneven["difference"], dtype=torch.float32) + settings.gain * drawn[:, 7]
-    uneven["difference"] = sides.clamp(-1.0, 1.0)
+    friction_scale = effects.setdefault("friction_scale", {"factor": 1.0})
+    factor = torch.as_tensor(friction_scale["factor"], dtype=torch.float32) * torch.exp(settings.friction * drawn[:, 5])
+    friction_scale["factor"] = factor.clamp(0.02, 3.0)
+    drive_gain = effects.setdefault("drive_gain", {"gain": 1.0})
+    gain = torch.as_tensor(drive_gain["gain"], dtype=torch.float32) * (1.0 + settings.gain * drawn[:, 6])
+    drive_gain["gain"] = gain.clamp(0.2, 2.0)
+    asymmetry = effects.setdefault("drive_asymmetry", {"difference": 0.0})
+    difference = torch.as_tensor(asymmetry["difference"], dtype=torch.float32) + settings.gain * drawn[:, 7]
+    asymmetry["difference"] = difference.clamp(-1.0, 1.0)
     return replace(robot, effects=tuple(effects.items()))

@@ -1,4 +1,4 @@
-"""LiveGap: how far predictions were off, seconds later, while the robot drives."""
+"""LiveGap: error of recent predictions, measured while the robot drives."""
 
 from __future__ import annotations
 
@@ -12,81 +12,86 @@ from monoforce_ros.core import FAST_SHARE, CommandTrack, MotionTrack, StaleDataE
 from monoforce_ros.prediction.predictor import Prediction, Predictor
 
 HORIZONS = (1.0, 2.0, 5.0)
-_EVERY = 0.5
-"""Least time between the predictions that are kept to be compared [s]."""
-_KEPT = 120
-_LARGEST_GAP = 0.3
-_FEWEST = 6
-"""Comparisons that a regime needs to be named."""
-_FREEDOM = 6.0
-"""Variance of the second difference of three noisy values, in units of theirs."""
+"""Times after the start of a prediction at which its error is measured [s]."""
+_INTERVAL = 0.5
+"""Smallest time between predictions that are compared [s]."""
+_MAXIMUM_SAMPLES = 120
+_MAXIMUM_GAP = 0.3
+"""Largest time between a compared pose and the nearest odometry [s]."""
+_MINIMUM_SAMPLES = 6
+"""Smallest number of comparisons for a statement about the error or about a regime."""
+_SECOND_DIFFERENCE_VARIANCE = 6.0
+"""Variance of the second difference of independent values, over their own variance."""
 
 
 @dataclass(frozen=True)
 class GapSample:
-    """One prediction, compared."""
+    """Errors of one prediction."""
 
     stamp: int
-    """Of the prediction [ns]."""
+    """Start of the prediction [ns]."""
     position: np.ndarray
-    """Distance to where the robot was at each of :data:`HORIZONS` [m]; NaN where that is not known."""
+    """Distance between predicted and measured position at each of :data:`HORIZONS` [m]; NaN if unknown."""
     heading: np.ndarray
-    """[rad], signed: predicted minus measured."""
+    """Predicted minus measured heading [rad]."""
     moved: np.ndarray
-    """Distance from the start to where the robot was [m]."""
+    """Distance between the start and the measured position [m]."""
     regimes: frozenset[str]
+    """Motion regimes of the commands during the first 2 s."""
 
 
 @dataclass(frozen=True)
 class GapSummary:
-    """Running error over the last minute or so of comparisons."""
+    """Statistics of the error over the last minute or so."""
 
     count: int
+    """Number of compared predictions."""
     position: np.ndarray
-    """Median at each horizon [m]; NaN without a comparison."""
+    """Median position error at each horizon [m]; NaN without a comparison."""
     heading: np.ndarray
-    """Median size [rad]."""
+    """Median absolute heading error [rad]."""
     floor: np.ndarray
-    """What the noise of the odometry alone makes of it [m]."""
+    """Noise floor: median position error that odometry noise alone causes [m]."""
     worst: str
-    """The regime in which the error at 2 s is largest, in words; empty where none stands out."""
+    """The motion regime with the largest error at 2 s; empty unless it differs clearly from the others."""
 
     @property
     def excessive(self) -> bool:
-        """Whether the error at 2 s is more than noise and a quarter of a metre or a tenth of the way explain."""
-        return bool(self.count >= _FEWEST and self.position[1] > max(3.0 * self.floor[1], 0.25))
+        """Whether the error at 2 s exceeds both 0.25 m and three times the noise floor."""
+        return bool(self.count >= _MINIMUM_SAMPLES and self.position[1] > max(3.0 * self.floor[1], 0.25))
 
 
 @dataclass
 class LiveGap:
-    """Keeps predictions until it is known what happened, and compares.
+    """Keeps predictions until their horizon has passed, and compares them with the measured motion.
 
-    The driver may have changed his mind after a prediction was made: each is rolled out again on its own map and from
-    its own start, with the commands that were really given, so that only the model's error is left.
+    Commands may have changed after a prediction was made. Each prediction is therefore rolled out again on its map and
+    from its start, under the recorded commands, so that only the error of the model remains.
     """
 
     predictor: Predictor
+    """Robot and physics of the predictions."""
     _waiting: deque[Prediction] = field(default_factory=deque)
-    _samples: deque[GapSample] = field(default_factory=lambda: deque(maxlen=_KEPT))
+    _samples: deque[GapSample] = field(default_factory=lambda: deque(maxlen=_MAXIMUM_SAMPLES))
     _noise: tuple[float, float] = (0.0, 0.0)
 
     def clear(self) -> None:
-        """Forget everything: time began anew."""
+        """Forget all predictions, as after a backward time jump."""
         self._waiting.clear()
         self._samples.clear()
 
     def remember(self, prediction: Prediction) -> None:
-        """Keep a prediction for later, unless the last one kept is too recent."""
-        if self._waiting and prediction.stamp - self._waiting[-1].stamp < _EVERY * 1e9:
+        """Keep a prediction for a later comparison, unless the last one is too recent."""
+        if self._waiting and prediction.stamp - self._waiting[-1].stamp < _INTERVAL * 1e9:
             return
         self._waiting.append(prediction)
 
     def compare(self, motion: MotionTrack, commands: CommandTrack) -> GapSample | None:
-        """Compare the oldest prediction whose last horizon has passed; None where none has.
+        """Compare the oldest prediction if its last horizon has passed; None otherwise, or without a known error.
 
         Args:
-            motion: measured, up to now; at least from the prediction on.
-            commands: given, up to now.
+            motion: measured motion from the start of the prediction until now.
+            commands: recorded commands until now.
         """
         last = min(HORIZONS[-1], self.predictor.steps * self.predictor.options.time_step)
         if not self._waiting or not len(motion) or motion.stamps[-1] < self._waiting[0].stamp + round(last * 1e9):
@@ -103,7 +108,7 @@ class LiveGap:
         return None
 
     def summary(self) -> GapSummary:
-        """The running error."""
+        """Statistics of the errors so far."""
         empty = np.full(len(HORIZONS), np.nan)
         if not self._samples:
             return GapSummary(0, empty, empty, empty, "")
@@ -111,17 +116,17 @@ class LiveGap:
         heading = np.abs([sample.heading for sample in self._samples])
         moved = np.array([sample.moved for sample in self._samples])
         spread, turn = self._noise
-        # Median of a normal error: of both ends' positions, in two dimensions, and of the start's heading, in one.
+        # Medians of normal errors: 1.18 σ in two dimensions (positions of start and end), 0.67 σ in one (heading).
         floor = np.hypot(1.18 * np.sqrt(2.0) * spread, 0.67 * turn * _median(moved))
         return GapSummary(len(self._samples), _median(position), _median(heading), floor, self._worst(position[:, 1]))
 
     def _worst(self, errors: np.ndarray) -> str:
-        """The regime whose error at 2 s is half again as large as that of the rest."""
+        """The regime with the largest error at 2 s, if that is over 1.5 times the error outside of it."""
         found, largest = "", 1.5
         for regime in sorted(set().union(*(sample.regimes for sample in self._samples))):
             inside = np.array([regime in sample.regimes for sample in self._samples])
             known = np.isfinite(errors)
-            if (inside & known).sum() < _FEWEST or (~inside & known).sum() < _FEWEST:
+            if (inside & known).sum() < _MINIMUM_SAMPLES or (~inside & known).sum() < _MINIMUM_SAMPLES:
                 continue
             ratio = np.median(errors[inside & known]) / max(np.median(errors[~inside & known]), 1e-3)
             if ratio > largest:
@@ -132,7 +137,7 @@ class LiveGap:
 def odometry_noise(motion: MotionTrack) -> tuple[float, float]:
     """Standard deviation of measured positions [m] and headings [rad], from their second differences.
 
-    Motion is smooth over three neighbouring poses, noise is not; robust against jumps.
+    Motion is smooth over three consecutive poses, noise is not. The median makes the estimate robust to jumps.
     """
     if len(motion) < 8:
         return 0.0, 0.0
@@ -140,11 +145,12 @@ def odometry_noise(motion: MotionTrack) -> tuple[float, float]:
     heading = np.unwrap(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y**2 + z**2)))
     values = np.column_stack([motion.positions[:, :2], heading])
     second = np.abs(values[:-2] - 2.0 * values[1:-1] + values[2:])
-    deviation = 1.4826 * np.median(second, axis=0) / np.sqrt(_FREEDOM)
+    deviation = 1.4826 * np.median(second, axis=0) / np.sqrt(_SECOND_DIFFERENCE_VARIANCE)
     return float(np.hypot(*deviation[:2]) / np.sqrt(2.0)), float(deviation[2])
 
 
 def _compared(prediction: Prediction, motion: MotionTrack, twists: np.ndarray, predictor: Predictor) -> GapSample:
+    """Errors of a prediction under the recorded commands ``[T, 2]``."""
     count = len(HORIZONS)
     position, heading, moved = np.full(count, np.nan), np.full(count, np.nan), np.full(count, np.nan)
     positions, rotations = prediction.positions(), prediction.rotations()
@@ -154,7 +160,7 @@ def _compared(prediction: Prediction, motion: MotionTrack, twists: np.ndarray, p
         if step >= len(positions) or not inside[step] or not bool(prediction.rollout.valid[0]):
             continue
         try:
-            state = motion.at(prediction.stamp + round(horizon * 1e9), maximum_gap=_LARGEST_GAP)
+            state = motion.at(prediction.stamp + round(horizon * 1e9), maximum_gap=_MAXIMUM_GAP)
         except StaleDataError:
             continue
         position[i] = np.linalg.norm(positions[step] - state.position)
@@ -166,12 +172,12 @@ def _compared(prediction: Prediction, motion: MotionTrack, twists: np.ndarray, p
 
 
 def _regimes(twists: np.ndarray, predictor: Predictor) -> frozenset[str]:
-    """Regimes of commands ``[T, 2]``."""
+    """Motion regimes of commands ``[T, 2]``."""
     masks = motion_regimes(twists[None], FAST_SHARE * predictor.robot.maximum_speed)
     return frozenset(name for name, mask in masks.items() if mask[0])
 
 
 def _median(values: np.ndarray) -> np.ndarray:
-    """Median of each column over what is known; NaN where nothing is."""
+    """Median of the finite values of each column; NaN without any."""
     known = np.isfinite(values).any(axis=0)
     return np.array([np.nanmedian(values[:, i]) if known[i] else np.nan for i in range(values.shape[1])])

@@ -1,4 +1,4 @@
-"""Predictor: observation, motion and commands → where the robot will be and which forces will act on it."""
+"""Predictor: from observation, motion and commands to future poses and contact forces."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from monoforce_ros.terrain import Grid, TerrainMap
 
 @dataclass(frozen=True)
 class Prediction:
-    """A terrain map and what a robot will do on it."""
+    """A terrain map and the predicted motion on it."""
 
     motion: MotionState
     """The measured state that the prediction starts from."""
     terrain: TerrainMap
     rollout: Rollout
-    """A batch of one, in the terrain frame."""
+    """Motion and forces in the terrain frame, a batch of one."""
 
     @property
     def stamp(self) -> int:
@@ -45,9 +45,10 @@ def start_states(motions: list[MotionState], dtype: torch.dtype = torch.float32)
     def tensor(values: list[np.ndarray]) -> torch.Tensor:
         return torch.as_tensor(np.array(values), dtype=dtype)
 
-    # Candidates all start from one motion.
-    known = {id(motion): motion.terrain_from_base[:3, :3] for motion in {id(m): m for m in motions}.values()}
-    rotations = [known[id(motion)] for motion in motions]
+    # Candidates share one motion, whose rotation is computed only once.
+    unique = {id(motion): motion for motion in motions}
+    by_motion = {key: motion.terrain_from_base[:3, :3] for key, motion in unique.items()}
+    rotations = [by_motion[id(motion)] for motion in motions]
     return State(
         position=tensor([np.zeros(3)] * len(motions)),
         rotation=tensor(rotations),
@@ -57,14 +58,14 @@ def start_states(motions: list[MotionState], dtype: torch.dtype = torch.float32)
 
 
 class Predictor:
-    """Predicts with one robot, one terrain source and one horizon.
+    """Predicts the motion of one robot with one terrain source.
 
     Args:
         robot: the robot's model.
-        source: where terrain comes from.
+        source: source of the terrain maps.
         horizon: length of a prediction [s].
-        options: physics.
-        history: seconds of commands before the start that delays and lags of the drives need.
+        options: of the physics.
+        history: time before the start over which delays and lags of the drives need commands [s].
     """
 
     def __init__(
@@ -83,7 +84,7 @@ class Predictor:
         self.history = round(history / self.options.time_step)
 
     def warm_up(self) -> None:
-        """Make the first prediction as fast as the others: compile kernels, load libraries."""
+        """Compile kernels and load libraries, so that the first prediction is as fast as later ones."""
         still = MotionState(0, np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3))
         self.roll_out(TerrainMap.flat(Grid.square(2.0, 0.5)), [still], np.zeros((1, self.history + 2, 2)))
 
@@ -98,10 +99,10 @@ class Predictor:
         """Predict from one observation.
 
         Args:
-            observation: what the sensors saw.
-            motion: the robot's state at that time.
+            observation: sensor data.
+            motion: the robot's state at the same time.
             twists: commanded forward speed [m/s] and yaw rate [rad/s] at ``command_stamps``, ``[history + T, 2]``.
-            force_every: of so many steps the forces of the first one are computed.
+            force_every: interval of the steps at which contact forces are returned.
         """
         terrain = self.source.terrain(observation, motion)
         return Prediction(motion, terrain, self.roll_out(terrain, [motion], twists[None], force_every=force_every))
@@ -118,10 +119,10 @@ class Predictor:
     ) -> Rollout:
         """Roll out motions ``[B]`` under twists ``[B, history + T, 2]`` on one map or a batch of maps."""
         with torch.no_grad():
-            given = torch.as_tensor(twists, dtype=torch.float32)
+            commands = torch.as_tensor(twists, dtype=torch.float32)
             start = start_states(motions)
             return self.differentiable_roll_out(
-                terrain, motions, given, start, self.robot,
+                terrain, motions, commands, start, self.robot,
                 with_forces=with_forces, with_contact=with_contact, force_every=force_every,
             )  # fmt: skip
 
@@ -137,9 +138,9 @@ class Predictor:
         with_contact: bool = False,
         force_every: int = 1,
     ) -> Rollout:
-        """As :meth:`roll_out`, with gradients, from other start states and with another variant of the robot."""
+        """As :meth:`roll_out` but with gradients, for given start states and a given variant of the robot."""
         speeds = drive_speeds(robot, twists, self.options.time_step, history=self.history)
-        # Terrain frames look along the robot's heading; what holds in the odometry frame turns with them.
+        # The terrain frame turns with the robot's heading; effects fixed in the odometry frame are rotated into it.
         heading = torch.tensor([motion.heading for motion in motions], dtype=torch.float32)
         return rollout(
             terrain, turned_effects(robot, heading), speeds, start, options=self.options, with_forces=with_forces,

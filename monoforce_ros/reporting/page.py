@@ -1,13 +1,13 @@
-"""Self-contained HTML pages: their style, figures as PNG, and texts put into documents."""
+"""Self-contained HTML pages: the shell and the style that all reports share, and figures embedded as PNG."""
 
 from __future__ import annotations
 
+import base64
+import html
 import io
-from pathlib import Path
+from collections.abc import Iterable, Mapping, Sequence
 
 from matplotlib.figure import Figure
-
-from monoforce_ros.core import write_text
 
 PAGE_STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #1c2733; background: #f5f7f8; margin: 0; }
@@ -28,18 +28,53 @@ dt { color: #6b7a88; } dd { margin: 0; overflow-wrap: anywhere; }
 """
 
 
-def write_between(document: Path, name: str, text: str) -> None:
-    """Put a text into a document, between its comments ``<!-- NAME -->`` and ``<!-- end of NAME -->``.
+def page(title: str, body: str, *, heading: str = "", lead: str = "") -> str:
+    """A complete HTML document that loads nothing from elsewhere.
 
-    Raises:
-        ValueError: the document has no such comments.
+    Args:
+        title: plain text, in the browser's title bar.
+        body: HTML below the heading.
+        heading: plain text at the top of the page; the title unless given.
+        lead: plain text of an introduction below the heading.
     """
-    content = document.read_text(encoding="utf-8")
-    begin, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
-    if begin not in content or end not in content:
-        raise ValueError(f"{document}: no {begin} and {end} to write between")
-    before, _, rest = content.partition(begin)
-    write_text(document, f"{before}{begin}\n{text.strip()}\n{end}{rest.partition(end)[2]}")
+    introduction = f'<p class="lead">{html.escape(lead, quote=False)}</p>' if lead else ""
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{html.escape(title)}</title><style>{PAGE_STYLE}</style></head>"
+        f"<body><main><h1>{html.escape(heading or title)}</h1>{introduction}{body}</main></body></html>"
+    )
+
+
+def card(body: str, *, heading: str = "", caption: str = "") -> str:
+    """A section of a page with HTML ``body``; heading and caption are plain text."""
+    top = f'<h2 style="margin-top:0">{html.escape(heading)}</h2>' if heading else ""
+    below = f'<p class="muted">{html.escape(caption, quote=False)}</p>' if caption else ""
+    return f'<section class="card">{top}{below}{body}</section>'
+
+
+def picture_card(png: bytes, *, alt: str, heading: str = "", caption: str = "") -> str:
+    """A section that shows a picture, which is part of the page."""
+    data = base64.b64encode(png).decode()
+    picture = f'<img alt="{html.escape(alt)}" src="data:image/png;base64,{data}">'
+    return card(picture, heading=heading, caption=caption)
+
+
+def definition_list(entries: Mapping[str, object]) -> str:
+    """Names and values in two columns, as plain text."""
+    listed = "".join(f"<dt>{html.escape(k)}</dt><dd>{html.escape(str(v))}</dd>" for k, v in entries.items())
+    return f"<dl>{listed}</dl>"
+
+
+def folded_list(summary: str, lines: Iterable[str]) -> str:
+    """Lines of plain text below a summary that unfolds them; nothing without lines."""
+    listed = "".join(f"<li>{html.escape(line)}</li>" for line in lines)
+    return f"<details><summary>{html.escape(summary)}</summary><ul>{listed}</ul></details>" if listed else ""
+
+
+def table(head: Sequence[str], rows: Iterable[str]) -> str:
+    """A table of HTML header cells and of rows that are HTML ``<tr>`` elements."""
+    return f"<table><tr>{''.join(f'<th>{cell}</th>' for cell in head)}</tr>{''.join(rows)}</table>"
 
 
 def figure_png(figure: Figure) -> bytes:

@@ -1,4 +1,4 @@
-"""Robot models from YAML: body points, drives, sensors."""
+"""Robot models: body points, drives, mass properties and sensors, read from and written to YAML files."""
 
 from monoforce_ros.robots.loader import RobotFileError, load_robot, robot_file, shipped_robots
 from monoforce_ros.robots.mass import add_point_mass

@@ -1,4 +1,4 @@
-"""Belts: the outlines that touch the ground. A wheel is a belt around one circle, a track around two equal ones."""
+"""Belts: outlines of wheels and tracks. A wheel is a belt around one circle, a track a belt around two."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ def belt_outline(
         spacing: the largest distance between neighbouring samples [m].
 
     Returns:
-        positions ``[n, 2]`` (x, z) [m], unit tangents ``[n, 2]`` along which the surface moves relative to the body
-        when the drive runs forward (backwards at the bottom), and the arc length of each sample ``[n]`` [m].
+        positions ``[n, 2]`` (x, z) [m]; unit tangents ``[n, 2]`` in the direction in which the surface moves relative
+        to the body when the drive runs forward (backwards at the bottom); arc length of each sample ``[n]`` [m].
     """
-    # The straight parts leave the circles where their radii are perpendicular to them, tilted by this angle.
+    # Angle of the straight parts, which are tangents of both circles, to the line between the centres.
     tilt = 0.0 if length == 0.0 else math.asin(np.clip((rear_radius - front_radius) / length, -1.0, 1.0))
     front, rear = np.array([length / 2, 0.0]), np.array([-length / 2, 0.0])
     pieces = [_arc(front, front_radius, -math.pi / 2 + tilt, math.pi / 2 - tilt, spacing)]
@@ -35,15 +35,14 @@ def belt_outline(
     else:
         pieces.append(_arc(rear, front_radius, math.pi / 2, 3 * math.pi / 2, spacing))
     positions, directions, lengths = (np.concatenate(parts) for parts in zip(*pieces, strict=True))
-    # The outline is walked counter-clockwise seen from the right-handed y axis's tip (x towards z), that is forwards
-    # along the bottom; the belt of a robot that drives forward runs the other way.
+    # The outline runs forwards along the bottom; the belt of a robot that drives forward moves the other way.
     return positions, -directions, lengths
 
 
 def _arc(
     centre: np.ndarray, radius: float, start: float, end: float, spacing: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    # An even count puts samples symmetrically about the lowest point, never at the seam of two pieces.
+    # With an even count, samples are symmetric about the lowest point and never at the junction of two pieces.
     count = max(2, 2 * math.ceil(radius * (end - start) / spacing / 2))
     angles = start + (np.arange(count) + 0.5) * (end - start) / count
     radial = np.stack([np.cos(angles), np.sin(angles)], axis=1)

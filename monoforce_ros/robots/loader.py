@@ -1,4 +1,4 @@
-"""Robot files: YAML → RobotModel, with every key checked."""
+"""Robot files: YAML → RobotModel, with validation of every key."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from monoforce_ros.robots.robot_model import Flipper, RobotModel
 
 MAXIMUM_FILE_BYTES = 1_000_000
 DEFAULT_SPACING = 0.05
-"""Largest distance of neighbouring samples along a belt [m]; across it, rows are twice as far apart at the most."""
+"""Largest distance between neighbouring samples along a belt [m]; across it, rows are at most twice as far apart."""
 
 _VALUE_KEYS = {"value", "low", "high", "unit"}
 _TOP_KEYS = {
@@ -28,18 +28,18 @@ _TOP_KEYS = {
 
 
 class RobotFileError(ValueError):
-    """A robot file that cannot be used; the message names the file, the field, what was got and what was expected."""
+    """The robot file is invalid; the message names the file, the field, the value and what was expected."""
 
 
 def shipped_robots() -> list[str]:
-    """Names of the robots that come with the package."""
+    """Names of the robots in the package."""
     return sorted(path.stem for path in (share_directory() / "config" / "robots").glob("*.yaml"))
 
 
 def robot_file(name_or_file: str | Path) -> Path:
-    """The YAML file of a shipped robot's name, or of a path.
+    """The YAML file of a robot, given by name or path.
 
-    Raises ``RobotFileError`` that lists the shipped robots if there is none.
+    Raises ``RobotFileError``, which lists the shipped robots, if it does not exist.
     """
     text = str(name_or_file)
     if text.endswith((".yaml", ".yml")) or "/" in text:
@@ -58,10 +58,10 @@ def load_robot(name_or_file: str | Path, *, spacing: float = DEFAULT_SPACING) ->
 
     Args:
         name_or_file: a shipped robot's name or the path of a YAML file.
-        spacing: distance between body samples [m]; results do not depend on it beyond discretisation.
+        spacing: distance between body samples [m]; results depend on it only by discretisation.
 
     Raises:
-        RobotFileError: the file is missing, is not YAML, or a field is unknown, missing, or out of its range.
+        RobotFileError: the file is missing or not YAML, or a field is unknown, missing or out of its range.
     """
     path = robot_file(name_or_file)
     if path.stat().st_size > MAXIMUM_FILE_BYTES:
@@ -74,7 +74,7 @@ def load_robot(name_or_file: str | Path, *, spacing: float = DEFAULT_SPACING) ->
 
 
 class _Reader:
-    """Turns parsed YAML into a RobotModel, naming file and field in every complaint."""
+    """Converts parsed YAML into a RobotModel; every error names the file and the field."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -130,7 +130,7 @@ class _Reader:
         areas = np.concatenate(samples.areas)
         drive_sides = np.array(
             [
-                np.sign(np.mean(np.concatenate(samples.points)[np.concatenate(samples.owners) == index, 1]))
+                np.sign(np.mean(np.concatenate(samples.points)[np.concatenate(samples.point_drives) == index, 1]))
                 for index in range(len(samples.drives))
             ]
         )
@@ -147,7 +147,7 @@ class _Reader:
             points=tensor(np.concatenate(samples.points)),
             point_areas=tensor(areas),
             point_tangents=tensor(np.concatenate(samples.tangents)),
-            point_drives=torch.as_tensor(np.concatenate(samples.owners), dtype=torch.int64),
+            point_drives=torch.as_tensor(np.concatenate(samples.point_drives), dtype=torch.int64),
             drive_names=tuple(samples.drives),
             drive_offsets=tensor(drive_sides * track_width / 2),
             friction_longitudinal=tensor(
@@ -166,11 +166,11 @@ class _Reader:
             effect_intervals=self.intervals(top.get("effects", [])),
             flippers=tuple(samples.flippers),
             flipper_angles=tensor(samples.angles),
-            point_flippers=torch.as_tensor(np.concatenate(samples.arms), dtype=torch.int64),
+            point_flippers=torch.as_tensor(np.concatenate(samples.point_flippers), dtype=torch.int64),
         )
 
     def effects(self, content: Any) -> tuple[tuple[str, dict[str, float]], ...]:
-        """Names and values as they stand; whether the catalogue has them is checked where they act."""
+        """Names and parameter values; they are checked against the catalogue where they are used."""
         listed = []
         for index, entry in enumerate(self.items(content, "effects")):
             where = f"effects[{index}]"
@@ -187,7 +187,7 @@ class _Reader:
         return tuple(listed)
 
     def intervals(self, content: Any) -> tuple[tuple[str, dict[str, tuple[float, float]]], ...]:
-        """Of parameters that have one; :meth:`effects` has checked the entries."""
+        """Confidence intervals of the parameters that have one; :meth:`effects` has checked the entries."""
         listed = []
         for index, effect in enumerate(self.items(content, "effects")):
             known = {}
@@ -240,29 +240,34 @@ class _Reader:
             raise self.fail(f"{where}.end", entry["end"], "front or rear")
         joint = self.vector(entry["joint"], f"{where}.joint", 3, 20.0, "m")
         length = self.number(entry["length"], f"{where}.length", 0.01, 5.0, "m")
-        radii = [self.number(entry[k], f"{where}.{k}", 0.01, 2.0, "m") for k in ("root_radius", "tip_radius")]
-        if abs(radii[0] - radii[1]) >= length:
+        root, tip = (self.number(entry[k], f"{where}.{k}", 0.01, 2.0, "m") for k in ("root_radius", "tip_radius"))
+        if abs(root - tip) >= length:
             raise self.fail(f"{where}.length", length, "more than the difference of the radii [m]")
         angle = self.number(entry["angle"], f"{where}.angle", -7.0, 7.0, "rad")
         flipper = Flipper(
             name=str(entry["name"]),
-            joint=tuple(joint.tolist()),
+            joint=(float(joint[0]), float(joint[1]), float(joint[2])),
             end=entry["end"],
             mass=self.number(entry["mass"], f"{where}.mass", 0.0, 1e4, "kg"),
             centre=length / 2,
         )
         first = len(samples.points)
         level = {**entry, "centre": [length / 2, 0.0, 0.0]}
-        self.belt(level, where, (length, *radii), samples, spacing)
+        self.belt(level, where, (length, root, tip), samples, spacing)
         turn = flipper.turned(torch.tensor(angle, dtype=torch.float64)).numpy()
         samples.points[first] = joint + samples.points[first] @ turn.T
         samples.tangents[first] = samples.tangents[first] @ turn.T
-        samples.arms[first][:] = len(samples.flippers)
+        samples.point_flippers[first][:] = len(samples.flippers)
         samples.flippers.append(flipper)
         samples.angles.append(angle)
 
     def belt(
-        self, content: Mapping[str, Any], where: str, shape: tuple[float, float, float], samples: _Samples, spacing
+        self,
+        content: Mapping[str, Any],
+        where: str,
+        shape: tuple[float, float, float],
+        samples: _Samples,
+        spacing: float,
     ) -> None:
         centre = self.vector(content["centre"], f"{where}.centre", 3, 20.0, "m")
         width = self.number(content["width"], f"{where}.width", 0.005, 3.0, "m")
@@ -281,7 +286,7 @@ class _Reader:
         size = self.vector(box["size"], f"{where}.size", 3, 20.0, "m")
         if (size <= 0).any():
             raise self.fail(f"{where}.size", size.tolist(), "positive edge lengths [m]")
-        # Faces are sampled three times as sparsely as belts: the hull meets the ground only when something goes wrong.
+        # Faces are sampled more coarsely than belts, because the hull touches the ground only in unusual poses.
         for axis in range(3):
             first, second = (a for a in range(3) if a != axis)
             counts = [max(2, math.ceil(size[a] / (4 * spacing))) for a in (first, second)]
@@ -317,14 +322,14 @@ class _Reader:
 
 
 class _Samples:
-    """Body samples as they are collected from the parts of a robot file."""
+    """Body samples collected from the parts of a robot file."""
 
     def __init__(self):
         self.points: list[np.ndarray] = []
         self.areas: list[np.ndarray] = []
         self.tangents: list[np.ndarray] = []
-        self.owners: list[np.ndarray] = []
-        self.arms: list[np.ndarray] = []
+        self.point_drives: list[np.ndarray] = []
+        self.point_flippers: list[np.ndarray] = []
         self.drives: list[str] = []
         self.flippers: list[Flipper] = []
         self.angles: list[float] = []
@@ -335,5 +340,5 @@ class _Samples:
         self.points.append(points)
         self.areas.append(areas)
         self.tangents.append(tangents)
-        self.arms.append(np.full(len(points), -1))
-        self.owners.append(np.full(len(points), -1 if drive is None else self.drives.index(str(drive))))
+        self.point_flippers.append(np.full(len(points), -1))
+        self.point_drives.append(np.full(len(points), -1 if drive is None else self.drives.index(str(drive))))

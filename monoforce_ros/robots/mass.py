@@ -1,4 +1,4 @@
-"""Masses: what adding or taking away a point mass does to a rigid body."""
+"""Mass properties of a rigid body with a point mass added or removed."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from torch import Tensor
 def add_point_mass(
     mass: Tensor, centre: Tensor, inertia: Tensor, added: Tensor, place: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Mass, centre of mass and inertia of a body with a point mass added to it (taken away, where negative).
+    """Mass, centre of mass and inertia of a body with a point mass added to it (removed, if negative).
 
     Args:
         mass: ``[]`` or ``[B]`` [kg].
         centre: centre of mass ``[..., 3]`` [m].
         inertia: about that centre ``[..., 3, 3]`` [kg m²].
         added: ``[]`` or ``[B]`` [kg].
-        place: where ``[..., 3]`` [m].
+        place: position of the point mass ``[..., 3]`` [m].
 
     Returns:
         mass, centre and inertia about the new centre, by the parallel-axis theorem.

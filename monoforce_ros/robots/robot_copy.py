@@ -1,11 +1,12 @@
-"""Robot copy: a robot's file with what was found, where it was found, and how sure that is."""
+"""Copies of robot files with identified effects, their confidence intervals and their provenance."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -15,7 +16,7 @@ from monoforce_ros.robots.loader import RobotFileError, robot_file
 
 
 def fingerprint(paths: Sequence[Path]) -> str:
-    """A short hash of the bags' contents."""
+    """A hash of the contents of bags, 16 hexadecimal digits."""
     digest = hashlib.sha256()
     for path in paths:
         files = [path] if path.is_file() else sorted(file for file in path.iterdir() if file.is_file())
@@ -29,26 +30,29 @@ def fingerprint(paths: Sequence[Path]) -> str:
 def write_robot(
     robot: str | Path,
     out: Path,
-    effects: Sequence[dict],
+    effects: Sequence[Mapping[str, Any]],
     bags: Sequence[Path],
     data_fingerprint: str,
-    commissioning: dict | None = None,
+    commissioning: Mapping[str, Any] | None = None,
     found_by: str = "diagnose",
 ) -> Path:
-    """Write a copy of a robot's file with effects added, or with new values where it had them.
+    """Write a copy of a robot's file with effects added, or with new values of effects that it has.
 
     Args:
         robot: name or file of the nominal robot.
-        out: the copy; it appears when it is complete.
-        effects: ``name`` and ``parameters`` {name: {value, low, high, unit}}.
-        bags: where they were found.
-        data_fingerprint: of these.
-        commissioning: what disagreed on the healthy robot, kept for later runs.
-        found_by: what found the effects.
+        out: the copy; it appears once it is complete.
+        effects: entries with ``name``, ``parameters`` {name: {value, low, high, unit}} and, optionally,
+            ``indistinguishable``: names of effects that explain the data equally well.
+        bags: recordings from which the effects were identified.
+        data_fingerprint: fingerprint of the bags.
+        commissioning: nominal residual of the healthy robot, for later runs: ``samples_s`` and ``residual_rms``.
+        found_by: name of the tool that identified the effects.
     """
     content = yaml.safe_load(robot_file(robot).read_text(encoding="utf-8"))
     present = {entry["name"]: entry for entry in content.get("effects", [])}
     for effect in effects:
+        # ``rivals`` is the former name of the key.
+        indistinguishable = list(effect.get("indistinguishable", effect.get("rivals", [])))
         present[effect["name"]] = {
             "name": effect["name"],
             "parameters": {
@@ -62,21 +66,26 @@ def write_robot(
                 "date": datetime.now(UTC).date().isoformat(),
                 "bags": [path.name for path in bags],
                 "data": data_fingerprint,
-                "rivals": list(effect.get("rivals", [])),
+                "indistinguishable": indistinguishable,
+                "rivals": list(indistinguishable),  # the former name, kept for one release
             },
         }
     content["effects"] = list(present.values())
     if commissioning is not None:
-        content["commissioning"] = commissioning
+        content["commissioning"] = dict(commissioning)
     write_text(out, yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
     return out
 
 
 def read_nominal_residual(robot: str | Path, samples: Sequence[float]) -> np.ndarray | None:
-    """What disagreed on the healthy robot, ``[K, 3]`` [m, m, rad], by its file; None if it was never commissioned.
+    """RMS residual of the healthy robot from its file, ``[K, 3]`` [m, m, rad]; None without commissioning.
+
+    Args:
+        robot: name or file.
+        samples: times in a window at which the residual is needed [s], ``[K]``.
 
     Raises:
-        RobotFileError: the file's entry makes no sense or is for other times.
+        RobotFileError: the file's entry is invalid or for other times.
     """
     path = robot_file(robot)
     entry = yaml.safe_load(path.read_text(encoding="utf-8")).get("commissioning")

@@ -1,9 +1,10 @@
-"""RobotModel: what the physics needs to know of a robot."""
+"""RobotModel: the physical model of a robot."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,7 +15,7 @@ from monoforce_ros.robots.mass import add_point_mass
 
 @dataclass(frozen=True)
 class Flipper:
-    """An arm with a driven belt that turns about a lateral axis; its pose is kinematic (paper III-D)."""
+    """An arm with a driven belt that rotates about a lateral axis; its pose is kinematic (paper III-D)."""
 
     name: str
     joint: tuple[float, float, float]
@@ -22,12 +23,12 @@ class Flipper:
     end: str
     """``front``: at angle 0 it points forward; ``rear``: backward. Positive angles raise the tip."""
     mass: float
-    """[kg], part of the robot's mass."""
+    """Mass [kg], included in the robot's mass."""
     centre: float
     """Distance of its centre of mass from the axle [m]."""
 
     def turned(self, angle: Tensor) -> Tensor:
-        """Rotation ``[3, 3]`` of the arm, which at the identity points forward."""
+        """Rotation ``[3, 3]`` of the arm, which points forward at the identity."""
         about_y = -angle if self.end == "front" else angle + torch.pi
         cos, sin = torch.cos(about_y), torch.sin(about_y)
         zero, one = torch.zeros_like(cos), torch.ones_like(cos)
@@ -38,8 +39,8 @@ class Flipper:
 class RobotModel:
     """A rigid body sampled by surface points, some of which are moved by drives (paper III-B, III-D).
 
-    All lengths are in the robot's base frame (x forward, y left, z up; REP 103) and in metres. Any of the physical
-    quantities may carry a leading batch dimension ``[B]`` where a rollout shall vary it from trajectory to trajectory.
+    All lengths are in the robot's base frame (x forward, y left, z up; REP 103) and in metres. Physical quantities
+    may have a leading batch dimension ``[B]``, to vary them between the trajectories of a rollout.
     """
 
     name: str
@@ -53,14 +54,14 @@ class RobotModel:
     points: Tensor
     """Surface points [m], ``[N, 3]``."""
     point_areas: Tensor
-    """Area that each point stands for [m²], ``[N]``; forces scale with it, so that sampling density does not matter."""
+    """Surface area of each point [m²], ``[N]``; forces scale with it, so that they do not depend on the sampling."""
     point_tangents: Tensor
     """Velocity of the surface relative to the body for a drive speed of 1 m/s [-], ``[N, 3]``; zero on the hull."""
     point_drives: Tensor
-    """Index of the drive that moves each point, ``[N]`` int64; -1 on the hull."""
+    """Index of the drive of each point, ``[N]`` int64; -1 on the hull."""
     drive_names: tuple[str, ...]
     drive_offsets: Tensor
-    """Lateral offset y of each drive used to turn a twist into drive speeds [m], ``[D]``."""
+    """Lateral offset y of each drive for the conversion of twists into drive speeds [m], ``[D]``."""
     friction_longitudinal: Tensor
     """Factor on the terrain's friction along the rolling direction [-], ``[]`` or ``[B]``."""
     friction_lateral: Tensor
@@ -70,23 +71,23 @@ class RobotModel:
     maximum_yaw_rate: float = float("inf")
     """Largest commanded yaw rate [rad/s]."""
     wheel_radius: float | None = None
-    """Mean radius of the wheels [m]; None for a robot without wheels."""
+    """Mean radius of the wheels [m]; None without wheels."""
     sensors: Mapping[str, Tensor] = field(default_factory=dict)
     """Pose of each sensor frame in the base frame: ``[4, 4]`` homogeneous matrix, base ← sensor."""
 
     flippers: tuple[Flipper, ...] = ()
     flipper_angles: Tensor | None = None
-    """Angles at which the flippers are posed [rad], ``[F]``."""
+    """Angles of the flippers [rad], ``[F]``."""
     point_flippers: Tensor | None = None
-    """Index of the flipper that each point belongs to, ``[N]`` int64; -1 elsewhere."""
+    """Index of the flipper of each point, ``[N]`` int64; -1 elsewhere."""
     effects: tuple[tuple[str, Mapping[str, float | Tensor]], ...] = ()
-    """Effects that act on the robot: name and parameter values, see :mod:`monoforce_ros.effects`."""
+    """Effects of the robot: names and parameter values, see :mod:`monoforce_ros.effects`."""
     effect_intervals: tuple[tuple[str, Mapping[str, tuple[float, float]]], ...] = ()
-    """Between which values parameters of the effects lie (95 %), where that is known."""
+    """95 % confidence intervals of effect parameters, where known."""
 
     @property
     def number_of_drives(self) -> int:
-        """How many drives the robot has."""
+        """Number of drives."""
         return len(self.drive_names)
 
     @property
@@ -95,16 +96,16 @@ class RobotModel:
         return self.points.amin(dim=0), self.points.amax(dim=0)
 
     def covers(self, points: np.ndarray) -> np.ndarray:
-        """Which points ``[n, 3]`` [m] (base frame) are the robot's own body, mounted on it or hang over it, ``[n]``.
+        """Which points ``[n, 3]`` [m] (base frame) belong to the robot, its load, or anything above it, ``[n]`` bool.
 
-        Points on the ground below the body are not.
+        Points on the ground below the body do not.
         """
         low, high = (bound.cpu().numpy() for bound in self.bounds)
         across = ((points[:, :2] > low[:2] - 0.1) & (points[:, :2] < high[:2] + 0.1)).all(axis=1)
         return across & (points[:, 2] > low[2] + 0.05)
 
     def with_points(self, keep: Tensor) -> RobotModel:
-        """The robot with those of its points ``keep`` ``[N]`` bool alone; mass and inertia stay."""
+        """The robot with only the points ``keep`` ``[N]`` bool; mass and inertia stay."""
         flippers = None if self.point_flippers is None else self.point_flippers[keep]
         return replace(
             self,
@@ -117,30 +118,31 @@ class RobotModel:
 
     @property
     def ground_clearance(self) -> float:
-        """Height of the base frame over the lowest driven point [m]."""
+        """Height of the base frame above the lowest driven point [m]."""
         return -float(self.points[self.point_drives >= 0][:, 2].min())
 
     def posed(self, angles: Tensor) -> RobotModel:
-        """The robot with its flippers at ``angles`` [rad] ``[F]``: their points move, mass and inertia follow.
+        """The robot with its flippers at ``angles`` [rad] ``[F]``, including the change of its mass properties.
 
-        Raises ``ValueError`` where the robot has another number of flippers.
+        Raises ``ValueError`` if the robot has another number of flippers.
         """
+        current = self.flipper_angles if self.flipper_angles is not None else self.points.new_zeros(0)
         if angles.shape != (len(self.flippers),):
             raise ValueError(f"flipper angles: got shape {tuple(angles.shape)}, expected [{len(self.flippers)}]")
         angles = angles.to(self.points)
         points, tangents = self.points.clone(), self.point_tangents.clone()
         mass, centre, inertia = self.mass, self.centre_of_mass, self.inertia
         for index, flipper in enumerate(self.flippers):
-            before, after = flipper.turned(self.flipper_angles[index]), flipper.turned(angles[index])
+            before, after = flipper.turned(current[index]), flipper.turned(angles[index])
             turn = after @ before.T
             joint = points.new_tensor(flipper.joint)
-            own = self.point_flippers == index
-            points[own] = joint + (self.points[own] - joint) @ turn.T
-            tangents[own] = self.point_tangents[own] @ turn.T
-            own_mass = points.new_tensor(flipper.mass)
+            on_flipper = self.point_flippers == index
+            points[on_flipper] = joint + (self.points[on_flipper] - joint) @ turn.T
+            tangents[on_flipper] = self.point_tangents[on_flipper] @ turn.T
+            flipper_mass = points.new_tensor(flipper.mass)
             for sign, pose in ((-1.0, before), (1.0, after)):
                 place = joint + flipper.centre * pose[:, 0]
-                mass, centre, inertia = add_point_mass(mass, centre, inertia, sign * own_mass, place)
+                mass, centre, inertia = add_point_mass(mass, centre, inertia, sign * flipper_mass, place)
         return replace(
             self,
             points=points,
@@ -152,7 +154,7 @@ class RobotModel:
         )
 
     def drive_speeds(self, twist: Tensor) -> Tensor:
-        """Ideal drive speeds of a commanded twist, limited to what the robot accepts.
+        """Ideal drive speeds of a commanded twist, limited to the robot's maximum speeds.
 
         Args:
             twist: forward speed [m/s] and yaw rate [rad/s], ``[..., 2]``.
@@ -166,7 +168,7 @@ class RobotModel:
 
     def to(self, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> RobotModel:
         """The same robot with its floating-point tensors in another precision or on another device."""
-        changed = {}
+        changed: dict[str, Any] = {}  # `replace` takes values of every field's type
         for entry in fields(self):
             value = getattr(self, entry.name)
             if isinstance(value, Tensor):

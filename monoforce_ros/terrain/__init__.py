@@ -1,4 +1,4 @@
-"""Terrain maps: what they hold, how they come from lidar, and how they are stored."""
+"""Terrain maps: heights and material of the ground on a grid, their construction from lidar, and their files."""
 
 from monoforce_ros.terrain.accumulation import accumulate
 from monoforce_ros.terrain.files import TerrainFileError, load_terrain, save_terrain

@@ -1,4 +1,4 @@
-"""Accumulation: several lidar sweeps along a drive as one cloud in one frame."""
+"""Accumulation: several lidar sweeps of a recording as one cloud in one frame."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ import numpy as np
 from monoforce_ros.core import transform_points
 
 VOXEL = 0.1
-"""Edge of the cubes in which a return looks for company [m]."""
+"""Edge of the cubes in which neighbouring returns are counted [m]."""
 _LARGEST_INDEX = 1 << 20
 
 
 def accumulate(
     sweeps: Iterable[tuple[np.ndarray, np.ndarray]], *, maximum_range: float = 12.0, minimum_returns: int = 3
 ) -> np.ndarray:
-    """Join sweeps, each from its own pose, and leave out what is alone.
+    """Join sweeps, each from its own pose, and remove isolated returns.
 
-    A return whose cube and the 26 around it hold fewer than ``minimum_returns`` of all sweeps together is dust, a
-    raindrop or the edge of a beam that hit two things.
+    A return is isolated if its cube and the 26 around it contain fewer than ``minimum_returns`` of all sweeps together:
+    dust, rain, or a beam split by an edge.
 
     Args:
-        sweeps: returns ``[n, 3]`` [m] in the base frame, without the robot's own body, and the pose ``[4, 4]`` of the
-            base frame in the frame to join them in, in which z points against gravity.
-        maximum_range: returns further from the robot are left out: errors of its attitude lift them [m].
-        minimum_returns: in a return's neighbourhood, itself included.
+        sweeps: returns ``[n, 3]`` [m] in the base frame, without those from the robot's body, and the pose ``[4, 4]``
+            of the base frame in the common frame, in which z points up.
+        maximum_range: largest distance of returns from the robot [m]; attitude errors displace distant ones.
+        minimum_returns: smallest number of returns in the neighbourhood of a return, including itself.
 
     Returns:
         ``[m, 3]`` [m], float64.
@@ -39,14 +39,14 @@ def accumulate(
     cloud = np.concatenate(joined) if joined else np.zeros((0, 3))
     if not len(cloud):
         return cloud
-    return cloud[company(cloud, VOXEL) >= minimum_returns]
+    return cloud[count_neighbours(cloud, VOXEL) >= minimum_returns]
 
 
-def company(points: np.ndarray, voxel: float) -> np.ndarray:
-    """How many points share the cube of each one, or touch it, itself included, ``[n]``."""
+def count_neighbours(points: np.ndarray, voxel: float) -> np.ndarray:
+    """Number of points in the cube of each point and in the 26 around it, including itself, ``[n]``."""
     index = np.floor((points - points.min(axis=0)) / voxel).astype(np.int64) + 1
     if (index >= _LARGEST_INDEX).any():
-        raise ValueError(f"points: spread over {np.ptp(points, axis=0).max():.0f} m, too far for cubes of {voxel} m")
+        raise ValueError(f"points: spread over {np.ptp(points, axis=0).max():.0f} m, too far for voxels of {voxel} m")
     keys, inverse, counts = np.unique(_key(index), return_inverse=True, return_counts=True)
     cubes = np.stack([keys >> 40, (keys >> 20) & (_LARGEST_INDEX - 1), keys & (_LARGEST_INDEX - 1)], axis=1)
     around = np.zeros(len(keys), np.int64)

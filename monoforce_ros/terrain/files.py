@@ -1,4 +1,4 @@
-"""Files: a terrain map and where it lies, as an ``.npz`` archive that holds nothing but numbers."""
+"""Files: a terrain map and its pose as an ``.npz`` archive of numeric arrays."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ _LARGEST_FILE = 2_000_000_000
 
 
 class TerrainFileError(ValueError):
-    """A file that is no terrain map; the message says what is wrong with it."""
+    """The file is not a valid terrain map; the message says why."""
 
 
 def save_terrain(
-    path: str | Path, terrain: TerrainMap, odometry_from_terrain: np.ndarray | None = None, **extra
+    path: str | Path, terrain: TerrainMap, odometry_from_terrain: np.ndarray | None = None, **extra: np.ndarray
 ) -> Path:
     """Write a single map.
 
     Args:
-        path: of the file; it appears when it is complete.
-        terrain: the map, not a batch.
-        odometry_from_terrain: pose ``[4, 4]`` of the map's frame; at the origin unless given.
-        extra: further arrays to keep.
+        path: of the file; it appears once it is complete.
+        terrain: a single map, not a batch.
+        odometry_from_terrain: pose ``[4, 4]`` of the map's frame; the identity unless given.
+        extra: further arrays to store.
     """
     if terrain.batch_size is not None:
         raise ValueError(f"terrain: got a batch of {terrain.batch_size} maps, expected one")
@@ -38,7 +38,8 @@ def save_terrain(
     content["origin"] = np.array(terrain.grid.origin)
     content["odometry_from_terrain"] = np.eye(4) if odometry_from_terrain is None else odometry_from_terrain
     with atomic_path(path) as unfinished, unfinished.open("wb") as file:
-        np.savez_compressed(file, **content, **extra)
+        # The stubs take every keyword for `allow_pickle`.
+        np.savez_compressed(file, **content, **extra)  # type: ignore[arg-type]
     return path
 
 
@@ -46,14 +47,14 @@ def load_terrain(path: str | Path) -> tuple[TerrainMap, np.ndarray]:
     """Read a map and the pose ``[4, 4]`` of its frame in the odometry frame.
 
     Raises:
-        TerrainFileError: the file is missing, too large, damaged, or holds no map.
+        TerrainFileError: the file is missing, too large, damaged, or contains no map.
     """
     path = Path(path)
     try:
         with zipfile.ZipFile(path) as archive:
             size = sum(entry.file_size for entry in archive.infolist())
         if size > _LARGEST_FILE:
-            raise TerrainFileError(f"{path}: holds {size} bytes, expected at most {_LARGEST_FILE}")
+            raise TerrainFileError(f"{path}: contains {size} bytes, expected at most {_LARGEST_FILE}")
         with np.load(path, allow_pickle=False) as content:
             missing = {*CHANNELS, "observed", "resolution", "origin"} - set(content.files)
             if missing:

@@ -1,4 +1,4 @@
-"""Grid: where the cells of a map lie."""
+"""Grid: size, resolution and origin of a map's cells."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Grid:
-    """A regular grid, indexed ``[row = y, column = x]``; a cell's reference point is its centre."""
+    """A regular grid, indexed ``[row = y, column = x]``; the reference point of a cell is its centre."""
 
     rows: int
     columns: int

@@ -1,4 +1,4 @@
-"""Lidar cloud → terrain map: heights of the cells that were hit, interpolation in between (the paper's [19])."""
+"""Lidar cloud → terrain map: heights of the cells with returns, interpolated in between (the paper's [19])."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from monoforce_ros.terrain.terrain_map import TerrainDefaults, TerrainMap
 
 @dataclass(frozen=True)
 class LidarSettings:
-    """How a cloud becomes a height map."""
+    """Parameters of the conversion from cloud to height map."""
 
     lowest: float = -4.0
-    """Returns further below the robot are errors [m]."""
+    """Returns further below the robot are ignored as errors [m]."""
     highest: float = 3.0
-    """Returns further above the robot cannot stop it [m]."""
+    """Returns further above the robot are ignored as harmless [m]."""
     headroom: float = 0.9
-    """A vertical gap of this size lets the robot pass below: what hangs above it is left out [m]."""
+    """Vertical gap that the robot passes under; returns above such a gap are ignored [m]."""
     quantile: float = 0.75
-    """Height of a cell among its returns: above the middle, so that edges of obstacles count."""
+    """Quantile of a cell's returns that is its height: above the median, so that edges of obstacles count [-]."""
     minimum_cells: int = 20
-    """With fewer observed cells there is no map."""
+    """Smallest number of observed cells of a map."""
 
     def __post_init__(self):
         if not self.lowest < self.highest:
@@ -35,11 +35,11 @@ class LidarSettings:
 
 
 _NEARBY = 0.5
-"""Radius in which a cell's ground is looked for [m]; slopes up to 45° are allowed for over it."""
+"""Radius of the search for the ground of a cell [m]; slopes up to 45° are allowed within it."""
 
 
 class TerrainError(ValueError):
-    """Measurements that do not suffice for a map."""
+    """The measurements do not suffice for a map."""
 
 
 def terrain_from_cloud(
@@ -53,16 +53,18 @@ def terrain_from_cloud(
     """Terrain map of a lidar cloud.
 
     Args:
-        points: returns ``[n, 3]`` [m] in the terrain frame, without the robot's own body.
-        grid: where the map's cells lie.
-        support: points ``[m, 3]`` [m] on which the robot is known to stand. They fix ``height`` in their cells, where
-            the lidar sees nothing, and leave ``geometric_height`` and ``observed`` alone.
+        points: returns ``[n, 3]`` [m] in the terrain frame, without those from the robot's body.
+        grid: cells of the map.
+        settings: parameters of the conversion.
+        material: material of all cells.
+        support: ground contact points ``[m, 3]`` [m] of the robot. They determine ``height`` in their cells, which the
+            lidar does not see; ``geometric_height`` and ``observed`` stay unchanged.
 
     Returns:
-        float32 map; cells without a return hold interpolated heights and are False in ``observed``.
+        float32 map; cells without a return have interpolated heights and are False in ``observed``.
 
     Raises:
-        TerrainError: hardly any return lies on the grid.
+        TerrainError: too few cells have returns.
     """
     heights, observed = cell_heights(points, grid, settings)
     if observed.sum() < settings.minimum_cells:
@@ -90,7 +92,7 @@ def terrain_from_cloud(
 
 
 def cell_heights(points: np.ndarray, grid: Grid, settings: LidarSettings) -> tuple[np.ndarray, np.ndarray]:
-    """Height of each cell that has returns, ``[rows, columns]`` [m], and the mask of these cells."""
+    """Height of each cell with returns, ``[rows, columns]`` [m], and the mask of these cells."""
     z = points[:, 2]
     rows, columns, inside = grid.cells(points[:, :2])
     inside &= (z > settings.lowest) & (z < settings.highest)
@@ -102,7 +104,7 @@ def cell_heights(points: np.ndarray, grid: Grid, settings: LidarSettings) -> tup
     order = np.lexsort((z, flat))
     flat, z = flat[order], z[order]
     first = np.r_[True, flat[1:] != flat[:-1]]
-    # Count the gaps below each return; within a cell, only what lies under the first gap belongs to the ground.
+    # Count the gaps below each return: within a cell, only returns below the first gap belong to the ground.
     gaps = np.cumsum(np.r_[False, ~first[1:] & (np.diff(z) > settings.headroom)])
     cell = np.cumsum(first) - 1
     ground = gaps == gaps[np.flatnonzero(first)][cell]
@@ -120,10 +122,10 @@ def cell_heights(points: np.ndarray, grid: Grid, settings: LidarSettings) -> tup
 
 
 def _stands_on_ground(lowest: np.ndarray, cells: np.ndarray, grid: Grid, settings: LidarSettings) -> np.ndarray:
-    """Which cells' lowest returns belong to the ground or to what stands on it, rather than to a crown in the air.
+    """Which cells' lowest returns belong to the ground or to objects on it, rather than to an overhanging crown.
 
-    A crown whose ground below was not hit shows by hanging far over the lowest return nearby; what stands on the
-    ground has returns at its foot.
+    A crown without returns from the ground below it lies far above the lowest return nearby; objects on the ground have
+    returns at their foot.
     """
     floor = np.full((grid.rows, grid.columns), np.inf, np.float32)
     floor.ravel()[cells] = lowest
@@ -133,10 +135,10 @@ def _stands_on_ground(lowest: np.ndarray, cells: np.ndarray, grid: Grid, setting
 
 
 def fill_holes(heights: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Smooth interpolation into the cells that are not ``known``; known cells keep their value.
+    """Interpolate smoothly into cells that are not ``known``; known cells keep their value.
 
     A pyramid of weighted averages (push–pull, Gortler et al. 1996): each hole takes its value from the finest level at
-    which it has neighbours, so that narrow gaps are bridged locally and wide ones by the trend around them.
+    which it has neighbours, so that narrow gaps are filled locally and wide ones by the trend around them.
     """
     levels = [(np.where(known, heights, 0.0).astype(np.float32), known.astype(np.float32))]
     while min(levels[-1][0].shape) > 1 and (levels[-1][1] < 1.0).any():
@@ -144,7 +146,7 @@ def fill_holes(heights: np.ndarray, known: np.ndarray) -> np.ndarray:
         coarser_weight = cv2.pyrDown(weight, borderType=cv2.BORDER_REFLECT_101)
         coarser = cv2.pyrDown(weighted * weight, borderType=cv2.BORDER_REFLECT_101)
         value = np.where(coarser_weight > 1e-6, coarser / np.maximum(coarser_weight, 1e-6), 0.0)
-        # A coarse cell that saw a quarter of its surroundings is as good as one that saw all of it.
+        # A coarse cell with data in a quarter of its area counts fully.
         levels.append((value.astype(np.float32), np.minimum(1.0, 4.0 * coarser_weight).astype(np.float32)))
     filled = levels[-1][0]
     for value, weight in reversed(levels[:-1]):

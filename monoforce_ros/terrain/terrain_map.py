@@ -1,9 +1,9 @@
-"""TerrainMap: the ground as the physics sees it (paper III-C, "Terrain model")."""
+"""TerrainMap: the terrain model of the physics (paper III-C, "Terrain model")."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -17,7 +17,7 @@ CHANNELS = ("height", "geometric_height", "stiffness", "damping", "friction")
 
 @dataclass(frozen=True)
 class TerrainDefaults:
-    """Material of ground about which nothing more is known: firm soil."""
+    """Material of ground without further information: firm soil."""
 
     stiffness: float = 2.0e6
     """[N/m³]: a Husky's wheels sink 8 mm."""
@@ -31,14 +31,14 @@ class TerrainDefaults:
 class TerrainMap:
     """Maps of the ground in one frame (z up), ``[rows, columns]`` or, for a batch, ``[B, rows, columns]``.
 
-    All maps have the same shape and finite values; a cell without a measurement holds an interpolated value and is
-    False in ``observed``. Raises ``ValueError`` naming the channel otherwise.
+    All channels have the same shape and finite values; a cell without a measurement has an interpolated value and is
+    False in ``observed``. The constructor raises ``ValueError`` otherwise, and names the channel.
     """
 
     height: Tensor
-    """Height at which the ground starts to generate forces (H_t) [m]."""
+    """Height of the supporting ground, below which contact forces act (H_t) [m]."""
     geometric_height: Tensor
-    """Height of what a sensor sees (H_g), vegetation included [m]."""
+    """Height of the visible surface, vegetation included (H_g) [m]."""
     stiffness: Tensor
     """Spring constant per contact area [N/m³]."""
     damping: Tensor
@@ -60,7 +60,7 @@ class TerrainMap:
             channel = getattr(self, name)
             if channel.shape != shape:
                 raise ValueError(f"terrain {name}: got shape {tuple(channel.shape)}, expected {tuple(shape)}")
-            # One NaN or infinity makes the sum one; a sum of large finite numbers may overflow, hence the second look.
+            # The sum is a fast test; as large finite numbers may overflow, a failed one is confirmed cell by cell.
             if name != "observed" and not torch.isfinite(channel.sum()) and not torch.isfinite(channel).all():
                 bad = int((~torch.isfinite(channel)).sum())
                 raise ValueError(
@@ -82,7 +82,7 @@ class TerrainMap:
         observed: Tensor | None = None,
         material: TerrainDefaults = TerrainDefaults(),
     ) -> TerrainMap:
-        """A map of one material; what is visible is the ground, and all of it observed, unless given."""
+        """A map of one material; unless given, the visible surface is the ground, and all cells are observed."""
 
         def constant(value: float) -> Tensor:
             return torch.full_like(height, value, requires_grad=False)
@@ -112,35 +112,48 @@ class TerrainMap:
 
     @classmethod
     def stack(cls, maps: Sequence[TerrainMap]) -> TerrainMap:
-        """A batch ``[B, rows, columns]`` of maps that lie on one grid."""
+        """A batch ``[B, rows, columns]`` of maps on the same grid."""
         if any(entry.grid != maps[0].grid for entry in maps):
-            raise ValueError("terrain maps on different grids cannot be stacked")
+            raise ValueError("terrain maps: got different grids, expected one grid for a batch")
         channels = {name: torch.stack([getattr(m, name) for m in maps]) for name in (*CHANNELS, "observed")}
         return cls(**channels, grid=maps[0].grid)
 
     def measured_nearby(self, reach: float = 0.3) -> np.ndarray:
-        """Whether a cell of one map was measured or is within ``reach`` [m] of one that was, ``[rows, columns]`` bool.
+        """Whether a cell of a single map is within ``reach`` [m] of a measured one, ``[rows, columns]`` bool.
 
-        Between a lidar's rings heights are interpolated, and as good as measured.
+        Heights interpolated between the rings of a lidar are as good as measured.
         """
         observed = self.observed.cpu().numpy()
         if not observed.any():
             return observed
-        away = cv2.distanceTransform((~observed).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-        return away * self.grid.resolution <= reach + 1e-6
+        distance = cv2.distanceTransform((~observed).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        return distance * self.grid.resolution <= reach + 1e-6
 
     @property
     def batch_size(self) -> int | None:
         """Number of maps in the batch; None for a single map."""
         return self.height.shape[0] if self.height.ndim == 3 else None
 
+    def with_cells(self, cells: Tensor, values: Mapping[str, Tensor]) -> TerrainMap:
+        """A map that takes the ``values`` of each channel in ``cells`` ``[rows, columns]`` bool, which are observed."""
+
+        def merged(name: str, channel: Tensor) -> Tensor:
+            return torch.where(cells, values[name].to(channel), channel)
+
+        return replace(
+            self,
+            height=merged("height", self.height),
+            geometric_height=merged("geometric_height", self.geometric_height),
+            stiffness=merged("stiffness", self.stiffness),
+            damping=merged("damping", self.damping),
+            friction=merged("friction", self.friction),
+            observed=self.observed | cells,
+        )
+
     def to(self, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> TerrainMap:
         """The same map in another precision or on another device."""
-        changed = {}
-        for entry in fields(self):
-            value = getattr(self, entry.name)
-            if isinstance(value, Tensor):
-                changed[entry.name] = value.to(device=device, dtype=dtype if value.is_floating_point() else None)
-        if all(value is getattr(self, name) for name, value in changed.items()):
+        channels = {name: getattr(self, name).to(device=device, dtype=dtype) for name in CHANNELS}
+        observed = self.observed.to(device=device)
+        if observed is self.observed and all(channel is getattr(self, name) for name, channel in channels.items()):
             return self
-        return replace(self, **changed)
+        return TerrainMap(**channels, observed=observed, grid=self.grid)

@@ -1,0 +1,75 @@
+"""Fusion of a lidar and cameras: surfaces measured by the lidar, compliance predicted from images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+
+from monoforce_ros.core import MotionState
+from monoforce_ros.perception.ground_alignment import clear_footprint
+from monoforce_ros.perception.lidar import LidarTerrain
+from monoforce_ros.perception.observation import Observation, TerrainSource
+from monoforce_ros.terrain import Grid, TerrainMap
+
+_RIGID_BELOW, _COMPLIANT_FROM = 0.02, 0.06
+"""Compliance (H_g − H_t of the encoder) up to which a surface counts as rigid, and from which on as compliant [m]."""
+_HEIGHT_TOLERANCE = 0.25
+"""How far a compliant surface measured by the lidar may lie above the surface that the encoder predicts [m]."""
+
+
+def apply_compliance(lidar: TerrainMap, camera: TerrainMap) -> TerrainMap:
+    """The lidar's surfaces, lowered to the predicted supporting ground where the encoder predicts that they are
+    compliant (H_d).
+
+    Material is blended likewise: compliant cells take the encoder's, rigid ones that of the lidar's map. The encoder's
+    material is fitted to trajectories on all kinds of ground; on rigid ground the configured one predicts better.
+
+    Args:
+        lidar: map from a lidar.
+        camera: map from an encoder, on the same grid.
+    """
+    compliance = (camera.geometric_height - camera.height).clamp_min(0.0)
+    share = ((compliance - _RIGID_BELOW) / (_COMPLIANT_FROM - _RIGID_BELOW)).clamp(0.0, 1.0)
+    # A surface far above the predicted one is another object, which the encoder has not recognised.
+    above = (lidar.height - camera.height).clamp_min(0.0)
+    height = lidar.height - share * torch.minimum(above, compliance + _HEIGHT_TOLERANCE)
+    return replace(
+        camera,
+        height=height,
+        geometric_height=height + share * compliance,
+        stiffness=torch.lerp(lidar.stiffness, camera.stiffness, share),
+        damping=torch.lerp(lidar.damping, camera.damping, share),
+        friction=torch.lerp(lidar.friction, camera.friction, share),
+        observed=lidar.observed | camera.observed,
+    )
+
+
+@dataclass(frozen=True)
+class LidarCameraTerrain:
+    """Lidar heights, lowered by the compliance that the encoder predicts (H_d); both on the encoder's grid.
+
+    A lidar locates walls accurately but measures the top of grass; an encoder recognises grass, but its heights are
+    less accurate.
+    """
+
+    lidar: LidarTerrain
+    camera: TerrainSource
+    """Source of the encoder's maps, with or without temporal memory."""
+    sensors: ClassVar[tuple[str, ...]] = ("lidar", "camera")
+
+    @property
+    def grid(self) -> Grid:
+        """The encoder's grid."""
+        return self.camera.grid
+
+    def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
+        """Fused map, or the map of the only available sensor; raises ``ValueError`` if neither suffices."""
+        if observation.cloud is None:
+            return self.camera.terrain(observation, motion)
+        if not observation.images:
+            return self.lidar.terrain(observation, motion)
+        fused = apply_compliance(self.lidar.terrain(observation, motion), self.camera.terrain(observation, motion))
+        # What is still high is rigid. (Not done for a lidar alone: grass around the robot would look like a wall.)
+        return clear_footprint(fused, self.lidar.robot, motion)

@@ -1,0 +1,64 @@
+"""The terrain sources that users select by name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from monoforce_ros.encoder import TerrainEncoder, fused, load_encoder, packed
+from monoforce_ros.perception.camera import CameraTerrain
+from monoforce_ros.perception.flat import FlatTerrain
+from monoforce_ros.perception.fusion import LidarCameraTerrain
+from monoforce_ros.perception.lidar import LidarTerrain
+from monoforce_ros.perception.observation import TerrainSource
+from monoforce_ros.perception.temporal_memory import TemporalMemory
+from monoforce_ros.robots import RobotModel
+from monoforce_ros.terrain import Grid, TerrainDefaults
+
+SOURCES = ("lidar", "camera", "lidar_camera", "flat")
+"""Names of the terrain sources."""
+
+
+def choose_terrain_source(
+    kind: str,
+    robot: RobotModel,
+    *,
+    grid: Grid | None = None,
+    material: TerrainDefaults = TerrainDefaults(),  # noqa: B008  (frozen)
+    checkpoint: str | Path = "",
+    device: str = "cpu",
+    precision: str = "float32",
+    threads: int | None = None,
+    retention_time: float = 0.0,
+) -> TerrainSource:
+    """A terrain source by its name, one of :data:`SOURCES`.
+
+    Args:
+        kind: its name.
+        robot: the robot on the ground.
+        grid: cells of the maps; sources with an encoder use the encoder's.
+        material: material of ground for which the source does not predict it.
+        checkpoint: of the encoder; empty for the shipped one.
+        device: where the encoder runs.
+        precision: of the encoder, see :func:`monoforce_ros.encoder.fused`.
+        threads: CPU threads of the encoder; by default PyTorch's current number.
+        retention_time: how long terrain seen by cameras is kept after it leaves the images [s]; 0 disables it.
+
+    Raises:
+        ValueError: there is no such source or precision.
+        CheckpointError: the encoder cannot be loaded.
+    """
+    if kind not in SOURCES:
+        raise ValueError(f"terrain source: got {kind!r}, expected one of {SOURCES}")
+    grid = grid or Grid.square()
+    if kind == "flat":
+        return FlatTerrain(robot, grid, material)
+    if kind == "lidar":
+        return LidarTerrain(robot, grid, material)
+    encoder = load_encoder(checkpoint, "camera")
+    # Packed weights and half precision save time on the CPU only.
+    encoder = packed(fused(encoder, precision)) if device == "cpu" else fused(encoder).to(device)
+    assert isinstance(encoder, TerrainEncoder), "checked by load_encoder"
+    camera: TerrainSource = CameraTerrain(encoder, robot, threads)
+    if retention_time:
+        camera = TemporalMemory(camera, robot, stiffness=encoder.config.stiffness, retention_time=retention_time)
+    return camera if kind == "camera" else LidarCameraTerrain(LidarTerrain(robot, camera.grid, material), camera)
