@@ -9,7 +9,7 @@ from monoforce_ros.bags import BagReader, Recording
 from monoforce_ros.core import MotionTrack, transform_points
 from monoforce_ros.datasets import DatasetError, RoughScene, robot_file_for, scene_to_bag
 from monoforce_ros.messages import stamp_of
-from monoforce_ros.nodes.inputs import AHEAD
+from monoforce_ros.nodes.inputs import ODOMETRY_LAG
 from monoforce_ros.robots import load_robot
 
 SCENES = {"husky_robingas": ("husky", 4), "tradr_robingas": ("tradr", 6)}
@@ -101,7 +101,7 @@ def test_the_path_starts_at_the_robot_and_keeps_to_the_ground(played):
     path = outputs["path"][0]
     poses = np.array([[p.pose.position.x, p.pose.position.y, p.pose.position.z] for p in path.poses])
     # If the cloud overtook its odometry, the motion is extrapolated from odometry at most 30 ms older.
-    earlier = [i for i, s in enumerate(track.stamps) if stamp - AHEAD <= s < stamp]
+    earlier = [i for i, s in enumerate(track.stamps) if stamp - ODOMETRY_LAG <= s < stamp]
     starts = [motion, *(until(track, i + 1).at(stamp) for i in earlier)]
     away = [np.abs(poses[0] - start.position).max() for start in starts]
     assert min(away) < 1e-6, away

@@ -2,15 +2,43 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar, Self, overload
+from typing import Any, ClassVar, Protocol, Self, overload
 
 import numpy as np
 
 from monoforce_ros.synthetic.graphics import mujoco
 from monoforce_ros.synthetic.vehicle import Vehicle
 
-if TYPE_CHECKING:
-    from monoforce_ros.synthetic.simulation import Simulation
+
+class Simulation(Protocol):
+    """What a fault can read and change in a running world (:class:`monoforce_ros.synthetic.simulation.Simulation`)."""
+
+    model: mujoco.MjModel
+    data: mujoco.MjData
+    robot: Vehicle
+    base: int
+    wheel_bodies: list[int]
+    tyres: list[int]
+    tyre_friction: np.ndarray
+
+    @property
+    def time(self) -> float:
+        """Time since the robot came to rest [s]."""
+
+    def state(self) -> Any:
+        """The present pose and twist of the base frame."""
+
+    def heading(self) -> float:
+        """Direction of the chassis' x axis in the horizontal plane [rad]."""
+
+    def wheel_states(self) -> tuple[np.ndarray, np.ndarray]:
+        """Angle [rad] and speed [rad/s] of each wheel."""
+
+    def wheel_velocities(self) -> np.ndarray:
+        """Velocity of each wheel's centre in world axes ``[wheels, 3]`` [m/s]."""
+
+    def grass_forces(self) -> np.ndarray | None:
+        """Force of the grass on each wheel ``[wheels, 3]`` [N], or None."""
 
 
 class Parameter:

@@ -8,17 +8,14 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from typing import TYPE_CHECKING, override
+from typing import override
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from monoforce_ros.synthetic.fault import Fault, Parameter
+from monoforce_ros.synthetic.fault import Fault, Parameter, Simulation
 from monoforce_ros.synthetic.graphics import mujoco
 from monoforce_ros.synthetic.vehicle import Vehicle
-
-if TYPE_CHECKING:
-    from monoforce_ros.synthetic.simulation import Simulation
 
 
 class CommandDelay(Fault):
