@@ -1,11 +1,11 @@
 """Baselines for ``hidden_effects.py``: other ways to reduce the error, cross-validated on the same folds.
 
-``refit``: the parameters of commissioning, fitted again. ``network``: a small neural network that predicts the model's
+``refit``: the commissioning parameters, refitted. ``network``: a small neural network that predicts the model's
 error at the end of a window from its start state and commands. ``sindy``: accelerations by sparse regression (pysindy)
 instead of the physics, integrated from the start of each window.
 
-Baselines are trained and tested on all windows of a fold, also on those that reach into the next block; ``diagnose`` is
-tested only on windows that end within their block.
+Baselines are trained and tested on all windows of a fold, including those that reach into the next block; ``diagnose``
+is tested only on windows that end within their block.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _HISTORY = 0.5
 def baseline_errors(
     evidence: Evidence, data: EvidenceWindows, robot: RobotModel, scale: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Residuals ``[W, 3]`` at the last sample of each window, of every baseline trained on the other fold."""
+    """Residuals ``[W, 3]`` at the last sample of each window, for each baseline trained on the other folds."""
     predictions = Predictions(robot, data)
     before = predictions.residuals([()])[0][:, -1]
     folds = folds_of(data.starts)
@@ -101,11 +101,11 @@ def _sindy(evidence: Evidence, train: EvidenceWindows, test: EvidenceWindows) ->
     starts, commands = pieces(test)
     now = np.array([state[0] for state in starts])
     commands = np.array(commands)
-    place, heading = np.zeros((len(now), 2)), np.zeros(len(now))
+    position, heading = np.zeros((len(now), 2)), np.zeros(len(now))
     for step in range(commands.shape[1] - 1):
         rate = np.asarray(model.predict(now, u=commands[:, step]))
         now = np.clip(now + _STEP * rate, -5.0, 5.0)
         heading = heading + _STEP * now[:, 1]
-        place = place + _STEP * now[:, :1] * np.stack([np.cos(heading), np.sin(heading)], axis=1)
-    predicted = np.concatenate([place, heading[:, None]], axis=1)
+        position = position + _STEP * now[:, :1] * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    predicted = np.concatenate([position, heading[:, None]], axis=1)
     return predicted - relative_motion(motion, test)[:, -1]

@@ -4,11 +4,11 @@
                                                     [--docs FILE] [--png FILE]
 
 The three processes communicate through ROS in real time. A run succeeds if the robot comes within half a metre of the
-goal in the given time without touching the wall. `lidar` takes grass for solid ground, `camera` runs the terrain
+goal within the time limit without touching the wall. `lidar` treats grass as solid ground, `camera` runs the terrain
 encoder, and `lidar_camera` lowers the lidar's heights by the encoder's predicted compliance.
 
-Settings of the encoder and the selector were chosen on courses with seeds 80000 to 80031. Results are reported for
-other seeds, from 91000 on (the default), on which nothing was chosen; `--docs` refuses the former.
+Settings of the encoder and the selector were tuned on courses with seeds 80000 to 80031. Reported results use held-out
+seeds from 91000 on (the default); `--docs` rejects the tuning seeds.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from monoforce_ros.synthetic import WALL_THICKNESS, CourseSettings
 
 ENVIRONMENT = {"ROS_DOMAIN_ID": "88", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 CHOICE_SEEDS = range(80_000, 80_032)
-"""Seeds of courses on which settings of the encoder and the selector were chosen; never report results on them."""
+"""Seeds of courses for tuning the encoder and the selector; never report results on them."""
 REPORT_SEED = 91_000
-"""First seed of courses for reported results; choose nothing on this seed and those after it."""
+"""First seed of courses for reported results; do not tune on this or later seeds."""
 TOLERANCE = 0.5
 """Distance to the goal at which it counts as reached [m]."""
 GOAL_BEHIND_GRASS = 2.0
@@ -89,7 +89,7 @@ def drive(seed: int, source: str, robot: str, checkpoint: str, seconds: float, f
     processes[-1].wait_for("simulating")
     parameters = [f"terrain_source:={source}", "candidates:=46", "horizon:=4.0", "rate:=5.0", f"robot:={robot}",
                   "candidate_yaw_rate:=1.0", "candidate_speeds:=[0.0,0.4,0.8]"]  # fmt: skip
-    # Near obstacles leave the camera's field of view.
+    # Nearby obstacles leave the camera's field of view.
     parameters += ["camera_retention_time:=20.0"] if source == "camera" else []
     parameters += [f"checkpoint:={checkpoint}"] if checkpoint else []
     words = [word for parameter in parameters for word in ("-p", parameter)]
@@ -161,8 +161,8 @@ def main() -> None:
         "--seed",
         type=int,
         default=REPORT_SEED,
-        help=f"first seed (%(default)s); {CHOICE_SEEDS[0]} to {CHOICE_SEEDS[-1]} are for choosing settings, those from "
-        f"{REPORT_SEED} on for reporting",
+        help=f"first seed (%(default)s); {CHOICE_SEEDS[0]} to {CHOICE_SEEDS[-1]} are for tuning, those from {REPORT_SEED} "
+        f"on for reporting",
     )
     parser.add_argument("--source", nargs="+", choices=("lidar", "camera", "lidar_camera"),
                         default=["lidar", "camera", "lidar_camera"])  # fmt: skip
@@ -178,8 +178,7 @@ def main() -> None:
     seeds = range(options.seed, options.seed + options.count)
     if options.docs and set(seeds) & set(CHOICE_SEEDS):
         parser.error(
-            f"--docs: got seeds {seeds[0]} to {seeds[-1]}, some of which were used to choose settings, expected seeds "
-            f"from {REPORT_SEED} on"
+            f"--docs: got seeds {seeds[0]} to {seeds[-1]}, including tuning seeds, expected seeds from {REPORT_SEED} on"
         )
     rows = []
     for source in options.source:

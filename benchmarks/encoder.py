@@ -86,7 +86,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--threads", type=int, default=2, help="threads of PyTorch (default: %(default)s)")
     parser.add_argument("--compile", action="store_true", help="also measure torch.compile (needs a C++ compiler)")
-    parser.add_argument("--quick", action="store_true", help="few repeats, for a test")
+    parser.add_argument("--quick", action="store_true", help="few repeats, for testing")
     parser.add_argument("--json", type=Path, help="write the figures to this file")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)

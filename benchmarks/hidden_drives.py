@@ -1,4 +1,4 @@
-"""The recordings of ``hidden_effects.py``: the faults injected in each, and how it is made."""
+"""Recordings of ``hidden_effects.py``: injected faults and generation."""
 
 from __future__ import annotations
 
@@ -64,22 +64,22 @@ class Case:
 
     @property
     def name(self) -> str:
-        """Of its folder."""
+        """Name of its folder."""
         faults = "+".join(text.replace(":", "_").replace("=", "").replace(",", "_") for text in self.hidden)
         return f"{self.kind}-{self.ground}-{self.noise}-{self.seed}" + (f"-{faults}" if faults else "")
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the injected faults."""
+        """Names of the injected faults."""
         return tuple(text.partition(":")[0] for text in self.hidden)
 
 
 SEED = 40_000
-"""Thresholds and rules were chosen on recordings with smaller seeds, none of which is part of the benchmark."""
+"""First seed. Thresholds and rules were tuned on smaller seeds, which the benchmark does not use."""
 
 
 def all_cases(first: int = SEED) -> list[Case]:
-    """Every recording of the benchmark, from a first seed on; no seed is used twice."""
+    """All recordings of the benchmark, starting at a first seed; each has a unique seed."""
     cases = [
         Case("healthy", (), ground, noise, first + 9000 + number)
         for number, (ground, noise) in enumerate(
@@ -96,7 +96,7 @@ def all_cases(first: int = SEED) -> list[Case]:
     for number, strengths in enumerate(SINGLES):
         for which, text in enumerate(strengths):
             cases.append(Case("single", (text,), "flat", "usual", seed + 10 * number + which))
-        # The stronger fault again: over hills, and with other noise.
+        # The stronger fault again, over hills and with different noise.
         cases.append(Case("single", (strengths[-1],), "hills", "usual", seed + 10 * number + 5))
         noise = "none" if number % 2 else "rough"
         cases.append(Case("single", (strengths[-1],), "flat", noise, seed + 10 * number + 6))
@@ -111,7 +111,7 @@ def all_cases(first: int = SEED) -> list[Case]:
 
 
 def record_case(case: Case, folder: Path) -> Path:
-    """Make the recording unless it exists; returns the bag."""
+    """Create the recording unless it exists; returns the bag."""
     from monoforce_ros.synthetic import LidarSettings, TerrainSettings
     from monoforce_ros.synthetic.hidden import parse_hidden
     from monoforce_ros.synthetic.odometry import OdometrySettings

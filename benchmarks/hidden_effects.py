@@ -1,10 +1,11 @@
-"""Hidden effects: MuJoCo recordings with injected faults, diagnosed as a user would.
+"""Hidden effects: diagnose MuJoCo recordings with injected faults through the user interface.
 
     scripts/run.sh python benchmarks/hidden_effects.py [--jobs 2] [--json FILE] [--docs docs/discrepancy.md]
 
-Recordings and reports are made once and kept in the folder. A recording of the healthy robot commissions the nominal
-robot file; all others are diagnosed with it: without a fault, with one effect at two strengths, over hills with a lidar
-map and at other noise, with pairs, and with out-of-catalogue effects. The truth next to a bag is read only to score.
+Recordings and reports are created once and kept in the folder. A recording of the healthy robot commissions the nominal
+robot file, which is used to diagnose all others: without a fault, with one effect at two strengths, over hills with a
+lidar map, with different noise, with pairs, and with out-of-catalogue effects. The ground truth next to a bag is used
+only for scoring.
 """
 
 from __future__ import annotations
@@ -25,17 +26,17 @@ from tqdm import tqdm
 from monoforce_ros.reporting import figure_png, write_between
 
 STRONG = 2.0
-"""RMS residual over its scale (noise and nominal residual) from which on an effect counts as strong. The corresponding
+"""RMS residual, divided by its scale (noise and nominal residual), above which an effect is strong. The corresponding
 robust loss is half its square."""
 KINDS = ("empty", "single", "pair", "out-of-catalogue")
 CLASSES = (frozenset({"command_delay", "pose_clock_offset", "command_clock_offset"}),)
-"""Effects that count as one; docs/discrepancy.md gives the reason."""
+"""Effects that count as the same; see docs/discrepancy.md for the reason."""
 DRAGS = frozenset({"viscous_drag", "quadratic_drag"})
-"""Resistance that grows with speed: indistinguishable in a recording at about one speed."""
+"""Resistance that grows with speed; indistinguishable in a recording at nearly constant speed."""
 
 
 def commissioned(folder: Path, seed: int) -> Path:
-    """The robot file commissioned on the healthy recording; made once."""
+    """The robot file commissioned on the healthy recording; created once."""
     from monoforce_ros.discrepancy.cli import main as diagnose
 
     case = next(case for case in all_cases(seed) if case.kind == "healthy")
@@ -46,7 +47,7 @@ def commissioned(folder: Path, seed: int) -> Path:
 
 
 def run_case(case: Case, folder: Path, robot: Path, options: argparse.Namespace) -> dict:
-    """Make and diagnose a recording; returns its row."""
+    """Create and diagnose a recording; returns its row."""
     import torch
 
     from monoforce_ros.discrepancy.cli import main as diagnose
@@ -76,7 +77,7 @@ def run_case(case: Case, folder: Path, robot: Path, options: argparse.Namespace)
 
 
 def with_baselines(result: dict, bag: Path, robot: Path, row: Path) -> dict:
-    """The row with the errors of other methods, for single effects on level ground only."""
+    """Add the errors of other methods to the row, for single effects on level ground only."""
     comparable = (result["kind"], result["ground"], result["noise"]) == ("single", "flat", "usual")
     if not comparable or "baselines" in result or result["verdict"] == "error":
         return result
@@ -100,7 +101,7 @@ def with_baselines(result: dict, bag: Path, robot: Path, row: Path) -> dict:
 
 
 def same(one: str, other: str) -> bool:
-    """Whether two names count as one."""
+    """Whether two effect names count as the same."""
     return one == other or any({one, other} <= group for group in CLASSES)
 
 
@@ -111,12 +112,12 @@ def gap_over_noise(row: dict) -> float:
 
 
 def named(row: dict) -> list[str]:
-    """Effects of the catalogue that a report names."""
+    """Names of the effects found in a report."""
     return [effect["name"] for effect in row["effects"]] if row["verdict"] == "effect_found" else []
 
 
 def named_as_other_drag(row: dict) -> bool:
-    """Whether the other drag was named, and the right one listed as indistinguishable."""
+    """Whether the wrong drag was named, with the right one listed as indistinguishable."""
     truth = row["truth"][0]["name"]
     if not named(row) or not {truth, named(row)[0]} <= DRAGS:
         return False
@@ -125,19 +126,19 @@ def named_as_other_drag(row: dict) -> bool:
 
 
 def diagnosed(row: dict) -> bool:
-    """Whether there was a diagnosis at all."""
+    """Whether the recording could be diagnosed."""
     return row["verdict"] not in ("error", "not_identifiable")
 
 
 def strong(row: dict) -> bool:
-    """Whether the effect is strong; without a diagnosis its strength is unknown and it counts as strong, and missed."""
+    """Whether the effect is strong. Without a diagnosis its strength is unknown; it then counts as strong and missed."""
     return not diagnosed(row) or row["numbers"].get("loss_before", 0.0) >= 0.5 * STRONG**2
 
 
 def parameter_error(row: dict) -> float | None:
-    """Relative error of the largest injected parameter; None where it has no counterpart of the same name.
+    """Relative error of the largest injected parameter; None if the effect has no parameter of this name.
 
-    ``turning_scrub`` has none: it is injected as axles further apart and estimated as a factor on the track width.
+    ``turning_scrub`` has none: it is injected as a longer wheelbase and estimated as a factor on the track width.
     """
     truth, effect = row["truth"][0], row["effects"][0]
     common = set(effect["parameters"]) & set(truth["parameters"])
@@ -149,7 +150,7 @@ def parameter_error(row: dict) -> float | None:
 
 
 def scores(rows: list[dict]) -> dict:
-    """Shares by kind; every share holds its denominator."""
+    """Scores by kind; every share includes its denominator."""
     singles = [row for row in rows if row["kind"] == "single"]
     matter = [row for row in singles if strong(row)]
     pairs = [row for row in rows if row["kind"] == "pair" and strong(row)]
@@ -201,7 +202,7 @@ def scores(rows: list[dict]) -> dict:
 
 
 def _baseline_scores(rows: list[dict]) -> dict[str, dict]:
-    """Median over recordings of the median position error after 2 s, and of the share of the reducible gap closed."""
+    """Medians over recordings: median position error after 2 s, and closed share of the reducible gap."""
     methods = {"nominal model": lambda row: row["gap"]["position_2s"]["before"]}
     titles = {
         "refit": "refit of friction, track width and lag",
@@ -222,12 +223,12 @@ def _baseline_scores(rows: list[dict]) -> dict[str, dict]:
 
 
 def _after(entry: dict) -> float:
-    """Error after the diagnosis: where no effect was added, that of the nominal model."""
+    """Error after the diagnosis; that of the nominal model if no effect was added."""
     return entry["before"] if entry["after"] is None else entry["after"]
 
 
 def closed_share(row: dict) -> float:
-    """Share of the reducible gap after 2 s in the metric with the largest error before; NaN where none was added."""
+    """Closed share of the reducible gap after 2 s, in the metric with the largest initial error; NaN without effects."""
     entries = [entry for key, entry in row["gap"].items() if key.endswith("_2s") and "closed" in entry]
     if not entries:
         return float("nan")
@@ -235,7 +236,7 @@ def closed_share(row: dict) -> float:
 
 
 def confusion(rows: list[dict]) -> dict[str, Counter]:
-    """By injected effect, pairs left out: the effect that was named first, or else the verdict."""
+    """Counts by injected effect, without pairs, of the effect named first, or of the verdict if none was named."""
     table: dict[str, Counter] = {}
     for row in rows:
         if row["kind"] == "pair":
@@ -247,7 +248,7 @@ def confusion(rows: list[dict]) -> dict[str, Counter]:
 
 
 def print_rows(rows: list[dict]) -> None:
-    """One line for each recording."""
+    """Print one line per recording."""
     for row in sorted(rows, key=lambda row: (row["kind"], row["case"])):
         effects = [
             f"{effect['name']}(" + ",".join(f"{k}={v['value']:.3g}" for k, v in effect["parameters"].items()) + ")"
@@ -290,7 +291,7 @@ def confusion_figure(rows: list[dict]) -> Figure:
 
 
 def section(rows: list[dict], found: dict, figure: Path | None, folder: Path) -> str:
-    """The section of the document."""
+    """Section of the document."""
 
     def share(key: str) -> str:
         return f"{found[key]['count']} of {found[key]['of']} ({100 * found[key]['share']:.0f} %)"
@@ -358,14 +359,14 @@ def section(rows: list[dict], found: dict, figure: Path | None, folder: Path) ->
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
-        "--folder", type=Path, default=Path("out/hidden"), help="for recordings and reports (%(default)s)"
+        "--folder", type=Path, default=Path("out/hidden"), help="folder for recordings and reports (%(default)s)"
     )
     parser.add_argument("--seed", type=int, default=SEED, help="first seed (%(default)s)")
     parser.add_argument("--jobs", type=int, default=2, help="recordings diagnosed in parallel (%(default)s)")
     parser.add_argument(
         "--only", nargs="+", default=[""], metavar="TEXT", help="only recordings whose name contains one of these"
     )
-    parser.add_argument("--again", action="store_true", help="diagnose again where there is a report")
+    parser.add_argument("--again", action="store_true", help="diagnose again even if there is a report")
     parser.add_argument("--baselines", action="store_true", help="compare with other methods (needs pysindy)")
     parser.add_argument("--json", type=Path, help="write rows and scores to this file")
     parser.add_argument(

@@ -1,9 +1,9 @@
-"""Compare the rollout with an independent engine: the same Husky, terrain and commands in MuJoCo and here, for 5 s.
+"""Compare the rollout with an independent engine: the same Husky, terrain and commands in both, for 5 s.
 
     scripts/run.sh python benchmarks/mujoco_check.py [--json FILE] [--figure FILE]
 
-The ground is level, or gentle hills without obstacles. Friction and the effective track width are set once for all
-runs, from the first arc on level ground: the tyres of the two engines slip differently in turns.
+The ground is level, or gentle hills without obstacles. Friction and the effective track width are the same in all runs;
+the track width is fitted to the first arc on level ground, because the two engines' tyres slip differently in turns.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ FRICTION = 0.8
 
 
 def bare_scenery(roughness: float, seed: int) -> Scenery:
-    """Hills without obstacles, or level ground for a roughness of 0."""
+    """Hills without obstacles; level ground if the roughness is 0."""
     return build_scenery(TerrainSettings(roughness=roughness, flat=roughness == 0.0, bare=True), seed)
 
 
@@ -91,7 +91,7 @@ def yaw_of(rotations: np.ndarray) -> float:
 
 
 def fitted_robot(seed: int) -> RobotModel:
-    """The Husky with the effective track width for which an arc on level ground turns as in MuJoCo."""
+    """The Husky with the effective track width that reproduces MuJoCo's yaw in an arc on level ground."""
     robot = load_robot("husky")
     scenery = bare_scenery(0.0, seed)
     _, rotations, origin = drive_in_mujoco(scenery, COMMANDS["arc to the left"], seed)
@@ -125,12 +125,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, help="write the results to this file")
     parser.add_argument("--figure", type=Path, help="draw the trajectories into this PNG")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3], help="seeds of the terrain (%(default)s)")
     options = parser.parse_args()
     torch.set_num_threads(1)
     robot = fitted_robot(options.seeds[0])
     factor = robot.effects[0][1]["track_width_factor"]
-    print(f"set once: friction {FRICTION}, effective track width × {factor:.2f}\n")
+    print(f"same in all runs: friction {FRICTION}, effective track width × {factor:.2f}\n")
     print("| ground | commands | Δx at 5 s [m] | ΔR at 5 s [deg] | Δyaw at 5 s [deg] |\n|---|---|---|---|---|")
     rows, figure = [], Figure(figsize=(9, 5), layout="constrained", dpi=110)
     axes = figure.subplots()

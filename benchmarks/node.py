@@ -1,4 +1,4 @@
-"""Latency from sensor to published path, rate, CPU and memory of the installed predictor, between processes.
+"""Latency from sensor to published path, rate, CPU and memory of the installed predictor, measured across processes.
 
     scripts/run.sh python benchmarks/node.py [--seconds 20] [--only NAME ...] [--json FILE] [--docs FILE]
 
@@ -259,7 +259,7 @@ def endure(case: Case, minutes: float, folder: Path) -> dict:
     listener = Listener()
     samples = []
     try:
-        # Memory of libraries, kernels and caches in the first seconds is not a leak.
+        # Libraries, kernels and caches allocate memory in the first seconds; this is not a leak.
         listener.run(12.0)
         for part in range(10):
             paths = listener.run(6.0 * minutes)
@@ -276,7 +276,7 @@ def endure(case: Case, minutes: float, folder: Path) -> dict:
 
 
 def endurance_table(found: dict) -> str:
-    """As Markdown."""
+    """Markdown table."""
     lines = ["| minute | memory | threads | paths |", "|---|---|---|---|"]
     lines += [
         f"| {s['minute']:.1f} | {s['memory_mb']:.0f} MB | {s['threads']} | {s['paths']} |" for s in found["samples"]
@@ -291,7 +291,7 @@ def _candidates(row: dict) -> str:
 
 
 def table(rows: list[dict]) -> str:
-    """As Markdown."""
+    """Markdown table."""
     lines = [
         "| input | sent | paths | p50 | p95 | p99 | candidates, p95 | CPU | memory | dropped |",
         "|---|---|---|---|---|---|---|---|---|---|",
@@ -309,17 +309,19 @@ def main() -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=20.0, help="duration of each case (%(default)s)")
-    parser.add_argument("--only", nargs="+", choices=[case.name for case in CASES], metavar="NAME")
+    parser.add_argument(
+        "--only", nargs="+", choices=[case.name for case in CASES], metavar="NAME", help="run only these cases"
+    )
     parser.add_argument(
         "--endurance",
         type=float,
         metavar="MINUTES",
-        help="instead play the bag in a loop at double speed for this long, with 8 candidates and an ensemble of 8; "
-        "sensors are those of the first case of --only, by default one camera",
+        help="play the bag in a loop at double speed for this long instead, with 8 candidates and an ensemble of 8; "
+        "uses the sensors of the first case of --only (default: one camera)",
     )
     parser.add_argument("--json", type=Path)
     parser.add_argument(
-        "--docs", type=Path, help="write the table between the `<!-- latency -->` marks of this document"
+        "--docs", type=Path, help="write the table between the `<!-- latency -->` comments of this document"
     )
     options = parser.parse_args()
     cases = [case for case in CASES if not options.only or case.name in options.only]

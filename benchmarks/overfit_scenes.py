@@ -1,4 +1,4 @@
-"""Overfit the encoder to the ROUGH scenes: lidar heights from real images.
+"""Overfit the encoder to the ROUGH scenes: predict lidar heights from real images.
 
     scripts/run.sh python benchmarks/overfit_scenes.py SCENES [--steps 150] [--json FILE] [--figure FILE.png]
 

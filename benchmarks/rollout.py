@@ -1,8 +1,8 @@
-"""Speed of the rollout: PyTorch eager, torch.compile and Warp side by side, on this machine.
+"""Speed of the rollout with PyTorch eager, torch.compile and Warp on this machine.
 
     scripts/run.sh python benchmarks/rollout.py [--json FILE] [--quick]
 
-Every figure is the median of several runs after a warm-up; the first call, with what it compiles, stands apart.
+Every figure is the median of several runs after a warm-up; the first call, with compilation, is reported separately.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from monoforce_ros.terrain import Grid, TerrainMap
 
 STEPS = 500
 SPACING = 0.066
-"""Sampling of the body that gives about 200 points for the Husky [m]."""
+"""Point spacing that gives about 200 points for the Husky [m]."""
 
 
 def problem(robot: RobotModel, batch: int, steps: int, device: str) -> tuple:
-    """A bumpy map and a fan of arcs, as a planner asks for."""
+    """A bumpy map and a fan of arcs, as in planning."""
     grid = Grid.square(25.6, 0.1)
     x, y = np.meshgrid(grid.x, grid.y)
     height = torch.from_numpy((0.08 * np.sin(1.3 * x) * np.cos(0.9 * y)).astype(np.float32))
@@ -49,7 +49,7 @@ def problem(robot: RobotModel, batch: int, steps: int, device: str) -> tuple:
 
 
 def timed(work, repeats: int, device: str) -> float:
-    """Median duration [s], with everything on the device finished."""
+    """Median duration [s], including all work on the device."""
     durations = []
     for _ in range(repeats):
         if device == "cuda":
@@ -63,7 +63,7 @@ def timed(work, repeats: int, device: str) -> float:
 
 
 def backends(device: str) -> dict:
-    """Rollout functions by name; torch.compile compiles the whole loop of a short rollout and calls it repeatedly."""
+    """Rollout functions by name."""
     options = PhysicsOptions()
 
     def eager(terrain, robot, speeds, state):
@@ -72,7 +72,7 @@ def backends(device: str) -> dict:
     def warp(terrain, robot, speeds, state):
         return rollout(terrain, robot, speeds, state, options=options, with_forces=False, backend="warp").position
 
-    # One compiled step, called in a loop: the compiler would unroll a loop of 500 steps for minutes.
+    # Compile a single step and call it in a loop; compiling an unrolled loop of 500 steps takes minutes.
     step = torch.compile(lambda p: integrate(p, options, False), dynamic=False)
 
     def compiled(terrain, robot, speeds, state):
@@ -132,19 +132,19 @@ def measure(name: str, function, batch: int, *, backward: bool, quick: bool, dev
 
 
 def backward_memory(batch: int, robot: RobotModel, steps: int) -> int:
-    """Bytes that a Warp rollout keeps for its backward pass."""
-    kept = 0
+    """Bytes that a Warp rollout stores for its backward pass."""
+    stored = 0
 
     def pack(tensor):
-        nonlocal kept
-        kept += tensor.untyped_storage().nbytes()
+        nonlocal stored
+        stored += tensor.untyped_storage().nbytes()
         return tensor
 
     terrain, robot, speeds, state = problem(robot, batch, steps, "cpu")
     state.position.requires_grad_(True)
     with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
         rollout(terrain, robot, speeds, state, with_forces=False, backend="warp")
-    return kept
+    return stored
 
 
 ALL_EFFECTS = (
@@ -163,7 +163,7 @@ ALL_EFFECTS = (
 
 
 def cold_start() -> float:
-    """Seconds of the first Warp rollout in a new process with an empty kernel cache, imports left out."""
+    """Duration of the first Warp rollout in a new process with an empty kernel cache, without imports [s]."""
     with tempfile.TemporaryDirectory() as cache:
         lines = [
             "import time, torch, warp as wp",
@@ -180,7 +180,7 @@ def cold_start() -> float:
 
 
 def table(rows: list[dict]) -> str:
-    """Markdown, with the ratio to PyTorch eager measured in the same run."""
+    """Markdown table with the speed-up over PyTorch eager, measured in the same run."""
     eager = {(r["batch"], r["backward"]): r["seconds"] for r in rows if r["backend"] == "torch eager"}
     lines = [
         "| case | backend | first call [s] | median [ms] | ns per point and step | times faster than eager |",
@@ -199,7 +199,7 @@ def table(rows: list[dict]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, help="write the figures to this file")
-    parser.add_argument("--quick", action="store_true", help="50 steps, one run each: to see that it works")
+    parser.add_argument("--quick", action="store_true", help="50 steps and one run each, for testing")
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
     parser.add_argument("--backends", nargs="+", default=["torch eager", "torch.compile", "warp"])
     options = parser.parse_args()
@@ -209,7 +209,7 @@ def main() -> None:
     rows = []
     for batch, backward in cases:
         for name, function in backends(options.device).items():
-            # The slow ones take minutes where the batch is large, and say nothing new there.
+            # Slow backends take minutes with large batches and give no additional information.
             if name not in options.backends or (name != "warp" and batch == 512 and not options.quick and backward):
                 continue
             if name == "torch.compile" and backward:
@@ -243,13 +243,15 @@ def main() -> None:
             for which in (robot, loaded)
         ]
         ratios[f"B = {batch}, {'forward + backward' if backward else 'forward'}"] = pair[1] / pair[0]
-    kept = backward_memory(64, robot, 50 if options.quick else STEPS)
+    stored = backward_memory(64, robot, 50 if options.quick else STEPS)
     print("\n" + table(rows))
     cold = cold_start()
-    print(f"\nfirst Warp rollout ever, compiling its kernels: {cold:.1f} s; later processes load them from the cache")
+    print(
+        f"\nfirst Warp rollout, including kernel compilation: {cold:.1f} s; later processes load kernels from the cache"
+    )
     for case, ratio in ratios.items():
-        print(f"all contact and body effects on, {case}: {ratio:.2f} times the time without")
-    print(f"kept for the backward pass at B = 64: {kept / 1e6:.1f} MB; body points: {len(robot.points)}")
+        print(f"with all contact and body effects, {case}: {ratio:.2f} times the duration without")
+    print(f"stored for the backward pass at B = 64: {stored / 1e6:.1f} MB; body points: {len(robot.points)}")
     if options.json:
         machine = {
             "processor": platform.processor() or platform.machine(),
@@ -260,7 +262,7 @@ def main() -> None:
         content = {
             "machine": machine,
             "rows": rows,
-            "kept_for_backward_b64_bytes": kept,
+            "kept_for_backward_b64_bytes": stored,
             "effects": ratios,
             "cold_s": cold,
         }

@@ -1,4 +1,4 @@
-"""ROS nodes and installed executables as used by benchmarks and tests: a peer node, and processes to talk to."""
+"""Helpers for benchmarks and tests: a ROS peer node, and installed executables as processes."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ class Peer:
     """A node that publishes and subscribes in the thread that spins it.
 
     Args:
-        name: of the node.
-        environment: ``ROS_DOMAIN_ID``, and variables that the middleware reads from the process's environment.
+        name: name of the node.
+        environment: ``ROS_DOMAIN_ID``, and environment variables for the middleware.
     """
 
     def __init__(self, name: str, environment: Mapping[str, str]):
-        # The domain is passed to the context: a process may have peers in several domains.
+        # Pass the domain to the context, because a process may have peers in several domains.
         os.environ.update({key: value for key, value in environment.items() if key != "ROS_DOMAIN_ID"})
         self.context = rclpy.Context()
         rclpy.init(context=self.context, domain_id=int(environment["ROS_DOMAIN_ID"]))
@@ -53,10 +53,10 @@ class Executable:
     """An installed executable of the package, running as a process with its output in a file.
 
     Args:
-        name: of the executable.
-        arguments: of its command line.
+        name: name of the executable.
+        arguments: command-line arguments.
         log: file for its output.
-        environment: added to the environment of this process.
+        environment: variables added to this process's environment.
     """
 
     def __init__(self, name: str, arguments: list[str], log: Path, environment: Mapping[str, str]):
@@ -70,7 +70,7 @@ class Executable:
             )
 
     def wait_for(self, text: str, seconds: float = 90.0) -> None:
-        """Wait until the output contains a text; exit with the output if the process ends or takes longer."""
+        """Wait until the output contains ``text``; print the output and exit if the process ends or takes too long."""
         deadline = time.monotonic() + seconds
         while text not in self._log.read_text():
             if self.process.poll() is not None or time.monotonic() > deadline:

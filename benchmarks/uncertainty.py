@@ -1,9 +1,9 @@
-"""Coverage of the predicted 90 % band at 1, 2 and 5 s: share of measured positions within it, over recordings.
+"""Coverage of the predicted 90 % band at 1, 2 and 5 s: share of measured positions inside the band.
 
     scripts/run.sh python benchmarks/uncertainty.py BAG... [--terrain lidar|camera|flat] [--json FILE]
 
-Predictions start every second and use the recorded commands. A calibrated band contains 90 % of the outcomes; the
-factor that would calibrate it on these recordings (`ensemble_scale` of the predictor) is printed as well.
+Predictions start every second and use the recorded commands. A calibrated band contains 90 % of the outcomes. The
+benchmark also prints the factor that calibrates it on these recordings (`ensemble_scale` of the predictor).
 """
 
 from __future__ import annotations
@@ -42,16 +42,16 @@ def recording_ratios(bag: Path, predictor: Predictor, settings: EnsembleSettings
         twists = recording.commands.sample(predictor.command_stamps(stamp))
         prediction = Prediction(motion, terrain, predictor.roll_out(terrain, [motion], twists[None]))
         found = spread(predictor, prediction, twists, settings)
-        places, inside = prediction.positions(), prediction.rollout.inside[0].numpy()
+        positions, inside = prediction.positions(), prediction.rollout.inside[0].numpy()
         row, sizes = [], []
         for horizon in HORIZONS:
             step = round(horizon / predictor.options.time_step)
             try:
                 state = recording.motion.at(stamp + round(1e9 * horizon), maximum_gap=0.3)
-                off = float(np.hypot(*(places[step, :2] - state.position[:2])))
+                error = float(np.hypot(*(positions[step, :2] - state.position[:2])))
             except StaleDataError:
-                off = np.nan
-            row.append(off / max(found.radius[step], 1e-6) if inside[: step + 1].all() else np.nan)
+                error = np.nan
+            row.append(error / max(found.radius[step], 1e-6) if inside[: step + 1].all() else np.nan)
             sizes.append(found.radius[step])
         ratios.append(row)
         radii.append(sizes)
@@ -62,12 +62,14 @@ def main() -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("bags", nargs="+", type=Path)
-    parser.add_argument("--robot", default="husky")
-    parser.add_argument("--terrain", choices=SOURCES, default="lidar")
+    parser.add_argument("--robot", default="husky", help="robot name or file (%(default)s)")
+    parser.add_argument("--terrain", choices=SOURCES, default="lidar", help="terrain source (%(default)s)")
     parser.add_argument("--checkpoint", default="", help="checkpoint of the terrain encoder (default: the shipped one)")
-    parser.add_argument("--members", type=int, default=EnsembleSettings.members)
-    parser.add_argument("--scale", type=float, default=EnsembleSettings.scale)
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--members", type=int, default=EnsembleSettings.members, help="ensemble size (%(default)s)")
+    parser.add_argument(
+        "--scale", type=float, default=EnsembleSettings.scale, help="factor on the spread (%(default)s)"
+    )
+    parser.add_argument("--json", type=Path, help="write the results to this file")
     options = parser.parse_args()
     torch.set_num_threads(1)
     robot = load_robot(options.robot)

@@ -1,15 +1,15 @@
-"""A wall ahead (the paper's Figure 9): which terrain encoders predict the crash that happens in the simulator.
+"""A wall ahead (the paper's Figure 9): which terrain encoders predict the crash that occurs in the simulator.
 
     scripts/run.sh python benchmarks/wall.py --monoforce FILE [--no-geometric FILE] [--lss FILE] [--count 12]
         [--json FILE] [--png FILE] [--docs FILE]
 
-A robot gets one image of the scene ahead and the command to drive straight on for five seconds. The simulated robot
-drives until the wall stops it; each encoder predicts the same motion from the image. Some scenes, drawn at random, have
-no wall, which reveals encoders that always predict a crash. Each prediction is repeated with uniform friction: a wall
-blurred into a slope stops a robot only if its friction is predicted to be low.
+The robot is commanded to drive straight ahead for five seconds. The simulated robot drives until the wall stops it; each
+encoder predicts the same motion from one image. Randomly selected scenes have no wall, to detect encoders that always
+predict a crash. Each prediction is repeated with uniform friction, because a wall blurred into a slope stops the robot
+only if the predicted friction is low.
 
-Seeds 70000 on are those of the table in docs/training.md. The thresholds of encoder/edges.py and the average of
-encoders were chosen on seeds 80000 to 80031; on 93000 to 93031 nothing was chosen.
+The table in docs/training.md uses seeds from 70000 on. The thresholds of encoder/edges.py and the average of encoders
+were tuned on seeds 80000 to 80031; seeds 93000 to 93031 are held out.
 """
 
 from __future__ import annotations
@@ -37,20 +37,20 @@ from monoforce_ros.terrain import Grid, TerrainDefaults
 
 SPEED, HORIZON = 0.8, 5.0
 STOPPED = 0.7
-"""A robot that covers less than this share of the commanded distance has crashed."""
+"""The robot has crashed if it covers less than this share of the commanded distance."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Sensor data of a scene, and how far the simulated robot drives."""
+    """Sensor data of a scene, and the distance covered by the simulated robot."""
 
     observation: Observation
     start: MotionState
     wall: float | None
-    """Distance to the wall [m], None without one."""
+    """Distance to the wall [m]; None without a wall."""
     image: np.ndarray
     driven: float
-    """Distance that the simulated robot covers [m]."""
+    """Distance covered by the simulated robot [m]."""
 
 
 def scene(seed: int) -> Scene:
@@ -131,7 +131,7 @@ def main() -> None:
         parser.add_argument(f"--{key.replace('_', '-')}", type=Path, metavar="FILE.safetensors")
     parser.add_argument("--robot", default="husky", help="name or file (default: %(default)s)")
     parser.add_argument("--count", type=int, default=24, help="number of scenes (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=70000, help="of the first scene (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=70000, help="seed of the first scene (default: %(default)s)")
     for name in ("json", "png", "docs"):
         parser.add_argument(f"--{name}", type=Path)
     options = parser.parse_args()

@@ -1,9 +1,9 @@
-"""Real recordings: the Warthog of the DRIVE dataset on asphalt, gravel, sand and grass, from commands to motion.
+"""Real recordings: diagnose the Warthog of the DRIVE dataset on asphalt, gravel, sand and grass.
 
     scripts/run.sh python benchmarks/warthog_reports.py FOLDER [--json FILE] [--docs docs/discrepancy.md]
 
-Each recording is converted to a bag and diagnosed with the shipped Warthog file on level ground; the second day on
-asphalt is the held-out recording of the first. Each ground gets a robot file with its effects.
+Each recording is converted to a bag and diagnosed with the shipped Warthog file on level ground; the
+recording of another day on asphalt is held out for the first. Each ground gets a robot file with its effects.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ GROUNDS = {
 
 
 def bag_of(source: Path, folder: Path) -> Path:
-    """The recording as a bag; made once."""
+    """The recording as a bag; converted once."""
     bag = folder / "bags" / source.name.split(".")[0]
     if not bag.exists():
         drive_to_bag(DriveRecording.open(source), bag)
@@ -53,7 +53,7 @@ def run(source: Path, folder: Path, ground: str, held_out: list[Path]) -> dict:
 
 
 def section(rows: list[dict]) -> str:
-    """The section of the document."""
+    """Section of the document."""
     lines = [
         "| ground | verdict | found | position after 2 s [m] | after 5 s [m] | heading after 2 s [deg] | time |",
         "|---|---|---|---|---|---|---|",

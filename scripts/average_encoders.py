@@ -1,4 +1,4 @@
-"""Averages the weights of encoders that were fine-tuned from the same checkpoint.
+"""Averages the weights of encoders fine-tuned from the same checkpoint.
 
 scripts/run.sh python scripts/average_encoders.py OUT.safetensors FILE.safetensors=SHARE...
 """

@@ -1,4 +1,4 @@
-"""The demo: plays the bundled bag to a predictor node, records its messages, and draws one of its predictions.
+"""Demo: plays the bundled bag to a predictor node, records its messages, and draws one of its predictions.
 
 Writes into --out: prediction.png (a prediction of the node), outputs/ (its messages as a bag), evaluation/ (a report).
 """
@@ -82,7 +82,7 @@ def play(bag: Path, out: Path, robot: str, terrain: str) -> None:
 
 
 def published(out: Path) -> dict[int, dict[str, object]]:
-    """The complete predictions among the recorded messages, by stamp."""
+    """Complete predictions among the recorded messages, by stamp."""
     by_stamp: dict[int, dict[str, object]] = {}
     with BagReader(out / "outputs") as bag:
         for message in bag.messages([f"/predicted/{name}" for name in OUTPUTS]):
@@ -126,8 +126,8 @@ def draw(bag: Path, out: Path, robot_name: str, moment: float) -> int:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("out/demo"), help="output folder (%(default)s)")
-    parser.add_argument("--bag", type=Path, default=share_directory() / "bags" / "demo", help="bag to play")
-    parser.add_argument("--robot", default="husky", help="robot name or file")
+    parser.add_argument("--bag", type=Path, default=share_directory() / "bags" / "demo", help="bag to play (demo bag)")
+    parser.add_argument("--robot", default="husky", help="robot name or file (%(default)s)")
     parser.add_argument(
         "--terrain",
         choices=("camera", "lidar", "flat"),
@@ -135,7 +135,7 @@ def main() -> None:
         help="terrain source (%(default)s)",
     )
     parser.add_argument(
-        "--moment", type=float, default=3.3, help="time in the bag of the prediction to draw [s] (%(default)s)"
+        "--moment", type=float, default=3.3, help="time in the bag of the drawn prediction [s] (%(default)s)"
     )
     options = parser.parse_args()
     began = time.monotonic()

@@ -25,7 +25,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def draw(recording: Recording, seconds: float) -> Figure:
-    """The figure of one time of a recording."""
+    """Draw the figure for one time of a recording."""
     robot = load_robot("husky")
     predictor = Predictor(robot, LidarTerrain(robot, Grid.square(), TerrainDefaults()))
     stamp = int(recording.motion.stamps[0] + 1e9 * seconds)
@@ -88,9 +88,9 @@ def draw(recording: Recording, seconds: float) -> Figure:
 def main() -> None:
     """Draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("bag", nargs="?", type=Path, default=ROOT / "bags" / "demo")
-    parser.add_argument("--at", type=float, default=1.2, help="seconds into the bag (%(default)s)")
-    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "candidates.png")
+    parser.add_argument("bag", nargs="?", type=Path, default=ROOT / "bags" / "demo", help="bag with lidar (demo bag)")
+    parser.add_argument("--at", type=float, default=1.2, help="time in the bag [s] (%(default)s)")
+    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "candidates.png", help="PNG to write")
     options = parser.parse_args()
     torch.set_num_threads(1)
     options.out.parent.mkdir(parents=True, exist_ok=True)

@@ -15,7 +15,7 @@ from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap
 
 
 def robots(axes) -> None:
-    """Body points from the side, each with the direction in which its surface moves."""
+    """Side view of body points with the directions in which driven surfaces move."""
     for row, name in enumerate(shipped_robots()):
         robot = load_robot(name)
         left = robot.points[:, 1] >= 0
@@ -31,7 +31,7 @@ def robots(axes) -> None:
 
 
 def friction(axes) -> None:
-    """Friction over slip, as a part of the load."""
+    """Friction divided by load, over slip."""
     slip = np.linspace(-0.4, 0.4, 400)
     for regularisation, colour in ((0.02, "#0b84a5"), (0.1, "#7fc4d6")):
         axes.plot(
@@ -47,7 +47,7 @@ def friction(axes) -> None:
 
 
 def drop(axes) -> None:
-    """A Husky dropped from 0.3 m onto ground of very different stiffness, all at a step of 10 ms."""
+    """A Husky dropped from 0.3 m onto ground of very different stiffness, with time steps of 10 ms."""
     robot = load_robot("husky")
     for stiffness, colour in ((2e5, "#7fc4d6"), (2e6, "#0b84a5"), (2e8, "#1a1a1a")):
         material = TerrainDefaults(stiffness=stiffness, damping=0.02 * stiffness)

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Runs a command inside the project's environment and workspace: scripts/run.sh COMMAND [ARG ...]
-# A first word that names an installed executable of the package is found in install/, as `ros2 run` would.
+# Runs a command in the project's environment and workspace: scripts/run.sh COMMAND [ARG ...]
+# If COMMAND is an installed executable of the package, it is run from install/, like `ros2 run`.
 set -euo pipefail
 root=$(cd "$(dirname "$0")/.." && pwd)
 unset _ROS_WHEELS_BOOTSTRAP_COMPLETE

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Makes .venv with the locked packages and builds the package with colcon.
-# Finished work is stamped, so a second call only checks the stamps.
+# Creates .venv with the locked packages and builds the package with colcon.
+# Finished steps are marked by stamp files, so repeated calls are fast.
 #   scripts/set_up.sh environment | build | interfaces | graphics
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -9,7 +9,7 @@ venv=$root/.venv
 
 say() { printf '[set-up] %s\n' "$*"; }
 
-# A command named python3.12 may be a shim that answers nothing, so each candidate is asked for its version.
+# A command named python3.12 may be a non-working shim, so check the version that each candidate reports.
 is_python_312() {
   [ "$("$1" -c 'import sys, venv, ensurepip; print("%d.%d" % sys.version_info[:2])' 2>/dev/null)" = 3.12 ]
 }
@@ -36,7 +36,8 @@ environment() {
     say "the environment is up to date"
     return
   fi
-  # Made anew for another lock: packages that share folders, as those of ROS do, do not survive the removal of one.
+  # Recreate .venv when the lock file changes: removing one of several packages that share a folder, such as the ROS
+  # packages, breaks the others.
   if [ -f "$venv/.locked" ] || ! is_python_312 "$venv/bin/python"; then
     if ! python=$(find_python); then
       cat >&2 <<'TEXT'
@@ -46,27 +47,27 @@ environment() {
            Ubuntu 24.04:  sudo apt install python3.12 python3.12-venv
            pyenv:         pyenv install 3.12
            uv:            uv python install 3.12
-         or name one:     MONOFORCE_PYTHON=/path/to/python3.12 make test
+         or select one:   MONOFORCE_PYTHON=/path/to/python3.12 make test
 TEXT
       exit 1
     fi
-    say "making .venv with $python"
+    say "creating .venv with $python"
     rm -rf "$venv"
     "$python" -m venv "$venv"
   fi
   local uv_version
   uv_version=$(sed -n 's/^uv==\([^ ;]*\).*/\1/p' requirements.lock)
-  say "fetching uv $uv_version, the installer"
+  say "installing uv $uv_version"
   "$venv/bin/python" -m pip install --quiet --disable-pip-version-check "uv==$uv_version"
   say "installing $(grep -c '^[a-z0-9].*==' requirements.lock) locked packages (several GB, most of it torch's CUDA libraries)"
-  # Compiled here once: where Python may not write bytecode every start of a node would compile all of torch.
+  # Compile bytecode once, or every start of a node compiles all of torch if Python may not write bytecode.
   "$venv/bin/uv" pip sync --quiet --compile-bytecode --python "$venv/bin/python" requirements.lock
   printf '%s' "$lock_hash" >"$venv/.locked"
   say "environment ready after $((SECONDS - started)) s"
 }
 
-# rosidl and ament look below AMENT_PREFIX_PATH, which the wheels do not set; the guard variable must not
-# outlive the library path it stands for.
+# rosidl and ament search AMENT_PREFIX_PATH, which the wheels do not set. The guard variable marks the library path as
+# set up and must be removed together with it.
 ros_environment() {
   unset _ROS_WHEELS_BOOTSTRAP_COMPLETE
   export AMENT_PREFIX_PATH="$venv${AMENT_PREFIX_PATH:+:$AMENT_PREFIX_PATH}"
@@ -82,7 +83,7 @@ build() {
   fi
   ros_environment
   say "building with colcon"
-  # What is no longer in the source must not stay installed.
+  # Files removed from the source must not stay installed.
   rm -rf build/monoforce_ros install/monoforce_ros
   mkdir -p out
   if ! colcon --log-base log build --event-handlers console_cohesion- >out/colcon_build.log 2>&1; then
@@ -94,7 +95,7 @@ build() {
   say "built into install/ after $((SECONDS - started)) s"
 }
 
-# The typed messages for planners, beside monoforce_ros in install/. They take a C++ compiler; all else works without.
+# Builds the typed messages for planners, next to monoforce_ros in install/. Only this step needs a C++ compiler.
 interfaces() {
   local stamp=install/.interfaces source=msg_defs/monoforce_msgs started=$SECONDS headers arrays
   if [ -f "$stamp" ] && [ -z "$(find "$source" -type f -newer "$stamp" -print -quit)" ]; then
@@ -106,7 +107,7 @@ interfaces() {
     return
   fi
   ros_environment
-  # The wheels' exported targets name folders of the machine on which they were made.
+  # Exported CMake targets of the wheels contain paths of the machine that built them; replace these.
   headers=$("$venv/bin/python" -c 'import sysconfig; print(sysconfig.get_paths()["include"])')
   arrays=$("$venv/bin/python" -c 'import numpy; print(numpy.get_include())')
   if [ ! -f "$headers/Python.h" ]; then
@@ -127,16 +128,16 @@ interfaces() {
   say "monoforce_msgs built after $((SECONDS - started)) s"
 }
 
-# Only drawing camera images of synthetic worlds needs a GL library; everything else runs without.
+# Only rendering camera images of synthetic worlds needs a GL library.
 graphics() {
   if ldconfig -p 2>/dev/null | grep -q 'libOSMesa\.so'; then
-    say "OSMesa is there: synthetic cameras can be drawn"
+    say "OSMesa is installed: synthetic camera images can be rendered"
   elif [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null; then
-    say "installing OSMesa, which draws synthetic camera images without a display"
+    say "installing OSMesa, which renders synthetic camera images without a display"
     { apt-get -qq update && apt-get -qq install -y --no-install-recommends libosmesa6; } >/dev/null 2>&1 \
-      || say "OSMesa could not be installed: the tests that draw images will be skipped"
+      || say "OSMesa could not be installed: tests that render images will be skipped"
   else
-    say "OSMesa is missing: tests that draw synthetic images will be skipped (sudo apt install libosmesa6)"
+    say "OSMesa is missing: tests that render synthetic images will be skipped (sudo apt install libosmesa6)"
   fi
 }
 

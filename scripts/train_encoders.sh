@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Trains the shipped terrain encoder, or everything for the tables, from scratch: worlds, training, comparison.
+# Trains the shipped terrain encoder, or all encoders for the tables, from scratch: worlds, training, comparison.
 #   scripts/train_encoders.sh checkpoint | tables
 # Worlds and encoders are kept in out/; run it again to resume an interrupted run.
 set -euo pipefail
@@ -7,13 +7,13 @@ cd "$(dirname "$0")/.."
 target=${1:?checkpoint or tables}
 worlds=out/worlds
 cameras="--camera 320x240 --camera-rate 4 --lidar-rate 4"
-# Two trainings with one thread each are faster than one after the other with two.
+# Two parallel trainings with one thread each are faster than two sequential ones with two threads.
 threads="--threads 1"
 mkdir -p "$worlds" out/encoders models
 
 run() { scripts/run.sh "$@"; }
 
-# Complete folders of worlds are marked; others are recorded again.
+# Complete folders of worlds are marked; incomplete ones are recorded again.
 worlds() { # name, ground, first seed, count, options
   local folder=$worlds/$1 ground=$2 seed=$3 count=$4
   shift 4
@@ -41,10 +41,10 @@ logged() { # log, command...
 worlds mixed mixed 50000 20
 worlds grass grass 51000 16
 worlds rigid rigid 52000 6
-# Walls and grass close ahead, which runs along a track do not contain: the robot turns on the spot among them.
+# The robot turns on the spot among walls and grass: recordings along a track contain none close ahead.
 worlds yard yard 53000 16 --commands spin --duration 16
 held_out="$worlds/mixed/50018 $worlds/mixed/50019 $worlds/grass/51015 $worlds/rigid/52005 $worlds/yard/53015"
-# Samples are extracted first: two trainings started together would both do it.
+# Extract samples first, because parallel trainings would both do it.
 run train "$worlds"/{mixed,grass,rigid,yard}/* --held-out $held_out --samples "$worlds/cut" --samples-only
 
 if [ "$target" = tables ]; then
@@ -57,9 +57,9 @@ if [ "$target" = tables ]; then
   logged out/encoders/others.log others &
   other=$!
 fi
-# First the geometric loss only, which gives lift-splat-shoot, then all losses. Fine-tuning has a lower learning rate and more
-# weight on the geometric loss and on prominent cells, or it forgets walls. Longer fine-tuning improves the ground under
-# grass and worsens walls; the mean of the weights of a short and a long one is good at both.
+# Train with the geometric loss only (lift-splat-shoot), then with all losses. Fine-tuning uses a lower learning rate and
+# more weight on the geometric loss and on prominent cells; otherwise walls degrade. Longer fine-tuning improves the ground
+# under grass but degrades walls; the mean weights of a short and a long fine-tuning are good at both.
 train geometric 800 --losses geometric
 train lss 400 --losses geometric --start-from out/encoders/geometric/encoder.safetensors
 fine_tune() { # name, steps

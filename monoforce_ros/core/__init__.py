@@ -1,4 +1,4 @@
-"""What every room shares: cameras, rotations, tracks of motion and commands, time alignment, files."""
+"""Shared by every package: cameras, rotations, tracks of motion and commands, time alignment, files."""
 
 from monoforce_ros.core.alignment import DelayCorrelation, Delayed, largest_spread, nearest_stamp
 from monoforce_ros.core.camera import CameraModel

@@ -1,4 +1,4 @@
-"""Time alignment: which measurements belong together by their stamps, and how late one signal is behind another."""
+"""Time alignment: match measurements by their stamps, and estimate the delay between two signals."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 
 Delayed = Callable[[float], tuple[np.ndarray, np.ndarray]]
-"""A signal delayed by so many seconds, at the times of a reference ``[n]``, and the mask ``[n]`` of what is known."""
+"""Delay [s] → the delayed signal at the times of a reference ``[n]``, and the mask ``[n]`` of its known samples."""
 
 
 def nearest_stamp(stamps: np.ndarray, stamp: int, *, limit: float = np.inf) -> int | None:
-    """Index of the measurement nearest in time; None where there is none within a limit.
+    """Index of the measurement nearest in time; None if none lies within the limit.
 
     Args:
-        stamps: of the measurements, ascending ``[n]`` [ns].
-        stamp: asked for [ns].
-        limit: largest distance in time [s].
+        stamps: times of the measurements, ascending ``[n]`` [ns].
+        stamp: query time [ns].
+        limit: largest time difference [s].
     """
     if not len(stamps):
         return None
@@ -28,14 +28,14 @@ def nearest_stamp(stamps: np.ndarray, stamp: int, *, limit: float = np.inf) -> i
 
 
 def largest_spread(slop: float, intervals: Iterable[float]) -> float:
-    """Largest difference of stamps within one set of sensor data [s].
+    """Largest difference between the stamps of one set of sensor data [s].
 
-    What is more than half the slowest sensor's interval behind the others belongs to the set before: of cameras that
-    are triggered together one must not be used with the others' last images.
+    A measurement that is older than the others by more than half the slowest sensor's interval belongs to the previous
+    set: cameras that are triggered together must not be combined across triggers.
 
     Args:
-        slop: upper bound that the user sets [s].
-        intervals: between consecutive messages of each sensor, where known [s].
+        slop: upper bound set by the user [s].
+        intervals: time between consecutive messages of each sensor with a known rate [s].
     """
     slowest = max(intervals, default=np.inf)
     return min(slop, 0.5 * slowest)
@@ -43,14 +43,14 @@ def largest_spread(slop: float, intervals: Iterable[float]) -> float:
 
 @dataclass(frozen=True)
 class DelayCorrelation:
-    """Correlation of two signals over the delay between them, kept by pieces of the recording."""
+    """Correlation of two signals as a function of the delay between them, stored per piece of the recording."""
 
     lags: np.ndarray
-    """Delays that were tried, equally spaced ``[L]`` [s]."""
+    """Tested delays, equally spaced ``[L]`` [s]."""
     products: np.ndarray
-    """Inner products of both signals ``[pieces, L]``."""
+    """Inner products of the two signals ``[pieces, L]``."""
     energies: np.ndarray
-    """Inner products of each with itself ``[pieces, 2, L]``."""
+    """Inner product of each signal with itself ``[pieces, 2, L]``."""
 
     @classmethod
     def of(cls, pieces: Iterable[tuple[np.ndarray, Delayed]], lags: np.ndarray, *, fewest: int = 1) -> DelayCorrelation:
@@ -58,8 +58,8 @@ class DelayCorrelation:
 
         Args:
             pieces: values of the reference ``[n]`` and the other signal as a function of the delay.
-            lags: delays to try, equally spaced [s].
-            fewest: known samples below which a delay of a piece does not count.
+            lags: delays to test, equally spaced [s].
+            fewest: smallest number of known samples; a piece is ignored at delays with fewer.
         """
         products, energies = [], []
         for values, delayed in pieces:
@@ -79,20 +79,20 @@ class DelayCorrelation:
 
     @property
     def values(self) -> np.ndarray:
-        """Correlation at each delay, -1 to 1 ``[L]``; zero where nothing is known."""
+        """Correlation at each delay, -1 to 1 ``[L]``; zero without known samples."""
         return _normalised(self.products.sum(axis=0), self.energies.sum(axis=0))
 
     @property
     def strongest(self) -> int:
-        """Index of the delay whose correlation is largest in size."""
+        """Index of the delay with the largest absolute correlation."""
         return int(np.argmax(np.abs(self.values)))
 
     def peak(self, around: int) -> float:
-        """Delay of the strongest correlation near an index, by a parabola through three values [s]."""
+        """Delay of the strongest correlation near an index, refined by a parabola through three values [s]."""
         return self._peak(self.values, around, self._sign(around))
 
     def peak_without_each(self, around: int) -> np.ndarray:
-        """The same with each piece left out in turn, for a jackknife ``[pieces]`` [s]."""
+        """Peak delay with each piece left out in turn, for a jackknife ``[pieces]`` [s]."""
         product, energy = self.products.sum(axis=0), self.energies.sum(axis=0)
         sign = self._sign(around)
         return np.array(
@@ -112,11 +112,11 @@ class DelayCorrelation:
         if not 0 < top < len(values) - 1:
             return float(self.lags[top])
         left, middle, right = values[top - 1 : top + 2]
-        bend = left - 2 * middle + right
-        shift = 0.5 * (left - right) / bend if bend < 0 else 0.0
+        curvature = left - 2 * middle + right
+        shift = 0.5 * (left - right) / curvature if curvature < 0 else 0.0
         return float(self.lags[top] + np.clip(shift, -1.0, 1.0) * (self.lags[1] - self.lags[0]))
 
 
 def _normalised(products: np.ndarray, energies: np.ndarray) -> np.ndarray:
-    """Correlation at each delay, of ``products`` ``[L]`` and ``energies`` ``[2, L]``."""
+    """Correlation at each delay ``[L]`` from ``products`` ``[L]`` and ``energies`` ``[2, L]``."""
     return products / np.sqrt(np.maximum(energies.prod(axis=0), 1e-12))

@@ -1,4 +1,4 @@
-"""CameraModel: a calibrated camera, from pixels to rays and back."""
+"""CameraModel: a calibrated camera that projects points to pixels and pixels to rays."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ DISTORTION_MODELS = ("plumb_bob", "rational_polynomial", "equidistant")
 
 @dataclass(frozen=True)
 class CameraModel:
-    """Intrinsics of a camera as ``sensor_msgs/CameraInfo`` states them (before rectification).
+    """Intrinsics of a camera as in ``sensor_msgs/CameraInfo`` (before rectification).
 
     ``plumb_bob`` and ``rational_polynomial`` are OpenCV's model with 4, 5, 8, 12 or 14 coefficients, ``equidistant`` is
     its fisheye model. Camera axes: z forward, x right, y down (REP 103).
@@ -61,8 +61,8 @@ class CameraModel:
         """
         points = np.asarray(points, np.float64).reshape(-1, 3)
         pixels = np.full((len(points), 2), np.nan)
-        # Far outside the field of view a distortion polynomial folds back into the image, so points are pre-selected
-        # by the angle that the image's corners have.
+        # Far outside the field of view the distortion polynomial folds back into the image, so only points within the
+        # angle of the image's corners are projected.
         visible = (points[:, 2] > 0.05) & (self._slope(points) <= self._corner_slope() * 1.05)
         if visible.any():
             zero = np.zeros(3)
@@ -78,10 +78,10 @@ class CameraModel:
         return pixels, inside
 
     def rays(self, pixels: np.ndarray) -> np.ndarray:
-        """Directions of pixels' rays in the camera frame, distortion removed.
+        """Undistorted ray directions of pixels in the camera frame.
 
         Args:
-            pixels: ``[..., 2]`` (u, v), the centre of the first pixel at (0, 0).
+            pixels: ``[..., 2]`` (u, v); the centre of the first pixel is (0, 0).
 
         Returns:
             ``[..., 3]`` with z = 1, so that a ray times a depth is a point.
@@ -94,13 +94,13 @@ class CameraModel:
             normalised = cv2.fisheye.undistortPoints(flat, self.matrix, self._fisheye())[:, 0]
         else:
             criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-9)
-            # OpenCV 4 and 5 take the criteria in functions of different names.
+            # The function with termination criteria has different names in OpenCV 4 and 5.
             undistort = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)
             normalised = undistort(flat, self.matrix, self.distortion, R=None, P=None, criteria=criteria)[:, 0]
         return np.concatenate([normalised, np.ones((len(normalised), 1))], axis=1).reshape(*pixels.shape[:-1], 3)
 
     def resized(self, width: int, height: int) -> CameraModel:
-        """The camera whose image has been resized to ``width`` × ``height`` pixels (pixel centres kept aligned)."""
+        """The camera after resizing its image to ``width`` × ``height`` pixels (pixel centres kept aligned)."""
         scale = np.array([width / self.width, height / self.height])
         matrix = self.matrix.copy()
         matrix[0, 0] *= scale[0]

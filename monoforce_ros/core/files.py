@@ -1,4 +1,4 @@
-"""Files that are whole or absent: written beside their target and renamed."""
+"""Atomic file writes: write to a temporary file in the target's folder, then rename it."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from pathlib import Path
 
 
 def unfinished_path(path: str | Path) -> Path:
-    """Where a file or folder is written until it is whole: hidden, beside its target, one for each process."""
+    """Temporary path of a file or folder being written: hidden, in the target's folder, unique to this process."""
     path = Path(path)
     return path.with_name(f".{path.name}.unfinished-{os.getpid()}")
 
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """A path to write to; at the end of the block what was written there replaces ``path``.
+    """Yield a temporary path to write to; at the end of the block that file replaces ``path``.
 
-    A reader never meets half of a file. After an error, such as a full disk, the old file stays and the unfinished one
-    is removed.
+    Readers never see an incomplete file. After an error, such as a full disk, the old file remains and the temporary
+    one is removed.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -33,12 +33,12 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text file as a whole, UTF-8."""
+    """Write a UTF-8 text file atomically."""
     with atomic_path(path) as unfinished:
         unfinished.write_text(text, encoding="utf-8")
 
 
 def write_bytes(path: str | Path, data: bytes) -> None:
-    """Write a binary file as a whole."""
+    """Write a binary file atomically."""
     with atomic_path(path) as unfinished:
         unfinished.write_bytes(data)

@@ -1,4 +1,4 @@
-"""Exports that are imported when they are first asked for: who chooses a path need not load a physics engine."""
+"""Lazy exports, imported on first access: the path selector does not load the physics engine."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ def lazy_exports(package: str, modules: Mapping[str, tuple[str, ...]]) -> Callab
     """A ``__getattr__`` for a package (PEP 562).
 
     Args:
-        package: its dotted name.
-        modules: names that it exports, by the module of the package that defines them.
+        package: dotted name of the package.
+        modules: exported names by the module that defines them.
     """
     home = {name: module for module, names in modules.items() for name in names}
 

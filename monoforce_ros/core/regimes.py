@@ -1,4 +1,4 @@
-"""Motion regimes: in which ways of driving errors are sorted, the same for the running node and for ``diagnose``."""
+"""Motion regimes by which errors are grouped, in the running node and in ``diagnose``."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ import numpy as np
 TURNING_RATE, STRAIGHT_RATE = 0.3, 0.1
 """Mean commanded yaw rate above which a window is a turn, and below which it is straight [rad/s]."""
 STANDING_SPEED, STANDING_RATE = 0.05, 0.05
-"""Below both a robot stands [m/s, rad/s]."""
+"""A robot is standing below both [m/s, rad/s]."""
 FAST_SHARE = 0.6
-"""Share of the robot's largest speed above which it is fast."""
+"""Share of the robot's top speed above which motion is fast."""
 SPEED_CHANGE = 0.3
-"""Sum of the changes of commanded speed from which a window counts as changing speed [m/s]."""
+"""Sum of changes of the commanded speed above which a window is changing speed [m/s]."""
 
 
 def motion_regimes(twists: np.ndarray, fast: float) -> dict[str, np.ndarray]:
-    """Regimes of windows by what was commanded in them; a window may be in several.
+    """Regimes of windows from their commands; a window may be in several.
 
     Args:
         twists: forward speed [m/s] and yaw rate [rad/s] over each window ``[..., T, 2]``.
         fast: mean speed above which a window is fast [m/s].
 
     Returns:
-        a mask ``[...]`` by name.
+        masks ``[...]`` by name of the regime.
     """
     speed, rate = twists[..., 0].mean(axis=-1), twists[..., 1].mean(axis=-1)
     size, turning = np.abs(twists[..., 0]).mean(axis=-1), np.abs(twists[..., 1]).mean(axis=-1)

@@ -1,4 +1,4 @@
-"""Where the package's data files lie, in the source tree and in an installed workspace."""
+"""Location of the package's data files, in the source tree or an installed workspace."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ PACKAGE = "monoforce_ros"
 def share_directory() -> Path:
     """Folder that holds ``config/``, ``msg_defs/`` and ``bags/``.
 
-    The source tree wins when the package is imported from it, so that a stale installation is never read by accident.
-    Raises ``FileNotFoundError`` with what to do when neither place exists.
+    The source tree takes precedence if the package is imported from it, so that a stale installation is never used.
+
+    Raises:
+        FileNotFoundError: there is neither a source tree nor an installation.
     """
     source_tree = Path(__file__).resolve().parent.parent.parent
     if (source_tree / "package.xml").is_file():
@@ -22,6 +24,6 @@ def share_directory() -> Path:
         return Path(get_package_share_directory(PACKAGE))
     except PackageNotFoundError as error:
         raise FileNotFoundError(
-            f"the data files of {PACKAGE} were not found beside the code or below AMENT_PREFIX_PATH: "
+            f"the data files of {PACKAGE} were not found next to the code or below AMENT_PREFIX_PATH: "
             "source install/setup.bash of the workspace that the package was built in"
         ) from error

@@ -1,4 +1,4 @@
-"""Tracks: measured motion, angular velocity, wheel speeds and commands over time, and the terrain frame."""
+"""Tracks: measured motion, angular velocity, wheel speeds and commands over time; definition of the terrain frame."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ NANOSECOND = 1e-9
 
 
 class StaleDataError(ValueError):
-    """No measurement lies close enough to the time asked for; the message says how far the nearest is."""
+    """No measurement lies close enough to the requested time; the message gives the gap to the nearest one."""
 
 
 @dataclass(frozen=True)
@@ -33,11 +33,11 @@ class MotionState:
 
     @property
     def heading(self) -> float:
-        """Angle of the base's x axis about the vertical [rad]."""
+        """Yaw of the base's x axis [rad]."""
         return float(np.arctan2(self.rotation[1, 0], self.rotation[0, 0]))
 
     def onwards(self, seconds: float) -> MotionState:
-        """The state after ``seconds`` > 0 of the same velocities in base axes, with its own stamp; else itself."""
+        """The state extrapolated at constant velocities in base axes, stamp unchanged; itself if ``seconds`` ≤ 0."""
         if seconds <= 0.0:
             return self
         turn = Rotation.from_rotvec(self.angular_velocity * seconds).as_matrix()
@@ -84,11 +84,12 @@ class MotionTrack:
     def at(self, stamp: int, *, maximum_gap: float = 0.5) -> MotionState:
         """The motion at a time, interpolated between the measurements around it.
 
-        After the last measurement the robot is taken to go on as it did: sensors are often a little ahead of odometry.
+        After the last measurement the motion is extrapolated at constant velocity: sensor data are often slightly ahead
+        of odometry.
 
         Args:
             stamp: time [ns].
-            maximum_gap: largest distance in time [s] to the measurements used; beyond it nothing is invented.
+            maximum_gap: largest time difference to the measurements used [s].
 
         Raises:
             StaleDataError: the nearest measurements are further away than ``maximum_gap``.
@@ -134,7 +135,7 @@ class MotionTrack:
     def _refuse_gap(self, gap: float, maximum_gap: float) -> None:
         if gap > maximum_gap:
             raise StaleDataError(
-                f"the nearest odometry is {gap:.2f} s away from the time asked for, expected at most {maximum_gap:g} s"
+                f"the nearest odometry is {gap:.2f} s away from the requested time, expected at most {maximum_gap:g} s"
             )
 
     def _state(self, index: int, stamp: int) -> MotionState:
@@ -149,7 +150,7 @@ class MotionTrack:
 
 @dataclass(frozen=True)
 class AngularVelocityTrack:
-    """Angular velocity over time as an IMU shows it, in its own axes."""
+    """Angular velocity measured by an IMU over time, in the IMU's axes."""
 
     stamps: np.ndarray
     """``[n]`` int64 [ns], ascending."""
@@ -163,12 +164,12 @@ class AngularVelocityTrack:
 
 @dataclass(frozen=True)
 class WheelTrack:
-    """Measured turning speed of the wheels on either side over time."""
+    """Measured angular speed of the left and right wheels over time."""
 
     stamps: np.ndarray
     """``[n]`` int64 [ns], ascending."""
     speeds: np.ndarray
-    """Mean of the left and of the right wheels, ``[n, 2]`` [rad/s]."""
+    """Mean over the left and over the right wheels, ``[n, 2]`` [rad/s]."""
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -187,11 +188,11 @@ class CommandTrack:
         return len(self.stamps)
 
     def sample(self, stamps: np.ndarray, *, timeout: float = np.inf) -> np.ndarray:
-        """Commands in force at times.
+        """Commands that are active at given times.
 
         Args:
             stamps: ``[...]`` int64 [ns].
-            timeout: age [s] beyond which a command no longer holds and the base stands still.
+            timeout: age [s] after which a command expires and zero velocity is assumed.
 
         Returns:
             ``[..., 2]``; zero before the first command.
@@ -200,6 +201,6 @@ class CommandTrack:
         if not len(self):
             return np.zeros((*stamps.shape, 2))
         index = np.searchsorted(self.stamps, stamps, side="right") - 1
-        held = self.twists[np.maximum(index, 0)]
+        latest = self.twists[np.maximum(index, 0)]
         age = (stamps - self.stamps[np.maximum(index, 0)]) * NANOSECOND
-        return np.where(((index >= 0) & (age <= timeout))[..., None], held, 0.0)
+        return np.where(((index >= 0) & (age <= timeout))[..., None], latest, 0.0)

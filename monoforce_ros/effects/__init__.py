@@ -1,4 +1,4 @@
-"""The catalogue of effects: how physics grows. A new effect is one new file here and its test."""
+"""The catalogue of effects, which extend the physics. A new effect is one file in this package and a test."""
 
 from monoforce_ros.effects.catalogue import (
     CATALOGUE,

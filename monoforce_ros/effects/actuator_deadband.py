@@ -16,10 +16,10 @@ class ActuatorDeadband(Effect):
 
     name = "actuator_deadband"
     stage = "command"
-    summary = "The drives do not answer to speeds below the band, and to faster ones less it."
+    summary = "The drives ignore commanded speeds below the width; faster ones are reduced by it."
     formula = "u ← sign(u) max(|u| - width, 0)"
     source = "static friction in motor and gear"
-    parameters = (Parameter("width", "m/s", 0.0, 0.0, 1.0, 0.05, "half width of the band"),)
+    parameters = (Parameter("width", "m/s", 0.0, 0.0, 1.0, 0.05, "half width of the dead band"),)
     order = 20
     identified = ("width",)
     manoeuvre = "slow and fast stretches straight ahead"

@@ -15,8 +15,8 @@ from monoforce_ros.effects.effect import Effect, Parameter, Values, WheelRespons
 def _lagging(speeds: np.ndarray, value: float, step: float) -> np.ndarray:
     if value <= 1e-4:
         return speeds
-    kept = np.exp(-step / value)
-    return lfilter([1.0 - kept], [1.0, -kept], speeds, axis=1, zi=kept * speeds[:, :1])[0]
+    decay = np.exp(-step / value)
+    return lfilter([1.0 - decay], [1.0, -decay], speeds, axis=1, zi=decay * speeds[:, :1])[0]
 
 
 class ActuatorLag(Effect):
@@ -44,26 +44,26 @@ class ActuatorLag(Effect):
     def drive_speeds(self, speeds: Tensor, values: Values, time_step: float, offsets: Tensor) -> Tensor:
         """Drive speeds with this effect applied; see :class:`Effect`."""
         constant = values["time_constant"]
-        # exp(-Δt/τ) with a quotient that stays finite, and a gradient that is zero, at τ = 0.
+        # exp(-Δt/τ); at τ = 0 the quotient stays finite and the gradient is zero.
         slow = constant > 1e-6
         safe = torch.where(slow, constant, torch.ones_like(constant))
-        kept = torch.where(slow, torch.exp(-time_step / safe), torch.zeros_like(constant))
+        retained = torch.where(slow, torch.exp(-time_step / safe), torch.zeros_like(constant))
         if constant.ndim:
-            return _step_by_step(speeds, kept[:, None])
+            return _step_by_step(speeds, retained[:, None])
         count = speeds.shape[1]
         steps = torch.arange(count, device=speeds.device)
         distance = (steps[:, None] - steps).to(speeds.dtype)
-        # The response to all commands so far, the first of which has always held, as one matrix.
-        decay = kept ** distance.clamp_min(0.0)
-        weights = torch.where(distance >= 0, (1.0 - kept) * decay, torch.zeros_like(decay))
-        return torch.where(slow, weights @ speeds + (decay[:, :1] * kept) * speeds[:, :1], speeds)
+        # The response to all previous commands as one matrix. The first command also holds before the start.
+        decay = retained ** distance.clamp_min(0.0)
+        weights = torch.where(distance >= 0, (1.0 - retained) * decay, torch.zeros_like(decay))
+        return torch.where(slow, weights @ speeds + (decay[:, :1] * retained) * speeds[:, :1], speeds)
 
 
-def _step_by_step(speeds: Tensor, kept: Tensor) -> Tensor:
-    """The same where each trajectory has a constant of its own: a matrix for each would be large."""
+def _step_by_step(speeds: Tensor, retained: Tensor) -> Tensor:
+    """The lag with one time constant per trajectory, for which one matrix each would be large."""
     state = speeds[:, 0]
     result = []
     for speed in speeds.unbind(1):
-        state = speed + kept * (state - speed)
+        state = speed + retained * (state - speed)
         result.append(state)
     return torch.stack(result, dim=1)

@@ -1,4 +1,4 @@
-"""Largest speed that the drives reach."""
+"""Largest speed of the drives."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from monoforce_ros.effects.effect import Effect, Parameter, Values, WheelRespons
 
 
 class ActuatorSaturation(Effect):
-    """Largest speed that the drives reach."""
+    """Largest speed of the drives."""
 
     name = "actuator_saturation"
     stage = "command"
-    summary = "Faster commands are reached to this speed only."
+    summary = "The drives do not exceed this speed."
     formula = "u ← clamp(u, -limit, limit)"
     source = "limited voltage of the motors"
     parameters = (Parameter("limit", "m/s", math.inf, 0.05, 20.0, 1.0, "largest surface speed of a drive"),)
@@ -30,14 +30,14 @@ class ActuatorSaturation(Effect):
         speeds=lambda speeds, value, step: np.clip(speeds, -value, value),
         starts=lambda top: (0.9 * top, 0.6 * top),
         bounds=lambda top: (0.02 * top, 1.5 * top),
-        # A limit just below the fastest command, or above it, changes nothing.
+        # A limit just below the fastest command, or above it, has no effect.
         counts=lambda value, top: value <= 0.95 * top,
         wording="up to {:.2f} m/s",
         excludes=("actuator_deadband",),
     )
 
     def first_values(self) -> list[dict[str, float]]:
-        """Limits between a slow walk and the speed of most robots: neutral is no limit at all."""
+        """Limits from slow walking speed to the top speed of most robots; the neutral value is infinite."""
         return [{"limit": value} for value in (0.15, 0.3, 0.5, 0.7, 0.9, 1.5)]
 
     def drive_speeds(self, speeds: Tensor, values: Values, time_step: float, offsets: Tensor) -> Tensor:

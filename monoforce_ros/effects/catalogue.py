@@ -1,4 +1,4 @@
-"""Catalogue: every effect by name, and how the effects of a robot act together."""
+"""Catalogue: all effects by name, and the combined action of a robot's effects."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from monoforce_ros.terrain import TerrainMap
 
 
 class EffectError(ValueError):
-    """An effect that does not exist, or a parameter that it does not have or that is out of bounds."""
+    """Unknown effect, unknown parameter of an effect, or a value out of bounds."""
 
 
 _NO_EFFECTS = frozenset({"catalogue", "effect", "page", "setup"})
-"""Modules of this package that hold no effect."""
+"""Modules of this package without an effect."""
 
 
 def _discover() -> dict[str, Effect]:
@@ -47,43 +47,43 @@ def _discover() -> dict[str, Effect]:
 
 
 CATALOGUE: dict[str, Effect] = _discover()
-"""Effects by name, in the order of their stages."""
+"""Effects by name, sorted by stage."""
 
 
 def speed_effects() -> tuple[Effect, ...]:
-    """Effects that change drive speeds, in the order in which a command meets them."""
+    """Effects that change drive speeds, in the order in which they act on a command."""
     return tuple(sorted((e for e in CATALOGUE.values() if e.order is not None), key=lambda e: (e.order, e.name)))
 
 
 def identifiable_effects() -> tuple[Effect, ...]:
-    """Effects that a recording of motion and commands can identify; sensors and clocks come before dynamics."""
+    """Effects that a recording of motion and commands can identify; sensors and clocks first, then dynamics."""
     first = ("measurement", "command", "contact", "body")
     found = [effect for effect in CATALOGUE.values() if effect.identified]
     return tuple(sorted(found, key=lambda e: (first.index(e.stage), e.order or 0, e.name)))
 
 
 def wheel_effects() -> tuple[Effect, ...]:
-    """Effects that measured wheel speeds show, in the order in which a command meets them."""
+    """Effects that measured wheel speeds reveal, in the order in which they act on a command."""
     return tuple(effect for effect in speed_effects() if effect.wheel_response is not None)
 
 
 def separating_manoeuvre(first: str, second: str) -> str:
-    """What to drive so that a recording separates two effects; empty where neither file says."""
+    """Manoeuvre for which a recording separates two effects; empty if neither effect defines one."""
     one, two = _catalogued(first), _catalogued(second)
     return one.separated_by.get(second, "") or two.separated_by.get(first, "")
 
 
 def separating_sensor(first: str, second: str) -> str:
-    """The sensor that separates two effects which no manoeuvre does; empty where that is not so."""
+    """Sensor that separates two effects if no manoeuvre does; empty if neither effect defines one."""
     one, two = _catalogued(first), _catalogued(second)
     return one.separated_by_sensor.get(second, "") or two.separated_by_sensor.get(first, "")
 
 
 def effect_values(name: str, parameters: Mapping[str, float | Tensor], like: Tensor | None = None) -> dict[str, Tensor]:
-    """Values of all parameters of an effect, the neutral one where none is given.
+    """Values of all parameters of an effect; missing ones are neutral.
 
     Raises:
-        EffectError: the effect or a parameter is unknown, or a value out of bounds (its neutral value is always in).
+        EffectError: the effect or a parameter is unknown, or a value is out of bounds (neutral values are allowed).
     """
     if name not in CATALOGUE:
         raise EffectError(f"effect {name!r} is unknown; expected one of {sorted(CATALOGUE)}")
@@ -107,13 +107,13 @@ def effect_values(name: str, parameters: Mapping[str, float | Tensor], like: Ten
 
 
 def drive_speeds(robot: RobotModel, twists: Tensor, time_step: float, *, history: int = 0) -> Tensor:
-    """Drive speeds that result from commanded twists, with the robot's command effects.
+    """Drive speeds from commanded twists, with the robot's effects on commands.
 
     Args:
-        robot: its ``effects`` act in the order in which a command meets them.
+        robot: its effects act in the order of :func:`speed_effects`.
         twists: forward speed [m/s] and yaw rate [rad/s], ``[B, history + T, 2]``.
-        time_step: between them [s].
-        history: how many of them lie before the start: delay and lag need what was commanded then.
+        time_step: time between twists [s].
+        history: number of twists before the start; delay and lag need them.
 
     Returns:
         ``[B, T, D]`` [m/s].
@@ -128,7 +128,7 @@ def drive_speeds(robot: RobotModel, twists: Tensor, time_step: float, *, history
 
 
 def applied_setup(terrain: TerrainMap, robot: RobotModel) -> Setup:
-    """Terrain, robot and loads with the robot's contact and body effects in them."""
+    """Terrain, robot and loads with the robot's contact and body effects applied."""
     setup = Setup(terrain, robot, Loads.none(robot.points))
     for name, parameters in robot.effects:
         values = effect_values(name, parameters, robot.points)
@@ -137,13 +137,13 @@ def applied_setup(terrain: TerrainMap, robot: RobotModel) -> Setup:
 
 
 def turned_effects(robot: RobotModel, heading: Tensor) -> RobotModel:
-    """The robot for rollouts in frames turned about the vertical by ``heading`` ``[B]`` [rad] from the odometry's."""
+    """The robot with effects expressed in frames yawed by ``heading`` ``[B]`` [rad] relative to the odometry frame."""
     turned = tuple((name, CATALOGUE[name].turned(parameters, heading)) for name, parameters in robot.effects)
     return replace(robot, effects=turned) if robot.effects else robot
 
 
 def recorded_motion(motion: MotionTrack, robot: RobotModel) -> MotionTrack:
-    """Motion as the robot's measurement effects would have it recorded."""
+    """Motion as recorded under the robot's measurement effects."""
     for name, parameters in robot.effects:
         values = {key: float(value) for key, value in effect_values(name, parameters).items()}
         motion = CATALOGUE[name].motion(motion, values)
@@ -151,7 +151,7 @@ def recorded_motion(motion: MotionTrack, robot: RobotModel) -> MotionTrack:
 
 
 def recorded_commands(commands: CommandTrack, robot: RobotModel) -> CommandTrack:
-    """Commands as the robot's measurement effects would have them recorded."""
+    """Commands as recorded under the robot's measurement effects."""
     for name, parameters in robot.effects:
         values = {key: float(value) for key, value in effect_values(name, parameters).items()}
         commands = CATALOGUE[name].commands(commands, values)
@@ -159,7 +159,7 @@ def recorded_commands(commands: CommandTrack, robot: RobotModel) -> CommandTrack
 
 
 def corrected_motion(motion: MotionTrack, effects: Iterable[tuple[str, Mapping[str, float | Tensor]]]) -> MotionTrack:
-    """Recorded motion without what measurement effects did to it: each undoes itself with the opposite sign."""
+    """Recorded motion with measurement effects removed, by applying each with the opposite sign."""
     for name, parameters in effects:
         if _catalogued(name).stage == "measurement":
             motion = CATALOGUE[name].motion(motion, {key: -float(value) for key, value in _full(name, parameters)})
@@ -169,7 +169,7 @@ def corrected_motion(motion: MotionTrack, effects: Iterable[tuple[str, Mapping[s
 def corrected_commands(
     commands: CommandTrack, effects: Iterable[tuple[str, Mapping[str, float | Tensor]]]
 ) -> CommandTrack:
-    """Recorded commands without what measurement effects did to them."""
+    """Recorded commands with measurement effects removed."""
     for name, parameters in effects:
         if _catalogued(name).stage == "measurement":
             commands = CATALOGUE[name].commands(

@@ -15,7 +15,7 @@ class CommandClockOffset(Effect):
 
     name = "command_clock_offset"
     stage = "measurement"
-    summary = "The command's clock runs ahead by the offset."
+    summary = "The clock that stamps commands is ahead by the offset."
     formula = "stamp ← stamp + offset"
     source = "unsynchronised clocks"
     parameters = (Parameter("offset", "s", 0.0, -2.0, 2.0, 0.2, "recorded minus true time"),)
@@ -24,5 +24,5 @@ class CommandClockOffset(Effect):
     }
 
     def commands(self, commands: CommandTrack, values: Mapping[str, float]) -> CommandTrack:
-        """Commands as they are recorded under this effect."""
+        """Commands as recorded under this effect."""
         return replace(commands, stamps=commands.stamps + round(values["offset"] * 1e9))

@@ -1,4 +1,4 @@
-"""Dead time between a command and the drives' answer."""
+"""Dead time between a command and the response of the drives."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from monoforce_ros.effects.effect import Effect, Parameter, Values, WheelRespons
 
 
 def _delayed(speeds: np.ndarray, value: float, step: float) -> np.ndarray:
-    place = np.arange(speeds.shape[1]) - value / step
-    return np.stack([np.interp(place, np.arange(speeds.shape[1]), side) for side in speeds])
+    index = np.arange(speeds.shape[1]) - value / step
+    return np.stack([np.interp(index, np.arange(speeds.shape[1]), side) for side in speeds])
 
 
 class CommandDelay(Effect):
-    """Dead time between a command and the drives' answer."""
+    """Dead time between a command and the response of the drives."""
 
     name = "command_delay"
     stage = "command"
-    summary = "The drives follow each command later by a fixed time."
+    summary = "The drives follow each command after a fixed delay."
     formula = "u(t) ← u(t - delay), linear between steps"
     source = "communication and controller latency"
     parameters = (Parameter("delay", "s", 0.0, 0.0, 2.0, 0.2, "dead time"),)
@@ -29,7 +29,7 @@ class CommandDelay(Effect):
     identified = ("delay",)
     manoeuvre = "steps of the speed from standing"
     separated_by: ClassVar = {"actuator_lag": "steps of the speed from standing"}
-    # Motion and commands alone do not say which of their clocks is off, or whether the base waits.
+    # Motion and commands alone cannot separate a clock offset of either from a delay of the base.
     separated_by_sensor: ClassVar = {
         "pose_clock_offset": "record an IMU: its gyro shows whether the poses or the base are late",
         "command_clock_offset": "record an IMU: its gyro shows whether the poses or the base are late",
@@ -46,7 +46,7 @@ class CommandDelay(Effect):
     def drive_speeds(self, speeds: Tensor, values: Values, time_step: float, offsets: Tensor) -> Tensor:
         """Drive speeds with this effect applied; see :class:`Effect`."""
         count = speeds.shape[1]
-        # Before the first command there is none to delay: it is taken to have held.
+        # The first command is assumed to have been active before its stamp.
         place = torch.arange(count, dtype=speeds.dtype, device=speeds.device) - values["delay"][..., None] / time_step
         place = place.clamp_min(0.0)
         index = place.detach().floor().long().clamp_max(count - 1)

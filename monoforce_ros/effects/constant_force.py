@@ -14,7 +14,7 @@ class ConstantForce(Effect):
 
     name = "constant_force"
     stage = "body"
-    summary = "A tether, a slope that the map does not show, wind."
+    summary = "A constant force from a tether, wind, or a slope that the map does not contain."
     formula = "f = f_0 in body axes"
     source = "rigid-body mechanics"
     parameters = (

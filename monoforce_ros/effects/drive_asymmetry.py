@@ -15,7 +15,7 @@ class DriveAsymmetry(Effect):
 
     name = "drive_asymmetry"
     stage = "command"
-    summary = "The right side runs faster than the left by the difference, in parts of the speed."
+    summary = "The right side is faster than the left by this fraction of the speed."
     formula = "u_left ← (1 - d/2) u, u_right ← (1 + d/2) u"
     source = "unequal tyres or motors"
     parameters = (Parameter("difference", "-", 0.0, -1.0, 1.0, 0.1, "right minus left, over their mean"),)

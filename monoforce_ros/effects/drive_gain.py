@@ -1,4 +1,4 @@
-"""Drives that run faster or slower than commanded, all alike."""
+"""Drives that all run faster or slower than commanded by the same factor."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from monoforce_ros.effects.effect import Effect, Parameter, Values, per_trajecto
 
 
 class DriveGain(Effect):
-    """Drives that run faster or slower than commanded, all alike."""
+    """Drives that all run faster or slower than commanded by the same factor."""
 
     name = "drive_gain"
     stage = "command"
-    summary = "Wheel radius error or uniform slip: every speed is scaled."
+    summary = "All drive speeds are scaled, by a wheel-radius error or uniform slip."
     formula = "u ← gain u"
     source = "calibration of the wheel radius"
     parameters = (Parameter("gain", "-", 1.0, 0.2, 2.0, 0.1, "true over commanded speed"),)

@@ -1,4 +1,4 @@
-"""Effect: a named piece of physics with parameters that leaves a rollout unchanged at its neutral values."""
+"""Effect: a named physical effect whose parameters leave a rollout unchanged at their neutral values."""
 
 from __future__ import annotations
 
@@ -30,35 +30,35 @@ class Parameter:
     low: float
     high: float
     scale: float
-    """How far from neutral a robot is typically found: the prior's standard deviation."""
+    """Typical deviation from neutral: standard deviation of the prior."""
     meaning: str
 
 
 @dataclass(frozen=True)
 class WheelResponse:
-    """What measured wheel speeds show of an effect: how one parameter changes commanded wheel speeds."""
+    """An effect in measured wheel speeds: how one parameter changes commanded wheel speeds."""
 
     parameter: str
     speeds: Callable[[np.ndarray, float, float], np.ndarray]
-    """Wheel speeds ``[sides, T]`` [m/s] of commanded ones, the parameter's value and the time step [s]."""
+    """(commanded wheel speeds ``[sides, T]`` [m/s], parameter value, time step [s]) → wheel speeds [m/s]."""
     starts: Callable[[float], tuple[float, ...]]
-    """Values from which a fit starts, of the fastest commanded speed [m/s]."""
+    """Fastest commanded speed [m/s] → initial values of a fit."""
     bounds: Callable[[float], tuple[float, float]]
-    """Bounds of the fit, of the fastest commanded speed [m/s]."""
+    """Fastest commanded speed [m/s] → bounds of the fit."""
     counts: Callable[[float, float], bool]
-    """Whether a fitted value is an effect at all, of the value and the fastest commanded speed [m/s]."""
+    """(fitted value, fastest commanded speed [m/s]) → whether the value is large enough to count as an effect."""
     wording: str
-    """How a report says it, with the value in braces."""
+    """Text for reports, with braces for the value."""
     excludes: tuple[str, ...] = ()
-    """Effects that a model of the wheels does not hold beside this one: too alike to be fitted together."""
+    """Effects that a wheel model does not combine with this one because they are too similar to be fitted together."""
 
 
 class Effect(ABC):
-    """Base of the catalogue: one small file for each effect, which says everything about it.
+    """Base class of the catalogue's effects. One small file defines each effect completely.
 
-    A command effect changes drive speeds, a contact or body effect the setup of the rollout, a measurement effect what
-    is recorded. The methods below do nothing, so an effect overrides only what it acts on. The class attributes
-    say what ``diagnose`` needs to know; :mod:`monoforce_ros.effects.catalogue` checks them when it finds the file.
+    A command effect changes drive speeds, a contact or body effect changes the setup of the rollout, and a measurement
+    effect changes recorded data. The methods below do nothing; an effect overrides those it needs. ``diagnose`` reads
+    the class attributes; :mod:`monoforce_ros.effects.catalogue` checks them at import.
     """
 
     name: ClassVar[str]
@@ -69,33 +69,32 @@ class Effect(ABC):
     parameters: ClassVar[tuple[Parameter, ...]]
     order: ClassVar[int | None] = None
     """Position among the effects that change drive speeds, smallest first: electronics, then mechanics, then ground.
-    Required of every effect that overrides :meth:`drive_speeds`."""
+    Required for every effect that overrides :meth:`drive_speeds`."""
     identified: ClassVar[tuple[str, ...]] = ()
-    """Parameters that a recording of motion and commands can identify, the decisive one first. Empty: ``diagnose`` does
-    not try this effect."""
+    """Parameters that a recording of motion and commands can identify, the most important first. If empty, ``diagnose``
+    does not test this effect."""
     manoeuvre: ClassVar[str] = ""
-    """What to drive so that the effect shows."""
+    """Manoeuvre that makes the effect observable."""
     separated_by: ClassVar[Mapping[str, str]] = {}
-    """Effects that a recording may confuse with this one, and the manoeuvre that separates both. One of two files is
-    enough."""
+    """Similar effects and the manoeuvre that separates each from this one. One of the two files is enough."""
     separated_by_sensor: ClassVar[Mapping[str, str]] = {}
     """Effects that no manoeuvre separates from this one, and the sensor that does."""
     formula_terms: ClassVar[tuple[str, ...]] = ()
-    """Terms of ``learned_term`` that this effect consists of."""
+    """Terms of ``learned_term`` that are equivalent to this effect."""
     commissioning_start: ClassVar[Mapping[str, float]] = {}
-    """Values from which commissioning fits the effect to a healthy robot; empty where it does not."""
+    """Initial values for commissioning on a healthy robot; empty if commissioning does not fit this effect."""
     wheel_response: ClassVar[WheelResponse | None] = None
-    """What measured wheel speeds show of the effect."""
+    """The effect in measured wheel speeds."""
     gyro_measures: ClassVar[str] = ""
-    """Parameter that the comparison of poses with a gyro measures directly."""
+    """Parameter that comparing poses with a gyro measures directly."""
 
     def drive_speeds(self, speeds: Tensor, values: Values, time_step: float, offsets: Tensor) -> Tensor:
-        """Drive speeds ``[B, T, D]`` [m/s] that result from commanded ones.
+        """Drive speeds ``[B, T, D]`` [m/s] from commanded ones.
 
         Args:
-            speeds: commanded, the time before the start included.
-            values: parameters.
-            time_step: between the speeds [s].
+            speeds: commanded drive speeds ``[B, T, D]`` [m/s], including those before the start.
+            values: parameter values.
+            time_step: time between speeds [s].
             offsets: lateral offset of each drive ``[D]`` [m], left positive.
         """
         return speeds
@@ -105,27 +104,27 @@ class Effect(ABC):
         return setup
 
     def turned(self, values: Mapping[str, float | Tensor], heading: Tensor) -> Mapping[str, float | Tensor]:
-        """Parameters that hold in the odometry frame, in frames turned about the vertical by ``heading`` ``[B]``."""
+        """Odometry-frame parameters expressed in frames yawed by ``heading`` ``[B]`` [rad]."""
         return values
 
     def motion(self, motion: MotionTrack, values: Mapping[str, float]) -> MotionTrack:
-        """Motion as it is recorded under this effect."""
+        """Motion as recorded under this effect."""
         return motion
 
     def commands(self, commands: CommandTrack, values: Mapping[str, float]) -> CommandTrack:
-        """Commands as they are recorded under this effect."""
+        """Commands as recorded under this effect."""
         return commands
 
     def first_values(self) -> list[dict[str, float]]:
-        """Values of the identified parameters from which a fit starts, spread over the typical range."""
+        """Initial values of the identified parameters for a fit, spread over the typical range."""
         known = {parameter.name: parameter for parameter in self.parameters}
         neutral = {key: known[key].neutral for key in self.identified}
-        decisive = known[self.identified[0]]
-        starts = [decisive.neutral + factor * decisive.scale for factor in (-2.0, -1.0, -0.4, 0.4, 1.0, 2.0)]
-        return [neutral | {decisive.name: float(value)} for value in starts if decisive.low <= value <= decisive.high]
+        main = known[self.identified[0]]
+        starts = [main.neutral + factor * main.scale for factor in (-2.0, -1.0, -0.4, 0.4, 1.0, 2.0)]
+        return [neutral | {main.name: float(value)} for value in starts if main.low <= value <= main.high]
 
     def complaint(self) -> str:
-        """What is wrong with this effect's own description; empty where it is complete."""
+        """Error in this effect's class attributes; empty if there is none."""
         known = [parameter.name for parameter in self.parameters]
         missing = [key for key in ("name", "stage", "summary", "formula", "source") if not getattr(self, key, "")]
         if missing:
@@ -148,5 +147,5 @@ class Effect(ABC):
 
 
 def per_trajectory(value: Tensor, dimensions: int) -> Tensor:
-    """A scalar or ``[B]`` shaped to multiply a tensor of ``dimensions`` dimensions whose first is the batch."""
+    """Reshape a scalar or ``[B]`` to broadcast over a tensor of ``dimensions`` dimensions, batch first."""
     return value if value.ndim == 0 else value.reshape(-1, *[1] * (dimensions - 1))

@@ -1,4 +1,4 @@
-"""Friction across the rolling direction that differs from that along it."""
+"""Different friction along and across the rolling direction."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from monoforce_ros.effects.setup import Setup
 
 
 class FrictionAnisotropy(Effect):
-    """Friction across the rolling direction that differs from that along it."""
+    """Different friction along and across the rolling direction."""
 
     name = "friction_anisotropy"
     stage = "contact"
-    summary = "Lateral friction is scaled, longitudinal friction is not."
+    summary = "Only lateral friction is scaled."
     formula = "μ_lat ← factor μ_lat"
     source = "friction ellipse of tyres and grousers (Pacejka 2012)"
     parameters = (Parameter("factor", "-", 1.0, 0.05, 3.0, 0.3, "lateral over longitudinal friction"),)

@@ -1,4 +1,4 @@
-"""Ground of another friction than the map says."""
+"""Ground with a different friction than mapped."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from monoforce_ros.effects.setup import Setup
 
 
 class FrictionScale(Effect):
-    """Ground of another friction than the map says."""
+    """Ground with a different friction than mapped."""
 
     name = "friction_scale"
     stage = "contact"

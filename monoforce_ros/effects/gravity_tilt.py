@@ -1,4 +1,4 @@
-"""Gravity that is not along the odometry frame's z axis."""
+"""Gravity not aligned with the odometry frame's z axis."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from monoforce_ros.effects.setup import Setup
 
 
 class GravityTilt(Effect):
-    """Gravity that is not along the odometry frame's z axis."""
+    """Gravity not aligned with the odometry frame's z axis."""
 
     name = "gravity_tilt"
     stage = "body"
-    summary = "Ground that leans where the map says level, or a localisation that does: gravity is tilted in its frame."
+    summary = "Gravity is tilted in the odometry frame: unmapped slope or tilted localisation."
     formula = "g ← R_x(a) R_y(b) g"
-    source = "a slope that the map does not show; a localisation that started askew"
+    source = "slope missing from the map; localisation initialised with a tilt"
     parameters = (
         Parameter("about_x", "rad", 0.0, -0.5, 0.5, 0.05, "tilt about the odometry frame's x axis"),
         Parameter("about_y", "rad", 0.0, -0.5, 0.5, 0.05, "tilt about its y axis"),
@@ -34,7 +34,7 @@ class GravityTilt(Effect):
         return replace(setup, loads=replace(loads, gravity_tilt=loads.gravity_tilt + tilt.to(loads.gravity_tilt)))
 
     def turned(self, values: Mapping[str, float | Tensor], heading: Tensor) -> Mapping[str, float | Tensor]:
-        """The tilt about the axes of frames that are turned by ``heading``."""
+        """The tilt about the axes of frames yawed by ``heading`` ``[B]`` [rad]."""
         about_x, about_y = (torch.as_tensor(values.get(key, 0.0)).to(heading) for key in ("about_x", "about_y"))
         cos, sin = torch.cos(heading), torch.sin(heading)
         return {"about_x": cos * about_x + sin * about_y, "about_y": cos * about_y - sin * about_x}

@@ -16,12 +16,12 @@ class GyroBias(Effect):
 
     name = "gyro_bias"
     stage = "measurement"
-    summary = "The gyro shows a rate at rest."
+    summary = "The gyro measures a constant rate at rest."
     formula = "ω_z ← ω_z + bias"
     source = "sensor bias"
-    parameters = (Parameter("bias", "rad/s", 0.0, -0.5, 0.5, 0.02, "rate shown at rest"),)
+    parameters = (Parameter("bias", "rad/s", 0.0, -0.5, 0.5, 0.02, "measured rate at rest"),)
     gyro_measures = "bias"
 
     def motion(self, motion: MotionTrack, values: Mapping[str, float]) -> MotionTrack:
-        """Motion as it is recorded under this effect."""
+        """Motion as recorded under this effect."""
         return replace(motion, angular_velocities=motion.angular_velocities + np.array([0.0, 0.0, values["bias"]]))

@@ -1,4 +1,4 @@
-"""What the catalogue does not hold: a sparse sum of named features as a body wrench."""
+"""Dynamics missing from the catalogue, as a body wrench that is a sparse sum of named features."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ _ROWS = {"force_x": 0, "force_y": 1, "torque_z": 5}
 
 
 class LearnedTerm(Effect):
-    """What the catalogue does not hold: a sparse sum of named features as a body wrench."""
+    """Dynamics missing from the catalogue, as a body wrench that is a sparse sum of named features."""
 
     name = "learned_term"
     stage = "body"
-    summary = "A force forward, a force to the left and a torque about the vertical, each a weighted sum of features."
+    summary = "Forward force, lateral force and yaw torque, each a weighted sum of features."
     formula = "f = Σ w_k φ_k(v, ω, pitch, roll) in body axes"
-    source = "sparse regression of what the residual shows (Brunton et al. 2016)"
+    source = "sparse regression of the residual (Brunton et al. 2016)"
     parameters = tuple(
         Parameter(
             f"{row}:{feature}",

@@ -1,4 +1,4 @@
-"""The page of docs/ that lists every effect, made from the catalogue itself."""
+"""Generates docs/effects.md, the page that lists all effects, from the catalogue."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ from monoforce_ros.effects.effect import STAGES
 _INTRODUCTION = """# Effects
 
 Use this page to describe your robot beyond plain mechanics: look up an effect, its parameters and their units, and add
-it to the robot's file. `diagnose` finds most of them in recordings and writes them there by itself.
+it to the robot's file. `diagnose` identifies most of them in recordings and adds them to the file.
 
-An effect is a named piece of physics that a robot may or may not have. At its neutral values it leaves the prediction
-unchanged, bit for bit:
+An effect is an optional, named physical effect. At its neutral values the prediction is unchanged, bit for bit:
 
 ```yaml
 effects:
@@ -21,12 +20,11 @@ effects:
     provenance: {bag: yard.mcap, date: 2026-11-02}
 ```
 
-Effects compose. Effects on commands act in the order in which a command meets them: {order}.
-Delay and lag use the commands from before the start. Contact and body effects act in the
-rollout, in both backends, and every parameter is differentiable. Measurement effects change what is recorded, not what
-happens.
+Effects can be combined. Effects on commands act in this order: {order}.
+Delay and lag use the commands from before the start. Contact and body effects act in the rollout, in both backends, and
+every parameter is differentiable. Measurement effects change recorded data, not the motion itself.
 
-This page is made from the code: `python -m monoforce_ros.effects.page > docs/effects.md`.
+This page is generated: `python -m monoforce_ros.effects.page > docs/effects.md`.
 """
 
 
@@ -40,17 +38,17 @@ def catalogue_page() -> str:
                 continue
             parts.append(f"### {effect.name}\n\n{effect.summary}\n\n`{effect.formula}` — {effect.source}\n")
             rows = ["| parameter | unit | neutral | bounds | typical | meaning |", "|---|---|---|---|---|---|"]
-            shown = effect.parameters if len(effect.parameters) < 8 else effect.parameters[:3]
+            listed = effect.parameters if len(effect.parameters) < 8 else effect.parameters[:3]
             rows += [
                 f"| `{p.name}` | {p.unit} | {p.neutral:g} | {p.low:g} … {p.high:g} | ± {p.scale:g} | {p.meaning} |"
-                for p in shown
+                for p in listed
             ]
             rows = [row.replace("vx|vx|", "vx\\|vx\\|") for row in rows]
-            if len(shown) < len(effect.parameters):
-                names = ", ".join(f"`{p.name}`" for p in effect.parameters[len(shown) :])
-                rows.append(f"\nand likewise {names}")
+            if len(listed) < len(effect.parameters):
+                names = ", ".join(f"`{p.name}`" for p in effect.parameters[len(listed) :])
+                rows.append(f"\nLikewise: {names}")
             if effect.manoeuvre:
-                rows.append(f"\nShows in: {effect.manoeuvre}.")
+                rows.append(f"\nObservable in: {effect.manoeuvre}.")
             parts.append("\n".join(rows) + "\n")
     return "\n".join(parts).rstrip() + "\n"
 

@@ -1,4 +1,4 @@
-"""A load that the robot carries."""
+"""A load carried by the robot."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from monoforce_ros.robots import add_point_mass
 
 
 class Payload(Effect):
-    """A load that the robot carries."""
+    """A load carried by the robot."""
 
     name = "payload"
     stage = "body"
-    summary = "A point mass at a place on the robot changes mass, centre of mass and inertia."
+    summary = "A point mass on the robot changes mass, centre of mass and inertia."
     formula = "M ← M + m, c and J by the parallel-axis theorem"
     source = "rigid-body mechanics"
     parameters = (
         Parameter("mass", "kg", 0.0, -20.0, 200.0, 10.0, "added mass"),
-        Parameter("x", "m", 0.0, -1.0, 1.0, 0.2, "its place forward of the base frame"),
-        Parameter("y", "m", 0.0, -1.0, 1.0, 0.2, "its place to the left"),
-        Parameter("z", "m", 0.0, -0.5, 1.5, 0.2, "its place above"),
+        Parameter("x", "m", 0.0, -1.0, 1.0, 0.2, "position forward of the base frame"),
+        Parameter("y", "m", 0.0, -1.0, 1.0, 0.2, "position to the left"),
+        Parameter("z", "m", 0.0, -0.5, 1.5, 0.2, "position above"),
     )
     identified = ("mass", "x", "y")
     manoeuvre = "turns on the spot, and driving up and across a slope"
@@ -35,13 +35,13 @@ class Payload(Effect):
     }
 
     def first_values(self) -> list[dict[str, float]]:
-        """Loads ahead and behind: one in the middle changes the motion too little to start from."""
-        return [{"mass": mass, "x": place, "y": 0.0} for mass in (8.0, 20.0) for place in (-0.3, 0.3)]
+        """Loads at the front and the rear; a centred load changes the motion too little for an initial value."""
+        return [{"mass": mass, "x": x, "y": 0.0} for mass in (8.0, 20.0) for x in (-0.3, 0.3)]
 
     def setup(self, setup: Setup, values: Values) -> Setup:
         """The setup with this effect applied."""
         robot = setup.robot
         added = values["mass"]
-        place = torch.stack(torch.broadcast_tensors(values["x"], values["y"], values["z"]), dim=-1).to(robot.mass)
-        total, centre, inertia = add_point_mass(robot.mass, robot.centre_of_mass, robot.inertia, added, place)
+        position = torch.stack(torch.broadcast_tensors(values["x"], values["y"], values["z"]), dim=-1).to(robot.mass)
+        total, centre, inertia = add_point_mass(robot.mass, robot.centre_of_mass, robot.inertia, added, position)
         return replace(setup, robot=replace(robot, mass=total, centre_of_mass=centre, inertia=inertia))

@@ -14,7 +14,7 @@ class PoseClockOffset(Effect):
 
     name = "pose_clock_offset"
     stage = "measurement"
-    summary = "The pose's clock runs ahead by the offset."
+    summary = "The clock that stamps poses is ahead by the offset."
     formula = "stamp ← stamp + offset"
     source = "unsynchronised clocks, filter delay"
     parameters = (Parameter("offset", "s", 0.0, -2.0, 2.0, 0.2, "recorded minus true time"),)
@@ -23,5 +23,5 @@ class PoseClockOffset(Effect):
     gyro_measures = "offset"
 
     def motion(self, motion: MotionTrack, values: Mapping[str, float]) -> MotionTrack:
-        """Motion as it is recorded under this effect."""
+        """Motion as recorded under this effect."""
         return replace(motion, stamps=motion.stamps + round(values["offset"] * 1e9))

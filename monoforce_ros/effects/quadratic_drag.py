@@ -1,4 +1,4 @@
-"""Drag in proportion to the square of the speed."""
+"""Drag proportional to the square of the speed."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from monoforce_ros.effects.setup import Setup
 
 
 class QuadraticDrag(Effect):
-    """Drag in proportion to the square of the speed."""
+    """Drag proportional to the square of the speed."""
 
     name = "quadratic_drag"
     stage = "body"
-    summary = "The body is held back in proportion to the square of its speed."
+    summary = "A force against the motion grows with the square of the speed."
     formula = "f = -c |v| v"
     source = "fluid drag"
     parameters = (Parameter("coefficient", "N s²/m²", 0.0, 0.0, 2000.0, 30.0, "drag coefficient"),)

@@ -14,7 +14,7 @@ class RollingResistance(Effect):
 
     name = "rolling_resistance"
     stage = "contact"
-    summary = "Each loaded point is held back by a part of its load."
+    summary = "Each loaded point is resisted by a fraction of its load."
     formula = "f = -c N v / sqrt(v² + ε²) along the rolling direction"
     source = "Wong, Theory of Ground Vehicles"
     parameters = (Parameter("coefficient", "-", 0.0, 0.0, 1.0, 0.05, "resistance over load"),)

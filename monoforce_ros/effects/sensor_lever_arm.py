@@ -1,4 +1,4 @@
-"""A pose sensor away from the place it is taken for."""
+"""A pose sensor with an unmodelled offset from the base frame."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from monoforce_ros.effects.effect import Effect, Parameter
 
 
 class SensorLeverArm(Effect):
-    """A pose sensor away from the place it is taken for."""
+    """A pose sensor with an unmodelled offset from the base frame."""
 
     name = "sensor_lever_arm"
     stage = "measurement"
-    summary = "Recorded positions are those of another point of the robot."
+    summary = "Recorded positions are those of a different point on the robot."
     formula = "p ← p + R r, v ← v + ω × r"
     source = "mounting error"
     parameters = (
@@ -28,7 +28,7 @@ class SensorLeverArm(Effect):
     manoeuvre = "turns on the spot to both sides"
 
     def motion(self, motion: MotionTrack, values: Mapping[str, float]) -> MotionTrack:
-        """Motion as it is recorded under this effect."""
+        """Motion as recorded under this effect."""
         arm = np.array([values["x"], values["y"], 0.0])
         return replace(
             motion,

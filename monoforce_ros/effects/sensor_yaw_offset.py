@@ -1,4 +1,4 @@
-"""A pose sensor turned about the robot's vertical."""
+"""A pose sensor with a yaw offset."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from monoforce_ros.effects.effect import Effect, Parameter
 
 
 class SensorYawOffset(Effect):
-    """A pose sensor turned about the robot's vertical."""
+    """A pose sensor with a yaw offset."""
 
     name = "sensor_yaw_offset"
     stage = "measurement"
-    summary = "Recorded headings are off by the angle, and body velocities turned."
+    summary = "Recorded headings are offset by the angle, and body-frame velocities are rotated."
     formula = "R ← R R_z(angle)"
     source = "mounting error"
     parameters = (Parameter("angle", "rad", 0.0, -3.2, 3.2, 0.1, "yaw of the sensor on the robot"),)
@@ -24,7 +24,7 @@ class SensorYawOffset(Effect):
     manoeuvre = "straight stretches and turns on the spot"
 
     def motion(self, motion: MotionTrack, values: Mapping[str, float]) -> MotionTrack:
-        """Motion as it is recorded under this effect."""
+        """Motion as recorded under this effect."""
         turn = Rotation.from_euler("z", values["angle"])
         return replace(
             motion,

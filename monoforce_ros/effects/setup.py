@@ -1,4 +1,4 @@
-"""Setup: what a rollout integrates, with the extra loads that effects add to it."""
+"""Setup: terrain, robot and additional loads that a rollout integrates."""
 
 from __future__ import annotations
 
@@ -11,55 +11,55 @@ from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import TerrainMap
 
 FEATURES = ("1", "vx", "vy", "wz", "vx|vx|", "vy|vy|", "wz|wz|", "vx wz", "vy wz", "pitch", "roll")
-"""Features of a learned body wrench, from the body-frame velocity of the centre of mass [m/s], yaw rate [rad/s], and
-the sines of pitch (nose up) and roll (left side up)."""
+"""Features of a learned body wrench: body-frame velocity of the centre of mass [m/s], yaw rate [rad/s], and the sines
+of pitch (nose up) and roll (left side up)."""
 
 
 FEATURE_SIZES = (1.0, 0.5, 1.0, 0.5, 0.3, 1.0, 0.3, 1.0, 1.0, 1.0, 1.0)
-"""Typical size of each feature on a recording, to compare what their weights amount to."""
+"""Typical magnitude of each feature in a recording, for comparing their weights."""
 
 
 @dataclass(frozen=True)
 class Loads:
-    """Loads besides weight and ground; each is a scalar or ``[B]`` unless said otherwise. Zero means none."""
+    """Loads other than weight and contact; each is a scalar or ``[B]`` unless noted otherwise. Zero means none."""
 
     gravity_tilt: Tensor
     """Tilt of gravity about the terrain frame's x and y axes [rad], ``[2]`` or ``[B, 2]``."""
     rolling_resistance: Tensor
-    """Force against rolling as a part of the load on each point [-]."""
+    """Force against rolling as a fraction of the load on each point [-]."""
     linear_drag: Tensor
-    """Force against the centre of mass's velocity [N s/m]."""
+    """Force against the velocity of the centre of mass [N s/m]."""
     quadratic_drag: Tensor
-    """Force against the centre of mass's velocity times speed [N s²/m²]."""
+    """Force against the velocity of the centre of mass, times its speed [N s²/m²]."""
     vegetation_drag: Tensor
-    """Force against motion per area of a touching point and height of vegetation over the ground [N s/m⁴]."""
+    """Force against motion per contact area and height of the vegetation above the ground [N s/m⁴]."""
     vegetation_yield: Tensor
-    """Speed at which vegetation holds as much by being bent, whatever the speed, as by being moved [m/s]."""
+    """Speed at which the speed-independent bending force of vegetation equals its viscous drag [m/s]."""
     wrench: Tensor
     """Body-frame force [N] and torque [N m] per feature of ``FEATURES``, ``[6, F]`` or ``[B, 6, F]``."""
 
     @classmethod
     def none(cls, like: Tensor) -> Loads:
-        """No extra load, in the precision and on the device of ``like``."""
+        """No additional load, with the precision and device of ``like``."""
         zero = torch.zeros((), dtype=like.dtype, device=like.device)
         return cls(zero.expand(2), zero, zero, zero, zero, zero, zero.expand(6, len(FEATURES)))
 
     def with_wrench(self, row: int, feature: str, weight: Tensor) -> Loads:
-        """These loads and one more term of the body wrench.
+        """These loads with one more term of the body wrench.
 
         Args:
-            row: 0, 1, 2 for the force along x, y, z of the body [N], 3, 4, 5 for the torque about them [N m].
+            row: 0, 1, 2 for the force along body x, y, z [N]; 3, 4, 5 for the torque about them [N m].
             feature: one of :data:`FEATURES`.
-            weight: of the feature, a scalar or ``[B]``.
+            weight: weight of the feature, a scalar or ``[B]``.
         """
-        place = torch.zeros(6, len(FEATURES), dtype=self.wrench.dtype, device=self.wrench.device)
-        place[row, FEATURES.index(feature)] = 1.0
-        return replace(self, wrench=self.wrench + weight.to(self.wrench)[..., None, None] * place)
+        selected = torch.zeros(6, len(FEATURES), dtype=self.wrench.dtype, device=self.wrench.device)
+        selected[row, FEATURES.index(feature)] = 1.0
+        return replace(self, wrench=self.wrench + weight.to(self.wrench)[..., None, None] * selected)
 
 
 @dataclass(frozen=True)
 class Setup:
-    """Terrain, robot and loads; effects turn one setup into another."""
+    """Terrain, robot and loads; contact and body effects modify them."""
 
     terrain: TerrainMap
     robot: RobotModel

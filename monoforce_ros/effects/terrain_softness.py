@@ -1,4 +1,4 @@
-"""Ground softer or stiffer than the map says."""
+"""Ground softer or stiffer than mapped."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from monoforce_ros.effects.setup import Setup
 
 
 class TerrainSoftness(Effect):
-    """Ground softer or stiffer than the map says."""
+    """Ground softer or stiffer than mapped."""
 
     name = "terrain_softness"
     stage = "contact"
-    summary = "Stiffness is divided, damping with it."
+    summary = "Stiffness and damping are divided by the factor."
     formula = "e ← e / factor, d ← d / factor"
     source = "loose soil"
     parameters = (Parameter("factor", "-", 1.0, 0.1, 100.0, 3.0, "mapped over true stiffness"),)

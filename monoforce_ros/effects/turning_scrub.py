@@ -15,7 +15,7 @@ class TurningScrub(Effect):
 
     name = "turning_scrub"
     stage = "contact"
-    summary = "Turning is as slow as if the drives were further apart."
+    summary = "The robot turns more slowly, like one with a wider track."
     formula = "u - ū ← (u - ū) / factor, ū the mean of the drives"
     source = "Mandow et al. 2007, experimental kinematics of skid-steer vehicles"
     parameters = (Parameter("track_width_factor", "-", 1.0, 0.3, 4.0, 0.3, "effective over modelled track width"),)

@@ -1,4 +1,4 @@
-"""Drag of vegetation that stands over the ground."""
+"""Drag of vegetation above the ground."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from monoforce_ros.effects.setup import Setup
 
 
 class VegetationDrag(Effect):
-    """Drag of vegetation that stands over the ground."""
+    """Drag of vegetation above the ground."""
 
     name = "vegetation_drag"
     stage = "contact"
-    summary = "Touching points are held back in proportion to the height of what is seen above the supporting ground."
+    summary = "Resistance at contact points, proportional to the vegetation height (visible minus supporting ground)."
     formula = "f = -c A (H_g - H_t) (v + v_y v/|v|)"
-    source = "flow-like resistance of grass and brush, and of stems that bend however slowly"
+    source = "viscous resistance of grass and brush, and speed-independent bending of stems"
     parameters = (
         Parameter("coefficient", "N s/m⁴", 0.0, 0.0, 1e6, 1e4, "drag per area, height and speed"),
-        Parameter("yield_speed", "m/s", 0.0, 0.0, 10.0, 0.5, "speed at which stems hold twice what flow would"),
+        Parameter("yield_speed", "m/s", 0.0, 0.0, 10.0, 0.5, "speed at which bending and viscous force are equal"),
     )
 
     def setup(self, setup: Setup, values: Values) -> Setup:

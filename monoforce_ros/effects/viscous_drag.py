@@ -1,4 +1,4 @@
-"""Drag in proportion to speed."""
+"""Drag proportional to speed."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from monoforce_ros.effects.setup import Setup
 
 
 class ViscousDrag(Effect):
-    """Drag in proportion to speed."""
+    """Drag proportional to speed."""
 
     name = "viscous_drag"
     stage = "body"
-    summary = "The body is held back in proportion to its speed."
+    summary = "A force against the motion grows linearly with speed."
     formula = "f = -c v"
     source = "fluid drag"
     parameters = (Parameter("coefficient", "N s/m", 0.0, 0.0, 2000.0, 30.0, "drag coefficient"),)
     identified = ("coefficient",)
     manoeuvre = "slow and fast stretches straight ahead"
     separated_by: ClassVar = {"quadratic_drag": "slow and fast stretches straight ahead"}
-    # At about one speed both drags are alike.
+    # At nearly constant speed the two drags are indistinguishable.
     formula_terms = ("force_x:vx", "force_x:vx|vx|")
 
     def setup(self, setup: Setup, values: Values) -> Setup:

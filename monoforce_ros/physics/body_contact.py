@@ -1,4 +1,4 @@
-"""BodyContact: contact of all body points in a state, the same for every PyTorch integrator."""
+"""BodyContact: contact of all body points in a state, shared by the PyTorch integrators."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ from monoforce_ros.physics.rotation import cross_matrix
 
 @dataclass(frozen=True)
 class BodyContact:
-    """What contact depends on besides the state; every tensor may carry gradients."""
+    """Inputs of the contact model other than the state; every tensor may require gradients."""
 
     lookup: TerrainLookup
     points: Tensor
-    """Body points from the centre of mass, ``[B, 3, N]`` [m]."""
+    """Body points relative to the centre of mass in base axes, ``[B, 3, N]`` [m]."""
     tangents: Tensor
     """Direction in which each point's surface moves, ``[3, N]`` in base axes."""
     areas: Tensor
-    """``[N]`` [m²]."""
+    """Area of each point, ``[N]`` [m²]."""
     weights: Tensor
-    """Share of each point in the robot's weight, ``[B, N]`` [N]."""
+    """Share of the robot's weight per point, ``[B, N]`` [N]."""
     speeds: Tensor
-    """Of each drive and, last, of the hull, which does not move, ``[B, T, D + 1]`` [m/s]."""
+    """Surface speed of each drive; the last entry is the hull, at zero, ``[B, T, D + 1]`` [m/s]."""
     drives: Tensor
-    """Drive of each point, ``[N]`` int64; -1 on the hull."""
+    """Drive index of each point, ``[N]`` int64; -1 on the hull."""
     friction_factors: Tensor
-    """``[B, 2]``."""
+    """Longitudinal and lateral factor on the ground's friction, ``[B, 2]``."""
     rolling_resistance: Tensor
-    """``[B]``."""
+    """Coefficient per trajectory, ``[B]``."""
     yield_speed: Tensor
-    """Of vegetation, ``[B]`` [m/s]."""
+    """Yield speed of vegetation, ``[B]`` [m/s]."""
     options: PhysicsOptions
 
     @classmethod
@@ -50,7 +50,7 @@ class BodyContact:
             tangents=problem.point_tangents.T,
             areas=problem.point_areas,
             weights=problem.mass[:, None] * options.gravity * share,
-            # Drive -1, the hull, finds its zero at the end.
+            # Index -1, the hull, selects the zero at the end.
             speeds=torch.cat([problem.drive_speeds, torch.zeros_like(problem.drive_speeds[..., :1])], dim=-1),
             drives=problem.point_drives,
             friction_factors=problem.friction_factors,
@@ -69,22 +69,22 @@ class BodyContact:
         *,
         step_time: float | None = None,
     ) -> tuple[Tensor, Contact]:
-        """Arms from the centre of mass to the points ``[B, 3, N]`` [m] in terrain axes, and the contact there.
+        """Lever arms from the centre of mass to the points ``[B, 3, N]`` [m] in terrain axes, and their contact.
 
         Args:
-            step: whose drive speeds act.
-            centre: of mass, ``[B, 3]`` [m].
+            step: index of the drive speeds.
+            centre: centre of mass, ``[B, 3]`` [m].
             rotation: terrain ← base, ``[B, 3, 3]``.
-            velocity: of the centre of mass, ``[B, 3]`` [m/s].
+            velocity: velocity of the centre of mass, ``[B, 3]`` [m/s].
             angular_velocity: in terrain axes, ``[B, 3]`` [rad/s].
-            step_time: see :func:`contact`.
+            step_time: as in :func:`contact`.
         """
-        # Three products in one: arms to the points, their velocities by the rotation, velocities of the belts.
+        # One product for lever arms, velocities of the points due to rotation, and velocities of the belts.
         spin = cross_matrix(angular_velocity) @ rotation
         belts = self.tangents * self.speeds[:, step, self.drives][:, None]
-        nothing = torch.zeros_like(rotation)
+        zero = torch.zeros_like(rotation)
         frames = torch.cat(
-            [torch.cat([rotation, nothing], 2), torch.cat([spin, nothing], 2), torch.cat([nothing, rotation], 2)], 1
+            [torch.cat([rotation, zero], 2), torch.cat([spin, zero], 2), torch.cat([zero, rotation], 2)], 1
         )
         arms, spun, belt = (frames @ torch.cat([self.points, belts], 1)).split(3, dim=1)
         points = centre[..., None] + arms

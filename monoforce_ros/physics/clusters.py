@@ -1,4 +1,4 @@
-"""Clusters of body points: most of a robot is in the air, and a look at each cluster tells which part may not be."""
+"""Clusters of body points: most points are in the air, and one test per cluster skips all of its points."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ from torch import Tensor
 from torch.nn import functional
 
 _LARGEST = 8
-"""Points of a cluster."""
+"""Largest number of points per cluster."""
 _MARGIN = 1.001, 1e-3
-"""On each radius, as a factor and added [m]: rotations and coordinates are rounded."""
+"""Factor and offset [m] on each radius, to allow for rounding of rotations and coordinates."""
 
 
 @dataclass(frozen=True)
 class PointClusters:
-    """Spheres about neighbouring points."""
+    """Bounding spheres of neighbouring points."""
 
     order: Tensor
-    """The points' indices, cluster after cluster ``[N]``."""
+    """Point indices, sorted by cluster ``[N]``."""
     edges: Tensor
-    """Of each cluster the first place in the order, and the end ``[C + 1]`` int32."""
+    """Index in ``order`` of the first point of each cluster, then the end ``[C + 1]`` int32."""
     centres: Tensor
-    """In the base frame [m], ``[C, 3]``."""
+    """Centres of the spheres in the base frame [m], ``[C, 3]``."""
     radii: Tensor
-    """[m], ``[C]``."""
+    """Radii of the spheres [m], ``[C]``."""
 
     def ceiling(self, height: Tensor, resolution: float) -> Tensor:
-        """Highest ground ``[B, rows, columns]`` [m] that any cluster whose centre is nearest to a node may touch.
+        """Highest ground ``[B, rows, columns]`` [m] within reach of any cluster whose centre is nearest to each node.
 
-        A point is at most the radius from its centre, a corner of its cell one cell further, and the node that is
-        nearest to the centre half a cell from it. Coordinates off the map are clamped, which brings none further apart.
+        The reach adds the largest radius, one cell from a point to the corners of its cell, and half a cell from the
+        centre to its nearest node. Clamping coordinates off the map never increases these distances.
         """
         reach = int(np.ceil(float(self.radii.max()) / resolution + 1.5))
         width = 2 * reach + 1
@@ -42,7 +42,7 @@ class PointClusters:
 
 
 def point_clusters(points: Tensor) -> PointClusters:
-    """Clusters of points ``[N, 3]`` [m], in their precision and on their device."""
+    """Clusters of points ``[N, 3]`` [m], with their precision and device."""
     found = _clusters(points.detach().cpu().double().numpy().tobytes())
     return PointClusters(
         *(t.to(points.device) for t in found[:2]), *(t.to(points.device, points.dtype) for t in found[2:])
@@ -66,7 +66,7 @@ def _clusters(data: bytes) -> tuple[Tensor, ...]:
 
 
 def _halved(points: np.ndarray, chosen: np.ndarray) -> list[np.ndarray]:
-    """Indices split along their widest direction until few enough remain."""
+    """Split point indices along the widest axis until each part is small enough."""
     if len(chosen) <= _LARGEST:
         return [chosen]
     extent = np.ptp(points[chosen], axis=0)

@@ -1,4 +1,4 @@
-"""Contact: forces between body points and ground, with what an implicit integrator needs to know of them."""
+"""Contact: forces between body points and ground, with their velocity gains for an implicit integrator."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from monoforce_ros.physics.rotation import cross
 class Contact:
     """Contact forces along three directions per point: normal, longitudinal, lateral.
 
-    With the point's velocity ``u`` along these directions after a step, the force is ``force - gain * (u - u_now)``:
-    the gains are how fast the forces give way, by which the integrator stays stable however stiff the ground is.
+    With the point's velocity ``u`` along these directions after a step, the force is ``force - gain * (u - u_now)``.
+    The gains, the rates at which the forces decrease with velocity, keep the integrator stable at any stiffness.
     """
 
     directions: Tensor
@@ -29,7 +29,7 @@ class Contact:
 
     @property
     def vectors(self) -> Tensor:
-        """Whole force on each point in terrain axes, ``[B, 3, N]`` [N]."""
+        """Total force on each point in terrain axes, ``[B, 3, N]`` [N]."""
         return (self.directions * self.force[:, None]).sum(2)
 
 
@@ -55,18 +55,18 @@ def contact(
 
     Args:
         ground: terrain under the points.
-        points: ``[B, 3, N]`` [m].
-        velocities: of the body at the points, ``[B, 3, N]`` [m/s].
-        belt_velocities: of the moving surface relative to the body, ``[B, 3, N]`` [m/s].
+        points: positions, ``[B, 3, N]`` [m].
+        velocities: velocities of the body at the points, ``[B, 3, N]`` [m/s].
+        belt_velocities: velocities of the belt surface relative to the body, ``[B, 3, N]`` [m/s].
         lateral: the robot's y axis, ``[B, 3]``.
-        areas: ``[N]`` [m²].
-        weights: share m g of each point in the robot's weight, ``[B, N]`` or ``[N]`` [N] (``sigmoid`` only).
+        areas: area of each point, ``[N]`` [m²].
+        weights: share of the robot's weight m g per point, ``[B, N]`` or ``[N]`` [N] (``sigmoid`` only).
         friction_factors: longitudinal and lateral factor on the ground's friction, ``[B, 2]``.
-        rolling_resistance: force against rolling as a part of the load, ``[B]``.
-        yield_speed: at which vegetation holds as much by being bent as by being moved, ``[B]`` [m/s].
-        options: which laws.
-        step_time: over which the spring follows the motion [s]; the options' time step unless given, 0 for the force
-            at this very moment.
+        rolling_resistance: force against rolling as a fraction of the load, ``[B]``.
+        yield_speed: speed at which bending force and viscous drag of vegetation are equal, ``[B]`` [m/s].
+        options: contact laws.
+        step_time: time over which the spring follows the motion [s] (default: the time step); 0 gives the
+            instantaneous force.
     """
     normal = ground.normal
     if options.normal_force == "vertical":
@@ -79,15 +79,15 @@ def contact(
     across = lateral - (lateral * normal).sum(1, keepdim=True) * normal
     across = across * torch.rsqrt((across * across).sum(1, keepdim=True) + 1e-12)
     directions = torch.stack([normal, cross(across, normal), across], dim=2)
-    moved = (directions * velocities[:, :, None]).sum(1)
-    slip = moved[:, 1:] + (directions[:, :, 1:] * belt_velocities[:, :, None]).sum(1)
+    point_velocity = (directions * velocities[:, :, None]).sum(1)
+    slip = point_velocity[:, 1:] + (directions[:, :, 1:] * belt_velocities[:, :, None]).sum(1)
 
-    # Pressing on the ground is moving against its normal.
+    # Approach of the ground is motion against its normal.
     spring = ground.stiffness * depth
-    load = touching_areas * (spring - ground.damping * moved[:, 0]).clamp_min(0.0)
-    # Within the step the spring follows the motion: it acts as further damping (linearly implicit Euler).
+    load = touching_areas * (spring - ground.damping * point_velocity[:, 0]).clamp_min(0.0)
+    # The spring force follows the motion within the step, which acts as additional damping (linearly implicit Euler).
     damping = ground.damping + (options.time_step if step_time is None else step_time) * ground.stiffness
-    pressing = touching_areas * (spring - damping * moved[:, 0]).clamp_min(0.0)
+    pressing = touching_areas * (spring - damping * point_velocity[:, 0]).clamp_min(0.0)
     normal_gain = touching_areas * damping * (pressing > 0)
 
     friction = ground.friction[:, None] * friction_factors[..., None]
@@ -103,14 +103,14 @@ def contact(
     else:
         tangential_force = torch.zeros_like(slip)
         tangential_gain = tangential_force
-    # What holds the body back, rather than the belt: rolling resistance and vegetation.
-    along, across = moved[:, 1], moved[:, 2]
-    pace = torch.rsqrt(along * along + across * across + options.slip_regularisation**2)
-    brushing = touching_areas * ground.drag * (1.0 + yield_speed[:, None] * pace)
-    rolling = rolling_resistance[:, None] * load * torch.rsqrt(moved[:, 1] ** 2 + options.slip_regularisation**2)
-    held = torch.stack([rolling + brushing, brushing], dim=1)
+    # Rolling resistance and vegetation depend on the velocity of the body, not on slip.
+    along, across = point_velocity[:, 1], point_velocity[:, 2]
+    inverse_speed = torch.rsqrt(along * along + across * across + options.slip_regularisation**2)
+    vegetation = touching_areas * ground.drag * (1.0 + yield_speed[:, None] * inverse_speed)
+    rolling = rolling_resistance[:, None] * load * torch.rsqrt(along**2 + options.slip_regularisation**2)
+    resistance = torch.stack([rolling + vegetation, vegetation], dim=1)
     return Contact(
         directions=directions,
-        force=torch.cat([pressing[:, None], tangential_force - held * moved[:, 1:]], dim=1),
-        gain=torch.cat([normal_gain[:, None], tangential_gain + held], dim=1),
+        force=torch.cat([pressing[:, None], tangential_force - resistance * point_velocity[:, 1:]], dim=1),
+        gain=torch.cat([normal_gain[:, None], tangential_gain + resistance], dim=1),
     )

@@ -1,4 +1,4 @@
-"""ContactSummary: contact forces summed over a body, all that most questions about a rollout need of them."""
+"""ContactSummary: contact forces summed over the body, sufficient for costs and most other uses of a rollout."""
 
 from __future__ import annotations
 
@@ -10,44 +10,44 @@ from torch import Tensor
 from monoforce_ros.robots import RobotModel
 
 STEEP = 0.5
-"""A contact whose normal has a smaller vertical part pushes rather than carries: it is steeper than 60°."""
+"""Vertical component of the normal below which a contact is steep (more than 60°) and pushes rather than supports."""
 
 
 @dataclass(frozen=True)
 class ContactSummary:
-    """Sums over the body's points during ``S`` of a rollout's steps [N]."""
+    """Sums over the body's points during ``S`` steps of a rollout [N]."""
 
     load: Tensor
-    """Force of the ground along its normal on the points of each drive and, last, of the hull, ``[B, S, D + 1]``."""
+    """Normal force of the ground on each drive's points; the last entry is the hull, ``[B, S, D + 1]``."""
     traction: Tensor
-    """Force along the ground and the body's x axis on the points of each drive, ``[B, S, D]``."""
+    """Tangential force along the body's x axis on each drive's points, ``[B, S, D]``."""
     sides: Tensor
-    """Normal force on all points to the left and to the right of the base frame, ``[B, S, 2]``."""
+    """Normal force on all points left and right of the base frame, ``[B, S, 2]``."""
     push: Tensor
-    """Horizontal part of the normal forces of steep contacts, ``[B, S, 2]`` in terrain axes."""
+    """Horizontal component of the normal forces of steep contacts, ``[B, S, 2]`` in terrain axes."""
     force: Tensor
-    """Whole contact force, ``[B, S, 3]`` in terrain axes."""
+    """Total contact force, ``[B, S, 3]`` in terrain axes."""
 
     @classmethod
     def split(cls, sums: Tensor, drives: int) -> ContactSummary:
-        """Of all of it side by side, ``[B, S, 2 D + 8]``."""
+        """From one tensor with all sums concatenated, ``[B, S, 2 D + 8]``."""
         return cls(*sums.split((drives + 1, drives, 2, 2, 3), dim=-1))
 
     @classmethod
     def of_points(
         cls, robot: RobotModel, rotation: Tensor, normal_forces: Tensor, tangential_forces: Tensor, forces: Tensor
     ) -> ContactSummary:
-        """Sums of each point's forces; differentiable.
+        """Sum the forces of each point; differentiable.
 
         Args:
-            robot: whose points they act on.
-            rotation: at the start of each of the steps, ``[B, S, 3, 3]``.
-            normal_forces: ``[B, S, N]``.
-            tangential_forces: ``[B, S, N, 3]``.
-            forces: ``[B, S, N, 3]``.
+            robot: robot with the points.
+            rotation: rotation terrain ← base at the start of each step, ``[B, S, 3, 3]``.
+            normal_forces: ``[B, S, N]`` [N].
+            tangential_forces: ``[B, S, N, 3]`` [N] in terrain axes.
+            forces: total forces, ``[B, S, N, 3]`` [N] in terrain axes.
         """
         drives = robot.number_of_drives
-        # The hull, drive -1, is the last one.
+        # The hull, drive -1, becomes the last entry.
         member = torch.nn.functional.one_hot(robot.point_drives % (drives + 1), drives + 1).to(normal_forces)
         ahead = (tangential_forces * rotation[..., None, :, 0]).sum(-1)
         lateral = robot.points[:, 1].to(normal_forces)
@@ -64,5 +64,5 @@ class ContactSummary:
         )
 
     def joined(self, other: ContactSummary) -> ContactSummary:
-        """Of these trajectories and of others after them."""
+        """These trajectories followed by others."""
         return ContactSummary(*(torch.cat([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)))

@@ -1,6 +1,6 @@
-"""Loads besides contact: weight, drag, learned wrench and gyroscopic torque, assembled for every PyTorch integrator.
+"""Loads other than contact: weight, drag, learned wrench and gyroscopic torque, for the PyTorch integrators.
 
-``warp_kernels/loads.py`` holds the same formulas as a device function; a test compares both.
+``warp_kernels/loads.py`` has the same formulas as a device function; a test compares both.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ SMALLEST_SPEED = 1e-6
 
 @dataclass(frozen=True)
 class ExternalLoads:
-    """Loads on a batch of bodies at one moment, in terrain axes about the centre of mass."""
+    """Loads on a batch of bodies at one time, in terrain axes about the centre of mass."""
 
     force: Tensor
     """``[B, 3]`` [N]."""
     torque: Tensor
     """``[B, 3]`` [N m]."""
     drag: Tensor
-    """Rate at which the force falls with the velocity, ``[B]`` [N s/m]: an implicit integrator needs it."""
+    """Rate at which the force decreases with velocity, ``[B]`` [N s/m], for an implicit integrator."""
 
 
 @dataclass(frozen=True)
 class LoadModel:
-    """What the loads depend on besides the state; every entry may carry gradients."""
+    """Inputs of the loads other than the state; every entry may require gradients."""
 
     weight: Tensor
     """``[B, 3]`` [N]."""
@@ -54,9 +54,9 @@ class LoadModel:
 
         Args:
             rotation: terrain ← base, ``[B, 3, 3]``.
-            velocity: of the centre of mass [m/s], ``[B, 3]``.
-            angular_velocity: in terrain axes [rad/s], ``[B, 3]``.
-            inertia: about the centre of mass in terrain axes [kg m²], ``[B, 3, 3]``.
+            velocity: velocity of the centre of mass [m/s], ``[B, 3]``.
+            angular_velocity: angular velocity in terrain axes [rad/s], ``[B, 3]``.
+            inertia: inertia about the centre of mass in terrain axes [kg m²], ``[B, 3, 3]``.
         """
         in_body = rotation.transpose(1, 2) @ torch.stack([velocity, angular_velocity], dim=-1)
         extra = (self.wrench @ motion_features(in_body, rotation)[..., None])[..., 0]
@@ -71,7 +71,7 @@ class LoadModel:
 
 
 def tilted_gravity(tilt: Tensor, gravity: float) -> Tensor:
-    """Gravity ``[B, 3]`` [m/s²] turned about the y axis, then about the x axis, by ``tilt`` ``[B, 2]`` (x, y) [rad]."""
+    """Gravity ``[B, 3]`` [m/s²] rotated about the y axis, then the x axis, by ``tilt`` ``[B, 2]`` (x, y) [rad]."""
     about_x, about_y = tilt.unbind(-1)
     level = torch.cos(about_y)
     return -gravity * torch.stack([torch.sin(about_y), -torch.sin(about_x) * level, torch.cos(about_x) * level], -1)

@@ -13,7 +13,7 @@ from monoforce_ros.terrain import Grid, TerrainMap
 
 @dataclass(frozen=True)
 class Ground:
-    """What the terrain is at each of a batch of points."""
+    """Terrain properties at a batch of points."""
 
     height: Tensor
     """``[B, N]`` [m]."""
@@ -26,14 +26,14 @@ class Ground:
     friction: Tensor
     """``[B, N]``."""
     drag: Tensor
-    """Drag of vegetation per area, ``[B, N]`` [N s/m³]."""
+    """Vegetation drag per area, ``[B, N]`` [N s/m³]."""
 
 
 class TerrainLookup:
-    """Reads a terrain map at points. The maps are packed once, when the lookup is made.
+    """Reads a terrain map at points. The constructor packs the maps once.
 
-    Beyond the outermost cell centres the border is continued: the grid coordinate is clamped, never a flat index, and
-    the slope across the border is zero there.
+    Beyond the outermost cell centres the border values continue: grid coordinates (never flat indices) are clamped, and
+    the slope across the border is zero.
     """
 
     def __init__(self, terrain: TerrainMap, kind: str, batch: int, drag: Tensor | None = None):
@@ -45,7 +45,7 @@ class TerrainLookup:
         pages = channels.shape[1]
         if pages not in (1, batch):
             raise ValueError(f"terrain: got a batch of {pages} maps, expected 1 or {batch}")
-        # One row of cells per channel: gathering along contiguous memory is what the reference spends its time on.
+        # One row of cells per channel: gathers dominate the run time and need contiguous memory.
         self.channels = channels.flatten(1)
         cells = terrain.grid.rows * terrain.grid.columns
         self._page = None if pages == 1 else cells * torch.arange(batch, device=channels.device)[:, None]
@@ -63,7 +63,7 @@ class TerrainLookup:
         ]
 
     def with_channels(self, channels: Tensor) -> TerrainLookup:
-        """The same maps with other values, packed as :attr:`channels`."""
+        """A lookup with the same grid and other values, packed like :attr:`channels`."""
         other = copy(self)
         other.channels = channels
         return other
@@ -81,7 +81,7 @@ class TerrainLookup:
     def _bilinear(self, points: Tensor) -> Ground:
         raw = (points[:, :2] - self._origin) / self._grid.resolution
         coordinate = torch.clamp(raw, self._zero, self._limit)
-        # The last cell centre belongs to the square before it, so that its neighbour exists.
+        # The last cell centre belongs to the previous square, so that the neighbours exist.
         corner = torch.minimum(coordinate.detach().floor(), self._limit - 1.0)
         u, w = (coordinate - corner).unbind(1)
         column, row = corner.long().unbind(1)
@@ -89,7 +89,7 @@ class TerrainLookup:
         lower = 1.0 - w
         weights = torch.stack([lower - u * lower, u * lower, w - u * w, u * w])
         value = (values * weights).sum(1)
-        # Where the coordinate was clamped the height no longer depends on it.
+        # The height does not depend on clamped coordinates.
         free = (raw.detach() == coordinate.detach()) / self._grid.resolution
         here, right, above, diagonal = values[0]
         slope_x = (lower * (right - here) + w * (diagonal - above)) * free[:, 0]

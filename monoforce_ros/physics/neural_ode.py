@@ -19,14 +19,14 @@ METHODS = ("euler", "midpoint", "rk4", "dopri5")
 
 @dataclass(frozen=True)
 class OdeOptions:
-    """Which solver integrates, and how exactly."""
+    """Solver and its accuracy."""
 
     method: str = "rk4"
     """torchdiffeq's name: fixed steps (``euler``, ``midpoint``, ``rk4``) or adaptive (``dopri5``)."""
     adjoint: bool = False
-    """Gradients by solving the adjoint equation backwards in time (constant memory) instead of through the solver."""
+    """Compute gradients from the adjoint equation backwards in time (constant memory) instead of through the solver."""
     step: float = 0.001
-    """Step of the fixed-step methods [s]: stiff contacts need short ones."""
+    """Step of the fixed-step methods [s]; stiff contacts need short steps."""
     tolerance: float = 1e-5
     """Relative and absolute tolerance of the adaptive method."""
 
@@ -46,7 +46,7 @@ def integrate(
 ) -> Motion:
     """Solve for the motion at the rollout's time steps.
 
-    Forces are those at the beginning of each step: a continuous-time solver has none that act over a step.
+    Forces are those at the beginning of each step; a continuous-time solver has no average over a step.
     """
     from torchdiffeq import odeint
 
@@ -57,8 +57,8 @@ def integrate(
         times, settings = _solver(system, problem.steps, ode)
         states = odeint(system, _start(problem), times, **settings)
     centre, rotation, velocity, angular_velocity = (state.transpose(0, 1) for state in states)
-    # A general solver does not know that rotations are orthonormal. Two Newton steps lead back to the nearest ones;
-    # a singular value decomposition would too, but has no gradient where the values are equal.
+    # A general solver does not keep rotations orthonormal. Two Newton steps restore them; a singular value
+    # decomposition would too, but has no gradient at equal singular values.
     for _ in range(2):
         rotation = 1.5 * rotation - 0.5 * rotation @ rotation.transpose(-1, -2) @ rotation
     motion = Motion(centre, rotation, velocity, angular_velocity)
@@ -115,7 +115,7 @@ class _System(nn.Module):
 
     @property
     def tensors(self) -> tuple[Tensor, ...]:
-        """Everything that the derivative depends on and that may carry gradients."""
+        """All tensors on which the derivative depends and that may require gradients."""
         body, loads = self.body, self.loads
         return (
             body.lookup.channels, body.points, body.tangents, body.areas, body.weights, body.speeds,
@@ -151,11 +151,11 @@ class _System(nn.Module):
 
 
 class _AdjointSolution(torch.autograd.Function):
-    """Solves the adjoint equation for the gradient of every tensor of the system and of the start.
+    """Solves the adjoint equation for the gradients of all tensors of the system and the start state.
 
-    torchdiffeq's adjoint differentiates the system again and again with respect to the tensors that it is given. Here
-    these are copies without a history, so that one which depends on another (a payload's mass and centre of mass, a
-    map's height and its vegetation) is neither counted twice nor its graph walked twice.
+    torchdiffeq's adjoint repeatedly differentiates the system with respect to these tensors. They are detached copies,
+    because some depend on others (mass and centre of mass of a payload, height and vegetation of a map), and their
+    gradients would otherwise be counted twice and their graphs traversed twice.
     """
 
     @staticmethod
@@ -163,11 +163,11 @@ class _AdjointSolution(torch.autograd.Function):
         from torchdiffeq import odeint_adjoint
 
         leaves = [tensor.detach().requires_grad_(tensor.requires_grad) for tensor in tensors]
-        own = system.with_tensors(tuple(leaves[:-4]))
-        times, settings = _solver(own, steps, ode)
+        detached = system.with_tensors(tuple(leaves[:-4]))
+        times, settings = _solver(detached, steps, ode)
         with torch.enable_grad():
             parameters = tuple(leaf for leaf in leaves[:-4] if leaf.requires_grad)
-            states = odeint_adjoint(own, tuple(leaves[-4:]), times, adjoint_params=parameters, **settings)
+            states = odeint_adjoint(detached, tuple(leaves[-4:]), times, adjoint_params=parameters, **settings)
         ctx.leaves, ctx.states = leaves, states
         return tuple(state.detach() for state in states)
 

@@ -1,4 +1,4 @@
-"""PhysicsOptions: which of the models of rising complexity a rollout uses."""
+"""PhysicsOptions: contact and friction models of a rollout."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ TANGENTIAL_FORCES = ("coulomb", "sigmoid", "none")
 
 @dataclass(frozen=True)
 class PhysicsOptions:
-    """Models and numbers of a rollout; raises ``ValueError`` naming the field, the value and what is possible."""
+    """Models and numerical settings of a rollout; ``ValueError`` names an invalid field, its value and valid ones."""
 
     time_step: float = 0.01
-    """[s]."""
+    """Time step [s]."""
     lookup: str = "bilinear"
     """``bilinear`` interpolation of the maps or the ``constant`` value of a cell (paper III-C)."""
     normal_force: str = "normal"
-    """Along the surface ``normal`` or ``vertical`` (paper III-C)."""
+    """Direction: the surface ``normal`` or ``vertical`` (paper III-C)."""
     tangential_force: str = "coulomb"
-    """``coulomb`` on the actual load, ``sigmoid`` as in paper III-D, or ``none``."""
+    """``coulomb`` with the actual load, ``sigmoid`` as in paper III-D, or ``none``."""
     gravity: float = 9.81
     """[m/s²]."""
     slip_regularisation: float = 0.02
-    """Slip speed at which Coulomb friction has 71 % of its full size [m/s]."""
+    """Slip speed at which Coulomb friction reaches 71 % of its maximum [m/s]."""
 
     def __post_init__(self):
         for name, value, choices in (

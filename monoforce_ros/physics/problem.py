@@ -1,4 +1,4 @@
-"""Problem: a rollout's inputs in the form that both backends integrate."""
+"""Problem: inputs of a rollout in the form used by both backends."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from monoforce_ros.terrain import TerrainMap
 
 @dataclass(frozen=True)
 class Problem:
-    """Everything in one precision, on one device, finite, and relative to the centre of mass."""
+    """All inputs, finite, with one precision and device, and relative to the centre of mass."""
 
     terrain: TerrainMap
     """One map or a batch ``[B]``."""
@@ -51,29 +51,29 @@ class Problem:
     resistance: Tensor
     """Rolling resistance [-], linear [N s/m], quadratic drag [N s²/m²], yield speed of vegetation [m/s], ``[B, 4]``."""
     vegetation_drag: Tensor
-    """Drag map [N s/m³]: force against motion per area of a touching point; like the terrain, ``[(B,) rows, cols]``."""
+    """Drag map [N s/m³]: force per contact area and speed, shaped like the terrain ``[(B,) rows, cols]``."""
     wrench: Tensor
     """Body-frame force and torque per feature of the motion, ``[B, 6, F]``."""
 
     @classmethod
     def pose(cls, terrain: TerrainMap, robot: RobotModel, drive_speeds: Tensor, state: State) -> tuple[Problem, Tensor]:
-        """The problem and which of its trajectories started from finite numbers, ``[B]`` bool.
+        """The problem and a mask of the trajectories with finite inputs, ``[B]`` bool.
 
-        Those that did not are replaced by the robot standing at the map's origin: computed from NaN, they would poison
-        the gradient of the terrain that they share with the others.
+        Other trajectories are replaced by a robot at rest at the map's origin, because NaN would propagate into the
+        gradient of the shared terrain.
         """
         batch, dtype, device = state.position.shape[0], state.position.dtype, state.position.device
         setup = applied_setup(terrain.to(dtype, device), robot.to(dtype, device))
         terrain, robot, loads = setup.terrain, setup.robot, setup.loads
-        given = (state.position, state.rotation, state.velocity, state.angular_velocity, drive_speeds.to(dtype))
-        finite = torch.stack([torch.isfinite(t.detach()).reshape(batch, -1).all(1) for t in given]).all(0)
+        values = (state.position, state.rotation, state.velocity, state.angular_velocity, drive_speeds.to(dtype))
+        finite = torch.stack([torch.isfinite(t.detach()).reshape(batch, -1).all(1) for t in values]).all(0)
         if bool(finite.all()):
-            position, rotation, velocity, angular_velocity, speeds = given
+            position, rotation, velocity, angular_velocity, speeds = values
         else:
             identity = torch.eye(3, dtype=dtype, device=device)
-            neutral = (torch.zeros_like(t) if t is not given[1] else identity.expand_as(t) for t in given)
+            neutral = (torch.zeros_like(t) if t is not values[1] else identity.expand_as(t) for t in values)
             position, rotation, velocity, angular_velocity, speeds = (
-                torch.where(finite.view(-1, *[1] * (t.ndim - 1)), t, n) for t, n in zip(given, neutral, strict=True)
+                torch.where(finite.view(-1, *[1] * (t.ndim - 1)), t, n) for t, n in zip(values, neutral, strict=True)
             )
         centre_of_mass = robot.centre_of_mass.expand(batch, 3)
         offset = (rotation @ centre_of_mass[..., None])[..., 0]
@@ -117,7 +117,7 @@ class Problem:
 
 @dataclass(frozen=True)
 class Motion:
-    """What a backend returns; index 0 along time is the start."""
+    """Result of a backend; index 0 along time is the start state."""
 
     centre: Tensor
     """``[B, T + 1, 3]``."""
@@ -134,4 +134,4 @@ class Motion:
     forces: Tensor | None = None
     """``[B, T, N, 3]``."""
     contact: ContactSummary | None = None
-    """Where the backend summed the forces itself."""
+    """Sums of the forces, if the backend computed them."""

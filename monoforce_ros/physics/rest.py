@@ -1,4 +1,4 @@
-"""Rest: how deep a robot sinks into level ground under its own weight."""
+"""Rest: depth to which a robot sinks into level ground under its weight."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from monoforce_ros.robots import RobotModel
 
 
 def rest_depth(robot: RobotModel, stiffness: float, *, gravity: float = 9.81) -> float:
-    """Penetration [m] of the lowest driven point at which level ground of ``stiffness`` [N/m³] carries the robot.
+    """Penetration [m] of the lowest driven point at which level ground of ``stiffness`` [N/m³] supports the robot.
 
-    Solves ``Σ k A_i (δ - d_i)₊ = M g`` for δ, with d_i the height of point i over the lowest one, by bisection.
+    Solves ``Σ k A_i (δ - d_i)₊ = M g`` for δ, where d_i is the height of point i above the lowest one, by bisection.
     """
     driven = robot.point_drives >= 0
     gaps = (robot.points[driven][:, 2] - robot.points[driven][:, 2].min()).double()

@@ -1,4 +1,4 @@
-"""The rollout: a robot's motion over terrain (paper eq. 1), by the fastest backend that is there."""
+"""The rollout: a robot's motion over terrain (paper eq. 1), with the fastest available backend."""
 
 from __future__ import annotations
 
@@ -35,28 +35,28 @@ def rollout(
 ) -> Rollout:
     """Predict the motion of a batch of robots.
 
-    Semi-implicit Euler: velocities first, then positions by the new velocities, the rotation by the exponential map.
-    Contact forces enter linearly implicitly: with the forces' gains D on the body's six velocities,
-    ``(M + Δt D) Δv = Δt f`` is solved each step, which is stable for any stiffness, damping and friction.
+    Semi-implicit Euler: velocities are updated first, then positions from them, and rotations by the exponential map.
+    Contact forces are linearly implicit: with their gains D on the body's six velocities, each step solves
+    ``(M + Δt D) Δv = Δt f``, which is stable for any stiffness, damping and friction.
 
     Differentiable in the terrain's channels, drive speeds, start state, mass, centre of mass, inertia and friction.
-    Works in the precision and on the device of ``state``; nothing given is written to.
+    Uses the precision and device of ``state``; inputs are not modified.
 
     Args:
-        terrain: one map for all, or a batch ``[B]`` of maps.
-        robot: its physical quantities may carry a batch dimension.
+        terrain: one map for all trajectories, or a batch ``[B]`` of maps.
+        robot: robot; physical quantities may have a batch dimension.
         drive_speeds: surface speed of each drive during each step [m/s], ``[B, T, D]``.
         state: start states, ``[B]``.
         with_forces: whether to return per-point forces (memory grows with B · T · N).
-        with_contact: whether to return their sums over the body, which without gradients cost little.
-        force_every: of so many steps the first one's forces are returned; where many candidates are compared, all of
-            them would cost more than the motion.
-        ode: integrate by a solver of torchdiffeq instead, as the paper's Neural-ODE variant does; forces are then those
-            at the beginning of each step.
-        backend: ``warp`` (compiled kernels), ``torch`` (the reference), or ``auto``: Warp where it is installed.
+        with_contact: whether to return their sums over the body, which cost little without gradients.
+        force_every: return forces of every n-th step only; with many candidates the forces of all steps would take
+            longer than the motion.
+        ode: integrate with a torchdiffeq solver, as in the paper's Neural-ODE variant; forces are then those at the
+            beginning of each step.
+        backend: ``warp`` (compiled kernels), ``torch`` (the reference), or ``auto``: Warp if installed.
 
     Raises:
-        ValueError: shapes that do not fit together, or a backend that is not there.
+        ValueError: inconsistent shapes, or a backend that is not available.
     """
     batch = state.position.shape[0]
     if force_every < 1:
@@ -102,7 +102,7 @@ def _backend(name: str) -> _Backend:
     except ImportError as error:
         if name == "auto":
             return torch_backend
-        raise ValueError(f"backend: got 'warp', but {error}: pip install warp-lang, or take 'torch'") from error
+        raise ValueError(f"backend: got 'warp', but {error}: pip install warp-lang, or use 'torch'") from error
     return warp_backend
 
 
@@ -118,7 +118,7 @@ def _result(problem: Problem, motion: Motion, finite: Tensor, options: PhysicsOp
             return values
         return values.masked_fill(~valid.view(-1, *[1] * (values.ndim - 1)), torch.nan)
 
-    def mark_if_there(values: Tensor | None) -> Tensor | None:
+    def mark_optional(values: Tensor | None) -> Tensor | None:
         return None if values is None else mark(values)
 
     grid, points = problem.terrain.grid, position.detach()[..., :2]
@@ -132,9 +132,9 @@ def _result(problem: Problem, motion: Motion, finite: Tensor, options: PhysicsOp
         angular_velocity=mark(motion.angular_velocity),
         inside=((points >= low) & (points <= high)).all(dim=-1),
         valid=valid,
-        normal_forces=mark_if_there(motion.normal_forces),
-        tangential_forces=mark_if_there(motion.tangential_forces),
-        forces=mark_if_there(motion.forces),
+        normal_forces=mark_optional(motion.normal_forces),
+        tangential_forces=mark_optional(motion.tangential_forces),
+        forces=mark_optional(motion.forces),
         contact=motion.contact
         and ContactSummary(*(mark(getattr(motion.contact, f.name)) for f in fields(motion.contact))),
     )

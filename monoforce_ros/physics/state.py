@@ -1,4 +1,4 @@
-"""State and Rollout: where a robot is, and where it will be."""
+"""State and Rollout: current state and predicted motion of a robot."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from monoforce_ros.physics.contact_summary import ContactSummary
 
 @dataclass(frozen=True)
 class State:
-    """Rigid-body state of a batch of robots, in the terrain's frame."""
+    """Rigid-body state of a batch of robots, in the terrain frame."""
 
     position: Tensor
     """Origin of the base frame [m], ``[B, 3]``."""
@@ -39,7 +39,7 @@ class State:
     def at_rest(
         cls, height: float = 0.0, *, batch: int = 1, heading: float = 0.0, dtype: torch.dtype = torch.float32
     ) -> State:
-        """Robots standing still and level above the map's origin."""
+        """Robots at rest and level, ``height`` [m] above the map's origin, with yaw ``heading`` [rad]."""
         angle = torch.tensor(heading, dtype=dtype)
         cos, sin, zero, one = (
             torch.cos(angle),
@@ -68,22 +68,22 @@ class Rollout:
     angular_velocity: Tensor
     """``[B, T + 1, 3]`` [rad/s]."""
     inside: Tensor
-    """Whether the base frame's origin is on the map, ``[B, T + 1]`` bool; beyond its edge the map is continued."""
+    """Whether the base frame's origin is on the map, ``[B, T + 1]`` bool; border values continue beyond the edge."""
     valid: Tensor
-    """Whether a trajectory is finite throughout, ``[B]`` bool; an invalid one holds NaN and no gradient."""
+    """Whether a trajectory is finite throughout, ``[B]`` bool; invalid ones are NaN and have no gradient."""
     normal_forces: Tensor | None = None
-    """Force of the ground along its normal on each body point during each step [N], ``[B, T, N]``, never negative."""
+    """Normal force of the ground on each body point during each step [N], ``[B, T, N]``, never negative."""
     tangential_forces: Tensor | None = None
-    """Part of the contact force along the ground on each body point [N], ``[B, T, N, 3]`` in terrain axes."""
+    """Tangential contact force on each body point [N], ``[B, T, N, 3]`` in terrain axes."""
     forces: Tensor | None = None
-    """Whole contact force on each body point during each step [N], ``[B, T, N, 3]`` in terrain axes."""
+    """Total contact force on each body point during each step [N], ``[B, T, N, 3]`` in terrain axes."""
     contact: ContactSummary | None = None
     """The forces summed over the body's points, ``[B, T, …]``."""
     force_every: int = 1
-    """Forces and their sums are those of the first of so many steps; above, ``T`` is then that much smaller."""
+    """Forces and their sums are those of every n-th step; their dimension ``T`` is smaller by this factor."""
 
     def joined(self, other: Rollout) -> Rollout:
-        """These trajectories and others of the same times after them; forces only where both have them."""
+        """These trajectories followed by others with the same times; forces only if both have them."""
         parts = {}
         for entry in fields(self):
             mine, theirs = getattr(self, entry.name), getattr(other, entry.name)

@@ -1,4 +1,4 @@
-"""The PyTorch backend: the reference that every other one is checked against, in any precision, on any device."""
+"""The PyTorch backend: the reference for other backends, in any precision and on any device."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ def integrate(
     normal_forces, tangential_forces, forces = [], [], []
     for step in range(problem.steps):
         arms, touch = body.at(step, centre, rotation, velocity, angular_velocity)
-        # Rows that turn the body's six velocities into the points' velocities along the contact directions, and by
-        # their transpose forces along these into the body's force and torque.
+        # Maps forces along the contact directions to the body's force and torque; its transpose maps the body's six
+        # velocities to velocities of the points along these directions.
         levers = cross(arms[:, :, None], touch.directions)
         jacobian = torch.cat([touch.directions, levers], 1).flatten(2)
         force, gain = touch.force.flatten(1), touch.gain.flatten(1)
@@ -51,12 +51,12 @@ def integrate(
         rotation = exponential_map(step_time * angular_velocity) @ rotation
         history.append((centre, rotation, velocity, angular_velocity))
         if (with_forces or with_contact) and step % force_every == 0:
-            acted = touch.force - touch.gain * (change[:, None] @ jacobian).unflatten(2, (3, -1))[:, 0]
-            pressing = acted[:, 0].clamp_min(0.0)
-            normal_forces.append(pressing)
-            tangential = (touch.directions[:, :, 1:] * acted[:, None, 1:]).sum(2)
+            step_force = touch.force - touch.gain * (change[:, None] @ jacobian).unflatten(2, (3, -1))[:, 0]
+            normal_force = step_force[:, 0].clamp_min(0.0)
+            normal_forces.append(normal_force)
+            tangential = (touch.directions[:, :, 1:] * step_force[:, None, 1:]).sum(2)
             tangential_forces.append(tangential.transpose(1, 2))
-            forces.append((pressing[:, None] * touch.directions[:, :, 0] + tangential).transpose(1, 2))
+            forces.append((normal_force[:, None] * touch.directions[:, :, 0] + tangential).transpose(1, 2))
     centre, rotation, velocity, angular_velocity = (torch.stack(entries, 1) for entries in zip(*history, strict=True))
     motion = Motion(centre, rotation, velocity, angular_velocity)
     if not normal_forces:

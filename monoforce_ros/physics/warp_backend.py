@@ -1,4 +1,4 @@
-"""The Warp backend: the same rollout as compiled kernels on CPU or CUDA, differentiable through torch."""
+"""The Warp backend: the rollout as compiled kernels on CPU or CUDA, differentiable with torch."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from monoforce_ros.physics.warp_kernels import (
 from monoforce_ros.terrain import Grid
 
 CPU_THREADS = 2
-"""Launches at a time on the CPU: a launch runs in one core and lets other Python threads go on."""
+"""Simultaneous launches on the CPU; a launch uses one core and releases the GIL."""
 SMALLEST_SHARE = 4
-"""Trajectories below which splitting a batch over threads does not pay."""
+"""Smallest number of trajectories per thread; splitting smaller batches takes longer."""
 
 CHUNK = 8
-"""Trajectories whose per-step sums are kept at a time on the way back."""
+"""Number of trajectories whose per-step sums are in memory at once in the backward pass."""
 
 _TANGENTIAL = {"none": NO_FRICTION, "coulomb": COULOMB, "sigmoid": SIGMOID}
 _threads: ThreadPoolExecutor | None = None
@@ -51,7 +51,7 @@ def integrate(
     listed = torch.broadcast_tensors(terrain.stiffness, terrain.damping, terrain.friction, problem.vegetation_drag)
     material = torch.stack(listed, dim=-1)
     material = material if material.ndim == 4 else material[None]
-    # Both are read at one page, so a map of which only the material varies is repeated.
+    # The kernel reads both at the same page, so maps with equal heights but different materials are repeated.
     pages = max(len(height), len(material))
     height, material = height.expand(pages, -1, -1), material.expand(pages, -1, -1, -1)
     share = problem.point_areas / problem.point_areas.sum()
@@ -59,7 +59,7 @@ def integrate(
     sampled = (problem.points, problem.point_areas, problem.point_tangents, share)
 
     def inputs(body: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-        """In the order of :data:`_INPUTS`."""
+        """Kernel inputs in the order of :data:`_INPUTS`."""
         return (
             height,
             material,
@@ -77,7 +77,7 @@ def integrate(
     start = (problem.centre, problem.rotation, problem.velocity, problem.angular_velocity)
     clusters = point_clusters(problem.points)
     fixed = _Fixed(options, terrain.grid, drives[clusters.order], clusters)
-    # Points of a cluster lie side by side.
+    # Points of a cluster are contiguous.
     ordered = inputs(tuple(t[clusters.order] for t in sampled))
     states: tuple[Tensor, ...] = _Integrate.apply(fixed, *ordered, *start)
     centre, rotation, velocity, angular_velocity = states
@@ -97,12 +97,12 @@ _INPUTS = (
     "height", "material", "points", "areas", "tangents", "share", "speeds", "mass", "centre_of_mass", "inertia",
     "friction", "tilt", "resistance", "wrench",
 )  # fmt: skip
-"""Tensors that carry gradients into the kernels, besides the states."""
+"""Kernel inputs with gradients, other than the states."""
 _STATES = ("centre", "rotation", "velocity", "angular_velocity")
 
 
 class _Fixed:
-    """What a launch needs besides tensors that carry gradients."""
+    """Inputs of a launch without gradients."""
 
     def __init__(self, options: PhysicsOptions, grid: Grid, drives: Tensor, clusters: PointClusters):
         self.options = options
@@ -112,21 +112,21 @@ class _Fixed:
         self._ceiling: Tensor | None = None
 
     def ceiling(self, height: Tensor) -> Tensor:
-        """The highest ground near each node, which clusters of points are compared with."""
+        """The highest ground near each node, against which clusters are tested."""
         if self._ceiling is None:
             self._ceiling = self.clusters.ceiling(height, self.grid.resolution).contiguous()
         return self._ceiling
 
 
 class _Arguments:
-    """The structs of a launch over tensors, and the arrays of those that may carry gradients.
+    """Kernel structs for tensors, and the arrays that may have gradients.
 
     Args:
-        fixed: what carries none.
-        inputs: in the order of :data:`_INPUTS`.
-        states: in the order of :data:`_STATES`.
+        fixed: inputs without gradients.
+        inputs: tensors in the order of :data:`_INPUTS`.
+        states: tensors in the order of :data:`_STATES`.
         gradients: whether to collect gradients of the inputs.
-        state_gradients: into which those of the states are added; made anew where ``gradients`` are asked for.
+        state_gradients: tensors to which gradients of the states are added; allocated if None and ``gradients`` is set.
     """
 
     def __init__(
@@ -140,12 +140,12 @@ class _Arguments:
     ):
         self.double, kinds = _precision(inputs[0])
         element = _elements(kinds)
-        given = dict(zip(_INPUTS, inputs, strict=True))
+        named = dict(zip(_INPUTS, inputs, strict=True))
         self.inputs = {
             name: wp.from_torch(
                 value, dtype=element[name], requires_grad=gradients, grad=torch.zeros_like(value) if gradients else None
             )
-            for name, value in given.items()
+            for name, value in named.items()
         }
         if state_gradients is None and gradients:
             state_gradients = [torch.zeros_like(value) for value in states]
@@ -180,7 +180,7 @@ class _Arguments:
         self.structs: list[Any] = [ground, body, robots, options, moving]
 
     def gradients(self) -> list[Tensor]:
-        """Of the inputs, then of the states."""
+        """Gradients of the inputs, then of the states."""
         return [wp.to_torch(array.grad) for array in (*self.inputs.values(), *self.states.values())]
 
 
@@ -222,7 +222,7 @@ class _Integrate(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *state_gradients: Tensor) -> tuple[Tensor | None, ...]:
         saved = ctx.saved_tensors
-        # The adjoint adds to these while it walks back in time, hence copies.
+        # The adjoint accumulates into these backwards in time, hence the copies.
         gradients = [g.clone(memory_format=torch.contiguous_format) for g in state_gradients]
         given = _launch(ctx.fixed, saved[: len(_INPUTS)], saved[len(_INPUTS) :], state_gradients=gradients)
         return (None, *given, *(g[:, 0] for g in gradients))
@@ -257,13 +257,13 @@ def _launch(
     *,
     state_gradients: Sequence[Tensor] | None = None,
 ) -> list[Tensor]:
-    """Launch the integration, or its adjoint if ``state_gradients`` are given; then return the inputs' gradients."""
+    """Launch the integration, or with ``state_gradients`` its adjoint, which returns the inputs' gradients."""
     batch, steps = inputs[6].shape[:2]
     backward = state_gradients is not None
     device = str(inputs[0].device)
     double, kinds = _precision(inputs[0])
     kernel = integrate_kernel(double)
-    # Before the threads start, which would each compute it.
+    # Computed before the threads start; otherwise each would compute it.
     fixed.ceiling(inputs[0])
 
     def work(part: tuple[int, int]) -> list[Tensor]:
@@ -271,8 +271,8 @@ def _launch(
         arguments = _Arguments(fixed, inputs, states, gradients=backward, state_gradients=state_gradients)
         for chunk in range(first, first + count, CHUNK if backward else count):
             width = min(CHUNK, first + count - chunk) if backward else count
-            # The adjoint reads the sums of every step; keeping them for a few trajectories at a time costs one more
-            # forward launch and saves most of the memory.
+            # The adjoint reads the sums of every step. Storing them for a few trajectories at a time requires a second
+            # forward launch, but saves most of the memory.
             slots = max(1, steps) if backward else 1
             sums = inputs[0].new_zeros((width, slots, 9, 3))
             scratch = wp.from_torch(
@@ -284,7 +284,7 @@ def _launch(
                 wp.launch(kernel, dim=width, inputs=given, device=device, record_tape=False, **_adjoint(given))
         return arguments.gradients()[: len(_INPUTS)] if backward else []
 
-    # Compiled here: two threads must not do so at once.
+    # Compile here, because two threads must not compile at the same time.
     kernel.module.load(wp.get_device(device))
     return _summed(list(_in_parallel(work, _shares(batch, inputs[0].device))))
 
@@ -297,7 +297,7 @@ def _launch_forces(
     *,
     output_gradients: Sequence[Tensor] | None = None,
 ) -> list[Tensor]:
-    """Launch the forces of every so many steps, or their adjoint; then return the gradients of what was given."""
+    """Launch the forces of every n-th step, or with ``output_gradients`` their adjoint, which returns the gradients."""
     backward = output_gradients is not None
     device = str(given[0].device)
     inputs, states = given[: len(_INPUTS)], given[len(_INPUTS) :]
@@ -325,7 +325,7 @@ def _launch_forces(
 
 
 def _launch_summary(fixed: _Fixed, every: int, inputs: Sequence[Tensor], states: Sequence[Tensor]) -> Tensor:
-    """Launch the sums of the forces of every so many steps, ``[B, S, 2 D + 8]``."""
+    """Launch the sums of the forces of every n-th step; returns ``[B, S, 2 D + 8]``."""
     batch, steps, drives = inputs[6].shape
     device = str(inputs[0].device)
     double, kinds = _precision(inputs[0])
@@ -345,18 +345,18 @@ def _launch_summary(fixed: _Fixed, every: int, inputs: Sequence[Tensor], states:
 
 
 def _adjoint(inputs: Sequence[Any]) -> dict[str, Any]:
-    """Arguments that make a launch run a kernel's adjoint: arrays bring their gradients, the rest has none."""
+    """Launch arguments that run a kernel's adjoint: arrays have their own gradients, other arguments none."""
     adjoints = [None if isinstance(value, wp.array) else type(value)() for value in inputs]
     return {"adjoint": True, "adj_inputs": adjoints, "adj_outputs": []}
 
 
 def _summed(parts: list[list[Tensor]]) -> list[Tensor]:
-    """Gradients of several launches together."""
+    """Sum the gradients of several launches."""
     return [torch.stack(entries).sum(0) if len(entries) > 1 else entries[0] for entries in zip(*parts, strict=True)]
 
 
 def _shares(batch: int, device: torch.device) -> list[tuple[int, int]]:
-    """First trajectory and number of trajectories of each launch."""
+    """Index of the first trajectory and number of trajectories of each launch."""
     workers = 1 if device.type == "cuda" else max(1, min(CPU_THREADS, batch // SMALLEST_SHARE))
     edges = [round(batch * k / workers) for k in range(workers + 1)]
     return [(low, high - low) for low, high in itertools.pairwise(edges)]

@@ -1,4 +1,4 @@
-"""The rollout as Warp kernels, a file for each: motion, forces of every point, and their sums over the body."""
+"""Warp kernels of the rollout, one per file: motion, forces on each point, and their sums over the body."""
 
 import warp as wp
 

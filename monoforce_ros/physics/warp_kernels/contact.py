@@ -1,4 +1,4 @@
-"""Contact of one body point with the ground, and what integration shares (the formulas of ``physics/contact.py``)."""
+"""Contact of one body point with the ground, as device functions (formulas of ``physics/contact.py``)."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -44,17 +44,17 @@ def contact_functions(double: bool) -> ContactFunctions:
 
     @wp.func
     def corner(raw: scalar, cells: int) -> int:
-        # Never negative, so that cutting off the fraction is the floor, which would be a call on plain x86-64.
+        # Never negative, so truncation equals floor, which is a function call on plain x86-64.
         return wp.min(int(wp.clamp(raw, scalar(0.0), scalar(cells - 1))), cells - 2)
 
     @wp.func
     def nearest(raw: scalar, cells: int) -> int:
-        # rint rounds halves to even, as torch does.
+        # rint rounds halves to even, like torch.
         return int(wp.rint(wp.clamp(raw, scalar(0.0), scalar(cells - 1))))
 
     @wp.func
     def nearby(raw: scalar, cells: int) -> int:
-        # Which way halves are rounded does not matter here, and rint would be a call.
+        # Rounding of halves does not matter here, and rint is a function call.
         return int(wp.clamp(raw, scalar(0.0), scalar(cells - 1)) + scalar(0.5))
 
     @wp.func
@@ -123,9 +123,9 @@ def contact_functions(double: bool) -> ContactFunctions:
         else:
             level = ground.height[page, nearest(raw_y, ground.rows), nearest(raw_x, ground.columns)]
         gap = level - point[2]
-        # Most points are in the air: nothing more is computed for them.
+        # Most points are in the air and need no further computation.
         if gap > scalar(0.0):
-            stuff = vec4()
+            material = vec4()
             if options.lookup == 1:
                 m00 = ground.material[page, row, column]
                 m01 = ground.material[page, row, column + 1]
@@ -133,12 +133,12 @@ def contact_functions(double: bool) -> ContactFunctions:
                 m11 = ground.material[page, row + 1, column + 1]
                 below = m00 + u * (m01 - m00)
                 above = m10 + u * (m11 - m10)
-                stuff = below + w * (above - below)
+                material = below + w * (above - below)
             else:
-                stuff = ground.material[page, nearest(raw_y, ground.rows), nearest(raw_x, ground.columns)]
+                material = ground.material[page, nearest(raw_y, ground.rows), nearest(raw_x, ground.columns)]
             normal = vec3(scalar(0.0), scalar(0.0), scalar(1.0))
             if options.normal == 1:
-                # Where the coordinate was clamped the height no longer depends on it.
+                # The height does not depend on clamped coordinates.
                 slope_x = (
                     ((scalar(1.0) - w) * (h01 - h00) + w * (h11 - h10))
                     * ground.inverse_resolution
@@ -161,21 +161,21 @@ def contact_functions(double: bool) -> ContactFunctions:
             lateral = vec3(turned[0, 1], turned[1, 1], turned[2, 1])
             depth = gap * normal[2]
             approach = -wp.dot(velocity, normal)
-            spring = stuff[0] * depth
-            load = area * wp.max(spring + stuff[1] * approach, scalar(0.0))
-            # Within the step the spring follows the motion: it acts as further damping.
-            damping = stuff[1] + options.time_step * stuff[0]
+            spring = material[0] * depth
+            load = area * wp.max(spring + material[1] * approach, scalar(0.0))
+            # The spring force follows the motion within the step, which acts as additional damping.
+            damping = material[1] + options.time_step * material[0]
             pressing = area * wp.max(spring + damping * approach, scalar(0.0))
             normal_gain = wp.where(pressing > scalar(0.0), area * damping, scalar(0.0))
             across = lateral - wp.dot(lateral, normal) * normal
             across = across * (scalar(1.0) / wp.sqrt(wp.dot(across, across) + scalar(1.0e-12)))
             along = wp.cross(across, normal)
-            moved_along = wp.dot(velocity, along)
-            moved_across = wp.dot(velocity, across)
-            slip_along = moved_along + wp.dot(belt, along)
-            slip_across = moved_across + wp.dot(belt, across)
-            friction_along = stuff[2] * factors[0]
-            friction_across = stuff[2] * factors[1]
+            velocity_along = wp.dot(velocity, along)
+            velocity_across = wp.dot(velocity, across)
+            slip_along = velocity_along + wp.dot(belt, along)
+            slip_across = velocity_across + wp.dot(belt, across)
+            friction_along = material[2] * factors[0]
+            friction_across = material[2] * factors[1]
             force_along = scalar(0.0)
             force_across = scalar(0.0)
             gain_along = scalar(0.0)
@@ -194,15 +194,15 @@ def contact_functions(double: bool) -> ContactFunctions:
                 force_across = friction_across * weight * (active_across - scalar(0.5))
                 gain_along = friction_along * weight * active_along * (scalar(1.0) - active_along)
                 gain_across = friction_across * weight * active_across * (scalar(1.0) - active_across)
-            # What resists the body's motion rather than the belt's: rolling resistance and vegetation.
-            moved = wp.sqrt(moved_along * moved_along + moved_across * moved_across + options.slip_square)
-            held_across = area * stuff[3] * (scalar(1.0) + resistance[3] / moved)
-            rolling = resistance[0] * load / wp.sqrt(moved_along * moved_along + options.slip_square)
-            held_along = rolling + held_across
-            force_along = force_along - held_along * moved_along
-            force_across = force_across - held_across * moved_across
-            gain_along = gain_along + held_along
-            gain_across = gain_across + held_across
+            # Rolling resistance and vegetation depend on the velocity of the body, not on slip.
+            speed = wp.sqrt(velocity_along * velocity_along + velocity_across * velocity_across + options.slip_square)
+            resistance_across = area * material[3] * (scalar(1.0) + resistance[3] / speed)
+            rolling = resistance[0] * load / wp.sqrt(velocity_along * velocity_along + options.slip_square)
+            resistance_along = rolling + resistance_across
+            force_along = force_along - resistance_along * velocity_along
+            force_across = force_across - resistance_across * velocity_across
+            gain_along = gain_along + resistance_along
+            gain_across = gain_across + resistance_across
             touch.active = 1
             touch.normal = normal
             touch.along = along
@@ -213,12 +213,12 @@ def contact_functions(double: bool) -> ContactFunctions:
 
     @wp.func
     def over_the_step(touch: Touch, arm: vec3, change: vec3, turning_change: vec3) -> vec3:
-        # The forces that acted over the step: what the point's change of velocity left of them.
-        moved = change + wp.cross(turning_change, arm)
+        # The forces over the step, after the point's change of velocity has reduced them.
+        velocity_change = change + wp.cross(turning_change, arm)
         return vec3(
-            wp.max(touch.force[0] - touch.gain[0] * wp.dot(touch.normal, moved), scalar(0.0)),
-            touch.force[1] - touch.gain[1] * wp.dot(touch.along, moved),
-            touch.force[2] - touch.gain[2] * wp.dot(touch.across, moved),
+            wp.max(touch.force[0] - touch.gain[0] * wp.dot(touch.normal, velocity_change), scalar(0.0)),
+            touch.force[1] - touch.gain[1] * wp.dot(touch.along, velocity_change),
+            touch.force[2] - touch.gain[2] * wp.dot(touch.across, velocity_change),
         )
 
     return ContactFunctions(state_at, may_touch, below_ground, touch_ground, over_the_step)

@@ -1,4 +1,4 @@
-"""Kernel of the contact forces: one thread for each trajectory, step and body point."""
+"""Kernel of the contact forces: one thread per trajectory, step and body point."""
 
 from functools import cache
 from typing import Any

@@ -1,8 +1,8 @@
-"""Kernel of the motion: one thread for each trajectory, loops over steps and body points inside.
+"""Kernel of the motion: one thread per trajectory, with loops over steps and body points.
 
-Warp's adjoint of a value that is summed in a dynamic loop and then used non-linearly in the same kernel is wrong, so
-the summed wrench and gains go through per-step arrays: stored after the loop over points, loaded before the solve.
-On the way back Warp repeats the loads of a step but not its stores, so the arrays must hold every step by then.
+Warp's adjoint is wrong for a value that is summed in a dynamic loop and then used non-linearly in the same kernel.
+Therefore the summed wrench and gains go through per-step arrays, written after the loop over points and read before the
+solve. The backward pass repeats these reads but not the writes, so the arrays must contain all steps by then.
 """
 
 from functools import cache
@@ -63,19 +63,19 @@ def integrate_kernel(double: bool) -> Any:
             force = vec3()
             torque = vec3()
             diagonal = vec3()
-            beside = vec3()
+            off_diagonal = vec3()
             turning_diagonal = vec3()
-            turning_beside = vec3()
+            turning_off_diagonal = vec3()
             mixed_x = vec3()
             mixed_y = vec3()
             mixed_z = vec3()
             for cluster in range(count):
-                # Most clusters are higher than any ground below them: nothing is computed for their points.
+                # Most clusters are above all ground within reach and are skipped.
                 middle = state.position + turned * (body.cluster_centres[cluster] - offset)
                 if may_touch(ground, page, middle, body.cluster_radii[cluster]):
                     for i in range(body.cluster_edges[cluster], body.cluster_edges[cluster + 1]):
                         arm = turned * (body.points[i] - offset)
-                        # Of the rest most points are in the air.
+                        # Most of the remaining points are in the air.
                         if below_ground(ground, page, options.lookup, state.position + arm):
                             touch = touch_ground(ground, body, robots, options, page, b, step, i, state, arm)
                             acting = (
@@ -91,7 +91,7 @@ def integrate_kernel(double: bool) -> Any:
                             stiff = touch.gain[0] * normal
                             rolls = touch.gain[1] * along
                             slides = touch.gain[2] * across
-                            # The symmetric gain matrix, it times [arm]×, and [arm]× on both sides, entry by entry.
+                            # Entries of the symmetric gain matrix G, of G [arm]×, and of [arm]× G [arm]×.
                             xx = stiff[0] * normal[0] + rolls[0] * along[0] + slides[0] * across[0]
                             yy = stiff[1] * normal[1] + rolls[1] * along[1] + slides[1] * across[1]
                             zz = stiff[2] * normal[2] + rolls[2] * along[2] + slides[2] * across[2]
@@ -108,7 +108,7 @@ def integrate_kernel(double: bool) -> Any:
                                 yz * arm[2] - zz * arm[1], zz * arm[0] - xz * arm[2], xz * arm[1] - yz * arm[0]
                             )
                             diagonal = diagonal + vec3(xx, yy, zz)
-                            beside = beside + vec3(yz, xz, xy)
+                            off_diagonal = off_diagonal + vec3(yz, xz, xy)
                             mixed_x = mixed_x + first
                             mixed_y = mixed_y + second
                             mixed_z = mixed_z + third
@@ -117,7 +117,7 @@ def integrate_kernel(double: bool) -> Any:
                                 arm[2] * first[1] - arm[0] * third[1],
                                 arm[0] * second[2] - arm[1] * first[2],
                             )
-                            turning_beside = turning_beside + vec3(
+                            turning_off_diagonal = turning_off_diagonal + vec3(
                                 arm[2] * first[2] - arm[0] * third[2],
                                 arm[1] * third[2] - arm[2] * second[2],
                                 arm[1] * third[1] - arm[2] * second[1],
@@ -125,9 +125,9 @@ def integrate_kernel(double: bool) -> Any:
             summed[thread, slot, 0] = force
             summed[thread, slot, 1] = torque
             summed[thread, slot, 2] = diagonal
-            summed[thread, slot, 3] = beside
+            summed[thread, slot, 3] = off_diagonal
             summed[thread, slot, 4] = turning_diagonal
-            summed[thread, slot, 5] = turning_beside
+            summed[thread, slot, 5] = turning_off_diagonal
             summed[thread, slot, 6] = mixed_x
             summed[thread, slot, 7] = mixed_y
             summed[thread, slot, 8] = mixed_z

@@ -1,4 +1,4 @@
-"""Loads besides contact, as one device function (the formulas of ``physics/loads.py``, which a test compares)."""
+"""Loads other than contact, as a device function (formulas of ``physics/loads.py``; a test compares both)."""
 
 from functools import cache
 from typing import Any

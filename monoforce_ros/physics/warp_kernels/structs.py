@@ -1,6 +1,6 @@
-"""Structs that the kernels take, in one precision.
+"""Structs passed to the kernels, in one precision.
 
-Annotations must be real objects in Warp's language, not strings: the modules of this package do without
+Warp needs annotations as objects, not strings, so modules of this package must not use
 ``from __future__ import annotations``.
 """
 
@@ -111,7 +111,7 @@ def types(double: bool) -> Types:
         gain: vec3
 
     @wp.struct
-    class Loads:  # besides contact, about the centre of mass
+    class Loads:  # other than contact, about the centre of mass
         force: vec3
         torque: vec3
         drag: scalar

@@ -1,4 +1,4 @@
-"""Kernel of the contact forces summed over the body: one thread for each trajectory and step, without gradients."""
+"""Kernel of the contact forces summed over the body: one thread per trajectory and step, without gradients."""
 
 from functools import cache
 from typing import Any
