@@ -161,16 +161,18 @@ def main() -> None:
         "--seed",
         type=int,
         default=REPORT_SEED,
-        help=f"first seed (%(default)s); {CHOICE_SEEDS[0]} to {CHOICE_SEEDS[-1]} are for tuning, those from {REPORT_SEED} "
-        f"on for reporting",
+        help=f"first seed (%(default)s); {CHOICE_SEEDS[0]} to {CHOICE_SEEDS[-1]} are for tuning, seeds from "
+        f"{REPORT_SEED} on for reporting",
     )
     parser.add_argument("--source", nargs="+", choices=("lidar", "camera", "lidar_camera"),
-                        default=["lidar", "camera", "lidar_camera"])  # fmt: skip
-    parser.add_argument("--robot", default="husky", help="name or file (%(default)s)")
-    parser.add_argument("--checkpoint", default="", help="terrain encoder (the shipped one)")
+                        default=["lidar", "camera", "lidar_camera"], help="terrain sources (default: all)")  # fmt: skip
+    parser.add_argument("--robot", default="husky", help="robot name or file (%(default)s)")
+    parser.add_argument("--checkpoint", default="", help="terrain encoder weights (default: the shipped ones)")
     parser.add_argument("--seconds", type=float, default=75.0, help="time limit of each run (%(default)s)")
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--docs", type=Path, help="write the table between the marks of this document")
+    parser.add_argument("--json", type=Path, help="write the rows to this file")
+    parser.add_argument(
+        "--docs", type=Path, help="write the table into this document, between its `<!-- closed loop -->` comments"
+    )
     parser.add_argument("--png", type=Path, help="draw the trajectories")
     options = parser.parse_args()
     if options.count < 1:

@@ -131,7 +131,7 @@ def diagnosed(row: dict) -> bool:
 
 
 def strong(row: dict) -> bool:
-    """Whether the effect is strong. Without a diagnosis its strength is unknown; it then counts as strong and missed."""
+    """Whether the effect is strong; an undiagnosed one, of unknown strength, counts as strong and missed."""
     return not diagnosed(row) or row["numbers"].get("loss_before", 0.0) >= 0.5 * STRONG**2
 
 
@@ -228,7 +228,7 @@ def _after(entry: dict) -> float:
 
 
 def closed_share(row: dict) -> float:
-    """Closed share of the reducible gap after 2 s, in the metric with the largest initial error; NaN without effects."""
+    """Closed share of the reducible gap after 2 s, in the metric with the largest error before; NaN without effects."""
     entries = [entry for key, entry in row["gap"].items() if key.endswith("_2s") and "closed" in entry]
     if not entries:
         return float("nan")

@@ -319,7 +319,7 @@ def main() -> None:
         help="play the bag in a loop at double speed for this long instead, with 8 candidates and an ensemble of 8; "
         "uses the sensors of the first case of --only (default: one camera)",
     )
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--json", type=Path, help="write the results to this file")
     parser.add_argument(
         "--docs", type=Path, help="write the table between the `<!-- latency -->` comments of this document"
     )

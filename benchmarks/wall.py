@@ -3,7 +3,7 @@
     scripts/run.sh python benchmarks/wall.py --monoforce FILE [--no-geometric FILE] [--lss FILE] [--count 12]
         [--json FILE] [--png FILE] [--docs FILE]
 
-The robot is commanded to drive straight ahead for five seconds. The simulated robot drives until the wall stops it; each
+The robot is commanded to drive straight ahead for five seconds. In simulation it drives until the wall stops it; each
 encoder predicts the same motion from one image. Randomly selected scenes have no wall, to detect encoders that always
 predict a crash. Each prediction is repeated with uniform friction, because a wall blurred into a slope stops the robot
 only if the predicted friction is low.

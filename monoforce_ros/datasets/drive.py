@@ -281,7 +281,7 @@ def _open_windows(path: Path) -> DriveRecording:
 
 
 def _join(data: dict[str, np.ndarray], members: list[int], begin: int, step: int) -> DriveRun:
-    """Join consecutive windows, each of which starts at the origin, to one run."""
+    """Join consecutive windows, which each start at the origin, into one run."""
     positions, rotations = [], []
     origin, turn = np.zeros(3), Rotation.identity()
     for k in members:

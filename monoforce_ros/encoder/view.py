@@ -77,10 +77,10 @@ def encoder_input(views: Sequence[CameraView], support: np.ndarray | None, confi
     """Input for one map.
 
     Args:
-        views: one of each camera, in one terrain frame.
-        support: contact points of the wheels ``[m, 3]`` in that frame [m]; without them the ground is taken to be at
+        views: one view per camera, in one terrain frame.
+        support: contact points of the wheels ``[m, 3]`` in that frame [m]; without them the ground is assumed to be at
             the height of the frame's origin.
-        config: of the encoder.
+        config: configuration of the encoder.
     """
     images = np.stack([network_image(view.image, config) for view in views])
     rays = [

@@ -24,7 +24,7 @@ SAMPLE_TIME = 0.1
 PHYSICS, FLAT_PHYSICS, CONSTANT_VELOCITY = "physics", "physics, flat ground", "constant velocity, flat ground"
 """Names of the methods in reports: the prediction, and two baselines."""
 BATCH = 16
-"""Windows that are rolled out together."""
+"""Number of windows that are rolled out together."""
 MAXIMUM_SPREAD = 0.1
 """Largest time between the sensor data of one observation [s]."""
 MAXIMUM_GAP = 0.3
@@ -32,7 +32,7 @@ MAXIMUM_GAP = 0.3
 
 
 class EvaluationError(ValueError):
-    """The recording cannot be evaluated; the message says what is missing."""
+    """The recording cannot be evaluated; the message lists missing data."""
 
 
 @dataclass(frozen=True)

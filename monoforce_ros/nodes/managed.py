@@ -40,8 +40,8 @@ class ManagedNode(LifecycleNode):
         """Configure and activate at once, as nodes without a manager do.
 
         Raises:
-            ValueError, OSError: as raised by :meth:`set_up`; a ``ValueError`` stands for any other error, whose
-                traceback has been logged.
+            ValueError, OSError: as raised by :meth:`set_up`; other errors become a ``ValueError``, and their
+                traceback is logged.
         """
         self._autostarting = True
         configured = self.trigger_configure()

@@ -47,15 +47,15 @@ class SensorDecoder:
     def observe(
         self, stamp: int, received: Mapping[str, Received], track: MotionTrack, *, maximum_gap: float
     ) -> Observation | None:
-        """Decode sensor messages, report errors on their part, and return None if no usable data remain.
+        """Decode sensor messages, report errors per input, and return None if no usable data remain.
 
         Data from before ``stamp`` are transformed to the robot's pose at ``stamp``.
 
         Args:
-            stamp: of the observation [ns].
-            received: messages by part; ``odometry`` stands for an observation without sensors.
+            stamp: time of the observation [ns].
+            received: messages by input; ``odometry`` means an observation without sensors.
             track: measured motion.
-            maximum_gap: largest distance in time to measured motion [s].
+            maximum_gap: largest time difference to measured motion [s].
         """
         cloud: np.ndarray | None = None
         images: dict[str, np.ndarray] = {}

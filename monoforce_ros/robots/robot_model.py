@@ -37,7 +37,7 @@ class Flipper:
 
 @dataclass(frozen=True)
 class RobotModel:
-    """A rigid body sampled by surface points, some of which are moved by drives (paper III-B, III-D).
+    """A rigid body sampled by surface points; drives move some of them (paper III-B, III-D).
 
     All lengths are in the robot's base frame (x forward, y left, z up; REP 103) and in metres. Physical quantities
     may have a leading batch dimension ``[B]``, to vary them between the trajectories of a rollout.

@@ -30,14 +30,14 @@ def visible_terrain(
     """H_g*: the surface measured by the lidar between two times.
 
     Args:
-        recording: of which only the clouds are read, one at a time.
-        motion: measured poses at which sweeps are placed, preferably smoothed.
-        robot: whose points on its own body are removed from the sweeps.
-        grid: of the map.
+        recording: recording; only its clouds are read, one at a time.
+        motion: measured poses of the sweeps, preferably smoothed.
+        robot: robot; sweep points on its body are removed.
+        grid: grid of the map.
         odometry_from_terrain: pose ``[4, 4]`` of the map's frame.
         start, stop: times of the sweeps [ns].
         material: stiffness, damping and friction of the map.
-        settings: of the mapping.
+        settings: settings of the mapping.
 
     Raises:
         TerrainError: no sweep hit the grid.
