@@ -153,7 +153,7 @@ def test_missing_bags_are_named(tmp_path):
     with pytest.raises(BagError, match="cannot be read"):
         Recording.open(junk)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(BagError, match=r"holds no .mcap, .db3 or .bag file"):
+    with pytest.raises(BagError, match=r"contains no .mcap, .db3 or .bag file"):
         Recording.open(tmp_path / "empty")
 
 
@@ -207,7 +207,7 @@ def test_large_bags_are_read_in_little_memory(tmp_path):
 def test_a_bag_without_odometry_lists_its_types(tmp_path):
     with BagWriter(tmp_path / "drive") as bag:
         bag.write("/cmd_vel", builders.twist(1, 0), START)
-    with pytest.raises(BagError, match=r"no nav_msgs/msg/Odometry topic; it holds \['geometry_msgs/msg/Twist'\]"):
+    with pytest.raises(BagError, match=r"no nav_msgs/msg/Odometry topic; it contains \['geometry_msgs/msg/Twist'\]"):
         Recording.open(tmp_path / "drive")
     with pytest.raises(BagError, match="topic /cmd_vel is geometry_msgs/msg/Twist, expected nav_msgs"):
         Recording.open(tmp_path / "drive", odometry="/cmd_vel")

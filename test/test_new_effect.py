@@ -164,14 +164,14 @@ def test_a_new_file_is_found_by_catalogue_page_rollout_diagnosis_and_robot_files
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (SLOW_RIGHT.replace("ORDER", ""), "SlowRight changes drive speeds and has no order"),
+        (SLOW_RIGHT.replace("ORDER", ""), "SlowRight changes drive speeds but has no order"),
         (SIDE_WIND.replace('stage = "body"', 'stage = "soul"'), "stage: got 'soul', expected one of"),
         (
             SIDE_WIND.replace('identified = ("force",)', 'identified = ("froce",)'),
             r"parameters \['froce'\] are unknown",
         ),
         (SIDE_WIND.replace('name = "side_wind"', 'name = "payload"'), "an effect named 'payload' exists already"),
-        (SIDE_WIND.replace('    manoeuvre = "the same stretch in opposite directions"\n', ""), "names no manoeuvre"),
+        (SIDE_WIND.replace('    manoeuvre = "the same stretch in opposite directions"\n', ""), "has no manoeuvre"),
     ],
 )
 def test_an_incomplete_file_is_refused_with_its_name(tmp_path, text, words):

@@ -16,7 +16,7 @@ from monoforce_ros.bags.types import type_store
 
 
 class BagError(ValueError):
-    """A bag that cannot be read; the message names the file, the problem and what to do."""
+    """A bag that cannot be read; the message names the file, the problem and the remedy."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class BagReader:
         files = storage_files(self.path)
         salvaged = SalvagedBag(files) if files else None
         if salvaged is None or not salvaged.message_count:
-            where = "; ".join(salvaged.broken) if salvaged else "it holds no .mcap, .db3 or .bag file"
+            where = "; ".join(salvaged.broken) if salvaged else "it contains no .mcap, .db3 or .bag file"
             raise BagError(
                 f"{self.path} cannot be read ({type(reason).__name__}: {reason}; {where}): expected a rosbag2 folder "
                 "or a ROS 1 .bag file; is it still being written?"

@@ -85,7 +85,7 @@ class Recording:
                 "joints": _choose(bag, None, (JOINTS,)),
             }
             if chosen["odometry"] is None:
-                raise BagError(f"{bag.path} has no {ODOMETRY} topic; it holds {sorted(set(bag.topics.values()))}")
+                raise BagError(f"{bag.path} has no {ODOMETRY} topic; it contains {sorted(set(bag.topics.values()))}")
             image_topics = bag.of_type(*IMAGES)
             topics = {topic for topic in chosen.values() if topic}
             topics.update(image_topics, bag.of_type(CAMERA_INFO), bag.of_type(TRANSFORMS))

@@ -48,7 +48,7 @@ class SalvagedBag:
         files: the storage files of the bag, in order.
 
     Attributes:
-        broken: for each damaged file, why reading ended.
+        broken: reason why reading stopped, for each damaged file.
     """
 
     def __init__(self, files: list[Path]):
@@ -84,7 +84,7 @@ class SalvagedBag:
         return self._ros1_types().deserialize_ros1(data, message_type)
 
     def close(self) -> None:
-        """Do nothing: no file is kept open."""
+        """Do nothing: no file stays open."""
 
     def _ros1_types(self) -> Typestore:
         if self._types is None:
@@ -166,7 +166,7 @@ def _starts_with(file: Path, magic: bytes) -> bool:
 
 def _take(stream: BinaryIO, count: int, left: int) -> bytes:
     if count > min(left, _LARGEST_RECORD):
-        raise _BrokenError(f"a record of {count} bytes does not fit into the {max(left, 0)} that are left")
+        raise _BrokenError(f"a record of {count} bytes does not fit into the remaining {max(left, 0)} bytes")
     data = stream.read(count)
     if len(data) != count:
         raise _BrokenError("the file ends within a record")

@@ -54,10 +54,10 @@ def cut_windows(
     Args:
         motion: measured or smoothed motion.
         commands: recorded commands; zero before the first one.
-        length: of a window [s].
+        length: length of a window [s].
         stride: time between the starts of windows [s].
         history: duration of the commands before each start [s], for delays and lags of the drives.
-        time_step: of the physics [s].
+        time_step: time step of the physics [s].
         sample_time: time between samples of the motion [s].
         maximum_gap: largest time between a sample and the odometry around it [s].
         timeout: age beyond which a command is ignored [s].

@@ -25,5 +25,5 @@ def share_directory() -> Path:
     except PackageNotFoundError as error:
         raise FileNotFoundError(
             f"the data files of {PACKAGE} were not found next to the code or below AMENT_PREFIX_PATH: "
-            "source install/setup.bash of the workspace that the package was built in"
+            "source install/setup.bash of the workspace in which the package was built"
         ) from error

@@ -42,7 +42,7 @@ _LONGEST_REPEAT = 0.25
 _LAGS = np.arange(-10, 61) * 0.05
 """Candidate delays [s]."""
 _LONG_RUN, _TRANSIENT = 20.0, 3.0
-"""Runs shorter than the first hold one command and turn at a changing rate mostly within the second [s]."""
+"""Runs shorter than the first have one command; their turn rate changes mostly within the second [s]."""
 _FASTEST_TURN = 2.5
 _WEAKEST = 0.5
 """Correlation below which the clocks are considered unknown."""
@@ -85,7 +85,7 @@ class DriveRecording:
     path: Path
     runs: tuple[DriveRun, ...]
     steady: np.ndarray | None = None
-    """For windows: whether each is in steady state, ``[windows]`` bool, in the order of the file."""
+    """Whether each window is in steady state, ``[windows]`` bool, in the order of the file."""
 
     @classmethod
     def open(cls, path: str | Path) -> DriveRecording:
@@ -137,7 +137,7 @@ def drive_to_bag(
     Args:
         recording: file of the dataset.
         out: folder of the bag.
-        correct_delay: correct the pose stamps by the delay relative to the gyro; else they stay as recorded.
+        correct_delay: correct the pose stamps by the delay relative to the gyro instead of keeping them as recorded.
         storage: ``mcap`` or ``sqlite3``.
         overwrite: replace an existing bag.
 
@@ -246,7 +246,7 @@ def _open_windows(path: Path) -> DriveRecording:
         with zipfile.ZipFile(path) as archive:
             size = sum(entry.file_size for entry in archive.infolist())
         if size > LARGEST_FILE:
-            raise DatasetError(f"{path}: holds {size} bytes, expected at most {LARGEST_FILE}")
+            raise DatasetError(f"{path}: got {size} bytes, expected at most {LARGEST_FILE}")
         with np.load(path, allow_pickle=False) as content:
             names = (*_FIELDS, "steady_state_mask", "transitory_state_mask", "dt")
             missing = sorted(set(names) - set(content.files))
@@ -276,7 +276,7 @@ def _open_windows(path: Path) -> DriveRecording:
         runs.append(run)
         begin = int(run.stamps[-1]) + round(PAUSE * 1e9)
     if not runs:
-        raise DatasetError(f"{path}: no window holds finite numbers")
+        raise DatasetError(f"{path}: no window has finite numbers")
     return DriveRecording(path, tuple(runs), steady)
 
 

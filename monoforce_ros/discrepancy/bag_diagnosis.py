@@ -58,7 +58,7 @@ def read_evidence(bag: Path, robot: RobotModel, terrain: str, topics: Topics = T
         bag: the recording.
         robot: its own body is removed from the lidar's sweeps.
         terrain: ``flat``, ``lidar`` (all sweeps of the recording as one map) or a file of ``fit_terrain``.
-        topics: where they are not to be detected by type.
+        topics: topic names that replace detection by type.
 
     Raises:
         BagError, TerrainError, TerrainFileError: required data are missing or damaged.
@@ -97,8 +97,8 @@ def diagnose_bag(
         robot: name or file of the nominal robot; a commissioned file contains the nominal residual RMS.
         out: folder of the reports.
         terrain: see :func:`read_evidence`.
-        topics: where they are not to be detected by type.
-        settings: of the diagnosis.
+        topics: topic names that replace detection by type.
+        settings: settings of the diagnosis.
         held_out: further recordings on which errors before and after are compared; nothing is fitted to them.
         progress: called with the share of the work done and the next step.
 

@@ -33,10 +33,10 @@ def commission(
     """Fit friction, effective track width and servo response to recordings of a healthy robot.
 
     Args:
-        recordings: of the healthy robot.
+        recordings: recordings of the healthy robot.
         robot: the model as shipped.
-        samples: times in a window at which residuals are taken [s].
-        stride: between windows [s].
+        samples: times in a window at which residuals are computed [s].
+        stride: time between windows [s].
         progress: called with the share of the work done and the next step.
 
     Returns:

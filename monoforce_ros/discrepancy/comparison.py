@@ -161,7 +161,7 @@ def gap_table(comparisons: Sequence[Comparison], seed: int = 0) -> dict[str, Gap
 
 
 def _closed(before: float, after: float, noise: float) -> float | None:
-    """Share of the reducible gap that is closed; None where nothing is reducible."""
+    """Closed share of the reducible gap; None if the gap is not reducible."""
     reducible = before - noise
     return float(np.clip((before - after) / reducible, -1.0, 1.0)) if reducible > 0 else None
 

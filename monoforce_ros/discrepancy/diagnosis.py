@@ -57,7 +57,7 @@ class DiagnosisSettings:
     stride: float = 1.0
     """Time between their starts [s]."""
     samples: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0)
-    """Times in a window at which residuals are taken [s]."""
+    """Times in a window at which residuals are computed [s]."""
     max_effects: int = 4
     max_windows: int = 120
     """A longer recording is subsampled to about as many, spread over all of it."""
@@ -126,7 +126,7 @@ def diagnose(
         evidence: motion, commands and ground.
         robot: the nominal model with the effects of its file.
         nominal_residual: residual RMS of the healthy robot, ``[K, 3]`` at ``settings.samples`` [m, m, rad].
-        settings: of the diagnosis.
+        settings: settings of the diagnosis.
         progress: called with the share of the work done and the next step.
     """
     progress(0.0, "preflight")
@@ -246,7 +246,7 @@ def _with_measured_interval(
 
 
 def _accepts_bias(decision: Decision, robot: RobotModel) -> bool:
-    """Whether a bias of the gyro can be added to what was decided."""
+    """Whether a gyro bias can be added to the decision."""
     accepting = (Verdict.NO_DISCREPANCY, Verdict.EFFECT_FOUND)
     return decision.verdict in accepting and "gyro_bias" not in dict(robot.effects)
 

@@ -18,7 +18,7 @@ _DAMPINGS = (1e-3, 1e-1, 3.0)
 _NOT_FINITE = 1e3
 """Scaled residual assumed for a prediction that is not finite."""
 _BLOCK = 4.0
-"""Length of the blocks that are taken as independent [s]."""
+"""Length of blocks that are assumed to be independent [s]."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def with_values(effects: Effects, values: np.ndarray) -> Effects:
 
 
 def neutral_values(effects: Effects) -> np.ndarray:
-    """Values at which the effects do nothing, ``[P]``."""
+    """Neutral values of the effects, ``[P]``."""
     return np.array(
         [{p.name: p for p in CATALOGUE[name].parameters}[key].neutral for name, values in effects for key in values]
     )
@@ -94,7 +94,7 @@ def fit_effects(
     """Robust Levenberg-Marquardt from the best of several starts.
 
     Args:
-        predictions: of the recording's windows.
+        predictions: predictions for the recording's windows.
         starts: the same effects with different initial values.
         scale: expected size of a residual, ``[K, 3]``.
         iterations: largest number.
@@ -196,7 +196,7 @@ def estimate_effects(fit: Fit, indistinguishable: Mapping[str, Sequence[str]]) -
 
     Args:
         fit: its covariance gives the intervals.
-        indistinguishable: by effect, others that explain the recording about as well.
+        indistinguishable: for each effect, others that explain the recording about as well.
     """
     deviations = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
     estimates, at = [], 0

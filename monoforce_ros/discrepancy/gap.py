@@ -1,4 +1,4 @@
-"""Gap: prediction errors on a recording, how much of them is noise, and where they are largest."""
+"""Gap: prediction errors on a recording, their noise floor, and the regimes with the largest errors."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _SMALLEST = np.array([0.01, 0.01, np.radians(0.3)])
 
 @dataclass(frozen=True)
 class NoiseFloor:
-    """Residuals that noise alone leaves at the end of a window."""
+    """Residuals due to noise alone at the end of a window."""
 
     horizon: float
     """[s]."""
@@ -38,7 +38,7 @@ class NoiseFloor:
 
 @dataclass(frozen=True)
 class Localisation:
-    """A motion regime that holds more of the squared error of one component than of the time."""
+    """A motion regime whose share of one component's squared error exceeds its share of time."""
 
     axis: str
     regime: str
@@ -152,7 +152,7 @@ def find_regimes(data: EvidenceWindows) -> dict[str, np.ndarray]:
     rotations = sample_motion(data.motion, stamps)[1]
     speed = np.abs(commanded[..., 0]).mean(axis=1)
     pitch = np.abs(rotations[..., 2, 0]).mean(axis=1)
-    # A recording has its own fast windows, whatever the robot could do.
+    # "Fast" is relative to the recording, not to the top speed of the robot.
     fast = max(0.3, float(np.quantile(speed, 0.7)))
     masks = motion_regimes(commanded, fast) | {
         "on slopes steeper than 5°": pitch > np.sin(np.radians(5.0)),
@@ -171,7 +171,7 @@ def localise(
         residuals: ``[W, K, 3]``.
         floor: ``[K, 3]``.
         data: the windows.
-        regimes: from :func:`find_regimes`.
+        regimes: result of :func:`find_regimes`.
 
     Returns:
         the strongest entries, in order.

@@ -28,9 +28,9 @@ COMPONENTS = ("along", "across", "heading")
 HISTORY = 2.0
 """Length of the commands before a window, for delays and lags [s]."""
 _MARGIN = 1.3
-"""Margin at both ends of a stretch, so that a shifted clock still finds data [s]."""
+"""Margin at both ends of a stretch, so that data remain available with a shifted clock [s]."""
 _SHORT = 12.0
-"""Stretches shorter than this keep their beginning: it often holds the manoeuvre, such as a step of the command [s]."""
+"""Stretches shorter than this keep their beginning, which often contains the manoeuvre, such as a step [s]."""
 _LARGEST_BATCH = 1024
 _LEVEL_REACH, _HILLY_REACH = 0.1, 0.3
 """Height above a robot's lowest point up to which contact points are kept [m]."""
@@ -38,14 +38,14 @@ _LEVEL_REACH, _HILLY_REACH = 0.1, 0.3
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a recording holds: motion, commands, ground, and further sensors."""
+    """Data of a recording: motion, commands, ground, and other sensors."""
 
     smoothed: SmoothedMotion
     commands: CommandTrack
     terrain: TerrainMap | None = None
     """One map in its own frame, or None for level ground."""
     odometry_from_terrain: np.ndarray | None = None
-    """Pose ``[4, 4]`` of the map in the odometry frame; given whenever a map is."""
+    """Pose ``[4, 4]`` of the map in the odometry frame; required with a map."""
     split_maps: tuple[TerrainMap, TerrainMap] | None = None
     """Maps from the even and from the odd sweeps alone."""
     gyro: AngularVelocityTrack | None = None
@@ -78,7 +78,7 @@ class EvidenceWindows:
     horizon: float
     """Length of a window [s]."""
     samples: np.ndarray
-    """Times in a window at which residuals are taken [s], ``[K]``."""
+    """Times in a window at which residuals are computed [s], ``[K]``."""
     terrain: TerrainMap | None = None
     """One map in its own frame, or None for level ground."""
     odometry_from_terrain: np.ndarray | None = None
@@ -164,7 +164,7 @@ class Predictions:
     """Rolls out hypotheses over the windows of a recording.
 
     Args:
-        robot: with the effects of its file.
+        robot: robot with the effects of its file.
         data: the windows.
     """
 
@@ -225,7 +225,7 @@ class Predictions:
         steps = np.arange(-round(HISTORY / self.options.time_step), self._index[-1] + 1)
         command_stamps = data.starts[:, None] + np.rint(steps * self.options.time_step * 1e9).astype(np.int64)
         if data.terrain is None:
-            # On level ground every window starts at the origin, at the height at which its wheels stand.
+            # On level ground every window starts at the origin, with the wheels on the ground.
             frame_rotation = rotations[:, 0]
             lowest = np.einsum("wij,nj->wni", frame_rotation, self._underside())[..., 2].mean(axis=1)
             place = np.stack([0 * lowest, 0 * lowest, -lowest - self._depth], axis=1)

@@ -23,7 +23,7 @@ def learned_terms(predictions: Predictions, base: Effects, scale: np.ndarray, mo
     """Sums of one to ``most`` terms, each with the further term that explains most of the remaining residuals.
 
     Args:
-        predictions: of the recording's windows.
+        predictions: predictions for the recording's windows.
         base: effects that act in addition.
         scale: expected size of a residual, ``[K, 3]``.
         most: largest number of terms.

@@ -104,7 +104,7 @@ def _noise_entries(floor: NoiseFloor | None) -> dict[str, dict]:
 
 
 def _loss_entries(losses: Losses | None) -> dict[str, float]:
-    """Losses under their names in the report, those that were not needed left out."""
+    """Losses by their names in the report, without unused ones."""
     if losses is None:
         return {}
     entries = {

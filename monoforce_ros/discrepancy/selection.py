@@ -101,7 +101,7 @@ def paired(before: np.ndarray, after: np.ndarray, starts: np.ndarray, seed: int 
     """Mean gain, its one-sided 95 % lower bound, and the p-value of Wilcoxon's signed-rank test over blocks."""
     blocks = blocks_of(starts)
     numbers = np.unique(blocks)
-    # Clipped, so that a few windows that no effect explains do not decide.
+    # Clipped, so that a few windows that no effect explains do not dominate.
     difference = np.clip(before - after, -50.0, 50.0)
     sums = np.array([difference[blocks == block].sum() for block in numbers]) / len(starts)
     gain = float(sums.sum())
@@ -115,7 +115,7 @@ class Search:
     """A search over effects on one recording.
 
     Args:
-        robot: with the effects of its file.
+        robot: robot with the effects of its file.
         data: the recording's windows.
         scale: expected size of a residual, ``[K, 3]``.
         known: effects that another sensor measured: they always act and keep their values.
@@ -329,7 +329,7 @@ class Search:
         return best
 
     def _exchanged(self, best: Trial) -> tuple[Trial, dict[str, list[str]]]:
-        """Test each effect against all others in its place; also those that explain the recording as well there."""
+        """Replace each effect by every other one; also returns those that explain the recording about as well."""
         indistinguishable = {}
         for name in best.names[len(self.known) :]:
             if name not in best.names:

@@ -15,7 +15,7 @@ SMALLEST_SHARE = 0.6
 LARGEST_DRIFT = 0.12
 """Share of the excess loss that values which change over the recording may explain; beyond it no single value fits."""
 _CLEARLY = 3.0 * HEALTHY_LOSS
-"""Loss above which something is missing, whether it can be named or not."""
+"""Loss above which the model lacks an effect, known or not."""
 _WELL = 2.0 * HEALTHY_LOSS
 """Loss up to which an effect fits well enough to keep its name."""
 
@@ -54,7 +54,7 @@ class Decision:
 
     verdict: Verdict
     trial: Trial | None
-    """Effects to add to the model, a formula included; None where nothing is to be added."""
+    """Effects to add to the model, including a formula; None if there are none."""
     remarks: tuple[str, ...]
     """The reasons."""
     losses: Losses
@@ -118,10 +118,10 @@ def decide(search: Search, outcome: Outcome) -> Decision:
         if drift > (2.0 if _same(best, formula_trial, nominal) else 1.0) * LARGEST_DRIFT * excess:
             reason = f"{_drift_of(thirds, len(search.known))} over the recording: no single value fits"
         elif share < SMALLEST_SHARE and not search.known and not _same(best, formula_trial, nominal):
-            # Measurements by the gyro and the wheels hold whatever share they explain.
+            # Measurements by the gyro and the wheels are valid for any explained share.
             reason = f"{explained} only {100 * share:.0f} % of the excess loss"
     if reason:
-        # Measurements by the gyro and the wheels stay known, whatever else is not.
+        # Measurements by the gyro and the wheels remain known.
         measured = best if search.known and best.effects[: len(search.known)] == search.known else None
         return _unknown(formula_trial, nominal, reason, losses, measured)
     return replace(found, losses=losses)

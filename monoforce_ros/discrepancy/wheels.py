@@ -24,7 +24,7 @@ _MOST = 1500
 _BETTER = 0.08
 """Share of the squared error on held-out blocks that a model with one more effect must remove."""
 _LARGEST_MODEL = 3
-"""Effects that a model of the wheels holds at most."""
+"""Largest number of effects in a wheel model."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class WheelFinding:
     """Measured speed [rad/s] over commanded [m/s]: one over the wheel's radius."""
 
     def summary(self) -> str:
-        """In one sentence."""
+        """One sentence for reports."""
         parts = [_response(name).wording.format(next(iter(values.values()))) for name, values in self.effects]
         return "the measured wheel speeds follow the commands " + ", ".join(parts or ["without delay or limit"])
 
@@ -65,7 +65,7 @@ def compare_with_wheels(commands: CommandTrack, wheels: WheelTrack | None, robot
         return None
     ratio = _ratio(pieces, top)
     if ratio is not None and robot.wheel_radius is not None and 0.4 < ratio * robot.wheel_radius < 2.5:
-        # With a plausible ratio the known radius is used, so that a drive that is too slow shows as an error.
+        # Use the known radius if the ratio is plausible, so that a drive that is too slow appears as an error.
         ratio = 1.0 / robot.wheel_radius
     if len(pieces) < 2 or ratio is None:
         return None
@@ -160,7 +160,7 @@ def _response(name: str) -> WheelResponse:
 
 
 def _models() -> list[tuple[str, ...]]:
-    """Sets of effects that wheel speeds show, each in the order in which a command meets them."""
+    """Sets of effects that wheel speeds reveal, each in the order in which they act on a command."""
     names = [effect.name for effect in wheel_effects()]
     return [
         chosen

@@ -133,13 +133,13 @@ class Effect(ABC):
             return f"stage: got {self.stage!r}, expected one of {STAGES}"
         changes_speeds = type(self).drive_speeds is not Effect.drive_speeds
         if (changes_speeds or self.stage == "command") and self.order is None:
-            return "changes drive speeds and has no order: set its position among the command effects"
+            return "changes drive speeds but has no order: set its position among the command effects"
         for label, keys in (("identified", self.identified), ("commissioning_start", tuple(self.commissioning_start))):
             unknown = sorted(set(keys) - set(known))
             if unknown:
                 return f"{label}: parameters {unknown} are unknown; expected some of {known}"
         if self.identified and not self.manoeuvre:
-            return "can be identified and names no manoeuvre that shows it"
+            return "can be identified but has no manoeuvre: set the one that makes it observable"
         unbounded = any(math.isinf(parameter.neutral) for parameter in self.parameters)
         if self.identified and unbounded and type(self).first_values is Effect.first_values:
             return "has an infinite neutral value: override first_values"

@@ -54,7 +54,7 @@ def load_encoder(path: str | Path, sensor: str | None = None) -> Encoder:
     """Read an encoder.
 
     Args:
-        path: of the weights; the configuration is in the same folder. Empty for the shipped encoder.
+        path: path of the weights; the configuration is in the same folder. Empty for the shipped encoder.
         sensor: required sensor, ``camera`` or ``lidar``; any if None.
 
     Raises:
@@ -94,7 +94,7 @@ def averaged(paths: Sequence[str | Path], shares: Sequence[float]) -> Encoder:
     "Model soups", ICML 2022). The mean of independently trained encoders is useless.
 
     Args:
-        paths: of the checkpoints.
+        paths: paths of the checkpoints.
         shares: weight of each in the mean, above 0; they are normalised to a sum of 1.
 
     Raises:

@@ -29,7 +29,7 @@ def restore_edges(heights: Tensor, resolution: float) -> Tensor:
 
     Args:
         heights: predicted.
-        resolution: of the map [m].
+        resolution: resolution of the map [m].
     """
     high, low = _extremes(heights, max(1, round(_REACH / resolution)))
     difference = high - low
@@ -44,7 +44,7 @@ def _extremes(heights: Tensor, reach: int) -> tuple[Tensor, Tensor]:
     both = torch.stack([heights, -heights])
     highest, rows = both, heights.shape[1]
     for half in range(reach + 1):
-        # Slightly larger than the reach, so that the disc does not end in single cells.
+        # Slightly larger than the reach, so that the disc has no single protruding cells.
         away = [row for row in range(reach + 1) if math.floor(math.sqrt((reach + 0.4) ** 2 - row**2)) == half]
         if not away:
             continue

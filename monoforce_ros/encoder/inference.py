@@ -23,7 +23,7 @@ def fused(encoder: Encoder, precision: str = "float32") -> Encoder:
     """A faster copy with the same predictions, which can no longer be trained or saved.
 
     Args:
-        encoder: as loaded.
+        encoder: loaded encoder.
         precision: of the convolutions: ``float32``; ``bfloat16``, 1.5 times as fast on processors with bfloat16
             instructions, heights within a few millimetres; ``auto``, bfloat16 where the processor supports it. Heads,
             depths and the splat stay float32.

@@ -56,7 +56,7 @@ def lifted_points(rays: Tensor, origins: Tensor, depths: Tensor) -> Tensor:
     """Points at each depth along the ray of each feature cell.
 
     Args:
-        rays: in terrain axes ``[N, rows, columns, 3]``.
+        rays: rays in terrain axes ``[N, rows, columns, 3]``.
         origins: camera positions in the terrain frame ``[N, 3]`` [m].
         depths: ``[bins]`` [m].
 
@@ -86,7 +86,7 @@ def splat(depth: Tensor, features: Tensor, cells: Tensor, heights: Tensor, size:
         depth: probabilities ``[N, bins, rows, columns]``.
         features: ``[N, C, rows, columns]``.
         cells: cell indices over all maps ``[N, bins, rows, columns]`` int64; -1 is ignored.
-        heights: of the points [m], shaped like ``cells``.
+        heights: heights of the points [m], shaped like ``cells``.
         size: number of cells of all maps.
 
     Returns:

@@ -175,7 +175,7 @@ def maps_from_heads(
 
 
 def with_edges(maps: EncodedMaps, config: EncoderConfig) -> EncodedMaps:
-    """The same with steps restored in H_t; H_g changes by the same amount, so that H_d is kept."""
+    """Maps with steps restored in H_t; H_g changes by the same amount, so that H_d is unchanged."""
     change = restore_edges(maps.height, config.resolution) - maps.height
     return replace(maps, geometric_height=maps.geometric_height + change)
 

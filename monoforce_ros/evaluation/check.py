@@ -209,7 +209,7 @@ def check_text(check: BagCheck) -> str:
     lines = [f"{check.path}: {check.duration:.1f} s", "", *_topic_lines(check.topics), ""]
     marks = {Level.MISSING: "MISSING", Level.WARNING: "WARNING", Level.NOTE: "note", Level.OK: "ok"}
     lines += [f"{marks[finding.level]:>8}  {finding.text}" for finding in check.findings]
-    verdict = "predictions along this bag can be evaluated" if check.usable else "see what is MISSING above"
+    verdict = "predictions along this bag can be evaluated" if check.usable else "see the MISSING data above"
     return "\n".join([*lines, "", f"{'usable' if check.usable else 'not usable yet'}: {verdict}"])
 
 

@@ -88,7 +88,7 @@ def prediction_figure(
         picture: the camera image of the same time, if there is one.
         measured: measured positions ``[n, 3]`` in the odometry frame [m].
         under_recorded_commands: positions ``[n, 3]`` in the terrain frame [m] that are predicted under the commands
-            recorded afterwards; ``view`` then holds a prediction under the command at its start.
+            recorded afterwards; ``view`` is then a prediction under the command at its start.
         title: a line above the figure.
     """
     colour_range = _colour_range(view)

@@ -27,7 +27,7 @@ class Finding:
 
     level: Level
     text: str
-    """One sentence; for a fault it says what to do."""
+    """One sentence; for a problem, with its remedy."""
 
 
 def missing(text: str) -> Finding:
@@ -46,5 +46,5 @@ def note(text: str) -> Finding:
 
 
 def ok(text: str) -> Finding:
-    """A finding that nothing is wrong with."""
+    """A finding without a problem."""
     return Finding(Level.OK, text)

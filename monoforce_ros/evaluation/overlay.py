@@ -34,8 +34,8 @@ def draw_prediction(
         image: RGB ``[height, width, 3]``.
         camera: its model.
         base_from_camera: pose of the camera on the robot ``[4, 4]``.
-        view: what to draw.
-        width: of the result [px].
+        view: prediction to draw.
+        width: width of the result [px].
         colour_range: heights at the two ends of the colour scale [m], terrain frame.
 
     Returns:
@@ -88,7 +88,7 @@ def _draw_surface(
     observed = np.mean([terrain.observed.numpy()[c] for c in corners], axis=0) >= 0.5
     low, high = colour_range
     colours = colormaps[SURFACE_COLOURS](np.clip((mean_height - low) / (high - low), 0, 1))[..., :3]
-    # Shading by slope makes shape visible where the colour hardly changes.
+    # Shading by slope makes shapes visible at nearly constant colour.
     slope_y, slope_x = np.gradient(z, terrain.grid.resolution)
     light = (1.0 - 0.6 * slope_x - 0.4 * slope_y)[:-1, :-1] / np.sqrt(1 + slope_x**2 + slope_y**2)[:-1, :-1]
     colours = np.clip(colours * np.clip(0.35 + 0.65 * light, 0.25, 1.15)[..., None], 0, 1) * 255

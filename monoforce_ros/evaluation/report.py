@@ -78,7 +78,7 @@ def write_reports(
     """Write ``report.json`` and ``report.html``.
 
     Args:
-        folder: where to write them.
+        folder: output folder.
         evaluation: the results.
         settings: the inputs and options of the evaluation.
         pictures: figures of the page, in this order.
@@ -107,7 +107,7 @@ def _page(evaluation: RecordingEvaluation, settings: Mapping[str, object], pictu
         "".join(body),
         heading="Predicted and measured motion",
         lead="Predictions start at many times of the recording, use the commands recorded afterwards, and are compared "
-        "with the measured motion. A trajectory counts as long as it lies on the predicted map. The smallest error is "
+        "with the measured motion. A trajectory counts while it is on the predicted map. The smallest error is "
         "bold.",
     )
 

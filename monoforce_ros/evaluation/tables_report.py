@@ -117,8 +117,8 @@ def html_page(
     """A self-contained HTML page.
 
     Args:
-        comparisons: by kind of ground.
-        systems: in the order of the tables.
+        comparisons: comparisons by kind of ground.
+        systems: systems in the order of the tables.
         bags: names of the recordings by kind of ground.
     """
     body = [picture_card(figure_png(figure(comparisons, systems)), alt="errors by system")]
@@ -131,7 +131,7 @@ def html_page(
         "Comparison of terrain sources",
         "".join(body),
         lead="The same physics on different terrain maps. Once per second the motion of the next 5 s was predicted "
-        "under the recorded commands and compared with the measured motion, as long as the robot stayed on the map. "
+        "with the recorded commands and compared with the measured motion, while the robot was on the map. "
         "Numbers are means over recordings with 95 % confidence intervals (recordings resampled). The smallest error "
         "is bold.",
     )

@@ -1,4 +1,4 @@
-"""PredictionView: the parts of a prediction that figures show, from this process or from a node's messages."""
+"""PredictionView: the parts of a prediction for figures, from this process or from a node's messages."""
 
 from __future__ import annotations
 

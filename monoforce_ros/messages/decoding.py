@@ -54,7 +54,7 @@ def stamp_of(message: Any) -> int:
 def stamp_of_cdr(data: bytes) -> int:
     """Header stamp [ns] of an encoded message that begins with a header, without decoding the rest.
 
-    Raises ``MessageError`` where the data are too short to hold one.
+    Raises ``MessageError`` if the data are too short to contain one.
     """
     if len(data) < 12:
         raise MessageError(f"message: got {len(data)} bytes, expected at least the 12 of a header's stamp")
@@ -146,7 +146,7 @@ def decode_cloud(message: Any) -> np.ndarray:
 def decode_fields(message: Any, names: tuple[str, ...] | None = None) -> dict[str, np.ndarray]:
     """Fields of a ``sensor_msgs/PointCloud2`` by name, each ``[points]``; all of them, or only ``names``.
 
-    Raises ``MessageError`` if sizes are wrong or a field does not hold floating-point numbers.
+    Raises ``MessageError`` if sizes are wrong or a field does not contain floating-point numbers.
     """
     count = int(message.width) * int(message.height)
     if count < 1 or count > MAXIMUM_CLOUD_POINTS:

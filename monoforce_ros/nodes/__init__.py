@@ -2,5 +2,5 @@
 
 import os
 
-# Before PyTorch is loaded: with few cores, waiting threads that spin take time from those that work.
+# Must precede the import of PyTorch: with few cores, spinning idle threads slow down working ones.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")

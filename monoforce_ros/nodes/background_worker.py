@@ -11,12 +11,12 @@ import torch
 
 
 class BackgroundWorker[Job]:
-    """Processes one job after the other; a newer job replaces the one that waits, so that no queue builds up.
+    """Processes jobs one at a time; a newer job replaces a waiting one, so that no queue builds up.
 
     Args:
-        name: of the thread.
+        name: name of the thread.
         work: processes a job; must not raise.
-        niceness: of the thread and of threads that it starts, 0 to 19, added to that of the process as ``nice(1)``
+        niceness: niceness of the thread and its child threads, 0 to 19, added to that of the process as ``nice(1)``
             does. Linux only; elsewhere all threads have the same priority.
     """
 

@@ -36,7 +36,7 @@ def _arguments(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--clock", action="store_true", help="publish /clock with the bag's time")
     parser.add_argument("--topics", nargs="+", default=None, metavar="TOPIC", help="play only these topics")
     parser.add_argument(
-        "--wait", type=float, default=3.0, help="seconds to wait for a first subscriber before playing (default 3)"
+        "--wait", type=float, default=3.0, help="seconds to wait for the first subscriber before playing (default 3)"
     )
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     options = parser.parse_args(arguments)

@@ -90,12 +90,12 @@ def candidate_rollouts(
 
     Args:
         motion: common start.
-        rollout: of ``N`` candidates, with contact forces.
+        rollout: rollout of ``N`` candidates, with contact forces.
         robot: that was simulated.
         sequences: commands, each for an equal share of the horizon ``[N, K, 2]``.
-        assessment: of the rollouts.
-        frame_id: of the odometry.
-        time_step: between samples [s].
+        assessment: assessment of the rollouts.
+        frame_id: frame of the odometry.
+        time_step: time between samples [s].
     """
     times = rollout.times.double().cpu().numpy()
     stride = max(1, round(time_step / (times[1] - times[0])))

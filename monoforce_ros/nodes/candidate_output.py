@@ -104,7 +104,7 @@ class CandidateOutput:
         Args:
             prediction: provides the map and the start state.
             commands: up to the prediction.
-            frame_id: of the odometry.
+            frame_id: frame of the odometry.
         """
         sequences = self._sequences()
         if not len(sequences):

@@ -41,12 +41,12 @@ class Health:
         """Set a part's state.
 
         Args:
-            part: which part.
+            part: part of the node.
             level: OK, WARN, ERROR or STALE.
             message: the state in words.
             reason: short key of the state; while it stays the same, a message with other numbers is not logged again.
                 Defaults to the message.
-            values: to attach to the diagnostics.
+            values: values to add to the diagnostics.
         """
         reason = reason or message
         with self._lock:

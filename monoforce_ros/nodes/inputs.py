@@ -19,7 +19,7 @@ TIME_JUMP = 1_000_000_000
 """A stamp that is older by this than its predecessor on the same topic is a backward time jump [ns]."""
 
 ODOMETRY_LAG = 30_000_000
-"""By how much sensor data may be newer than the odometry that they are used with [ns]."""
+"""Largest time by which sensor data may be newer than the odometry used with them [ns]."""
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ class Inputs:
             return {"odometry": Received(None, self._states[-1].stamp, time.monotonic())}
 
     def drop(self, received: dict[str, Received]) -> None:
-        """Count a set that was taken but is not used."""
+        """Count a set that was removed from the inputs but not used."""
         with self.changed:
             self.dropped += received.keys() != {"odometry"}
 

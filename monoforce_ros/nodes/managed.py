@@ -1,4 +1,4 @@
-"""ManagedNode: a lifecycle node that starts by itself, or on request of a lifecycle manager."""
+"""ManagedNode: a lifecycle node that starts automatically or through a lifecycle manager."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class ManagedNode(LifecycleNode):
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Destroy what was created since set-up."""
+        """Destroy everything created since set-up."""
         self._clean_up()
         return TransitionCallbackReturn.SUCCESS
 

@@ -1,4 +1,4 @@
-"""Node parameters from a YAML file that holds the type, default, range and meaning of each."""
+"""Node parameters from a YAML file with the type, default, range and meaning of each."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def declare_parameters(node: Node, entries: list[ParameterEntry]) -> SimpleNames
 
 
 def _deprecated_value(node: Node, entry: ParameterEntry) -> ParameterValue | None:
-    """The value given under an entry's deprecated name, which is not declared for longer than it takes to read it."""
+    """The value set under an entry's deprecated name, which is undeclared again after reading."""
     value = _declare(node, entry, entry.formerly, None)
     node.undeclare_parameter(entry.formerly)
     return value
@@ -110,8 +110,8 @@ def follow_changes(
     """Check changes of dynamic parameters together, and apply either all of them or none.
 
     Args:
-        node: whose parameters change.
-        entries: of the parameters.
+        node: node with the parameters.
+        entries: definitions of the parameters.
         current: returns the values in use, as :func:`declare_parameters` does.
         change: applies all values, with the changes among them; raises ``ValueError`` if it refuses them.
     """

@@ -108,7 +108,7 @@ class PathSelectorNode(Node):
             self._goal = None
             self.health.report(PART, OK, f"the goal is reached: {distance:.2f} m away", reason="reached")
             return None
-        # Stamps alone do not show this: without odometry there are no new candidates either, and their ages stay equal.
+        # Stamps cannot detect this: without odometry there are no new candidates either, so their age stays constant.
         silence = time.monotonic() - self._odometry_arrival
         if silence > self.settings.timeout:
             self._report_stop(f"no odometry for {silence:.1f} s: the position is unknown", "silent")

@@ -59,7 +59,7 @@ class ComparisonJob:
 
 
 class PredictorNode(ManagedNode):
-    """Predicts from the newest data in a thread of its own, so that callbacks never wait for the physics."""
+    """Predicts from the newest data in a worker thread, so that callbacks never wait for the physics."""
 
     def __init__(self) -> None:
         super().__init__("predictor")

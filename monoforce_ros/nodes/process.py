@@ -23,7 +23,7 @@ def run_node[NodeType: Node](
 
     Args:
         make_node: creates the node; called after rclpy is initialised.
-        arguments: of the command line.
+        arguments: arguments of the command line.
         work: spins the node; the default only processes callbacks.
 
     Returns:

@@ -7,7 +7,7 @@ _EARLY = 0.25
 
 
 class RateLimiter:
-    """Skips inputs instead of delaying them, so that those in use are fresh.
+    """Skips inputs instead of delaying them, so that used inputs are fresh.
 
     Sleeping between inputs would add the lateness of each input to the next one.
     """

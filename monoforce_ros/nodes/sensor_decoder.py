@@ -24,7 +24,7 @@ class SensorDecoder:
 
     Args:
         frames: poses of the sensors on the robot.
-        health: where unusable messages are reported.
+        health: receives reports on unusable messages.
     """
 
     def __init__(self, frames: SensorFrames, health: Health):

@@ -25,7 +25,7 @@ _TICK = 0.01
 _COMMAND_TIMEOUT = 0.5
 """Commands older than this are ignored and the robot stops, as real bases do [s]."""
 _MAXIMUM_LAG = 0.5
-"""By how much the simulation may lag behind real time before the lag is discarded [s]."""
+"""Largest lag of the simulation behind real time; a larger lag is discarded [s]."""
 
 
 def _arguments(arguments: list[str]) -> argparse.Namespace:
@@ -37,7 +37,7 @@ def _arguments(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--robot", default="husky", metavar="NAME|FILE.yaml", help="robot name or file (%(default)s)")
     parser.add_argument("--ground", choices=GROUNDS, default="mixed", help="type of ground (%(default)s)")
     parser.add_argument("--flat", action="store_true", help="level ground without obstacles")
-    parser.add_argument("--course", action="store_true", help="test course: a wall across the way and a "
+    parser.add_argument("--course", action="store_true", help="test course: a wall across the path and a "
                         "band of tall grass behind it")  # fmt: skip
     parser.add_argument("--lidar-rate", type=float, default=5.0, metavar="HZ", help="0 disables it (%(default)s)")
     parser.add_argument("--camera-rate", type=float, default=0.0, metavar="HZ", help="0 disables it (%(default)s)")

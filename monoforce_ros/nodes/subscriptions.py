@@ -23,7 +23,7 @@ class AdaptiveSubscription:
         topic: name of the topic, resolved as ROS does.
         types: message classes by type name, in order of preference.
         callback: called with each message.
-        depth: of the queue.
+        depth: depth of the queue.
         reliability: ``reliable``, ``best_effort``, or ``auto``: reliable if every publisher offers it, as large
             best-effort messages are easily lost, otherwise best effort, which works with every publisher.
     """

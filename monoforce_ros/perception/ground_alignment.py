@@ -26,7 +26,7 @@ def support_points(robot: RobotModel, motion: MotionState, stiffness: float) -> 
     Args:
         robot: its wheels or tracks.
         motion: the robot's pose.
-        stiffness: of the ground [N/m³]; the wheels sink in by the rest depth.
+        stiffness: stiffness of the ground [N/m³]; the wheels sink in by the rest depth.
     """
     lowest = robot.points[robot.point_tangents[:, 0] < -0.97].numpy()
     points = transform_points(motion.terrain_from_base, lowest.astype(np.float64))
@@ -76,7 +76,7 @@ def clear_footprint(terrain: TerrainMap, robot: RobotModel, motion: MotionState)
     underside = float(hull[:, 2].min()) if len(hull) else 0.0
     if abs(np.linalg.det(pose[:2, :2])) < 0.1:  # the robot lies on its side
         return terrain
-    # Where the vertical through each cell meets the plane of the hull's underside, in base axes.
+    # Intersection of the vertical through each cell with the plane of the hull's underside, in base axes.
     cells = np.stack(np.meshgrid(grid.x, grid.y), axis=-1) - pose[:2, 2] * underside
     ahead, lateral = np.moveaxis(cells @ np.linalg.inv(pose[:2, :2]).T, -1, 0)
     inside = (ahead > rear) & (ahead < front) & (lateral > right) & (lateral < left)

@@ -37,9 +37,9 @@ def choose_terrain_source(
         robot: the robot on the ground.
         grid: cells of the maps; sources with an encoder use the encoder's.
         material: material of ground for which the source does not predict it.
-        checkpoint: of the encoder; empty for the shipped one.
-        device: where the encoder runs.
-        precision: of the encoder, see :func:`monoforce_ros.encoder.fused`.
+        checkpoint: checkpoint of the encoder; empty for the shipped one.
+        device: device of the encoder.
+        precision: precision of the encoder, see :func:`monoforce_ros.encoder.fused`.
         threads: CPU threads of the encoder; by default PyTorch's current number.
         retention_time: how long terrain seen by cameras is kept after it leaves the images [s]; 0 disables it.
 

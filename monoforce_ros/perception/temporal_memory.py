@@ -1,4 +1,4 @@
-"""TemporalMemory: fills cells that a terrain source does not observe now with what it observed shortly before."""
+"""TemporalMemory: fills currently unobserved cells with recent observations of a terrain source."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ class TemporalMemory:
     Args:
         source: source of the current maps.
         robot: the robot on the ground.
-        stiffness: of the ground under its wheels [N/m³].
+        stiffness: stiffness of the ground under its wheels [N/m³].
         retention_time: how long a cell is kept after it was last observed [s].
-        retention_distance: how far the robot may travel until a cell is forgotten, since odometry drifts [m].
+        retention_distance: distance travelled after which a cell is forgotten, since odometry drifts [m].
     """
 
     def __init__(

@@ -76,7 +76,7 @@ class BodyContact:
             centre: centre of mass, ``[B, 3]`` [m].
             rotation: terrain ← base, ``[B, 3, 3]``.
             velocity: velocity of the centre of mass, ``[B, 3]`` [m/s].
-            angular_velocity: in terrain axes, ``[B, 3]`` [rad/s].
+            angular_velocity: angular velocity in terrain axes, ``[B, 3]`` [rad/s].
             step_time: as in :func:`contact`.
         """
         # One product for lever arms, velocities of the points due to rotation, and velocities of the belts.

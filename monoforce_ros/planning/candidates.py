@@ -39,7 +39,7 @@ def fan_of_arcs(settings: CandidateSettings) -> np.ndarray:
     last the whole horizon.
     """
     arcs = settings.count - int(settings.stop and settings.count > 1)
-    # A remainder goes to the last speeds: a single arc must not be a turn in place.
+    # Assign a remainder to the last speeds: a single arc must not be a turn in place.
     shares = np.array_split(np.arange(arcs), len(settings.speeds))[::-1]
     fastest = max(settings.speeds)
     fan = []
@@ -57,7 +57,7 @@ def over_horizon(sequences: np.ndarray, before: np.ndarray, steps: int) -> np.nd
     """Commands of candidates over the horizon, with the commands before it.
 
     Args:
-        sequences: commands that each candidate holds in turn, for equal shares of the horizon ``[N, K, 2]``.
+        sequences: consecutive commands of each candidate, for equal shares of the horizon ``[N, K, 2]``.
         before: commands of the steps before the candidates start ``[history, 2]``.
         steps: number of steps after that.
 

@@ -116,7 +116,7 @@ def assess(
     """Terms, cost and feasibility of candidates. Differentiable in the rollout.
 
     Args:
-        rollout: of all candidates ``[N]``, with contact force sums.
+        rollout: rollout of all candidates ``[N]``, with contact force sums.
         terrain: the map of the rollout.
         robot: the robot of the rollout.
         twists: commanded forward speed [m/s] and yaw rate [rad/s] of each step ``[N, T, 2]``.

@@ -54,7 +54,7 @@ class CostToGo:
         return np.where(inside, self._values(self.proximity, cells), 0.0)
 
     def _cells(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Column and row of the cell of each place ``[..., 2]``, and whether it is on the map."""
+        """Column and row of the cell of each position ``[..., 2]``, and whether it is on the map."""
         cells = np.floor((places - self.origin) / self.resolution).astype(int)
         rows, columns = self.cost.shape
         return cells, ((cells >= 0) & (cells < [columns, rows])).all(axis=-1)
@@ -74,7 +74,7 @@ def cost_to_go(data: np.ndarray, resolution: float, origin: np.ndarray, goal: np
         resolution: edge of a cell [m].
         origin: corner of cell (0, 0) ``[2]`` [m].
         goal: ``[2]`` [m].
-        radius: of the robot [m]; cells closer than this to a lethal one are lethal too.
+        radius: radius of the robot [m]; cells closer than this to a lethal one are lethal too.
 
     Raises:
         ValueError: the map is empty.

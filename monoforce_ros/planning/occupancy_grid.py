@@ -51,7 +51,7 @@ def occupancy(
     height = terrain.height.detach().cpu().double().numpy()
     smooth = uniform_filter(height, max(1, round(_SLOPE_BASE / grid.resolution)), mode="nearest")
     slope = np.arctan(np.hypot(*np.gradient(smooth, grid.resolution)))
-    # The height range over three cells, less what the slope contributes to it.
+    # The height range over three cells, minus the contribution of the slope.
     span = maximum_filter(height, 3, mode="nearest") - minimum_filter(height, 3, mode="nearest")
     step = np.maximum(0.0, span - 2.0 * grid.resolution * np.tan(np.minimum(slope, 1.4)))
     share = np.maximum(slope / slope_limit, step / step_limit)

@@ -61,8 +61,8 @@ def refine(
         prediction: provides the map and the start state.
         before: commands before the candidate ``[history, 2]``; longer if the candidate starts later.
         sequence: commands for equal shares of the rest of the horizon ``[K, 2]``.
-        weights: of the cost terms.
-        limits: of the cost terms.
+        weights: weights of the cost terms.
+        limits: limits of the cost terms.
         seconds: time budget; no round starts that would probably exceed it [s].
         round_seconds: duration of a round on this machine, from an earlier refinement [s].
     """

@@ -15,7 +15,7 @@ WAYPOINTS = (25, 50, 75)
 _LOOKAHEAD = 0.5
 """Lookahead distance [m]."""
 _PROGRESS = 0.1
-"""Progress towards the goal that makes a candidate better than standing [m]."""
+"""Smallest progress towards the goal for which a candidate is better than standing [m]."""
 FIELDS = (
     *("x", "y", "heading", "speed", "yaw_rate", "cost", "feasible"),
     *(f"{axis}_{share}" for share in WAYPOINTS for axis in "xy"),
@@ -54,7 +54,7 @@ def select_candidate(
         candidates: :data:`FIELDS`, each ``[N]``; positions and headings in the odometry frame.
         robot: position of the robot ``[2]`` [m].
         goal: position of the goal ``[2]`` [m].
-        weights: of the criteria.
+        weights: weights of the criteria.
         cost_to_go: path lengths to the goal around obstacles; without it, straight distances are used.
         previous_command: forward speed [m/s] and yaw rate [rad/s] of the last command.
 
@@ -90,7 +90,7 @@ def select_candidate(
         start = float(cost_to_go.at(robot))
     # The final heading of a candidate that passes the goal does not matter.
     misalignment = np.where(nearest_at_end, misalignment, 0.0)
-    # Standing makes no progress; allow it only if no feasible candidate makes any.
+    # Standing makes no progress; allow it only if no feasible candidate does.
     standing = (np.abs(candidates["speed"]) < 1e-6) & (np.abs(candidates["yaw_rate"]) < 1e-6)
     if (feasible & ~standing & (start - remaining > _PROGRESS)).any():
         feasible = feasible & ~standing

@@ -164,7 +164,7 @@ def _varied_robot(robot: RobotModel, drawn: torch.Tensor, settings: EnsembleSett
         varied = dict(parameters)
         for key, (low, high) in intervals.get(name, {}).items():
             unit = _antithetic(random, len(drawn))
-            # A 95 % interval is 3.92 standard deviations wide; values stay within it, as parameters have bounds.
+            # A 95 % interval is 3.92 standard deviations wide; values stay within it, because parameters have bounds.
             value = torch.as_tensor(varied[key], dtype=torch.float32)
             varied[key] = (value + unit * (high - low) / 3.92).clamp(low, high)
         effects[name] = varied

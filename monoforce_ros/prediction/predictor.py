@@ -64,7 +64,7 @@ class Predictor:
         robot: the robot's model.
         source: source of the terrain maps.
         horizon: length of a prediction [s].
-        options: of the physics.
+        options: options of the physics.
         history: time before the start over which delays and lags of the drives need commands [s].
     """
 

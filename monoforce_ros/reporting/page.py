@@ -29,12 +29,12 @@ dt { color: #6b7a88; } dd { margin: 0; overflow-wrap: anywhere; }
 
 
 def page(title: str, body: str, *, heading: str = "", lead: str = "") -> str:
-    """A complete HTML document that loads nothing from elsewhere.
+    """A complete, self-contained HTML document.
 
     Args:
         title: plain text, in the browser's title bar.
         body: HTML below the heading.
-        heading: plain text at the top of the page; the title unless given.
+        heading: plain text at the top of the page (default: the title).
         lead: plain text of an introduction below the heading.
     """
     introduction = f'<p class="lead">{html.escape(lead, quote=False)}</p>' if lead else ""
@@ -54,7 +54,7 @@ def card(body: str, *, heading: str = "", caption: str = "") -> str:
 
 
 def picture_card(png: bytes, *, alt: str, heading: str = "", caption: str = "") -> str:
-    """A section that shows a picture, which is part of the page."""
+    """A section with an embedded picture."""
     data = base64.b64encode(png).decode()
     picture = f'<img alt="{html.escape(alt)}" src="data:image/png;base64,{data}">'
     return card(picture, heading=heading, caption=caption)
@@ -67,7 +67,7 @@ def definition_list(entries: Mapping[str, object]) -> str:
 
 
 def folded_list(summary: str, lines: Iterable[str]) -> str:
-    """Lines of plain text below a summary that unfolds them; nothing without lines."""
+    """Collapsible lines of plain text below a summary; empty without lines."""
     listed = "".join(f"<li>{html.escape(line)}</li>" for line in lines)
     return f"<details><summary>{html.escape(summary)}</summary><ul>{listed}</ul></details>" if listed else ""
 

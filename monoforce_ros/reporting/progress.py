@@ -12,7 +12,7 @@ def progress[T](items: Iterable[T], *, label: str | None = None, unit: str = "it
     """The items, with a bar that advances as they are iterated over.
 
     Args:
-        items: what to iterate over.
+        items: items to iterate over.
         label: text before the bar.
         unit: name of one item, in the singular.
         quiet: never show the bar.

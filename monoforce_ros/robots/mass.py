@@ -14,7 +14,7 @@ def add_point_mass(
     Args:
         mass: ``[]`` or ``[B]`` [kg].
         centre: centre of mass ``[..., 3]`` [m].
-        inertia: about that centre ``[..., 3, 3]`` [kg m²].
+        inertia: inertia about that centre ``[..., 3, 3]`` [kg m²].
         added: ``[]`` or ``[B]`` [kg].
         place: position of the point mass ``[..., 3]`` [m].
 

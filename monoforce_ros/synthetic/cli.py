@@ -29,13 +29,13 @@ def build_parser() -> argparse.ArgumentParser:
         description="Record bags in simulated worlds: hills, ramp, kerbs, rocks, walls, trees, mud and tall grass.",
     )
     parser.add_argument("out", type=Path, metavar="OUT", help="folder of the bag")
-    parser.add_argument("--seed", type=int, default=DEFAULT_SEED, help="for world, commands and noise (%(default)s)")
+    parser.add_argument("--seed", type=int, default=DEFAULT_SEED, help="seed of world, commands, noise (%(default)s)")
     parser.add_argument("--duration", type=float, default=10.0, metavar="SECONDS", help="(%(default)s)")
     parser.add_argument("--robot", default="husky", metavar="NAME|FILE.yaml", help="(%(default)s)")
     parser.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap", help="(%(default)s)")
     parser.add_argument("--camera", default="320x240", metavar="WIDTHxHEIGHT|none", help="(%(default)s)")
     parser.add_argument(
-        "--cameras", type=int, metavar="1-4", help="number, in the order front, left, right, rear (the robot's)"
+        "--cameras", type=int, metavar="1-4", help="number of cameras: front, left, right, rear (the robot's)"
     )
     parser.add_argument(
         "--distortion", metavar="K1,K2,P1,P2,K3", help="lens distortion of every camera, such as -0.3,0.1,0,0,0 (none)"
@@ -68,7 +68,7 @@ def build_parser() -> argparse.ArgumentParser:
         "--hide-random",
         type=int,
         metavar="SEED",
-        help="inject random faults: none, one, two, or one that is not in the catalogue of effects",
+        help="inject random faults: none, one, two, or one out-of-catalogue fault",
     )
     shape = parser.add_mutually_exclusive_group()
     shape.add_argument(
@@ -84,19 +84,19 @@ def build_parser() -> argparse.ArgumentParser:
         "--ground",
         choices=GROUNDS,
         default="mixed",
-        help="mixed: patches of tall grass; rigid: no grass; grass: along most of the track; yard: walls and grass "
-        "around the start (%(default)s)",
+        help="mixed: patches of tall grass; rigid: no grass; grass: tall grass on most of the track; yard: walls "
+        "and grass around the start (%(default)s)",
     )
     parser.add_argument(
         "--count",
         type=int,
         metavar="N",
-        help="record N bags OUT/SEED with the seeds from --seed on",
+        help="record N bags OUT/SEED with consecutive seeds from --seed",
     )
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="bags recorded in parallel (%(default)s)")
     parser.add_argument("--labels", action="store_true", help="write true heights, classes and poses to OUT.labels.npz")
     parser.add_argument("--force", action="store_true", help="overwrite OUT if it exists")
-    parser.add_argument("--quiet", action="store_true", help="print neither progress nor summary")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar and no summary")
     return parser
 
 
@@ -200,7 +200,7 @@ def _settings(options: argparse.Namespace) -> RecordingSettings:
 
 
 def _record_one(out: Path, options: argparse.Namespace) -> int:
-    # Imported late, so that --help and wrong options are answered at once.
+    # Imported late, so that --help and option errors are fast.
     from monoforce_ros.robots import RobotFileError
     from monoforce_ros.synthetic.graphics import DrawingError
     from monoforce_ros.synthetic.hidden import truth_file

@@ -24,13 +24,13 @@ class CommandProfile(Protocol):
         Args:
             time: since the start of the recording [s].
             position: ``[2]`` of the robot in the world [m].
-            heading: of the robot in the world [rad].
+            heading: heading of the robot in the world [rad].
         """
         ...
 
 
 class CommandTable:
-    """Commands that change at given times and are held in between.
+    """Commands that change at given times and hold in between.
 
     Args:
         times: ``[n]`` ascending [s]; the command is zero before the first one.
@@ -207,7 +207,7 @@ def make_profile(
         name_or_file: name or path.
         route: path that ``random`` follows.
         random: generator of random commands.
-        maximum_speed: of the robot [m/s]; profiles stay below 1.5 m/s, since the world is small.
+        maximum_speed: maximum speed of the robot [m/s]; profiles stay below 1.5 m/s, since the world is small.
 
     Raises:
         ValueError: there is neither such a profile nor such a file, or the file is not a table of commands.

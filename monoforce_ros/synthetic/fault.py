@@ -47,7 +47,7 @@ class Parameter:
     On a fault it is a float; on the class it is this declaration.
 
     Args:
-        default: value unless one is given, in SI units.
+        default: default value, in SI units.
         low, high: smallest and largest value.
         neutral: value at which the fault has no effect; random values scale the distance from it.
     """
@@ -67,7 +67,7 @@ class Parameter:
 
 
 class Fault:
-    """An injected fault. The methods below do nothing; a fault overrides those through which it acts.
+    """An injected fault. The methods below do nothing; a fault overrides those it needs.
 
     Args:
         values: parameters that differ from their defaults.
@@ -99,7 +99,7 @@ class Fault:
         """Change the compiled model once the robot has settled."""
 
     def wheel_speeds(self, time: float, speeds: np.ndarray) -> np.ndarray:
-        """Wheel speeds that the servos receive, given the commanded ones ``[wheels]`` [rad/s]; called at every step."""
+        """Wheel speeds received by the servos for commanded ones ``[wheels]`` [rad/s]; called at every step."""
         return speeds
 
     def apply_forces(self, simulation: Simulation) -> None:

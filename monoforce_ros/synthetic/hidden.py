@@ -69,7 +69,7 @@ def draw_hidden(seed: int, excluded: Sequence[str] = ()) -> tuple[Fault, ...]:
     Parameters deviate from their neutral value by 0.6 to 1.4 times as much as the default does, within their range.
 
     Args:
-        seed: of the random draw.
+        seed: seed of the random draw.
         excluded: names never drawn, such as ``vegetation_drag`` in a world without vegetation.
     """
     random = random_stream(seed, "hidden")
@@ -90,7 +90,7 @@ def draw_hidden(seed: int, excluded: Sequence[str] = ()) -> tuple[Fault, ...]:
 
 
 def describe(hidden: Sequence[Fault]) -> list[dict]:
-    """Name and parameters of each fault, and whether the catalogue of effects has it."""
+    """Name and parameters of each fault, and whether it is in the catalogue of effects."""
     names = {kind: name for name, kind in FAULTS.items()}
     return [
         {
@@ -103,7 +103,7 @@ def describe(hidden: Sequence[Fault]) -> list[dict]:
 
 
 def truth_file(bag: Path) -> Path:
-    """Path of a bag's ground-truth file, which lies next to the bag and not in it."""
+    """Path of a bag's ground-truth file, next to the bag."""
     return bag.with_name(f"{bag.name}.hidden.json")
 
 

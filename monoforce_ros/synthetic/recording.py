@@ -48,7 +48,7 @@ class RecordingSettings:
     """Settings of a recording.
 
     Attributes:
-        seed: for world, commands and sensor noise; each has its own random stream, so that the trajectory does not
+        seed: seed of world, commands and sensor noise; each has its own random stream, so that the trajectory does not
             depend on the recorded sensors.
         duration: [s].
         robot: name or YAML file.
@@ -167,7 +167,7 @@ class _Session:
         self._command_offset = round(1e9 * sum(fault.command_stamp_offset for fault in hidden))
         self._pose_offset = round(1e9 * sum(fault.pose_stamp_offset for fault in hidden))
         self._gyro_offset = np.array([0.0, 0.0, sum(fault.gyro_offset for fault in hidden)])
-        # Clouds and images are made in other threads; later messages wait for them, so that the bag is in order.
+        # Other threads render clouds and images; later messages wait for them, so that the bag is in order.
         self._workers = ThreadPoolExecutor(2, thread_name_prefix="recording")
         self._outbox: deque[tuple[str, int, object]] = deque()
         self._scan: Future[object] | None = None

@@ -25,7 +25,7 @@ class Route:
     Attributes:
         points: ``[n, 2]`` positions [m], first one at the origin.
         headings: ``[n]`` direction of travel [rad].
-        length: of one lap [m].
+        length: length of one lap [m].
     """
 
     def __init__(self, random: np.random.Generator):

@@ -20,11 +20,11 @@ class CameraSettings:
     """A pinhole camera with optional lens distortion.
 
     Attributes:
-        width: of the image [pixels].
-        height: of the image [pixels].
+        width: width of the image [pixels].
+        height: height of the image [pixels].
         field_of_view: horizontal field of view [rad].
         rate: images per second [Hz].
-        quality: of the JPEG files, 1 to 100.
+        quality: quality of the JPEG files, 1 to 100.
         distortion: k1, k2, p1, p2, k3 of OpenCV's plumb-bob model; empty for none.
         oversampling: rendered pixels per image pixel along each side, for anti-aliasing; 0 selects 2 for images up to
             400 pixels wide and 1 for larger ones.
@@ -179,7 +179,7 @@ def encode_jpeg(pixels: np.ndarray, quality: int) -> bytes:
 
 @dataclass(frozen=True, kw_only=True)
 class LidarSettings:
-    """A spinning lidar with motion-compensated clouds: all points of a revolution are taken at one instant.
+    """A spinning lidar with motion-compensated clouds: all points of a revolution are measured at one instant.
 
     Attributes:
         rings: number of rings.

@@ -81,7 +81,7 @@ def box(size: np.ndarray, heading: float) -> Shape:
 
     Args:
         size: length, width and height ``[3]`` [m].
-        heading: about the vertical [rad].
+        heading: yaw [rad].
     """
     corners: list[np.ndarray] = []
     normals: list[np.ndarray] = []

@@ -96,7 +96,7 @@ class Simulation:
             self.step()
         self.steps = 0
         self.odom_origin = self.data.qpos[:3].copy()
-        # Faults act once the robot has settled, so that it starts as without them.
+        # Faults start after the robot has settled, so that the start state is the same as without faults.
         for fault in hidden:
             fault.modify_model(self)
         self._faults_active = True

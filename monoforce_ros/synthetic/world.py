@@ -47,7 +47,7 @@ def build_model(
     Args:
         scenery: ground, rocks, trees and grass.
         robot: placed at the origin, heading along x.
-        seed: of the colours.
+        seed: seed of the colours.
         cameras: vertical field of view [rad] by sensor frame; if empty, geometry for images is left out.
         hidden: faults to inject.
     """

@@ -16,7 +16,7 @@ _LARGEST_FILE = 2_000_000_000
 
 
 class TerrainFileError(ValueError):
-    """The file is not a valid terrain map; the message says why."""
+    """The file is not a valid terrain map; the message gives the reason."""
 
 
 def save_terrain(
@@ -25,7 +25,7 @@ def save_terrain(
     """Write a single map.
 
     Args:
-        path: of the file; it appears once it is complete.
+        path: path of the file; it appears once it is complete.
         terrain: a single map, not a batch.
         odometry_from_terrain: pose ``[4, 4]`` of the map's frame; the identity unless given.
         extra: further arrays to store.

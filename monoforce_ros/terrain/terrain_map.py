@@ -82,7 +82,7 @@ class TerrainMap:
         observed: Tensor | None = None,
         material: TerrainDefaults = TerrainDefaults(),
     ) -> TerrainMap:
-        """A map of one material; unless given, the visible surface is the ground, and all cells are observed."""
+        """A map with one material. By default the visible surface equals the ground, and all cells are observed."""
 
         def constant(value: float) -> Tensor:
             return torch.full_like(height, value, requires_grad=False)

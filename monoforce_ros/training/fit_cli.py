@@ -92,7 +92,7 @@ def build_parser() -> argparse.ArgumentParser:
                         "(default: the length)")  # fmt: skip
     parser.add_argument("--chunk", type=float, default=FitSettings.chunk, metavar="S", help="length of the "
                         "chunks that are rolled out (default: %(default)s)")  # fmt: skip
-    parser.add_argument("--iterations", type=int, default=FitSettings.iterations, help="steps of the descent "
+    parser.add_argument("--iterations", type=int, default=FitSettings.iterations, help="gradient steps "
                         "(default: %(default)s)")  # fmt: skip
     parser.add_argument("--no-lidar", action="store_true", help="fit to the motion only")
     parser.add_argument("--friction", action="store_true", help="fit friction too")

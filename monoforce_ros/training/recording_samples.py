@@ -28,7 +28,7 @@ _OLD_NAMES = {"felt": "contact_mask"}
 
 
 class SamplesError(ValueError):
-    """A recording gives no samples, or a file of samples is unusable; the message says why."""
+    """A recording yields no samples, or a sample file is unusable; the message gives the reason."""
 
 
 @dataclass(frozen=True)

@@ -86,7 +86,7 @@ class Augmentation:
 
     @property
     def is_none(self) -> bool:
-        """Whether it changes nothing."""
+        """Whether the augmentation is the identity."""
         return self == Augmentation()
 
 
@@ -141,9 +141,9 @@ def sample(
 
     Args:
         recording: its samples.
-        index: of the sample.
-        config: of the encoder.
-        augmentation: of the sample.
+        index: index of the sample.
+        config: configuration of the encoder.
+        augmentation: augmentation of the sample.
         chunks: largest number of chunks of motion to roll out.
         horizon: time after the image over which they are spread [s].
     """

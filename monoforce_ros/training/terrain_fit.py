@@ -70,7 +70,7 @@ class FitSettings:
 
 @dataclass(frozen=True)
 class TerrainFit:
-    """Fitted terrain and how well it predicts the motion."""
+    """Fitted terrain and its error in predicting the motion."""
 
     terrain: TerrainMap
     """``height`` is H_t*, ``geometric_height`` is H_g* (H_t* without a visible terrain), ``friction`` as fitted."""
@@ -130,12 +130,12 @@ def fit_terrain(
         motion: measured, preferably smoothed (:func:`monoforce_ros.bags.smooth`).
         commands: recorded.
         robot: that was driven.
-        start: of the trajectory [ns].
-        length: of the trajectory [s].
+        start: start of the trajectory [ns].
+        length: length of the trajectory [s].
         visible: visible terrain on :func:`trajectory_grid`; without it the map depends on the wheel tracks alone.
         material: stiffness, damping and initial friction of the ground.
-        settings: of the fit.
-        backend: of the rollout.
+        settings: settings of the fit.
+        backend: backend of the rollout.
         progress: called after each step of the descent.
 
     Raises:

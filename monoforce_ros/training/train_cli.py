@@ -81,7 +81,7 @@ def build_parser() -> argparse.ArgumentParser:
                         "(default: OUT/samples)")  # fmt: skip
     parser.add_argument("--samples-only", action="store_true", help="extract the samples and stop")
     parser.add_argument("--sensor", choices=("camera", "lidar"), default="camera", help="input of the encoder: images, "
-                        "or a lidar sweep that it densifies (default: %(default)s)")  # fmt: skip
+                        "or a lidar sweep to densify (default: %(default)s)")  # fmt: skip
     parser.add_argument("--images", nargs="+", default=[], metavar="TOPIC", help="image topics (default: all with a "
                         "CameraInfo)")  # fmt: skip
     parser.add_argument("--period", type=float, default=SampleSettings.period, metavar="S", help="interval between "

@@ -69,7 +69,7 @@ class TrainingSettings:
 
 
 class TrainingError(RuntimeError):
-    """Training cannot start or continue; the message says why."""
+    """Training cannot start or continue; the message gives the reason."""
 
 
 @dataclass(frozen=True)
@@ -149,12 +149,12 @@ class Trainer:
     """Trains an encoder on recordings and saves its state in a folder.
 
     Args:
-        encoder: to train, with initial weights.
+        encoder: encoder to train, with initial weights.
         robot: that was driven.
-        recordings: to train on.
+        recordings: training recordings.
         held_out: recordings to validate on.
         out: folder for ``encoder.safetensors``, ``training.json``, ``state/`` and logs.
-        settings: of the training.
+        settings: settings of the training.
         process: this process and its device.
     """
 

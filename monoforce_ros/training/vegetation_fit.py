@@ -33,7 +33,7 @@ _LARGEST = (1e6, 10.0)
 
 @dataclass(frozen=True)
 class VegetationFit:
-    """Drag of vegetation, and how much it reduces the prediction error there."""
+    """Drag of vegetation, and the prediction error in vegetation with and without it."""
 
     coefficient: float
     """[N s/m⁴]."""
