@@ -113,24 +113,24 @@ def fit_effects(
     losses = total(starts, tried)
     best = int(np.argmin(losses))
     current, residual, loss = starts[best], tried[best], float(losses[best])
-    held = sum(len(parameters) for _, parameters in current[:free])
+    fixed = sum(len(parameters) for _, parameters in current[:free])
     typical, values = scales(current), flat(current)
     jacobian = None
-    for _ in range(iterations if held < len(values) else 0):
-        jacobian = _jacobian(predictions, current, residual, scale, held)
+    for _ in range(iterations if fixed < len(values) else 0):
+        jacobian = _jacobian(predictions, current, residual, scale, fixed)
         used = np.nan_to_num(residual).ravel()
         weight = np.minimum(1.0, OUTLIER / np.maximum(np.abs(used), 1e-9))
         gradient = jacobian @ (weight * used)
         curvature = (jacobian * weight) @ jacobian.T
         if prior:
             # The loss is a mean over residuals, the sums here are not.
-            gradient = gradient + prior * residual.size * ((values - neutral) / typical)[held:]
+            gradient = gradient + prior * residual.size * ((values - neutral) / typical)[fixed:]
             curvature = curvature + prior * residual.size * np.eye(len(curvature))
         diagonal = np.diag(np.diag(curvature) + 1e-6 * np.trace(curvature) + 1e-9)
         candidates = []
         for damping in _DAMPINGS:
             step = np.zeros(len(values))
-            step[held:] = typical[held:] * np.linalg.solve(curvature + damping * diagonal, gradient)
+            step[fixed:] = typical[fixed:] * np.linalg.solve(curvature + damping * diagonal, gradient)
             candidates.append(with_values(current, values - step))
         tried = predictions.residuals(candidates) / scale
         losses = total(candidates, tried)
@@ -141,30 +141,30 @@ def fit_effects(
         values = flat(current)
     covariance = np.zeros((len(values), len(values)))
     if jacobian is not None and jacobian.any():
-        covariance[held:, held:] = _covariance(jacobian, residual, typical[held:], predictions.data)
+        covariance[fixed:, fixed:] = _covariance(jacobian, residual, typical[fixed:], predictions.data)
     return Fit(current, robust(residual), covariance)
 
 
 def _jacobian(
-    predictions: Predictions, current: Effects, residual: np.ndarray, scale: np.ndarray, held: int
+    predictions: Predictions, current: Effects, residual: np.ndarray, scale: np.ndarray, fixed: int
 ) -> np.ndarray:
     """Derivatives of the scaled residuals by each free parameter in units of its typical size, ``[P, W K 3]``."""
     values, typical = flat(current), scales(current)
     steps = 3e-2 * typical
     units = np.eye(len(values))
     # Step away from bounds, and from neutral values beyond which an effect is undefined.
-    moved, actual = [], []
-    for i in range(held, len(values)):
-        there = with_values(current, values + steps * units[i])
-        change = flat(there)[i] - values[i]
+    shifted_effects, actual = [], []
+    for i in range(fixed, len(values)):
+        stepped = with_values(current, values + steps * units[i])
+        change = flat(stepped)[i] - values[i]
         if abs(change) < 0.5 * steps[i]:
-            there = with_values(current, values - steps * units[i])
-            change = flat(there)[i] - values[i]
-        moved.append(there)
+            stepped = with_values(current, values - steps * units[i])
+            change = flat(stepped)[i] - values[i]
+        shifted_effects.append(stepped)
         actual.append(change if change else np.inf)
-    shifted = predictions.residuals(moved) / scale
-    factors = (typical[held:] / np.array(actual))[:, None, None, None]
-    return np.nan_to_num((shifted - residual) * factors).reshape(len(moved), -1)
+    shifted = predictions.residuals(shifted_effects) / scale
+    factors = (typical[fixed:] / np.array(actual))[:, None, None, None]
+    return np.nan_to_num((shifted - residual) * factors).reshape(len(shifted_effects), -1)
 
 
 def _covariance(jacobian: np.ndarray, residual: np.ndarray, typical: np.ndarray, data: EvidenceWindows) -> np.ndarray:

@@ -226,8 +226,8 @@ class Search:
         gain, fits = 0.0, []
         for part in np.array_split(np.arange(len(starts)), pieces):
             predictions = Predictions(self.robot, replace(self.data, starts=starts[part]))
-            held = self._held(trial.effects)
-            fit = fit_effects(predictions, [trial.effects], self.scale, iterations=4, free=held)
+            fixed = self._fixed_count(trial.effects)
+            fit = fit_effects(predictions, [trial.effects], self.scale, iterations=4, free=fixed)
             gain += float(trial.held_out_loss[part].sum() - fit.loss.sum()) / len(starts)
             fits.append(fit.effects)
         return gain, fits
@@ -241,7 +241,7 @@ class Search:
         held_out_loss = np.zeros(len(self.data.starts))
         parts, losses = [], []
         for fitted, judged, where in self._split:
-            fit = fit_effects(fitted, [effects], self.scale, iterations=iterations, free=self._held(effects))
+            fit = fit_effects(fitted, [effects], self.scale, iterations=iterations, free=self._fixed_count(effects))
             held_out_loss[where] = robust(judged.residuals([fit.effects])[0] / self.scale)
             parts.append(fit.effects)
             losses.append(float(fit.loss.mean()) + float(held_out_loss[where].mean()))
@@ -249,7 +249,7 @@ class Search:
 
     def refit(self, effects: Effects) -> Fit:
         """Fit to the whole recording."""
-        return fit_effects(self.predictions, [effects], self.scale, iterations=6, free=self._held(effects))
+        return fit_effects(self.predictions, [effects], self.scale, iterations=6, free=self._fixed_count(effects))
 
     def ranked(self, fit: Fit) -> list[int]:
         """Indices of a fit's effects, ranked by leave-one-out loss: the loss of the others, fitted again without it."""
@@ -258,11 +258,11 @@ class Search:
         losses = []
         for i in range(len(fit.effects)):
             others = fit.effects[:i] + fit.effects[i + 1 :]
-            alone = fit_effects(self._coarse, [others], self.scale, iterations=4, free=self._held(others))
+            alone = fit_effects(self._coarse, [others], self.scale, iterations=4, free=self._fixed_count(others))
             losses.append(float(alone.loss.mean()))
         return sorted(range(len(losses)), key=lambda i: -losses[i])
 
-    def _held(self, effects: Effects) -> int:
+    def _fixed_count(self, effects: Effects) -> int:
         return len(self.known) if effects[: len(self.known)] == self.known else 0
 
     def _screened(self, base: Effects, number: str) -> tuple[float, list[tuple[str, Effects, float]]]:

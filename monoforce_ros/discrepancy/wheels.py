@@ -73,15 +73,15 @@ def compare_with_wheels(commands: CommandTrack, wheels: WheelTrack | None, robot
     block = np.arange(len(pieces)) % 2
     scores: dict[tuple[str, ...], tuple[float, np.ndarray, np.ndarray]] = {}
     for names in _models():
-        lost, fits = 0.0, []
+        loss, fits = 0.0, []
         for held_out in (0, 1):
             fitted = [piece for piece, number in zip(pieces, block, strict=True) if number != held_out]
             judged = [piece for piece, number in zip(pieces, block, strict=True) if number == held_out]
             fit = _fit(names, fitted, top)
             fits.append(fit)
-            lost += float(np.minimum(_residuals(fit, names, judged) ** 2, (0.5 * top) ** 2).sum())
-        scores[names] = (lost, np.mean(fits, axis=0), np.abs(fits[0] - fits[1]))
-    nothing = scores[()][0]
+            loss += float(np.minimum(_residuals(fit, names, judged) ** 2, (0.5 * top) ** 2).sum())
+        scores[names] = (loss, np.mean(fits, axis=0), np.abs(fits[0] - fits[1]))
+    baseline_loss = scores[()][0]
     best: tuple[str, ...] = ()
     for size in range(1, _LARGEST_MODEL + 1):
         found = min((names for names in scores if len(names) == size), key=lambda names: scores[names][0], default=None)
@@ -105,7 +105,7 @@ def compare_with_wheels(commands: CommandTrack, wheels: WheelTrack | None, robot
     return WheelFinding(
         tuple(effects),
         tuple(half_widths),
-        float(np.sqrt(nothing / count)),
+        float(np.sqrt(baseline_loss / count)),
         float(np.sqrt(scores[best][0] / count)),
         ratio,
     )
@@ -118,9 +118,9 @@ def _ratio(pieces: list[_Piece], top: float) -> float | None:
     for commanded, speeds, index in pieces:
         for side in range(2):
             for place, measured in zip(index, speeds[side], strict=True):
-                held = commanded[side, max(0, place - settled) : place + 1]
-                if np.ptp(held) < 0.02 * top and 0.1 * top < abs(held[-1]) < 0.6 * top:
-                    ratios.append(measured / held[-1])
+                recent = commanded[side, max(0, place - settled) : place + 1]
+                if np.ptp(recent) < 0.02 * top and 0.1 * top < abs(recent[-1]) < 0.6 * top:
+                    ratios.append(measured / recent[-1])
     if len(ratios) < 20:
         commanded = np.concatenate([commanded[:, index].ravel() for commanded, _, index in pieces])
         measured = np.concatenate([speeds.ravel() for _, speeds, _ in pieces])

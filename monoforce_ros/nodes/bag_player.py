@@ -135,12 +135,12 @@ class BagPlayer(Node):
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the player; see ``--help``."""
-    given = sys.argv if arguments is None else ["bag_player", *arguments]
-    options = _arguments(remove_ros_args(given)[1:])
+    command_line = sys.argv if arguments is None else ["bag_player", *arguments]
+    options = _arguments(remove_ros_args(command_line)[1:])
     # Raw images do not fit into the default shared memory segment; this must be set before the first node.
     for variable in _PROFILES:
         os.environ.setdefault(variable, str(share_directory() / "config" / "fastdds_large_messages.xml"))
-    rclpy.init(args=given, signal_handler_options=SignalHandlerOptions.ALL)
+    rclpy.init(args=command_line, signal_handler_options=SignalHandlerOptions.ALL)
     try:
         with BagReader(options.bag or share_directory() / "bags" / "demo") as bag:
             player = BagPlayer(bag, options)

@@ -77,9 +77,9 @@ class BagRecorder(Node):
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the recorder; see ``--help``."""
-    given = sys.argv if arguments is None else ["bag_recorder", *arguments]
-    options = _arguments(remove_ros_args(given)[1:])
-    rclpy.init(args=given)
+    command_line = sys.argv if arguments is None else ["bag_recorder", *arguments]
+    options = _arguments(remove_ros_args(command_line)[1:])
+    rclpy.init(args=command_line)
     for unfinished in BagWriter.unfinished(options.out):
         print(f"an earlier recording was killed and is in {unfinished}; it can be read as it is", file=sys.stderr)
     try:

@@ -111,8 +111,8 @@ class CandidateOutput:
             return
         motion, terrain, settings = prediction.motion, prediction.terrain, self._settings
         # Candidates take effect after the delay; the last command holds until then.
-        held = min(round(settings.candidate_delay / self._predictor.options.time_step), self._predictor.steps - 1)
-        start, steps = self._predictor.history + held, self._predictor.steps - held
+        delay = min(round(settings.candidate_delay / self._predictor.options.time_step), self._predictor.steps - 1)
+        start, steps = self._predictor.history + delay, self._predictor.steps - delay
         stamps = self._predictor.command_stamps(prediction.stamp)[:start]
         before = commands.sample(stamps, timeout=settings.command_timeout)
         twists = over_horizon(sequences, before, steps)

@@ -144,8 +144,8 @@ class PathSelectorNode(Node):
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the node; ``--help`` lists its parameters, which config/path_selector.yaml defines."""
-    given = sys.argv[1:] if arguments is None else arguments
-    if {"-h", "--help"} & set(given):
+    command_line = sys.argv[1:] if arguments is None else arguments
+    if {"-h", "--help"} & set(command_line):
         print(parameter_help("path_selector", read_parameter_file(PARAMETER_FILE)))
         return 0
     return run_node(PathSelectorNode, arguments)

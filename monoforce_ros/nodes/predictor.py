@@ -376,8 +376,8 @@ def _explained(error: Exception) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the predictor node; ``--help`` lists its parameters, which config/predictor.yaml defines."""
-    given = sys.argv[1:] if arguments is None else arguments
-    if {"-h", "--help"} & set(given):
+    command_line = sys.argv[1:] if arguments is None else arguments
+    if {"-h", "--help"} & set(command_line):
         print(parameter_help("predictor", read_parameter_file(PARAMETER_FILE)))
         return 0
     # The physics consists of many small operations, which are fastest on one thread; the encoder has its own setting.

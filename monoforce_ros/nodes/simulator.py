@@ -130,8 +130,8 @@ def _settings(options: argparse.Namespace) -> LiveSettings:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the simulator; see ``--help``."""
-    given = sys.argv if arguments is None else ["simulator", *arguments]
-    options = _arguments(remove_ros_args(given)[1:])
+    command_line = sys.argv if arguments is None else ["simulator", *arguments]
+    options = _arguments(remove_ros_args(command_line)[1:])
     try:
         world = LiveWorld(_settings(options))
     except (ValueError, OSError, RuntimeError) as error:
@@ -144,7 +144,7 @@ def main(arguments: list[str] | None = None) -> int:
         return node
 
     try:
-        return run_node(make_node, given, lambda node, executor: _run(node, executor, world, options.duration))
+        return run_node(make_node, command_line, lambda node, executor: _run(node, executor, world, options.duration))
     finally:
         world.close()
 

@@ -173,6 +173,6 @@ class _AdjointSolution(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        wanted = [leaf for leaf in ctx.leaves if leaf.requires_grad]
-        found = iter(torch.autograd.grad(ctx.states, wanted, gradients, allow_unused=True))
+        differentiable = [leaf for leaf in ctx.leaves if leaf.requires_grad]
+        found = iter(torch.autograd.grad(ctx.states, differentiable, gradients, allow_unused=True))
         return (None, None, None, *(next(found) if leaf.requires_grad else None for leaf in ctx.leaves))

@@ -205,8 +205,8 @@ def _contiguous(tensors: Sequence[Tensor]) -> list[Tensor]:
 class _Integrate(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, fixed: _Fixed, *tensors: Tensor) -> tuple[Tensor, ...]:
-        given = _contiguous(tensors)
-        inputs, start = given[: len(_INPUTS)], given[len(_INPUTS) :]
+        contiguous = _contiguous(tensors)
+        inputs, start = contiguous[: len(_INPUTS)], contiguous[len(_INPUTS) :]
         batch, steps = inputs[6].shape[:2]
         states = []
         for value in start:
@@ -224,30 +224,30 @@ class _Integrate(torch.autograd.Function):
         saved = ctx.saved_tensors
         # The adjoint accumulates into these backwards in time, hence the copies.
         gradients = [g.clone(memory_format=torch.contiguous_format) for g in state_gradients]
-        given = _launch(ctx.fixed, saved[: len(_INPUTS)], saved[len(_INPUTS) :], state_gradients=gradients)
-        return (None, *given, *(g[:, 0] for g in gradients))
+        input_gradients = _launch(ctx.fixed, saved[: len(_INPUTS)], saved[len(_INPUTS) :], state_gradients=gradients)
+        return (None, *input_gradients, *(g[:, 0] for g in gradients))
 
 
 class _Forces(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, fixed: _Fixed, every: int, *tensors: Tensor) -> tuple[Tensor, ...]:
-        given = _contiguous(tensors)
-        speeds, points = given[6], given[2]
+        contiguous = _contiguous(tensors)
+        speeds, points = contiguous[6], contiguous[2]
         batch, steps, count = speeds.shape[0], -(-speeds.shape[1] // every), points.shape[0]
         normal = speeds.new_zeros((batch, steps, count))
         tangential = speeds.new_zeros((batch, steps, count, 3))
         outputs = (normal, tangential, torch.zeros_like(tangential))
-        _launch_forces(fixed, every, given, outputs)
+        _launch_forces(fixed, every, contiguous, outputs)
         if any(ctx.needs_input_grad):
             ctx.fixed, ctx.every = fixed, every
-            ctx.save_for_backward(*given, *outputs)
+            ctx.save_for_backward(*contiguous, *outputs)
         return outputs
 
     @staticmethod
     def backward(ctx: Any, *output_gradients: Tensor) -> tuple[Tensor | None, ...]:
-        given, outputs = ctx.saved_tensors[:-3], ctx.saved_tensors[-3:]
+        tensors, outputs = ctx.saved_tensors[:-3], ctx.saved_tensors[-3:]
         gradients = [gradient.contiguous() for gradient in output_gradients]
-        return (None, None, *_launch_forces(ctx.fixed, ctx.every, given, outputs, output_gradients=gradients))
+        return (None, None, *_launch_forces(ctx.fixed, ctx.every, tensors, outputs, output_gradients=gradients))
 
 
 def _launch(
@@ -278,10 +278,17 @@ def _launch(
             scratch = wp.from_torch(
                 sums, dtype=kinds.vec3, requires_grad=backward, grad=torch.zeros_like(sums) if backward else None
             )
-            given = [chunk, steps, int(backward), *arguments.structs, scratch]
-            wp.launch(kernel, dim=width, inputs=given, device=device, record_tape=False)
+            values = [chunk, steps, int(backward), *arguments.structs, scratch]
+            wp.launch(kernel, dim=width, inputs=values, device=device, record_tape=False)
             if backward:
-                wp.launch(kernel, dim=width, inputs=given, device=device, record_tape=False, **_adjoint(given))
+                wp.launch(
+                    kernel,
+                    dim=width,
+                    inputs=values,
+                    device=device,
+                    record_tape=False,
+                    **_adjoint(values),
+                )
         return arguments.gradients()[: len(_INPUTS)] if backward else []
 
     # Compile here, because two threads must not compile at the same time.
@@ -292,16 +299,16 @@ def _launch(
 def _launch_forces(
     fixed: _Fixed,
     every: int,
-    given: Sequence[Tensor],
+    tensors: Sequence[Tensor],
     outputs: Sequence[Tensor],
     *,
     output_gradients: Sequence[Tensor] | None = None,
 ) -> list[Tensor]:
     """Launch the forces of every n-th step, or with ``output_gradients`` their adjoint, which returns the gradients."""
     backward = output_gradients is not None
-    device = str(given[0].device)
-    inputs, states = given[: len(_INPUTS)], given[len(_INPUTS) :]
-    double, kinds = _precision(given[0])
+    device = str(tensors[0].device)
+    inputs, states = tensors[: len(_INPUTS)], tensors[len(_INPUTS) :]
+    double, kinds = _precision(tensors[0])
     kernel = forces_kernel(double)
     fixed.ceiling(inputs[0])
 
@@ -321,7 +328,7 @@ def _launch_forces(
         return arguments.gradients() if backward else []
 
     kernel.module.load(wp.get_device(device))
-    return _summed(list(_in_parallel(work, _shares(outputs[0].shape[0], given[0].device))))
+    return _summed(list(_in_parallel(work, _shares(outputs[0].shape[0], tensors[0].device))))
 
 
 def _launch_summary(fixed: _Fixed, every: int, inputs: Sequence[Tensor], states: Sequence[Tensor]) -> Tensor:
@@ -336,8 +343,8 @@ def _launch_summary(fixed: _Fixed, every: int, inputs: Sequence[Tensor], states:
 
     def work(part: tuple[int, int]) -> None:
         first, count = part
-        given = [first, every, kinds.scalar(STEEP), *arguments.structs, result]
-        wp.launch(kernel, dim=(count, sums.shape[1]), inputs=given, device=device, record_tape=False)
+        values = [first, every, kinds.scalar(STEEP), *arguments.structs, result]
+        wp.launch(kernel, dim=(count, sums.shape[1]), inputs=values, device=device, record_tape=False)
 
     kernel.module.load(wp.get_device(device))
     _in_parallel(work, _shares(batch, inputs[0].device))
