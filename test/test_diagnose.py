@@ -47,7 +47,7 @@ from monoforce_ros.messages import decoding
 from monoforce_ros.perception import FlatTerrain
 from monoforce_ros.physics import State, rollout
 from monoforce_ros.prediction import Predictor
-from monoforce_ros.robots import RobotFileError, load_robot
+from monoforce_ros.robots import RobotFileError, load_robot, robot_file
 from monoforce_ros.robots.robot_copy import read_nominal_residual, write_robot
 from monoforce_ros.synthetic.hidden import parse_hidden
 from monoforce_ros.synthetic.odometry import OdometrySettings
@@ -319,6 +319,22 @@ def test_the_diagnosed_recording_is_not_held_out(late_again, tmp_path, capsys):
         assert status == 1
         assert "--held-out got the diagnosed recording" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_the_nominal_file_is_not_overwritten_and_a_stale_one_does_not_stay(late_robot, tmp_path, monkeypatch):
+    nominal = tmp_path / "husky.yaml"
+    nominal.write_text(robot_file("husky").read_text())
+    with pytest.raises(ValueError, match="the folder of the nominal robot file husky.yaml, expected another --out"):
+        diagnose_bag(late_robot, str(nominal), tmp_path)
+    with pytest.raises(ValueError, match="--held-out got a path that does not exist"):
+        diagnose_bag(late_robot, "husky", tmp_path / "out", held_out=[tmp_path / "nowhere"])
+    # A report without an effect must not stand beside a robot file of an earlier one.
+    stale = tmp_path / "out" / "husky.yaml"
+    stale.parent.mkdir()
+    stale.write_text(nominal.read_text())
+    monkeypatch.setattr(bag_diagnosis, "diagnose", lambda *_, **__: Diagnosis(Verdict.NO_DISCREPANCY))
+    assert diagnose_bag(late_robot, "husky", stale.parent).robot_file is None
+    assert not stale.exists() and (stale.parent / "husky.earlier.yaml").exists() and nominal.exists()
 
 
 def test_held_out_recordings_with_the_same_name_stay_apart(late_robot, late_again, tmp_path, monkeypatch):

@@ -189,3 +189,24 @@ def test_commands_of_both_types_are_decoded_and_nan_is_refused():
     assert decoding.decode_command(builders.twist_stamped(STAMP, "", 0.5, -0.1)).tolist() == [0.5, -0.1]
     with pytest.raises(MessageError, match="expected finite numbers"):
         decoding.decode_command(builders.twist(np.nan, 0.0))
+
+
+@pytest.mark.parametrize("name", ["jpeg", "png"])
+@pytest.mark.parametrize(("width", "height"), [(65_000, 65_000), (20_000, 20_000), (0, 5)])
+def test_a_few_bytes_that_claim_a_huge_picture_are_refused_before_it_is_decoded(name, width, height):
+    encoded = bytearray(cv2.imencode(f".{name}", np.zeros((8, 8, 3), np.uint8))[1].tobytes())
+    if name == "png":
+        encoded[16:24] = width.to_bytes(4, "big") + height.to_bytes(4, "big")
+    else:
+        frame = encoded.index(b"\xff\xc0")
+        encoded[frame + 5 : frame + 9] = height.to_bytes(2, "big") + width.to_bytes(2, "big")
+    with pytest.raises(MessageError, match=rf"image size: got {width} × {height}, expected 1 to"):
+        decoding.decode_image(builders.compressed_image(STAMP, "camera", name, bytes(encoded)))
+
+
+@pytest.mark.parametrize("name", ["jpeg", "png"])
+def test_images_of_any_size_keep_it(name):
+    picture = np.random.default_rng(1).integers(0, 255, (37, 53, 3), np.uint8)
+    for flags in ([], [cv2.IMWRITE_JPEG_PROGRESSIVE, 1] if name == "jpeg" else []):
+        data = cv2.imencode(f".{name}", picture, flags)[1].tobytes()
+        assert decoding.decode_image(builders.compressed_image(STAMP, "camera", name, data)).shape == (37, 53, 3)

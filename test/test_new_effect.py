@@ -75,8 +75,8 @@ from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import SmoothedMotion
 from monoforce_ros.core import CommandTrack, MotionTrack
-from monoforce_ros.discrepancy.diagnosis import Settings, diagnose
-from monoforce_ros.discrepancy.hypothesis import Evidence
+from monoforce_ros.discrepancy import DiagnosisSettings, Evidence, diagnose
+
 from monoforce_ros.effects import CATALOGUE, drive_speeds, identifiable_effects
 from monoforce_ros.effects.page import catalogue_page
 from monoforce_ros.physics import State, rollout
@@ -116,8 +116,8 @@ motion = MotionTrack(
 )
 commands = CommandTrack(10**9 + np.arange(len(twists)) * 10_000_000, twists)
 smoothed = SmoothedMotion(motion, 0.003, 0.002, (slice(0, len(motion)),))
-found = diagnose(Evidence(smoothed, commands), husky, settings=Settings(most_effects=1))
-result["named"] = [getattr(entry, "name", None) or entry["name"] for entry in found.effects]
+found = diagnose(Evidence(smoothed, commands), husky, settings=DiagnosisSettings(max_effects=1))
+result["named"] = [entry.name for entry in found.effects]
 result["tried"] = "side_wind" in str(found.candidates)
 print(json.dumps(result))
 """

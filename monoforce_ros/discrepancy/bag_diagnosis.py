@@ -16,6 +16,7 @@ from monoforce_ros.discrepancy.gap import noisy_motions
 from monoforce_ros.discrepancy.hypothesis import Effects, Evidence, corrected_evidence, window_starts
 from monoforce_ros.discrepancy.report import effect_entry, write_diagnosis
 from monoforce_ros.robots import RobotModel, fingerprint, load_robot, read_nominal_residual, write_robot
+from monoforce_ros.robots import robot_file as robot_file_of
 from monoforce_ros.terrain import Grid, load_terrain
 from monoforce_ros.training import split_maps
 
@@ -104,16 +105,21 @@ def diagnose_bag(
 
     Raises:
         BagError, TerrainError, TerrainFileError: required data are missing or damaged.
-        ValueError: a held-out recording is the diagnosed one, or too short.
+        ValueError: a held-out recording is the diagnosed one, missing or too short, or ``out`` holds the nominal file.
     """
     began = time.monotonic()
     model = load_robot(robot)
+    found_file = out / f"{model.name}.yaml"
+    if found_file.exists() and found_file.resolve() == robot_file_of(robot).resolve():
+        raise ValueError(f"{out}: got the folder of the nominal robot file {found_file.name}, expected another --out")
     progress(0.0, "reading")
     evidence, recording = read_evidence(bag, model, terrain, topics)
     data = fingerprint([bag])
     others = _distinct_names(held_out)
     for other in others.values():
-        if other.exists() and fingerprint([other]) == data:
+        if not other.exists():
+            raise ValueError(f"{other}: --held-out got a path that does not exist, expected a bag")
+        if fingerprint([other]) == data:
             raise ValueError(f"{other}: --held-out got the diagnosed recording {bag}, expected another recording")
     diagnosis = diagnose(
         evidence,
@@ -125,7 +131,10 @@ def diagnose_bag(
     robot_file = None
     if diagnosis.effects:
         effects = [effect_entry(effect) for effect in diagnosis.effects]
-        robot_file = write_robot(robot, out / f"{model.name}.yaml", effects, [bag], data)
+        robot_file = write_robot(robot, found_file, effects, [bag], data)
+    elif found_file.exists():
+        # Written by an earlier diagnosis: beside this report it would be mistaken for its result.
+        found_file.replace(found_file.with_suffix(".earlier.yaml"))
     if others:
         progress(0.97, "held-out recordings")
         tables = {

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from monoforce_ros.bags import BagError
 from monoforce_ros.discrepancy.bag_diagnosis import BagDiagnosis, Topics, diagnose_bag, read_evidence
@@ -19,6 +18,7 @@ from monoforce_ros.discrepancy.commissioning import commission
 from monoforce_ros.discrepancy.diagnosis import DiagnosisSettings
 from monoforce_ros.discrepancy.report import effect_entry, summary_lines
 from monoforce_ros.effects import EffectError
+from monoforce_ros.reporting import progress_bar
 from monoforce_ros.robots import RobotFileError, fingerprint, load_robot, shipped_robots, write_robot
 from monoforce_ros.terrain import TerrainError, TerrainFileError
 
@@ -103,7 +103,7 @@ def print_finding(found: BagDiagnosis) -> None:
 
 def _with_bar(bag: Path, out: Path, options: argparse.Namespace) -> BagDiagnosis:
     form = "{desc}: {percentage:3.0f}%|{bar}| [{elapsed}] {postfix}"
-    with tqdm(total=100, desc=bag.name, bar_format=form, disable=True if options.quiet else None, leave=False) as bar:
+    with progress_bar(100, label=bag.name, bar_format=form, quiet=options.quiet, leave=False) as bar:
 
         def progress(share: float, step: str) -> None:
             bar.set_postfix_str(step, refresh=False)
@@ -150,7 +150,7 @@ def _diagnose_many(options: argparse.Namespace) -> int:
     jobs = min(options.jobs, len(options.bags))
     with (
         ProcessPoolExecutor(jobs, mp_context=context) as pool,
-        tqdm(total=len(outs), desc="diagnose", unit="bag", disable=True if options.quiet else None, leave=False) as bar,
+        progress_bar(len(outs), label="diagnose", unit="bag", quiet=options.quiet, leave=False) as bar,
     ):
         running = {pool.submit(_run_alone, bag, out, options): bag for bag, out in zip(options.bags, outs, strict=True)}
         for done in as_completed(running):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import html
 import json
 from collections.abc import Iterable, Mapping
@@ -26,7 +25,7 @@ from monoforce_ros.discrepancy.figures import (
 from monoforce_ros.discrepancy.gap import Localisation, NoiseFloor
 from monoforce_ros.discrepancy.verdict import Losses, Verdict
 from monoforce_ros.effects import CATALOGUE
-from monoforce_ros.reporting import PAGE_STYLE, figure_png
+from monoforce_ros.reporting import card, definition_list, figure_png, page, picture, table
 
 _VERDICTS = {
     Verdict.EFFECT_FOUND: ("The model lacks a known effect.", "#0b6e4f"),
@@ -146,8 +145,8 @@ def summary_lines(diagnosis: Diagnosis) -> list[str]:
             if row.closed is not None:
                 change += f", {100 * row.closed:.0f} % of the reducible gap closed"
             lines.append(f"  {metric.split('_')[0]} error after 2 s, median, cross-validated: {change}")
-    for name, table in diagnosis.held_out.items():
-        row = table.get("position_2s")
+    for name, metrics in diagnosis.held_out.items():
+        row = metrics.get("position_2s")
         if row is not None and row.after is not None:
             lines.append(f"  held-out {name}: position error after 2 s {row.before:.3g} → {row.after:.3g} m")
         elif row is not None:
@@ -161,8 +160,7 @@ def _page(diagnosis: Diagnosis, inputs: Mapping[str, object], robot_file: Path |
     sentence, colour = _VERDICTS[diagnosis.verdict]
     remarks = "; ".join(diagnosis.remarks)
     parts = [
-        f"<h1>Diagnosis</h1><p class='lead' style='font-size:20px;color:{colour};margin-bottom:4px'>"
-        f"<b>{sentence}</b></p>"
+        f"<p class='lead' style='font-size:20px;color:{colour};margin-bottom:4px'><b>{sentence}</b></p>"
         f"<p class='lead'>{html.escape(remarks)}</p>",
     ]
     details = diagnosis.details
@@ -174,10 +172,11 @@ def _page(diagnosis: Diagnosis, inputs: Mapping[str, object], robot_file: Path |
         parts.append(_held_out_card(diagnosis))
     if details is not None and details.paths:
         parts.append(
-            _card(
-                "Predicted and measured paths",
-                f"{_image(paths_figure(details.paths))}<p class='muted'>Five seconds each, seen from above, the start "
-                "heading to the right; from the largest error down to the median.</p>",
+            card(
+                _image(paths_figure(details.paths), "predicted and measured paths from above"),
+                heading="Predicted and measured paths",
+                caption="Five seconds each, seen from above, the start heading to the right; from the largest error "
+                "down to the median.",
             )
         )
     if diagnosis.localisation or diagnosis.regimes:
@@ -185,25 +184,20 @@ def _page(diagnosis: Diagnosis, inputs: Mapping[str, object], robot_file: Path |
             f"{entry.text} (RMS {entry.rms:.3g} {entry.unit}, mean {entry.bias:+.2g} {entry.unit})"
             for entry in diagnosis.localisation[:5]
         )
-        figure = _image(regime_figure(diagnosis.regimes)) if diagnosis.regimes else ""
-        parts.append(_card("Where the error is largest", f"<ol>{items}</ol>{figure}"))
+        figure = _image(regime_figure(diagnosis.regimes), "error by motion regime") if diagnosis.regimes else ""
+        parts.append(card(f"<ol>{items}</ol>{figure}", heading="Where the error is largest"))
     if details is not None and details.compared:
-        parts.append(_card("On the map", _image(map_figure(details))))
-        parts.append(_card("Over time", _image(timeline_figure(details))))
+        parts.append(card(_image(map_figure(details), "errors on the map"), heading="On the map"))
+        parts.append(card(_image(timeline_figure(details), "errors over time"), heading="Over time"))
     if diagnosis.candidates:
-        parts.append(_card("Effects tested", _image(candidates_figure(diagnosis))))
+        parts.append(card(_image(candidates_figure(diagnosis), "gain of each effect"), heading="Effects tested"))
     if diagnosis.advice:
-        parts.append(_card("What to record next", f"<ul>{_list_items(diagnosis.advice)}</ul>"))
-    listed = "".join(
-        f"<dt>{html.escape(str(key))}</dt><dd>{html.escape(str(value))}</dd>" for key, value in inputs.items()
-    )
+        parts.append(card(f"<ul>{_list_items(diagnosis.advice)}</ul>", heading="What to record next"))
+    entries: dict[str, object] = dict(inputs)
     if robot_file is not None:
-        listed += f"<dt>robot file with the added effects</dt><dd>{html.escape(str(robot_file))}</dd>"
-    parts.append(_card("Inputs", f"<dl>{listed}</dl>"))
-    return (
-        "<!doctype html><html lang='en'><head><meta charset='utf-8'><title>Diagnosis</title>"
-        f"<style>{PAGE_STYLE}</style></head><body><main>{''.join(parts)}</main></body></html>"
-    )
+        entries["robot file with the added effects"] = robot_file
+    parts.append(card(definition_list(entries), heading="Inputs"))
+    return page("Diagnosis", "".join(parts))
 
 
 def _effects_card(diagnosis: Diagnosis) -> str:
@@ -221,11 +215,8 @@ def _effects_card(diagnosis: Diagnosis) -> str:
             )
     unknown = diagnosis.verdict == Verdict.UNKNOWN_EFFECT
     title = "Best formula for the error" if unknown else "Effects missing in the model"
-    return _card(
-        title,
-        "<table><tr><th>effect</th><th>parameter</th><th>value</th><th>95 % confidence interval</th>"
-        f"<th>indistinguishable from</th></tr>{''.join(rows)}</table>",
-    )
+    head = ("effect", "parameter", "value", "95 % confidence interval", "indistinguishable from")
+    return card(table(head, rows), heading=title)
 
 
 def _gap_card(diagnosis: Diagnosis) -> str:
@@ -237,11 +228,11 @@ def _gap_card(diagnosis: Diagnosis) -> str:
             f"<td>{row.before:.3g} {row.unit}</td>{_after_cells(row)}<td>{closed}</td></tr>"
         )
     note = f"{_CROSS_VALIDATED} " if diagnosis.fitted else ""
-    return _card(
-        "Prediction error",
-        f"{_image(gap_figure(diagnosis))}<table><tr><th>median error</th><th>noise floor</th><th>before</th>"
-        "<th>after</th><th>mean gain, 95 % interval</th><th>reducible gap closed</th></tr>"
-        f"{''.join(rows)}</table><p class='muted'>{note}The reducible gap is the error above the noise floor.</p>",
+    head = ("median error", "noise floor", "before", "after", "mean gain, 95 % interval", "reducible gap closed")
+    return card(
+        _image(gap_figure(diagnosis), "errors before and after") + table(head, rows),
+        heading="Prediction error",
+        caption=f"{note}The reducible gap is the error above the noise floor.",
     )
 
 
@@ -258,27 +249,22 @@ def _metric(metric: str, row: GapRow) -> str:
 
 
 def _held_out_card(diagnosis: Diagnosis) -> str:
-    rows = "".join(
+    rows = [
         f"<tr><td>{html.escape(name) if number == 0 else ''}</td><td>{_metric(metric, row)}</td>"
         f"<td>{row.before:.3g} {row.unit}</td>{_after_cells(row)}</tr>"
-        for name, table in diagnosis.held_out.items()
-        for number, (metric, row) in enumerate(table.items())
+        for name, metrics in diagnosis.held_out.items()
+        for number, (metric, row) in enumerate(metrics.items())
+    ]
+    return card(
+        table(("recording", "median error", "before", "after", "mean gain, 95 % interval"), rows),
+        heading="On held-out recordings",
+        caption="Nothing was fitted to or selected on these recordings.",
     )
-    return _card(
-        "On held-out recordings",
-        "<table><tr><th>recording</th><th>median error</th><th>before</th><th>after</th>"
-        f"<th>mean gain, 95 % interval</th></tr>{rows}</table>"
-        "<p class='muted'>Nothing was fitted to or selected on these recordings.</p>",
-    )
-
-
-def _card(title: str, content: str) -> str:
-    return f"<section class='card'><h2>{title}</h2>{content}</section>"
 
 
 def _list_items(texts: Iterable[str]) -> str:
     return "".join(f"<li>{html.escape(text)}</li>" for text in texts)
 
 
-def _image(figure: Figure) -> str:
-    return f"<img alt='' src='data:image/png;base64,{base64.b64encode(figure_png(figure)).decode()}'>"
+def _image(figure: Figure, alt: str) -> str:
+    return picture(figure_png(figure), alt=alt)

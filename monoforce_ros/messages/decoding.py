@@ -75,12 +75,36 @@ def _decode_compressed(message: Any) -> np.ndarray:
     data = np.frombuffer(message.data, np.uint8)
     if "compressedDepth" in message.format:
         raise MessageError(f"image format: got {message.format!r}, a depth image; expected a colour or grey image")
-    decoded = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+    size = _encoded_size(data.tobytes())
+    if size is not None and not 1 <= size[0] * size[1] <= MAXIMUM_IMAGE_PIXELS:
+        # A few bytes may claim a picture that no memory holds.
+        raise MessageError(f"image size: got {size[0]} × {size[1]}, expected 1 to {MAXIMUM_IMAGE_PIXELS} pixels")
+    decoded = cv2.imdecode(data, cv2.IMREAD_COLOR) if size is not None else None
     if decoded is None:
         raise MessageError(
             f"compressed image: {data.size} bytes of format {message.format!r} cannot be decoded, expected jpeg or png"
         )
     return cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB)
+
+
+def _encoded_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height that the header of a PNG or JPEG image states; None for other data."""
+    if data[:8] == b"\x89PNG\r\n\x1a\n" and len(data) >= 24:
+        width, height = struct.unpack(">II", data[16:24])
+        return width, height
+    if data[:2] != b"\xff\xd8":
+        return None
+    place = 2
+    while place + 9 <= len(data) and data[place] == 0xFF:
+        marker = data[place + 1]
+        if marker == 0xFF:  # padding
+            place += 1
+        elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # start of a frame (ITU T.81, table B.1)
+            height, width = struct.unpack(">HH", data[place + 5 : place + 9])
+            return width, height
+        else:
+            place += 2 + int.from_bytes(data[place + 2 : place + 4], "big")
+    return None
 
 
 def _decode_raw(message: Any) -> np.ndarray:

@@ -14,11 +14,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 from rosgraph_msgs.msg import Clock
-from tqdm import tqdm
 
 from monoforce_ros.bags import BagError, BagReader
 from monoforce_ros.core import share_directory
 from monoforce_ros.messages import message_class
+from monoforce_ros.reporting import progress_bar
 
 # Fast DDS 2 (Jazzy) reads the first, Fast DDS 3 the second.
 _PROFILES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
@@ -101,12 +101,12 @@ class BagPlayer(Node):
         stop = start + int(length * 1e9)
         published = 0
         began = time.monotonic()
-        bar = tqdm(
-            total=round(max(length, 0.0), 1),
+        bar = progress_bar(
+            round(max(length, 0.0), 1),
+            label="playing",
             unit="s",
-            desc="playing",
             bar_format="{desc} {percentage:3.0f}%|{bar}| {n:.1f}/{total:.1f} s",
-            disable=self.options.quiet or not sys.stderr.isatty(),
+            quiet=self.options.quiet,
         )
         with bar:
             for message in self.bag.messages(self.playable, start=start, stop=stop + 1):

@@ -8,6 +8,7 @@ from monoforce_ros.reporting.page import (
     figure_png,
     folded_list,
     page,
+    picture,
     picture_card,
     table,
 )
@@ -20,6 +21,7 @@ __all__ = [
     "figure_png",
     "folded_list",
     "page",
+    "picture",
     "picture_card",
     "progress",
     "progress_bar",

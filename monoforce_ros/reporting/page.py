@@ -6,8 +6,10 @@ import base64
 import html
 import io
 from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING
 
-from matplotlib.figure import Figure
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 PAGE_STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #1c2733; background: #f5f7f8; margin: 0; }
@@ -53,11 +55,14 @@ def card(body: str, *, heading: str = "", caption: str = "") -> str:
     return f'<section class="card">{top}{below}{body}</section>'
 
 
+def picture(png: bytes, *, alt: str) -> str:
+    """A picture embedded in the page."""
+    return f'<img alt="{html.escape(alt)}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'
+
+
 def picture_card(png: bytes, *, alt: str, heading: str = "", caption: str = "") -> str:
-    """A section with an embedded picture."""
-    data = base64.b64encode(png).decode()
-    picture = f'<img alt="{html.escape(alt)}" src="data:image/png;base64,{data}">'
-    return card(picture, heading=heading, caption=caption)
+    """A section with a picture."""
+    return card(picture(png, alt=alt), heading=heading, caption=caption)
 
 
 def definition_list(entries: Mapping[str, object]) -> str:

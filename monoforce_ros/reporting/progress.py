@@ -8,7 +8,7 @@ from typing import Never
 from tqdm import tqdm
 
 
-def progress[T](items: Iterable[T], *, label: str | None = None, unit: str = "it", quiet: bool = False) -> Iterable[T]:
+def progress[T](items: Iterable[T], *, label: str | None = None, unit: str = "it", quiet: bool = False) -> tqdm[T]:
     """The items, with a bar that advances as they are iterated over.
 
     Args:
@@ -27,6 +27,7 @@ def progress_bar(
     unit: str = "it",
     quiet: bool = False,
     leave: bool = True,
+    initial: float = 0,
     bar_format: str | None = None,
 ) -> tqdm[Never]:
     """A bar to be advanced by its method ``update``; a context manager that closes it.
@@ -37,9 +38,12 @@ def progress_bar(
         unit: name of one step, in the singular.
         quiet: never show the bar.
         leave: keep the finished bar on the terminal.
+        initial: steps that are done already.
         bar_format: layout, in tqdm's syntax.
     """
-    return tqdm(total=total, desc=label, unit=unit, disable=_disable(quiet), leave=leave, bar_format=bar_format)
+    return tqdm(
+        total=total, desc=label, unit=unit, disable=_disable(quiet), leave=leave, initial=initial, bar_format=bar_format
+    )
 
 
 def _disable(quiet: bool) -> bool | None:

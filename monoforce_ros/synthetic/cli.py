@@ -13,8 +13,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tqdm import tqdm
-
+from monoforce_ros.reporting import progress_bar
 from monoforce_ros.synthetic.random_streams import DEFAULT_SEED
 from monoforce_ros.synthetic.terrain_shape import GROUNDS
 
@@ -145,7 +144,7 @@ def _record_many(outs: list[Path], options: argparse.Namespace) -> int:
     context = multiprocessing.get_context("spawn")
     with (
         ProcessPoolExecutor(max(1, options.jobs), mp_context=context) as pool,
-        tqdm(total=len(outs), desc=options.out.name, unit="bag", disable=options.quiet) as bar,
+        progress_bar(len(outs), label=options.out.name, unit="bag", quiet=options.quiet) as bar,
     ):
         for done in as_completed([pool.submit(_record_one, *task) for task in tasks]):
             failed += done.result() != 0
@@ -211,8 +210,8 @@ def _record_one(out: Path, options: argparse.Namespace) -> int:
     try:
         settings = _settings(options)
         bar_format = "{desc}: {percentage:3.0f}%|{bar}| {n:.1f}/{total:.1f} s [{elapsed}<{remaining}]"
-        with tqdm(
-            total=options.duration, desc=out.name, bar_format=bar_format, disable=options.quiet, leave=False
+        with progress_bar(
+            options.duration, label=out.name, bar_format=bar_format, quiet=options.quiet, leave=False
         ) as bar:
             summary = record(out, settings, bar.update)
     except (DrawingError, RobotFileError, ValueError, OSError) as error:

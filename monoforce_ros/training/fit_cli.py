@@ -13,11 +13,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from monoforce_ros.bags import BagError, Recording, SmoothedMotion, smooth
 from monoforce_ros.core import write_bytes, write_text
-from monoforce_ros.reporting import figure_png
+from monoforce_ros.reporting import figure_png, progress
 from monoforce_ros.robots import RobotFileError, RobotModel, load_robot, shipped_robots
 from monoforce_ros.terrain import TerrainDefaults, TerrainError, save_terrain
 from monoforce_ros.training.fit_figure import fit_figure
@@ -158,7 +157,7 @@ def _fit_bag(
     if not starts:
         raise BagError(f"{bag}: got {(last - first) * 1e-9:.1f} s of odometry, expected {options.length:g} s or more")
     trajectories = []
-    bar = tqdm(starts, desc=bag.name, unit="trajectory", disable=True if options.quiet else None)
+    bar = progress(starts, label=bag.name, unit="trajectory", quiet=options.quiet)
     for index, start in enumerate(bar):
         name = f"{bag.name.removesuffix('.bag')}_{index:03d}"
         trajectories.append(_fit_one(name, recording, smoothed, robot, start, settings, options))

@@ -14,7 +14,6 @@ from typing import override
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from monoforce_ros.bags import BagError
 from monoforce_ros.core import write_text
@@ -27,6 +26,7 @@ from monoforce_ros.encoder import (
     load_encoder,
     new_encoder,
 )
+from monoforce_ros.reporting import progress, progress_bar
 from monoforce_ros.robots import RobotFileError, RobotModel, fingerprint, load_robot, shipped_robots, write_robot
 from monoforce_ros.training.losses import LossWeights
 from monoforce_ros.training.recording_samples import RecordingSamples, SamplesError, read_samples
@@ -280,7 +280,7 @@ def _samples(
     recordings = []
     settings = SampleSettings(period=options.period)
     folder = options.samples or options.out / "samples"
-    bar = tqdm(bags, desc=title, unit="bag", disable=True if options.quiet or not title or not bags else None)
+    bar = progress(bags, label=title, unit="bag", quiet=options.quiet or not title or not bags)
     with ProcessPoolExecutor(
         max(1, min(options.jobs, len(bags))),
         mp_context=multiprocessing.get_context("spawn"),
@@ -322,8 +322,7 @@ class _Log:
 
         self.trainer, self.logged = trainer, len(trainer.history)
         self.writer = SummaryWriter(str(out / "log"), purge_step=trainer.step) if trainer.process.first else None
-        self.bar = tqdm(total=steps, initial=trainer.step, desc="training", unit="step",
-                        disable=True if quiet else None)  # fmt: skip
+        self.bar = progress_bar(steps, initial=trainer.step, label="training", unit="step", quiet=quiet)
         # tqdm prints nothing without a terminal; log twenty lines instead.
         self.steps, self.lines = steps, 0 if quiet or sys.stderr.isatty() else max(1, steps // 20)
         self.smooth: float | None = None
