@@ -133,7 +133,7 @@ def diagnose_bag(
         effects = [effect_entry(effect) for effect in diagnosis.effects]
         robot_file = write_robot(robot, found_file, effects, [bag], data)
     elif found_file.exists():
-        # Written by an earlier diagnosis: beside this report it would be mistaken for its result.
+        # Rename the robot file of an earlier diagnosis, which would be mistaken for a result of this one.
         found_file.replace(found_file.with_suffix(".earlier.yaml"))
     if others:
         progress(0.97, "held-out recordings")

@@ -67,7 +67,7 @@ def build_parser() -> argparse.ArgumentParser:
         "--hide-random",
         type=int,
         metavar="SEED",
-        help="inject random faults: none, one, two, or one out-of-catalogue fault",
+        help="inject random faults: none, one or two of the catalogue, or an out-of-catalogue one",
     )
     shape = parser.add_mutually_exclusive_group()
     shape.add_argument(
