@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from monoforce_ros.physics import State, rollout
+from monoforce_ros.physics import PhysicsOptions, State, rollout
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainMap
 
@@ -159,3 +159,18 @@ def test_forces_of_every_fifth_step_are_those_of_all(backend):
     torch.testing.assert_close(gradient, expected, rtol=1e-9, atol=1e-9)
     with pytest.raises(ValueError, match="every 0 steps"):
         rollout(terrain, husky, speeds, state, backend=backend, force_every=0)
+
+
+@pytest.mark.parametrize("lookup", ["bilinear", "constant"])
+@pytest.mark.parametrize("backend", ["torch", "warp"])
+def test_a_trajectory_that_diverges_on_its_way_is_marked_and_leaves_the_others(backend, lookup):
+    robot, speeds, state = batch(2, 150, dtype=torch.float32)
+    # Torque that grows with the turn: explicit, and far beyond what a step can hold.
+    weights = {"torque_z:wz": torch.tensor([0.0, 2000.0]), "torque_z:1": torch.tensor([0.0, 50.0])}
+    wild = dataclasses.replace(robot, effects=(("learned_term", weights),))
+    options = PhysicsOptions(lookup=lookup)
+    result = rollout(bumps(0, torch.float32), wild, speeds, state, backend=backend, options=options)
+    calm = rollout(bumps(0, torch.float32), robot, speeds, state, backend=backend, options=options)
+    assert result.valid.tolist() == [True, False]
+    assert torch.equal(result.position[0], calm.position[0])
+    assert torch.isnan(result.position[1]).all()

@@ -8,7 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import BagWriter, builders
-from monoforce_ros.evaluation.check import BagCheck, check_bag, check_text
+from monoforce_ros.core import CommandTrack, MotionTrack
+from monoforce_ros.evaluation.check import BagCheck, check_bag, check_text, command_delay
 from monoforce_ros.evaluation.findings import Level
 from monoforce_ros.robots import load_robot
 
@@ -117,3 +118,20 @@ def test_the_exit_status_is_1_for_an_unusable_bag(tmp_path, executables, ros_env
     nothing = run(tmp_path / "nowhere")
     assert nothing.returncode == 1
     assert "does not exist" in nothing.stderr
+
+
+@pytest.mark.parametrize("yaw_gain", [1.0, 0.3, 0.05])
+def test_a_robot_that_turns_less_than_commanded_follows_its_commands(yaw_gain):
+    random = np.random.default_rng(7)
+    stamps = (10**9 + np.arange(1600) * 25_000_000).astype(np.int64)
+    twists = np.repeat(random.uniform([-0.5, -1.0], [0.9, 1.0], (40, 2)), 40, axis=0)
+    commands = CommandTrack(stamps, twists)
+    done = commands.sample(stamps - 200_000_000) * [1.0, yaw_gain]
+    done[:, 0] += 0.3 * random.standard_normal(len(done))
+    zeros = np.zeros((len(stamps), 3))
+    linear, angular = zeros.copy(), zeros.copy()
+    linear[:, 0], angular[:, 2] = done.T
+    motion = MotionTrack(stamps, zeros, np.tile([0.0, 0, 0, 1], (len(stamps), 1)), linear, angular)
+    delay, correlation = command_delay(motion, commands)
+    assert delay == pytest.approx(0.2, abs=0.03)
+    assert correlation > 0.6

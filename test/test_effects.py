@@ -333,3 +333,42 @@ def test_unknown_effects_parameters_and_values_out_of_bounds_are_named():
 
 def test_the_page_of_the_documents_is_what_the_code_says():
     assert (ROOT / "docs" / "effects.md").read_text() == catalogue_page()
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_a_value_for_each_trajectory_gives_what_each_value_gives_alone(husky, name):
+    """As many trajectories as drives, where a value that is broadcast along the wrong axis goes unnoticed."""
+    if CATALOGUE[name].stage == "measurement":
+        pytest.skip("measurement effects change recordings, not rollouts")
+    strong = ALL_STAGES[name]
+    milder = {
+        p.name: p.neutral if math.isinf(p.neutral) else 0.5 * (p.neutral + strong.get(p.name, p.neutral))
+        for p in CATALOGUE[name].parameters
+        if p.name in strong
+    }
+    time = torch.linspace(0, 1, 260, dtype=torch.float64)
+    twists = torch.stack([0.3 + 0.5 * time, 0.8 - time], dim=-1)[None]
+
+    def final(values, batch):
+        robot = having(husky, **{name: values})
+        speeds = drive_speeds(robot, twists.expand(batch, -1, -1), 0.01, history=200)
+        state = State.at_rest(husky.ground_clearance, batch=batch, dtype=torch.float64)
+        return rollout(grassy(), robot, speeds, state, backend="torch").position[:, -1]
+
+    both = {key: torch.tensor([strong[key], milder[key]], dtype=torch.float64) for key in strong}
+    alone = torch.cat([final(strong, 1), final(milder, 1)])
+    assert float((final(both, 2) - alone).abs().max()) < 1e-9
+    assert float((alone[0] - alone[1]).abs().max()) > 1e-6, "the values are too small to tell"
+    assert husky.number_of_drives == 2
+
+
+def test_every_effect_has_strong_values_to_be_tested_with():
+    acting = {name for name, effect in CATALOGUE.items() if effect.stage != "measurement"}
+    assert acting == set(ALL_STAGES), (
+        "add strong values of a new effect to STRONG, or to ALL_STAGES if it acts on commands"
+    )
+
+
+def test_an_effect_that_does_not_exist_is_named_before_anything_is_computed(husky):
+    with pytest.raises(EffectError, match="effect 'drive_gian' is unknown; expected one of"):
+        turned_effects(having(husky, drive_gian={"gain": 0.9}), torch.zeros(1))

@@ -46,7 +46,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from monoforce_ros.effects.effect import Effect, Parameter, Values
+from monoforce_ros.effects.effect import Effect, Parameter, Values, per_trajectory
 
 
 class SlowRight(Effect):
@@ -62,7 +62,7 @@ class SlowRight(Effect):
 
     def drive_speeds(self, speeds: Tensor, values: Values, time_step: float, offsets: Tensor) -> Tensor:
         right = (offsets < 0).to(speeds)
-        return speeds * (1.0 - values["share"] * right)
+        return speeds * (1.0 - per_trajectory(values["share"], 3) * right)
 '''
 
 SCRIPT = """
@@ -165,6 +165,7 @@ def test_a_new_file_is_found_by_catalogue_page_rollout_diagnosis_and_robot_files
     ("text", "words"),
     [
         (SLOW_RIGHT.replace("ORDER", ""), "SlowRight changes drive speeds but has no order"),
+        (SLOW_RIGHT.replace("ORDER", 'order = "65"'), "order: got '65', expected a whole number"),
         (SIDE_WIND.replace('stage = "body"', 'stage = "soul"'), "stage: got 'soul', expected one of"),
         (
             SIDE_WIND.replace('identified = ("force",)', 'identified = ("froce",)'),

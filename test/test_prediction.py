@@ -5,10 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+import yaml
+from conftest import ROOT
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.core import MotionState
-from monoforce_ros.perception import FlatTerrain, Observation, choose_terrain_source
+from monoforce_ros.perception import SOURCES, FlatTerrain, Observation, choose_terrain_source
 from monoforce_ros.perception.camera import encoder_threads
 from monoforce_ros.perception.fusion import apply_compliance
 from monoforce_ros.perception.ground_alignment import align_to_ground, clear_footprint
@@ -164,3 +166,8 @@ def test_the_encoder_has_its_own_number_of_threads_and_the_previous_one_is_resto
     assert torch.get_num_threads() == before
     with encoder_threads(None):
         assert torch.get_num_threads() == before
+
+
+def test_terrain_sources_are_those_that_the_node_offers():
+    schema = yaml.safe_load((ROOT / "config" / "predictor.yaml").read_text())
+    assert sorted(schema["terrain_source"]["choices"]) == sorted(SOURCES)

@@ -366,6 +366,8 @@ def test_the_loss_falls_and_the_checkpoint_loads(trained):
     assert described["settings"]["steps"] == 24 and list(described["recordings"]) == ["demo"]
     # The name in earlier releases is still written.
     assert described["drives"] == described["recordings"]
+    weights = described["settings"]["weights"]
+    assert weights["standing"] == weights["prominence"] and described["settings"]["vary"] is not None
 
 
 @pytest.mark.unhurried

@@ -138,7 +138,7 @@ def applied_setup(terrain: TerrainMap, robot: RobotModel) -> Setup:
 
 def turned_effects(robot: RobotModel, heading: Tensor) -> RobotModel:
     """The robot with effects expressed in frames yawed by ``heading`` ``[B]`` [rad] relative to the odometry frame."""
-    turned = tuple((name, CATALOGUE[name].turned(parameters, heading)) for name, parameters in robot.effects)
+    turned = tuple((name, _catalogued(name).turned(parameters, heading)) for name, parameters in robot.effects)
     return replace(robot, effects=turned) if robot.effects else robot
 
 

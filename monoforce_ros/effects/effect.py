@@ -132,6 +132,8 @@ class Effect(ABC):
         if self.stage not in STAGES:
             return f"stage: got {self.stage!r}, expected one of {STAGES}"
         changes_speeds = type(self).drive_speeds is not Effect.drive_speeds
+        if self.order is not None and not isinstance(self.order, int):
+            return f"order: got {self.order!r}, expected a whole number"
         if (changes_speeds or self.stage == "command") and self.order is None:
             return "changes drive speeds but has no order: set its position among the command effects"
         for label, keys in (("identified", self.identified), ("commissioning_start", tuple(self.commissioning_start))):

@@ -20,8 +20,10 @@ class TerrainSoftness(Effect):
 
     def setup(self, setup: Setup, values: Values) -> Setup:
         """The setup with this effect applied."""
-        terrain = setup.terrain
-        factor = per_trajectory(values["factor"], 3)
+        terrain, factor = setup.terrain, per_trajectory(values["factor"], 3)
+        if factor.ndim and terrain.batch_size is None:
+            # A value for each trajectory asks for a map of its own.
+            terrain = terrain.repeated(len(factor))
         return replace(
             setup, terrain=replace(terrain, stiffness=terrain.stiffness / factor, damping=terrain.damping / factor)
         )

@@ -190,13 +190,18 @@ def command_delay(motion: MotionTrack, commands: CommandTrack) -> tuple[float, f
     pieces = []
     for axis, values in enumerate((motion.linear_velocities[:, 0], motion.angular_velocities[:, 2])):
         measured = np.interp(seconds, times, values)
+        spread = float(measured.std())
+        # Both signals in units of one scale: a robot that turns at a third of what is commanded follows all the same,
+        # and an axis counts by how much it moves and is commanded to.
+        scale = np.sqrt(spread * float(commands.sample(stamps)[:, axis].std()))
 
-        def delayed(lag: float, axis: int = axis) -> tuple[np.ndarray, np.ndarray]:
+        def delayed(lag: float, axis: int = axis, scale: float = scale) -> tuple[np.ndarray, np.ndarray]:
             commanded = commands.sample(stamps - round(1e9 * lag))[:, axis]
+            own = float(commanded.std())
             # A nearly constant command carries no information about delay.
-            return commanded - commanded.mean(), np.full(len(stamps), commanded.std() > 0.02)
+            return (commanded - commanded.mean()) * scale / max(own, 1e-9), np.full(len(stamps), own > 0.02)
 
-        pieces.append((measured - measured.mean(), delayed))
+        pieces.append(((measured - measured.mean()) * scale / max(spread, 1e-9), delayed))
     correlation = DelayCorrelation.of(pieces, _LAGS)
     if not len(correlation) or correlation.values.max() <= 0.0:
         return float("nan"), 0.0

@@ -61,4 +61,8 @@ def choose_terrain_source(
     camera: TerrainSource = CameraTerrain(encoder, robot, threads)
     if retention_time:
         camera = TemporalMemory(camera, robot, stiffness=encoder.config.stiffness, retention_time=retention_time)
-    return camera if kind == "camera" else LidarCameraTerrain(LidarTerrain(robot, camera.grid, material), camera)
+    if kind == "camera":
+        return camera
+    if kind == "lidar_camera":
+        return LidarCameraTerrain(LidarTerrain(robot, camera.grid, material), camera)
+    raise ValueError(f"terrain source {kind!r} is listed in SOURCES, and choose_terrain_source has no branch for it")

@@ -82,7 +82,8 @@ class TerrainLookup:
         raw = (points[:, :2] - self._origin) / self._grid.resolution
         coordinate = torch.clamp(raw, self._zero, self._limit)
         # The last cell centre belongs to the previous square, so that the neighbours exist.
-        corner = torch.minimum(coordinate.detach().floor(), self._limit - 1.0)
+        # A trajectory that diverged has no cell; its NaN comes back through the fractions below.
+        corner = torch.minimum(torch.nan_to_num(coordinate.detach()).floor(), self._limit - 1.0)
         u, w = (coordinate - corner).unbind(1)
         column, row = corner.long().unbind(1)
         values = self._gather(self._corners + (row * self._grid.columns + column))
@@ -99,7 +100,7 @@ class TerrainLookup:
         return Ground(value[0], normal, *value[1:])
 
     def _constant(self, points: Tensor) -> Ground:
-        coordinate = (points[:, :2].detach() - self._origin) / self._grid.resolution
+        coordinate = torch.nan_to_num((points[:, :2].detach() - self._origin) / self._grid.resolution)
         column, row = torch.clamp(coordinate, self._zero, self._limit).round().long().unbind(1)
         value = self._gather(row * self._grid.columns + column)
         flat = torch.zeros_like(value[0])

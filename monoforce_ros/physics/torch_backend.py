@@ -44,7 +44,9 @@ def integrate(
         external = loads.at(rotation, velocity, angular_velocity, inertia)
         compliance = (jacobian * gain[:, None]) @ jacobian.transpose(1, 2)
         system = mass_matrix(inertia) + step_time * (compliance + external.drag[:, None, None] * linear_part)
-        change = torch.linalg.solve(system, step_time * (wrench + torch.cat([external.force, external.torque], -1)))
+        load = step_time * (wrench + torch.cat([external.force, external.torque], -1))
+        # Without error checks: a trajectory that diverged is marked invalid and must not end the others.
+        change = torch.linalg.solve_ex(system, load[..., None])[0][..., 0]
         velocity = velocity + change[:, :3]
         angular_velocity = angular_velocity + change[:, 3:]
         centre = centre + step_time * velocity

@@ -150,6 +150,11 @@ class TerrainMap:
             observed=self.observed | cells,
         )
 
+    def repeated(self, count: int) -> TerrainMap:
+        """This map ``count`` times as a batch, without a copy."""
+        channels = {name: getattr(self, name).expand(count, -1, -1) for name in (*CHANNELS, "observed")}
+        return replace(self, **channels)
+
     def to(self, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> TerrainMap:
         """The same map in another precision or on another device."""
         channels = {name: getattr(self, name).to(device=device, dtype=dtype) for name in CHANNELS}

@@ -338,13 +338,16 @@ class Trainer:
         return True
 
 
+_RENAMED_WEIGHTS = {"standing": "prominence", "standing_decrease": "prominent_decrease"}
+"""Loss weights by the names of earlier releases."""
+
+
 def _renamed(settings: dict) -> dict:
     """Saved settings of an earlier release under their names of today."""
     settings = {"augment" if name == "vary" else name: value for name, value in settings.items()}
-    old = {"standing": "prominence", "standing_decrease": "prominent_decrease"}
     weights = settings.get("weights")
     if isinstance(weights, dict):
-        settings["weights"] = {old.get(name, name): value for name, value in weights.items()}
+        settings["weights"] = {_RENAMED_WEIGHTS.get(name, name): value for name, value in weights.items()}
     return settings
 
 
@@ -376,9 +379,13 @@ def validate(encoder: Encoder, recordings: Sequence[RecordingSamples], device: t
 def describe(config: EncoderConfig, settings: TrainingSettings, recordings: Sequence[RecordingSamples]) -> dict:
     """Content of ``training.json``: configuration, settings and number of samples of each recording."""
     counts = {recording.name: len(recording) for recording in recordings}
+    current = asdict(settings)
+    # Also under the names of earlier releases.
+    current["vary"] = current["augment"]
+    current["weights"] |= {old: current["weights"][new] for old, new in _RENAMED_WEIGHTS.items()}
     return {
         "config": asdict(config),
-        "settings": asdict(settings),
+        "settings": current,
         "recordings": counts,
         "drives": counts,  # the name in earlier releases
     }
