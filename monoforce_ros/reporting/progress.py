@@ -28,6 +28,7 @@ def progress_bar(
     quiet: bool = False,
     leave: bool = True,
     initial: float = 0,
+    always: bool = False,
     bar_format: str | None = None,
 ) -> tqdm[Never]:
     """A bar to be advanced by its method ``update``; a context manager that closes it.
@@ -39,10 +40,17 @@ def progress_bar(
         quiet: never show the bar.
         leave: keep the finished bar on the terminal.
         initial: steps that are done already.
+        always: show the bar also where standard error is not a terminal, as in a log file.
         bar_format: layout, in tqdm's syntax.
     """
     return tqdm(
-        total=total, desc=label, unit=unit, disable=_disable(quiet), leave=leave, initial=initial, bar_format=bar_format
+        total=total,
+        desc=label,
+        unit=unit,
+        disable=quiet if always else _disable(quiet),
+        leave=leave,
+        initial=initial,
+        bar_format=bar_format,
     )
 
 

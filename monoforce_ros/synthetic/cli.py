@@ -144,7 +144,7 @@ def _record_many(outs: list[Path], options: argparse.Namespace) -> int:
     context = multiprocessing.get_context("spawn")
     with (
         ProcessPoolExecutor(max(1, options.jobs), mp_context=context) as pool,
-        progress_bar(len(outs), label=options.out.name, unit="bag", quiet=options.quiet) as bar,
+        progress_bar(len(outs), label=options.out.name, unit="bag", quiet=options.quiet, always=True) as bar,
     ):
         for done in as_completed([pool.submit(_record_one, *task) for task in tasks]):
             failed += done.result() != 0
@@ -211,7 +211,7 @@ def _record_one(out: Path, options: argparse.Namespace) -> int:
         settings = _settings(options)
         bar_format = "{desc}: {percentage:3.0f}%|{bar}| {n:.1f}/{total:.1f} s [{elapsed}<{remaining}]"
         with progress_bar(
-            options.duration, label=out.name, bar_format=bar_format, quiet=options.quiet, leave=False
+            options.duration, label=out.name, bar_format=bar_format, quiet=options.quiet, always=True, leave=False
         ) as bar:
             summary = record(out, settings, bar.update)
     except (DrawingError, RobotFileError, ValueError, OSError) as error:
