@@ -143,11 +143,15 @@ def _fit(times: np.ndarray, values: np.ndarray, rates: np.ndarray, noise: float 
     return float((residuals**2).sum()), freedom
 
 
+def _pieces(length: int) -> list[slice]:
+    """Pieces of a stretch, spread over it: the curvature weight of all of it follows from them."""
+    count = min(_PIECES, max(1, length // _PIECE))
+    return [slice(start, start + _PIECE) for start in np.linspace(0, max(0, length - _PIECE), count).astype(int)]
+
+
 def _penalty(times: np.ndarray, values: np.ndarray) -> float:
     """The curvature weight that best predicts left-out poses, from a few pieces of the stretch."""
-    count = min(_PIECES, max(1, len(times) // _PIECE))
-    starts = np.linspace(0, max(0, len(times) - _PIECE), count).astype(int)
-    pieces = [slice(start, start + _PIECE) for start in starts]
+    pieces = _pieces(len(times))
 
     def error(exponent: float) -> float:
         total = 0.0
@@ -165,17 +169,22 @@ def _penalty(times: np.ndarray, values: np.ndarray) -> float:
 
 
 def _with_noise(times: np.ndarray, values: np.ndarray, noise: float) -> BSpline:
-    """The smoothest curve whose residuals have the given standard deviation."""
+    """The smoothest curve whose residuals have the given standard deviation, judged on a few pieces of the stretch."""
+    pieces = _pieces(len(times))
 
     def excess(exponent: float) -> float:
-        return float(np.std(values - make_smoothing_spline(times, values, lam=10.0**exponent)(times)) - noise)
+        variances = [
+            np.var(values[piece] - make_smoothing_spline(times[piece], values[piece], lam=10.0**exponent)(times[piece]))
+            for piece in pieces
+        ]
+        return float(np.sqrt(np.mean(variances)) - noise)
 
     low, high = _EXPONENTS
     if excess(low) >= 0.0:
         return make_smoothing_spline(times, values, lam=10.0**low)
     if excess(high) <= 0.0:
         return make_smoothing_spline(times, values, lam=10.0**high)
-    return make_smoothing_spline(times, values, lam=10.0 ** brentq(excess, low, high, xtol=0.02))
+    return make_smoothing_spline(times, values, lam=10.0 ** brentq(excess, low, high, xtol=0.05))
 
 
 def _degrees(residuals: np.ndarray) -> float:

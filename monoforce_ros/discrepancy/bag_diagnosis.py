@@ -13,9 +13,11 @@ from monoforce_ros.bags import Recording, smooth
 from monoforce_ros.discrepancy.comparison import GapRow, compare, gap_table
 from monoforce_ros.discrepancy.diagnosis import Diagnosis, DiagnosisSettings, diagnose
 from monoforce_ros.discrepancy.gap import noisy_motions
+from monoforce_ros.discrepancy.ground import supporting_terrain
 from monoforce_ros.discrepancy.hypothesis import Effects, Evidence, corrected_evidence, window_starts
+from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.report import effect_entry, write_diagnosis
-from monoforce_ros.robots import RobotModel, fingerprint, load_robot, read_nominal_residual, write_robot
+from monoforce_ros.robots import RobotModel, fingerprint, load_robot, write_robot
 from monoforce_ros.robots import robot_file as robot_file_of
 from monoforce_ros.terrain import Grid, load_terrain
 from monoforce_ros.training import split_maps
@@ -77,7 +79,8 @@ def read_evidence(bag: Path, robot: RobotModel, terrain: str, topics: Topics = T
     columns, rows = np.ceil((high - low) / 0.1).astype(int) + 1
     grid = Grid(int(rows), int(columns), 0.1, (float(low[0]), float(low[1])))
     ground, parts = split_maps(recording, motion, robot, grid)
-    return replace(evidence, terrain=ground, odometry_from_terrain=np.eye(4), split_maps=parts), recording
+    ground, even, odd = (supporting_terrain(part, motion, robot) for part in (ground, *parts))
+    return replace(evidence, terrain=ground, odometry_from_terrain=np.eye(4), split_maps=(even, odd)), recording
 
 
 def diagnose_bag(
@@ -124,7 +127,7 @@ def diagnose_bag(
     diagnosis = diagnose(
         evidence,
         model,
-        nominal_residual=read_nominal_residual(robot, settings.samples),
+        nominal=NominalModel.read(robot, settings.samples),
         settings=settings,
         progress=progress,
     )

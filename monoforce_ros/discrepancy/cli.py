@@ -172,11 +172,8 @@ def _commission(options: argparse.Namespace) -> int:
     topics = Topics(options.odometry, options.commands, options.cloud)
     recordings = [read_evidence(bag, robot, options.terrain, topics)[0] for bag in options.bags]
     settings = DiagnosisSettings()
-    effects, nominal_residual = commission(recordings, robot, samples=settings.samples)
-    kept = {
-        "samples_s": list(settings.samples),
-        "residual_rms": [[float(f"{value:.4g}") for value in row] for row in nominal_residual],
-    }
+    effects, nominal = commission(recordings, robot, samples=settings.samples)
+    kept = nominal.entry(settings.samples)
     entries = [effect_entry(effect) for effect in effects]
     out = write_robot(
         options.robot, options.out / f"{robot.name}.yaml", entries, options.bags, fingerprint(options.bags), kept
@@ -184,7 +181,7 @@ def _commission(options: argparse.Namespace) -> int:
     for effect in effects:
         for key, parameter in effect.parameters.items():
             print(f"{effect.name}: {key} {parameter.value:.3g} {parameter.unit}")
-    along, across, heading = nominal_residual[-1]
+    along, across, heading = nominal.residual[-1]
     print(
         f"nominal residual RMS of the healthy robot after {settings.horizon:g} s: {100 * along:.1f} cm along, "
         f"{100 * across:.1f} cm across, {np.degrees(heading):.2f}° in heading"

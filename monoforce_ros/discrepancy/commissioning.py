@@ -2,24 +2,53 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from monoforce_ros.discrepancy.estimates import EffectEstimate
-from monoforce_ros.discrepancy.fit import Fit, estimate_effects, fit_effects, flat, with_values
-from monoforce_ros.discrepancy.gap import map_floor, noise_floor, noisy_motions, residual_scale
-from monoforce_ros.discrepancy.hypothesis import Effects, Evidence, Predictions, window_starts
+from monoforce_ros.discrepancy.fit import (
+    OUTLIER,
+    Fit,
+    estimate_effects,
+    first_values,
+    fit_effects,
+    flat,
+    jacobian,
+    robust,
+    with_values,
+)
+from monoforce_ros.discrepancy.gap import noise_floor, noisy_motions, residual_scale
+from monoforce_ros.discrepancy.ground import terrain_uncertainty
+from monoforce_ros.discrepancy.hypothesis import Effects, Evidence, EvidenceWindows, Predictions, window_starts
+from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.preflight import complaints
-from monoforce_ros.discrepancy.selection import blocks_of
-from monoforce_ros.effects import CATALOGUE
+from monoforce_ros.discrepancy.score_test import variation
+from monoforce_ros.discrepancy.selection import BLOCK, Search, blocks_of
+from monoforce_ros.effects import CATALOGUE, identifiable_effects
 from monoforce_ros.robots import RobotModel
 
 COMMISSIONED: Effects = tuple(
     (effect.name, dict(effect.commissioning_start)) for effect in CATALOGUE.values() if effect.commissioning_start
 )
 """Effects that every robot needs, with the values at which their fit starts."""
+_SEGMENT = 2 * BLOCK
+"""Length of the segments between which the healthy robot varies [s]: two blocks, so that most kinds of motion occur in
+each."""
+_FEWEST_SEGMENTS = 3
+_MOST_EFFECTS = 3
+"""Effects of the catalogue that commissioning adds to those that every robot needs."""
+
+
+@dataclass(frozen=True)
+class _Prepared:
+    """A recording of the healthy robot, cut into windows."""
+
+    data: EvidenceWindows
+    predictions: Predictions
+    floor: np.ndarray
+    """Residuals by noise and map, ``[W, K, 3]``."""
 
 
 def commission(
@@ -29,8 +58,12 @@ def commission(
     samples: Sequence[float] = (0.5, 1.0, 1.5, 2.0),
     stride: float = 0.5,
     progress: Callable[[float, str], None] = lambda share, step: None,
-) -> tuple[tuple[EffectEstimate, ...], np.ndarray]:
-    """Fit friction, effective track width and servo response to recordings of a healthy robot.
+) -> tuple[tuple[EffectEstimate, ...], NominalModel]:
+    """Fit to recordings of a healthy robot all that it takes to predict them.
+
+    Friction, effective track width and servo response are always fitted; of the other effects those that are
+    significant in more than half of the recordings. They are no faults: they become the nominal model, with which later
+    recordings are compared.
 
     Args:
         recordings: recordings of the healthy robot.
@@ -40,39 +73,133 @@ def commission(
         progress: called with the share of the work done and the next step.
 
     Returns:
-        the effects, and the nominal residual RMS ``[K, 3]`` at ``samples`` beyond the noise of the poses [m, m, rad].
+        the effects, and what remains: the residual beyond the noise of the poses, and how it varies.
 
     Raises:
         ValueError: a recording is not sufficient; the message says why.
     """
-    times = np.array(samples)
-    fits: list[Fit] = []
     prepared = []
     for number, evidence in enumerate(recordings):
-        progress(number / len(recordings), "commissioning")
-        smoothed = evidence.smoothed
-        starts = window_starts(smoothed.motion, smoothed.stretches, samples[-1], stride)
-        found = complaints(smoothed, evidence.commands, starts)
-        if found:
-            raise ValueError("; ".join(found))
-        data = evidence.cut(starts, times)
-        predictions = Predictions(robot, data)
-        floor = np.hypot(
-            noise_floor(smoothed.motion, noisy_motions(smoothed), data), map_floor(robot, data, evidence.split_maps)
-        )
-        # Blocks are roughly independent, windows within a block are not: the prior weighs as much as one block.
-        prior = 1.0 / len(np.unique(blocks_of(starts)))
-        scale = residual_scale(floor, None)
-        fits.append(fit_effects(predictions, [COMMISSIONED], scale, iterations=12, prior=prior))
-        prepared.append((predictions, floor))
+        progress(0.3 * number / len(recordings), "reading the noise")
+        prepared.append(_prepare(evidence, robot, np.array(samples), stride))
+    names = [name for name, _ in COMMISSIONED]
+    chosen = COMMISSIONED
+    fits = [_fitted(entry, chosen) for entry in prepared]
+    found: list[str] = []
+    for number, (entry, fit) in enumerate(zip(prepared, fits, strict=True)):
+        progress(0.3 + 0.4 * number / len(prepared), "searching for further effects")
+        found += _further(robot, entry, fit.effects)
+    further = [name for name in dict.fromkeys(found) if found.count(name) > 0.5 * len(prepared)]
+    if further:
+        chosen = (*chosen, *(first_values(CATALOGUE[name])[0][0] for name in further))
+        fits = [_fitted(entry, chosen) for entry in prepared]
     values = np.median([flat(fit.effects) for fit in fits], axis=0)
     merged = replace(fits[0], effects=with_values(fits[0].effects, values))
-    squares = []
-    for predictions, floor in prepared:
-        # With the values that go into the file, not with those of each recording.
-        residuals = np.nan_to_num(predictions.residuals([merged.effects])[0])
-        # Robust: single windows with a disturbance must not raise the nominal residual.
-        spread = np.quantile(np.abs(residuals), 0.68, axis=0)
-        squares.append(np.maximum(spread**2 - floor**2, 0.0))
+    progress(0.8, "variation between segments")
+    nominal = _nominal(prepared, merged.effects, [*names, *further])
     progress(1.0, "done")
-    return estimate_effects(merged, {}), np.sqrt(np.mean(squares, axis=0))
+    return estimate_effects(merged, {}), nominal
+
+
+def _prepare(evidence: Evidence, robot: RobotModel, samples: np.ndarray, stride: float) -> _Prepared:
+    smoothed = evidence.smoothed
+    starts = window_starts(smoothed.motion, smoothed.stretches, float(samples[-1]), stride)
+    found = complaints(smoothed, evidence.commands, starts)
+    if found:
+        raise ValueError("; ".join(found))
+    data = evidence.cut(starts, samples)
+    floor = np.hypot(
+        noise_floor(smoothed.motion, noisy_motions(smoothed), data),
+        terrain_uncertainty(robot, data, evidence.split_maps),
+    )
+    return _Prepared(data, Predictions(robot, data), floor)
+
+
+def _fitted(entry: _Prepared, effects: Effects) -> Fit:
+    # Blocks are roughly independent, windows within a block are not: the prior weighs as much as one block.
+    prior = 1.0 / len(np.unique(blocks_of(entry.data.starts)))
+    starts = [effects]
+    if len(effects) > len(COMMISSIONED):
+        # Every sign of the last effect: a fit may not cross neutral by itself.
+        name = effects[-1][0]
+        starts = [(*effects[:-1], start[0]) for start in first_values(CATALOGUE[name])]
+    return fit_effects(entry.predictions, starts, residual_scale(entry.floor, None), iterations=12, prior=prior)
+
+
+def _further(robot: RobotModel, entry: _Prepared, effects: Effects) -> list[str]:
+    """Names of the effects that one recording needs in addition."""
+    fitted = replace(robot, effects=tuple({**dict(robot.effects), **dict(effects)}.items()))
+    data = replace(entry.data, starts=entry.data.starts[::2])
+    predictions = Predictions(fitted, data)
+    floor = entry.floor[::2]
+    residuals = np.nan_to_num(predictions.residuals([()])[0])
+    spread = np.quantile(np.abs(residuals), 0.683, axis=0)
+    # Scaled by what is left, so that a recording is judged by its own size of errors.
+    scale = np.sqrt(residual_scale(floor, None) ** 2 + np.maximum(spread**2 - (floor**2).mean(axis=0), 0.0))
+    search = Search(fitted, data, scale, excluded=[name for name, _ in effects])
+    best = search.run(_MOST_EFFECTS).best
+    return list(best.names)
+
+
+def _nominal(prepared: Sequence[_Prepared], effects: Effects, fitted_names: Sequence[str]) -> NominalModel:
+    squares = []
+    residuals = []
+    for entry in prepared:
+        # With the values that go into the file, not with those of each recording.
+        residual = np.nan_to_num(entry.predictions.residuals([effects])[0])
+        residuals.append(residual)
+        # Robust: single windows with a disturbance must not raise the nominal residual.
+        spread = np.quantile(np.abs(residual), 0.683, axis=0)
+        squares.append(np.maximum(spread**2 - np.mean(entry.floor**2, axis=0), 0.0))
+    nominal = NominalModel(np.sqrt(np.mean(squares, axis=0)))
+    changes: dict[str, list[float]] = {}
+    losses, segments = [], []
+    for entry, residual in zip(prepared, residuals, strict=True):
+        scale = residual_scale(entry.floor, nominal)
+        starts = entry.data.starts
+        length = max(float(starts[-1] - starts[0]) * 1e-9 + entry.data.horizon, 1.0)
+        count = max(_FEWEST_SEGMENTS, round(length / _SEGMENT))
+        numbers = np.minimum(((starts - starts[0]) * count) // max(int(starts[-1] - starts[0]), 1), count - 1).astype(
+            int
+        )
+        scaled = residual / scale
+        window_losses = robust(scaled)
+        losses += [float(window_losses[numbers == number].mean()) for number in np.unique(numbers)]
+        segments.append(len(np.unique(numbers)))
+        weights = np.minimum(1.0, OUTLIER / np.maximum(np.abs(scaled), 1e-9))
+        metric = scale / nominal.scale
+        # A coefficient of a fitted effect does not count as fitted here: its change is the variation.
+        for name, columns, known in _directions(entry, effects, scale):
+            within = variation(scaled, weights, numbers, columns, known, metric)
+            if within is not None:
+                changes.setdefault(name, []).append(within)
+    return replace(
+        nominal,
+        variation={name: float(np.sqrt(np.mean(np.square(values)))) for name, values in changes.items()},
+        segments=sum(segments),
+        loss=float(np.exp(np.mean(np.log(losses)))),
+        loss_spread=float(np.std(np.log(losses), ddof=1)),
+    )
+
+
+def _directions(entry: _Prepared, effects: Effects, scale: np.ndarray) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Influence of every effect and of every term of a formula, with those of the fitted effects to project out."""
+    predictions = entry.predictions
+    base = predictions.residuals([effects])[0] / scale
+    rows = np.nan_to_num(jacobian(predictions, effects, base, scale, 0)).reshape(-1, *base.shape)
+    owners = [name for name, values in effects for _ in values]
+    for name in dict.fromkeys(owners):
+        own = np.array([owner == name for owner in owners])
+        yield name, rows[own], rows[~own]
+    search = Search(predictions.robot, entry.data, scale)
+    present = {name for name, _ in effects}
+    for effect in identifiable_effects():
+        if effect.name in present:
+            continue
+        starts = first_values(effect)
+        # The influence of an effect is not linear: the larger variation of two values counts.
+        for start in (starts[len(starts) // 2 - 1], starts[len(starts) // 2]):
+            direction = search.influence(effects, start[0])
+            yield effect.name, direction.columns, rows
+    for direction in search.formula_directions(effects):
+        yield direction.name, direction.columns, rows

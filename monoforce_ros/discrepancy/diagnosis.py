@@ -21,17 +21,17 @@ from monoforce_ros.discrepancy.comparison import (
     regime_table,
 )
 from monoforce_ros.discrepancy.estimates import EffectEstimate, ParameterEstimate
-from monoforce_ros.discrepancy.fit import estimate_effects
+from monoforce_ros.discrepancy.fit import Fit, estimate_effects
 from monoforce_ros.discrepancy.gap import (
     Localisation,
     NoiseFloor,
     find_regimes,
     localise,
-    map_floor,
     noise_floor,
     noisy_motions,
     residual_scale,
 )
+from monoforce_ros.discrepancy.ground import terrain_uncertainty
 from monoforce_ros.discrepancy.hypothesis import (
     Effects,
     Evidence,
@@ -40,9 +40,11 @@ from monoforce_ros.discrepancy.hypothesis import (
     subsampled,
     window_starts,
 )
+from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.preflight import advice, complaints
-from monoforce_ros.discrepancy.selection import BLOCK, CandidateScore, Search, Trial
-from monoforce_ros.discrepancy.verdict import Decision, Losses, Verdict, decide
+from monoforce_ros.discrepancy.selection import BLOCK, HEALTHY_LOSS, CandidateScore, Outcome, Search, Trial, paired
+from monoforce_ros.discrepancy.thresholds import Thresholds
+from monoforce_ros.discrepancy.verdict import Decision, Findings, Losses, Verdict, decide, fits
 from monoforce_ros.discrepancy.wheels import WheelFinding, compare_with_wheels
 from monoforce_ros.effects import CATALOGUE
 from monoforce_ros.robots import RobotModel
@@ -62,6 +64,7 @@ class DiagnosisSettings:
     max_windows: int = 120
     """A longer recording is subsampled to about as many, spread over all of it."""
     seed: int = 0
+    thresholds: Thresholds = field(default_factory=Thresholds)
 
 
 @dataclass(frozen=True)
@@ -72,7 +75,7 @@ class Details:
     before: np.ndarray
     """Residuals of the nominal model, ``[W, K, 3]`` [m, m, rad]."""
     floor: np.ndarray
-    """Noise floor, ``[K, 3]`` [m, m, rad]."""
+    """Residuals by noise and map, ``[K, 3]`` [m, m, rad]."""
     compared: tuple[Comparison, ...]
     paths: tuple[PathComparison, ...]
 
@@ -84,6 +87,8 @@ class Diagnosis:
     verdict: Verdict
     effects: tuple[EffectEstimate, ...] = ()
     """Effects to add to the model, the most important first; of an ``unknown_effect`` the formula, if it helps."""
+    known_parts: tuple[EffectEstimate, ...] = ()
+    """Of an ``unknown_effect``: effects of the catalogue that explain a part of it. They are not added to the model."""
     localisation: tuple[Localisation, ...] = ()
     gap: Mapping[str, GapRow] = field(default_factory=dict)
     """By metric, such as ``position_2s``."""
@@ -116,7 +121,7 @@ def diagnose(
     evidence: Evidence,
     robot: RobotModel,
     *,
-    nominal_residual: np.ndarray | None = None,
+    nominal: NominalModel | None = None,
     settings: DiagnosisSettings = DiagnosisSettings(),
     progress: Callable[[float, str], None] = lambda share, step: None,
 ) -> Diagnosis:
@@ -125,7 +130,7 @@ def diagnose(
     Args:
         evidence: motion, commands and ground.
         robot: the nominal model with the effects of its file.
-        nominal_residual: residual RMS of the healthy robot, ``[K, 3]`` at ``settings.samples`` [m, m, rad].
+        nominal: what commissioning learned, at ``settings.samples``; None for a robot that was never commissioned.
         settings: settings of the diagnosis.
         progress: called with the share of the work done and the next step.
     """
@@ -141,7 +146,11 @@ def diagnose(
     data = evidence.cut(starts, samples)
     progress(0.02, "noise floor")
     noisy = noisy_motions(smoothed, settings.seed)
-    floor = np.hypot(noise_floor(smoothed.motion, noisy, data), map_floor(robot, data, evidence.split_maps))
+    uncertainty = np.hypot(
+        noise_floor(smoothed.motion, noisy, data), terrain_uncertainty(robot, data, evidence.split_maps)
+    )
+    floor = np.sqrt((uncertainty**2).mean(axis=0))
+    thresholds = settings.thresholds
     gyro = compare_with_gyro(smoothed, evidence.gyro)
     wheels = None
     if not any(CATALOGUE[name].stage == "command" and name not in dict(COMMISSIONED) for name, _ in robot.effects):
@@ -150,17 +159,30 @@ def diagnose(
     search = Search(
         robot,
         data,
-        residual_scale(floor, nominal_residual),
+        residual_scale(uncertainty, nominal),
+        nominal=nominal,
         known=_measured_effects(gyro, wheels, robot),
         # The gyro measures the offset of the pose clock, or that there is none.
         excluded=() if gyro is None else ("pose_clock_offset",),
+        thresholds=thresholds,
+        seed=settings.seed,
         progress=_Steps(progress, 0.05, 0.85),
     )
     if gyro is not None and wheels is not None:
         _refine_clock(search, gyro)
     before = search.predictions.residuals([()])[0]
     outcome = search.run(settings.max_effects)
-    decision = decide(search, outcome)
+    findings = Findings(
+        outcome.nominal, outcome.best, outcome.fit,
+        healthy_loss=HEALTHY_LOSS if nominal is None else nominal.loss,
+        commissioned=nominal is not None and nominal.segments > 0,
+        known=search.known,
+    )  # fmt: skip
+    if not fits(findings, thresholds):
+        learned = search.learn(outcome.best.effects)
+        gain = paired(outcome.best.held_out_loss, learned.held_out_loss, data.starts, thresholds.comparison_rate)
+        findings = replace(findings, formula=learned, formula_gain=gain)
+    decision = decide(findings, thresholds)
     progress(0.88, "comparing before and after")
 
     def compared_with(trial: Trial | None) -> list[Comparison]:
@@ -176,12 +198,15 @@ def diagnose(
         else:
             compared = compared_with(decision.trial)
         gap = gap_table(compared, settings.seed)
+    known_parts: tuple[EffectEstimate, ...] = ()
+    if decision.parts is not None:
+        known_parts = _estimated(search, search.refit(decision.parts.effects), outcome)
     # Values for the robot's file are fitted to the whole recording.
     effects: tuple[EffectEstimate, ...] = ()
     fitted: Effects = ()
     if decision.trial is not None:
         whole = search.refit(decision.trial.effects)
-        estimates = estimate_effects(whole, outcome.indistinguishable)
+        estimates = _estimated(search, whole, outcome)
         fitted = whole.effects
         effects = tuple(_with_measured_interval(estimates[i], gyro, wheels) for i in search.ranked(whole))
     if gyro is not None and gyro.biased and _accepts_bias(decision, robot):
@@ -191,13 +216,14 @@ def diagnose(
     if wheels is not None and evidence.wheels is not None:
         decision = replace(decision, remarks=(*decision.remarks, wheels.summary()))
     at_horizon = next((comparison for comparison in compared if comparison.horizon == settings.horizon), None)
-    expected = np.hypot(floor, 0 if nominal_residual is None else nominal_residual)
+    expected = np.hypot(floor, 0 if nominal is None else nominal.residual)
     parts = None if decision.trial is None else decision.trial.parts
     paths = tuple(measured_paths(robot, data, parts))
     progress(1.0, "done")
     return Diagnosis(
         verdict=decision.verdict,
         effects=effects,
+        known_parts=known_parts,
         localisation=localise(before, expected, data, find_regimes(data)),
         gap=gap,
         noise_floor=NoiseFloor(float(samples[-1]), *(float(value) for value in floor[-1])),
@@ -209,6 +235,27 @@ def diagnose(
         losses=decision.losses,
         details=Details(data, before, floor, tuple(compared), paths),
     )
+
+
+def _estimated(search: Search, fit: Fit, outcome: Outcome) -> tuple[EffectEstimate, ...]:
+    """Estimates of a fit; those of sensors and clocks include what the robot's file says already."""
+    estimates = estimate_effects(
+        fit,
+        outcome.indistinguishable,
+        healthy_variances=search.healthy_variances(fit),
+        segments=0 if search.nominal is None else search.nominal.segments,
+        confidence=search.thresholds.confidence,
+    )
+    in_file = dict(search.robot.effects)
+    result = []
+    for estimate in estimates:
+        if CATALOGUE[estimate.name].stage == "measurement" and estimate.name in in_file:
+            # The recording was corrected by these values before the search.
+            added = {key: float(value) for key, value in in_file[estimate.name].items()}
+            shifted = {key: value.shifted(added.get(key, 0.0)) for key, value in estimate.parameters.items()}
+            estimate = replace(estimate, parameters=shifted)
+        result.append(estimate)
+    return tuple(result)
 
 
 def _measured_effects(gyro: GyroFinding | None, wheels: WheelFinding | None, robot: RobotModel) -> Effects:

@@ -19,6 +19,10 @@ class ParameterEstimate:
         """The same value with a symmetric interval."""
         return replace(self, low=self.value - half_width, high=self.value + half_width)
 
+    def shifted(self, amount: float) -> ParameterEstimate:
+        """Value and interval, all of them larger by an amount."""
+        return replace(self, value=self.value + amount, low=self.low + amount, high=self.high + amount)
+
 
 @dataclass(frozen=True)
 class EffectEstimate:

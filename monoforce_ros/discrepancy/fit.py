@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import t as student_distribution
 
 from monoforce_ros.core import huber
 from monoforce_ros.discrepancy.estimates import EffectEstimate, ParameterEstimate
@@ -30,6 +31,10 @@ class Fit:
     """Robust loss of each window, ``[W]``."""
     covariance: np.ndarray
     """Of the parameters in their order, ``[P, P]``."""
+    derivatives: np.ndarray | None = None
+    """Of the scaled residuals by each parameter that was fitted, in units of its typical size, ``[P, W, K, 3]``."""
+    blocks: int = 0
+    """Number of blocks from whose scores the covariance follows."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -115,13 +120,13 @@ def fit_effects(
     current, residual, loss = starts[best], tried[best], float(losses[best])
     fixed = sum(len(parameters) for _, parameters in current[:free])
     typical, values = scales(current), flat(current)
-    jacobian = None
+    rows = None
     for _ in range(iterations if fixed < len(values) else 0):
-        jacobian = _jacobian(predictions, current, residual, scale, fixed)
+        rows = jacobian(predictions, current, residual, scale, fixed)
         used = np.nan_to_num(residual).ravel()
         weight = np.minimum(1.0, OUTLIER / np.maximum(np.abs(used), 1e-9))
-        gradient = jacobian @ (weight * used)
-        curvature = (jacobian * weight) @ jacobian.T
+        gradient = rows @ (weight * used)
+        curvature = (rows * weight) @ rows.T
         if prior:
             # The loss is a mean over residuals, the sums here are not.
             gradient = gradient + prior * residual.size * ((values - neutral) / typical)[fixed:]
@@ -140,15 +145,24 @@ def fit_effects(
         current, residual, loss = candidates[best], tried[best], float(losses[best])
         values = flat(current)
     covariance = np.zeros((len(values), len(values)))
-    if jacobian is not None and jacobian.any():
-        covariance[fixed:, fixed:] = _covariance(jacobian, residual, typical[fixed:], predictions.data)
-    return Fit(current, robust(residual), covariance)
+    if rows is not None and rows.any():
+        covariance[fixed:, fixed:] = _covariance(rows, residual, typical[fixed:], predictions.data)
+    derivatives = None if rows is None else rows.reshape(-1, *residual.shape)
+    return Fit(current, robust(residual), covariance, derivatives, len(np.unique(_block_numbers(predictions.data))))
 
 
-def _jacobian(
+def jacobian(
     predictions: Predictions, current: Effects, residual: np.ndarray, scale: np.ndarray, fixed: int
 ) -> np.ndarray:
-    """Derivatives of the scaled residuals by each free parameter in units of its typical size, ``[P, W K 3]``."""
+    """Derivatives of the scaled residuals by each parameter in units of its typical size, ``[P, W K 3]``.
+
+    Args:
+        predictions: predictions for the recording's windows.
+        current: effects at whose values the derivatives are taken.
+        residual: their scaled residuals, ``[W, K, 3]``.
+        scale: expected size of a residual, ``[K, 3]`` or ``[W, K, 3]``.
+        fixed: number of leading parameters that are left out.
+    """
     values, typical = flat(current), scales(current)
     steps = 3e-2 * typical
     units = np.eye(len(values))
@@ -178,7 +192,7 @@ def _covariance(jacobian: np.ndarray, residual: np.ndarray, typical: np.ndarray,
     count = len(used)
     rows = jacobian.reshape(len(jacobian), count, -1)
     scores = np.einsum("pwk,wk->wp", rows, (weight * used).reshape(count, -1))
-    blocks = ((data.starts - data.starts[0]) // round(_BLOCK * 1e9)).astype(int)
+    blocks = _block_numbers(data)
     block_scores = np.array([scores[blocks == block].sum(axis=0) for block in np.unique(blocks)])
     information = np.einsum("pwk,qwk->pq", rows * weight.reshape(1, count, -1), rows)
     inverse = np.linalg.pinv(information + 1e-9 * np.eye(len(information)) * np.trace(information))
@@ -186,29 +200,49 @@ def _covariance(jacobian: np.ndarray, residual: np.ndarray, typical: np.ndarray,
     return small_sample * inverse @ (block_scores.T @ block_scores) @ inverse * np.outer(typical, typical)
 
 
+def _block_numbers(data: EvidenceWindows) -> np.ndarray:
+    return ((data.starts - data.starts[0]) // round(_BLOCK * 1e9)).astype(int)
+
+
 def first_values(effect: Effect) -> list[Effects]:
     """Starts over the range where an effect is typically found, its neutral value excepted."""
     return [((effect.name, values),) for values in effect.first_values()]
 
 
-def estimate_effects(fit: Fit, indistinguishable: Mapping[str, Sequence[str]]) -> tuple[EffectEstimate, ...]:
-    """Fitted effects with 95 % confidence intervals.
+def estimate_effects(
+    fit: Fit,
+    indistinguishable: Mapping[str, Sequence[str]],
+    *,
+    healthy_variances: np.ndarray | None = None,
+    segments: int = 0,
+    confidence: float = 0.95,
+) -> tuple[EffectEstimate, ...]:
+    """Fitted effects with confidence intervals.
 
     Args:
         fit: its covariance gives the intervals.
         indistinguishable: for each effect, others that explain the recording about as well.
+        healthy_variances: variance of each parameter on the healthy robot, ``[P]``: the model's own error, which no
+            residual of this recording shows.
+        segments: number of healthy segments from which they were estimated.
+        confidence: of the intervals.
     """
-    deviations = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
+    sampling = np.maximum(np.diag(fit.covariance), 0.0)
+    healthy = np.zeros_like(sampling) if healthy_variances is None else healthy_variances
+    total = sampling + healthy
+    # Welch and Satterthwaite: degrees of freedom of a sum of estimated variances.
+    parts = sampling**2 / max(fit.blocks - len(sampling), 1) + healthy**2 / max(segments, 1)
+    degrees = np.where(parts > 0, total**2 / np.maximum(parts, 1e-300), np.inf)
+    half_widths = student_distribution.ppf(0.5 + 0.5 * confidence, np.maximum(degrees, 1.0)) * np.sqrt(total)
     estimates, at = [], 0
     for name, parameters in fit.effects:
         known = {p.name: p for p in CATALOGUE[name].parameters}
         listed = {}
         for key, value in parameters.items():
-            half_width = 1.96 * float(deviations[at])
             listed[key] = ParameterEstimate(
                 value=float(value),
-                low=float(max(value - half_width, known[key].low)),
-                high=float(min(value + half_width, known[key].high)),
+                low=float(max(value - half_widths[at], known[key].low)),
+                high=float(min(value + half_widths[at], known[key].high)),
                 unit=known[key].unit,
             )
             at += 1

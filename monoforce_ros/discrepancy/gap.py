@@ -10,16 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import SmoothedMotion, smooth
 from monoforce_ros.core import MotionTrack, motion_regimes, wrap_angle
-from monoforce_ros.discrepancy.hypothesis import EvidenceWindows, Predictions, sample_motion
-from monoforce_ros.robots import RobotModel
-from monoforce_ros.terrain import TerrainMap
+from monoforce_ros.discrepancy.hypothesis import EvidenceWindows, sample_motion
+from monoforce_ros.discrepancy.nominal import SMALLEST, NominalModel
 
 _NOISE_DRAWS = 3
-_KNOWN_SHAPE = 0.5
-"""Share of the ground's influence on the motion that predictions reproduce: the rest is their error on the true heights
-of MuJoCo's hills."""
-_SMALLEST = np.array([0.01, 0.01, np.radians(0.3)])
-"""Residuals below this are insignificant even on noise-free data [m, m, rad]."""
 
 
 @dataclass(frozen=True)
@@ -103,28 +97,6 @@ def noise_floor(motion: MotionTrack, noisy: Sequence[MotionTrack], data: Evidenc
     return np.quantile(np.abs(noise_residuals(motion, noisy, data)), 0.683, axis=0)
 
 
-def map_floor(robot: RobotModel, data: EvidenceWindows, split_maps: tuple[TerrainMap, TerrainMap] | None) -> np.ndarray:
-    """Residuals that errors of the terrain map cause, even with a perfect robot model, ``[K, 3]`` [m, m, rad].
-
-    It has two parts. Predictions on the split maps, from every other sweep each, differ by twice the effect of the
-    whole map's noise. And only the share ``_KNOWN_SHAPE`` of the hills' influence, the difference to predictions on
-    level ground, is taken as known, because a map has cells and tyres deform. Zero on level ground.
-    """
-    if data.terrain is None:
-        return np.zeros((len(data.samples), 3))
-
-    def spread(one: TerrainMap | None, other: TerrainMap | None) -> np.ndarray:
-        moves = [
-            np.nan_to_num(Predictions(robot, replace(data, terrain=ground)).residuals([()])[0])
-            for ground in (one, other)
-        ]
-        # Robust: a single window with a spurious step under a wheel must not raise the floor of all others.
-        return np.quantile(np.abs(moves[0] - moves[1]), 0.68, axis=0)
-
-    shape = (1.0 - _KNOWN_SHAPE) * spread(data.terrain, None)
-    return shape if split_maps is None else np.hypot(shape, 0.5 * spread(*split_maps))
-
-
 def relative_motion(motion: MotionTrack, data: EvidenceWindows) -> np.ndarray:
     """Motion since the start of each window, in the frame of the start pose, ``[W, K, 3]`` [m, m, rad]."""
     stamps = data.starts[:, None] + np.rint(np.r_[0.0, data.samples] * 1e9).astype(np.int64)
@@ -136,11 +108,11 @@ def relative_motion(motion: MotionTrack, data: EvidenceWindows) -> np.ndarray:
     return np.concatenate([moved[..., :2], turned[..., None]], axis=-1)
 
 
-def residual_scale(floor: np.ndarray, nominal_residual: np.ndarray | None) -> np.ndarray:
-    """Expected size of a residual, ``[K, 3]``: noise, and the nominal residual RMS of the healthy robot."""
-    squares = floor**2 + _SMALLEST**2
-    if nominal_residual is not None:
-        squares = squares + nominal_residual**2
+def residual_scale(floor: np.ndarray, nominal: NominalModel | None) -> np.ndarray:
+    """Expected size of a residual by noise, map and the healthy robot's own error, like ``floor`` ``[..., K, 3]``."""
+    squares = floor**2 + SMALLEST**2
+    if nominal is not None:
+        squares = squares + nominal.residual**2
     return np.sqrt(squares)
 
 
@@ -179,7 +151,7 @@ def localise(
     horizon = float(data.samples[-1])
     names = (("along-track error", "m"), ("cross-track error", "m"), ("heading error", "rad"))
     squares = residuals[:, -1] ** 2
-    scaled = squares.mean(axis=0) / (floor[-1] ** 2 + _SMALLEST**2)
+    scaled = squares.mean(axis=0) / (floor[-1] ** 2 + SMALLEST**2)
     entries = []
     for axis, (name, unit) in enumerate(names):
         total = squares[:, axis].sum()

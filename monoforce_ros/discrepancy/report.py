@@ -60,6 +60,7 @@ def report_content(diagnosis: Diagnosis, inputs: Mapping[str, object], robot_fil
     return {
         "verdict": str(diagnosis.verdict),
         "effects": [effect_entry(effect) for effect in diagnosis.effects],
+        "known_parts": [effect_entry(effect) for effect in diagnosis.known_parts],
         "localisation": [_localisation_entry(entry) for entry in diagnosis.localisation],
         "gap": _gap_entries(diagnosis.gap),
         "noise_floor": _noise_entries(diagnosis.noise_floor),
@@ -112,7 +113,7 @@ def _loss_entries(losses: Losses | None) -> dict[str, float]:
         "loss_of_a_healthy_robot": losses.healthy,
         "share_explained": losses.share_explained,
         "loss_by_formula": losses.by_formula,
-        "share_by_drift": losses.share_by_drift,
+        "p_rest": losses.p_rest,
     }
     return {key: value for key, value in entries.items() if value is not None}
 

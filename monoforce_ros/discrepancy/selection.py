@@ -1,41 +1,49 @@
-"""Selection: which effects explain a recording, by two-fold cross-validation over blocks.
+"""Selection: which effects explain a recording.
 
-Every effect is screened by a quick fit; the most promising ones are fitted on every other block and judged by their
-loss on the remaining blocks. Effects are added one at a time while they reduce the held-out loss enough; then each is
-tested again in the presence of the others, and may be dropped or replaced. The folds that judge the effects also select
-them, so the loss of the selected effects is somewhat optimistic.
+Every effect is screened by a quick fit. Its influence on the residuals is then tested against the null distribution of
+the strongest of all candidates on this very recording (:mod:`score_test`). Of the significant ones the best is the one
+with the smallest held-out loss, by two-fold cross-validation over blocks. Effects are added one at a time while a
+further one is significant in the presence of the others; then each is tested again, and may be dropped or replaced.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.stats import wilcoxon
+from scipy.stats import t as student_distribution
 
-from monoforce_ros.discrepancy.fit import Fit, first_values, fit_effects, robust, without
+from monoforce_ros.discrepancy.fit import (
+    OUTLIER,
+    Fit,
+    first_values,
+    fit_effects,
+    flat,
+    jacobian,
+    robust,
+    scales,
+    without,
+)
 from monoforce_ros.discrepancy.hypothesis import Effects, EvidenceWindows, Predictions
 from monoforce_ros.discrepancy.learned import learned_terms
+from monoforce_ros.discrepancy.nominal import NominalModel
+from monoforce_ros.discrepancy.score_test import Direction, ScoreResult, block_numbers, score_tests
+from monoforce_ros.discrepancy.thresholds import Thresholds
 from monoforce_ros.effects import CATALOGUE, Effect, identifiable_effects, separating_sensor
 from monoforce_ros.robots import RobotModel
 
 HEALTHY_LOSS = 0.5
 """Robust loss of residuals as large as their scale: half the square of a standard deviation."""
-SMALLEST_GAIN = 0.05
-"""Smallest gain of an added effect, as a share of the loss before."""
-SMALLEST_STEP = 0.15
-"""Smallest gain of an added effect, absolute: three tenths of a healthy robot's loss."""
 _FOLDS = 2
 BLOCK = 8.0
 """Length of the blocks that are held out together [s]: longer than a window."""
-_ALPHA = 0.01
-"""Significance level of one effect's gain; most of the guard against false alarms is the smallest gain."""
-_JUDGED = 5
+_JUDGED = 6
+"""Significant effects that are cross-validated in one round, those with the smallest screening loss first."""
 _ALTERNATIVES = 2
-_LATER_GAIN = 0.1
-"""Smallest gain of a further effect, as a share of the unexplained loss while that is large, else of the loss that was
-to be explained: a small remainder is due to the simulator more often than to the robot."""
+"""Combinations that do not begin with the best single effect and are tried where that one leads to no good fit."""
+_SMALLEST_SECANT = 0.1
+"""Smallest distance from neutral, in typical sizes, at which the influence of one of several parameters is taken."""
 
 
 @dataclass(frozen=True)
@@ -70,9 +78,20 @@ class CandidateScore:
     gain: float
     """Reduction of the loss: held out where ``judged``, else of the screening fit."""
     p: float
-    """One-sided p-value of the gain over blocks; 1 where it was not judged."""
+    """p-value of the effect, adjusted for all candidates of the round."""
     judged: bool
     """Whether the candidate was cross-validated."""
+
+
+@dataclass(frozen=True)
+class FitTest:
+    """Whether what effects leave unexplained looks like a healthy robot."""
+
+    p: float
+    """Smallest adjusted p-value."""
+    strongest: str
+    """What the residuals contain most significantly."""
+    tests: tuple[ScoreResult, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -82,8 +101,10 @@ class Outcome:
     nominal: Trial
     best: Trial
     """The nominal trial where no effect was added."""
-    tried: tuple[CandidateScore, ...]
-    indistinguishable: dict[str, list[str]]
+    fit: FitTest
+    """Of the best trial."""
+    tried: tuple[CandidateScore, ...] = ()
+    indistinguishable: Mapping[str, Sequence[str]] = field(default_factory=dict)
     """By selected effect: others that explain the recording about as well in its place."""
 
 
@@ -94,21 +115,35 @@ def folds_of(starts: np.ndarray) -> np.ndarray:
 
 def blocks_of(starts: np.ndarray) -> np.ndarray:
     """Number of the half block in which each window starts."""
-    return ((starts - starts[0]) // round(0.5 * BLOCK * 1e9)).astype(int)
+    return block_numbers(starts, 0.5 * BLOCK)
 
 
-def paired(before: np.ndarray, after: np.ndarray, starts: np.ndarray, seed: int = 0) -> tuple[float, float, float]:
-    """Mean gain, its one-sided 95 % lower bound, and the p-value of Wilcoxon's signed-rank test over blocks."""
+def paired(
+    before: np.ndarray, after: np.ndarray, starts: np.ndarray, rate: float, seed: int = 0
+) -> tuple[float, float]:
+    """Mean gain of a trial over another one, and its lower bound at a one-sided error rate (bootstrap over blocks)."""
     blocks = blocks_of(starts)
     numbers = np.unique(blocks)
     # Clipped, so that a few windows that no effect explains do not dominate.
     difference = np.clip(before - after, -50.0, 50.0)
     sums = np.array([difference[blocks == block].sum() for block in numbers]) / len(starts)
-    gain = float(sums.sum())
     picked = np.random.default_rng(seed).integers(0, len(sums), (2000, len(sums)))
-    # By ranks: a gain in all blocks counts, even where it is much larger in a few of them.
-    chance = float(wilcoxon(sums, alternative="greater").pvalue) if np.abs(sums).max() > 1e-12 else 1.0
-    return gain, float(np.quantile(sums[picked].sum(axis=1), 0.05)), chance
+    return float(sums.sum()), float(np.quantile(sums[picked].sum(axis=1), rate))
+
+
+@dataclass(frozen=True)
+class _Screened:
+    """A candidate after its quick fit."""
+
+    effects: Effects
+    """With the base's effects before it."""
+    loss: float
+    """On the subsampled windows."""
+    test: ScoreResult
+
+    @property
+    def name(self) -> str:
+        return self.effects[-1][0]
 
 
 class Search:
@@ -117,9 +152,11 @@ class Search:
     Args:
         robot: robot with the effects of its file.
         data: the recording's windows.
-        scale: expected size of a residual, ``[K, 3]``.
+        scale: expected size of a residual, ``[W, K, 3]``.
+        nominal: what commissioning learned; None for a robot that was never commissioned.
         known: effects that another sensor measured: they always act and keep their values.
         excluded: effects that another sensor rules out.
+        thresholds: error rates.
         progress: called with a description of the next step.
     """
 
@@ -129,16 +166,23 @@ class Search:
         data: EvidenceWindows,
         scale: np.ndarray,
         *,
+        nominal: NominalModel | None = None,
         known: Effects = (),
         excluded: Sequence[str] = (),
+        thresholds: Thresholds = Thresholds(),  # noqa: B008
+        seed: int = 0,
         progress: Callable[[str], None] = lambda step: None,
     ):
-        self.robot, self.data, self.scale = robot, data, scale
+        self.robot, self.data, self.nominal, self.thresholds = robot, data, nominal, thresholds
+        self.scale = np.broadcast_to(scale, (len(data.starts), len(data.samples), 3))
         self.known = known
         self.predictions = Predictions(robot, data)
-        self._progress = progress
+        self._seed, self._progress = seed, progress
         starts = data.starts
         self._coarse = Predictions(robot, replace(data, starts=starts[::2]))
+        self._coarse_scale = self.scale[::2]
+        self._blocks = block_numbers(starts, thresholds.block)
+        self._metric = 1.0 if nominal is None else self.scale / nominal.scale
         folds = folds_of(starts)
         # A window that reaches into the next block shares motion with windows of the held-out fold.
         ends = folds_of(np.r_[starts[0], starts + round(data.horizon * 1e9)])[1:]
@@ -150,65 +194,60 @@ class Search:
             self._split.append(
                 (
                     Predictions(robot, replace(data, starts=starts[fitted])),
+                    self.scale[fitted],
                     Predictions(robot, replace(data, starts=starts[folds == held_out])),
                     folds == held_out,
                 )
             )
         self._own = dict(robot.effects)
-        # The recording is already corrected for measurement effects in the file; a second one would add to them.
-        self._taken = {name for name in self._own if CATALOGUE[name].stage == "measurement"} | set(excluded)
+        self._excluded = set(excluded)
+        self._fits: dict[tuple[str, ...], Fit] = {}
 
     def run(self, most_effects: int) -> Outcome:
-        """Add effects while they reduce the loss enough, then test each in the presence of the others."""
+        """Add effects while a further one is significant, then test each in the presence of the others."""
         nominal = Trial((), ((),) * _FOLDS, self.loss_of(()))
         start = nominal
         if self.known:
             start = Trial(self.known, (self.known,) * _FOLDS, self.loss_of(self.known))
-            if start.loss > nominal.loss + SMALLEST_STEP:
+            _, low = self._gain(start, nominal)
+            if low > 0:
                 # The motion contradicts the measurement of the other sensor.
                 self.known, start = (), nominal
-        judged, tried = self._round(start, 1)
-        found = self._preferred(judged, start) if judged else None
-        if found is None or not self._pays(start, found, nominal):
-            return Outcome(nominal, start, tuple(tried), {})
-        indistinguishable = {found.names[-1]: self._indistinguishable(found, judged)}
-        best, listed = self._extended(found, nominal, most_effects)
+        judged, tried = self._round(start, 1, nominal, self.thresholds.effect_rate)
+        if not judged:
+            return Outcome(nominal, start, self.fit_test(start), tuple(tried))
+        best, listed = self._extended(self._preferred(judged), nominal, most_effects)
         tried += listed
-        others = [trial for trial in judged if trial is not found and self._pays(start, trial, nominal)]
-        for other in others[:_ALTERNATIVES]:
+        fit = self.fit_test(best)
+        for other in [trial for trial in judged if trial.names[-1] not in best.names][:_ALTERNATIVES]:
             # The effect that explains most alone need not be part of the best combination.
-            if best.loss < 3 * HEALTHY_LOSS or most_effects < 2:
+            if fit.p > self.thresholds.fit_rate or most_effects < 2:
                 break
             extended, listed = self._extended(other, nominal, most_effects)
             tried += listed
-            gain, low, _ = self._gain(best, extended)
-            if low > 0 and gain > _LATER_GAIN * (nominal.loss - HEALTHY_LOSS):
-                best = extended
-        if len(best.effects) > 1 + len(self.known):
-            best, indistinguishable = self._exchanged(best)
-        return Outcome(nominal, best, tuple(tried), indistinguishable)
+            gain, low = self._gain(best, extended)
+            if low > 0 and gain > self.thresholds.smallest_share * nominal.loss:
+                best, fit = extended, self.fit_test(extended)
+        exchanged, indistinguishable = self._exchanged(best)
+        if exchanged is not best:
+            best, fit = exchanged, self.fit_test(exchanged)
+        return Outcome(nominal, best, fit, tuple(tried), indistinguishable)
 
     def _extended(self, best: Trial, nominal: Trial, most_effects: int) -> tuple[Trial, list[CandidateScore]]:
-        """Add effects one at a time while each reduces the loss enough."""
+        """Add effects one at a time while a further one is significant."""
         tried: list[CandidateScore] = []
         for step in range(1, most_effects):
-            if best.loss < HEALTHY_LOSS:
-                # The remaining loss is that of a healthy robot.
-                break
-            judged, listed = self._round(best, step + 1)
+            judged, listed = self._round(best, step + 1, nominal, self.thresholds.further_rate)
             tried += listed
             if not judged:
                 break
-            found = self._preferred(judged, best)
-            if not self._pays(best, found, nominal):
-                break
-            best = self._pruned(found, nominal)
+            best = self._pruned(self._preferred(judged))
         return best, tried
 
     def learn(self, base: Effects = (), most: int = 3) -> Trial:
         """The sparse formula that best explains the residuals left by ``base``, with one to ``most`` terms.
 
-        A further term must reduce the held-out loss by a tenth.
+        A further term must reduce the held-out loss beyond chance.
         """
         trials = []
         for number, effects in enumerate(learned_terms(self.predictions, base or self.known, self.scale, most)):
@@ -216,21 +255,9 @@ class Search:
             trials.append(self.judge(effects))
         best = trials[0]
         for trial in trials[1:]:
-            if trial.loss < 0.9 * best.loss:
+            if self._gain(best, trial)[1] > 0:
                 best = trial
         return best
-
-    def drifting(self, trial: Trial, pieces: int = 3) -> tuple[float, list[Effects]]:
-        """Reduction of the loss by fits to each third of the recording alone, and these fits."""
-        starts = self.data.starts
-        gain, fits = 0.0, []
-        for part in np.array_split(np.arange(len(starts)), pieces):
-            predictions = Predictions(self.robot, replace(self.data, starts=starts[part]))
-            fixed = self._fixed_count(trial.effects)
-            fit = fit_effects(predictions, [trial.effects], self.scale, iterations=4, free=fixed)
-            gain += float(trial.held_out_loss[part].sum() - fit.loss.sum()) / len(starts)
-            fits.append(fit.effects)
-        return gain, fits
 
     def loss_of(self, effects: Effects) -> np.ndarray:
         """Robust loss of each window, ``[W]``."""
@@ -240,16 +267,40 @@ class Search:
         """Cross-validate: fit without each fold, and judge on it."""
         held_out_loss = np.zeros(len(self.data.starts))
         parts, losses = [], []
-        for fitted, judged, where in self._split:
-            fit = fit_effects(fitted, [effects], self.scale, iterations=iterations, free=self._fixed_count(effects))
-            held_out_loss[where] = robust(judged.residuals([fit.effects])[0] / self.scale)
+        for fitted, scale, judged, where in self._split:
+            fit = fit_effects(fitted, [effects], scale, iterations=iterations, free=self._fixed_count(effects))
+            held_out_loss[where] = robust(judged.residuals([fit.effects])[0] / self.scale[where])
             parts.append(fit.effects)
             losses.append(float(fit.loss.mean()) + float(held_out_loss[where].mean()))
         return Trial(parts[int(np.argmin(losses))], tuple(parts), held_out_loss)
 
     def refit(self, effects: Effects) -> Fit:
         """Fit to the whole recording."""
-        return fit_effects(self.predictions, [effects], self.scale, iterations=6, free=self._fixed_count(effects))
+        names = tuple(name for name, _ in effects)
+        if names not in self._fits:
+            self._fits[names] = fit_effects(
+                self.predictions, [effects], self.scale, iterations=6, free=self._fixed_count(effects)
+            )
+        return self._fits[names]
+
+    def healthy_variances(self, fit: Fit) -> np.ndarray:
+        """Variance of each parameter of a fit if its effect varies as much as on the healthy robot, ``[P]``."""
+        fixed = sum(len(values) for _, values in fit.effects[: self._fixed_count(fit.effects)])
+        variances = np.zeros(len(flat(fit.effects)))
+        if self.nominal is None or fit.derivatives is None:
+            return variances
+        typical, at = scales(fit.effects), 0
+        for name, values in fit.effects:
+            place = np.arange(at, at + len(values))
+            at += len(values)
+            if place[0] < fixed:
+                continue
+            columns = (fit.derivatives[place - fixed] * self._metric).reshape(len(values), -1)
+            squares = columns @ columns.T / columns.shape[1]
+            squares += 1e-6 * np.trace(squares) * np.eye(len(values)) + 1e-12 * np.eye(len(values))
+            spread = self.nominal.variation_of(name) ** 2 / len(values) * np.linalg.inv(squares)
+            variances[place] = np.diag(spread) * typical[place] ** 2
+        return variances
 
     def ranked(self, fit: Fit) -> list[int]:
         """Indices of a fit's effects, ranked by leave-one-out loss: the loss of the others, fitted again without it."""
@@ -258,73 +309,173 @@ class Search:
         losses = []
         for i in range(len(fit.effects)):
             others = fit.effects[:i] + fit.effects[i + 1 :]
-            alone = fit_effects(self._coarse, [others], self.scale, iterations=4, free=self._fixed_count(others))
+            free = self._fixed_count(others)
+            alone = fit_effects(self._coarse, [others], self._coarse_scale, iterations=4, free=free)
             losses.append(float(alone.loss.mean()))
         return sorted(range(len(losses)), key=lambda i: -losses[i])
+
+    def fit_test(self, trial: Trial) -> FitTest:
+        """Whether the residuals that a trial leaves look like those of the healthy robot.
+
+        Tested together: every term of a formula; a change over the recording, with the speed and with the direction of
+        turning of each effect that was found; and the size of the residuals, where the healthy robot's is known.
+        """
+        self._progress("testing what is left")
+        base = self.refit(trial.effects).effects if trial.effects else ()
+        directions = [*self.formula_directions(base), *self._varying_directions(base)]
+        residual = self.predictions.residuals([base])[0] / self.scale
+        tests = self._tested(base, residual, directions)
+        loss = float(robust(residual).mean())
+        material = [test for test in tests if test.gain > self.thresholds.smallest_share * max(loss, HEALTHY_LOSS)]
+        strongest = min(material, key=lambda test: test.adjusted, default=None)
+        p, name = (1.0, "") if strongest is None else (strongest.adjusted, strongest.name)
+        if self.nominal is not None and self.nominal.segments > 1:
+            size = _size_p(trial.loss, self.nominal)
+            # Two tests: the smaller p-value of two has twice the rate.
+            p, name = (min(1.0, 2 * p), name) if p < size else (min(1.0, 2 * size), "residuals that are too large")
+        return FitTest(p, name, tuple(tests))
+
+    def formula_directions(self, base: Effects) -> list[Direction]:
+        """Change of the residuals by each term of a formula in addition to a base."""
+        learned = CATALOGUE["learned_term"]
+        keys = [parameter.name for parameter in learned.parameters]
+        step = 0.02 * 9.81 * float(self.robot.mass.mean())
+        neutral = dict.fromkeys(keys, 0.0)
+        trials: list[Effects] = [(*base, (learned.name, neutral))]
+        trials += [(*base, (learned.name, {**neutral, key: step})) for key in keys]
+        rolled = self.predictions.residuals(trials) / self.scale
+        return [
+            self._direction(f"{learned.name} {key}", (row - rolled[0])[None])
+            for key, row in zip(keys, rolled[1:], strict=True)
+        ]
+
+    def _varying_directions(self, base: Effects) -> list[Direction]:
+        starts = self.data.starts
+        time = (starts - starts.mean()) / max(float(np.ptp(starts)), 1.0)
+        twists = self.data.commands.sample(starts + round(0.5 * self.data.horizon * 1e9))
+        speed, turning = np.abs(twists[:, 0]), np.sign(twists[:, 1])
+        regimes = {
+            "over the recording": time / max(float(time.std()), 1e-9),
+            "with the speed": (speed - speed.mean()) / max(float(speed.std()), 1e-9),
+            "with the direction of turning": turning - turning.mean(),
+        }
+        directions = []
+        rolled = self.predictions.residuals([base])[0] / self.scale
+        for name, _ in base[len(self.known) :]:
+            change = rolled - self.predictions.residuals([without(base, name)])[0] / self.scale
+            directions += [
+                replace(self._direction(name, (factor[:, None, None] * change)[None]), name=f"{name} changes {regime}")
+                for regime, factor in regimes.items()
+            ]
+        return directions
+
+    def _direction(self, name: str, columns: np.ndarray) -> Direction:
+        if self.nominal is None:
+            return Direction(name, columns)
+        return Direction(name, columns, self.nominal.variation_of(name), self.nominal.segments)
+
+    def _tested(self, base: Effects, residual: np.ndarray, directions: Sequence[Direction]) -> list[ScoreResult]:
+        fixed = self._fixed_count(base)
+        free = sum(len(values) for _, values in base[fixed:])
+        fitted = None
+        if free:
+            skipped = sum(len(values) for _, values in base[:fixed])
+            rows = jacobian(self.predictions, base, residual, self.scale, skipped)
+            fitted = rows.reshape(free, *residual.shape)
+        weights = np.minimum(1.0, OUTLIER / np.maximum(np.abs(np.nan_to_num(residual)), 1e-9))
+        return score_tests(
+            residual, weights, self._blocks, directions, fitted=fitted, metric=self._metric,
+            draws=self.thresholds.draws, seed=self._seed,
+        )  # fmt: skip
 
     def _fixed_count(self, effects: Effects) -> int:
         return len(self.known) if effects[: len(self.known)] == self.known else 0
 
-    def _screened(self, base: Effects, number: str) -> tuple[float, list[tuple[str, Effects, float]]]:
-        """Loss of ``base``, and a quick fit of every further effect on every other window, best first."""
-        results = []
-        before = float(robust(self._coarse.residuals([base])[0] / self.scale).mean())
+    def _screened(self, base: Effects, number: str) -> tuple[float, list[_Screened]]:
+        """Loss of ``base``, and a quick fit and test of every further effect, smallest loss first."""
+        before = float(robust(self._coarse.residuals([base])[0] / self._coarse_scale).mean())
         names = {name for name, _ in base}
+        fits: list[Fit] = []
         for effect in identifiable_effects():
-            name = effect.name
-            if name in names or name in self._taken:
+            if effect.name in names or effect.name in self._excluded:
                 continue
-            self._progress(f"{number}{name}")
+            self._progress(f"{number}{effect.name}")
             starts = [base + start for start in self._starts(effect)]
-            fit = fit_effects(self._coarse, starts, self.scale, iterations=3, free=len(base))
-            results.append((name, fit.effects, float(fit.loss.mean())))
-        return before, sorted(results, key=lambda entry: entry[2])
+            fits.append(fit_effects(self._coarse, starts, self._coarse_scale, iterations=3, free=len(base)))
+        residual = self.predictions.residuals([base])[0] / self.scale
+        tests = self._tested(base, residual, [self.influence(base, fit.effects[-1]) for fit in fits])
+        screened = [_Screened(fit.effects, float(fit.loss.mean()), test) for fit, test in zip(fits, tests, strict=True)]
+        return before, sorted(screened, key=lambda entry: entry.loss)
 
-    def _round(self, best: Trial, number: int) -> tuple[list[Trial], list[CandidateScore]]:
-        before, screened = self._screened(best.effects, f"{number}: ")
-        span = before - screened[0][2]
+    def influence(self, base: Effects, effect: tuple[str, Mapping[str, float]]) -> Direction:
+        """Change of the residuals by an effect in addition to a base, one column for each parameter that was fitted."""
+        name, values = effect
+        known = {parameter.name: parameter for parameter in CATALOGUE[name].parameters}
+        # The recording is corrected for measurement effects of the file: what is found adds to them.
+        in_file = {} if CATALOGUE[name].stage == "measurement" else dict(self._own.get(name, {}))
+        own = {key: float(value) for key, value in in_file.items()}
+        hypotheses: list[Effects] = [base]
+        if len(values) == 1:
+            hypotheses.append((*base, effect))
+        else:
+            neutral = {key: own.get(key, known[key].neutral) for key in values}
+            for key, value in values.items():
+                least = _SMALLEST_SECANT * known[key].scale
+                away = value - neutral[key]
+                changed = value if abs(away) > least else neutral[key] + (least if away >= 0 else -least)
+                if not known[key].low <= changed <= known[key].high:
+                    changed = neutral[key] - (changed - neutral[key])
+                hypotheses.append((*base, (name, {**neutral, key: changed})))
+        rolled = self.predictions.residuals(hypotheses[:1]) / self.scale
+        changed_rows = self.predictions.residuals(hypotheses[1:]) / self.scale
+        return self._direction(name, np.nan_to_num(changed_rows - rolled))
+
+    def _round(self, best: Trial, number: int, nominal: Trial, rate: float) -> tuple[list[Trial], list[CandidateScore]]:
+        """Trials with one more effect that is significant, smallest held-out loss first, and the scores of all."""
+        base = self.refit(best.effects).effects if best.effects else ()
+        before, screened = self._screened(base, f"{number}: ")
+        passed = [entry for entry in screened if entry.test.adjusted <= rate and entry.loss < before]
         judged = []
-        for place, (name, effects, loss) in enumerate(screened):
-            related = bool(name != screened[0][0] and separating_sensor(name, screened[0][0]))
-            if (place < _JUDGED or related) and before - loss > 0.05 * span:
-                self._progress(f"{number}: {name}, judged")
-                judged.append(self.judge(effects))
+        for entry in passed[:_JUDGED]:
+            self._progress(f"{number}: {entry.name}, judged")
+            judged.append(self.judge(entry.effects))
         listed = []
-        for name, _, loss in screened:
-            trial = next((trial for trial in judged if trial.names[-1] == name), None)
-            gain, _, chance = (before - loss, 0, 1.0) if trial is None else self._gain(best, trial)
-            listed.append(CandidateScore(name, number, float(gain), float(chance), judged=trial is not None))
-        return sorted(judged, key=lambda trial: trial.loss), listed
+        for entry in screened:
+            trial = next((trial for trial in judged if trial.names[-1] == entry.name), None)
+            gain = before - entry.loss if trial is None else self._gain(best, trial)[0]
+            listed.append(
+                CandidateScore(entry.name, number, float(gain), entry.test.adjusted, judged=trial is not None)
+            )
+        least = self.thresholds.smallest_share * nominal.loss
+        kept = []
+        for trial in judged:
+            gain, low = self._gain(best, trial)
+            if low > 0 and gain > least:
+                kept.append(trial)
+        return sorted(kept, key=lambda trial: trial.loss), listed
 
-    def _gain(self, before: Trial, after: Trial) -> tuple[float, float, float]:
-        return paired(before.held_out_loss, after.held_out_loss, self.data.starts)
+    def _gain(self, before: Trial, after: Trial) -> tuple[float, float]:
+        rate = self.thresholds.comparison_rate
+        return paired(before.held_out_loss, after.held_out_loss, self.data.starts, rate)
 
-    def _pays(self, before: Trial, after: Trial, nominal: Trial) -> bool:
-        gain, low, chance = self._gain(before, after)
-        # A large gain needs less significance: a dozen blocks rarely agree to one in a hundred.
-        large = gain > 0.4 * (nominal.loss - HEALTHY_LOSS) and chance < 5 * _ALPHA
-        significant = (chance < _ALPHA or large) and low > 0
-        least = max(SMALLEST_GAIN * before.loss, SMALLEST_STEP)
-        if len(after.effects) > 1 + len(self.known):
-            unexplained = before.loss > 3 * HEALTHY_LOSS
-            least = max(least, _LATER_GAIN * ((before if unexplained else nominal).loss - HEALTHY_LOSS))
-        return significant and gain > least
-
-    def _preferred(self, judged: list[Trial], before: Trial) -> Trial:
-        """The best trial, or one about as good with fewer parameters."""
+    def _preferred(self, judged: list[Trial]) -> Trial:
+        """The best trial, or one that is not significantly worse with fewer parameters."""
         best = judged[0]
         for trial in judged[1:]:
-            margin, low, _ = self._gain(trial, best)
-            simpler = _parameter_count(trial) < _parameter_count(best)
-            if simpler and (low <= 0 or margin < 0.02 * before.loss):
+            _, low = self._gain(trial, best)
+            if _parameter_count(trial) < _parameter_count(best) and low <= 0:
                 best = trial
         return best
 
-    def _pruned(self, best: Trial, nominal: Trial) -> Trial:
-        """The trial without effects that no longer reduce the loss enough in the presence of the others."""
+    def _pruned(self, best: Trial) -> Trial:
+        """The trial without effects that are no longer significant in the presence of the others."""
         for name in best.names[len(self.known) : -1]:
             fewer = self.judge(without(best.effects, name))
-            if not self._pays(fewer, best, nominal):
+            base = self.refit(fewer.effects).effects
+            residual = self.predictions.residuals([base])[0] / self.scale
+            effect = next(entry for entry in best.effects if entry[0] == name)
+            (test,) = self._tested(base, residual, [self.influence(base, effect)])
+            if test.p > self.thresholds.further_rate or self._gain(fewer, best)[1] <= 0:
                 best = fewer
         return best
 
@@ -334,39 +485,43 @@ class Search:
         for name in best.names[len(self.known) :]:
             if name not in best.names:
                 continue
-            others = without(best.effects, name)
-            before, screened = self._screened(others, f"{name} or ")
-            judged = [
-                self.judge(effects)
-                for other, effects, loss in screened[:4]
-                if other != name and loss < 0.5 * (before + best.loss)
-            ]
-            judged = sorted([*judged, best], key=lambda trial: trial.loss)
-            if judged[0] is not best:
-                gain, low, _ = self._gain(best, judged[0])
-                if low > 0 and gain > 0.02 * best.loss:
-                    best = judged[0]
+            base = tuple(entry for entry in self.refit(best.effects).effects if entry[0] != name)
+            before, screened = self._screened(base, f"{name} or ")
+            reached = float(
+                robust(self._coarse.residuals([self.refit(best.effects).effects])[0] / self._coarse_scale).mean()
+            )
+            near = [entry for entry in screened if entry.name != name and entry.loss < 0.5 * (before + reached)]
+            judged = sorted([*(self.judge(entry.effects) for entry in near[:_JUDGED]), best], key=lambda t: t.loss)
+            if judged[0] is not best and self._gain(best, judged[0])[1] > 0:
+                best = judged[0]
             kept = best.names[-1] if name not in best.names else name
-            indistinguishable[kept] = self._indistinguishable(best, [t for t in judged if t is not best], kept)
+            others = [trial for trial in judged if trial is not best]
+            indistinguishable[kept] = self._indistinguishable(best, others, kept)
         return best, indistinguishable
 
-    def _indistinguishable(self, best: Trial, judged: Sequence[Trial], effect: str | None = None) -> list[str]:
-        """Effects that explain the recording about as well in place of ``effect``, by default the last one."""
-        effect = effect or best.names[-1]
+    def _indistinguishable(self, best: Trial, judged: Sequence[Trial], effect: str) -> list[str]:
+        """Effects that explain the recording about as well in place of ``effect``.
+
+        The other explanation is fitted; if what the best one predicts beyond it is not significant in its residuals
+        (Davidson and MacKinnon's J test), the recording does not tell them apart.
+        """
         found = []
+        chosen = self.predictions.residuals([self.refit(best.effects).effects])[0] / self.scale
         for trial in judged:
             other = next((name for name in trial.names if name not in best.names), None)
             if other is None:
                 continue
-            _, low, _ = self._gain(trial, best)
-            if low <= 0 or separating_sensor(other, effect):
+            base = self.refit(trial.effects).effects
+            residual = self.predictions.residuals([base])[0] / self.scale
+            (test,) = self._tested(base, residual, [self._direction(effect, np.nan_to_num(chosen - residual)[None])])
+            if test.p > self.thresholds.comparison_rate or separating_sensor(other, effect):
                 found.append(other)
         return found
 
     def _starts(self, effect: Effect) -> list[Effects]:
         name = effect.name
         starts = first_values(effect)
-        if name in self._own:
+        if name in self._own and effect.stage != "measurement":
             known = {key: float(value) for key, value in dict(self._own[name]).items()}
             starts = [((name, {**known, **dict(values)}),) for ((_, values),) in starts]
             starts.append(((name, {key: known.get(key, value) for key, value in starts[0][0][1].items()}),))
@@ -376,3 +531,11 @@ class Search:
 def _parameter_count(trial: Trial) -> int:
     """Parameters of the effect that was added last."""
     return len(CATALOGUE[trial.names[-1]].identified)
+
+
+def _size_p(loss: float, nominal: NominalModel) -> float:
+    """p-value of the mean loss of a healthy recording, whose logarithm varies like that of the healthy segments."""
+    spread = nominal.loss_spread * np.sqrt(1.0 + 1.0 / nominal.segments)
+    return float(
+        student_distribution.sf(np.log(max(loss, 1e-9) / nominal.loss) / max(spread, 1e-3), nominal.segments - 1)
+    )

@@ -77,6 +77,18 @@ def write_robot(
     return out
 
 
+def read_commissioning(robot: str | Path) -> Mapping[str, Any] | None:
+    """What commissioning wrote into a robot file, unchecked; None without commissioning.
+
+    Args:
+        robot: name or file.
+    """
+    entry = yaml.safe_load(robot_file(robot).read_text(encoding="utf-8")).get("commissioning")
+    if entry is not None and not isinstance(entry, Mapping):
+        raise RobotFileError(f"{robot_file(robot)}: commissioning: got {type(entry).__name__}, expected a mapping")
+    return entry
+
+
 def read_nominal_residual(robot: str | Path, samples: Sequence[float]) -> np.ndarray | None:
     """RMS residual of the healthy robot from its file, ``[K, 3]`` [m, m, rad]; None without commissioning.
 

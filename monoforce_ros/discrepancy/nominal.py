@@ -1,0 +1,78 @@
+"""Nominal model: what commissioning learned of the healthy robot, and how much of its motion stays unexplained."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from monoforce_ros.robots import RobotFileError, read_commissioning, read_nominal_residual, robot_file
+
+SMALLEST = np.array([0.01, 0.01, np.radians(0.3)])
+"""Residuals below this are insignificant even on noise-free data [m, m, rad]."""
+
+
+@dataclass(frozen=True)
+class NominalModel:
+    """The healthy robot's residual, and how much each effect's influence varies between its segments."""
+
+    residual: np.ndarray
+    """RMS residual beyond noise and terrain, ``[K, 3]`` at the times of the windows [m, m, rad]."""
+    variation: Mapping[str, float] = field(default_factory=dict)
+    """By effect: RMS change of the residual by the effect's variation between segments, in units of ``scale``."""
+    segments: int = 0
+    """Number of segments."""
+    loss: float = 0.5
+    """Mean robust loss of the healthy robot; 0.5 if its residuals are normal."""
+    loss_spread: float = 0.0
+    """Standard deviation of the logarithm of a segment's mean loss."""
+
+    @property
+    def scale(self) -> np.ndarray:
+        """Unit of ``variation``, ``[K, 3]`` [m, m, rad]."""
+        return np.sqrt(self.residual**2 + SMALLEST**2)
+
+    def variation_of(self, name: str) -> float:
+        """Of an effect; of one that commissioning did not know, the largest."""
+        return float(self.variation.get(name, max(self.variation.values(), default=0.0)))
+
+    def entry(self, samples: tuple[float, ...]) -> dict[str, Any]:
+        """The entry ``commissioning`` of a robot file."""
+        return {
+            "samples_s": list(samples),
+            "residual_rms": [[float(f"{value:.4g}") for value in row] for row in self.residual],
+            "variation": {name: float(f"{value:.4g}") for name, value in self.variation.items()},
+            "segments": self.segments,
+            "loss": float(f"{self.loss:.4g}"),
+            "loss_spread": float(f"{self.loss_spread:.4g}"),
+        }
+
+    @classmethod
+    def read(cls, robot: str | Path, samples: tuple[float, ...]) -> NominalModel | None:
+        """The nominal model in a robot file; None without commissioning.
+
+        A file that an earlier release commissioned holds the residual only; then variations are unknown.
+
+        Raises:
+            RobotFileError: the entry is invalid or for other times.
+        """
+        residual = read_nominal_residual(robot, samples)
+        entry = read_commissioning(robot)
+        if residual is None or entry is None:
+            return None
+        try:
+            variation = {str(name): float(value) for name, value in dict(entry.get("variation") or {}).items()}
+            numbers = [float(entry.get(key, value)) for key, value in (("loss", 0.5), ("loss_spread", 0.0))]
+            segments = int(entry.get("segments", 0))
+        except (TypeError, ValueError) as error:
+            raise RobotFileError(f"{robot_file(robot)}: commissioning: expected numbers, got {error}") from error
+        values = [*variation.values(), *numbers]
+        if segments < 0 or not all(np.isfinite(value) and value >= 0 for value in values) or numbers[0] <= 0:
+            raise RobotFileError(
+                f"{robot_file(robot)}: commissioning: variation, loss and loss_spread: expected finite numbers of 0 or "
+                "more; commission the robot again"
+            )
+        return cls(residual, variation, segments, *numbers)

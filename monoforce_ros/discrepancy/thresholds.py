@@ -1,0 +1,33 @@
+"""Thresholds: every number that decides a verdict, and where it comes from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """Numbers that decide a verdict.
+
+    Attributes:
+        effect_rate: stated rate at which a healthy recording yields an effect, over all candidates together.
+        fit_rate: stated rate at which a healthy recording, or one whose effects are all known, yields
+            ``unknown_effect``. Together with ``effect_rate`` it is the usual 5 % of false alarms.
+        further_rate: stated rate at which a further effect is added though none is missing.
+        comparison_rate: stated one-sided error rate when two explanations are compared on held-out windows.
+        confidence: of the intervals.
+        draws: draws from the null distribution. The standard error of a rate of 2.5 % is 0.8 % with 400 draws.
+        block: length of blocks that count as independent [s]: twice the window of 2 s, so that windows of different
+            blocks share at most one window's motion.
+        smallest_share: smallest share of the reducible error that an explanation must remove to be reported as one:
+            less than a twentieth cannot be seen in any figure of the report.
+    """
+
+    effect_rate: float = 0.025
+    fit_rate: float = 0.025
+    further_rate: float = 0.025
+    comparison_rate: float = 0.05
+    confidence: float = 0.95
+    draws: int = 400
+    block: float = 4.0
+    smallest_share: float = 0.05
