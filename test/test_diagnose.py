@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+import yaml
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import Recording, SmoothedMotion, builders, smooth
@@ -29,7 +30,8 @@ from monoforce_ros.discrepancy import diagnosis as diagnosis_module
 from monoforce_ros.discrepancy.clocks import compare_with_gyro
 from monoforce_ros.discrepancy.comparison import GapRow, compare
 from monoforce_ros.discrepancy.fit import first_values, fit_effects
-from monoforce_ros.discrepancy.gap import map_floor, noise_floor, noisy_motions
+from monoforce_ros.discrepancy.gap import noise_floor, noisy_motions
+from monoforce_ros.discrepancy.ground import supporting_terrain, terrain_uncertainty
 from monoforce_ros.discrepancy.hypothesis import (
     EvidenceWindows,
     Predictions,
@@ -37,9 +39,9 @@ from monoforce_ros.discrepancy.hypothesis import (
     subsampled,
     window_starts,
 )
+from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.report import effect_entry, report_content
-from monoforce_ros.discrepancy.selection import Search, Trial
-from monoforce_ros.discrepancy.verdict import _same
+from monoforce_ros.discrepancy.selection import Search
 from monoforce_ros.discrepancy.wheels import compare_with_wheels
 from monoforce_ros.effects.catalogue import CATALOGUE, drive_speeds, recorded_commands, recorded_motion
 from monoforce_ros.evaluation.recording_evaluation import PHYSICS, evaluate_recording
@@ -48,7 +50,7 @@ from monoforce_ros.perception import FlatTerrain
 from monoforce_ros.physics import State, rollout
 from monoforce_ros.prediction import Predictor
 from monoforce_ros.robots import RobotFileError, load_robot, robot_file
-from monoforce_ros.robots.robot_copy import read_nominal_residual, write_robot
+from monoforce_ros.robots.robot_copy import write_robot
 from monoforce_ros.synthetic.hidden import parse_hidden
 from monoforce_ros.synthetic.odometry import OdometrySettings
 from monoforce_ros.synthetic.recording import RecordingSettings, record
@@ -122,23 +124,6 @@ def test_effects_are_ranked_by_leave_one_out_loss(husky):
     assert search.ranked(fit) == [1, 0]
     alone = replace(fit, effects=fit.effects[:1])
     assert search.ranked(alone) == [0]
-
-
-def test_an_effect_keeps_its_name_against_a_formula_that_repeats_it():
-    def trial(effects, loss):
-        return Trial(effects, (effects, effects), np.full(4, loss))
-
-    nominal, drag = trial((), 4.0), (("viscous_drag", {"coefficient": 150.0}),)
-    as_formula = (("learned_term", {"force_x:vx": -170.0, "torque_z:vx": 20.0}),)
-    assert _same(trial(drag, 1.2), trial(as_formula, 0.6), nominal)
-    # Not where the formula explains far more, or where its largest term belongs to another effect.
-    assert not _same(trial(drag, 3.0), trial(as_formula, 0.6), nominal)
-    assert not _same(trial((("payload", {"mass": 9.0}),), 1.2), trial(as_formula, 0.6), nominal)
-    turned = (("learned_term", {"force_x:vx": -20.0, "torque_z:vx": 170.0}),)
-    assert not _same(trial(drag, 1.2), trial(turned, 0.6), nominal)
-    push = (("constant_force", {"x": 0.0, "y": 150.0}),)
-    constant = (("learned_term", {"force_y:1": 147.0, "torque_z:wz": 10.8, "force_x:wz": 55.9}),)
-    assert _same(trial(push, 1.5), trial(constant, 0.6), nominal)
 
 
 def test_batched_hypotheses_equal_single_calls(husky):
@@ -394,16 +379,20 @@ def test_a_commissioned_model_predicts_the_healthy_robot(husky, tmp_path):
     )
     motion, commands = simulated_recording(husky, injected)
     smoothed = SmoothedMotion(motion, 0.002, 0.001, (slice(0, len(motion)),))
-    effects, nominal_residual = commission([Evidence(smoothed, commands)], husky)
+    effects, learned = commission([Evidence(smoothed, commands)], husky)
     found = {effect.name: effect.parameters for effect in effects}
     assert found["turning_scrub"]["track_width_factor"].value == pytest.approx(1.2, rel=0.05)
     assert found["actuator_lag"]["time_constant"].value == pytest.approx(0.15, abs=0.03)
-    assert nominal_residual.shape == (4, 3)
-    kept = {"samples_s": [0.5, 1.0, 1.5, 2.0], "residual_rms": nominal_residual.tolist()}
+    samples = (0.5, 1.0, 1.5, 2.0)
+    assert learned.residual.shape == (4, 3) and learned.segments >= 3
+    assert {"drive_gain", "friction_scale", "learned_term torque_z:1"} <= set(learned.variation)
     entries = [effect_entry(effect) for effect in effects]
-    file = write_robot("husky", tmp_path / "husky.yaml", entries, [tmp_path], "0", kept)
-    np.testing.assert_allclose(read_nominal_residual(file, (0.5, 1.0, 1.5, 2.0)), nominal_residual)
-    assert read_nominal_residual("husky", (0.5, 1.0)) is None
+    file = write_robot("husky", tmp_path / "husky.yaml", entries, [tmp_path], "0", learned.entry(samples))
+    read = NominalModel.read(file, samples)
+    np.testing.assert_allclose(read.residual, learned.residual, rtol=1e-3)
+    assert read.variation == pytest.approx(dict(learned.variation), rel=1e-3)
+    assert (read.segments, read.loss) == (learned.segments, pytest.approx(learned.loss, rel=1e-3))
+    assert NominalModel.read("husky", samples) is None
     nominal = load_robot(file)
     starts = window_starts(motion, [slice(0, len(motion))], 2.0, 1.0)
     before, after = (
@@ -412,7 +401,12 @@ def test_a_commissioned_model_predicts_the_healthy_robot(husky, tmp_path):
     )
     assert after < 0.2 * before
     with pytest.raises(RobotFileError, match="commission the robot again"):
-        read_nominal_residual(file, (1.0, 2.0))
+        NominalModel.read(file, (1.0, 2.0))
+    broken = yaml.safe_load(file.read_text())
+    broken["commissioning"]["variation"]["drive_gain"] = float("nan")
+    file.write_text(yaml.safe_dump(broken))
+    with pytest.raises(RobotFileError, match="finite numbers of 0 or more"):
+        NominalModel.read(file, samples)
 
 
 def test_a_gyro_distinguishes_a_late_pose_clock_from_a_late_robot(husky):
@@ -499,22 +493,41 @@ def test_long_recordings_are_subsampled_over_their_length():
     assert len(subsampled(starts[:100], 8.0, 120)) == 100
 
 
-def test_the_map_floor_is_zero_on_level_ground_and_grows_with_map_noise(husky):
+def test_the_uncertainty_of_terrain_is_zero_on_level_ground_and_grows_with_map_noise(husky):
     motion, commands = simulated_recording(husky, (), seconds=12.0)
     starts = window_starts(motion, [slice(0, len(motion))], 2.0, 1.0)
     level = EvidenceWindows(motion, commands, starts, 2.0, SAMPLES)
-    assert (map_floor(husky, level, None) == 0).all()
+    assert (terrain_uncertainty(husky, level, None) == 0).all()
     grid = Grid.square(24.0, 0.1)
     x, y = np.meshgrid(grid.x, grid.y)
     hills = 0.06 * np.sin(1.5 * x) * np.cos(1.2 * y)
+    # The noise is at the left only: windows there are less certain than the others.
+    noise = np.where(x < motion.positions[:, 0].mean(), 0.03 * np.sin(5 * x), 0.0)
     maps = [
         TerrainMap.from_height(torch.as_tensor(height, dtype=torch.float32), grid)
-        for height in (hills, hills + 0.02 * np.sin(5 * x), hills - 0.02 * np.sin(5 * x))
+        for height in (hills, hills + noise, hills - noise)
     ]
     on_map = replace(level, terrain=maps[0], odometry_from_terrain=np.eye(4))
-    shape = map_floor(husky, on_map, None)
-    noisy = map_floor(husky, on_map, (maps[1], maps[2]))
-    assert (shape[-1] > 0).all() and (noisy[-1] > shape[-1]).all()
+    shape = terrain_uncertainty(husky, on_map, None)
+    noisy = terrain_uncertainty(husky, on_map, (maps[1], maps[2]))
+    assert shape.shape == (len(starts), 4, 3)
+    assert (shape[:, -1].mean(axis=0) > 0).all() and (noisy[:, -1].mean(axis=0) > shape[:, -1].mean(axis=0)).all()
+
+
+def test_the_ground_under_grass_is_traced_where_the_robot_drove(husky):
+    motion, _ = simulated_recording(husky, (), seconds=12.0)
+    grid = Grid.square(24.0, 0.1)
+    grass = TerrainMap.from_height(torch.full((grid.rows, grid.columns), 0.3), grid)
+    found = supporting_terrain(grass, motion, husky)
+    rows, columns, _ = grid.cells(motion.positions[:, :2])
+    under = found.height.numpy()[rows, columns]
+    assert np.abs(under).max() < 0.03
+    assert (found.geometric_height == 0.3).all()
+    # Far from the path the visible surface stays.
+    far = np.hypot(*(np.stack(np.meshgrid(grid.x, grid.y))[..., None] - motion.positions[:, :2].T[:, None, None])).min(
+        axis=-1
+    )
+    assert (found.height.numpy()[far > 3.0] == np.float32(0.3)).all()
 
 
 @pytest.fixture(scope="module")

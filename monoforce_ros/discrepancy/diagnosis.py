@@ -44,7 +44,7 @@ from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.preflight import advice, complaints
 from monoforce_ros.discrepancy.selection import BLOCK, HEALTHY_LOSS, CandidateScore, Outcome, Search, Trial, paired
 from monoforce_ros.discrepancy.thresholds import Thresholds
-from monoforce_ros.discrepancy.verdict import Decision, Findings, Losses, Verdict, decide, fits
+from monoforce_ros.discrepancy.verdict import Decision, Findings, Losses, Verdict, decide
 from monoforce_ros.discrepancy.wheels import WheelFinding, compare_with_wheels
 from monoforce_ros.effects import CATALOGUE
 from monoforce_ros.robots import RobotModel
@@ -178,7 +178,7 @@ def diagnose(
         commissioned=nominal is not None and nominal.segments > 0,
         known=search.known,
     )  # fmt: skip
-    if not fits(findings, thresholds):
+    if findings.fit.p <= thresholds.fit_rate:
         learned = search.learn(outcome.best.effects)
         gain = paired(outcome.best.held_out_loss, learned.held_out_loss, data.starts, thresholds.comparison_rate)
         findings = replace(findings, formula=learned, formula_gain=gain)
@@ -200,7 +200,8 @@ def diagnose(
         gap = gap_table(compared, settings.seed)
     known_parts: tuple[EffectEstimate, ...] = ()
     if decision.parts is not None:
-        known_parts = _estimated(search, search.refit(decision.parts.effects), outcome)
+        partial = _estimated(search, search.refit(decision.parts.effects), outcome)
+        known_parts = tuple(_with_measured_interval(estimate, gyro, wheels) for estimate in partial)
     # Values for the robot's file are fitted to the whole recording.
     effects: tuple[EffectEstimate, ...] = ()
     fitted: Effects = ()

@@ -215,10 +215,10 @@ class Search:
                 self.known, start = (), nominal
         judged, tried = self._round(start, 1, nominal, self.thresholds.effect_rate)
         if not judged:
-            return Outcome(nominal, start, self.fit_test(start), tuple(tried))
+            return Outcome(nominal, start, self.fit_test(start, nominal), tuple(tried))
         best, listed = self._extended(self._preferred(judged), nominal, most_effects)
         tried += listed
-        fit = self.fit_test(best)
+        fit = self.fit_test(best, nominal)
         for other in [trial for trial in judged if trial.names[-1] not in best.names][:_ALTERNATIVES]:
             # The effect that explains most alone need not be part of the best combination.
             if fit.p > self.thresholds.fit_rate or most_effects < 2:
@@ -227,10 +227,10 @@ class Search:
             tried += listed
             gain, low = self._gain(best, extended)
             if low > 0 and gain > self.thresholds.smallest_share * nominal.loss:
-                best, fit = extended, self.fit_test(extended)
+                best, fit = extended, self.fit_test(extended, nominal)
         exchanged, indistinguishable = self._exchanged(best)
         if exchanged is not best:
-            best, fit = exchanged, self.fit_test(exchanged)
+            best, fit = exchanged, self.fit_test(exchanged, nominal)
         return Outcome(nominal, best, fit, tuple(tried), indistinguishable)
 
     def _extended(self, best: Trial, nominal: Trial, most_effects: int) -> tuple[Trial, list[CandidateScore]]:
@@ -314,26 +314,28 @@ class Search:
             losses.append(float(alone.loss.mean()))
         return sorted(range(len(losses)), key=lambda i: -losses[i])
 
-    def fit_test(self, trial: Trial) -> FitTest:
+    def fit_test(self, trial: Trial, nominal: Trial) -> FitTest:
         """Whether the residuals that a trial leaves look like those of the healthy robot.
 
         Tested together: every term of a formula; a change over the recording, with the speed and with the direction of
         turning of each effect that was found; and the size of the residuals, where the healthy robot's is known.
+        What is small beside the nominal model's loss does not count: an effect that is nearly all of an error keeps its
+        name, though the model's own error differs a little under it.
         """
         self._progress("testing what is left")
         base = self.refit(trial.effects).effects if trial.effects else ()
         directions = [*self.formula_directions(base), *self._varying_directions(base)]
         residual = self.predictions.residuals([base])[0] / self.scale
         tests = self._tested(base, residual, directions)
-        loss = float(robust(residual).mean())
-        material = [test for test in tests if test.gain > self.thresholds.smallest_share * max(loss, HEALTHY_LOSS)]
-        strongest = min(material, key=lambda test: test.adjusted, default=None)
+        least = self.thresholds.smallest_share * nominal.loss
+        strongest = min((test for test in tests if test.gain > least), key=lambda test: test.adjusted, default=None)
         p, name = (1.0, "") if strongest is None else (strongest.adjusted, strongest.name)
-        if self.nominal is not None and self.nominal.segments > 1:
-            size = _size_p(trial.loss, self.nominal)
-            # Two tests: the smaller p-value of two has twice the rate.
-            p, name = (min(1.0, 2 * p), name) if p < size else (min(1.0, 2 * size), "residuals that are too large")
-        return FitTest(p, name, tuple(tests))
+        healthy = self.nominal
+        if healthy is not None and healthy.segments > 1 and trial.loss - healthy.loss > least:
+            size = _size_p(trial.loss, healthy)
+            p, name = (p, name) if p < size else (size, "residuals that are too large")
+        # Two tests: the smaller p-value of two has twice the rate.
+        return FitTest(min(1.0, 2.0 * p), name, tuple(tests))
 
     def formula_directions(self, base: Effects) -> list[Direction]:
         """Change of the residuals by each term of a formula in addition to a base."""

@@ -19,8 +19,9 @@ class Thresholds:
         draws: draws from the null distribution. The standard error of a rate of 2.5 % is 0.8 % with 400 draws.
         block: length of blocks that count as independent [s]: twice the window of 2 s, so that windows of different
             blocks share at most one window's motion.
-        smallest_share: smallest share of the reducible error that an explanation must remove to be reported as one:
-            less than a twentieth cannot be seen in any figure of the report.
+        smallest_share: smallest share of the nominal model's loss that an explanation must remove, or a rest must make
+            up, to be reported: the loss is quadratic, so a twentieth of it is an error of less than a quarter (√0.05)
+            of the error that was there.
     """
 
     effect_rate: float = 0.025

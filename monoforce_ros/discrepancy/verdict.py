@@ -87,11 +87,14 @@ class Decision:
 def fits(findings: Findings, thresholds: Thresholds) -> bool:
     """Whether what the best effects leave looks like the healthy robot.
 
-    Effects of a robot that was never commissioned cannot be judged so: nobody knows how large its errors should be.
+    Of a robot that was never commissioned nobody knows how large its errors should be. Its effects keep their names
+    unless a formula in addition to them explains more than half of what they leave.
     """
-    if findings.best.effects and not findings.commissioned:
+    if findings.fit.p > thresholds.fit_rate:
         return True
-    return findings.fit.p > thresholds.fit_rate
+    if findings.commissioned or not findings.best.effects:
+        return False
+    return findings.formula_gain[1] <= 0 or findings.formula_gain[0] < 0.5 * findings.best.loss
 
 
 def decide(findings: Findings, thresholds: Thresholds = Thresholds()) -> Decision:  # noqa: B008
