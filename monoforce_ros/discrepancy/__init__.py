@@ -2,9 +2,12 @@
 
 from monoforce_ros.discrepancy.bag_diagnosis import BagDiagnosis, Topics, diagnose_bag, read_evidence
 from monoforce_ros.discrepancy.commissioning import commission
+from monoforce_ros.discrepancy.credibility import complaint
 from monoforce_ros.discrepancy.diagnosis import Diagnosis, DiagnosisSettings, diagnose
 from monoforce_ros.discrepancy.estimates import EffectEstimate, ParameterEstimate
+from monoforce_ros.discrepancy.ground import Ground
 from monoforce_ros.discrepancy.hypothesis import Evidence
+from monoforce_ros.discrepancy.motion_check import command_delay, motion_faults
 from monoforce_ros.discrepancy.verdict import Verdict
 
 __all__ = [
@@ -13,11 +16,15 @@ __all__ = [
     "DiagnosisSettings",
     "EffectEstimate",
     "Evidence",
+    "Ground",
     "ParameterEstimate",
     "Topics",
     "Verdict",
+    "command_delay",
     "commission",
+    "complaint",
     "diagnose",
     "diagnose_bag",
+    "motion_faults",
     "read_evidence",
 ]

@@ -17,11 +17,14 @@ from monoforce_ros.discrepancy.bag_diagnosis import BagDiagnosis, Topics, diagno
 from monoforce_ros.discrepancy.commissioning import commission
 from monoforce_ros.discrepancy.diagnosis import DiagnosisSettings
 from monoforce_ros.discrepancy.report import effect_entry, summary_lines
+from monoforce_ros.discrepancy.verdict import Verdict
 from monoforce_ros.effects import EffectError
 from monoforce_ros.reporting import progress_bar
 from monoforce_ros.robots import RobotFileError, fingerprint, load_robot, shipped_robots, write_robot
 from monoforce_ros.terrain import TerrainError, TerrainFileError
 
+NOT_IDENTIFIABLE_STATUS = 3
+"""Exit status where a recording cannot be diagnosed; 1 is an error, 2 a wrong option."""
 _ERRORS = (BagError, EffectError, RobotFileError, TerrainFileError, TerrainError, ValueError, OSError)
 
 
@@ -31,14 +34,17 @@ def build_parser() -> argparse.ArgumentParser:
         prog="diagnose",
         description="Compare a robot's model with recordings, find the physical effects that it lacks, and write them "
         "into a copy of its file. Each bag gets a folder with report.html and report.json.",
+        epilog="Exit status: 0 a diagnosis was made; 1 an error; 2 wrong usage; 3 a recording cannot be diagnosed "
+        "(not_identifiable), the report says why.",
     )
     parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 folder or ROS 1 .bag file")
     parser.add_argument("--robot", default="husky", help=f"robot file or one of {', '.join(shipped_robots())}")
     parser.add_argument(
         "--terrain",
-        default="flat",
-        metavar="flat|lidar|FILE",
-        help="ground of the recording: level, mapped from the lidar, or a file of fit_terrain (%(default)s)",
+        default="auto",
+        metavar="auto|flat|lidar|FILE",
+        help="ground of the recording: from the lidar where the bag has clouds and else level (auto), level, mapped "
+        "from the lidar, or a file of fit_terrain (%(default)s)",
     )
     parser.add_argument("--out", type=Path, required=True, help="folder for the reports")
     parser.add_argument(
@@ -83,19 +89,27 @@ def main(arguments: list[str] | None = None) -> int:
             return _commission(options)
         if len(options.bags) > 1:
             return _diagnose_many(options)
-        print_finding(_with_bar(options.bags[0], options.out, options))
+        found = _with_bar(options.bags[0], options.out, options)
+        print_finding(found)
+        return _status(found)
     except _ERRORS as error:
         print(f"diagnose: {error}", file=sys.stderr)
         return 1
-    return 0
+
+
+def _status(found: BagDiagnosis) -> int:
+    """Exit status of one diagnosis."""
+    return NOT_IDENTIFIABLE_STATUS if found.diagnosis.verdict == Verdict.NOT_IDENTIFIABLE else 0
 
 
 def print_finding(found: BagDiagnosis) -> None:
     """Print the result."""
     for complaint in found.complaints[:3]:
         print(f"diagnose: {found.bag}: {complaint}", file=sys.stderr)
-    first, *rest = summary_lines(found.diagnosis)
+    first, *rest = summary_lines(found.diagnosis, found.doubts)
     print(f"{found.bag}: {first}")
+    if found.ground is not None:
+        rest.append(f"  ground: {found.ground.description}")
     if found.robot_file:
         rest.append(f"  robot file: {found.robot_file}")
     print("\n".join([*rest, f"  report: {found.page}"]))
@@ -145,7 +159,7 @@ def _diagnose_many(options: argparse.Namespace) -> int:
     outs = [
         options.out / (name if names.count(name) == 1 else f"{number:02d}_{name}") for number, name in enumerate(names)
     ]
-    failed = 0
+    failed = refused = 0
     context = multiprocessing.get_context("spawn")
     jobs = min(options.jobs, len(options.bags))
     with (
@@ -160,11 +174,14 @@ def _diagnose_many(options: argparse.Namespace) -> int:
                 failed += 1
                 print(f"diagnose: {running[done]}: {found}", file=sys.stderr)
             else:
+                refused += _status(found) != 0
                 print_finding(found)
             bar.update()
     if failed:
         print(f"diagnose: {failed} of {len(outs)} bags failed", file=sys.stderr)
-    return int(failed > 0)
+    if refused:
+        print(f"diagnose: {refused} of {len(outs)} recordings cannot be diagnosed", file=sys.stderr)
+    return 1 if failed else NOT_IDENTIFIABLE_STATUS if refused else 0
 
 
 def _commission(options: argparse.Namespace) -> int:
