@@ -5,6 +5,7 @@ from monoforce_ros.discrepancy.commissioning import commission
 from monoforce_ros.discrepancy.credibility import complaint
 from monoforce_ros.discrepancy.diagnosis import Diagnosis, DiagnosisSettings, diagnose
 from monoforce_ros.discrepancy.estimates import EffectEstimate, ParameterEstimate
+from monoforce_ros.discrepancy.export import Exported, ExportKind, export_effects
 from monoforce_ros.discrepancy.ground import Ground
 from monoforce_ros.discrepancy.hypothesis import Evidence
 from monoforce_ros.discrepancy.motion_check import command_delay, motion_faults
@@ -16,6 +17,8 @@ __all__ = [
     "DiagnosisSettings",
     "EffectEstimate",
     "Evidence",
+    "ExportKind",
+    "Exported",
     "Ground",
     "ParameterEstimate",
     "Topics",
@@ -25,6 +28,7 @@ __all__ = [
     "complaint",
     "diagnose",
     "diagnose_bag",
+    "export_effects",
     "motion_faults",
     "read_evidence",
 ]

@@ -16,6 +16,7 @@ from monoforce_ros.bags import BagError
 from monoforce_ros.discrepancy.bag_diagnosis import BagDiagnosis, Topics, diagnose_bag, read_evidence
 from monoforce_ros.discrepancy.commissioning import commission
 from monoforce_ros.discrepancy.diagnosis import DiagnosisSettings
+from monoforce_ros.discrepancy.export import export_effects, export_target
 from monoforce_ros.discrepancy.report import effect_entry, summary_lines
 from monoforce_ros.discrepancy.verdict import Verdict
 from monoforce_ros.effects import EffectError
@@ -67,6 +68,14 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="BAG",
         help="compare errors before and after on these other recordings too; nothing is fitted to them",
     )
+    parser.add_argument(
+        "--export",
+        nargs="+",
+        default=[],
+        metavar="FILE",
+        help="write the effects for other tools: FILE.xml (MuJoCo), FILE.diff_drive.yaml (ros2_control) or "
+        "FILE.nav2.yaml (Nav2), or KIND:FILE with mujoco, diff_drive or nav2; with one bag only",
+    )
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="bags diagnosed in parallel (%(default)s)")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     return parser
@@ -80,6 +89,13 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error(f"--effects: got {options.effects}, expected 1 to 6")
     if options.jobs < 1:
         parser.error(f"--jobs: got {options.jobs}, expected 1 or more")
+    if options.export and (len(options.bags) > 1 or options.commission):
+        parser.error("--export: got several bags or --commission, expected one bag to diagnose")
+    try:
+        for target in options.export:
+            export_target(target)
+    except ValueError as error:
+        parser.error(str(error))
     # Many small operations: one thread is faster than several, and does not collapse on a busy machine.
     torch.set_num_threads(1)
     try:
@@ -91,10 +107,21 @@ def main(arguments: list[str] | None = None) -> int:
             return _diagnose_many(options)
         found = _with_bar(options.bags[0], options.out, options)
         print_finding(found)
+        if options.export:
+            _export(found, options)
         return _status(found)
     except _ERRORS as error:
         print(f"diagnose: {error}", file=sys.stderr)
         return 1
+
+
+def _export(found: BagDiagnosis, options: argparse.Namespace) -> None:
+    """Write the effects for other tools, and say what these lack."""
+    for exported in export_effects(options.export, load_robot(options.robot), found.diagnosis.effects):
+        for file in exported.files:
+            print(f"  {exported.kind}: {file}")
+        for text in exported.not_exported:
+            print(f"  {exported.kind}: not exported: {text}")
 
 
 def _status(found: BagDiagnosis) -> int:
