@@ -31,7 +31,6 @@ from monoforce_ros.discrepancy.clocks import compare_with_gyro
 from monoforce_ros.discrepancy.comparison import GapRow, compare
 from monoforce_ros.discrepancy.fit import first_values, fit_effects
 from monoforce_ros.discrepancy.gap import noise_floor, noisy_motions
-from monoforce_ros.discrepancy.ground import supporting_terrain, terrain_uncertainty
 from monoforce_ros.discrepancy.hypothesis import (
     EvidenceWindows,
     Predictions,
@@ -42,6 +41,7 @@ from monoforce_ros.discrepancy.hypothesis import (
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.report import effect_entry, report_content
 from monoforce_ros.discrepancy.selection import Search
+from monoforce_ros.discrepancy.terrain_evidence import supporting_terrain, terrain_uncertainty
 from monoforce_ros.discrepancy.wheels import compare_with_wheels
 from monoforce_ros.effects.catalogue import CATALOGUE, drive_speeds, recorded_commands, recorded_motion
 from monoforce_ros.evaluation.recording_evaluation import PHYSICS, evaluate_recording

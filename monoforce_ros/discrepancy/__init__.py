@@ -2,9 +2,13 @@
 
 from monoforce_ros.discrepancy.bag_diagnosis import BagDiagnosis, Topics, diagnose_bag, read_evidence
 from monoforce_ros.discrepancy.commissioning import commission
+from monoforce_ros.discrepancy.credibility import complaint
 from monoforce_ros.discrepancy.diagnosis import Diagnosis, DiagnosisSettings, diagnose
 from monoforce_ros.discrepancy.estimates import EffectEstimate, ParameterEstimate
+from monoforce_ros.discrepancy.export import Exported, ExportKind, export_effects
+from monoforce_ros.discrepancy.ground import Ground
 from monoforce_ros.discrepancy.hypothesis import Evidence
+from monoforce_ros.discrepancy.motion_check import command_delay, motion_faults
 from monoforce_ros.discrepancy.verdict import Verdict
 
 __all__ = [
@@ -13,11 +17,18 @@ __all__ = [
     "DiagnosisSettings",
     "EffectEstimate",
     "Evidence",
+    "ExportKind",
+    "Exported",
+    "Ground",
     "ParameterEstimate",
     "Topics",
     "Verdict",
+    "command_delay",
     "commission",
+    "complaint",
     "diagnose",
     "diagnose_bag",
+    "export_effects",
+    "motion_faults",
     "read_evidence",
 ]

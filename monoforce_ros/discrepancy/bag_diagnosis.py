@@ -11,12 +11,18 @@ import numpy as np
 
 from monoforce_ros.bags import Recording, smooth
 from monoforce_ros.discrepancy.comparison import GapRow, compare, gap_table
+from monoforce_ros.discrepancy.credibility import complaint
 from monoforce_ros.discrepancy.diagnosis import Diagnosis, DiagnosisSettings, diagnose
 from monoforce_ros.discrepancy.gap import noisy_motions
-from monoforce_ros.discrepancy.ground import supporting_terrain
+from monoforce_ros.discrepancy.ground import Ground, choose_ground
 from monoforce_ros.discrepancy.hypothesis import Effects, Evidence, corrected_evidence, window_starts
+from monoforce_ros.discrepancy.motion_check import motion_faults
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.report import effect_entry, write_diagnosis
+from monoforce_ros.discrepancy.terrain_evidence import supporting_terrain
+from monoforce_ros.discrepancy.verdict import Verdict
+from monoforce_ros.discrepancy.wheels import compare_with_wheels
+from monoforce_ros.effects import CATALOGUE
 from monoforce_ros.robots import RobotModel, fingerprint, load_robot, write_robot
 from monoforce_ros.robots import robot_file as robot_file_of
 from monoforce_ros.terrain import Grid, load_terrain
@@ -48,6 +54,10 @@ class BagDiagnosis:
     """A copy of the robot's file with the identified effects; None where there are none."""
     complaints: tuple[str, ...] = ()
     """Problems found when reading the bag."""
+    doubts: tuple[str, ...] = ()
+    """Reasons to doubt the result that lie in the recording or in the robot's file, such as ground without a map."""
+    ground: Ground | None = None
+    """The terrain that the recording was compared on."""
 
     def without_arrays(self) -> BagDiagnosis:
         """The same without the arrays for figures, to pass it between processes."""
@@ -60,27 +70,38 @@ def read_evidence(bag: Path, robot: RobotModel, terrain: str, topics: Topics = T
     Args:
         bag: the recording.
         robot: its own body is removed from the lidar's sweeps.
-        terrain: ``flat``, ``lidar`` (all sweeps of the recording as one map) or a file of ``fit_terrain``.
+        terrain: ``auto`` (see :func:`choose_ground`), ``flat``, ``lidar`` (all sweeps of the recording as one map) or a
+            file of ``fit_terrain``.
         topics: topic names that replace detection by type.
 
     Raises:
         BagError, TerrainError, TerrainFileError: required data are missing or damaged.
     """
+    evidence, recording, _ = read_with_ground(bag, robot, terrain, topics)
+    return evidence, recording
+
+
+def read_with_ground(
+    bag: Path, robot: RobotModel, terrain: str, topics: Topics = Topics()
+) -> tuple[Evidence, Recording, Ground]:
+    """As :func:`read_evidence`, and which ground was taken."""
     recording = Recording.open(bag, odometry=topics.odometry, commands=topics.commands, cloud=topics.cloud)
     smoothed = smooth(recording.motion)
     evidence = Evidence(smoothed, recording.commands, gyro=recording.angular_velocity, wheels=recording.wheels)
-    if terrain == "flat":
-        return evidence, recording
-    if terrain != "lidar":
-        ground, pose = load_terrain(Path(terrain))
-        return replace(evidence, terrain=ground, odometry_from_terrain=pose), recording
+    ground = choose_ground(terrain, recording, smoothed, robot)
+    if ground.source == "flat":
+        return evidence, recording, ground
+    if ground.source != "lidar":
+        terrain_map, pose = load_terrain(Path(ground.source))
+        return replace(evidence, terrain=terrain_map, odometry_from_terrain=pose), recording, ground
     motion = smoothed.motion
     low, high = motion.positions.min(axis=0)[:2] - _MARGIN, motion.positions.max(axis=0)[:2] + _MARGIN
     columns, rows = np.ceil((high - low) / 0.1).astype(int) + 1
     grid = Grid(int(rows), int(columns), 0.1, (float(low[0]), float(low[1])))
-    ground, parts = split_maps(recording, motion, robot, grid)
-    ground, even, odd = (supporting_terrain(part, motion, robot) for part in (ground, *parts))
-    return replace(evidence, terrain=ground, odometry_from_terrain=np.eye(4), split_maps=(even, odd)), recording
+    maps, parts = split_maps(recording, motion, robot, grid)
+    whole, even, odd = (supporting_terrain(part, motion, robot) for part in (maps, *parts))
+    evidence = replace(evidence, terrain=whole, odometry_from_terrain=np.eye(4), split_maps=(even, odd))
+    return evidence, recording, ground
 
 
 def diagnose_bag(
@@ -88,7 +109,7 @@ def diagnose_bag(
     robot: str | Path,
     out: Path,
     *,
-    terrain: str = "flat",
+    terrain: str = "auto",
     topics: Topics = Topics(),
     settings: DiagnosisSettings = DiagnosisSettings(),  # noqa: B008
     held_out: Sequence[Path] = (),
@@ -116,7 +137,7 @@ def diagnose_bag(
     if found_file.exists() and found_file.resolve() == robot_file_of(robot).resolve():
         raise ValueError(f"{out}: got the folder of the nominal robot file {found_file.name}, expected another --out")
     progress(0.0, "reading")
-    evidence, recording = read_evidence(bag, model, terrain, topics)
+    evidence, recording, ground = read_with_ground(bag, model, terrain, topics)
     data = fingerprint([bag])
     others = _distinct_names(held_out)
     for other in others.values():
@@ -131,8 +152,11 @@ def diagnose_bag(
         settings=settings,
         progress=progress,
     )
+    doubts = [ground.complaint] if ground.unknown else []
+    if diagnosis.verdict == Verdict.NOT_IDENTIFIABLE:
+        diagnosis = _with_wheels(diagnosis, evidence, model)
     robot_file = None
-    if diagnosis.effects:
+    if diagnosis.effects and all(not complaint(effect, _in_file(model, effect.name)) for effect in diagnosis.effects):
         effects = [effect_entry(effect) for effect in diagnosis.effects]
         robot_file = write_robot(robot, found_file, effects, [bag], data)
     elif found_file.exists():
@@ -145,17 +169,37 @@ def diagnose_bag(
         }
         diagnosis = replace(diagnosis, held_out=tables)
     smoothed = evidence.smoothed
+    motion = smoothed.motion
+    steps = [np.linalg.norm(np.diff(motion.positions[part, :2], axis=0), axis=1).sum() for part in smoothed.stretches]
     inputs = {
         "bag": str(bag),
         "data": data,
         "robot": str(robot),
+        "recording_s": round(float(motion.stamps[-1] - motion.stamps[0]) * 1e-9, 1),
+        "driven_m": round(float(np.sum(steps)), 1),
         "terrain": terrain,
+        "ground": ground.description,
+        "ground_unknown": ground.unknown,
         "topics": ", ".join(f"{role} {topic}" for role, topic in recording.topics.items()),
         "noise of the poses": f"{100 * smoothed.position_noise:.1f} cm, {np.degrees(smoothed.rotation_noise):.2f}°",
         "duration_s": round(time.monotonic() - began, 1),
     }
-    report, page = write_diagnosis(out, diagnosis, inputs, robot_file)
-    return BagDiagnosis(bag, diagnosis, report, page, robot_file, recording.warnings)
+    report, page = write_diagnosis(out, diagnosis, inputs, robot_file, doubts)
+    return BagDiagnosis(bag, diagnosis, report, page, robot_file, recording.warnings, tuple(doubts), ground)
+
+
+def _in_file(robot: RobotModel, name: str) -> dict[str, float]:
+    """Values of an effect in the robot's file; those of sensors and clocks are neutral for what adds to them."""
+    values = {} if CATALOGUE[name].stage == "measurement" else dict(robot.effects).get(name, {})
+    return {key: float(value) for key, value in values.items()}
+
+
+def _with_wheels(diagnosis: Diagnosis, evidence: Evidence, robot: RobotModel) -> Diagnosis:
+    """A refused diagnosis with what the wheels say of the robot, and of the drives alone."""
+    faults = motion_faults(evidence.smoothed, evidence.commands, evidence.wheels)
+    wheels = compare_with_wheels(evidence.commands, evidence.wheels, robot)
+    remarks = diagnosis.remarks if wheels is None else (*diagnosis.remarks, wheels.summary())
+    return replace(diagnosis, advice=faults or diagnosis.advice, remarks=remarks)
 
 
 def _distinct_names(bags: Sequence[Path]) -> dict[str, Path]:

@@ -16,12 +16,16 @@ from monoforce_ros.bags import BagError
 from monoforce_ros.discrepancy.bag_diagnosis import BagDiagnosis, Topics, diagnose_bag, read_evidence
 from monoforce_ros.discrepancy.commissioning import commission
 from monoforce_ros.discrepancy.diagnosis import DiagnosisSettings
+from monoforce_ros.discrepancy.export import export_effects, export_target
 from monoforce_ros.discrepancy.report import effect_entry, summary_lines
+from monoforce_ros.discrepancy.verdict import Verdict
 from monoforce_ros.effects import EffectError
 from monoforce_ros.reporting import progress_bar
 from monoforce_ros.robots import RobotFileError, fingerprint, load_robot, shipped_robots, write_robot
 from monoforce_ros.terrain import TerrainError, TerrainFileError
 
+NOT_IDENTIFIABLE_STATUS = 3
+"""Exit status where a recording cannot be diagnosed; 1 is an error, 2 a wrong option."""
 _ERRORS = (BagError, EffectError, RobotFileError, TerrainFileError, TerrainError, ValueError, OSError)
 
 
@@ -31,14 +35,17 @@ def build_parser() -> argparse.ArgumentParser:
         prog="diagnose",
         description="Compare a robot's model with recordings, find the physical effects that it lacks, and write them "
         "into a copy of its file. Each bag gets a folder with report.html and report.json.",
+        epilog="Exit status: 0 a diagnosis was made; 1 an error; 2 wrong usage; 3 a recording cannot be diagnosed "
+        "(not_identifiable), the report says why.",
     )
     parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 folder or ROS 1 .bag file")
     parser.add_argument("--robot", default="husky", help=f"robot file or one of {', '.join(shipped_robots())}")
     parser.add_argument(
         "--terrain",
-        default="flat",
-        metavar="flat|lidar|FILE",
-        help="ground of the recording: level, mapped from the lidar, or a file of fit_terrain (%(default)s)",
+        default="auto",
+        metavar="auto|flat|lidar|FILE",
+        help="ground of the recording: from the lidar where the bag has clouds and else level (auto), level, mapped "
+        "from the lidar, or a file of fit_terrain (%(default)s)",
     )
     parser.add_argument("--out", type=Path, required=True, help="folder for the reports")
     parser.add_argument(
@@ -61,6 +68,14 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="BAG",
         help="compare errors before and after on these other recordings too; nothing is fitted to them",
     )
+    parser.add_argument(
+        "--export",
+        nargs="+",
+        default=[],
+        metavar="FILE",
+        help="write the effects for other tools: FILE.xml (MuJoCo), FILE.diff_drive.yaml (ros2_control) or "
+        "FILE.nav2.yaml (Nav2), or KIND:FILE with mujoco, diff_drive or nav2; with one bag only",
+    )
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="bags diagnosed in parallel (%(default)s)")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     return parser
@@ -74,6 +89,13 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error(f"--effects: got {options.effects}, expected 1 to 6")
     if options.jobs < 1:
         parser.error(f"--jobs: got {options.jobs}, expected 1 or more")
+    if options.export and (len(options.bags) > 1 or options.commission):
+        parser.error("--export: got several bags or --commission, expected one bag to diagnose")
+    try:
+        for target in options.export:
+            export_target(target)
+    except ValueError as error:
+        parser.error(str(error))
     # Many small operations: one thread is faster than several, and does not collapse on a busy machine.
     torch.set_num_threads(1)
     try:
@@ -83,19 +105,38 @@ def main(arguments: list[str] | None = None) -> int:
             return _commission(options)
         if len(options.bags) > 1:
             return _diagnose_many(options)
-        print_finding(_with_bar(options.bags[0], options.out, options))
+        found = _with_bar(options.bags[0], options.out, options)
+        print_finding(found)
+        if options.export:
+            _export(found, options)
+        return _status(found)
     except _ERRORS as error:
         print(f"diagnose: {error}", file=sys.stderr)
         return 1
-    return 0
+
+
+def _export(found: BagDiagnosis, options: argparse.Namespace) -> None:
+    """Write the effects for other tools, and say what these lack."""
+    for exported in export_effects(options.export, load_robot(options.robot), found.diagnosis.effects):
+        for file in exported.files:
+            print(f"  {exported.kind}: {file}")
+        for text in exported.not_exported:
+            print(f"  {exported.kind}: not exported: {text}")
+
+
+def _status(found: BagDiagnosis) -> int:
+    """Exit status of one diagnosis."""
+    return NOT_IDENTIFIABLE_STATUS if found.diagnosis.verdict == Verdict.NOT_IDENTIFIABLE else 0
 
 
 def print_finding(found: BagDiagnosis) -> None:
     """Print the result."""
     for complaint in found.complaints[:3]:
         print(f"diagnose: {found.bag}: {complaint}", file=sys.stderr)
-    first, *rest = summary_lines(found.diagnosis)
+    first, *rest = summary_lines(found.diagnosis, found.doubts)
     print(f"{found.bag}: {first}")
+    if found.ground is not None:
+        rest.append(f"  ground: {found.ground.description}")
     if found.robot_file:
         rest.append(f"  robot file: {found.robot_file}")
     print("\n".join([*rest, f"  report: {found.page}"]))
@@ -145,7 +186,7 @@ def _diagnose_many(options: argparse.Namespace) -> int:
     outs = [
         options.out / (name if names.count(name) == 1 else f"{number:02d}_{name}") for number, name in enumerate(names)
     ]
-    failed = 0
+    failed = refused = 0
     context = multiprocessing.get_context("spawn")
     jobs = min(options.jobs, len(options.bags))
     with (
@@ -160,11 +201,14 @@ def _diagnose_many(options: argparse.Namespace) -> int:
                 failed += 1
                 print(f"diagnose: {running[done]}: {found}", file=sys.stderr)
             else:
+                refused += _status(found) != 0
                 print_finding(found)
             bar.update()
     if failed:
         print(f"diagnose: {failed} of {len(outs)} bags failed", file=sys.stderr)
-    return int(failed > 0)
+    if refused:
+        print(f"diagnose: {refused} of {len(outs)} recordings cannot be diagnosed", file=sys.stderr)
+    return 1 if failed else NOT_IDENTIFIABLE_STATUS if refused else 0
 
 
 def _commission(options: argparse.Namespace) -> int:

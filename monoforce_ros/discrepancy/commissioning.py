@@ -20,12 +20,12 @@ from monoforce_ros.discrepancy.fit import (
     with_values,
 )
 from monoforce_ros.discrepancy.gap import noise_floor, noisy_motions, residual_scale
-from monoforce_ros.discrepancy.ground import terrain_uncertainty
 from monoforce_ros.discrepancy.hypothesis import Effects, Evidence, EvidenceWindows, Predictions, window_starts
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.preflight import complaints
 from monoforce_ros.discrepancy.score_test import variation
 from monoforce_ros.discrepancy.selection import BLOCK, Search, blocks_of
+from monoforce_ros.discrepancy.terrain_evidence import terrain_uncertainty
 from monoforce_ros.effects import CATALOGUE, identifiable_effects
 from monoforce_ros.robots import RobotModel
 

@@ -21,7 +21,7 @@ from monoforce_ros.discrepancy.comparison import (
     regime_table,
 )
 from monoforce_ros.discrepancy.estimates import EffectEstimate, ParameterEstimate
-from monoforce_ros.discrepancy.fit import Fit, estimate_effects
+from monoforce_ros.discrepancy.fit import Fit
 from monoforce_ros.discrepancy.gap import (
     Localisation,
     NoiseFloor,
@@ -31,7 +31,6 @@ from monoforce_ros.discrepancy.gap import (
     noisy_motions,
     residual_scale,
 )
-from monoforce_ros.discrepancy.ground import terrain_uncertainty
 from monoforce_ros.discrepancy.hypothesis import (
     Effects,
     Evidence,
@@ -43,6 +42,7 @@ from monoforce_ros.discrepancy.hypothesis import (
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.preflight import advice, complaints
 from monoforce_ros.discrepancy.selection import BLOCK, HEALTHY_LOSS, CandidateScore, Outcome, Search, Trial, paired
+from monoforce_ros.discrepancy.terrain_evidence import terrain_uncertainty
 from monoforce_ros.discrepancy.thresholds import Thresholds
 from monoforce_ros.discrepancy.verdict import Decision, Findings, Losses, Verdict, decide
 from monoforce_ros.discrepancy.wheels import WheelFinding, compare_with_wheels
@@ -240,13 +240,7 @@ def diagnose(
 
 def _estimated(search: Search, fit: Fit, outcome: Outcome) -> tuple[EffectEstimate, ...]:
     """Estimates of a fit; those of sensors and clocks include what the robot's file says already."""
-    estimates = estimate_effects(
-        fit,
-        outcome.indistinguishable,
-        healthy_variances=search.healthy_variances(fit),
-        segments=0 if search.nominal is None else search.nominal.segments,
-        confidence=search.thresholds.confidence,
-    )
+    estimates = search.estimates(fit, outcome.indistinguishable)
     in_file = dict(search.robot.effects)
     result = []
     for estimate in estimates:

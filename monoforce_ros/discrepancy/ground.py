@@ -1,111 +1,121 @@
-"""Ground: the terrain map of a recording, with supporting heights where the robot drove, and its uncertainty."""
+"""Ground: which terrain a recording is compared on, and whether that is the ground that it was driven on."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
-import torch
-from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from monoforce_ros.core import MotionTrack
-from monoforce_ros.discrepancy.hypothesis import EvidenceWindows, Predictions
-from monoforce_ros.physics import rest_depth
+from monoforce_ros.bags import BagError, Recording, SmoothedMotion
+from monoforce_ros.core import NANOSECOND
 from monoforce_ros.robots import RobotModel
-from monoforce_ros.terrain import TerrainMap
 
-_REACH = 1.5
-"""Distance from the driven cells within which the traced ground replaces the visible one [m]: a robot's width, so that
-predictions that leave the measured path by less still find supporting ground."""
-_SMOOTHING = 0.1
-"""Standard deviation of the smoothing of the traced correction [m]: a cell."""
+LEVEL_SLOPE = np.arcsin(0.05)
+"""Slope up to which ground counts as level [rad].
+
+On it gravity pulls with a twentieth of the weight, the typical rolling resistance of the catalogue: more would be taken
+for an effect.
+"""
+_SHARE_OF_PLANE = 0.8
+"""Share of the heights' variance above which one plane describes the ground: most of it, with room for noise."""
+_APART = 1.0
+"""Distance over which slopes are taken from heights [m]."""
 
 
 @dataclass(frozen=True)
 class Ground:
-    """A map, and two maps of the same ground with independent noise."""
+    """The terrain that a recording is compared on."""
 
-    terrain: TerrainMap
-    split: tuple[TerrainMap, TerrainMap] | None = None
-    """From the even and from the odd sweeps."""
+    source: str
+    """``flat``, ``lidar`` or a file."""
+    description: str
+    """For reports: what was taken and why."""
+    complaint: str = ""
+    """Why this is not the ground that the robot drove on; empty if nothing speaks against it."""
+
+    @property
+    def unknown(self) -> bool:
+        """Whether the robot drove over ground that no map shows."""
+        return bool(self.complaint)
 
 
-def supporting_terrain(visible: TerrainMap, motion: MotionTrack, robot: RobotModel) -> TerrainMap:
-    """The map with the ground that carried the robot in place of the visible one where it drove.
-
-    A lidar sees the top of vegetation, the wheels trace the ground below. ``geometric_height`` stays the visible one,
-    so that their difference is the height of the vegetation. Near the path the difference is extrapolated, since wheels
-    that leave the measured path by a few centimetres must not meet a step; it fades out with the distance.
+def choose_ground(terrain: str, recording: Recording, smoothed: SmoothedMotion, robot: RobotModel) -> Ground:
+    """The terrain of a recording: as asked for, or for ``auto`` from what the bag holds.
 
     Args:
-        visible: map in the odometry frame.
-        motion: smoothed poses of the base frame.
-        robot: its wheels or tracks.
+        terrain: ``auto``, ``flat``, ``lidar`` or a file of ``fit_terrain``.
+        recording: its clouds serve as map where there are any and their sensor's pose is known.
+        smoothed: the measured motion, whose roll, pitch and heights show whether ground is level.
+        robot: its file may know the pose of the lidar.
     """
-    grid = visible.grid
-    underside = robot.points[robot.point_tangents[:, 0] < -0.97].double().numpy()
+    if terrain == "lidar":
+        return Ground(terrain, f"lidar map of {len(recording.clouds)} sweeps")
+    if terrain not in ("auto", "flat"):
+        return Ground(terrain, f"map {Path(terrain).name}")
+    reason = "no clouds in the bag"
+    if terrain == "auto" and recording.clouds:
+        try:
+            points, frame = recording.cloud(recording.clouds[0])
+            recording.sensor_pose(frame, robot.base_frame, robot.sensors)
+            if len(points):
+                return Ground("lidar", f"lidar map of {len(recording.clouds)} sweeps (the bag has clouds)")
+            reason = "the bag's clouds are empty"
+        except (BagError, ValueError) as error:
+            reason = f"clouds cannot be used: {error}"
+    slope, plane = slope_of(smoothed)
+    said = "as asked for" if terrain == "flat" else reason
+    complaint = ""
+    if slope > LEVEL_SLOPE:
+        remedy = "use --terrain lidar or a map" if recording.clouds else "record a lidar, or give a map of fit_terrain"
+        what = f"the ground is not level (slopes of {np.degrees(slope):.1f}° by the poses, root mean square)"
+        if plane > _SHARE_OF_PLANE:
+            what = (
+                f"the poses lie in a plane that is tilted by {np.degrees(slope):.1f}°: the ground slopes, or z of the "
+                "localisation is not against gravity"
+            )
+            remedy = "level the localisation's frame by its IMU, or " + remedy
+        complaint = f"{what}; level ground is assumed ({said}), so that slopes may pass for an effect: {remedy}"
+    return Ground("flat", f"level ({said})", complaint)
+
+
+def slope_of(smoothed: SmoothedMotion) -> tuple[float, float]:
+    """Root mean square slope of the ground that the robot drove over, by its poses, beyond their noise [rad].
+
+    Also returns the share of the variance of the heights that one tilted plane explains. The slope is the larger of two
+    estimates: the tilt of the robot, without one that it keeps in its own axes as a sensor mounted at an angle has; and
+    the change of its height along the way.
+    """
+    motion = smoothed.motion
     rotations = Rotation.from_quat(motion.quaternions).as_matrix()
-    points = (np.einsum("tij,nj->tni", rotations, underside) + motion.positions[:, None]).reshape(-1, 3)
-    points[:, 2] += rest_depth(robot, float(visible.stiffness.median()))
-    rows, columns, inside = grid.cells(points[:, :2])
-    flat, heights = (rows * grid.columns + columns)[inside], points[inside, 2]
-    if not len(flat):
-        return visible
-    order = np.lexsort((heights, flat))
-    flat, heights = flat[order], heights[order]
-    starts = np.flatnonzero(np.r_[True, flat[1:] != flat[:-1]])
-    # A low quantile: a wheel may hang above a cell that another wheel touches.
-    middle = starts + np.diff(np.r_[starts, len(flat)]) // 4
-    seen = visible.height.double().numpy()
-    change, traced = np.zeros(seen.shape), np.zeros(seen.shape, bool)
-    change.ravel()[flat[starts]] = heights[middle] - seen.ravel()[flat[starts]]
-    traced.ravel()[flat[starts]] = True
-    distance, nearest = distance_transform_edt(~traced, sampling=grid.resolution, return_indices=True)
-    spread = gaussian_filter(change[nearest[0], nearest[1]], _SMOOTHING / grid.resolution)
-    spread = np.where(traced, change, spread) * np.clip(1.0 - distance / _REACH, 0.0, 1.0)
-    height = visible.height + torch.from_numpy(spread.astype(np.float32))
-    return replace(visible, height=height)
-
-
-def terrain_uncertainty(
-    robot: RobotModel, data: EvidenceWindows, split: tuple[TerrainMap, TerrainMap] | None
-) -> np.ndarray:
-    """Residuals that errors of the map cause in each window with a perfect robot model, ``[W, K, 3]`` [m, m, rad].
-
-    It has two parts, both measured on the maps at hand. Predictions on maps from every other sweep differ by twice the
-    effect of the whole map's noise. And predictions on the map at half its resolution differ by as much as the map's
-    own resolution leaves open, if errors are of first order in the cell size (Richardson). Half of the squares is that
-    of the window, half that of all windows, for a single difference is a poor estimate of a standard deviation.
-    Zero on level ground.
-    """
-    shape = (len(data.starts), len(data.samples), 3)
-    if data.terrain is None:
-        return np.zeros(shape)
-
-    def predicted(terrain: TerrainMap) -> np.ndarray:
-        return np.nan_to_num(Predictions(robot, replace(data, terrain=terrain)).residuals([()])[0])
-
-    reference = predicted(data.terrain)
-    parts = [predicted(coarsened(data.terrain)) - reference]
-    if split is not None:
-        parts.append(0.5 * (predicted(split[0]) - predicted(split[1])))
-    squares = np.zeros(shape)
-    for part in parts:
-        # Robust: a single window with a spurious step under a wheel must not raise the uncertainty of all others.
-        common = np.quantile(np.abs(part), 0.683, axis=0)
-        squares += 0.5 * part**2 + 0.5 * common**2
-    return np.sqrt(squares)
-
-
-def coarsened(terrain: TerrainMap) -> TerrainMap:
-    """The map with heights averaged over two by two cells, on the same grid."""
-
-    def halved(values: torch.Tensor) -> torch.Tensor:
-        rows, columns = values.shape
-        even = torch.nn.functional.pad(values[None, None], (0, columns % 2, 0, rows % 2), mode="replicate")
-        small = torch.nn.functional.avg_pool2d(even, 2)
-        large = torch.nn.functional.interpolate(small, scale_factor=2, mode="bilinear", align_corners=False)
-        return large[0, 0, :rows, :columns]
-
-    return replace(terrain, height=halved(terrain.height), geometric_height=halved(terrain.geometric_height))
+    every = max(1, len(motion) // 4000)
+    up = rotations[::every, 2, :2]  # of the odometry frame's z axis, in the base frame: minus pitch and roll
+    yaw = np.arctan2(rotations[::every, 1, 0], rotations[::every, 0, 0])
+    # up = mounting + slope turned into the base frame; where the robot hardly turns all of it is slope.
+    rows = np.zeros((len(up), 2, 4))
+    rows[:, 0, 0] = rows[:, 1, 1] = 1.0
+    rows[:, 0, 2], rows[:, 0, 3] = np.cos(yaw), np.sin(yaw)
+    rows[:, 1, 2], rows[:, 1, 3] = -np.sin(yaw), np.cos(yaw)
+    matrix = rows.reshape(-1, 4)
+    prior = np.diag([1.0, 1.0, 0.0, 0.0]) * 0.02 * len(up) + 1e-9 * np.eye(4)
+    solution = np.linalg.solve(matrix.T @ matrix + prior, matrix.T @ up.ravel())
+    tilts = up - solution[:2]
+    tilt = float(np.mean((tilts**2).sum(axis=1))) - 2.0 * smoothed.rotation_noise**2
+    heights = []
+    for stretch in smoothed.stretches:
+        places = motion.positions[stretch]
+        along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(places[:, :2], axis=0), axis=1))]
+        if along[-1] < 2 * _APART or (motion.stamps[stretch][-1] - motion.stamps[stretch][0]) * NANOSECOND < 2.0:
+            continue
+        keep = np.r_[True, np.diff(along) > 1e-6]
+        heights.append(np.diff(np.interp(np.arange(0.0, along[-1], _APART), along[keep], places[keep, 2])) / _APART)
+    rise = 0.0
+    if heights:
+        steps = np.concatenate(heights)
+        # A height that drifts as a whole is no slope; the median is robust against jumps of a localisation.
+        rise = float(np.median(np.abs(steps)) / 0.6745) ** 2 - 2.0 * (smoothed.position_noise / _APART) ** 2
+    places = np.c_[motion.positions[:, :2], np.ones(len(motion))]
+    height = motion.positions[:, 2]
+    off = height - places @ np.linalg.lstsq(places, height, rcond=None)[0]
+    return float(np.sqrt(max(tilt, rise, 0.0))), 1.0 - float(off.var() / max(height.var(), 1e-12))

@@ -14,9 +14,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.stats import t as student_distribution
 
+from monoforce_ros.discrepancy.credibility import complaint
+from monoforce_ros.discrepancy.estimates import EffectEstimate
 from monoforce_ros.discrepancy.fit import (
     OUTLIER,
     Fit,
+    estimate_effects,
     first_values,
     fit_effects,
     flat,
@@ -302,6 +305,24 @@ class Search:
             variances[place] = np.diag(spread) * typical[place] ** 2
         return variances
 
+    def estimates(
+        self, fit: Fit, indistinguishable: Mapping[str, Sequence[str]] | None = None
+    ) -> tuple[EffectEstimate, ...]:
+        """Fitted effects with intervals that hold the healthy robot's variation too."""
+        return estimate_effects(
+            fit,
+            indistinguishable or {},
+            healthy_variances=self.healthy_variances(fit),
+            segments=0 if self.nominal is None else self.nominal.segments,
+            confidence=self.thresholds.confidence,
+        )
+
+    def _credible(self, trial: Trial) -> bool:
+        """Whether the effect that was added last is a measurement."""
+        estimate = self.estimates(self.refit(trial.effects))[-1]
+        in_file = {} if CATALOGUE[estimate.name].stage == "measurement" else dict(self._own.get(estimate.name, {}))
+        return not complaint(estimate, {key: float(value) for key, value in in_file.items()})
+
     def ranked(self, fit: Fit) -> list[int]:
         """Indices of a fit's effects, ranked by leave-one-out loss: the loss of the others, fitted again without it."""
         if len(fit.effects) < 2:
@@ -452,7 +473,7 @@ class Search:
         kept = []
         for trial in judged:
             gain, low = self._gain(best, trial)
-            if low > 0 and gain > least:
+            if low > 0 and gain > least and self._credible(trial):
                 kept.append(trial)
         return sorted(kept, key=lambda trial: trial.loss), listed
 

@@ -7,15 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import BagError, BagReader, Recording, SmoothedMotion, camera_info_topic, smooth
-from monoforce_ros.core import NANOSECOND, CommandTrack, DelayCorrelation, MotionTrack
+from monoforce_ros.core import NANOSECOND, MotionTrack
+from monoforce_ros.discrepancy import command_delay, motion_faults
 from monoforce_ros.evaluation.findings import Finding, Level, missing, note, ok, warning
 from monoforce_ros.evaluation.topic_check import IMU, TopicCheck
 from monoforce_ros.robots import RobotModel
-
-_LAGS = np.arange(-0.5, 1.525, 0.025)
 
 
 @dataclass(frozen=True)
@@ -81,11 +79,11 @@ def _contents(path: str | Path, robot: RobotModel, topics: Collection[TopicCheck
             f"{robot.base_frame!r}: set base_frame in the robot's file, or transform the odometry"
         )
     smoothed = smooth(motion)
+    faults = motion_faults(smoothed, recording.commands, recording.wheels)
+    yield from (missing(text) for text in faults)
     yield from _motion_findings(recording, smoothed, span)
     if len(recording.commands):
-        yield from _command_findings(recording, smoothed.motion, robot)
-    else:
-        yield missing("commands: no Twist or TwistStamped; record the commands of the base controller (cmd_vel)")
+        yield from _command_findings(recording, smoothed.motion, robot, follows=not faults)
     sensors = [*_cloud_findings(recording, robot), *_image_findings(recording, robot)]
     yield from sensors
     if not any(finding.level is Level.OK for finding in sensors):
@@ -138,9 +136,6 @@ def _motion_findings(recording: Recording, smoothed: SmoothedMotion, span: float
         yield warning("the robot hardly moves: too little motion for training or comparison")
     if len(motion) > 20:
         yield from _twist_findings(motion.linear_velocities[:, 0], speeds)
-    up = Rotation.from_quat(motion.quaternions).as_matrix()[:, 2, 2]
-    if np.median(up) < 0.7:
-        yield warning("by its odometry the robot lies on its side or upside down: does z point up in that frame?")
 
 
 def _twist_findings(stated: np.ndarray, smoothed: np.ndarray) -> Iterator[Finding]:
@@ -154,22 +149,22 @@ def _twist_findings(stated: np.ndarray, smoothed: np.ndarray) -> Iterator[Findin
         yield warning("the odometry's speed has the opposite sign of its poses' motion: wrong frame of the twist?")
 
 
-def _command_findings(recording: Recording, motion: MotionTrack, robot: RobotModel) -> Iterator[Finding]:
+def _command_findings(
+    recording: Recording, motion: MotionTrack, robot: RobotModel, *, follows: bool
+) -> Iterator[Finding]:
+    """Findings about commands; whether motion follows them is of interest where nothing worse was found."""
     commands = recording.commands
     largest_speed, largest_yaw_rate = np.abs(commands.twists).max(axis=0)
     yield ok(
         f"commands {recording.topics['commands']}: {len(commands)}, up to {largest_speed:.2f} m/s and "
         f"{largest_yaw_rate:.2f} rad/s"
     )
-    first = max(int(commands.stamps[0]), int(motion.stamps[0]))
-    last = min(int(commands.stamps[-1]), int(motion.stamps[-1]))
-    if last < first:
-        yield missing("commands and odometry do not overlap in time: they were stamped by different clocks")
-        return
     if largest_speed > 1.5 * robot.maximum_speed:
         yield warning(
             f"commands far exceed the maximum speed of {robot.name}, {robot.maximum_speed:g} m/s: wrong robot or unit?"
         )
+    if not follows:
+        return
     delay, correlation = command_delay(motion, commands)
     if correlation > 0.5:
         yield note(f"motion follows commands {delay:.2f} s later (correlation {correlation:.2f})")
@@ -178,35 +173,6 @@ def _command_findings(recording: Recording, motion: MotionTrack, robot: RobotMod
             f"motion does not follow the commands (correlation {correlation:.2f}): wrong topic, unsynchronised clock, "
             "or another source of commands"
         )
-
-
-def command_delay(motion: MotionTrack, commands: CommandTrack) -> tuple[float, float]:
-    """Delay from command to motion [s], and the correlation of both at that delay, 0 to 1; NaN and 0 if unknown."""
-    first, last = int(motion.stamps[0]), int(motion.stamps[-1])
-    stamps = np.arange(first, last, 25_000_000, dtype=np.int64)
-    if len(stamps) < 80:
-        return float("nan"), 0.0
-    seconds, times = (stamps - first) * NANOSECOND, (motion.stamps - first) * NANOSECOND
-    pieces = []
-    for axis, values in enumerate((motion.linear_velocities[:, 0], motion.angular_velocities[:, 2])):
-        measured = np.interp(seconds, times, values)
-        spread = float(measured.std())
-        # Both signals in units of one scale: a robot that turns at a third of what is commanded follows all the same,
-        # and an axis counts by how much it moves and is commanded to.
-        scale = np.sqrt(spread * float(commands.sample(stamps)[:, axis].std()))
-
-        def delayed(lag: float, axis: int = axis, scale: float = scale) -> tuple[np.ndarray, np.ndarray]:
-            commanded = commands.sample(stamps - round(1e9 * lag))[:, axis]
-            own = float(commanded.std())
-            # A nearly constant command carries no information about delay.
-            return (commanded - commanded.mean()) * scale / max(own, 1e-9), np.full(len(stamps), own > 0.02)
-
-        pieces.append(((measured - measured.mean()) * scale / max(spread, 1e-9), delayed))
-    correlation = DelayCorrelation.of(pieces, _LAGS)
-    if not len(correlation) or correlation.values.max() <= 0.0:
-        return float("nan"), 0.0
-    best = int(np.argmax(correlation.values))
-    return float(_LAGS[best]), float(correlation.values[best])
 
 
 def check_text(check: BagCheck) -> str:

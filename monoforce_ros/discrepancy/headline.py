@@ -1,0 +1,231 @@
+"""Headline: what a diagnosis means, how sure it is and what to do, in a few sentences; what stays unexplained first."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+from monoforce_ros.discrepancy.comparison import GapRow
+from monoforce_ros.discrepancy.credibility import complaint
+from monoforce_ros.discrepancy.diagnosis import Diagnosis
+from monoforce_ros.discrepancy.estimates import EffectEstimate
+from monoforce_ros.discrepancy.learned import LEARNED
+from monoforce_ros.discrepancy.verdict import Verdict
+from monoforce_ros.discrepancy.wording import cause, finding, remedy
+
+MOST = 0.5
+"""Share of an error above which most of it is explained: by the meaning of "most"."""
+ABOVE_NOISE = 2.0
+"""An error counts if it is at least so many times the noise floor: the noise is then the smaller part of it."""
+
+
+class Tone(StrEnum):
+    """How far a result can be acted on."""
+
+    GOOD = "good"
+    """The recording is explained."""
+    PARTLY = "partly"
+    """Something is known, and something is left or in doubt."""
+    UNKNOWN = "unknown"
+    """Nothing is known."""
+
+
+@dataclass(frozen=True)
+class Explained:
+    """Errors after 2 s without and with the added effects, on data to which nothing was fitted."""
+
+    metric: str
+    """``position`` or ``heading``."""
+    row: GapRow
+    recording: str
+    """Name of the held-out recording; empty for the held-out blocks of the diagnosed one."""
+
+    @property
+    def share(self) -> float:
+        """Explained share of the error above the noise floor, at most 1; negative where the error grew."""
+        assert self.row.after is not None
+        reducible = self.row.before - self.row.noise
+        return float(min((self.row.before - self.row.after) / reducible, 1.0)) if reducible > 0 else 0.0
+
+    @property
+    def counts(self) -> bool:
+        """Whether there was an error to explain."""
+        return self.row.before > ABOVE_NOISE * self.row.noise
+
+    @property
+    def grew(self) -> bool:
+        """Whether the error is larger with the effects: its median, or beyond chance where it is mostly noise."""
+        assert self.row.after is not None
+        certain = self.row.gain_high is not None and self.row.gain_high < 0
+        return self.row.after > self.row.before and (self.counts or certain)
+
+
+@dataclass(frozen=True)
+class Headline:
+    """The first screen of a report."""
+
+    tone: Tone
+    sentence: str
+    unexplained: str
+    """What is left of the error; empty where nothing was added."""
+    findings: tuple[str, ...]
+    """What is wrong, the most important first."""
+    doubts: tuple[str, ...]
+    """Why the findings may be wrong, or cannot be trusted."""
+    confidence: tuple[str, ...]
+    """How sure the findings are."""
+    actions: tuple[str, ...]
+    helps: bool = False
+    """Whether the added effects improve predictions: no error after 2 s grew, and one at least shrank."""
+
+
+def credible_effects(diagnosis: Diagnosis) -> tuple[tuple[EffectEstimate, ...], tuple[str, ...]]:
+    """The effects that may be called found, and why the others may not."""
+    judged = [(effect, complaint(effect)) for effect in diagnosis.effects]
+    return tuple(e for e, why in judged if not why), tuple(why for _, why in judged if why)
+
+
+def explained(diagnosis: Diagnosis) -> tuple[Explained, ...]:
+    """Position and heading errors after 2 s, on held-out recordings, or else on held-out blocks of this one.
+
+    Recordings shorter than the windows of 2 s have those at the longest shorter time.
+    """
+    tables: Mapping[str, Mapping[str, GapRow]] = diagnosis.held_out or {"": diagnosis.gap}
+    found = []
+    for recording, table in tables.items():
+        for metric in ("position", "heading"):
+            rows = [
+                row
+                for name, row in table.items()
+                if name.startswith(f"{metric}_") and 0 < row.horizon <= 2.0 and row.after is not None
+            ]
+            if rows:
+                found.append(Explained(metric, max(rows, key=lambda row: row.horizon), recording))
+    return tuple(found)
+
+
+def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
+    """The first screen of a diagnosis.
+
+    Args:
+        diagnosis: the result.
+        complaints: further reasons for doubt, such as ground that no map shows.
+    """
+    if diagnosis.verdict == Verdict.NOT_IDENTIFIABLE:
+        return Headline(
+            Tone.UNKNOWN, "This recording cannot be diagnosed.", "", tuple(diagnosis.advice), tuple(complaints),
+            tuple(diagnosis.remarks), ("record again as said here, then run diagnose on the new recording",),
+        )  # fmt: skip
+    if diagnosis.verdict == Verdict.NO_DISCREPANCY:
+        return Headline(
+            Tone.PARTLY if complaints else Tone.GOOD,
+            "Nothing is wrong: the robot moves as its model predicts.",
+            "",
+            (),
+            tuple(complaints),
+            _sizes(diagnosis),
+            diagnosis.advice,
+        )
+    effects, refused = credible_effects(diagnosis)
+    doubts = [*complaints, *refused]
+    named = [effect for effect in effects if effect.name != LEARNED]
+    rows = explained(diagnosis)
+    left = _left(rows)
+    confidence = [*_sizes(diagnosis), *_intervals(effects)]
+    for effect in named:
+        if effect.indistinguishable:
+            others = " or ".join(cause(other) for other in effect.indistinguishable)
+            doubts.append(f"{cause(effect.name)} could as well be {others}: this recording cannot tell them apart")
+    actions = [*(remedy(effect.name) for effect in effects), *diagnosis.advice]
+    counted = [row for row in rows if row.counts]
+    grew = [row for row in rows if row.grew]
+    doubts += [_growth(row) for row in grew]
+    enough = bool(counted) and all(row.share >= MOST for row in counted)
+    findings = tuple(finding(effect) for effect in effects)
+    helps = bool(effects) and not grew and not refused and any(row.share > 0 for row in rows)
+
+    def result(tone: Tone, sentence: str) -> Headline:
+        return Headline(
+            tone, sentence, left, findings, tuple(doubts), tuple(confidence), tuple(dict.fromkeys(actions)), helps
+        )
+
+    if diagnosis.verdict == Verdict.UNKNOWN_EFFECT:
+        sentence = "Something is wrong that no known effect explains."
+        if named:
+            sentence = "Something is wrong that no known effect explains, besides what was found."
+        return result(Tone.UNKNOWN, sentence)
+    if diagnosis.verdict == Verdict.NO_IMPROVEMENT or not effects:
+        sentence = "The robot does not move as predicted, and the cause is not established."
+        return result(Tone.UNKNOWN, sentence)
+    if enough and not grew and not refused and not complaints:
+        sentence = "The cause was found." if len(effects) == 1 else f"{len(effects)} causes were found."
+        return result(Tone.GOOD, sentence)
+    if grew and not any(row.share >= MOST for row in counted):
+        sentence = "The error is not explained: with what was found, predictions get worse."
+    elif not enough:
+        sentence = "Most of the error is not explained; a part of the cause was found."
+    elif grew:
+        sentence = f"A cause was found, but with it the {grew[0].metric} error grows."
+    else:
+        sentence = "A cause was found, with doubts."
+    return result(Tone.PARTLY, sentence)
+
+
+def _left(rows: Sequence[Explained]) -> str:
+    """What stays unexplained, in one sentence."""
+    texts = []
+    for row in rows:
+        where = f" on {row.recording}" if row.recording else ""
+        if not row.counts:
+            texts.append(f"the {row.metric} error{where} was hardly above the noise before")
+        elif row.grew:
+            texts.append(f"all of the {row.metric} error{where}, which grew")
+        else:
+            texts.append(f"{100 * (1 - max(row.share, 0.0)):.0f} % of the {row.metric} error{where}")
+    return f"Unexplained after {rows[0].row.horizon:g} s: {'; '.join(texts)}." if texts else ""
+
+
+def _growth(row: Explained) -> str:
+    where = f" on {row.recording}" if row.recording else ""
+    assert row.row.after is not None
+    return (
+        f"the {row.metric} error{where} grows with these effects, from {row.row.before:.2g} to "
+        f"{row.row.after:.2g} {row.row.unit} after {row.row.horizon:g} s"
+    )
+
+
+def _sizes(diagnosis: Diagnosis) -> tuple[str, ...]:
+    """The size of the errors, before and after, in plain numbers."""
+    texts = []
+    for row in explained(diagnosis):
+        where = f"held-out recording {row.recording}" if row.recording else "held-out parts of this recording"
+        unit = "°" if row.row.unit == "deg" else f" {row.row.unit}"
+        texts.append(
+            f"{row.metric} error after {row.row.horizon:g} s: {row.row.before:.2g} → {row.row.after:.2g}{unit} "
+            f"(median, {where}; noise {row.row.noise:.2g}{unit})"
+        )
+    if texts:
+        return tuple(texts)
+    for metric in ("position", "heading"):
+        rows = [entry for name, entry in diagnosis.gap.items() if name.startswith(metric) and 0 < entry.horizon <= 2.0]
+        if rows:
+            last = max(rows, key=lambda entry: entry.horizon)
+            unit = "°" if last.unit == "deg" else f" {last.unit}"
+            size, noise = f"{last.before:.2g}{unit}", f"{last.noise:.2g}{unit}"
+            texts.append(f"{metric} error after {last.horizon:g} s: {size} (median; noise {noise})")
+    return tuple(texts)
+
+
+def _intervals(effects: Sequence[EffectEstimate]) -> list[str]:
+    """The 95 % intervals of each effect's values."""
+    texts = []
+    for effect in effects:
+        if effect.name == LEARNED:
+            continue
+        listed = []
+        for key, value in effect.parameters.items():
+            unit = "" if value.unit == "-" else f" {value.unit}"
+            listed.append(f"{key.replace('_', ' ')} {value.low:.3g} to {value.high:.3g}{unit}")
+        texts.append(f"{cause(effect.name)}: {', '.join(listed)} with 95 % confidence")
+    return texts

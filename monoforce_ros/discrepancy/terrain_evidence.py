@@ -1,0 +1,102 @@
+"""Terrain evidence: supporting heights where the robot drove, and what the map leaves uncertain of the motion."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from scipy.ndimage import distance_transform_edt, gaussian_filter
+from scipy.spatial.transform import Rotation
+
+from monoforce_ros.core import MotionTrack
+from monoforce_ros.discrepancy.hypothesis import EvidenceWindows, Predictions
+from monoforce_ros.physics import rest_depth
+from monoforce_ros.robots import RobotModel
+from monoforce_ros.terrain import TerrainMap
+
+_REACH = 1.5
+"""Distance from the driven cells within which the traced ground replaces the visible one [m]: a robot's width, so that
+predictions that leave the measured path by less still find supporting ground."""
+_SMOOTHING = 0.1
+"""Standard deviation of the smoothing of the traced correction [m]: a cell."""
+
+
+def supporting_terrain(visible: TerrainMap, motion: MotionTrack, robot: RobotModel) -> TerrainMap:
+    """The map with the ground that carried the robot in place of the visible one where it drove.
+
+    A lidar sees the top of vegetation, the wheels trace the ground below. ``geometric_height`` stays the visible one,
+    so that their difference is the height of the vegetation. Near the path the difference is extrapolated, since wheels
+    that leave the measured path by a few centimetres must not meet a step; it fades out with the distance.
+
+    Args:
+        visible: map in the odometry frame.
+        motion: smoothed poses of the base frame.
+        robot: its wheels or tracks.
+    """
+    grid = visible.grid
+    underside = robot.points[robot.point_tangents[:, 0] < -0.97].double().numpy()
+    rotations = Rotation.from_quat(motion.quaternions).as_matrix()
+    points = (np.einsum("tij,nj->tni", rotations, underside) + motion.positions[:, None]).reshape(-1, 3)
+    points[:, 2] += rest_depth(robot, float(visible.stiffness.median()))
+    rows, columns, inside = grid.cells(points[:, :2])
+    flat, heights = (rows * grid.columns + columns)[inside], points[inside, 2]
+    if not len(flat):
+        return visible
+    order = np.lexsort((heights, flat))
+    flat, heights = flat[order], heights[order]
+    starts = np.flatnonzero(np.r_[True, flat[1:] != flat[:-1]])
+    # A low quantile: a wheel may hang above a cell that another wheel touches.
+    middle = starts + np.diff(np.r_[starts, len(flat)]) // 4
+    seen = visible.height.double().numpy()
+    change, traced = np.zeros(seen.shape), np.zeros(seen.shape, bool)
+    change.ravel()[flat[starts]] = heights[middle] - seen.ravel()[flat[starts]]
+    traced.ravel()[flat[starts]] = True
+    distance, nearest = distance_transform_edt(~traced, sampling=grid.resolution, return_indices=True)
+    spread = gaussian_filter(change[nearest[0], nearest[1]], _SMOOTHING / grid.resolution)
+    spread = np.where(traced, change, spread) * np.clip(1.0 - distance / _REACH, 0.0, 1.0)
+    height = visible.height + torch.from_numpy(spread.astype(np.float32))
+    return replace(visible, height=height)
+
+
+def terrain_uncertainty(
+    robot: RobotModel, data: EvidenceWindows, split: tuple[TerrainMap, TerrainMap] | None
+) -> np.ndarray:
+    """Residuals that errors of the map cause in each window with a perfect robot model, ``[W, K, 3]`` [m, m, rad].
+
+    It has two parts, both measured on the maps at hand. Predictions on maps from every other sweep differ by twice the
+    effect of the whole map's noise. And predictions on the map at half its resolution differ by as much as the map's
+    own resolution leaves open, if errors are of first order in the cell size (Richardson). Half of the squares is that
+    of the window, half that of all windows, for a single difference is a poor estimate of a standard deviation.
+    Zero on level ground.
+    """
+    shape = (len(data.starts), len(data.samples), 3)
+    if data.terrain is None:
+        return np.zeros(shape)
+
+    def predicted(terrain: TerrainMap) -> np.ndarray:
+        return np.nan_to_num(Predictions(robot, replace(data, terrain=terrain)).residuals([()])[0])
+
+    reference = predicted(data.terrain)
+    parts = [predicted(coarsened(data.terrain)) - reference]
+    if split is not None:
+        parts.append(0.5 * (predicted(split[0]) - predicted(split[1])))
+    squares = np.zeros(shape)
+    for part in parts:
+        # Robust: a single window with a spurious step under a wheel must not raise the uncertainty of all others.
+        common = np.quantile(np.abs(part), 0.683, axis=0)
+        squares += 0.5 * part**2 + 0.5 * common**2
+    return np.sqrt(squares)
+
+
+def coarsened(terrain: TerrainMap) -> TerrainMap:
+    """The map with heights averaged over two by two cells, on the same grid."""
+
+    def halved(values: torch.Tensor) -> torch.Tensor:
+        rows, columns = values.shape
+        even = torch.nn.functional.pad(values[None, None], (0, columns % 2, 0, rows % 2), mode="replicate")
+        small = torch.nn.functional.avg_pool2d(even, 2)
+        large = torch.nn.functional.interpolate(small, scale_factor=2, mode="bilinear", align_corners=False)
+        return large[0, 0, :rows, :columns]
+
+    return replace(terrain, height=halved(terrain.height), geometric_height=halved(terrain.geometric_height))

@@ -1,0 +1,182 @@
+"""Wording: what an effect means, in the words of somebody who repairs robots."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+
+from monoforce_ros.discrepancy.estimates import EffectEstimate
+from monoforce_ros.discrepancy.learned import LEARNED, formula
+from monoforce_ros.effects import CATALOGUE
+
+_Values = Mapping[str, float]
+
+
+def finding(estimate: EffectEstimate) -> str:
+    """What an estimate means for the robot, as one sentence with its values.
+
+    An effect without a sentence of its own here is described by the summary in its file.
+    """
+    values = {key: parameter.value for key, parameter in estimate.parameters.items()}
+    if estimate.name == LEARNED:
+        return f"An unnamed force or torque acts on the robot: {formula(values)} [N, N m]."
+    described = _FINDINGS.get(estimate.name)
+    try:
+        if described is not None:
+            return described(values)
+    except KeyError:
+        # An estimate with other parameters than this sentence expects.
+        pass
+    summary = CATALOGUE[estimate.name].summary if estimate.name in CATALOGUE else estimate.name
+    listed = ", ".join(f"{key} {value.value:.3g} {value.unit}" for key, value in estimate.parameters.items())
+    return f"{summary.rstrip('.')}: {listed}."
+
+
+def remedy(name: str) -> str:
+    """What to check on the robot where this effect was found."""
+    return _REMEDIES.get(name, "use the written robot file, or mend the robot and record again")
+
+
+def cause(name: str) -> str:
+    """The effect in a few words, for lists of what else it could be."""
+    return _CAUSES.get(name, name.replace("_", " "))
+
+
+def _change(factor: float, less: str, more: str) -> str:
+    """A factor as a change in percent."""
+    return f"{100 * abs(1 - factor):.0f} % {less if factor < 1 else more}"
+
+
+def _sides(x: float, y: float, unit: str) -> str:
+    """A vector in the base frame (x forward, y left), without components that round to nothing beside the larger."""
+    largest = max(abs(x), abs(y))
+    parts = []
+    if abs(x) > 0.1 * largest:
+        parts.append(f"{abs(x):.3g} {unit} {'forward' if x > 0 else 'backward'}")
+    if abs(y) > 0.1 * largest:
+        parts.append(f"{abs(y):.3g} {unit} to the {'left' if y > 0 else 'right'}")
+    return " and ".join(parts) or f"0 {unit}"
+
+
+def _clock(what: str) -> Callable[[_Values], str]:
+    def sentence(values: _Values) -> str:
+        # Offset: recorded minus true time.
+        return f"{what} are stamped {abs(values['offset']):.2f} s {'late' if values['offset'] > 0 else 'early'}."
+
+    return sentence
+
+
+def _asymmetry(values: _Values) -> str:
+    difference = values["difference"]
+    fast, slow = ("right", "left") if difference > 0 else ("left", "right")
+    percent = f"{100 * abs(difference):.0f} %"
+    return f"The {fast} side runs {percent} faster than the {slow} side: the robot pulls to the {slow}."
+
+
+def _scrub(values: _Values) -> str:
+    factor = values["track_width_factor"]
+    return f"The robot turns {_change(1 / factor, 'less', 'more')} than its wheels ask for."
+
+
+def _friction(values: _Values) -> str:
+    factor = values["factor"]
+    return f"The ground grips {_change(factor, 'less than assumed: it is slippery', 'more than assumed')}."
+
+
+def _payload(values: _Values) -> str:
+    mass = values["mass"]
+    place = ""
+    if "x" in values and "y" in values:
+        x, y = values["x"], values["y"]
+        ahead = f"{abs(x):.2f} m {'ahead of' if x > 0 else 'behind'} the base frame's origin"
+        place = f", {ahead} and {abs(y):.2f} m to its {'left' if y > 0 else 'right'}"
+    if mass < 0:
+        return f"The robot is {-mass:.0f} kg lighter than modelled{place}."
+    return f"The robot carries {mass:.0f} kg that its model does not have{place}."
+
+
+def _tilt(values: _Values) -> str:
+    angle = math.degrees(math.hypot(values.get("about_x", 0.0), values.get("about_y", 0.0)))
+    return f"Down is {angle:.1f}° off: the ground slopes, or the localisation is tilted."
+
+
+_FINDINGS: dict[str, Callable[[_Values], str]] = {
+    "command_delay": lambda v: f"The drives react {v['delay']:.2f} s late to every command.",
+    "actuator_lag": lambda v: (
+        f"The drives are sluggish: {v['time_constant']:.2f} s after a change of the command a third is still missing."
+    ),
+    "actuator_saturation": lambda v: f"The drives run no faster than {v['limit']:.2f} m/s, whatever is commanded.",
+    "actuator_deadband": lambda v: (
+        f"The drives ignore commands below {v['width']:.2f} m/s, and run slower by as much above."
+    ),
+    "drive_gain": lambda v: f"The drives run {_change(v['gain'], 'slower', 'faster')} than commanded.",
+    "drive_asymmetry": _asymmetry,
+    "turning_scrub": _scrub,
+    "friction_scale": _friction,
+    "friction_anisotropy": lambda v: f"Sideways, tyres grip {_change(v['factor'], 'less', 'more')} than lengthways.",
+    "rolling_resistance": lambda v: (
+        f"The robot rolls heavily: it is held back by {100 * v['coefficient']:.0f} % of its weight at any speed."
+    ),
+    "viscous_drag": lambda v: (
+        f"The faster the robot drives, the more it is held back: by {v['coefficient']:.0f} N at 1 m/s."
+    ),
+    "quadratic_drag": lambda v: (
+        f"The robot is held back by {v['coefficient']:.0f} N at 1 m/s, and four times as much at twice the speed."
+    ),
+    "constant_force": lambda v: f"Something pulls the robot with {_sides(v['x'], v['y'], 'N')} all the time.",
+    "gravity_tilt": _tilt,
+    "payload": _payload,
+    "pose_clock_offset": _clock("The poses"),
+    "command_clock_offset": _clock("The commands"),
+    "sensor_yaw_offset": lambda v: (
+        f"The localisation's forward is turned {abs(math.degrees(v['angle'])):.1f}° to the "
+        f"{'left' if v['angle'] > 0 else 'right'} of the robot's."
+    ),
+    "sensor_lever_arm": lambda v: (
+        f"The poses are those of a point {_sides(v['x'], v['y'], 'm')} of the robot's base frame."
+    ),
+    "gyro_bias": lambda v: f"The gyro reads {math.degrees(v['bias']):+.2f}°/s at rest.",
+}
+_REMEDIES = {
+    "command_delay": "look for the delay between planner and motor driver: network, bridges, controller rate",
+    "actuator_lag": "look at the gains and ramps of the motor controller, and at the battery",
+    "actuator_saturation": "look at the controller's speed limit, at battery and load; plan below this speed",
+    "actuator_deadband": "look at the smallest output of the motor controller, and for friction in motor and gear",
+    "drive_gain": "measure the wheels and compare with the radius that the base controller has",
+    "drive_asymmetry": "compare tyre pressure, wear, chain and motor of both sides",
+    "turning_scrub": "set the wheel separation multiplier of the base controller (diagnose --export)",
+    "friction_scale": "look at tyres and ground; drive slower in turns and when braking",
+    "rolling_resistance": "look for soft ground, low tyre pressure, a dragging brake or a tight bearing",
+    "viscous_drag": "look for a dragging brake or gear, tall grass, mud or water",
+    "quadratic_drag": "look for wind, tall grass or water",
+    "constant_force": "look for a tether, wind, or a slope that the map does not have",
+    "gravity_tilt": "level the localisation's map frame, or give a map of the ground (--terrain)",
+    "payload": "weigh the robot, and enter the load in its file",
+    "pose_clock_offset": "correct the stamps of the localisation, or synchronise its clock",
+    "command_clock_offset": "synchronise the clocks of planner and base",
+    "sensor_yaw_offset": "measure how the localisation's sensor is mounted, and correct its transform",
+    "sensor_lever_arm": "measure where the localisation's sensor is mounted, and correct its transform",
+    "gyro_bias": "calibrate the gyro while the robot stands",
+    LEARNED: "repeat the manoeuvre with the largest error at half the speed, and look at the robot meanwhile",
+}
+_CAUSES = {
+    "command_delay": "drives that react late",
+    "actuator_lag": "sluggish drives",
+    "actuator_saturation": "a speed limit of the drives",
+    "actuator_deadband": "small commands that the drives ignore",
+    "drive_gain": "drives that run too slow or too fast",
+    "drive_asymmetry": "sides of unequal speed",
+    "turning_scrub": "turning less than the wheels ask for",
+    "friction_scale": "slippery or grippy ground",
+    "friction_anisotropy": "tyres that slip sideways",
+    "rolling_resistance": "rolling heavily",
+    "viscous_drag": "drag that grows with speed",
+    "quadratic_drag": "drag that grows with the square of the speed",
+    "constant_force": "a steady pull",
+    "gravity_tilt": "a slope or a tilted localisation",
+    "payload": "a load",
+    "pose_clock_offset": "late poses",
+    "command_clock_offset": "a wrong command clock",
+    "sensor_yaw_offset": "a localisation sensor mounted at an angle",
+    "sensor_lever_arm": "a localisation sensor mounted elsewhere",
+}

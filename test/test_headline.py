@@ -1,0 +1,185 @@
+"""The first screen of a diagnosis follows the verdict and what is explained on held-out data."""
+
+import re
+
+import pytest
+
+from monoforce_ros.discrepancy import Diagnosis, EffectEstimate, ParameterEstimate, Verdict
+from monoforce_ros.discrepancy.comparison import GapRow
+from monoforce_ros.discrepancy.credibility import complaint
+from monoforce_ros.discrepancy.headline import Tone, explained, headline
+from monoforce_ros.discrepancy.page import diagnosis_page
+from monoforce_ros.discrepancy.report import report_content, summary_lines
+from monoforce_ros.discrepancy.wording import cause, finding, remedy
+from monoforce_ros.effects import CATALOGUE, identifiable_effects
+
+
+def effect(name, *, indistinguishable=(), **parameters):
+    """An estimate; each parameter is (value, low, high)."""
+    units = {parameter.name: parameter.unit for parameter in CATALOGUE[name].parameters}
+    entries = {key: ParameterEstimate(*values, units[key]) for key, values in parameters.items()}
+    return EffectEstimate(name, entries, indistinguishable)
+
+
+DELAY = effect("command_delay", delay=(0.3, 0.28, 0.32))
+
+
+def row(before, after, unit="m", noise=0.01, horizon=2.0):
+    change = 0.0 if after is None else before - after
+    bounds = (None, None) if after is None else (change - 0.001, change + 0.001)
+    return GapRow(horizon, before, after, *bounds, unit, noise)
+
+
+def diagnosed(position, heading, *, effects=(DELAY,), verdict=Verdict.EFFECT_FOUND, **more):
+    gap = {"position_2s": row(*position), "heading_2s": row(*heading, unit="deg", noise=0.3)}
+    return Diagnosis(verdict, effects=effects, gap=gap, fitted=tuple((e.name, {}) for e in effects), **more)
+
+
+def test_an_explained_error_is_good_and_what_is_left_is_said_first():
+    top = headline(diagnosed((0.5, 0.06), (8.0, 1.0)))
+    assert top.tone is Tone.GOOD and top.helps
+    assert top.sentence == "The cause was found."
+    assert top.unexplained == "Unexplained after 2 s: 10 % of the position error; 9 % of the heading error."
+    assert top.findings == ("The drives react 0.30 s late to every command.",)
+    assert any("0.28 to 0.32 s" in text for text in top.confidence)
+    lines = summary_lines(diagnosed((0.5, 0.06), (8.0, 1.0)))
+    assert lines[0].startswith("effect_found: ") and "Unexplained" in lines[1]
+
+
+@pytest.mark.parametrize(
+    ("position", "heading", "sentence"),
+    [
+        ((0.5, 0.45), (8.0, 7.2), "Most of the error is not explained"),  # a tenth
+        ((0.5, 0.51), (8.0, 7.9), "predictions get worse"),  # a position gain of -2 %
+        ((0.5, 0.1), (8.0, 12.0), "but with it the heading error grows|Most of the error is not"),
+        ((0.5, 0.2), (8.0, 7.0), "Most of the error is not explained"),  # the heading is not explained
+    ],
+)
+def test_a_small_share_or_a_grown_error_is_never_good(position, heading, sentence):
+    top = headline(diagnosed(position, heading))
+    assert top.tone is not Tone.GOOD
+    assert re.search(sentence, top.sentence)
+    grown = position[1] > position[0] or heading[1] > heading[0]
+    assert any("grows with these effects" in text for text in top.doubts) == grown
+    assert top.helps == (not grown)
+    # Neither is the page green, whatever the search says of the share of its own loss.
+    assert "#0b6e4f'" not in diagnosis_page(diagnosed(position, heading), {}, None)
+
+
+def test_held_out_recordings_go_before_blocks_of_the_diagnosed_one():
+    held_out = {"tuesday": {"position_2s": row(0.4, 0.39), "heading_2s": row(6.0, 5.9, "deg", 0.3)}}
+    top = headline(diagnosed((0.5, 0.05), (8.0, 0.8), held_out=held_out))
+    assert top.tone is Tone.PARTLY
+    assert "97 % of the position error on tuesday" in top.unexplained
+    shares = {entry.metric: entry.share for entry in explained(diagnosed((0.5, 0.05), (8.0, 0.8)))}
+    assert shares == {"position": pytest.approx(0.918, abs=1e-3), "heading": pytest.approx(0.935, abs=1e-3)}
+
+
+def test_an_error_within_the_noise_needs_no_explanation():
+    top = headline(diagnosed((0.5, 0.06), (0.4, 0.41)))
+    assert top.tone is Tone.PARTLY  # beyond chance, the heading grew
+    calm = diagnosed((0.5, 0.06), (0.4, 0.39))
+    assert headline(calm).tone is Tone.GOOD
+    assert "the heading error was hardly above the noise before" in headline(calm).unexplained
+
+
+@pytest.mark.parametrize("verdict", list(Verdict))
+def test_every_verdict_has_a_sentence_a_page_and_a_tone(verdict):
+    adds = verdict in (Verdict.EFFECT_FOUND, Verdict.UNKNOWN_EFFECT)
+    after = (0.1, 1.5) if adds else (None, None)
+    formula = EffectEstimate("learned_term", {"torque_z:vx": ParameterEstimate(231.0, 229.0, 232.0, "N m")})
+    effects = {Verdict.EFFECT_FOUND: (DELAY,), Verdict.UNKNOWN_EFFECT: (formula,)}.get(verdict, ())
+    diagnosis = diagnosed((0.5, after[0]), (8.0, after[1]), effects=effects, verdict=verdict, advice=("drive longer",))
+    top = headline(diagnosis)
+    assert (top.tone is Tone.GOOD) == (verdict in (Verdict.EFFECT_FOUND, Verdict.NO_DISCREPANCY))
+    inputs = {"bag": "monday", "robot": "husky", "recording_s": 61.0, "driven_m": 30.5}
+    page = diagnosis_page(diagnosis, inputs, None)
+    first = page[: page.index("<section class='card result'")]
+    assert "monday" in first and "husky" in first and "61.0 s, 30.5 m driven" in first
+    assert top.sentence in page and "drive longer" in page.lower()
+    assert report_content(diagnosis, inputs, None)["headline"]["tone"] == top.tone
+    if verdict == Verdict.UNKNOWN_EFFECT:
+        assert "no known effect" in top.sentence and "torque_z = 231 vx" in top.findings[0]
+
+
+def test_doubts_take_the_green_away():
+    ground = "the ground is not level, and there is no map of it"
+    top = headline(diagnosed((0.5, 0.06), (8.0, 1.0)), [ground])
+    assert top.tone is Tone.PARTLY and ground in top.doubts
+    arm = effect("sensor_lever_arm", x=(0.16, -0.2, 0.5), y=(2.0, 0.17, 2.0))
+    both = diagnosed((0.5, 0.06), (8.0, 1.0), effects=(DELAY, arm))
+    top = headline(both)
+    assert top.tone is Tone.PARTLY and not top.helps
+    assert len(top.findings) == 1 and any("sensor_lever_arm" in text for text in top.doubts)
+    page = diagnosis_page(both, {}, None)
+    assert page.index("Effects missing in the model") < page.index("Fitted, but not established")
+    assert headline(diagnosed((0.5, 0.06), (8.0, 1.0), effects=(arm,))).tone is Tone.UNKNOWN
+    late = effect("command_delay", delay=(0.3, 0.28, 0.32), indistinguishable=("pose_clock_offset",))
+    assert any("late poses" in text for text in headline(diagnosed((0.5, 0.06), (8.0, 1.0), effects=(late,))).doubts)
+
+
+@pytest.mark.parametrize(
+    "estimate",
+    [
+        effect("friction_scale", factor=(0.02, 0.02, 0.05)),
+        effect("turning_scrub", track_width_factor=(4.0, 3.6, 4.0)),
+        effect("sensor_lever_arm", x=(0.1, 0.05, 0.2), y=(-2.0, -2.0, -1.9)),
+        effect("sensor_lever_arm", x=(0.1, -0.1, 0.3), y=(0.2, -0.1, 0.5)),
+        effect("payload", mass=(5.0, -1.0, 11.0), x=(0.4, 0.3, 0.5), y=(0.0, -0.1, 0.1)),
+        effect("rolling_resistance", coefficient=(0.01, 0.0, 0.05)),
+        effect("actuator_saturation", limit=(9.0, 2.0, 20.0)),
+        effect("command_delay", delay=(float("nan"), 0.0, 1.0)),
+    ],
+    ids=lambda estimate: estimate.name,
+)
+def test_bounds_and_intervals_that_hold_neutral_are_no_findings(estimate):
+    assert complaint(estimate).startswith(f"{estimate.name}: ")
+
+
+@pytest.mark.parametrize(
+    "estimate",
+    [
+        DELAY,
+        effect("friction_scale", factor=(0.1, 0.05, 0.2)),
+        effect("constant_force", x=(3.0, -5.0, 11.0), y=(91.0, 80.0, 102.0)),
+        effect("payload", mass=(17.0, 10.0, 24.0), x=(0.0, -0.1, 0.1), y=(0.0, -0.1, 0.1)),
+        effect("actuator_saturation", limit=(0.6, 0.58, 0.62)),
+        effect("rolling_resistance", coefficient=(0.2, 0.15, 0.25)),
+    ],
+    ids=lambda estimate: estimate.name,
+)
+def test_measurements_are_not_complained_about(estimate):
+    assert complaint(estimate) == ""
+
+
+def test_an_unknown_effect_or_parameter_is_refused():
+    with pytest.raises(ValueError, match="expected one of the catalogue"):
+        complaint(EffectEstimate("command_dealy", DELAY.parameters))
+    with pytest.raises(ValueError, match=r"expected \['delay'\]"):
+        complaint(EffectEstimate("command_delay", {"time": ParameterEstimate(0.3, 0.2, 0.4, "s")}))
+
+
+@pytest.mark.parametrize("name", [known.name for known in identifiable_effects()])
+def test_every_effect_is_said_in_words(name):
+    kind = CATALOGUE[name]
+    for values in kind.first_values():
+        units = {parameter.name: parameter.unit for parameter in kind.parameters}
+        estimate = EffectEstimate(name, {k: ParameterEstimate(v, v, v, units[k]) for k, v in values.items()})
+        text = finding(estimate)
+        assert text.endswith(".") and text[0].isupper() and name not in text
+    assert remedy(name) and cause(name)
+
+
+@pytest.mark.parametrize(
+    ("estimate", "text"),
+    [
+        (effect("pose_clock_offset", offset=(0.4, 0.3, 0.5)), "The poses are stamped 0.40 s late."),
+        (effect("pose_clock_offset", offset=(-0.2, -0.3, -0.1)), "The poses are stamped 0.20 s early."),
+        (effect("turning_scrub", track_width_factor=(2.0, 1.9, 2.1)), "The robot turns 50 % less than"),
+        (effect("drive_asymmetry", difference=(0.1, 0.1, 0.1)), "The right side runs 10 % faster than the left"),
+        (effect("constant_force", x=(1.0, 0, 2), y=(-90.0, -95, -85)), "pulls the robot with 90 N to the right all"),
+    ],
+)
+def test_sentences_have_the_right_sign(estimate, text):
+    assert text in finding(estimate)
+    assert "ahead" not in finding(estimate)
