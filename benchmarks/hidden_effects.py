@@ -86,7 +86,8 @@ def with_baselines(result: dict, bag: Path, robot: Path, row: Path) -> dict:
     from monoforce_ros.discrepancy import read_evidence
     from monoforce_ros.discrepancy.gap import noise_floor, noisy_motions, residual_scale
     from monoforce_ros.discrepancy.hypothesis import window_starts
-    from monoforce_ros.robots import load_robot, read_nominal_residual
+    from monoforce_ros.discrepancy.nominal import NominalModel
+    from monoforce_ros.robots import load_robot
 
     model = load_robot(robot)
     evidence, _ = read_evidence(bag, model, "lidar" if result["ground"] == "hills" else "flat")
@@ -94,7 +95,8 @@ def with_baselines(result: dict, bag: Path, robot: Path, row: Path) -> dict:
     starts = window_starts(smoothed.motion, smoothed.stretches, 2.0, 1.0)
     data = evidence.cut(starts, np.array([0.5, 1.0, 1.5, 2.0]))
     floor = noise_floor(smoothed.motion, noisy_motions(smoothed), data)
-    errors = baseline_errors(evidence, data, model, residual_scale(floor, read_nominal_residual(robot, data.samples)))
+    nominal = NominalModel.read(robot, tuple(float(sample) for sample in data.samples))
+    errors = baseline_errors(evidence, data, model, residual_scale(floor, nominal))
     result["baselines"] = {name: float(np.median(np.hypot(e[:, 0], e[:, 1]))) for name, e in errors.items()}
     row.write_text(json.dumps(result, indent=1))
     return result
@@ -259,7 +261,7 @@ def print_rows(rows: list[dict]) -> None:
         print(
             f"{row['case']:64s} {row['verdict']:16s} ×{gap_over_noise(row):4.1f} {losses:12s} "
             f"f{numbers.get('loss_by_formula', np.nan):.2f} s{numbers.get('share_explained', np.nan):.2f} "
-            f"d{numbers.get('share_by_drift', np.nan):.2f} {row['seconds']:3.0f}s {' + '.join(effects)}"
+            f"p{numbers.get('p_rest', np.nan):.3f} {row['seconds']:3.0f}s {' + '.join(effects)}"
         )
 
 
