@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,6 +26,7 @@ from monoforce_ros.discrepancy.preflight import complaints
 from monoforce_ros.discrepancy.score_test import variation
 from monoforce_ros.discrepancy.selection import BLOCK, Search, blocks_of
 from monoforce_ros.discrepancy.terrain_evidence import terrain_uncertainty
+from monoforce_ros.discrepancy.wheels import WheelFinding, compare_with_wheels
 from monoforce_ros.effects import CATALOGUE, identifiable_effects
 from monoforce_ros.robots import RobotModel
 
@@ -82,21 +83,22 @@ def commission(
     for number, evidence in enumerate(recordings):
         progress(0.3 * number / len(recordings), "reading the noise")
         prepared.append(_prepare(evidence, robot, np.array(samples), stride))
-    names = [name for name, _ in COMMISSIONED]
-    chosen = COMMISSIONED
-    fits = [_fitted(entry, chosen) for entry in prepared]
-    found: list[str] = []
+    drives = _drives([compare_with_wheels(e.commands, e.wheels, robot) for e in recordings])
+    chosen = (*drives, *(entry for entry in COMMISSIONED if entry[0] not in dict(drives)))
+    fits = [_fitted(entry, chosen, len(drives)) for entry in prepared]
+    found: list[tuple[str, Mapping[str, float]]] = []
     for number, (entry, fit) in enumerate(zip(prepared, fits, strict=True)):
         progress(0.3 + 0.4 * number / len(prepared), "searching for further effects")
         found += _further(robot, entry, fit.effects)
-    further = [name for name in dict.fromkeys(found) if found.count(name) > 0.5 * len(prepared)]
+    counted = [name for name, _ in found]
+    further = {name: values for name, values in found if counted.count(name) > 0.5 * len(prepared)}
     if further:
-        chosen = (*chosen, *(first_values(CATALOGUE[name])[0][0] for name in further))
-        fits = [_fitted(entry, chosen) for entry in prepared]
+        chosen = (*chosen, *further.items())
+        fits = [_fitted(entry, chosen, len(drives)) for entry in prepared]
     values = np.median([flat(fit.effects) for fit in fits], axis=0)
     merged = replace(fits[0], effects=with_values(fits[0].effects, values))
     progress(0.8, "variation between segments")
-    nominal = _nominal(prepared, merged.effects, [*names, *further])
+    nominal = _nominal(prepared, merged.effects)
     progress(1.0, "done")
     return estimate_effects(merged, {}), nominal
 
@@ -115,19 +117,29 @@ def _prepare(evidence: Evidence, robot: RobotModel, samples: np.ndarray, stride:
     return _Prepared(data, Predictions(robot, data), floor)
 
 
-def _fitted(entry: _Prepared, effects: Effects) -> Fit:
+def _drives(findings: Sequence[WheelFinding | None]) -> Effects:
+    """What the wheels of more than half of the recordings show of the drives, at the median of their values."""
+    measured = [dict(finding.effects) for finding in findings if finding is not None]
+    names = [name for name in dict.fromkeys(name for shown in measured for name in shown)]
+    kept = []
+    for name in names:
+        values = [next(iter(shown[name].items())) for shown in measured if name in shown]
+        if len(values) > 0.5 * len(findings):
+            kept.append((name, {values[0][0]: float(np.median([value for _, value in values]))}))
+    return tuple(kept)
+
+
+def _fitted(entry: _Prepared, effects: Effects, fixed: int) -> Fit:
+    """The effects fitted to one recording, without the first ``fixed`` ones."""
     # Blocks are roughly independent, windows within a block are not: the prior weighs as much as one block.
     prior = 1.0 / len(np.unique(blocks_of(entry.data.starts)))
-    starts = [effects]
-    if len(effects) > len(COMMISSIONED):
-        # Every sign of the last effect: a fit may not cross neutral by itself.
-        name = effects[-1][0]
-        starts = [(*effects[:-1], start[0]) for start in first_values(CATALOGUE[name])]
-    return fit_effects(entry.predictions, starts, residual_scale(entry.floor, None), iterations=12, prior=prior)
+    return fit_effects(
+        entry.predictions, [effects], residual_scale(entry.floor, None), iterations=12, free=fixed, prior=prior
+    )
 
 
-def _further(robot: RobotModel, entry: _Prepared, effects: Effects) -> list[str]:
-    """Names of the effects that one recording needs in addition."""
+def _further(robot: RobotModel, entry: _Prepared, effects: Effects) -> Effects:
+    """The effects that one recording needs in addition."""
     fitted = replace(robot, effects=tuple({**dict(robot.effects), **dict(effects)}.items()))
     data = replace(entry.data, starts=entry.data.starts[::2])
     predictions = Predictions(fitted, data)
@@ -138,10 +150,10 @@ def _further(robot: RobotModel, entry: _Prepared, effects: Effects) -> list[str]
     scale = np.sqrt(residual_scale(floor, None) ** 2 + np.maximum(spread**2 - (floor**2).mean(axis=0), 0.0))
     search = Search(fitted, data, scale, excluded=[name for name, _ in effects])
     best = search.run(_MOST_EFFECTS).best
-    return list(best.names)
+    return search.refit(best.effects).effects if best.effects else ()
 
 
-def _nominal(prepared: Sequence[_Prepared], effects: Effects, fitted_names: Sequence[str]) -> NominalModel:
+def _nominal(prepared: Sequence[_Prepared], effects: Effects) -> NominalModel:
     squares = []
     residuals = []
     for entry in prepared:

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from monoforce_ros.discrepancy.clocks import GyroFinding, compare_with_gyro
-from monoforce_ros.discrepancy.commissioning import COMMISSIONED
 from monoforce_ros.discrepancy.comparison import (
     Comparison,
     GapRow,
@@ -46,7 +45,7 @@ from monoforce_ros.discrepancy.terrain_evidence import terrain_uncertainty
 from monoforce_ros.discrepancy.thresholds import Thresholds
 from monoforce_ros.discrepancy.verdict import Decision, Findings, Losses, Verdict, decide
 from monoforce_ros.discrepancy.wheels import WheelFinding, compare_with_wheels
-from monoforce_ros.effects import CATALOGUE
+from monoforce_ros.effects import CATALOGUE, wheel_effects
 from monoforce_ros.robots import RobotModel
 
 
@@ -152,10 +151,7 @@ def diagnose(
     floor = np.sqrt((uncertainty**2).mean(axis=0))
     thresholds = settings.thresholds
     gyro = compare_with_gyro(smoothed, evidence.gyro)
-    wheels = None
-    if not any(CATALOGUE[name].stage == "command" and name not in dict(COMMISSIONED) for name, _ in robot.effects):
-        # A file that has effects of the drives already is compared by the motion alone.
-        wheels = compare_with_wheels(evidence.commands, evidence.wheels, robot)
+    wheels = compare_with_wheels(evidence.commands, evidence.wheels, robot)
     search = Search(
         robot,
         data,
@@ -254,11 +250,42 @@ def _estimated(search: Search, fit: Fit, outcome: Outcome) -> tuple[EffectEstima
 
 
 def _measured_effects(gyro: GyroFinding | None, wheels: WheelFinding | None, robot: RobotModel) -> Effects:
-    """Effects that the gyro and the wheel speeds measure, that of the gyro first."""
+    """Effects that the gyro and the wheel speeds measure and the robot's file does not hold, that of the gyro first."""
     measured: Effects = ()
     if gyro is not None and gyro.poses_late and "pose_clock_offset" not in dict(robot.effects):
         measured = (("pose_clock_offset", {"offset": gyro.offset}),)
-    return measured if wheels is None else measured + wheels.effects
+    return measured if wheels is None else measured + changed_drives(wheels, robot)
+
+
+def changed_drives(wheels: WheelFinding, robot: RobotModel) -> Effects:
+    """What the wheels show of the drives, in place of the file's values; empty where they confirm those.
+
+    The wheels measure the whole response to a command, with what the file holds of it already. Where one value differs
+    by more than its confidence interval, all of them are taken from the wheels: they were fitted together.
+    """
+    in_file = dict(robot.effects)
+    shown = dict(wheels.effects)
+    different = False
+    complete: list[tuple[str, Mapping[str, float]]] = []
+    for effect in wheel_effects():
+        response = effect.wheel_response
+        assert response is not None
+        neutral = next(p.neutral for p in effect.parameters if p.name == response.parameter)
+        expected = float(in_file.get(effect.name, {}).get(response.parameter, neutral))
+        found = shown.get(effect.name)
+        value = neutral if found is None else float(found[response.parameter])
+        half_width = 0.0
+        if found is not None:
+            half_width = wheels.half_widths[[name for name, _ in wheels.effects].index(effect.name)]
+        if value != expected and (found is not None or effect.name in in_file):
+            # Of an effect that the wheels do not show the half-width is unknown: the largest one stands for it.
+            limit = half_width if found is not None else max(wheels.half_widths, default=np.inf)
+            different |= abs(value - expected) > limit
+            if np.isfinite(value):
+                complete.append((effect.name, {response.parameter: value}))
+        elif found is not None:
+            complete.append((effect.name, dict(found)))
+    return tuple(complete) if different else ()
 
 
 def _refine_clock(search: Search, gyro: GyroFinding) -> None:
