@@ -40,6 +40,7 @@ from monoforce_ros.discrepancy.hypothesis import (
     subsampled,
     window_starts,
 )
+from monoforce_ros.discrepancy.kinematic_baseline import StepComparison
 from monoforce_ros.discrepancy.preflight import advice, complaints
 from monoforce_ros.discrepancy.selection import BLOCK, CandidateScore, Search, Trial
 from monoforce_ros.discrepancy.verdict import Decision, Losses, Verdict, decide
@@ -101,6 +102,8 @@ class Diagnosis:
     """The reasons for the verdict."""
     losses: Losses | None = None
     details: Details | None = None
+    steps: StepComparison | None = None
+    """Errors after steps of the command beside those of a kinematic fit."""
 
     def __post_init__(self):
         if self.verdict in _NOTHING_ADDED:
