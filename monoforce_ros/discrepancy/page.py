@@ -61,7 +61,7 @@ def diagnosis_page(
     """
     top = headline(diagnosis, complaints)
     parts = [_STYLE, _facts(inputs), _result(top, robot_file)]
-    if diagnosis.remarks:
+    if diagnosis.remarks and diagnosis.verdict != Verdict.NOT_IDENTIFIABLE:
         reasons = f"<ul>{_list_items(diagnosis.remarks)}</ul>"
         parts.append(card(reasons, heading=f"Why the verdict is {diagnosis.verdict}"))
     details = diagnosis.details
@@ -228,8 +228,8 @@ def _steps_card(steps: StepComparison) -> str:
         table(("method", "median position error"), rows),
         heading="Two seconds after a step of the command",
         caption=f"The measure of the literature, on {steps.windows} windows that begin with a step; all methods know "
-        "the measured speed at the start. Kinematic fit and effects are fitted to every other block of 8 s and tested on "
-        "the others.",
+        "the measured speed at the start. Kinematic fit and effects are fitted to every other block of 8 s, and tested "
+        "on the others.",
     )
 
 
