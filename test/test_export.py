@@ -107,6 +107,8 @@ def test_a_speed_limit_does_the_same_in_mujoco(husky, tmp_path):
     model, _ = model_with(tmp_path, husky, limit)
     there, here = driven(model, 2.0, 0.9, 0.9)[-1, 0], predicted(husky, (limit,), 2.0, 0.9, 0.9)[-1, 0]
     assert there == pytest.approx(0.4, rel=0.03) and here == pytest.approx(0.4, rel=0.03)
+    # The file says how to use it.
+    assert '<general class="monoforce_drive_left or monoforce_drive_right"' in (tmp_path / "effects.xml").read_text()
 
 
 def test_unequal_sides_and_a_gain_do_the_same_in_mujoco(husky, tmp_path):

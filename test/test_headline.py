@@ -96,6 +96,8 @@ def test_every_verdict_has_a_sentence_a_page_and_a_tone(verdict):
     page = diagnosis_page(diagnosis, inputs, None)
     first = page[: page.index("<section class='card result'")]
     assert "monday" in first and "husky" in first and "61.0 s, 30.5 m driven" in first
+    if after[0] is None and verdict == Verdict.NO_IMPROVEMENT:
+        assert top.unexplained == "Unexplained: all of the error."
     assert top.sentence in page and "drive longer" in page.lower()
     assert report_content(diagnosis, inputs, None)["headline"]["tone"] == top.tone
     if verdict == Verdict.UNKNOWN_EFFECT:

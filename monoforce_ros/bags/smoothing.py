@@ -173,11 +173,11 @@ def _with_noise(times: np.ndarray, values: np.ndarray, noise: float) -> BSpline:
     pieces = _pieces(len(times))
 
     def excess(exponent: float) -> float:
-        variances = [
-            np.var(values[piece] - make_smoothing_spline(times[piece], values[piece], lam=10.0**exponent)(times[piece]))
+        left = [
+            values[piece] - make_smoothing_spline(times[piece], values[piece], lam=10.0**exponent)(times[piece])
             for piece in pieces
         ]
-        return float(np.sqrt(np.mean(variances)) - noise)
+        return float(np.std(np.concatenate(left)) - noise)
 
     low, high = _EXPONENTS
     if excess(low) >= 0.0:

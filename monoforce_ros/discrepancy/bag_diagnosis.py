@@ -18,7 +18,9 @@ from monoforce_ros.discrepancy.ground import Ground, choose_ground
 from monoforce_ros.discrepancy.hypothesis import Effects, Evidence, corrected_evidence, window_starts
 from monoforce_ros.discrepancy.motion_check import motion_faults
 from monoforce_ros.discrepancy.nominal import NominalModel
+from monoforce_ros.discrepancy.nominal_residual import residual_complaint
 from monoforce_ros.discrepancy.report import effect_entry, write_diagnosis
+from monoforce_ros.discrepancy.step_errors import compare_after_steps
 from monoforce_ros.discrepancy.terrain_evidence import supporting_terrain
 from monoforce_ros.discrepancy.verdict import Verdict
 from monoforce_ros.discrepancy.wheels import compare_with_wheels
@@ -145,14 +147,16 @@ def diagnose_bag(
             raise ValueError(f"{other}: --held-out got a path that does not exist, expected a bag")
         if fingerprint([other]) == data:
             raise ValueError(f"{other}: --held-out got the diagnosed recording {bag}, expected another recording")
+    nominal = NominalModel.read(robot, settings.samples)
     diagnosis = diagnose(
         evidence,
         model,
-        nominal=NominalModel.read(robot, settings.samples),
+        nominal=nominal,
         settings=settings,
         progress=progress,
     )
-    doubts = [ground.complaint] if ground.unknown else []
+    large = residual_complaint(None if nominal is None else nominal.residual, evidence.smoothed, evidence.commands)
+    doubts = [text for text in (ground.complaint, large) if text]
     if diagnosis.verdict == Verdict.NOT_IDENTIFIABLE:
         diagnosis = _with_wheels(diagnosis, evidence, model)
     robot_file = None
@@ -162,6 +166,9 @@ def diagnose_bag(
     elif found_file.exists():
         # Rename the robot file of an earlier diagnosis, which would be mistaken for a result of this one.
         found_file.replace(found_file.with_suffix(".earlier.yaml"))
+    if diagnosis.verdict != Verdict.NOT_IDENTIFIABLE:
+        progress(0.96, "comparing with a kinematic fit")
+        diagnosis = replace(diagnosis, steps=compare_after_steps(evidence, model, diagnosis.fitted))
     if others:
         progress(0.97, "held-out recordings")
         tables = {

@@ -13,10 +13,11 @@ import numpy as np
 import torch
 
 from monoforce_ros.bags import BagError
-from monoforce_ros.discrepancy.bag_diagnosis import BagDiagnosis, Topics, diagnose_bag, read_evidence
+from monoforce_ros.discrepancy.bag_diagnosis import BagDiagnosis, Topics, diagnose_bag, read_with_ground
 from monoforce_ros.discrepancy.commissioning import commission
 from monoforce_ros.discrepancy.diagnosis import DiagnosisSettings
 from monoforce_ros.discrepancy.export import export_effects, export_target
+from monoforce_ros.discrepancy.nominal_residual import residual_complaint
 from monoforce_ros.discrepancy.report import effect_entry, summary_lines
 from monoforce_ros.discrepancy.verdict import Verdict
 from monoforce_ros.effects import EffectError
@@ -214,7 +215,13 @@ def _diagnose_many(options: argparse.Namespace) -> int:
 def _commission(options: argparse.Namespace) -> int:
     robot = load_robot(options.robot)
     topics = Topics(options.odometry, options.commands, options.cloud)
-    recordings = [read_evidence(bag, robot, options.terrain, topics)[0] for bag in options.bags]
+    recordings = []
+    for bag in options.bags:
+        evidence, _, ground = read_with_ground(bag, robot, options.terrain, topics)
+        recordings.append(evidence)
+        print(f"{bag}: ground: {ground.description}")
+        if ground.unknown:
+            print(f"diagnose: {bag}: {ground.complaint}", file=sys.stderr)
     settings = DiagnosisSettings()
     effects, nominal = commission(recordings, robot, samples=settings.samples)
     kept = nominal.entry(settings.samples)
@@ -231,6 +238,10 @@ def _commission(options: argparse.Namespace) -> int:
         f"{100 * across:.1f} cm across, {np.degrees(heading):.2f}° in heading"
     )
     print(f"robot file: {out}")
+    for bag, evidence in zip(options.bags, recordings, strict=True):
+        large = residual_complaint(nominal.residual, evidence.smoothed, evidence.commands)
+        if large:
+            print(f"diagnose: {bag}: {large}", file=sys.stderr)
     return 0
 
 

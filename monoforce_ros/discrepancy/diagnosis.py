@@ -38,6 +38,7 @@ from monoforce_ros.discrepancy.hypothesis import (
     subsampled,
     window_starts,
 )
+from monoforce_ros.discrepancy.kinematic_baseline import StepComparison
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.preflight import advice, complaints
 from monoforce_ros.discrepancy.selection import BLOCK, HEALTHY_LOSS, CandidateScore, Outcome, Search, Trial, paired
@@ -105,6 +106,8 @@ class Diagnosis:
     """The reasons for the verdict."""
     losses: Losses | None = None
     details: Details | None = None
+    steps: StepComparison | None = None
+    """Errors after steps of the command beside those of a kinematic fit."""
 
     def __post_init__(self):
         if self.verdict in _NOTHING_ADDED:

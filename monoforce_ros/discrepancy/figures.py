@@ -136,14 +136,14 @@ def timeline_figure(details: Details) -> Figure:
     for axis, (ax, (name, factor)) in enumerate(zip(axes, names, strict=False)):
         band = 2 * factor * details.floor[-1, axis]
         ax.axhspan(-band, band, color=_FLOOR, alpha=0.25, lw=0)
-        ax.plot(times, factor * details.before[:, -1, axis], color=_BEFORE, lw=1.4, label=_NOMINAL)
+        ax.plot(*with_gaps(times, factor * details.before[:, -1, axis]), color=_BEFORE, lw=1.4, label=_NOMINAL)
         if compared is not None and compared.after is not None:
             starts = (compared.starts - data.starts[0]) * 1e-9
             ax.plot(starts, factor * compared.after[:, axis], ".", color=_AFTER, ms=5, label=_WITH_EFFECTS)
         ax.set_ylabel(name)
     commanded = data.commands.sample(data.starts)
-    axes[3].plot(times, commanded[:, 0], color=_MEASURED, lw=1.2, label="speed [m/s]")
-    axes[3].plot(times, commanded[:, 1], color=_FLOOR, lw=1.2, label="yaw rate [rad/s]")
+    axes[3].plot(*with_gaps(times, commanded[:, 0]), color=_MEASURED, lw=1.2, label="speed [m/s]")
+    axes[3].plot(*with_gaps(times, commanded[:, 1]), color=_FLOOR, lw=1.2, label="yaw rate [rad/s]")
     axes[3].set_ylabel("commands")
     axes[3].legend(frameon=False, ncols=2)
     for ax in axes:
@@ -156,6 +156,18 @@ def timeline_figure(details: Details) -> Figure:
     axes[0].legend(frameon=False, ncols=2)
     axes[-1].set_xlabel("time in the recording [s]")
     return figure
+
+
+def with_gaps(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Times and values with a NaN in each gap, so that no line is drawn across it.
+
+    A gap is a step of more than one and a half times the median step: a window is missing.
+    """
+    steps = np.diff(times)
+    if not len(steps):
+        return times, values
+    at = np.flatnonzero(steps > 1.5 * np.median(steps)) + 1
+    return np.insert(times, at, np.nan), np.insert(values.astype(float), at, np.nan)
 
 
 def candidates_figure(diagnosis: Diagnosis) -> Figure:

@@ -131,7 +131,7 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
     doubts = [*complaints, *refused]
     named = [effect for effect in effects if effect.name != LEARNED]
     rows = explained(diagnosis)
-    left = _left(rows)
+    left = _left(rows) or "Unexplained: all of the error."
     confidence = [*_sizes(diagnosis), *_intervals(effects)]
     for effect in named:
         if effect.indistinguishable:
@@ -143,6 +143,12 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
     doubts += [_growth(row) for row in grew]
     enough = bool(counted) and all(row.share >= MOST for row in counted)
     findings = tuple(finding(effect) for effect in effects)
+    if not named:
+        # Without a name for it, where the error shows is what is known.
+        findings += tuple(
+            f"The {entry.axis} shows most in this regime: {entry.regime} ({100 * entry.share_of_error:.0f} % of it)."
+            for entry in diagnosis.localisation[:2]
+        )
     helps = bool(effects) and not grew and not refused and any(row.share > 0 for row in rows)
 
     def result(tone: Tone, sentence: str) -> Headline:

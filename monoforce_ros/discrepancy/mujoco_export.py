@@ -69,10 +69,11 @@ def mujoco_files(
         usage.append(f'Include the other inside the robot\'s base body: <include file="{base_path.name}"/>.')
     if any(name in effects for name in ("friction_scale", "terrain_softness")):
         usage.append(f'Give tyres or tracks the class: <geom class="{TYRE_CLASS}" .../>.')
-    if "<actuator>" in "\n".join(top):
-        usage.append(
-            "The actuators replace those of the model; joints are named DRIVE_wheel, and FL_wheel for a wheel FL."
-        )
+    if _has_drives(effects):
+        classes = " or ".join(DRIVE_CLASS.format(name) for name in robot.drive_names)
+        usage.append(f'Drive each wheel by a servo of its side\'s class: <general class="{classes}" joint="..."/>.')
+        usage.append(f"These are velocity servos with a gain of {SERVO_GAIN:g}: scale gainprm and biasprm alike.")
+        usage.append('Light wheels need <option integrator="implicitfast"/> with them.')
     usage += [f"Not exported: {text}." for text in missing]
     # MuJoCo refuses to include a file without elements.
     named = f'  <custom><text name="monoforce_effects" data={quoteattr(" ".join(effects) or "none")}/></custom>'

@@ -21,6 +21,7 @@ from monoforce_ros.discrepancy.figures import (
     timeline_figure,
 )
 from monoforce_ros.discrepancy.headline import Headline, Tone, credible_effects, headline
+from monoforce_ros.discrepancy.kinematic_baseline import StepComparison
 from monoforce_ros.discrepancy.verdict import Verdict
 from monoforce_ros.discrepancy.wording import finding
 from monoforce_ros.reporting import card, definition_list, figure_png, page, picture, table
@@ -60,7 +61,7 @@ def diagnosis_page(
     """
     top = headline(diagnosis, complaints)
     parts = [_STYLE, _facts(inputs), _result(top, robot_file)]
-    if diagnosis.remarks:
+    if diagnosis.remarks and diagnosis.verdict != Verdict.NOT_IDENTIFIABLE:
         reasons = f"<ul>{_list_items(diagnosis.remarks)}</ul>"
         parts.append(card(reasons, heading=f"Why the verdict is {diagnosis.verdict}"))
     details = diagnosis.details
@@ -70,6 +71,8 @@ def diagnosis_page(
         parts.append(_gap_card(diagnosis))
     if diagnosis.held_out:
         parts.append(_held_out_card(diagnosis))
+    if diagnosis.steps is not None:
+        parts.append(_steps_card(diagnosis.steps))
     if details is not None and details.paths:
         parts.append(
             card(
@@ -204,6 +207,29 @@ def _held_out_card(diagnosis: Diagnosis) -> str:
         table(("recording", "median error", "before", "after", "mean gain, 95 % interval"), rows),
         heading="On held-out recordings",
         caption="Nothing was fitted to or selected on these recordings.",
+    )
+
+
+def _steps_card(steps: StepComparison) -> str:
+    """Errors after steps of the command, by method."""
+    methods = [
+        ("commands followed at once", steps.ideal),
+        ("nominal model", steps.before),
+        ("kinematic fit: gains, dead time, lag, limits", steps.kinematic),
+        ("with the added effects", steps.after),
+    ]
+    best = min(error for _, error in methods if error is not None)
+    rows = [
+        f"<tr><td>{name}</td><td{' class=best' if error == best else ''}>{error:.3g} m</td></tr>"
+        for name, error in methods
+        if error is not None
+    ]
+    return card(
+        table(("method", "median position error"), rows),
+        heading="Two seconds after a step of the command",
+        caption=f"The measure of the literature, on {steps.windows} windows that begin with a step; all methods know "
+        "the measured speed at the start. Kinematic fit and effects are fitted to every other block of 8 s, and tested "
+        "on the others.",
     )
 
 

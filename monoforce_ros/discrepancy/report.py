@@ -52,6 +52,7 @@ def report_content(
         "regimes": [asdict(row) for row in diagnosis.regimes],
         "remarks": list(diagnosis.remarks),
         "numbers": _loss_entries(diagnosis.losses),
+        "steps": None if diagnosis.steps is None else asdict(diagnosis.steps),
         "held_out": {name: _gap_entries(table) for name, table in diagnosis.held_out.items()},
     }
 

@@ -1,0 +1,61 @@
+"""Step errors: the effects of a diagnosis on windows that begin with a step of the command, beside a kinematic fit."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from monoforce_ros.discrepancy.fit import fit_effects
+from monoforce_ros.discrepancy.gap import residual_scale
+from monoforce_ros.discrepancy.hypothesis import Effects, Evidence, Predictions, corrected_evidence, window_starts
+from monoforce_ros.discrepancy.kinematic_baseline import HORIZON, StepComparison, compare_on_steps, step_starts
+from monoforce_ros.discrepancy.selection import folds_of
+from monoforce_ros.robots import RobotModel
+
+_MOST = 120
+"""Windows at most, spread over the recording: as many as a diagnosis uses."""
+_SPACING = 0.05
+"""Time between possible starts [s]."""
+
+
+def compare_after_steps(evidence: Evidence, robot: RobotModel, effects: Effects) -> StepComparison | None:
+    """Position errors 2 s after steps: nominal model, effects and kinematic fit, each tested where it was not fitted.
+
+    Args:
+        evidence: the recording.
+        robot: the nominal model.
+        effects: those found, with their values; they are fitted again to each half of the blocks.
+
+    Returns:
+        None where there are too few steps.
+    """
+    evidence = corrected_evidence(evidence, robot)
+    motion = evidence.smoothed.motion
+    starts = step_starts(
+        evidence.commands, np.sort(window_starts(motion, evidence.smoothed.stretches, HORIZON, _SPACING))
+    )
+    starts = starts[:: max(1, -(-len(starts) // _MOST))]
+    if not len(starts):
+        return None
+    samples = np.array([0.5, 1.0, 1.5, HORIZON])
+    scale = residual_scale(np.zeros((len(samples), 3)), None)
+
+    def predictions(at: np.ndarray) -> Predictions:
+        return Predictions(robot, evidence.cut(at, samples))
+
+    def errors(at: np.ndarray, folds: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+        before = _distance(predictions(at), ())
+        if not effects:
+            return before, None
+        after = np.zeros(len(at))
+        for fold in (0, 1):
+            fit = fit_effects(predictions(at[folds != fold]), [effects], scale, iterations=4)
+            after[folds == fold] = _distance(predictions(at[folds == fold]), fit.effects)
+        return before, after
+
+    return compare_on_steps(motion, evidence.commands, starts, folds_of(starts), errors)
+
+
+def _distance(predictions: Predictions, effects: Effects) -> np.ndarray:
+    """Position errors at the end of each window [m]; infinite where a prediction diverged."""
+    residuals = predictions.residuals([effects])[0][:, -1]
+    return np.nan_to_num(np.hypot(residuals[:, 0], residuals[:, 1]), nan=np.inf)

@@ -1,0 +1,106 @@
+"""The kinematic baseline recovers the parameters of a kinematic robot, and is tested on blocks it was not fitted to."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from monoforce_ros.bags import SmoothedMotion
+from monoforce_ros.core import CommandTrack, MotionTrack
+from monoforce_ros.discrepancy import Evidence
+from monoforce_ros.discrepancy.kinematic_baseline import (
+    KinematicModel,
+    compare_on_steps,
+    fit_kinematics,
+    position_errors,
+    step_starts,
+)
+from monoforce_ros.discrepancy.step_errors import compare_after_steps
+from monoforce_ros.robots import load_robot
+
+TRUTH = KinematicModel(0.9, 0.6, 0.35, 0.3, 0.7, 5.0)
+
+
+def recording(seconds=120.0, held=4.0):
+    """A robot that is exactly kinematic, driven by steps of the command."""
+    step = 0.05
+    random = np.random.default_rng(5)
+    twists = np.repeat(random.uniform([0.1, -0.9], [1.0, 0.9], (round(seconds / held), 2)), round(held / step), axis=0)
+    stamps = 10**9 + np.arange(len(twists)) * round(step * 1e9)
+    start = np.zeros((1, 2))
+    # A fine time step, so that the truth does not depend on it.
+    fine = 10
+    path = TRUTH.drive(np.repeat(twists, fine, axis=0)[None], start, 0, step / fine)[0][fine - 1 :: fine]
+    times = stamps + round(step * 1e9)
+    velocities = np.gradient(path, step, axis=0)
+    speed = np.hypot(velocities[:, 0], velocities[:, 1])
+    zeros = np.zeros(len(path))
+    motion = MotionTrack(
+        times,
+        np.c_[path[:, :2], zeros],
+        Rotation.from_euler("z", path[:, 2:]).as_quat(),
+        np.c_[speed, zeros, zeros],
+        np.c_[zeros, zeros, velocities[:, 2]],
+    )
+    return motion, CommandTrack(stamps, twists)
+
+
+def possible(motion):
+    return np.arange(motion.stamps[0] + 3 * 10**9, motion.stamps[-1] - 3 * 10**9, 50_000_000)
+
+
+def test_windows_begin_with_steps_of_the_command():
+    motion, commands = recording()
+    starts = step_starts(commands, possible(motion))
+    steps = commands.stamps[1:][(np.diff(commands.twists, axis=0) != 0).any(axis=1)]
+    assert 20 <= len(starts) <= len(steps)
+    late = [(start - steps[steps <= start].max()) * 1e-9 for start in starts]
+    assert max(late) <= 0.25
+    constant = CommandTrack(commands.stamps, np.tile([0.5, 0.1], (len(commands), 1)))
+    assert len(step_starts(constant, possible(motion))) == 0
+
+
+def test_the_parameters_of_a_kinematic_robot_are_recovered():
+    motion, commands = recording()
+    found = fit_kinematics(motion, commands, step_starts(commands, possible(motion)))
+    for name, tolerance in (("speed_gain", 0.03), ("yaw_gain", 0.03), ("delay", 0.05), ("lag", 0.06),
+                            ("largest_speed", 0.03)):  # fmt: skip
+        assert getattr(found, name) == pytest.approx(getattr(TRUTH, name), abs=tolerance), name
+    with pytest.raises(ValueError, match="got no windows"):
+        fit_kinematics(motion, commands, np.zeros(0, np.int64))
+
+
+def test_neither_half_is_fitted_to_itself():
+    motion, commands = recording()
+    starts = step_starts(commands, possible(motion))
+    folds = ((starts - starts[0]) // (8 * 10**9)) % 2
+
+    def errors(at, halves):
+        return np.full(len(at), 0.5), np.full(len(at), 0.1)
+
+    found = compare_on_steps(motion, commands, starts, folds, errors)
+    assert found.windows == len(starts)
+    assert (found.before, found.after) == (0.5, 0.1)
+    assert found.kinematic < 0.1 * found.ideal
+    # Commands of one half that mean nothing spoil the errors of the other half only.
+    wrong = CommandTrack(commands.stamps, commands.twists.copy())
+    mask = ((wrong.stamps - starts[0]) // (8 * 10**9)) % 2 == 0
+    wrong.twists[mask] *= -1
+    model = fit_kinematics(motion, wrong, starts[folds == 0])
+    assert np.median(position_errors(model, motion, commands, starts[folds == 1])) > 5 * found.kinematic
+    assert compare_on_steps(motion, commands, starts[:4], folds[:4], errors) is None
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_effects_and_kinematic_fit_are_compared_on_the_same_windows():
+    motion, commands = recording(seconds=60.0)
+    evidence = Evidence(SmoothedMotion(motion, 0.001, 0.001, (slice(0, len(motion)),)), commands)
+    robot = load_robot("husky")
+    # The values are those of another robot: they are fitted to the half that is not tested.
+    effects = (("command_delay", {"delay": 0.1}), ("turning_scrub", {"track_width_factor": 1.0}))
+    found = compare_after_steps(evidence, robot, effects)
+    assert found.windows >= 10 and len(found.models) == 2
+    assert found.after < 0.8 * found.before
+    assert found.kinematic < 0.2 * found.before
+    assert compare_after_steps(evidence, robot, ()).after is None
+    still = CommandTrack(commands.stamps, np.tile([0.5, 0.1], (len(commands), 1)))
+    assert compare_after_steps(Evidence(evidence.smoothed, still), robot, ()) is None
