@@ -21,7 +21,9 @@ from monoforce_ros.effects.catalogue import (
     turned_effects,
 )
 from monoforce_ros.effects.page import catalogue_page
+from monoforce_ros.effects.timing import contains, values_from, values_growing
 from monoforce_ros.physics import PhysicsOptions, State, rollout
+from monoforce_ros.physics.problem import Problem
 from monoforce_ros.physics.rest import rest_depth
 from monoforce_ros.robots import RobotFileError, load_robot, robot_file
 from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap
@@ -71,6 +73,7 @@ STRONG = {
     "friction_scale": {"factor": 0.5},
     "friction_anisotropy": {"factor": 0.6},
     "terrain_softness": {"factor": 4.0},
+    "rotation_centre": {"x": 0.07},
     "learned_term": {"force_x:vx": -20.0, "torque_z:vx wz": 8.0, "force_y:roll": 30.0},
 }
 
@@ -108,6 +111,11 @@ ALL_STAGES = {
     "drive_gain": {"gain": 0.93},
     "drive_asymmetry": {"difference": 0.07},
     "turning_scrub": {"track_width_factor": 1.4},
+    "yaw_rate_limit": {"limit": 0.11},
+    "drive_loss": {"loss": -0.3},
+    "supply_sag": {"sag": 0.25},
+    "acceleration_limit": {"limit": 0.13},
+    "yaw_acceleration_limit": {"limit": 0.21},
 }
 
 
@@ -156,6 +164,48 @@ def test_command_effects_have_their_closed_forms(husky):
     band = steps(having(husky, actuator_deadband={"width": 0.1}), [-0.5, -0.05, 0.0, 0.08, 0.5])
     np.testing.assert_allclose(band, [-0.4, 0, 0, 0, 0.4])
     np.testing.assert_allclose(steps(having(husky, drive_gain={"gain": 0.9}), [0.5]), [0.45])
+
+
+def twist_of(robot, commands):
+    """Forward speed and yaw rate ``[T, 2]`` that the drives make of commands ``[T, 2]`` at 100 Hz."""
+    left, right = drive_speeds(robot, torch.as_tensor(commands).double()[None], 0.01)[0].numpy().T
+    width = float(robot.drive_offsets.max() - robot.drive_offsets.min())
+    return np.stack([(left + right) / 2, (right - left) / width], axis=1)
+
+
+def test_limits_of_the_twist_clamp_and_ramp_it(husky):
+    fast = dataclasses.replace(husky, maximum_speed=9.0, maximum_yaw_rate=9.0)
+    time = np.arange(400) * 0.01
+    step = np.where((time >= 1.0)[:, None], [1.2, 3.0], 0.0)
+    step[time >= 3.0] = [-0.4, 0.0]
+    limited = having(
+        fast, yaw_rate_limit={"limit": 1.0}, acceleration_limit={"limit": 2.0}, yaw_acceleration_limit={"limit": 1.6}
+    )
+    forward, yaw_rate = twist_of(limited, step).T
+    rise = time - 1.0 + 0.01
+    expected = np.clip(np.where(time < 3.0, 2.0 * rise, 1.2 - 2.0 * (time - 3.0 + 0.01)), -0.4, 1.2).clip(
+        min=np.where(time < 3.0, 0.0, -0.4)
+    )
+    np.testing.assert_allclose(forward, expected, atol=1e-9)
+    # The ramp starts from the clamped rate, not from the commanded one: it slows down at once.
+    expected = np.where(time < 3.0, np.clip(1.6 * rise, 0.0, 1.0), np.clip(1.0 - 1.6 * (time - 3.0 + 0.01), 0.0, 1.0))
+    np.testing.assert_allclose(yaw_rate, expected, atol=1e-9)
+    # One limit leaves the other axis alone.
+    forward, yaw_rate = twist_of(having(fast, yaw_rate_limit={"limit": 1.0}), step).T
+    np.testing.assert_allclose(forward, step[:, 0], atol=1e-12)
+    np.testing.assert_allclose(yaw_rate, np.clip(step[:, 1], -1.0, 1.0), atol=1e-12)
+
+
+def test_commands_beyond_the_limits_of_the_robot_file_are_clamped(husky):
+    assert (husky.maximum_speed, husky.maximum_yaw_rate) == (1.0, 2.0)
+    np.testing.assert_allclose(twist_of(husky, [[4.0, -7.0]]), [[1.0, -2.0]])
+    # The base clamps a command before it ramps to it: leaving the limit takes no time.
+    commands = np.r_[np.full(150, 7.0), np.zeros(100)][:, None] * [0.0, 1.0]
+    ramped = twist_of(having(husky, yaw_acceleration_limit={"limit": 4.0}), commands)[:, 1]
+    np.testing.assert_allclose(ramped[150:], np.clip(2.0 - 0.04 * np.arange(1, 101), 0.0, None), atol=1e-9)
+    # And in prediction: two commands beyond the limit move the robot alike.
+    moved = [run(husky, (0.3, rate), 1.5) for rate in (2.0, 5.0)]
+    assert torch.equal(moved[0].position, moved[1].position) and torch.equal(moved[0].rotation, moved[1].rotation)
 
 
 def test_asymmetry_and_scrub_act_on_the_sides(husky):
@@ -218,6 +268,16 @@ def test_tilted_gravity_stays_with_the_ground_when_the_robot_turns(husky):
     # Small angles: the order of the two turns does not matter.
     np.testing.assert_allclose(moved[1:], [moved[0]] * 2, atol=1e-3)
     assert turned_effects(husky, headings) is husky
+
+
+def test_a_map_is_not_repeated_for_each_trajectory(husky):
+    """A search rolls out a thousand trajectories on one map: a copy of the map for each would not fit in memory."""
+    factors = torch.tensor([2.0, 5.0, 9.0], dtype=torch.float64)
+    robot = having(husky, terrain_softness={"factor": factors}, vegetation_drag={"coefficient": 1e4 * factors})
+    speeds = torch.zeros(3, 10, 2, dtype=torch.float64)
+    posed, _ = Problem.pose(grassy(), robot, speeds, State.at_rest(0.13, batch=3, dtype=torch.float64))
+    shape = (GRID.rows, GRID.columns)
+    assert posed.terrain.stiffness.shape == posed.vegetation.shape == shape
 
 
 def test_a_lag_of_its_own_for_each_trajectory_is_the_same_lag(husky):
@@ -372,3 +432,86 @@ def test_every_effect_has_strong_values_to_be_tested_with():
 def test_an_effect_that_does_not_exist_is_named_before_anything_is_computed(husky):
     with pytest.raises(EffectError, match="effect 'drive_gian' is unknown; expected one of"):
         turned_effects(having(husky, drive_gian={"gain": 0.9}), torch.zeros(1))
+
+
+def test_a_dead_drive_stands_still_and_a_slipping_one_loses_its_share(husky):
+    commands = torch.tensor([[[0.5, 0.4], [-0.5, 0.4]]], dtype=torch.float64)
+    healthy = drive_speeds(husky, commands, 0.01)[0]
+    dead = drive_speeds(having(husky, drive_loss={"loss": 1.0}), commands, 0.01)[0]
+    assert dead[:, 0].abs().max() == 0.0 and torch.equal(dead[:, 1], healthy[:, 1])
+    slipping = drive_speeds(having(husky, drive_loss={"loss": -0.3}), commands, 0.01)[0]
+    assert torch.equal(slipping[:, 0], healthy[:, 0])
+    torch.testing.assert_close(slipping[:, 1], 0.7 * healthy[:, 1])
+    # It turns towards the weak side, and is slower than a robot with unequal tyres.
+    lost = run(having(husky, drive_loss={"loss": -0.2}), (0.6, 0.0), 3.0).position[0, -1]
+    unequal = run(having(husky, drive_asymmetry={"difference": -0.2}), (0.6, 0.0), 3.0).position[0, -1]
+    plain = run(husky, (0.6, 0.0), 3.0).position[0, -1]
+    assert float(lost[1]) < -0.05 and float(unequal[1]) < -0.05
+    assert float(plain[0] - lost[0]) > 3.0 * float(plain[0] - unequal[0])
+
+
+def test_the_supply_sags_with_the_speed_of_all_drives(husky):
+    np.testing.assert_allclose(
+        steps(having(husky, supply_sag={"sag": 0.5}), [0.2, 0.8, -0.8]), [0.2 / 1.1, 0.8 / 1.4, -0.8 / 1.4]
+    )
+    turning = drive_speeds(having(husky, supply_sag={"sag": 0.5}), torch.tensor([[[0.0, 1.0]]]).double(), 0.01)[0, 0]
+    speed = 0.2854 / (1 + 0.5 * 0.2854)
+    np.testing.assert_allclose(turning.numpy(), [-speed, speed], rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["husky", "tradr"])
+def test_the_robot_turns_about_a_point_near_its_weight(name):
+    """Its instantaneous centre of rotation is where the lateral velocity vanishes, at x = -v_y / ω."""
+    robot, centres = load_robot(name).to(torch.float64), []
+    for shift in (-0.05, 0.0, 0.05):
+        turned = run(having(robot, rotation_centre={"x": shift}), (0.0, 1.0), 2.0)
+        body = turned.rotation[0, -1].T @ turned.velocity[0, -1]
+        centres.append(-float(body[1] / turned.angular_velocity[0, -1, 2]))
+    assert centres[0] < centres[1] - 0.03 and centres[2] > centres[1] + 0.03
+    weight = [
+        float(run(having(robot, rotation_centre={"x": x}), (0, 0), 1.0).normal_forces[0, -1].sum()) for x in (0, 0.05)
+    ]
+    assert weight[0] == pytest.approx(weight[1], rel=1e-3)  # a payload would add to it
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("actuator_saturation", {"limit": 0.4}),
+        ("friction_scale", {"factor": 0.1}),
+        ("payload", {"mass": 20.0, "x": 0.3}),
+    ],
+)
+def test_an_effect_that_begins_in_a_recording_acts_on_later_trajectories_only(husky, name, values):
+    starts, onset = np.array([0.0, 4.0, 9.9, 10.0, 12.0]), 10.0
+    assert contains(starts, 2.0, onset).tolist() == [False, False, True, False, False]
+    assert contains(starts, 12.0, onset).tolist() == [True, True, True, False, False]
+
+    def final(effects, batch):
+        robot = dataclasses.replace(husky, effects=effects)
+        twists = torch.tensor([0.9, 0.7], dtype=torch.float64).expand(batch, 60, 2)
+        state = State.at_rest(husky.ground_clearance, batch=batch, dtype=torch.float64)
+        terrain = TerrainMap.flat(GRID, dtype=torch.float64)
+        return rollout(terrain, robot, drive_speeds(robot, twists, 0.01), state, with_forces=False).position[:, -1]
+
+    beginning = final(((name, values_from(name, values, starts, onset, like=husky.mass)),), 5)
+    healthy, acting = final((), 1)[0], final(((name, values),), 1)[0]
+    assert (beginning[:3] == healthy).all()
+    torch.testing.assert_close(beginning[3:], acting.expand(2, 3), rtol=0, atol=1e-12)
+    assert float((healthy - acting).abs().max()) > 1e-4
+
+
+def test_an_effect_grows_linearly_between_two_times():
+    starts = np.array([0.0, 10.0, 15.0, 20.0, 90.0])
+    fading = values_growing("drive_gain", {"gain": 0.8}, starts, 10.0, 20.0)
+    np.testing.assert_allclose(fading["gain"].numpy(), [1.0, 1.0, 0.9, 0.8, 0.8], rtol=1e-6)
+    assert float(fading["gain"][0]) == 1.0
+    assert set(values_growing("payload", {"mass": 5.0}, starts, 0.0, 1.0)) == {"mass", "x", "y", "z"}
+    with pytest.raises(EffectError, match="no finite neutral value to grow from"):
+        values_growing("actuator_saturation", {"limit": 0.5}, starts, 0.0, 1.0)
+    with pytest.raises(ValueError, match="got 5 s to 5 s, expected an end after the start"):
+        values_growing("drive_gain", {"gain": 0.5}, starts, 5.0, 5.0)
+    with pytest.raises(EffectError, match="effect 'drive_gian' is unknown"):
+        values_growing("drive_gian", {"gain": 0.5}, starts, 0.0, 5.0)
+    with pytest.raises(EffectError, match="gain is 7"):
+        values_from("drive_gain", {"gain": 7.0}, starts, 5.0)

@@ -2,29 +2,41 @@
 
 from __future__ import annotations
 
-import itertools
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 from scipy.optimize import least_squares
+from scipy.stats import t as student
+from scipy.stats import wilcoxon
 
 from monoforce_ros.core import CommandTrack, WheelTrack
 from monoforce_ros.discrepancy.hypothesis import Effects
-from monoforce_ros.effects import CATALOGUE, WheelResponse, wheel_effects
+from monoforce_ros.discrepancy.wheel_motion import half_track, undriven_stretches
+from monoforce_ros.effects import CATALOGUE, Fastest, WheelResponse, wheel_effects
 from monoforce_ros.robots import RobotModel
 
-_Piece = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Commanded speeds with history ``[2, T]`` [m/s], measured speeds ``[2, n]``, and their indices in T ``[n]``."""
-_STEP = 0.02
+_STEP, _FINE_STEP = 0.04, 0.01
+"""Of the modelled wheel speeds, in the selection and in the final fit [s]."""
 _HISTORY = 2.0
+"""Length of the commands before a block [s]: the longest dead time of the catalogue."""
 _LONGEST_GAP = 1.0
-_BLOCK = 6.0
-_MOST = 1500
-"""Samples of each side that are used at most."""
-_BETTER = 0.08
-"""Share of the squared error on held-out blocks that a model with one more effect must remove."""
-_LARGEST_MODEL = 3
-"""Largest number of effects in a wheel model."""
+_BLOCK = 4.0
+"""Length of the blocks that are fitted or held out together [s]: longer than drives respond to a step."""
+_MOST_BLOCKS = 60
+"""Blocks that are used at most: whole ones, spread evenly over the recording."""
+_MOST_SAMPLES = 80
+"""Samples of a block that are used at most: about 13 Hz, which shows a time constant of 0.08 s."""
+_FEWEST_SAMPLES = 10
+_ALPHA = 0.05
+"""Probability that a step of the selection adds an effect that the wheels do not show, over all candidates."""
+_LARGEST_MODEL = 5
+"""Largest number of effects in a wheel model: dead time, three limits of the twist and a lag."""
+_EVALUATIONS = 8
+"""Of a fit: it starts from the values of a similar model."""
+_FURTHER = 0.01
+"""Share of the error that a further effect must remove for the search to go on."""
 
 
 @dataclass(frozen=True)
@@ -40,117 +52,277 @@ class WheelFinding:
     error_after: float
     ratio: float
     """Measured speed [rad/s] over commanded [m/s]: one over the wheel's radius."""
+    used_blocks: int = 0
+    """Blocks of the recording that were used."""
+    all_blocks: int = 0
+    """Blocks of the recording in which the robot was driven by commands."""
 
     def summary(self) -> str:
         """One sentence for reports."""
         parts = [_response(name).wording.format(next(iter(values.values()))) for name, values in self.effects]
-        return "the measured wheel speeds follow the commands " + ", ".join(parts or ["without delay or limit"])
+        text = "the measured wheel speeds follow the commands " + ", ".join(parts or ["without delay or limit"])
+        if self.used_blocks < self.all_blocks:
+            text += f" ({self.used_blocks} of {self.all_blocks} blocks of {_BLOCK:g} s, spread over the recording)"
+        return text
 
 
 def compare_with_wheels(commands: CommandTrack, wheels: WheelTrack | None, robot: RobotModel) -> WheelFinding | None:
     """How measured wheel speeds follow commands; None without wheel speeds, or where they do not follow at all.
 
-    Dead time, dead band, saturation and lag are fitted to both sides in every sensible combination on every other block
-    of the recording; of the combinations that predict the held-out blocks well the smallest is selected.
+    The recording is cut into blocks, every other of which is fitted and the others held out, and the reverse. A model
+    with more effects is selected if it reduces the held-out error: its gains, one for each block, must be positive on
+    average by Wilcoxon's signed-rank test at an error rate of 5 % over all effects that could be added (Bonferroni).
     """
     if wheels is None or len(wheels) < 100 or not len(commands):
         return None
-    pieces = _pieces(commands, wheels, robot)
-    if not pieces:
+    found = _Blocks.of(commands, wheels, robot, _STEP)
+    if found is None or found.fastest.speed < 0.1:
         return None
-    top = float(
-        np.quantile(np.concatenate([np.abs(commanded[:, index]).max(axis=1) for commanded, _, index in pieces]), 0.995)
-    )
-    if top < 0.1:
-        return None
-    ratio = _ratio(pieces, top)
+    chosen = found.spread(_MOST_BLOCKS)
+    blocks = found[chosen]
+    ratio = blocks.ratio()
     if ratio is not None and robot.wheel_radius is not None and 0.4 < ratio * robot.wheel_radius < 2.5:
         # Use the known radius if the ratio is plausible, so that a drive that is too slow appears as an error.
         ratio = 1.0 / robot.wheel_radius
-    if len(pieces) < 2 or ratio is None:
+    if len(blocks) < 2 or ratio is None:
         return None
-    pieces = [(commanded, speeds / ratio, index) for commanded, speeds, index in pieces]
-    block = np.arange(len(pieces)) % 2
-    scores: dict[tuple[str, ...], tuple[float, np.ndarray, np.ndarray]] = {}
-    for names in _models():
-        loss, fits = 0.0, []
-        for held_out in (0, 1):
-            fitted = [piece for piece, number in zip(pieces, block, strict=True) if number != held_out]
-            judged = [piece for piece, number in zip(pieces, block, strict=True) if number == held_out]
-            fit = _fit(names, fitted, top)
-            fits.append(fit)
-            loss += float(np.minimum(_residuals(fit, names, judged) ** 2, (0.5 * top) ** 2).sum())
-        scores[names] = (loss, np.mean(fits, axis=0), np.abs(fits[0] - fits[1]))
-    baseline_loss = scores[()][0]
-    best: tuple[str, ...] = ()
-    for size in range(1, _LARGEST_MODEL + 1):
-        found = min((names for names in scores if len(names) == size), key=lambda names: scores[names][0], default=None)
-        if found is not None and scores[found][0] < (1.0 - _BETTER) * scores[best][0]:
-            best = found
-    effects, half_widths = [], []
-    for name, value, spread in zip(best, *scores[best][1:], strict=True):
-        response = _response(name)
-        if response.counts(float(value), top):
-            effects.append((name, {response.parameter: float(value)}))
-            # The difference of both folds is √2 times the error of each.
-            half_widths.append(float(max(1.4 * spread, 0.02 * value)))
-    count = sum(len(index) for _, _, index in pieces) * 2
-    spreads = [
-        float(np.var(np.concatenate([values.ravel() for values in side])))
-        for side in ([speeds for _, speeds, _ in pieces], [commanded[:, index] for commanded, _, index in pieces])
-    ]
-    if scores[best][0] / count > 0.5 * min(spreads):
+    blocks = replace(blocks, measured=blocks.measured / ratio)
+    selection = _Selection(blocks)
+    best = selection.run()
+    weak = _weak(best, blocks)
+    if weak:
+        # Too small to matter: fitted again without them.
+        best = selection.scored(tuple(name for name in best.names if name not in weak), best)
+    values, half_widths = best.values, np.zeros(0)
+    if best.names:
+        fine = _Blocks.of(commands, wheels, robot, _FINE_STEP)
+        assert fine is not None
+        fine = replace(fine, measured=fine.measured / ratio)[chosen]
+        values = _fit(best.names, fine, [best.values])
+        half_widths = _half_widths(values, best.names, fine)
+    baseline = selection.scored((), None)
+    count = float(blocks.known.sum()) * 2
+    spreads = [float(np.var(part[blocks.pairs])) for part in (blocks.measured, blocks.at_samples(blocks.commanded()))]
+    if best.loss / count > 0.5 * min(spreads):
         # The wheels do not follow the commands.
         return None
     return WheelFinding(
-        tuple(effects),
-        tuple(half_widths),
-        float(np.sqrt(baseline_loss / count)),
-        float(np.sqrt(scores[best][0] / count)),
+        tuple(
+            (name, {_response(name).parameter: float(value)}) for name, value in zip(best.names, values, strict=True)
+        ),
+        tuple(float(value) for value in half_widths),
+        float(np.sqrt(baseline.loss / count)),
+        float(np.sqrt(best.loss / count)),
         ratio,
+        used_blocks=len(blocks),
+        all_blocks=len(found),
     )
 
 
-def _ratio(pieces: list[_Piece], top: float) -> float | None:
-    """Measured [rad/s] over commanded speed [m/s] where a command of medium size was constant for a while."""
-    settled = round(1.5 / _STEP)
-    ratios = []
-    for commanded, speeds, index in pieces:
-        for side in range(2):
-            for place, measured in zip(index, speeds[side], strict=True):
-                recent = commanded[side, max(0, place - settled) : place + 1]
-                if np.ptp(recent) < 0.02 * top and 0.1 * top < abs(recent[-1]) < 0.6 * top:
-                    ratios.append(measured / recent[-1])
-    if len(ratios) < 20:
-        commanded = np.concatenate([commanded[:, index].ravel() for commanded, _, index in pieces])
-        measured = np.concatenate([speeds.ravel() for _, speeds, _ in pieces])
-        ratio = float(commanded @ measured) / max(float(commanded @ commanded), 1e-9)
-    else:
-        ratio = float(np.median(ratios))
-    return ratio if ratio > 0.1 else None
+@dataclass(frozen=True)
+class _Blocks:
+    """Commands and measured wheel speeds in blocks of one length."""
+
+    twists: np.ndarray
+    """Commanded forward speed [m/s] and yaw rate [rad/s], with those before the block, ``[n, 2, T]``."""
+    measured: np.ndarray
+    """Measured speed of the left and right wheels, ``[n, 2, K]`` [rad/s], or [m/s] after division by the ratio."""
+    place: np.ndarray
+    """Time of each sample since the first command, in steps, ``[n, K]``."""
+    known: np.ndarray
+    """Samples that exist, ``[n, K]`` bool; others fill the array."""
+    step: float
+    """Time between commands [s]."""
+    half: float
+    """Lateral distance of the drives from the centre line [m]."""
+
+    @classmethod
+    def of(cls, commands: CommandTrack, wheels: WheelTrack, robot: RobotModel, step: float) -> _Blocks | None:
+        """All blocks of about ``_BLOCK`` in which the robot is driven by commands, at time steps of ``step`` [s]."""
+        stamps = wheels.stamps
+        undriven = undriven_stretches(commands, wheels, None, robot)
+        breaks = np.flatnonzero(np.diff(stamps) > _LONGEST_GAP * 1e9) + 1
+        length = round((_HISTORY + _BLOCK) / step) + 1
+        twists, measured, place, known = [], [], [], []
+        for run in np.split(np.arange(len(stamps)), breaks):
+            number = (stamps[run] - stamps[run[0]]) // round(_BLOCK * 1e9)
+            for part in np.split(run, np.flatnonzero(np.diff(number)) + 1):
+                if len(part) < _FEWEST_SAMPLES or stamps[part[-1]] - stamps[part[0]] < 0.5 * _BLOCK * 1e9:
+                    continue
+                part = part[:: -(-len(part) // _MOST_SAMPLES)]
+                first, last = int(stamps[part[0]]) - round(_HISTORY * 1e9), int(stamps[part[-1]])
+                if ((undriven[:, 0] < last) & (undriven[:, 1] > first)).any():
+                    continue
+                grid = first + np.rint(np.arange(length) * step * 1e9).astype(np.int64)
+                fill = (0, _MOST_SAMPLES - len(part))
+                twists.append(commands.sample(grid).T)
+                measured.append(np.pad(wheels.speeds[part].T, ((0, 0), fill)))
+                place.append(np.pad((stamps[part] - first) * 1e-9 / step, fill))
+                known.append(np.arange(_MOST_SAMPLES) < len(part))
+        if not twists:
+            return None
+        bounds = np.array([[robot.maximum_speed], [robot.maximum_yaw_rate]])
+        limited = np.clip(np.array(twists), -bounds, bounds)
+        return cls(limited, np.array(measured), np.array(place), np.array(known), step, half_track(robot))
+
+    def __len__(self) -> int:
+        return len(self.twists)
+
+    def __getitem__(self, chosen: np.ndarray) -> _Blocks:
+        parts = {name: getattr(self, name)[chosen] for name in ("twists", "measured", "place", "known")}
+        return replace(self, **parts)
+
+    def spread(self, most: int) -> np.ndarray:
+        """Indices of at most ``most`` blocks, evenly spread over the recording; those without any motion go first."""
+        if len(self) <= most:
+            return np.arange(len(self))
+        moving = np.flatnonzero((np.abs(self.commanded()).max(axis=(1, 2)) > 0) | (self.measured != 0).any(axis=(1, 2)))
+        return moving[np.unique(np.linspace(0, len(moving) - 1, min(most, len(moving))).round().astype(int))]
+
+    @property
+    def fastest(self) -> Fastest:
+        """Fastest commands: 99.5 % quantiles."""
+        speeds = np.abs(self.commanded()).max(axis=1)
+        return Fastest(float(np.quantile(speeds, 0.995)), float(np.quantile(np.abs(self.twists[:, 1]), 0.995)))
+
+    @property
+    def pairs(self) -> np.ndarray:
+        """Mask of the known samples of both sides, ``[n, 2, K]``."""
+        return np.broadcast_to(self.known[:, None], self.measured.shape)
+
+    def commanded(self, twists: np.ndarray | None = None) -> np.ndarray:
+        """Wheel speeds ``[n, 2, T]`` [m/s] of commanded or given twists."""
+        forward, yaw_rate = np.moveaxis(self.twists if twists is None else twists, 1, 0)
+        return np.stack([forward - self.half * yaw_rate, forward + self.half * yaw_rate], axis=1)
+
+    def at_samples(self, speeds: np.ndarray) -> np.ndarray:
+        """Speeds ``[n, 2, T]`` at the samples, ``[n, 2, K]``."""
+        index = np.minimum(self.place.astype(int), speeds.shape[2] - 2)[:, None]
+        before, after = (np.take_along_axis(speeds, index + shift, axis=2) for shift in (0, 1))
+        return before + (self.place[:, None] - index) * (after - before)
+
+    def ratio(self) -> float | None:
+        """Measured [rad/s] over commanded speed [m/s] where a command of medium size was constant for a while."""
+        commanded, top = self.commanded(), self.fastest.speed
+        # From 1.5 s before a sample until it.
+        settled = round(1.5 / self.step)
+        shift = {"size": settled + 1, "origin": settled // 2, "axis": 2}
+        extent = self.at_samples(maximum_filter1d(commanded, **shift) - minimum_filter1d(commanded, **shift))
+        recent = self.at_samples(commanded)
+        steady = self.pairs & (extent < 0.02 * top) & (np.abs(recent) > 0.1 * top) & (np.abs(recent) < 0.6 * top)
+        sides = [self.measured[:, side][steady[:, side]] / recent[:, side][steady[:, side]] for side in range(2)]
+        if min(map(len, sides)) < 10:
+            measured, recent = self.measured[self.pairs], recent[self.pairs]
+            ratio = float(recent @ measured) / max(float(recent @ recent), 1e-9)
+        else:
+            # A dead side says nothing about the wheel's radius.
+            left, right = (float(np.median(side)) for side in sides)
+            ratio = 0.5 * (left + right) if min(left, right) > 0.5 * max(left, right) else max(left, right)
+        return ratio if ratio > 0.1 else None
 
 
-def _pieces(commands: CommandTrack, wheels: WheelTrack, robot: RobotModel) -> list[_Piece]:
-    """The recording in blocks of about ``_BLOCK``, each with the commands before it."""
-    every = max(1, -(-len(wheels) // _MOST))
-    stamps, speeds = wheels.stamps[::every], wheels.speeds[::every]
-    half = 0.5 * float((robot.drive_offsets.max() - robot.drive_offsets.min()).abs())
-    breaks = np.flatnonzero(np.diff(stamps) > _LONGEST_GAP * 1e9) + 1
-    pieces = []
-    for run in np.split(np.arange(len(stamps)), breaks):
-        if len(run) < 10:
-            continue
-        length = (stamps[run[-1]] - stamps[run[0]]) * 1e-9
-        for part in np.array_split(run, max(1, round(length / _BLOCK))):
-            if len(part) < 10:
-                continue
-            first = int(stamps[part[0]]) - round(_HISTORY * 1e9)
-            count = round((int(stamps[part[-1]]) - first) * 1e-9 / _STEP) + 1
-            twists = commands.sample(first + np.rint(np.arange(count) * _STEP * 1e9).astype(np.int64))
-            commanded = np.stack([twists[:, 0] - half * twists[:, 1], twists[:, 0] + half * twists[:, 1]])
-            index = np.rint((stamps[part] - first) * 1e-9 / _STEP).astype(int)
-            pieces.append((commanded, speeds[part].T, index))
-    return pieces
+@dataclass(frozen=True)
+class _Model:
+    """Effects of the drives, fitted and judged on held-out blocks."""
+
+    names: tuple[str, ...]
+    values: np.ndarray
+    """Mean over the folds, ``[P]``."""
+    losses: np.ndarray
+    """Sum of squared errors of each block with the values fitted without its fold, ``[n]`` [m²/s²]."""
+
+    @property
+    def loss(self) -> float:
+        """Sum over the blocks."""
+        return float(self.losses.sum())
+
+
+class _Selection:
+    """Selection of the effects that measured wheel speeds show."""
+
+    def __init__(self, blocks: _Blocks):
+        self._blocks = blocks
+        self._fold = np.arange(len(blocks)) % 2
+        self._known: dict[tuple[str, ...], _Model] = {}
+        self._order = [effect.name for effect in wheel_effects()]
+
+    def run(self) -> _Model:
+        """The smallest model that no larger one improves.
+
+        The best model of each size is found by a floating search (Pudil et al. 1994): one more effect, exchanges, and
+        removals that improve the smaller size. One effect may stand in for several: a lag for two ramps.
+        """
+        found = [self.scored((), None)]
+        while len(found) <= _LARGEST_MODEL:
+            candidates = [self.scored(names, found[-1]) for names in self._larger(found[-1].names)]
+            if not candidates:
+                break
+            further = self._exchanged(min(candidates, key=lambda model: model.loss))
+            if further.loss > (1.0 - _FURTHER) * found[-1].loss:
+                break
+            found.append(further)
+            for size in range(len(found) - 1, 1, -1):
+                found[size - 1] = min([found[size - 1], *self._smaller(found[size])], key=lambda model: model.loss)
+        best = found[0]
+        for model in found[1:]:
+            if _better(best, model, len(self._order) - len(best.names)):
+                best = model
+        return self._pruned(best)
+
+    def scored(self, names: tuple[str, ...], start: _Model | None) -> _Model:
+        """A model fitted to each fold and judged on the other, from the values of a similar one."""
+        if names not in self._known:
+            losses, values = np.zeros(len(self._blocks)), []
+            starts = _starts(names, self._blocks.fastest, start)
+            for held_out in (0, 1):
+                fitted, judged = (self._blocks[self._fold == number] for number in (1 - held_out, held_out))
+                fit = _fit(names, fitted, starts)
+                values.append(fit)
+                losses[self._fold == held_out] = _block_losses(fit, names, judged, self._blocks.fastest.speed)
+            self._known[names] = _Model(names, np.mean(values, axis=0), losses)
+        return self._known[names]
+
+    def _larger(self, names: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
+        for name in self._order:
+            excluded = any(other in _response(name).excludes or name in _response(other).excludes for other in names)
+            if name not in names and not excluded:
+                yield tuple(other for other in self._order if other in names or other == name)
+
+    def _exchanged(self, best: _Model) -> _Model:
+        """The best model with one effect replaced by another, or ``best``; a first effect may stand in for a later."""
+        tried = [best]
+        for name in best.names:
+            rest = tuple(other for other in best.names if other != name)
+            tried += [self.scored(names, best) for names in self._larger(rest) if name not in names]
+        return min(tried, key=lambda model: model.loss)
+
+    def _smaller(self, model: _Model) -> list[_Model]:
+        return [self.scored(tuple(other for other in model.names if other != name), model) for name in model.names]
+
+    def _pruned(self, best: _Model) -> _Model:
+        """The model without effects that do not improve it."""
+        for fewer in sorted(self._smaller(best), key=lambda model: model.loss):
+            if not _better(fewer, best, 1):
+                return self._pruned(fewer)
+        return best
+
+
+def _better(smaller: _Model, larger: _Model, candidates: int) -> bool:
+    """Whether the larger model's held-out error is smaller beyond chance, given how many models it is the best of."""
+    gains = smaller.losses - larger.losses
+    if larger.loss >= smaller.loss or not gains.any():
+        return False
+    # By ranks: blocks without a step of the commands show little of either sign, and count little.
+    return bool(wilcoxon(gains, alternative="greater").pvalue * candidates < _ALPHA)
+
+
+def _weak(model: _Model, blocks: _Blocks) -> list[str]:
+    """Effects of a model whose values are too small to count."""
+    return [
+        name
+        for name, value in zip(model.names, model.values, strict=True)
+        if not _response(name).counts(float(value), blocks.fastest)
+    ]
 
 
 def _response(name: str) -> WheelResponse:
@@ -159,44 +331,65 @@ def _response(name: str) -> WheelResponse:
     return response
 
 
-def _models() -> list[tuple[str, ...]]:
-    """Sets of effects that wheel speeds reveal, each in the order in which they act on a command."""
-    names = [effect.name for effect in wheel_effects()]
-    return [
-        chosen
-        for size in range(_LARGEST_MODEL + 1)
-        for chosen in itertools.combinations(names, size)
-        if not any(other in _response(name).excludes for name in chosen for other in chosen)
-    ]
+def _modelled(values: np.ndarray, names: tuple[str, ...], blocks: _Blocks) -> np.ndarray:
+    """Speeds ``[n, 2, T]`` [m/s] of wheels that follow the commands under effects: those on the twist act first."""
+    named = [(_response(name), float(value)) for name, value in zip(names, values, strict=True)]
+    twists = blocks.twists
+    for response, value in named:
+        if response.of_twist:
+            twists = response.speeds(twists, value, blocks.step)
+    speeds = blocks.commanded(twists)
+    for response, value in named:
+        if not response.of_twist:
+            speeds = response.speeds(speeds, value, blocks.step)
+    return speeds
 
 
-def _model(values: np.ndarray, names: tuple[str, ...], commanded: np.ndarray) -> np.ndarray:
-    """Speeds ``[2, T]`` of the wheels that follow commanded ones under effects."""
-    for name, value in zip(names, values, strict=True):
-        commanded = _response(name).speeds(commanded, float(value), _STEP)
-    return commanded
+def _residuals(values: np.ndarray, names: tuple[str, ...], blocks: _Blocks) -> np.ndarray:
+    """Measured minus modelled speed ``[n, 2, K]`` [m/s]; zero where there is no sample."""
+    return (blocks.measured - blocks.at_samples(_modelled(values, names, blocks))) * blocks.pairs
 
 
-def _residuals(values: np.ndarray, names: tuple[str, ...], pieces: list[_Piece]) -> np.ndarray:
-    """Measured minus modelled speed of all samples of both sides [m/s]."""
-    return np.concatenate(
-        [(speeds - _model(values, names, commanded)[:, index]).ravel() for commanded, speeds, index in pieces]
-    )
+def _block_losses(values: np.ndarray, names: tuple[str, ...], blocks: _Blocks, top: float) -> np.ndarray:
+    """Sum of squared errors of each block ``[n]``, each clipped so that a few outliers do not decide."""
+    return np.minimum(_residuals(values, names, blocks) ** 2, (0.5 * top) ** 2).sum(axis=(1, 2))
 
 
-def _fit(names: tuple[str, ...], pieces: list[_Piece], top: float) -> np.ndarray:
-    """Parameters by robust least squares from a few starts."""
+def _starts(names: tuple[str, ...], fastest: Fastest, similar: _Model | None) -> list[np.ndarray]:
+    """Initial values: those of a similar model, with each initial value of what it does not hold."""
+    known = {} if similar is None else dict(zip(similar.names, similar.values, strict=True))
+    listed = [(float(known[name]),) if name in known else _response(name).starts(fastest) for name in names]
+    return [np.array([values[i % len(values)] for values in listed]) for i in range(max(map(len, listed), default=0))]
+
+
+def _fit(names: tuple[str, ...], blocks: _Blocks, starts: Sequence[np.ndarray]) -> np.ndarray:
+    """Parameters by robust least squares from the best of a few starts."""
     if not names:
         return np.zeros(0)
-    starts = {name: _response(name).starts(top) for name in names}
-    bounds = np.array([_response(name).bounds(top) for name in names])
-    best, cost = np.zeros(len(names)), np.inf
-    for number in range(max(len(starts[name]) for name in names)):
-        start = [starts[name][number % len(starts[name])] for name in names]
-        fit = least_squares(
-            _residuals, start, args=(names, pieces), loss="soft_l1", f_scale=0.05 * top, diff_step=1e-2, max_nfev=20,
-            bounds=(bounds[:, 0], bounds[:, 1]),
-        )  # fmt: skip
-        if fit.cost < cost:
-            best, cost = fit.x, fit.cost
-    return best
+    fastest = blocks.fastest
+    bounds = np.array([_response(name).bounds(fastest) for name in names])
+    inside = [np.clip(start, bounds[:, 0] + 1e-6, bounds[:, 1] - 1e-6) for start in starts]
+    start = min(inside, key=lambda values: _block_losses(values, names, blocks, fastest.speed).sum())
+    return least_squares(
+        lambda values: _residuals(values, names, blocks).ravel(), start, loss="soft_l1", f_scale=0.05 * fastest.speed,
+        diff_step=1e-2, max_nfev=_EVALUATIONS, bounds=(bounds[:, 0], bounds[:, 1]), x_scale=np.ptp(bounds, axis=1),
+    ).x  # fmt: skip
+
+
+def _half_widths(values: np.ndarray, names: tuple[str, ...], blocks: _Blocks) -> np.ndarray:
+    """Half-widths of 95 % intervals from the scores of each block (sandwich estimate, White 1980), ``[P]``."""
+    base = _residuals(values, names, blocks)
+    derivatives = []
+    for i, value in enumerate(values):
+        step = max(0.01 * abs(value), 1e-3)
+        shifted = [_residuals(values + sign * step * np.eye(len(values))[i], names, blocks) for sign in (1, -1)]
+        derivatives.append((shifted[0] - shifted[1]) / (2 * step))
+    jacobian = np.array(derivatives)
+    top = blocks.fastest.speed
+    weight = 1.0 / np.sqrt(1.0 + (base / (0.05 * top)) ** 2)
+    scores = np.einsum("pnsk,nsk->np", jacobian, weight * base)
+    information = np.einsum("pnsk,nsk,qnsk->pq", jacobian, weight, jacobian)
+    inverse = np.linalg.pinv(information)
+    freedom = max(1, len(blocks) - len(values))
+    covariance = len(blocks) / freedom * inverse @ (scores.T @ scores) @ inverse
+    return student.ppf(0.975, freedom) * np.sqrt(np.maximum(np.diag(covariance), 0.0))

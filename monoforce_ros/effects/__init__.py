@@ -17,8 +17,9 @@ from monoforce_ros.effects.catalogue import (
     turned_effects,
     wheel_effects,
 )
-from monoforce_ros.effects.effect import STAGES, Effect, Parameter, WheelResponse, per_trajectory
+from monoforce_ros.effects.effect import STAGES, Effect, Fastest, Parameter, WheelResponse, per_trajectory
 from monoforce_ros.effects.setup import FEATURE_SIZES, FEATURES, Loads, Setup
+from monoforce_ros.effects.timing import contains, values_from, values_growing
 
 __all__ = [
     "CATALOGUE",
@@ -27,11 +28,13 @@ __all__ = [
     "STAGES",
     "Effect",
     "EffectError",
+    "Fastest",
     "Loads",
     "Parameter",
     "Setup",
     "WheelResponse",
     "applied_setup",
+    "contains",
     "corrected_commands",
     "corrected_motion",
     "drive_speeds",
@@ -44,5 +47,7 @@ __all__ = [
     "separating_sensor",
     "speed_effects",
     "turned_effects",
+    "values_from",
+    "values_growing",
     "wheel_effects",
 ]

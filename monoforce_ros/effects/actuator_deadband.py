@@ -27,9 +27,9 @@ class ActuatorDeadband(Effect):
     wheel_response = WheelResponse(
         parameter="width",
         speeds=lambda speeds, value, step: np.sign(speeds) * np.maximum(np.abs(speeds) - value, 0.0),
-        starts=lambda top: (0.05 * top,),
-        bounds=lambda top: (0.0, 0.6 * top),
-        counts=lambda value, top: value >= 0.02,
+        starts=lambda fastest: (0.05 * fastest.speed,),
+        bounds=lambda fastest: (0.0, 0.6 * fastest.speed),
+        counts=lambda value, fastest: value >= 0.02,
         wording="slower by {:.2f} m/s",
         excludes=("actuator_saturation",),
     )

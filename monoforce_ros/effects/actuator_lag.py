@@ -10,13 +10,14 @@ from scipy.signal import lfilter
 from torch import Tensor
 
 from monoforce_ros.effects.effect import Effect, Parameter, Values, WheelResponse
+from monoforce_ros.effects.ramp import at_stamps
 
 
 def _lagging(speeds: np.ndarray, value: float, step: float) -> np.ndarray:
     if value <= 1e-4:
         return speeds
     decay = np.exp(-step / value)
-    return lfilter([1.0 - decay], [1.0, -decay], speeds, axis=1, zi=decay * speeds[:, :1])[0]
+    return at_stamps(lfilter([1.0 - decay], [1.0, -decay], speeds, axis=-1, zi=decay * speeds[..., :1])[0])
 
 
 class ActuatorLag(Effect):
@@ -35,9 +36,9 @@ class ActuatorLag(Effect):
     wheel_response = WheelResponse(
         parameter="time_constant",
         speeds=_lagging,
-        starts=lambda top: (0.1, 0.4),
-        bounds=lambda top: (0.0, 2.0),
-        counts=lambda value, top: value >= 0.08,
+        starts=lambda fastest: (0.1, 0.4),
+        bounds=lambda fastest: (0.0, 3.0),
+        counts=lambda value, fastest: value >= 0.08,
         wording="with a time constant of {:.2f} s",
     )
 

@@ -28,10 +28,10 @@ class ActuatorSaturation(Effect):
     wheel_response = WheelResponse(
         parameter="limit",
         speeds=lambda speeds, value, step: np.clip(speeds, -value, value),
-        starts=lambda top: (0.9 * top, 0.6 * top),
-        bounds=lambda top: (0.02 * top, 1.5 * top),
+        starts=lambda fastest: (0.9 * fastest.speed, 0.6 * fastest.speed),
+        bounds=lambda fastest: (0.02 * fastest.speed, 1.5 * fastest.speed),
         # A limit just below the fastest command, or above it, has no effect.
-        counts=lambda value, top: value <= 0.95 * top,
+        counts=lambda value, fastest: value <= 0.95 * fastest.speed,
         wording="up to {:.2f} m/s",
         excludes=("actuator_deadband",),
     )

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from monoforce_ros.core import CommandTrack, MotionTrack
 from monoforce_ros.effects.effect import STAGES, Effect
-from monoforce_ros.effects.setup import Loads, Setup
+from monoforce_ros.effects.setup import Setup
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import TerrainMap
 
@@ -23,7 +23,7 @@ class EffectError(ValueError):
     """Unknown effect, unknown parameter of an effect, or a value out of bounds."""
 
 
-_NO_EFFECTS = frozenset({"catalogue", "effect", "page", "setup"})
+_NO_EFFECTS = frozenset({"catalogue", "effect", "page", "ramp", "setup", "timing"})
 """Modules of this package without an effect."""
 
 
@@ -51,7 +51,8 @@ CATALOGUE: dict[str, Effect] = _discover()
 
 
 def speed_effects() -> tuple[Effect, ...]:
-    """Effects that change drive speeds, in the order in which they act on a command."""
+    """Effects that change twists or drive speeds, in the order in which they act on a command."""
+    # Twists are changed before they become drive speeds, whatever the order.
     return tuple(sorted((e for e in CATALOGUE.values() if e.order is not None), key=lambda e: (e.order, e.name)))
 
 
@@ -118,18 +119,25 @@ def drive_speeds(robot: RobotModel, twists: Tensor, time_step: float, *, history
     Returns:
         ``[B, T, D]`` [m/s].
     """
+    given = dict(robot.effects)
+    active = [
+        (effect, effect_values(effect.name, given[effect.name], twists))
+        for effect in speed_effects()
+        if effect.name in given
+    ]
+    # The base limits a command before it ramps to it.
+    twists = robot.limited_twist(twists)
+    for effect, values in active:
+        twists = effect.twists(twists, values, time_step)
     speeds = robot.drive_speeds(twists)
-    active = dict(robot.effects)
-    for effect in speed_effects():
-        if effect.name in active:
-            values = effect_values(effect.name, active[effect.name], speeds)
-            speeds = effect.drive_speeds(speeds, values, time_step, robot.drive_offsets)
+    for effect, values in active:
+        speeds = effect.drive_speeds(speeds, values, time_step, robot.drive_offsets)
     return speeds[:, history:]
 
 
 def applied_setup(terrain: TerrainMap, robot: RobotModel) -> Setup:
     """Terrain, robot and loads with the robot's contact and body effects applied."""
-    setup = Setup(terrain, robot, Loads.none(robot.points))
+    setup = Setup.plain(terrain, robot)
     for name, parameters in robot.effects:
         values = effect_values(name, parameters, robot.points)
         setup = CATALOGUE[name].setup(setup, values)

@@ -12,8 +12,11 @@ from monoforce_ros.effects.effect import Effect, Parameter, Values, WheelRespons
 
 
 def _delayed(speeds: np.ndarray, value: float, step: float) -> np.ndarray:
-    index = np.arange(speeds.shape[1]) - value / step
-    return np.stack([np.interp(index, np.arange(speeds.shape[1]), side) for side in speeds])
+    whole, fraction = divmod(value / step, 1.0)
+    # The first command is assumed to have been active before its stamp.
+    index = np.arange(speeds.shape[-1]) - int(whole)
+    later, earlier = speeds[..., np.maximum(index, 0)], speeds[..., np.maximum(index - 1, 0)]
+    return later + fraction * (earlier - later)
 
 
 class CommandDelay(Effect):
@@ -37,9 +40,9 @@ class CommandDelay(Effect):
     wheel_response = WheelResponse(
         parameter="delay",
         speeds=_delayed,
-        starts=lambda top: (0.05, 0.3, 0.7),
-        bounds=lambda top: (0.0, 1.8),
-        counts=lambda value, top: value >= 0.06,
+        starts=lambda fastest: (0.05, 0.3, 0.7),
+        bounds=lambda fastest: (0.0, 1.8),
+        counts=lambda value, fastest: value >= 0.06,
         wording="{:.2f} s late",
     )
 

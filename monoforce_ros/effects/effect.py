@@ -35,20 +35,33 @@ class Parameter:
 
 
 @dataclass(frozen=True)
+class Fastest:
+    """Fastest commands of a recording."""
+
+    speed: float
+    """Of the wheels [m/s]."""
+    yaw_rate: float
+    """Of the robot [rad/s]."""
+
+
+@dataclass(frozen=True)
 class WheelResponse:
     """An effect in measured wheel speeds: how one parameter changes commanded wheel speeds."""
 
     parameter: str
     speeds: Callable[[np.ndarray, float, float], np.ndarray]
-    """(commanded wheel speeds ``[sides, T]`` [m/s], parameter value, time step [s]) → wheel speeds [m/s]."""
-    starts: Callable[[float], tuple[float, ...]]
-    """Fastest commanded speed [m/s] → initial values of a fit."""
-    bounds: Callable[[float], tuple[float, float]]
-    """Fastest commanded speed [m/s] → bounds of the fit."""
-    counts: Callable[[float, float], bool]
-    """(fitted value, fastest commanded speed [m/s]) → whether the value is large enough to count as an effect."""
+    """(commands, parameter value, time step [s]) → changed commands. Commands are wheel speeds ``[..., 2, T]`` [m/s],
+    left and right, or, with ``of_twist``, forward speed [m/s] and yaw rate [rad/s]."""
+    starts: Callable[[Fastest], tuple[float, ...]]
+    """Initial values of a fit."""
+    bounds: Callable[[Fastest], tuple[float, float]]
+    """Bounds of the fit."""
+    counts: Callable[[float, Fastest], bool]
+    """Whether a fitted value is large enough to count as an effect."""
     wording: str
     """Text for reports, with braces for the value."""
+    of_twist: bool = False
+    """Whether the effect changes the commanded twist rather than the wheel speeds."""
     excludes: tuple[str, ...] = ()
     """Effects that a wheel model does not combine with this one because they are too similar to be fitted together."""
 
@@ -56,9 +69,9 @@ class WheelResponse:
 class Effect(ABC):
     """Base class of the catalogue's effects. One small file defines each effect completely.
 
-    A command effect changes drive speeds, a contact or body effect changes the setup of the rollout, and a measurement
-    effect changes recorded data. The methods below do nothing; an effect overrides those it needs. ``diagnose`` reads
-    the class attributes; :mod:`monoforce_ros.effects.catalogue` checks them at import.
+    A command effect changes commanded twists or drive speeds, a contact or body effect changes the setup of the
+    rollout, and a measurement effect changes recorded data. The methods below do nothing; an effect overrides those it
+    needs. ``diagnose`` reads the class attributes; :mod:`monoforce_ros.effects.catalogue` checks them at import.
     """
 
     name: ClassVar[str]
@@ -68,8 +81,8 @@ class Effect(ABC):
     source: ClassVar[str]
     parameters: ClassVar[tuple[Parameter, ...]]
     order: ClassVar[int | None] = None
-    """Position among the effects that change drive speeds, smallest first: electronics, then mechanics, then ground.
-    Required for every effect that overrides :meth:`drive_speeds`."""
+    """Position among the effects on commands, smallest first: the base controller, electronics, mechanics, ground.
+    Required for every effect that overrides :meth:`twists` or :meth:`drive_speeds`; all twists change first."""
     identified: ClassVar[tuple[str, ...]] = ()
     """Parameters that a recording of motion and commands can identify, the most important first. If empty, ``diagnose``
     does not test this effect."""
@@ -87,6 +100,16 @@ class Effect(ABC):
     """The effect in measured wheel speeds."""
     gyro_measures: ClassVar[str] = ""
     """Parameter that comparing poses with a gyro measures directly."""
+
+    def twists(self, twists: Tensor, values: Values, time_step: float) -> Tensor:
+        """Twists ``[B, T, 2]`` [m/s, rad/s] that the base controller makes of commanded ones.
+
+        Args:
+            twists: commanded forward speed and yaw rate ``[B, T, 2]``, including those before the start.
+            values: parameter values.
+            time_step: time between twists [s].
+        """
+        return twists
 
     def drive_speeds(self, speeds: Tensor, values: Values, time_step: float, offsets: Tensor) -> Tensor:
         """Drive speeds ``[B, T, D]`` [m/s] from commanded ones.
@@ -131,7 +154,8 @@ class Effect(ABC):
             return f"has no {', '.join(missing)}"
         if self.stage not in STAGES:
             return f"stage: got {self.stage!r}, expected one of {STAGES}"
-        changes_speeds = type(self).drive_speeds is not Effect.drive_speeds
+        kind = type(self)
+        changes_speeds = kind.drive_speeds is not Effect.drive_speeds or kind.twists is not Effect.twists
         if self.order is not None and not isinstance(self.order, int):
             return f"order: got {self.order!r}, expected a whole number"
         if (changes_speeds or self.stage == "command") and self.order is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import ClassVar
 
 from monoforce_ros.effects.effect import Effect, Parameter, Values
 from monoforce_ros.effects.setup import Setup
@@ -17,6 +18,13 @@ class FrictionAnisotropy(Effect):
     formula = "μ_lat ← factor μ_lat"
     source = "friction ellipse of tyres and grousers (Pacejka 2012)"
     parameters = (Parameter("factor", "-", 1.0, 0.05, 3.0, 0.3, "lateral over longitudinal friction"),)
+    identified = ("factor",)
+    manoeuvre = "turns on the spot, wide arcs and hard starts straight ahead"
+    separated_by: ClassVar = {
+        "friction_scale": "hard starts straight ahead, which need longitudinal friction only",
+        "turning_scrub": "turns on the spot at low and high yaw rate",
+        "payload": "hard starts, and driving up and across a slope",
+    }
 
     def setup(self, setup: Setup, values: Values) -> Setup:
         """The setup with this effect applied."""

@@ -21,6 +21,7 @@ effects:
 ```
 
 Effects can be combined. Effects on commands act in this order: {order}.
+Limits of the twist act before it becomes drive speeds.
 Delay and lag use the commands from before the start. Contact and body effects act in the rollout, in both backends, and
 every parameter is differentiable. Measurement effects change recorded data, not the motion itself.
 

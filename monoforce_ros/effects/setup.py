@@ -32,7 +32,7 @@ class Loads:
     quadratic_drag: Tensor
     """Force against the velocity of the centre of mass, times its speed [N s²/m²]."""
     vegetation_drag: Tensor
-    """Force against motion per contact area and height of the vegetation above the ground [N s/m⁴]."""
+    """Force against motion per contact area, speed and height of the vegetation above the ground [N s/m⁴]."""
     vegetation_yield: Tensor
     """Speed at which the speed-independent bending force of vegetation equals its viscous drag [m/s]."""
     wrench: Tensor
@@ -64,3 +64,12 @@ class Setup:
     terrain: TerrainMap
     robot: RobotModel
     loads: Loads
+    softness: Tensor
+    """Divisor of the terrain's stiffness and damping [-], a scalar or ``[B]``; 1 keeps the map's values. It is not part
+    of the map, because a map for each trajectory would exceed the memory."""
+
+    @classmethod
+    def plain(cls, terrain: TerrainMap, robot: RobotModel) -> Setup:
+        """A setup without effects."""
+        like = robot.points
+        return cls(terrain, robot, Loads.none(like), torch.ones((), dtype=like.dtype, device=like.device))

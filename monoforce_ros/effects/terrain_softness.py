@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import ClassVar
 
-from monoforce_ros.effects.effect import Effect, Parameter, Values, per_trajectory
+from monoforce_ros.effects.effect import Effect, Parameter, Values
 from monoforce_ros.effects.setup import Setup
 
 
@@ -17,13 +18,17 @@ class TerrainSoftness(Effect):
     formula = "e ← e / factor, d ← d / factor"
     source = "loose soil"
     parameters = (Parameter("factor", "-", 1.0, 0.1, 100.0, 3.0, "mapped over true stiffness"),)
+    identified = ("factor",)
+    manoeuvre = "over bumps and edges, slow and fast"
+    separated_by: ClassVar = {
+        "rolling_resistance": "over bumps and on level ground",
+        "payload": "over bumps, and hard starts",
+    }
+
+    def first_values(self) -> list[dict[str, float]]:
+        """From hard ground to mud, by equal ratios: stiffness varies by orders of magnitude."""
+        return [{"factor": value} for value in (0.2, 0.5, 2.0, 5.0, 15.0, 50.0)]
 
     def setup(self, setup: Setup, values: Values) -> Setup:
         """The setup with this effect applied."""
-        terrain, factor = setup.terrain, per_trajectory(values["factor"], 3)
-        if factor.ndim and terrain.batch_size is None:
-            # A value for each trajectory asks for a map of its own.
-            terrain = terrain.repeated(len(factor))
-        return replace(
-            setup, terrain=replace(terrain, stiffness=terrain.stiffness / factor, damping=terrain.damping / factor)
-        )
+        return replace(setup, softness=setup.softness * values["factor"])

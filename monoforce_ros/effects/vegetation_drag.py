@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import ClassVar
 
 from monoforce_ros.effects.effect import Effect, Parameter, Values
 from monoforce_ros.effects.setup import Setup
 
 
 class VegetationDrag(Effect):
-    """Drag of vegetation above the ground."""
+    """Drag of vegetation above the ground.
+
+    It acts where the map holds vegetation. Without a map of it the same resistance is everywhere, and its two parts are
+    in the catalogue: bending, which does not depend on speed, is ``rolling_resistance``, and the rest ``viscous_drag``.
+    """
 
     name = "vegetation_drag"
     stage = "contact"
@@ -20,6 +25,16 @@ class VegetationDrag(Effect):
         Parameter("coefficient", "N s/m⁴", 0.0, 0.0, 1e6, 1e4, "drag per area, height and speed"),
         Parameter("yield_speed", "m/s", 0.0, 0.0, 10.0, 0.5, "speed at which bending and viscous force are equal"),
     )
+    identified = ("coefficient", "yield_speed")
+    manoeuvre = "slow and fast stretches inside and outside the vegetation"
+    separated_by: ClassVar = {
+        name: "inside and outside the vegetation, or at several heights of it"
+        for name in ("viscous_drag", "quadratic_drag", "rolling_resistance", "drive_gain")
+    }
+
+    def first_values(self) -> list[dict[str, float]]:
+        """From grass to brush; stems bend as much as they drag at walking speed."""
+        return [{"coefficient": value, "yield_speed": 0.5} for value in (2e3, 1e4, 4e4, 1.6e5)]
 
     def setup(self, setup: Setup, values: Values) -> Setup:
         """The setup with this effect applied."""

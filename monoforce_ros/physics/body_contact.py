@@ -33,6 +33,8 @@ class BodyContact:
     """Drive index of each point, ``[N]`` int64; -1 on the hull."""
     friction_factors: Tensor
     """Longitudinal and lateral factor on the ground's friction, ``[B, 2]``."""
+    ground_factors: Tensor
+    """Divisor of the ground's stiffness and damping, and vegetation drag [N s/m⁴], ``[B, 2]``."""
     rolling_resistance: Tensor
     """Coefficient per trajectory, ``[B]``."""
     yield_speed: Tensor
@@ -45,7 +47,7 @@ class BodyContact:
         rolling, _, _, yield_speed = problem.resistance.unbind(-1)
         share = problem.point_areas / problem.point_areas.sum()
         return cls(
-            lookup=TerrainLookup(problem.terrain, options.lookup, problem.batch_size, problem.vegetation_drag),
+            lookup=TerrainLookup(problem.terrain, options.lookup, problem.batch_size, problem.vegetation),
             points=problem.points.T - problem.centre_of_mass[..., None],
             tangents=problem.point_tangents.T,
             areas=problem.point_areas,
@@ -54,6 +56,7 @@ class BodyContact:
             speeds=torch.cat([problem.drive_speeds, torch.zeros_like(problem.drive_speeds[..., :1])], dim=-1),
             drives=problem.point_drives,
             friction_factors=problem.friction_factors,
+            ground_factors=problem.ground_factors,
             rolling_resistance=rolling,
             yield_speed=yield_speed,
             options=options,
@@ -97,6 +100,7 @@ class BodyContact:
             self.areas,
             self.weights,
             self.friction_factors,
+            self.ground_factors,
             self.rolling_resistance,
             self.yield_speed,
             self.options,

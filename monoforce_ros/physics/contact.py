@@ -42,6 +42,7 @@ def contact(
     areas: Tensor,
     weights: Tensor,
     friction_factors: Tensor,
+    ground_factors: Tensor,
     rolling_resistance: Tensor,
     yield_speed: Tensor,
     options: PhysicsOptions,
@@ -62,6 +63,8 @@ def contact(
         areas: area of each point, ``[N]`` [m²].
         weights: share of the robot's weight m g per point, ``[B, N]`` or ``[N]`` [N] (``sigmoid`` only).
         friction_factors: longitudinal and lateral factor on the ground's friction, ``[B, 2]``.
+        ground_factors: divisor of the ground's stiffness and damping [-], and force of vegetation per area, height and
+            speed [N s/m⁴], ``[B, 2]``.
         rolling_resistance: force against rolling as a fraction of the load, ``[B]``.
         yield_speed: speed at which bending force and viscous drag of vegetation are equal, ``[B]`` [m/s].
         options: contact laws.
@@ -82,11 +85,13 @@ def contact(
     point_velocity = (directions * velocities[:, :, None]).sum(1)
     slip = point_velocity[:, 1:] + (directions[:, :, 1:] * belt_velocities[:, :, None]).sum(1)
 
+    softness, drag = ground_factors[..., None].unbind(1)
+    stiffness, ground_damping = ground.stiffness / softness, ground.damping / softness
     # Approach of the ground is motion against its normal.
-    spring = ground.stiffness * depth
-    load = touching_areas * (spring - ground.damping * point_velocity[:, 0]).clamp_min(0.0)
+    spring = stiffness * depth
+    load = touching_areas * (spring - ground_damping * point_velocity[:, 0]).clamp_min(0.0)
     # The spring force follows the motion within the step, which acts as additional damping (linearly implicit Euler).
-    damping = ground.damping + (options.time_step if step_time is None else step_time) * ground.stiffness
+    damping = ground_damping + (options.time_step if step_time is None else step_time) * stiffness
     pressing = touching_areas * (spring - damping * point_velocity[:, 0]).clamp_min(0.0)
     normal_gain = touching_areas * damping * (pressing > 0)
 
@@ -106,7 +111,7 @@ def contact(
     # Rolling resistance and vegetation depend on the velocity of the body, not on slip.
     along, across = point_velocity[:, 1], point_velocity[:, 2]
     inverse_speed = torch.rsqrt(along * along + across * across + options.slip_regularisation**2)
-    vegetation = touching_areas * ground.drag * (1.0 + yield_speed[:, None] * inverse_speed)
+    vegetation = touching_areas * (drag * ground.vegetation) * (1.0 + yield_speed[:, None] * inverse_speed)
     rolling = rolling_resistance[:, None] * load * torch.rsqrt(along**2 + options.slip_regularisation**2)
     resistance = torch.stack([rolling + vegetation, vegetation], dim=1)
     return Contact(

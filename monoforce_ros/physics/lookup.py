@@ -25,8 +25,8 @@ class Ground:
     """``[B, N]`` [N s/m³]."""
     friction: Tensor
     """``[B, N]``."""
-    drag: Tensor
-    """Vegetation drag per area, ``[B, N]`` [N s/m³]."""
+    vegetation: Tensor
+    """Height of the vegetation above the ground, ``[B, N]`` [m]."""
 
 
 class TerrainLookup:
@@ -36,10 +36,10 @@ class TerrainLookup:
     the slope across the border is zero.
     """
 
-    def __init__(self, terrain: TerrainMap, kind: str, batch: int, drag: Tensor | None = None):
-        drag = torch.zeros_like(terrain.height) if drag is None else drag
-        listed = torch.broadcast_tensors(terrain.height, terrain.stiffness, terrain.damping, terrain.friction, drag)
-        channels = torch.stack(listed)
+    def __init__(self, terrain: TerrainMap, kind: str, batch: int, vegetation: Tensor | None = None):
+        vegetation = torch.zeros_like(terrain.height) if vegetation is None else vegetation
+        listed = (terrain.height, terrain.stiffness, terrain.damping, terrain.friction, vegetation)
+        channels = torch.stack(torch.broadcast_tensors(*listed))
         if channels.ndim == 3:
             channels = channels[:, None]
         pages = channels.shape[1]

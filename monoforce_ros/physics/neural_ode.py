@@ -119,18 +119,18 @@ class _System(nn.Module):
         body, loads = self.body, self.loads
         return (
             body.lookup.channels, body.points, body.tangents, body.areas, body.weights, body.speeds,
-            body.friction_factors, body.rolling_resistance, body.yield_speed,
+            body.friction_factors, body.ground_factors, body.rolling_resistance, body.yield_speed,
             loads.weight, loads.linear_drag, loads.quadratic_drag, loads.wrench, self.mass, self.inertia,
         )  # fmt: skip
 
     def with_tensors(self, tensors: tuple[Tensor, ...]) -> _System:
         """The same system with other :attr:`tensors`."""
-        channels, points, tangents, areas, weights, speeds, friction, rolling, yield_speed, *rest = tensors
+        channels, points, tangents, areas, weights, speeds, friction, ground, rolling, yield_speed, *rest = tensors
         *loads, mass, inertia = rest
         body = replace(
             self.body, lookup=self.body.lookup.with_channels(channels), points=points, tangents=tangents, areas=areas,
-            weights=weights, speeds=speeds, friction_factors=friction, rolling_resistance=rolling,
-            yield_speed=yield_speed,
+            weights=weights, speeds=speeds, friction_factors=friction, ground_factors=ground,
+            rolling_resistance=rolling, yield_speed=yield_speed,
         )  # fmt: skip
         return _System(body, LoadModel(*loads), mass, inertia, self.options)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from monoforce_ros.effects import applied_setup, per_trajectory
+from monoforce_ros.effects import applied_setup
 from monoforce_ros.physics.contact_summary import ContactSummary
 from monoforce_ros.physics.state import State
 from monoforce_ros.robots import RobotModel
@@ -50,8 +50,10 @@ class Problem:
     """Tilt of gravity about x and y [rad], ``[B, 2]``."""
     resistance: Tensor
     """Rolling resistance [-], linear [N s/m], quadratic drag [N s²/m²], yield speed of vegetation [m/s], ``[B, 4]``."""
-    vegetation_drag: Tensor
-    """Drag map [N s/m³]: force per contact area and speed, shaped like the terrain ``[(B,) rows, cols]``."""
+    vegetation: Tensor
+    """Height of the vegetation above the ground [m], shaped like the terrain ``[(B,) rows, cols]``."""
+    ground_factors: Tensor
+    """Divisor of stiffness and damping [-], and vegetation drag per area, height and speed [N s/m⁴], ``[B, 2]``."""
     wrench: Tensor
     """Body-frame force and torque per feature of the motion, ``[B, 6, F]``."""
 
@@ -79,8 +81,6 @@ class Problem:
         offset = (rotation @ centre_of_mass[..., None])[..., 0]
         resistance = (loads.rolling_resistance, loads.linear_drag, loads.quadratic_drag, loads.vegetation_yield)
         vegetation = (terrain.geometric_height - terrain.height).clamp_min(0.0)
-        if loads.vegetation_drag.ndim and vegetation.ndim == 2:
-            vegetation = vegetation.expand(batch, -1, -1)
         factors = [robot.friction_longitudinal.expand(batch), robot.friction_lateral.expand(batch)]
         problem = cls(
             terrain=terrain,
@@ -99,7 +99,8 @@ class Problem:
             friction_factors=torch.stack(factors, dim=-1),
             gravity_tilt=loads.gravity_tilt.expand(batch, 2),
             resistance=torch.stack([value.expand(batch) for value in resistance], dim=-1),
-            vegetation_drag=vegetation * per_trajectory(loads.vegetation_drag, 3),
+            vegetation=vegetation,
+            ground_factors=torch.stack([setup.softness.expand(batch), loads.vegetation_drag.expand(batch)], dim=-1),
             wrench=loads.wrench.expand(batch, 6, -1),
         )
         return problem, finite

@@ -48,7 +48,7 @@ def integrate(
     """Integrate with Warp; see :func:`monoforce_ros.physics.rollout`."""
     terrain = problem.terrain
     height = terrain.height if terrain.height.ndim == 3 else terrain.height[None]
-    listed = torch.broadcast_tensors(terrain.stiffness, terrain.damping, terrain.friction, problem.vegetation_drag)
+    listed = torch.broadcast_tensors(terrain.stiffness, terrain.damping, terrain.friction, problem.vegetation)
     material = torch.stack(listed, dim=-1)
     material = material if material.ndim == 4 else material[None]
     # The kernel reads both at the same page, so maps with equal heights but different materials are repeated.
@@ -69,6 +69,7 @@ def integrate(
             problem.centre_of_mass,
             problem.inertia,
             problem.friction_factors,
+            problem.ground_factors,
             problem.gravity_tilt,
             problem.resistance,
             problem.wrench,
@@ -95,7 +96,7 @@ def integrate(
 
 _INPUTS = (
     "height", "material", "points", "areas", "tangents", "share", "speeds", "mass", "centre_of_mass", "inertia",
-    "friction", "tilt", "resistance", "wrench",
+    "friction", "ground_factors", "tilt", "resistance", "wrench",
 )  # fmt: skip
 """Kernel inputs with gradients, other than the states."""
 _STATES = ("centre", "rotation", "velocity", "angular_velocity")
@@ -194,7 +195,7 @@ def _precision(tensor: Tensor) -> tuple[bool, Types]:
 def _elements(kinds: Types) -> dict[str, Any]:
     """Warp element types of inputs and states."""
     s, v2, v3, v4, m = kinds.scalar, kinds.vec2, kinds.vec3, kinds.vec4, kinds.mat33
-    inputs = (s, v4, v3, s, v3, s, s, s, v3, m, v2, v2, v4, kinds.wrench)
+    inputs = (s, v4, v3, s, v3, s, s, s, v3, m, v2, v2, v2, v4, kinds.wrench)
     return dict(zip((*_INPUTS, *_STATES), (*inputs, v3, m, v3, v3), strict=True))
 
 

@@ -153,6 +153,12 @@ class RobotModel:
             flipper_angles=angles,
         )
 
+    def limited_twist(self, twist: Tensor) -> Tensor:
+        """A commanded twist ``[..., 2]`` [m/s, rad/s], limited to the robot's maximum speed and yaw rate."""
+        forward = twist[..., :1].clamp(-self.maximum_speed, self.maximum_speed)
+        yaw_rate = twist[..., 1:].clamp(-self.maximum_yaw_rate, self.maximum_yaw_rate)
+        return torch.cat([forward, yaw_rate], dim=-1)
+
     def drive_speeds(self, twist: Tensor) -> Tensor:
         """Ideal drive speeds of a commanded twist, limited to the robot's maximum speeds.
 
@@ -162,8 +168,7 @@ class RobotModel:
         Returns:
             surface speed of each drive [m/s], ``[..., D]``, positive forward.
         """
-        forward = twist[..., :1].clamp(-self.maximum_speed, self.maximum_speed)
-        yaw_rate = twist[..., 1:].clamp(-self.maximum_yaw_rate, self.maximum_yaw_rate)
+        forward, yaw_rate = self.limited_twist(twist).split(1, dim=-1)
         return forward - yaw_rate * self.drive_offsets.to(twist)
 
     def to(self, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> RobotModel:

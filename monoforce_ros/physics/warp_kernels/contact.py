@@ -153,6 +153,9 @@ def contact_functions(double: bool) -> ContactFunctions:
                 normal = vec3(-slope_x * upward, -slope_y * upward, upward)
             area = body.areas[i]
             factors = robots.friction[b]
+            ground_factors = robots.ground_factors[b]
+            stiffness = material[0] / ground_factors[0]
+            ground_damping = material[1] / ground_factors[0]
             resistance = robots.resistance[b]
             turned = state.rotation
             velocity = state.linear + wp.cross(state.angular, arm)
@@ -161,10 +164,10 @@ def contact_functions(double: bool) -> ContactFunctions:
             lateral = vec3(turned[0, 1], turned[1, 1], turned[2, 1])
             depth = gap * normal[2]
             approach = -wp.dot(velocity, normal)
-            spring = material[0] * depth
-            load = area * wp.max(spring + material[1] * approach, scalar(0.0))
+            spring = stiffness * depth
+            load = area * wp.max(spring + ground_damping * approach, scalar(0.0))
             # The spring force follows the motion within the step, which acts as additional damping.
-            damping = material[1] + options.time_step * material[0]
+            damping = ground_damping + options.time_step * stiffness
             pressing = area * wp.max(spring + damping * approach, scalar(0.0))
             normal_gain = wp.where(pressing > scalar(0.0), area * damping, scalar(0.0))
             across = lateral - wp.dot(lateral, normal) * normal
@@ -196,7 +199,7 @@ def contact_functions(double: bool) -> ContactFunctions:
                 gain_across = friction_across * weight * active_across * (scalar(1.0) - active_across)
             # Rolling resistance and vegetation depend on the velocity of the body, not on slip.
             speed = wp.sqrt(velocity_along * velocity_along + velocity_across * velocity_across + options.slip_square)
-            resistance_across = area * material[3] * (scalar(1.0) + resistance[3] / speed)
+            resistance_across = area * (ground_factors[1] * material[3]) * (scalar(1.0) + resistance[3] / speed)
             rolling = resistance[0] * load / wp.sqrt(velocity_along * velocity_along + options.slip_square)
             resistance_along = rolling + resistance_across
             force_along = force_along - resistance_along * velocity_along

@@ -49,7 +49,7 @@ def types(double: bool) -> Types:
     class Ground:
         height: wp.array3d(dtype=scalar)  # [pages, rows, columns]
         ceiling: wp.array3d(dtype=scalar)  # highest ground near each node
-        material: wp.array3d(dtype=vec4)  # stiffness, damping, friction, vegetation drag
+        material: wp.array3d(dtype=vec4)  # stiffness, damping, friction, height of vegetation
         rows: int
         columns: int
         origin_x: scalar
@@ -74,6 +74,7 @@ def types(double: bool) -> Types:
         centre_of_mass: wp.array(dtype=vec3)
         inertia: wp.array(dtype=mat33)
         friction: wp.array(dtype=vec2)  # longitudinal and lateral factor
+        ground_factors: wp.array(dtype=vec2)  # divisor of stiffness and damping, drag of vegetation
         tilt: wp.array(dtype=vec2)  # of gravity
         resistance: wp.array(dtype=vec4)  # rolling, linear drag, quadratic drag, yield speed of vegetation
         wrench: wp.array(dtype=wrench_matrix)

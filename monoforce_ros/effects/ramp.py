@@ -1,0 +1,48 @@
+"""Ramp: a signal that follows its target at a limited rate, for the effects that limit accelerations."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from monoforce_ros.effects.effect import per_trajectory
+
+
+def ramped(target: Tensor, rate: Tensor, time_step: float) -> Tensor:
+    """The signal that follows ``target`` ``[B, T]``, changing by at most ``rate`` per second.
+
+    Args:
+        target: its first value is assumed to have been reached.
+        rate: largest change per second, a scalar or ``[B]``; infinite returns ``target`` bit for bit.
+        time_step: time between values [s].
+    """
+    change = per_trajectory(rate, 1) * time_step
+    state = target[:, 0]
+    values = [state]
+    for wanted in target.unbind(1)[1:]:
+        state = torch.minimum(torch.maximum(wanted, state - change), state + change)
+        values.append(state)
+    return torch.stack(values, dim=1)
+
+
+def ramped_array(target: np.ndarray, rate: float, time_step: float) -> np.ndarray:
+    """The same for arrays ``[..., T]``, at the stamps of the targets (:func:`at_stamps`)."""
+    change = rate * time_step
+    # Time first: each step then reads contiguous memory.
+    wanted = np.moveaxis(target, -1, 0)
+    result = np.empty_like(wanted)
+    state = wanted[0]
+    for index, value in enumerate(wanted):
+        state = np.minimum(np.maximum(value, state - change), state + change)
+        result[index] = state
+    return at_stamps(np.moveaxis(result, 0, -1))
+
+
+def at_stamps(result: np.ndarray) -> np.ndarray:
+    """Values ``[..., T]`` at the stamps of targets, from those that a filter reaches with each of them.
+
+    A filter acts on a target for a whole time step. A target that was sampled changed half a step before its stamp on
+    average, so that the filter is early by half a step.
+    """
+    return np.concatenate([result[..., :1], 0.5 * (result[..., 1:] + result[..., :-1])], axis=-1)

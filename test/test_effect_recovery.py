@@ -1,0 +1,77 @@
+"""Values of effects that were injected into a drive of our own physics are recovered from its motion."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from monoforce_ros.core import CommandTrack, MotionTrack
+from monoforce_ros.discrepancy.fit import first_values, fit_effects
+from monoforce_ros.discrepancy.hypothesis import EvidenceWindows, Predictions, window_starts
+from monoforce_ros.effects import CATALOGUE, drive_speeds
+from monoforce_ros.physics import State, rollout
+from monoforce_ros.robots import load_robot
+from monoforce_ros.terrain import Grid, TerrainMap
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+SAMPLES = np.array([0.5, 1.0, 1.5, 2.0])
+GRID = Grid.square(40.0, 0.2)
+SCALE = np.tile([0.01, 0.01, 0.005], (4, 1))
+
+
+def rough_and_grassy():
+    """Bumps of 4 cm, and vegetation up to 0.4 m high on one half."""
+    x, y = (torch.from_numpy(values).float() for values in np.meshgrid(GRID.x, GRID.y))
+    ground = 0.04 * torch.sin(2.1 * x) * torch.cos(1.7 * y)
+    return TerrainMap.from_height(ground, GRID, geometric_height=ground + 0.4 * torch.sigmoid(2.0 * x))
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters", "tolerance"),
+    [
+        ("yaw_rate_limit", {"limit": 0.5}, 0.03),
+        ("acceleration_limit", {"limit": 0.7}, 0.05),
+        ("yaw_acceleration_limit", {"limit": 0.9}, 0.05),
+        ("drive_loss", {"loss": -0.25}, 0.05),
+        ("supply_sag", {"sag": 0.3}, 0.08),
+        ("rotation_centre", {"x": 0.06}, 0.1),
+        ("friction_anisotropy", {"factor": 0.6}, 0.1),
+        ("terrain_softness", {"factor": 6.0}, 0.25),
+        ("vegetation_drag", {"coefficient": 2.5e4}, 0.25),
+    ],
+)
+def test_injected_values_are_recovered_from_motion(name, parameters, tolerance):
+    husky, terrain = load_robot("husky"), None
+    injected = dict(parameters)
+    if CATALOGUE[name].stage == "contact" and name != "friction_anisotropy":
+        terrain = rough_and_grassy()
+    if name == "vegetation_drag":
+        injected["yield_speed"] = 0.5
+    robot, random = replace(husky, effects=((name, injected),)), np.random.default_rng(4)
+    commanded = np.repeat(random.uniform([-0.3, -1.2], [1.0, 1.2], (18, 2)), 150, axis=0)
+    speeds = drive_speeds(robot, torch.as_tensor(commanded[None], dtype=torch.float32), 0.01)
+    ground = TerrainMap.flat(Grid.square(2.0, 1.0)) if terrain is None else terrain
+    result = rollout(ground, robot, speeds, State.at_rest(0.14), with_forces=False)
+    rotations = Rotation.from_matrix(result.rotation[0, ::5].double().numpy())
+    motion = MotionTrack(
+        (10**9 + np.arange(len(rotations)) * 50_000_000).astype(np.int64),
+        result.position[0, ::5].double().numpy(),
+        rotations.as_quat(),
+        rotations.inv().apply(result.velocity[0, ::5].double().numpy()),
+        rotations.inv().apply(result.angular_velocity[0, ::5].double().numpy()),
+    )
+    commands = CommandTrack(10**9 + np.arange(len(commanded)) * 10_000_000, commanded)
+    starts = window_starts(motion, [slice(0, len(motion))], 2.0, 1.0)
+    data = EvidenceWindows(motion, commands, starts, 2.0, SAMPLES, terrain, None if terrain is None else np.eye(4))
+    predictions = Predictions(husky, data)
+    before, floor = (np.abs(predictions.residuals([effects])[0]).mean() for effects in ((), ((name, injected),)))
+    fit = fit_effects(predictions, first_values(CATALOGUE[name]), SCALE)
+    found = dict(fit.effects)[name]
+    for key, value in parameters.items():
+        assert found[key] == pytest.approx(value, rel=tolerance), key
+    # As good as the injected values, which leave what the restarts of the windows cost.
+    after = np.abs(predictions.residuals([fit.effects])[0]).mean()
+    assert after < max(0.25 * before, 1.1 * floor)
+    assert after < 0.9 * before

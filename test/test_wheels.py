@@ -1,0 +1,257 @@
+"""Wheels: how drives follow commands, wheels that turn in place, and stretches that nobody commanded."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from monoforce_ros.bags import Recording
+from monoforce_ros.core import CommandTrack, MotionTrack, WheelTrack
+from monoforce_ros.discrepancy.wheel_motion import undriven_stretches, wheels_without_motion
+from monoforce_ros.discrepancy.wheels import compare_with_wheels
+from monoforce_ros.effects import drive_speeds
+from monoforce_ros.physics import State, rollout
+from monoforce_ros.robots import load_robot
+from monoforce_ros.terrain import Grid, TerrainMap
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+ORIGIN = 10**18
+
+
+@pytest.fixture(scope="module")
+def husky():
+    return load_robot("husky")
+
+
+def drawn_commands(seconds, seed, hold=2.0):
+    """Random steps of the twist, published at 20 Hz."""
+    random = np.random.default_rng(seed)
+    count = round(seconds / hold)
+    twists = np.repeat(random.uniform([-0.4, -1.8], [1.0, 1.8], (count, 2)), round(hold / 0.05), axis=0)
+    return CommandTrack(ORIGIN + np.arange(len(twists)) * 50_000_000, twists)
+
+
+def wheels_of(commands, robot, effects, *, rate=14.0, noise=0.05, seed=2):
+    """Wheel speeds as measured by joint states, with effects between commands and wheels."""
+    seconds = (commands.stamps[-1] - commands.stamps[0]) * 1e-9
+    stamps = commands.stamps[0] + np.arange(round(seconds / 0.01)) * 10_000_000
+    commanded = torch.as_tensor(commands.sample(stamps)[None], dtype=torch.float32)
+    # Stamps that share no multiple with those of the commands, as of two computers.
+    every = round(100 / rate)
+    speeds = drive_speeds(replace(robot, effects=effects), commanded, 0.01)[0, ::every].double().numpy()
+    measured = speeds / robot.wheel_radius + noise * np.random.default_rng(seed).standard_normal(speeds.shape)
+    return WheelTrack(stamps[::every], measured)
+
+
+HUSKY_BASE = (
+    ("yaw_rate_limit", {"limit": 1.0}),
+    ("acceleration_limit", {"limit": 1.9}),
+    ("yaw_acceleration_limit", {"limit": 1.9}),
+    ("command_delay", {"delay": 0.2}),
+)
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [
+        HUSKY_BASE,
+        (("yaw_acceleration_limit", {"limit": 1.2}),),
+        (("supply_sag", {"sag": 0.4}),),
+        (("drive_loss", {"loss": 0.4}),),
+        (("drive_loss", {"loss": -1.0}),),
+        (("command_delay", {"delay": 0.3}), ("actuator_lag", {"time_constant": 0.2})),
+    ],
+)
+def test_effects_of_the_drives_are_recovered_from_wheel_speeds(husky, effects):
+    commands = drawn_commands(90.0, 5)
+    found = compare_with_wheels(commands, wheels_of(commands, husky, effects), husky)
+    assert {name for name, _ in found.effects} == {name for name, _ in effects}
+    for (name, values), half_width in zip(found.effects, found.half_widths, strict=True):
+        (key, value), (_, injected) = *values.items(), *dict(effects)[name].items()
+        assert value == pytest.approx(injected, rel=0.06, abs=0.015), key
+        assert 0.0 < half_width < 0.1
+
+
+def test_a_dead_time_is_found_though_it_is_a_small_share_of_the_error():
+    """A fast robot with noisy wheel speeds and rare steps: the dead time removes less than 8 % of the squared error."""
+    warthog, delays = load_robot("warthog"), []
+    for seed in range(6):
+        random = np.random.default_rng(seed)
+        twists = np.repeat(random.uniform([-1.5, -2.0], [4.0, 2.0], (16, 2)), 300, axis=0)
+        commands = CommandTrack(ORIGIN + np.arange(len(twists)) * 50_000_000, twists)
+        wheels = wheels_of(commands, warthog, (("command_delay", {"delay": 0.25}),), noise=2.7, seed=seed)
+        found = compare_with_wheels(commands, wheels, warthog)
+        assert found.error_after**2 > 0.92 * found.error_before**2
+        assert {name for name, _ in found.effects} <= {"command_delay"}
+        delays += [values["delay"] for _, values in found.effects]
+    assert len(delays) >= 4
+    assert delays == pytest.approx([0.25] * len(delays), abs=0.04)
+
+
+def test_noise_alone_shows_no_effect(husky):
+    """At an error rate of 5 % for each size of model, and with values that count: hardly ever."""
+    named = []
+    for seed in range(8):
+        commands = drawn_commands(60.0, 20 + seed)
+        found = compare_with_wheels(commands, wheels_of(commands, husky, (), noise=0.6, seed=seed), husky)
+        named += [name for name, _ in found.effects]
+    assert len(named) <= 1, named
+
+
+def test_a_long_recording_keeps_its_evidence_and_says_what_was_used(husky):
+    commands = drawn_commands(1200.0, 7)
+    wheels = wheels_of(commands, husky, (("command_delay", {"delay": 0.35}),))
+    found = compare_with_wheels(commands, wheels, husky)
+    assert [name for name, _ in found.effects] == ["command_delay"]
+    assert found.effects[0][1]["delay"] == pytest.approx(0.35, abs=0.01)
+    assert (found.used_blocks, found.all_blocks) == (60, 300)
+    assert "60 of 300 blocks of 4 s, spread over the recording" in found.summary()
+
+
+def test_the_limits_of_the_robot_file_are_no_effect(husky):
+    """Commands beyond them are clamped in prediction: what the wheels do then is expected."""
+    commands = drawn_commands(60.0, 9)
+    narrow = replace(husky, maximum_yaw_rate=0.8)
+    assert compare_with_wheels(commands, wheels_of(commands, narrow, ()), narrow).effects == ()
+    found = compare_with_wheels(commands, wheels_of(commands, narrow, ()), husky)
+    assert [name for name, _ in found.effects] == ["yaw_rate_limit"]
+    assert found.effects[0][1]["limit"] == pytest.approx(0.8, abs=0.02)
+
+
+def driven(robot, commands, effects=(), noise=0.01):
+    """Motion of our own physics at 20 Hz under commands, on level ground, with noise on positions."""
+    steps = round((commands.stamps[-1] - commands.stamps[0]) * 1e-9 / 0.01)
+    stamps = ORIGIN + np.arange(steps) * 10_000_000
+    twists = torch.as_tensor(commands.sample(stamps)[None], dtype=torch.float32)
+    robot = replace(robot, effects=effects)
+    terrain = TerrainMap.flat(Grid.square(2.0, 1.0))
+    result = rollout(terrain, robot, drive_speeds(robot, twists, 0.01), State.at_rest(0.13), with_forces=False)
+    rotations = Rotation.from_matrix(result.rotation[0, :-1:5].double().numpy())
+    positions = result.position[0, :-1:5].double().numpy()
+    return MotionTrack(
+        stamps[::5],
+        positions + noise * np.random.default_rng(0).standard_normal(positions.shape),
+        rotations.as_quat(),
+        rotations.inv().apply(result.velocity[0, :-1:5].double().numpy()),
+        rotations.inv().apply(result.angular_velocity[0, :-1:5].double().numpy()),
+    )
+
+
+def held(motion, low, high):
+    """The motion with the robot held where it is from ``low`` to ``high`` [s], as by an obstacle."""
+    positions, quaternions = motion.positions.copy(), motion.quaternions.copy()
+    inside = slice(int(low * 20), int(high * 20))
+    noise = positions[inside] - positions[inside].mean(axis=0)
+    still = 0.01 * np.random.default_rng(1).standard_normal(noise.shape)
+    positions[int(high * 20) :] -= positions[int(high * 20)] - positions[int(low * 20)]
+    positions[inside], quaternions[inside] = positions[int(low * 20)] + still, quaternions[int(low * 20)]
+    return replace(motion, positions=positions, quaternions=quaternions)
+
+
+def test_wheels_that_turn_while_the_robot_stays_are_found_with_their_stretch(husky):
+    commands = drawn_commands(60.0, 3)
+    wheels, motion = wheels_of(commands, husky, ()), driven(husky, commands)
+    assert wheels_without_motion(motion, wheels, commands, husky) is None
+    found = wheels_without_motion(held(motion, 20.0, 32.0), wheels, commands, husky)
+    assert found.side == "both" and found.share < 0.5
+    low, high = ((stamp - ORIGIN) * 1e-9 for stamp in (found.stretches[0][0], found.stretches[-1][1]))
+    assert low == pytest.approx(20.0, abs=2.0) and high == pytest.approx(32.0, abs=2.0)
+    assert "the wheels turn" in found.summary() and "off the ground, dug in or blocked" in found.summary()
+    jacked_up = wheels_without_motion(held(motion, 0.0, 59.5), wheels, commands, husky)
+    assert jacked_up.share > 0.9 and "neither ground nor sensors" in jacked_up.summary()
+    assert jacked_up.followed == pytest.approx(1.0, abs=0.02)
+    # What cannot be compared is no finding.
+    assert wheels_without_motion(motion, None, commands, husky) is None
+    assert wheels_without_motion(motion, wheels, commands, load_robot("tradr")) is None
+
+
+@pytest.mark.parametrize("factor", [0.04, 0.1])
+def test_a_robot_on_ice_moves(husky, factor):
+    commands = drawn_commands(60.0, 4)
+    wheels = wheels_of(commands, husky, ())
+    motion = driven(husky, commands, (("friction_scale", {"factor": factor}),))
+    assert wheels_without_motion(motion, wheels, commands, husky) is None
+
+
+def test_wheels_of_one_side_that_turn_in_place(husky):
+    """The left side stands in a hole: the robot turns about it."""
+    count = 600
+    stamps = ORIGIN + np.arange(count) * 50_000_000
+    yaw = 0.4 * np.sin(0.5 * np.arange(count) * 0.05)
+    half = 0.2854
+    left = np.array([0.0, half, 0.0])
+    rotations = Rotation.from_euler("z", yaw[:, None])
+    positions = left - rotations.apply(left) + 0.003 * np.random.default_rng(3).standard_normal((count, 3))
+    motion = MotionTrack(stamps, positions, rotations.as_quat(), np.zeros((count, 3)), np.zeros((count, 3)))
+    rate = np.gradient(yaw, 0.05)
+    wheels = WheelTrack(stamps, np.stack([np.full(count, 3.0), 2 * half * rate / husky.wheel_radius], axis=1))
+    commands = CommandTrack(stamps[:1], np.array([[0.25, -0.87]]))
+    found = wheels_without_motion(motion, wheels, commands, husky)
+    assert found.side == "left" and "the left wheels turn" in found.summary()
+
+
+def with_joystick(commands, low, high, *, silent):
+    """Commands that are zero, or absent, from 3 s before ``low`` to ``high`` [s], and the twist really driven then."""
+    times = (commands.stamps - ORIGIN) * 1e-9
+    joystick = (times >= low) & (times < high)
+    idle = (times >= low - 3.0) & (times < high)
+    true = commands.twists.copy()
+    true[idle & ~joystick] = 0.0
+    recorded = np.where(idle[:, None], 0.0, commands.twists)
+    first = np.flatnonzero(idle)[0]
+    kept = ~idle | (np.arange(len(idle)) == first) if silent else np.ones(len(idle), bool)
+    return CommandTrack(commands.stamps[kept], recorded[kept]), CommandTrack(commands.stamps, true)
+
+
+@pytest.mark.parametrize("silent", [True, False])
+@pytest.mark.parametrize("by_wheels", [True, False])
+def test_stretches_driven_by_joystick_are_found(husky, silent, by_wheels):
+    recorded, true = with_joystick(drawn_commands(80.0, 6), 30.0, 44.0, silent=silent)
+    wheels = wheels_of(true, husky, HUSKY_BASE) if by_wheels else None
+    motion = None if by_wheels else driven(husky, true, HUSKY_BASE)
+    found = (undriven_stretches(recorded, wheels, motion, husky) - ORIGIN) * 1e-9
+    assert len(found) == 1
+    assert found[0] == pytest.approx([30.0, 44.5], abs=1.2)
+    # Driven by commands alone there are none, even with slow drives.
+    wheels = wheels_of(true, husky, HUSKY_BASE) if by_wheels else None
+    assert len(undriven_stretches(true, wheels, motion, husky)) == 0
+
+
+def test_a_base_that_keeps_its_last_command_is_driven_by_it(husky):
+    commands = drawn_commands(60.0, 8)
+    times = (commands.stamps - ORIGIN) * 1e-9
+    silent = CommandTrack(*(part[(times < 20.0) | (times > 30.0)] for part in (commands.stamps, commands.twists)))
+    wheels = wheels_of(silent, husky, ())
+    assert len(undriven_stretches(silent, wheels, None, husky)) == 0
+
+
+def test_a_joystick_does_not_spoil_what_the_drives_show(husky):
+    recorded, true = with_joystick(drawn_commands(90.0, 6), 30.0, 54.0, silent=False)
+    found = compare_with_wheels(recorded, wheels_of(true, husky, (("command_delay", {"delay": 0.3}),)), husky)
+    assert [name for name, _ in found.effects] == ["command_delay"]
+    assert found.effects[0][1]["delay"] == pytest.approx(0.3, abs=0.015)
+
+
+def test_a_jacked_up_husky_is_told_from_one_on_wet_grass(husky, real_data):
+    found = {}
+    for name in ("husky_wheels_in_the_air", "husky_wet_grass"):
+        folder = real_data / "doughnut" / name
+        if not folder.is_dir():
+            pytest.skip(f"no recording at {folder}")
+        recording = Recording.open(folder)
+        without = wheels_without_motion(recording.motion, recording.wheels, recording.commands, husky)
+        drives = compare_with_wheels(recording.commands, recording.wheels, husky)
+        found[name] = without, dict(drives.effects)
+        assert len(undriven_stretches(recording.commands, recording.wheels, recording.motion, husky)) == 0
+    lifted, grass = found["husky_wheels_in_the_air"][0], found["husky_wet_grass"][0]
+    assert grass is None
+    assert lifted.side == "both" and lifted.share > 0.8 and lifted.followed > 0.5
+    # The drives are the same on the stand and on grass: limits of the base, no dead band.
+    for _, drives in found.values():
+        assert "actuator_deadband" not in drives
+        assert drives["yaw_rate_limit"]["limit"] == pytest.approx(1.0, abs=0.05)
+        assert drives["acceleration_limit"]["limit"] == pytest.approx(1.9, abs=0.25)
+        assert drives["yaw_acceleration_limit"]["limit"] == pytest.approx(1.9, abs=0.2)
+        assert 0.05 < drives["command_delay"]["delay"] < 0.25
