@@ -45,6 +45,7 @@ from monoforce_ros.discrepancy.selection import BLOCK, HEALTHY_LOSS, CandidateSc
 from monoforce_ros.discrepancy.terrain_evidence import terrain_uncertainty
 from monoforce_ros.discrepancy.thresholds import Thresholds
 from monoforce_ros.discrepancy.verdict import Decision, Findings, Losses, Verdict, decide
+from monoforce_ros.discrepancy.wheel_motion import undriven_stretches, wheels_without_motion
 from monoforce_ros.discrepancy.wheels import WheelFinding, compare_with_wheels
 from monoforce_ros.effects import CATALOGUE, wheel_effects
 from monoforce_ros.robots import RobotModel
@@ -141,9 +142,10 @@ def diagnose(
     smoothed = evidence.smoothed
     starts = window_starts(smoothed.motion, smoothed.stretches, settings.horizon, settings.stride)
     starts = subsampled(starts, BLOCK, settings.max_windows)
+    starts, left_out = _comparable(starts, evidence, robot, settings.horizon)
     found = complaints(smoothed, evidence.commands, starts)
     if found:
-        return Diagnosis(Verdict.NOT_IDENTIFIABLE, advice=tuple(found))
+        return Diagnosis(Verdict.NOT_IDENTIFIABLE, advice=(*left_out, *found))
     samples = np.array(settings.samples)
     data = evidence.cut(starts, samples)
     progress(0.02, "noise floor")
@@ -213,6 +215,8 @@ def diagnose(
         effects, gap = (*effects, _bias_estimate(gyro)), {**gap, "yaw_rate_gyro": _bias_row(gyro)}
         remarks = (*decision.remarks, "the gyro measures a rotation that the poses do not show")
         decision = replace(decision, verdict=Verdict.EFFECT_FOUND, remarks=remarks)
+    if left_out:
+        decision = replace(decision, remarks=(*decision.remarks, *left_out))
     if wheels is not None and evidence.wheels is not None:
         decision = replace(decision, remarks=(*decision.remarks, wheels.summary()))
     at_horizon = next((comparison for comparison in compared if comparison.horizon == settings.horizon), None)
@@ -235,6 +239,32 @@ def diagnose(
         losses=decision.losses,
         details=Details(data, before, floor, tuple(compared), paths),
     )
+
+
+def _comparable(
+    starts: np.ndarray, evidence: Evidence, robot: RobotModel, horizon: float
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Windows in which the ground moves the robot as its commands ask, and what was left out for which reason."""
+    remarks = []
+    if not len(starts) or not len(evidence.commands):
+        return starts, ()
+
+    def overlapping(stretches: np.ndarray) -> np.ndarray:
+        low, high = stretches.reshape(-1, 2).T
+        return ((starts[:, None] < high) & (starts[:, None] + round(horizon * 1e9) > low)).any(axis=1)
+
+    undriven = undriven_stretches(evidence.commands, evidence.wheels, evidence.smoothed.motion, robot)
+    left_out = overlapping(undriven)
+    if left_out.any():
+        seconds = float(np.diff(undriven, axis=1).sum()) * 1e-9
+        remarks.append(f"{seconds:.0f} s are left out in which the robot moved without commands (a joystick?)")
+    spinning = wheels_without_motion(evidence.smoothed.motion, evidence.wheels, evidence.commands, robot)
+    if spinning is not None:
+        remarks.append(spinning.summary())
+        if spinning.side == "both":
+            left_out |= overlapping(np.array(spinning.stretches, np.int64))
+            remarks[-1] += "; this time is left out"
+    return starts[~left_out], tuple(remarks)
 
 
 def _estimated(search: Search, fit: Fit, outcome: Outcome) -> tuple[EffectEstimate, ...]:

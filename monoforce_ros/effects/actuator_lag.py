@@ -50,7 +50,7 @@ class ActuatorLag(Effect):
         safe = torch.where(slow, constant, torch.ones_like(constant))
         retained = torch.where(slow, torch.exp(-time_step / safe), torch.zeros_like(constant))
         if constant.ndim:
-            return _step_by_step(speeds, retained[:, None])
+            return _by_doubling(speeds, retained[:, None, None])
         count = speeds.shape[1]
         steps = torch.arange(count, device=speeds.device)
         distance = (steps[:, None] - steps).to(speeds.dtype)
@@ -60,11 +60,14 @@ class ActuatorLag(Effect):
         return torch.where(slow, weights @ speeds + (decay[:, :1] * retained) * speeds[:, :1], speeds)
 
 
-def _step_by_step(speeds: Tensor, retained: Tensor) -> Tensor:
-    """The lag with one time constant per trajectory, for which one matrix each would be large."""
-    state = speeds[:, 0]
-    result = []
-    for speed in speeds.unbind(1):
-        state = speed + retained * (state - speed)
-        result.append(state)
-    return torch.stack(result, dim=1)
+def _by_doubling(speeds: Tensor, retained: Tensor) -> Tensor:
+    """The lag with one time constant per trajectory, for which one matrix each would be large.
+
+    The linear recurrence is solved by doubling the number of terms in each pass (Hillis and Steele 1986).
+    """
+    result = torch.cat([speeds[:, :1], (1.0 - retained) * speeds[:, 1:]], dim=1)
+    reach, factor = 1, retained
+    while reach < speeds.shape[1]:
+        result = torch.cat([result[:, :reach], result[:, reach:] + factor * result[:, :-reach]], dim=1)
+        reach, factor = 2 * reach, factor * factor
+    return result
