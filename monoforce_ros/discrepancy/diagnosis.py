@@ -40,7 +40,8 @@ from monoforce_ros.discrepancy.hypothesis import (
 )
 from monoforce_ros.discrepancy.kinematic_baseline import StepComparison
 from monoforce_ros.discrepancy.nominal import NominalModel
-from monoforce_ros.discrepancy.preflight import advice, complaints
+from monoforce_ros.discrepancy.onset import find_onset
+from monoforce_ros.discrepancy.preflight import FEWEST_WINDOWS, advice, complaints
 from monoforce_ros.discrepancy.selection import BLOCK, HEALTHY_LOSS, CandidateScore, Outcome, Search, Trial, paired
 from monoforce_ros.discrepancy.terrain_evidence import terrain_uncertainty
 from monoforce_ros.discrepancy.thresholds import Thresholds
@@ -153,26 +154,44 @@ def diagnose(
     uncertainty = np.hypot(
         noise_floor(smoothed.motion, noisy, data), terrain_uncertainty(robot, data, evidence.split_maps)
     )
-    floor = np.sqrt((uncertainty**2).mean(axis=0))
     thresholds = settings.thresholds
     gyro = compare_with_gyro(smoothed, evidence.gyro)
     wheels = compare_with_wheels(evidence.commands, evidence.wheels, robot)
-    search = Search(
-        robot,
-        data,
-        residual_scale(uncertainty, nominal),
-        nominal=nominal,
-        known=_measured_effects(gyro, wheels, robot),
-        # The gyro measures the offset of the pose clock, or that there is none.
-        excluded=() if gyro is None else ("pose_clock_offset",),
-        thresholds=thresholds,
-        seed=settings.seed,
-        progress=_Steps(progress, 0.05, 0.85),
-    )
-    if gyro is not None and wheels is not None:
-        _refine_clock(search, gyro)
-    before = search.predictions.residuals([()])[0]
+    known = _measured_effects(gyro, wheels, robot)
+    steps = _Steps(progress, 0.05, 0.85)
+
+    def searched(part: np.ndarray) -> Search:
+        """A search on some of the windows."""
+        search = Search(
+            robot,
+            replace(data, starts=starts[part]),
+            residual_scale(uncertainty[part], nominal),
+            nominal=nominal,
+            known=known,
+            # The gyro measures the offset of the pose clock, or that there is none.
+            excluded=() if gyro is None else ("pose_clock_offset",),
+            thresholds=thresholds,
+            seed=settings.seed,
+            progress=steps,
+        )
+        if gyro is not None and wheels is not None:
+            _refine_clock(search, gyro)
+        return search
+
+    search = searched(np.ones(len(starts), bool))
     outcome = search.run(settings.max_effects)
+    if outcome.fit.p <= thresholds.fit_rate and (onset := find_onset(search, outcome.best)) is not None:
+        late = starts >= onset.stamp
+        if late.sum() >= FEWEST_WINDOWS:
+            left_out = (
+                *left_out,
+                f"it begins {onset.since_start:.0f} s after the start: what follows describes the time after that",
+            )
+            search = searched(late)
+            outcome = search.run(settings.max_effects)
+            data, uncertainty = search.data, uncertainty[late]
+    floor = np.sqrt((uncertainty**2).mean(axis=0))
+    before = search.predictions.residuals([()])[0]
     findings = Findings(
         outcome.nominal, outcome.best, outcome.fit,
         healthy_loss=HEALTHY_LOSS if nominal is None else nominal.loss,

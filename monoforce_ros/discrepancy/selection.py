@@ -271,7 +271,7 @@ class Search:
         held_out_loss = np.zeros(len(self.data.starts))
         parts, losses = [], []
         for fitted, scale, judged, where in self._split:
-            fit = fit_effects(fitted, [effects], scale, iterations=iterations, free=self._fixed_count(effects))
+            fit = fit_effects(fitted, [effects], scale, iterations=iterations, free=self.fixed_count(effects))
             held_out_loss[where] = robust(judged.residuals([fit.effects])[0] / self.scale[where])
             parts.append(fit.effects)
             losses.append(float(fit.loss.mean()) + float(held_out_loss[where].mean()))
@@ -282,13 +282,13 @@ class Search:
         names = tuple(name for name, _ in effects)
         if names not in self._fits:
             self._fits[names] = fit_effects(
-                self.predictions, [effects], self.scale, iterations=6, free=self._fixed_count(effects)
+                self.predictions, [effects], self.scale, iterations=6, free=self.fixed_count(effects)
             )
         return self._fits[names]
 
     def healthy_variances(self, fit: Fit) -> np.ndarray:
         """Variance of each parameter of a fit if its effect varies as much as on the healthy robot, ``[P]``."""
-        fixed = sum(len(values) for _, values in fit.effects[: self._fixed_count(fit.effects)])
+        fixed = sum(len(values) for _, values in fit.effects[: self.fixed_count(fit.effects)])
         variances = np.zeros(len(flat(fit.effects)))
         if self.nominal is None or fit.derivatives is None:
             return variances
@@ -330,7 +330,7 @@ class Search:
         losses = []
         for i in range(len(fit.effects)):
             others = fit.effects[:i] + fit.effects[i + 1 :]
-            free = self._fixed_count(others)
+            free = self.fixed_count(others)
             alone = fit_effects(self._coarse, [others], self._coarse_scale, iterations=4, free=free)
             losses.append(float(alone.loss.mean()))
         return sorted(range(len(losses)), key=lambda i: -losses[i])
@@ -398,7 +398,7 @@ class Search:
         return Direction(name, columns, self.nominal.variation_of(name), self.nominal.segments)
 
     def _tested(self, base: Effects, residual: np.ndarray, directions: Sequence[Direction]) -> list[ScoreResult]:
-        fixed = self._fixed_count(base)
+        fixed = self.fixed_count(base)
         free = sum(len(values) for _, values in base[fixed:])
         fitted = None
         if free:
@@ -411,7 +411,8 @@ class Search:
             draws=self.thresholds.draws, seed=self._seed,
         )  # fmt: skip
 
-    def _fixed_count(self, effects: Effects) -> int:
+    def fixed_count(self, effects: Effects) -> int:
+        """Number of leading effects that keep the values which another sensor measured."""
         return len(self.known) if effects[: len(self.known)] == self.known else 0
 
     def _screened(self, base: Effects, number: str) -> tuple[float, list[_Screened]]:
