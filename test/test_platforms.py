@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from benchmark_case import SETS, Case, all_cases
 from benchmark_score import closed_share, covered, found_all, scores
-from case_recording import CaseFiles, displacement, hidden_job, record_platform
+from case_recording import CaseFiles, displacement, hidden_job, record_platform, record_together
 from command_faults import DeadBand, Delay, DriveFactors, Lag, TwistLimits
 from drawn_platform import draw_platform, write_robot_file
-from drive_commands import ManoeuvreDriver, ReplayedCommands
+from drive_commands import FollowingDriver, LeadingDriver, ManoeuvreDriver, ReplayedCommands
 from drive_session import DriveJob
 from force_faults import BodyForce, Drag
 from ground_shape import Ground, draw_hills, write_map
@@ -60,6 +60,9 @@ def test_sets_have_different_platforms_and_the_counts_that_the_benchmark_promise
             SINGLES
         )
     assert len({case.name for case in cases}) == len(cases)
+    worlds = [case for case in cases if case.engine == "worlds"]
+    assert {case.ground for case in worlds} == {"mixed", "rigid", "grass", "yard", "bare"}
+    assert all(case.kind == "empty" for case in worlds)
 
 
 def test_a_healthy_platform_drives_as_commanded():
@@ -229,3 +232,46 @@ def test_the_gap_counts_drives_on_which_nothing_was_added():
     assert closed_share({"position_2s": entry}) == pytest.approx(0.9)
     assert closed_share({"position_2s": entry | {"after": None}}) == 0.0
     assert closed_share({"position_2s": entry | {"before": 0.105}}) is None
+
+
+def test_newton_drives_side_by_side_on_level_ground_and_hills():
+    newton_engine = pytest.importorskip("newton_engine", reason="newton is in benchmarks/requirements.txt")
+    platform = draw_platform(1)
+    hills = draw_hills(5, platform.friction)
+    commands = np.tile([0.5 * platform.maximum_speed, 0.0], (40, 1))
+    leader = LeadingDriver(ReplayedCommands(commands))
+    slow = DriveFactors(left=0.5, right=0.5)
+    jobs = [
+        DriveJob(platform, Ground(), leader, (), 2.0),
+        DriveJob(platform, Ground(), FollowingDriver(leader), (slow,), 1.5),
+        DriveJob(platform, hills, ReplayedCommands(commands), (), 2.0),
+    ]
+    level, slowed, hilly = newton_engine.simulate_together(jobs)
+    expected = 0.5 * platform.maximum_speed * platform.radius / platform.controller_radius
+    assert level.velocities[-1, 0] == pytest.approx(expected, rel=0.05)
+    assert len(slowed.positions) == 151
+    np.testing.assert_array_equal(slowed.commands, level.commands[: len(slowed.commands)])
+    assert slowed.positions[-1, 0] < 0.6 * level.positions[150, 0]
+    clearance = platform.radius - platform.axle_height
+    assert level.positions[-1, 2] == pytest.approx(clearance, abs=0.02)
+    under = hills.height(hilly.positions[:, :2])
+    assert np.ptp(under) > 0.02
+    assert np.median(hilly.positions[:, 2] - under) == pytest.approx(clearance, abs=0.04)
+
+
+def test_cases_recorded_together_have_files_only_where_the_effect_matters(tmp_path):
+    def simulate_in_turn(jobs):
+        return [simulate(job) for job in jobs]
+
+    seed = 1000
+    matters = Case("choosing", seed, 1, "mujoco", "level", "single", ("sensor_yaw_offset",))
+    empty = Case("choosing", seed, 2, "mujoco", "level", "empty")
+    record_together([[matters, empty]], tmp_path, simulate_in_turn)
+    for case in (matters, empty):
+        files = CaseFiles.of(case, tmp_path)
+        truth = json.loads(files.truth.read_text())
+        assert truth["usable"]
+        assert files.bag.exists()
+        assert files.check.exists() == (case.kind == "single")
+    assert CaseFiles.of(empty, tmp_path).commissioning.exists()
+    record_together([[matters, empty]], tmp_path, lambda jobs: pytest.fail("everything is recorded"))

@@ -11,6 +11,9 @@ from hidden_effect import KINDS, OUTSIDE, PAIRED, SINGLES, WITH_ONSET
 SETS = {"choosing": (1_000, 60), "reporting": (900_000, 108)}
 """First seed and number of platforms of each set. Rules and thresholds are chosen on one and reported on the other."""
 ENGINES = ("mujoco", "newton")
+WORLDS = {"choosing": 2, "reporting": 5}
+"""Empty drives of each set on each kind of ground of the package's own worlds; their engine is called ``worlds``."""
+WORLD_GROUNDS = ("mixed", "rigid", "grass", "yard", "bare")
 CASE_KINDS = ("empty", "single", "pair", "outside", "stuck")
 DURATION = 60.0
 """Of a drive [s]."""
@@ -26,8 +29,8 @@ class Case:
         set_name: of ``SETS``.
         platform_seed: seed of the platform.
         number: of the drive on its platform.
-        engine: of ``ENGINES``.
-        ground: ``level`` or ``hills``.
+        engine: of ``ENGINES``, or ``worlds``.
+        ground: ``level`` or ``hills``, in worlds of ``WORLD_GROUNDS``.
         kind: of ``CASE_KINDS``.
         effects: names of the kinds that are hidden.
         late: whether the effect begins in the middle of the drive.
@@ -88,6 +91,9 @@ def all_cases(set_name: str) -> list[Case]:
             Case(set_name, seed, number, engine, ground, kind, effects, is_late)
             for number, (kind, effects, is_late) in enumerate(plan, start=1)
         ]
+    for number, ground in enumerate(WORLD_GROUNDS):
+        seed = first + count + number
+        cases += [Case(set_name, seed, drive, "worlds", ground, "empty") for drive in range(1, WORLDS[set_name] + 1)]
     return cases
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.stats import binomtest
 
 Row = dict
-ENGINES = ("mujoco", "newton")
+ENGINES = ("mujoco", "newton", "worlds")
 
 
 def named(row: Row) -> list[dict]:

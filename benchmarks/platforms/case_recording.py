@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from benchmark_case import DURATION, Case
 from drawn_platform import Platform, draw_platform, write_robot_file
-from drive_commands import ManoeuvreDriver, ReplayedCommands
+from drive_commands import FollowingDriver, LeadingDriver, ManoeuvreDriver, ReplayedCommands
 from drive_session import DriveJob, Trace
 from ground_shape import Ground, draw_hills, write_map
 from hidden_effect import HiddenEffect, draw_effect
@@ -90,6 +90,92 @@ def record_platform(cases: Sequence[Case], work: Path) -> None:
             _record_case(platform, case, entry, mujoco_engine.simulate)
 
 
+@dataclass
+class _Attempt:
+    """A case of one attempt among the jobs of a batch: the indices of its drives."""
+
+    case: Case
+    hidden: tuple[HiddenEffect, ...]
+    drive: int
+    without: list[tuple[int, float]]
+    """Drives without one of the effects, with the onset of that effect [s]."""
+    check: int | None
+
+
+def record_together(
+    platforms: Sequence[Sequence[Case]],
+    work: Path,
+    simulate_together: Callable[[Sequence[DriveJob]], list[Trace]],
+) -> None:
+    """Record platforms with an engine that simulates many drives at once, unless their truth files exist.
+
+    A drive and those without one of its effects are simulated side by side under the same commands. Cases whose effect
+    does not matter are drawn again in the next batch.
+
+    Args:
+        platforms: the cases of each platform.
+        work: folder of the benchmark.
+        simulate_together: the engine.
+    """
+    todo = [case for cases in platforms for case in cases if not CaseFiles.of(case, work).truth.exists()]
+    for attempt in range(MOST_DRAWS):
+        jobs: list[DriveJob] = []
+        healthy: list[tuple[int, Case]] = []
+        for cases in platforms if attempt == 0 else ():
+            files = CaseFiles.of(cases[0], work)
+            platform = draw_platform(cases[0].platform_seed)
+            write_robot_file(platform, files.robot)
+            if not files.commissioning.exists():
+                healthy.append((len(jobs), cases[0]))
+                jobs.append(commissioning_job(platform, cases[0]))
+        attempts = [_add_attempt(jobs, case, attempt) for case in todo]
+        if not jobs:
+            return
+        traces = simulate_together(jobs)
+        for index, case in healthy:
+            _write_commissioning(case, CaseFiles.of(case, work), jobs[index], traces[index])
+        todo = [entry.case for entry in attempts if not _keep(entry, jobs, traces, work, attempt)]
+
+
+def _add_attempt(jobs: list[DriveJob], case: Case, attempt: int) -> _Attempt:
+    """Add the drives of one attempt of a case to the jobs."""
+    platform = draw_platform(case.platform_seed)
+    hidden = draw_hidden(case, platform, attempt)
+    job = hidden_job(platform, case, hidden)
+    leader = LeadingDriver(job.driver)
+    entry = _Attempt(case, hidden, len(jobs), [], None)
+    jobs.append(dataclasses.replace(job, driver=leader))
+    for index, effect in enumerate(hidden):
+        if effect.kind.moves:
+            others = [other for number, other in enumerate(hidden) if number != index]
+            duration = DURATION if case.late else COMPARED
+            follower = FollowingDriver(leader)
+            entry.without.append((len(jobs), effect.onset))
+            jobs.append(dataclasses.replace(hidden_job(platform, case, others), driver=follower, duration=duration))
+    if hidden:
+        entry.check = len(jobs)
+        jobs.append(hidden_job(platform, case, hidden, check=True))
+    return entry
+
+
+def _keep(entry: _Attempt, jobs: Sequence[DriveJob], traces: Sequence[Trace], work: Path, attempt: int) -> bool:
+    """Write an attempt if its effects matter, or give it up if it was the last; whether the case is done."""
+    files, job, trace = CaseFiles.of(entry.case, work), jobs[entry.drive], traces[entry.drive]
+    displacements = [displacement(job, trace, jobs[index], traces[index], onset) for index, onset in entry.without]
+    check = entry.check
+    usable = trace.mishap is None and all(value >= SMALLEST_EFFECT for value in displacements)
+    usable = usable and (check is None or traces[check].mishap is None)
+    if not usable and attempt + 1 < MOST_DRAWS:
+        return False
+    if usable:
+        write_case(entry.case, files, entry.hidden, job, trace)
+        if check is not None:
+            seed = entry.case.seed * 10 + 1
+            _write(traces[check], jobs[check], combined_measurement(jobs[check]), seed, files, files.check)
+    write_truth(entry.case, files, entry.hidden, displacements, attempt + 1, usable=usable)
+    return True
+
+
 def _driver(platform: Platform, seed: int) -> ManoeuvreDriver:
     return ManoeuvreDriver(platform.maximum_speed, platform.maximum_yaw_rate, seed)
 
@@ -107,10 +193,13 @@ def commissioning_job(platform: Platform, case: Case) -> DriveJob:
 
 def _record_commissioning(platform: Platform, case: Case, files: CaseFiles, simulate) -> None:
     job = commissioning_job(platform, case)
-    trace = simulate(job)
+    _write_commissioning(case, files, job, simulate(job))
+
+
+def _write_commissioning(case: Case, files: CaseFiles, job: DriveJob, trace: Trace) -> None:
     if trace.mishap is not None and len(trace.positions) * TICK < 45.0:
         raise RuntimeError(f"{case.platform_name}: commissioning ended early: {trace.mishap}")
-    _write(trace, job, Measurement(), platform.seed * 100, files, files.commissioning)
+    _write(trace, job, Measurement(), job.platform.seed * 100, files, files.commissioning)
 
 
 def _write(trace: Trace, job: DriveJob, measurement: Measurement, seed: int, files: CaseFiles, bag: Path) -> None:
@@ -151,9 +240,9 @@ def _record_case(platform: Platform, case: Case, files: CaseFiles, simulate) -> 
         hidden = draw_hidden(case, platform, attempt)
         job = hidden_job(platform, case, hidden)
         trace = simulate(job)
+        displacements: list[float] = []
         if trace.mishap is not None:
             continue
-        displacements = []
         for index, effect in enumerate(hidden):
             if not effect.kind.moves:
                 continue

@@ -65,7 +65,13 @@ def diagnose_case(case: Case, work: Path, judged: Judged) -> dict | None:
     else:
         out = judged.results / "reports" / case.name
         held_out = ["--held-out", str(_bag(files.check, judged))] if files.check.exists() else []
-        arguments = [str(_bag(files.bag, judged)), "--robot", str(nominal), *_terrain(files, files.bag), *held_out]
+        arguments = [
+            str(_bag(files.bag, judged)),
+            "--robot",
+            str(nominal),
+            *_terrain(case, files, files.bag),
+            *held_out,
+        ]
         status, message, seconds, cpu = _run([*arguments, "--out", str(out), "--quiet"], judged)
         report = out / "report.json"
         row |= {"seconds": seconds, "cpu_seconds": cpu, "report": str(out / "report.html")}
@@ -93,7 +99,7 @@ def _nominal(case: Case, files: CaseFiles, judged: Judged) -> Path | None:
     robot, failure = folder / "platform.yaml", folder / "failure.txt"
     if not robot.exists() and not failure.exists():
         bag = files.commissioning
-        arguments = ["--commission", str(_bag(bag, judged)), "--robot", str(files.robot), *_terrain(files, bag)]
+        arguments = ["--commission", str(_bag(bag, judged)), "--robot", str(files.robot), *_terrain(case, files, bag)]
         status, message, seconds, _ = _run([*arguments, "--out", str(folder), "--quiet"], judged)
         if status == 0:
             write_text(folder / "seconds.txt", f"{seconds:.1f}\n")
@@ -102,7 +108,9 @@ def _nominal(case: Case, files: CaseFiles, judged: Judged) -> Path | None:
     return robot if robot.exists() else None
 
 
-def _terrain(files: CaseFiles, bag: Path) -> list[str]:
+def _terrain(case: Case, files: CaseFiles, bag: Path) -> list[str]:
+    if case.engine == "worlds":
+        return ["--terrain", "lidar"]
     file = files.terrain(bag)
     return ["--terrain", str(file)] if file.exists() else []
 

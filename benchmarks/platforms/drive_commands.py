@@ -95,3 +95,35 @@ class ReplayedCommands:
         """The command at ``time``."""
         speed, rate = self._commands[min(round(time * RATE), len(self._commands) - 1)]
         return float(speed), float(rate)
+
+
+class LeadingDriver:
+    """A driver whose latest command others can follow.
+
+    Args:
+        driver: gives the commands.
+    """
+
+    def __init__(self, driver: Driver):
+        self._driver = driver
+        self.last = (0.0, 0.0)
+
+    def command(self, time: float, position: np.ndarray, heading: float) -> tuple[float, float]:
+        """The command at ``time``."""
+        self.last = self._driver.command(time, position, heading)
+        return self.last
+
+
+class FollowingDriver:
+    """The same commands as another driver, in a drive that is simulated side by side and after that one.
+
+    Args:
+        leader: the other driver.
+    """
+
+    def __init__(self, leader: LeadingDriver):
+        self._leader = leader
+
+    def command(self, time: float, position: np.ndarray, heading: float) -> tuple[float, float]:
+        """The command at ``time``."""
+        return self._leader.last

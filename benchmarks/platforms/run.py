@@ -16,11 +16,12 @@ from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, as_completed, wait
 from pathlib import Path
 
-from benchmark_case import CASE_KINDS, ENGINES, SETS, Case, all_cases
+from benchmark_case import CASE_KINDS, ENGINES, SETS, WORLD_GROUNDS, Case, all_cases
 from benchmark_score import ENGINES as SCORED
 from benchmark_score import row_line, scores, table
-from case_recording import CaseFiles, record_platform
+from case_recording import CaseFiles, record_platform, record_together
 from diagnosis_run import ABLATIONS, Judged, code_version, commission_platform, diagnose_case, forget
+from drive_session import DriveJob, Trace
 from tqdm import tqdm
 
 from monoforce_ros.core import write_text
@@ -64,8 +65,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, default=Path("out/platforms"), help="folder of all files (%(default)s)")
     parser.add_argument("--set", choices=SETS, default="choosing", help="set of seeds (%(default)s)")
-    parser.add_argument("--engine", choices=ENGINES, help="only recordings of this engine")
-    parser.add_argument("--ground", choices=("level", "hills"), help="only recordings on this ground")
+    parser.add_argument("--engine", choices=(*ENGINES, "worlds"), help="only recordings of this engine")
+    parser.add_argument("--ground", choices=("level", "hills", *WORLD_GROUNDS), help="only recordings on this ground")
     parser.add_argument("--kind", choices=CASE_KINDS, nargs="+", default=CASE_KINDS, help="only cases of these kinds")
     parser.add_argument("--cases", nargs="+", default=[""], metavar="TEXT", help="only names with one of these")
     parser.add_argument("--limit", type=int, metavar="N", help="only the first N of them")
@@ -87,8 +88,9 @@ def build_parser() -> argparse.ArgumentParser:
 
 def chosen_cases(options: argparse.Namespace) -> list[Case]:
     """The cases that the options select."""
-    platforms = QUICK_PLATFORMS if options.quick else options.platforms or SETS[options.set][1]
-    last = SETS[options.set][0] + platforms
+    first, count = SETS[options.set]
+    platforms = QUICK_PLATFORMS if options.quick else options.platforms
+    last = first + (count + len(WORLD_GROUNDS) if platforms is None else platforms)
     cases = [
         case
         for case in all_cases(options.set)
@@ -107,11 +109,39 @@ def record(cases: Sequence[Case], options: argparse.Namespace) -> None:
     for case in cases:
         if not CaseFiles.of(case, options.work).truth.exists():
             missing.setdefault(case.platform_name, []).append(case)
-    jobs = [platform for platform in missing.values() if platform[0].engine == "mujoco"]
+    newton = [platform for platform in missing.values() if platform[0].engine == "newton"]
+    if newton:
+        # One process and one model for each job: a step costs the same for one robot as for a hundred.
+        parts = [part for part in (newton[number :: options.jobs] for number in range(options.jobs)) if part]
+        with _pool(options.jobs) as pool:
+            print(f"record {len(newton)} platforms with newton", flush=True)
+            for done in as_completed([pool.submit(_record_with_newton, part, options.work) for part in parts]):
+                done.result()
+    jobs = [platform for platform in missing.values() if platform[0].engine != "newton"]
     with _pool(options.jobs) as pool, tqdm(total=len(jobs), desc="record", unit="platform", disable=not jobs) as bar:
-        for done in as_completed([pool.submit(record_platform, platform, options.work) for platform in jobs]):
+        for done in as_completed([pool.submit(_record_alone, platform, options.work) for platform in jobs]):
             done.result()
             bar.update()
+
+
+def _record_alone(platform: Sequence[Case], work: Path) -> None:
+    if platform[0].engine == "worlds":
+        from world_recording import record_world
+
+        record_world(platform, work)
+    else:
+        record_platform(platform, work)
+
+
+def _record_with_newton(platforms: Sequence[Sequence[Case]], work: Path) -> None:
+    import newton_engine
+
+    def simulate(jobs: Sequence[DriveJob]) -> list[Trace]:
+        longest = max(job.duration for job in jobs)
+        with tqdm(total=round(longest), desc=f"newton, {len(jobs)} drives", unit="s", mininterval=5.0) as bar:
+            return newton_engine.simulate_together(jobs, bar.update)
+
+    record_together(platforms, work, simulate)
 
 
 def in_parallel(cases: Sequence[Case], options: argparse.Namespace, judged: Judged) -> list[dict | None]:
