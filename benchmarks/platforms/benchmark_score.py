@@ -185,3 +185,25 @@ def row_line(row: Row) -> str:
     ]
     answer = f"{' + '.join(values)} → {' + '.join(effects)}"
     return f"{mark} {row['case']:64s} {row['verdict']:16s} {row['seconds']:4.0f} s  {answer}"
+
+
+def baseline_table(rows: Sequence[Row]) -> str:
+    """Position errors after 2 s of ``diagnose`` and other methods on single effects as a Markdown table."""
+    compared = [r for r in rows if "error" not in r.get("baselines", {"error": ""}) and "position_2s" in r["gap"]]
+    if not compared:
+        return "No baselines."
+    gaps = [row["gap"]["position_2s"] for row in compared]
+    before, noise = (np.array([gap[key] for gap in gaps]) for key in ("before", "noise"))
+    methods = {
+        "nominal model": before,
+        "refit of friction, track width and lag": [row["baselines"]["refit"] for row in compared],
+        "neural residual": [row["baselines"]["network"] for row in compared],
+        "pysindy on the accelerations": [row["baselines"]["sindy"] for row in compared],
+        "diagnose": [gap["before"] if gap["after"] is None else gap["after"] for gap in gaps],
+    }
+    lines = [f"| method, {len(compared)} single effects | median error after 2 s [m] | gap closed |", "|---|---|---|"]
+    for name, values in methods.items():
+        errors = np.array(values)
+        closed = np.median((before - errors) / np.maximum(before - noise, 1e-6))
+        lines.append(f"| {name} | {np.median(errors):.3f} | {100 * closed:.0f} % |")
+    return "\n".join(lines)

@@ -72,7 +72,7 @@ def diagnose_case(case: Case, work: Path, judged: Judged) -> dict | None:
             *_terrain(case, files, files.bag),
             *held_out,
         ]
-        status, message, seconds, cpu = _run([*arguments, "--out", str(out), "--quiet"], judged)
+        status, message, seconds, cpu = _diagnose([*arguments, "--out", str(out), "--quiet"], judged)
         report = out / "report.json"
         row |= {"seconds": seconds, "cpu_seconds": cpu, "report": str(out / "report.html")}
         if status == 0 and report.exists():
@@ -100,7 +100,7 @@ def _nominal(case: Case, files: CaseFiles, judged: Judged) -> Path | None:
     if not robot.exists() and not failure.exists():
         bag = files.commissioning
         arguments = ["--commission", str(_bag(bag, judged)), "--robot", str(files.robot), *_terrain(case, files, bag)]
-        status, message, seconds, _ = _run([*arguments, "--out", str(folder), "--quiet"], judged)
+        status, message, seconds, _ = _diagnose([*arguments, "--out", str(folder), "--quiet"], judged)
         if status == 0:
             write_text(folder / "seconds.txt", f"{seconds:.1f}\n")
         else:
@@ -128,13 +128,37 @@ def _bag(bag: Path, judged: Judged) -> Path:
     return copy
 
 
+def add_baselines(case: Case, work: Path, judged: Judged) -> dict:
+    """The row of a diagnosed case with the median position errors of other methods after 2 s [m]."""
+    files, result = CaseFiles.of(case, work), judged.results / "cases" / f"{case.name}.json"
+    row = json.loads(result.read_text())
+    if "baselines" not in row:
+        robot = judged.results / "nominal" / case.platform_name / "platform.yaml"
+        terrain = (_terrain(case, files, files.bag) or ["--terrain", "flat"])[1]
+        out = judged.results / "reports" / case.name / "baselines.json"
+        out.parent.mkdir(parents=True, exist_ok=True)
+        script = str(Path(__file__).with_name("baseline_run.py"))
+        arguments = [script, str(_bag(files.bag, judged)), str(robot), terrain, str(out)]
+        status, message, _, _ = _run(arguments, judged)
+        if status != 0:
+            # Not kept: pysindy may be installed later.
+            return row | {"baselines": {"error": message}}
+        row["baselines"] = json.loads(out.read_text())
+        write_text(result, json.dumps(row, indent=1) + "\n")
+    return row
+
+
+def _diagnose(arguments: list[str], judged: Judged) -> tuple[int, str, float, float]:
+    return _run(["-m", "monoforce_ros.discrepancy.cli", *arguments], judged)
+
+
 def _run(arguments: list[str], judged: Judged) -> tuple[int, str, float, float]:
-    """Run ``diagnose``: its exit status, last words, wall time and processor time [s]."""
+    """Run Python with the judged code: its exit status, last words, wall time and processor time [s]."""
     environment = os.environ | {"PYTHONPATH": str(judged.code), "OMP_NUM_THREADS": "1"}
     began, used = time.monotonic(), _children_seconds()
     try:
         done = subprocess.run(
-            [sys.executable, "-m", "monoforce_ros.discrepancy.cli", *arguments],
+            [sys.executable, *arguments],
             cwd=judged.code,
             env=environment,
             capture_output=True,

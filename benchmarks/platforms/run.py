@@ -18,9 +18,9 @@ from pathlib import Path
 
 from benchmark_case import CASE_KINDS, ENGINES, SETS, WORLD_GROUNDS, Case, all_cases
 from benchmark_score import ENGINES as SCORED
-from benchmark_score import row_line, scores, table
+from benchmark_score import baseline_table, row_line, scores, table
 from case_recording import CaseFiles, record_platform, record_together
-from diagnosis_run import ABLATIONS, Judged, code_version, commission_platform, diagnose_case, forget
+from diagnosis_run import ABLATIONS, Judged, add_baselines, code_version, commission_platform, diagnose_case, forget
 from drive_session import DriveJob, Trace
 from tqdm import tqdm
 
@@ -49,14 +49,17 @@ def main() -> int:
         for case in cases:
             forget(case, judged)
     rows = [row for row in in_parallel(cases, options, judged) if row is not None]
+    if options.baselines:
+        rows = with_baselines(rows, cases, options, judged)
     rows.sort(key=lambda row: (CASE_KINDS.index(row["kind"]), row["case"]))
-    print("\n" + table(rows))
+    text = table(rows) + ("\n\n" + baseline_table(rows) if options.baselines else "")
+    print("\n" + text)
     if options.json:
         found = {"all": scores(rows)}
         found |= {engine: scores([row for row in rows if row["engine"] == engine]) for engine in SCORED}
         write_text(options.json, json.dumps({"label": label, "scores": found, "rows": rows}, indent=1) + "\n")
     if options.docs:
-        write_between(options.docs, "platforms", table(rows))
+        write_between(options.docs, "platforms", text)
     return 0
 
 
@@ -81,6 +84,7 @@ def build_parser() -> argparse.ArgumentParser:
         "--code", type=Path, default=Path(__file__).parents[2], help="repository to judge (the one of this file)"
     )
     parser.add_argument("--label", help="name of the results' folder (by default a fingerprint of the code)")
+    parser.add_argument("--baselines", action="store_true", help="compare with other methods on single effects")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write rows and scores to this file")
     parser.add_argument("--docs", type=Path, metavar="FILE", help="write the table into this document")
     return parser
@@ -168,6 +172,21 @@ def in_parallel(cases: Sequence[Case], options: argparse.Namespace, judged: Judg
                 if result is not None:
                     bar.write(row_line(result))
     return rows
+
+
+def with_baselines(
+    rows: Sequence[dict], cases: Sequence[Case], options: argparse.Namespace, judged: Judged
+) -> list[dict]:
+    """The rows, those of diagnosed single effects with the errors of other methods."""
+    known = {case.name: case for case in cases}
+    singles = [row for row in rows if row["kind"] == "single" and "gap" in row]
+    others = [row for row in rows if row not in singles]
+    with _pool(options.jobs) as pool, tqdm(total=len(singles), desc="baselines", unit="case") as bar:
+        running = [pool.submit(add_baselines, known[row["case"]], options.work, judged) for row in singles]
+        for done in as_completed(running):
+            others.append(done.result())
+            bar.update()
+    return others
 
 
 def _pool(jobs: int) -> ProcessPoolExecutor:
