@@ -29,7 +29,7 @@ class Onset:
 def find_onset(search: Search, trial: Trial) -> Onset | None:
     """The time from which effects act, if that explains a recording better than effects that always act.
 
-    The effects are fitted to the last third of the recording. Before the onset the nominal model's residuals count, after
+    The effects are fitted to the last third of the recording. Before the onset the nominal residuals count, after
     it those with the effects; the onset with the smallest loss is taken, and must gain beyond chance over blocks.
 
     Args:

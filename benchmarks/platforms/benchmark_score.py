@@ -1,0 +1,209 @@
+"""Benchmark score: shares over rows of the benchmark, each with its count and its binomial confidence interval."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.stats import binomtest
+
+Row = dict
+ENGINES = ("mujoco", "newton", "worlds")
+
+
+def named(row: Row) -> list[dict]:
+    """The effects that a report names; none with any verdict but ``effect_found``."""
+    return row["effects"] if row["verdict"] == "effect_found" else []
+
+
+def says(effect: dict, hidden: dict) -> bool:
+    """Whether an effect of a report is the hidden one: its name or one of those reported as indistinguishable."""
+    return bool({effect["name"], *effect.get("indistinguishable", [])} & set(hidden["names"]))
+
+
+def found_all(row: Row) -> bool:
+    """Whether every hidden effect is named, each by another effect of the report; a single one by the first."""
+    effects = named(row)
+    if len(row["hidden"]) == 1:
+        return bool(effects) and says(effects[0], row["hidden"][0])
+    first, second = row["hidden"]
+    return any(
+        says(one, first) and says(other, second)
+        for number, one in enumerate(effects)
+        for index, other in enumerate(effects)
+        if number != index
+    )
+
+
+def named_exactly(row: Row) -> bool:
+    """Whether the first effect of a report has the very name of the only hidden one."""
+    effects = named(row)
+    return bool(effects) and effects[0]["name"] == row["hidden"][0]["name"]
+
+
+def covered(row: Row) -> list[bool]:
+    """For each parameter with a known truth, whether the interval of the effect of that name contains it."""
+    results = []
+    for hidden in row["hidden"]:
+        if hidden["onset_s"]:
+            continue
+        for effect in named(row):
+            if effect["name"] != hidden["name"]:
+                continue
+            for key in hidden["estimated"]:
+                parameter = effect["parameters"].get(key)
+                if parameter is not None:
+                    results.append(parameter["low"] <= hidden["values"][key] <= parameter["high"])
+    return results
+
+
+def closed_share(gap: dict[str, dict]) -> float | None:
+    """Closed share of the reducible gap after 2 s in the metric with the largest error over its noise.
+
+    0 where nothing was added to the model; None where the error is within 10 % of its noise, so that there is no gap.
+    """
+    entries = [entry for key, entry in gap.items() if key.endswith("_2s")]
+    entries = [entry for entry in entries if entry["before"] > 1.1 * entry["noise"]]
+    if not entries:
+        return None
+    worst = max(entries, key=lambda entry: entry["before"] / max(entry["noise"], 1e-6))
+    after = worst["before"] if worst["after"] is None else worst["after"]
+    return (worst["before"] - after) / (worst["before"] - worst["noise"])
+
+
+def share(part: Sequence[object], whole: Sequence[object]) -> dict:
+    """A share with its exact 95 % interval (Clopper and Pearson 1934)."""
+    count, total = len(part), len(whole)
+    if not total:
+        return {"share": None, "count": 0, "of": 0}
+    low, high = binomtest(count, total).proportion_ci()
+    return {"share": count / total, "count": count, "of": total, "low": float(low), "high": float(high)}
+
+
+def _median(values: Sequence[float]) -> dict:
+    if not values:
+        return {"median": None, "of": 0}
+    return {"median": float(np.median(values)), "mean": float(np.mean(np.clip(values, -1, 1))), "of": len(values)}
+
+
+def scores(rows: Sequence[Row]) -> dict[str, dict]:
+    """The scores of some rows."""
+    of_kind = {kind: [row for row in rows if row["kind"] == kind] for kind in ("empty", "single", "pair", "outside")}
+    stuck = [row for row in rows if row["kind"] == "stuck"]
+    empty, singles, pairs, outside = of_kind.values()
+    hidden = [*singles, *pairs, *outside]
+    right = [row for row in (*singles, *pairs) if found_all(row)]
+    inside = [hit for row in rows for hit in covered(row)]
+    closed = [value for row in hidden if (value := closed_share(row.get("gap", {}))) is not None]
+    checked = [
+        value
+        for row in hidden
+        for table in row.get("held_out", {}).values()
+        if (value := closed_share(table)) is not None
+    ]
+    return {
+        "singles_named": share([row for row in singles if found_all(row)], singles),
+        "singles_named_exactly": share([row for row in singles if named_exactly(row)], singles),
+        "pairs_named": share([row for row in pairs if found_all(row)], pairs),
+        "false_alarms": share([row for row in empty if row["verdict"] != "no_discrepancy"], empty),
+        "empty_named": share([row for row in empty if named(row)], empty),
+        "outside_named": share([row for row in outside if named(row)], outside),
+        "outside_unknown": share([row for row in outside if row["verdict"] == "unknown_effect"], outside),
+        "wheels_in_the_air_misnamed": share(
+            [row for row in stuck if any(not says(effect, row["hidden"][0]) for effect in named(row))], stuck
+        ),
+        "extra_effects": share([row for row in right if len(named(row)) > len(row["hidden"])], right),
+        "intervals_with_truth": share([hit for hit in inside if hit], inside),
+        "gap_closed": _median(closed),
+        "gap_closed_on_second_drive": _median(checked),
+        "not_diagnosed": share([row for row in rows if row["verdict"] in ("error", "not_identifiable")], rows),
+        "seconds": _median([row["seconds"] for row in rows]) | {"mean": None},
+        "processor_seconds": _median([row["cpu_seconds"] for row in rows]) | {"mean": None},
+    }
+
+
+TARGETS = {
+    "singles_named": "≥ 90 %", "pairs_named": "≥ 85 %", "false_alarms": "1 to 5 %", "outside_named": "≤ 15 %",
+    "extra_effects": "≤ 10 %", "intervals_with_truth": "≥ 90 %", "gap_closed": "≥ 80 %", "seconds": "≤ 60 s",
+}  # fmt: skip
+TITLES = {
+    "singles_named": "single effects named (first; its class counts)",
+    "singles_named_exactly": "… by exactly the injected name",
+    "pairs_named": "pairs, both named",
+    "false_alarms": "false alarms: any verdict but no_discrepancy on empty drives",
+    "empty_named": "… an effect named",
+    "outside_named": "outside the catalogue, yet an effect named",
+    "outside_unknown": "… unknown_effect",
+    "wheels_in_the_air_misnamed": "wheels in the air, yet another effect named",
+    "extra_effects": "more effects than hidden ones, of the rightly named",
+    "intervals_with_truth": "95 % intervals that contain the truth",
+    "gap_closed": "reducible gap closed, cross-validated, median over all drives with something hidden",
+    "gap_closed_on_second_drive": "… on a second drive with the same effect",
+    "not_diagnosed": "no diagnosis (counts as missed)",
+    "seconds": "time of a diagnosis of 60 s, median",
+    "processor_seconds": "… processor time",
+}
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Scores of all rows and by engine as a Markdown table."""
+    columns = {"all": list(rows)} | {engine: [r for r in rows if r["engine"] == engine] for engine in ENGINES}
+    found = {name: scores(part) for name, part in columns.items()}
+    lines = ["| score | target | " + " | ".join(columns) + " |", "|---|---|" + "---|" * len(columns)]
+    for key, title in TITLES.items():
+        cells = [_cell(key, found[name][key]) for name in columns]
+        lines.append(f"| {title} | {TARGETS.get(key, '–')} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def _cell(key: str, entry: dict) -> str:
+    if not entry["of"]:
+        return "–"
+    if "median" in entry:
+        value = entry["median"]
+        text = f"{value:.0f} s" if "seconds" in key else f"{100 * value:.0f} %"
+        return f"{text} of {entry['of']}"
+    low, high = 100 * entry["low"], 100 * entry["high"]
+    return f"{100 * entry['share']:.0f} % [{low:.0f}, {high:.0f}] ({entry['count']}/{entry['of']})"
+
+
+def row_line(row: Row) -> str:
+    """One line for a terminal."""
+    effects = [
+        f"{effect['name']}(" + ", ".join(f"{k} {v['value']:.3g}" for k, v in effect["parameters"].items()) + ")"
+        for effect in row.get("effects", [])
+    ]
+    if row["kind"] == "empty":
+        mark = "ok " if row["verdict"] == "no_discrepancy" else "BAD"
+    elif row["kind"] in ("single", "pair"):
+        mark = "ok " if found_all(row) else "BAD"
+    else:
+        mark = "ok " if not named(row) else "BAD"
+    values = [
+        f"{hidden['name']} " + " ".join(f"{key} {value:.3g}" for key, value in hidden["values"].items())
+        for hidden in row["hidden"]
+    ]
+    answer = f"{' + '.join(values)} → {' + '.join(effects)}"
+    return f"{mark} {row['case']:64s} {row['verdict']:16s} {row['seconds']:4.0f} s  {answer}"
+
+
+def baseline_table(rows: Sequence[Row]) -> str:
+    """Position errors after 2 s of ``diagnose`` and other methods on single effects as a Markdown table."""
+    compared = [r for r in rows if "error" not in r.get("baselines", {"error": ""}) and "position_2s" in r["gap"]]
+    if not compared:
+        return "No baselines."
+    gaps = [row["gap"]["position_2s"] for row in compared]
+    before, noise = (np.array([gap[key] for gap in gaps]) for key in ("before", "noise"))
+    methods = {
+        "nominal model": before,
+        "refit of friction, track width and lag": [row["baselines"]["refit"] for row in compared],
+        "neural residual": [row["baselines"]["network"] for row in compared],
+        "pysindy on the accelerations": [row["baselines"]["sindy"] for row in compared],
+        "diagnose": [gap["before"] if gap["after"] is None else gap["after"] for gap in gaps],
+    }
+    lines = [f"| method, {len(compared)} single effects | median error after 2 s [m] | gap closed |", "|---|---|---|"]
+    for name, values in methods.items():
+        errors = np.array(values)
+        closed = np.median((before - errors) / np.maximum(before - noise, 1e-6))
+        lines.append(f"| {name} | {np.median(errors):.3f} | {100 * closed:.0f} % |")
+    return "\n".join(lines)

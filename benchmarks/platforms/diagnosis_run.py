@@ -1,0 +1,185 @@
+"""Diagnosis run: the package's own commands on the recordings of a case, in processes of their own."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from benchmark_case import Case
+from case_recording import CaseFiles
+
+from monoforce_ros.bags import BagReader, BagWriter
+from monoforce_ros.core import write_text
+
+ABLATIONS = {"wheels": "sensor_msgs/msg/JointState", "imu": "sensor_msgs/msg/Imu"}
+"""Message types that an ablation takes out of every recording."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """The code that is judged, and where its results go.
+
+    Attributes:
+        code: root of the repository whose package runs.
+        results: folder of the results of this code.
+        without: of ``ABLATIONS``, or empty.
+        timeout: of one command [s].
+    """
+
+    code: Path
+    results: Path
+    without: str
+    timeout: float
+
+
+def code_version(code: Path) -> str:
+    """Fingerprint of the package's source files, by which results are kept apart."""
+    digest = hashlib.sha256()
+    for file in sorted((code / "monoforce_ros").rglob("*.py")):
+        digest.update(str(file.relative_to(code)).encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def diagnose_case(case: Case, work: Path, judged: Judged) -> dict | None:
+    """The row of a recorded case, from its file where there is one; None where the case cannot be judged."""
+    files = CaseFiles.of(case, work)
+    truth = json.loads(files.truth.read_text())
+    sensors = truth["sensors"]
+    if not truth["usable"] or not sensors.get({"imu": "gyro"}.get(judged.without, judged.without), True):
+        return None
+    result = judged.results / "cases" / f"{case.name}.json"
+    if result.exists():
+        return json.loads(result.read_text())
+    nominal = _nominal(case, files, judged)
+    row = {key: truth[key] for key in ("case", "kind", "engine", "ground", "hidden", "displacement_m", "sensors")}
+    if nominal is None:
+        row |= {"verdict": "error", "message": "commissioning failed", "seconds": 0.0, "cpu_seconds": 0.0}
+    else:
+        out = judged.results / "reports" / case.name
+        held_out = ["--held-out", str(_bag(files.check, judged))] if files.check.exists() else []
+        arguments = [
+            str(_bag(files.bag, judged)),
+            "--robot",
+            str(nominal),
+            *_terrain(case, files, files.bag),
+            *held_out,
+        ]
+        status, message, seconds, cpu = _diagnose([*arguments, "--out", str(out), "--quiet"], judged)
+        report = out / "report.json"
+        row |= {"seconds": seconds, "cpu_seconds": cpu, "report": str(out / "report.html")}
+        if status == 0 and report.exists():
+            content = json.loads(report.read_text())
+            keys = ("verdict", "effects", "gap", "held_out", "numbers", "remarks", "advice")
+            row |= {key: content[key] for key in keys if key in content}
+        else:
+            row |= {"verdict": "error", "message": message}
+    write_text(result, json.dumps(row, indent=1) + "\n")
+    return row
+
+
+def commission_platform(case: Case, work: Path, judged: Judged) -> None:
+    """Commission the platform of a case, unless it was or its commissioning failed."""
+    files = CaseFiles.of(case, work)
+    result = judged.results / "cases" / f"{case.name}.json"
+    if json.loads(files.truth.read_text())["usable"] and not result.exists():
+        _nominal(case, files, judged)
+
+
+def _nominal(case: Case, files: CaseFiles, judged: Judged) -> Path | None:
+    """The commissioned robot file of a platform by this code, made once; None where commissioning failed."""
+    folder = judged.results / "nominal" / case.platform_name
+    robot, failure = folder / "platform.yaml", folder / "failure.txt"
+    if not robot.exists() and not failure.exists():
+        bag = files.commissioning
+        arguments = ["--commission", str(_bag(bag, judged)), "--robot", str(files.robot), *_terrain(case, files, bag)]
+        # A failure costs all drives of the platform, and the bag is up to twice as long.
+        patient = replace(judged, timeout=4 * judged.timeout)
+        status, message, seconds, _ = _diagnose([*arguments, "--out", str(folder), "--quiet"], patient)
+        if status == 0:
+            write_text(folder / "seconds.txt", f"{seconds:.1f}\n")
+        else:
+            write_text(failure, message)
+    return robot if robot.exists() else None
+
+
+def _terrain(case: Case, files: CaseFiles, bag: Path) -> list[str]:
+    if case.engine == "worlds":
+        return ["--terrain", "lidar"]
+    file = files.terrain(bag)
+    return ["--terrain", str(file)] if file.exists() else []
+
+
+def _bag(bag: Path, judged: Judged) -> Path:
+    """The bag, or a copy without the ablated sensor."""
+    if not judged.without:
+        return bag
+    copy = bag.parent / f"without-{judged.without}" / bag.name
+    if not copy.exists():
+        with BagReader(bag) as reader, BagWriter(copy) as writer:
+            kept = [topic for topic, kind in reader.topics.items() if kind != ABLATIONS[judged.without]]
+            for message in reader.messages(kept):
+                writer.write_serialized(message.topic, message.message_type, message.data, message.received)
+    return copy
+
+
+def add_baselines(case: Case, work: Path, judged: Judged) -> dict:
+    """The row of a diagnosed case with the median position errors of other methods after 2 s [m]."""
+    files, result = CaseFiles.of(case, work), judged.results / "cases" / f"{case.name}.json"
+    row = json.loads(result.read_text())
+    if "baselines" not in row:
+        robot = judged.results / "nominal" / case.platform_name / "platform.yaml"
+        terrain = (_terrain(case, files, files.bag) or ["--terrain", "flat"])[1]
+        out = judged.results / "reports" / case.name / "baselines.json"
+        out.parent.mkdir(parents=True, exist_ok=True)
+        script = str(Path(__file__).with_name("baseline_run.py"))
+        arguments = [script, str(_bag(files.bag, judged)), str(robot), terrain, str(out)]
+        status, message, _, _ = _run(arguments, judged)
+        if status != 0:
+            # Not kept: pysindy may be installed later.
+            return row | {"baselines": {"error": message}}
+        row["baselines"] = json.loads(out.read_text())
+        write_text(result, json.dumps(row, indent=1) + "\n")
+    return row
+
+
+def _diagnose(arguments: list[str], judged: Judged) -> tuple[int, str, float, float]:
+    return _run(["-m", "monoforce_ros.discrepancy.cli", *arguments], judged)
+
+
+def _run(arguments: list[str], judged: Judged) -> tuple[int, str, float, float]:
+    """Run Python with the judged code: its exit status, last words, wall time and processor time [s]."""
+    environment = os.environ | {"PYTHONPATH": str(judged.code), "OMP_NUM_THREADS": "1"}
+    began, used = time.monotonic(), _children_seconds()
+    try:
+        done = subprocess.run(
+            [sys.executable, *arguments],
+            cwd=judged.code,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=judged.timeout,
+        )
+        status, output = done.returncode, done.stdout + done.stderr
+    except subprocess.TimeoutExpired:
+        status, output = -1, f"timeout after {judged.timeout:g} s"
+    return status, output.strip()[-2000:], time.monotonic() - began, _children_seconds() - used
+
+
+def _children_seconds() -> float:
+    """Processor time of the finished child processes of this worker, which runs one at a time [s]."""
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime
+
+
+def forget(case: Case, judged: Judged) -> None:
+    """Remove the result and the report of a case, so that it is diagnosed again."""
+    (judged.results / "cases" / f"{case.name}.json").unlink(missing_ok=True)
+    shutil.rmtree(judged.results / "reports" / case.name, ignore_errors=True)

@@ -1,0 +1,277 @@
+"""The independent benchmark of diagnose: drawn platforms, injected effects, recordings and scores."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from benchmark_case import SETS, Case, all_cases
+from benchmark_score import closed_share, covered, found_all, scores
+from case_recording import CaseFiles, displacement, hidden_job, record_platform, record_together
+from command_faults import DeadBand, Delay, DriveFactors, Lag, TwistLimits
+from drawn_platform import draw_platform, write_robot_file
+from drive_commands import FollowingDriver, LeadingDriver, ManoeuvreDriver, ReplayedCommands
+from drive_session import DriveJob
+from force_faults import BodyForce, Drag
+from ground_shape import Ground, draw_hills, write_map
+from hidden_effect import KINDS, OUTSIDE, SINGLES, HiddenEffect, draw_effect
+from injection import TICK, BaseState, Injection, Measurement
+from mujoco_engine import simulate
+from sensor_recording import measured_poses
+
+from monoforce_ros.bags import Recording
+from monoforce_ros.robots import load_robot
+from monoforce_ros.terrain import load_terrain
+
+
+def straight(platform, *injections, seconds=4.0, speed=0.5, rate=0.0, ground=Ground()):
+    commands = np.tile([speed * platform.maximum_speed, rate * platform.maximum_yaw_rate], (round(seconds * 20) + 1, 1))
+    return simulate(DriveJob(platform, ground, ReplayedCommands(commands), tuple(injections), seconds))
+
+
+def test_platforms_are_drawn_within_their_ranges_and_their_files_load(tmp_path):
+    for seed in range(40):
+        platform = draw_platform(seed)
+        assert 20 <= platform.mass <= 600
+        assert 0.3 <= platform.friction <= 1.0
+        assert 5 <= platform.poses.rate <= 50
+        model = load_robot(write_robot_file(platform, tmp_path / "platform.yaml"))
+        assert float(model.mass) == pytest.approx(platform.mass, rel=0.031)
+        assert float(model.drive_offsets.max()) * 2 == pytest.approx(platform.track, rel=0.031)
+        assert model.wheel_radius == pytest.approx(platform.radius, rel=0.031)
+        wheels = platform.wheel_centres
+        assert np.diff(np.sort(wheels[: platform.axles, 0])).min() > 2 * platform.radius
+
+
+def test_sets_have_different_platforms_and_the_counts_that_the_benchmark_promises():
+    seeds = {name: {case.platform_seed for case in all_cases(name)} for name in SETS}
+    assert not seeds["choosing"] & seeds["reporting"]
+    cases = all_cases("reporting")
+    counts = {kind: sum(case.kind == kind for case in cases) for kind in ("empty", "single", "pair", "outside")}
+    assert counts["empty"] >= 200
+    assert counts["single"] >= 200
+    assert counts["pair"] >= 60
+    assert counts["outside"] >= 60
+    assert len({effect for case in cases if case.kind == "outside" for effect in case.effects}) >= 8
+    for engine in ("mujoco", "newton"):
+        assert {e for case in cases if (case.kind, case.engine) == ("single", engine) for e in case.effects} == set(
+            SINGLES
+        )
+    assert len({case.name for case in cases}) == len(cases)
+    worlds = [case for case in cases if case.engine == "worlds"]
+    assert {case.ground for case in worlds} == {"mixed", "rigid", "grass", "yard", "bare"}
+    assert all(case.kind == "empty" for case in worlds)
+
+
+def test_a_healthy_platform_drives_as_commanded():
+    platform = draw_platform(1)
+    trace = straight(platform)
+    assert trace.mishap is None
+    expected = 0.5 * platform.maximum_speed * platform.radius / platform.controller_radius
+    assert trace.velocities[-1, 0] == pytest.approx(expected, rel=0.05)
+    assert abs(trace.positions[0, 2] - trace.positions[-1, 2]) < 0.01
+    turning = straight(platform, speed=0.0, rate=0.8)
+    assert 0.1 < turning.rates[-1, 2] / (0.8 * platform.maximum_yaw_rate) < 1.1
+
+
+def test_faults_act_in_the_engine():
+    platform = draw_platform(1)
+    healthy = straight(platform).positions[-1, 0]
+    assert straight(platform, DriveFactors(left=0.5, right=0.5)).positions[-1, 0] < 0.6 * healthy
+    assert straight(platform, Delay(delay=1.0)).positions[-1, 0] < healthy - 0.35 * platform.maximum_speed
+    assert straight(platform, Drag(coulomb=2.0 * platform.friction * platform.mass * 9.81)).positions[-1, 0] < 0.2
+    weight = platform.mass * 9.81
+    assert straight(platform, BodyForce(y=0.9 * platform.friction * weight)).positions[-1, 1] > 0.1
+    unbalanced = straight(platform, DriveFactors(left=0.7, right=1.0))
+    assert unbalanced.rates[-1, 2] > 0.02
+
+
+def test_an_effect_with_an_onset_changes_nothing_before_it():
+    platform = draw_platform(1)
+    late = DriveFactors(onset=2.0, left=0.3, right=0.3)
+    trace, healthy = straight(platform, late), straight(platform)
+    first = round(2.0 / TICK)
+    np.testing.assert_array_equal(trace.positions[:first], healthy.positions[:first])
+    assert trace.positions[-1, 0] < healthy.positions[-1, 0] - 0.1
+
+
+def test_command_faults_follow_their_formulas():
+    limits = TwistLimits(yaw_rate=0.5, acceleration=1.0, yaw_acceleration=2.0)
+    twists = np.array([limits.twist(0.0, np.array([1.0, 1.0])) for _ in range(50)])
+    np.testing.assert_allclose(twists[-1], [0.5, 0.5])
+    np.testing.assert_allclose(twists[9], [0.1, 0.2])
+    np.testing.assert_allclose(DeadBand(width=0.1).drives(0.0, np.array([0.05, -0.3])), [0.0, -0.2])
+    lag = Lag(time_constant=0.2)
+    lag.drives(0.0, np.zeros(2))
+    for _ in range(20):
+        speeds = lag.drives(0.0, np.ones(2))
+    np.testing.assert_allclose(speeds, 1 - np.exp(-1.0))
+
+
+def test_every_kind_can_be_injected_and_none_uses_the_packages_effects():
+    random, platform = np.random.default_rng(0), draw_platform(3)
+    state = BaseState(np.zeros(3), np.eye(3), np.array([0.5, 0.0, 0.0]), np.array([0.0, 0.0, 0.3]), np.ones(4))
+    for name in KINDS:
+        injection = draw_effect(name, random, platform).injection(platform)
+        assert np.isfinite(injection.twist(1.0, np.array([0.5, 0.2]))).all()
+        assert np.isfinite(injection.drives(1.0, np.array([0.5, 0.2]))).all()
+        assert np.isfinite(np.concatenate(injection.wrench(1.0, state))).all()
+        healthy = Injection()
+        acts = (
+            injection.build != healthy.build
+            or injection.measurement != healthy.measurement
+            or type(injection) is not Injection
+        )
+        assert acts, name
+    assert not set(OUTSIDE) & set(SINGLES)
+
+
+def test_displacement_is_zero_without_an_effect_and_sees_late_stamps():
+    platform = draw_platform(1)
+    case = Case("choosing", 1, 3, "mujoco", "level", "single", ("pose_clock_offset",))
+    job = dataclasses.replace(hidden_job(platform, case, ()), duration=20.0)
+    trace = simulate(job)
+    assert displacement(job, trace, job, trace) == 0.0
+    late = HiddenEffect("pose_clock_offset", {"offset": 0.5}).injection(platform)
+    shifted = dataclasses.replace(job, injections=(late,))
+    assert displacement(shifted, trace, job, trace) > 0.05
+
+
+def test_hidden_sensor_errors_change_poses_by_their_definition():
+    rotations = np.tile(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), (2, 1, 1))
+    shown, turned = measured_poses(np.zeros((2, 3)), rotations, Measurement(lever_arm=(1.0, 0.0), sensor_yaw=0.1))
+    np.testing.assert_allclose(shown[0], [0.0, 1.0, 0.0], atol=1e-12)
+    assert turned[0].as_euler("zyx")[0] == pytest.approx(np.pi / 2 + 0.1)
+
+
+def test_a_platform_is_recorded_as_a_user_would(tmp_path):
+    seed = next(s for s in range(1000, 1100) if (p := draw_platform(s)).wheels and p.gyro)
+    case = Case("choosing", seed, 3, "mujoco", "hills", "single", ("drive_gain",))
+    record_platform([case], tmp_path)
+    files = CaseFiles.of(case, tmp_path)
+    truth = json.loads(files.truth.read_text())
+    assert truth["usable"]
+    assert truth["displacement_m"][0] >= 0.1
+    recording = Recording.open(files.bag)
+    assert recording.wheels is not None
+    assert recording.angular_velocity is not None
+    assert (recording.motion.stamps[-1] - recording.motion.stamps[0]) * 1e-9 == pytest.approx(60.0, abs=0.5)
+    ground, _ = load_terrain(files.terrain(files.bag))
+    assert ground.height.shape[0] == 441
+    assert files.check.exists()
+    assert Recording.open(files.commissioning).motion.stamps[-1] > recording.motion.stamps[-1]
+
+
+def test_the_map_lies_under_the_wheels(tmp_path):
+    platform = draw_platform(1)
+    ground = draw_hills(5, platform.friction)
+    driver = ManoeuvreDriver(platform.maximum_speed, platform.maximum_yaw_rate, 1)
+    trace = simulate(DriveJob(platform, ground, driver, (), 10.0))
+    terrain, _ = load_terrain(write_map(ground, trace.positions[0], 1, tmp_path / "map.npz"))
+    path = trace.positions[::100] - trace.positions[0]
+    columns = np.rint((path[:, 0] - terrain.grid.origin[0]) / 0.1).astype(int)
+    rows = np.rint((path[:, 1] - terrain.grid.origin[1]) / 0.1).astype(int)
+    clearance = path[:, 2] - terrain.height.numpy()[rows, columns]
+    assert np.median(clearance) == pytest.approx(platform.radius - platform.axle_height, abs=0.05)
+
+
+def report_row(kind, hidden, effects, verdict="effect_found", **more):
+    return {
+        "case": "x", "kind": kind, "engine": "mujoco", "hidden": hidden, "effects": effects, "verdict": verdict,
+        "gap": {}, "held_out": {}, "seconds": 10.0, "cpu_seconds": 9.0, **more,
+    }  # fmt: skip
+
+
+def hidden_entry(name, **values):
+    names, estimated = KINDS[name].names, KINDS[name].estimated
+    return {"name": name, "values": values, "onset_s": 0.0, "names": names, "estimated": estimated}
+
+
+def found_entry(name, indistinguishable=(), **values):
+    parameters = {key: {"value": v, "low": v - 0.1, "high": v + 0.1} for key, v in values.items()}
+    return {"name": name, "parameters": parameters, "indistinguishable": list(indistinguishable)}
+
+
+def test_scores_count_names_classes_pairs_extras_and_intervals():
+    gain = hidden_entry("drive_gain", gain=0.8)
+    right = report_row("single", [gain], [found_entry("drive_gain", gain=0.85)])
+    wrong = report_row("single", [gain], [found_entry("payload", mass=3.0)])
+    in_class = report_row("single", [gain], [found_entry("payload", ("drive_gain",)), found_entry("actuator_lag")])
+    silent = report_row("single", [gain], [], "no_discrepancy")
+    pair = [gain, hidden_entry("actuator_lag", time_constant=0.3)]
+    both = report_row("pair", pair, [found_entry("actuator_lag"), found_entry("drive_gain", gain=1.2)])
+    half = report_row("pair", pair, [found_entry("drive_gain", gain=0.8)])
+    healthy = report_row("empty", [], [], "no_discrepancy")
+    alarm = report_row("empty", [], [], "unknown_effect")
+    outside = [report_row("outside", [hidden_entry("tether")], [found_entry("drive_gain")])]
+    outside.append(report_row("outside", [hidden_entry("tether")], [found_entry("drive_gain")], "unknown_effect"))
+    assert [found_all(row) for row in (right, wrong, in_class, silent, both, half)] == [
+        True, False, True, False, True, False,
+    ]  # fmt: skip
+    assert covered(right) == [True]
+    assert covered(both) == [False]
+    found = scores([right, wrong, in_class, silent, both, half, healthy, alarm, *outside])
+    assert found["singles_named"]["share"] == 0.5
+    assert found["singles_named_exactly"]["count"] == 1
+    assert found["pairs_named"]["share"] == 0.5
+    assert found["false_alarms"]["share"] == 0.5
+    assert found["empty_named"]["share"] == 0.0
+    assert found["outside_named"]["share"] == 0.5
+    assert found["outside_unknown"]["share"] == 0.5
+    assert found["extra_effects"]["count"] == 1
+    assert found["extra_effects"]["of"] == 3
+    low, high = found["singles_named"]["low"], found["singles_named"]["high"]
+    assert low < 0.07
+    assert high > 0.93
+
+
+def test_the_gap_counts_drives_on_which_nothing_was_added():
+    entry = {"horizon_s": 2.0, "before": 0.5, "after": 0.14, "noise": 0.1, "unit": "m"}
+    assert closed_share({"position_2s": entry}) == pytest.approx(0.9)
+    assert closed_share({"position_2s": entry | {"after": None}}) == 0.0
+    assert closed_share({"position_2s": entry | {"before": 0.105}}) is None
+
+
+def test_newton_drives_side_by_side_on_level_ground_and_hills():
+    newton_engine = pytest.importorskip("newton_engine", reason="newton is in benchmarks/requirements.txt")
+    platform = draw_platform(1)
+    hills = draw_hills(5, platform.friction)
+    commands = np.tile([0.5 * platform.maximum_speed, 0.0], (40, 1))
+    leader = LeadingDriver(ReplayedCommands(commands))
+    slow = DriveFactors(left=0.5, right=0.5)
+    jobs = [
+        DriveJob(platform, Ground(), leader, (), 2.0),
+        DriveJob(platform, Ground(), FollowingDriver(leader), (slow,), 1.5),
+        DriveJob(platform, hills, ReplayedCommands(commands), (), 2.0),
+    ]
+    level, slowed, hilly = newton_engine.simulate_together(jobs)
+    expected = 0.5 * platform.maximum_speed * platform.radius / platform.controller_radius
+    assert level.velocities[-1, 0] == pytest.approx(expected, rel=0.05)
+    assert len(slowed.positions) == 151
+    np.testing.assert_array_equal(slowed.commands, level.commands[: len(slowed.commands)])
+    assert slowed.positions[-1, 0] < 0.6 * level.positions[150, 0]
+    clearance = platform.radius - platform.axle_height
+    assert level.positions[-1, 2] == pytest.approx(clearance, abs=0.02)
+    under = hills.height(hilly.positions[:, :2])
+    assert np.ptp(under) > 0.02
+    assert np.median(hilly.positions[:, 2] - under) == pytest.approx(clearance, abs=0.04)
+
+
+def test_cases_recorded_together_have_files_only_where_the_effect_matters(tmp_path):
+    def simulate_in_turn(jobs):
+        return [simulate(job) for job in jobs]
+
+    seed = 1000
+    matters = Case("choosing", seed, 1, "mujoco", "level", "single", ("sensor_yaw_offset",))
+    empty = Case("choosing", seed, 2, "mujoco", "level", "empty")
+    record_together([[matters, empty]], tmp_path, simulate_in_turn)
+    for case in (matters, empty):
+        files = CaseFiles.of(case, tmp_path)
+        truth = json.loads(files.truth.read_text())
+        assert truth["usable"]
+        assert files.bag.exists()
+        assert files.check.exists() == (case.kind == "single")
+    assert CaseFiles.of(empty, tmp_path).commissioning.exists()
+    record_together([[matters, empty]], tmp_path, lambda jobs: pytest.fail("everything is recorded"))
