@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+from scipy.stats import t as student
 
 from monoforce_ros.bags import SmoothedMotion
 from monoforce_ros.core import AngularVelocityTrack, DelayCorrelation
@@ -15,12 +16,12 @@ _LAGS = np.arange(-50, 81) * _STEP
 """Delays of the poses that are tested [s]."""
 _PIECE = 8.0
 """Length of the pieces into which a recording is cut [s]."""
-_WEAKEST = 0.75
-"""Smallest correlation of the two yaw rates for a conclusion."""
+_WEAKEST = np.sqrt(0.5)
+"""Smallest correlation of the two yaw rates for a conclusion: they share at least half of their variance."""
 _LEAST_TURNING = 0.08
 """Smallest standard deviation of the yaw rate in a piece that is used for the delay [rad/s]."""
-_SMALLEST_OFFSET, _SMALLEST_BIAS = 0.04, 0.008
-"""Smaller values are not reported [s, rad/s]."""
+_HEALTHY_BIAS = np.radians(0.5)
+"""Largest bias of a healthy gyro [rad/s]: data sheets of robots' MEMS gyros allow 0.2 to 0.5 °/s after switching on."""
 
 
 @dataclass(frozen=True)
@@ -44,16 +45,19 @@ class GyroFinding:
     """Axis of the IMU that is vertical: 0, 1, 2 for x, y, z."""
     sign: int
     """-1 if that axis points down."""
+    resolution: float = 0.0
+    """Half the time between poses plus half that between gyro measurements [s]: a driver may stamp a measurement at the
+    beginning, the middle or the end of its interval, so that a smaller offset is none of a clock."""
 
     @property
     def poses_late(self) -> bool:
         """Whether the offset is significant."""
-        return abs(self.offset) > max(_SMALLEST_OFFSET, self.offset_half_width)
+        return abs(self.offset) > max(self.resolution, self.offset_half_width)
 
     @property
     def biased(self) -> bool:
-        """Whether the bias is significant."""
-        return abs(self.bias) > max(_SMALLEST_BIAS, 1.5 * self.bias_half_width)
+        """Whether the bias is significant, and larger than that of a healthy gyro."""
+        return abs(self.bias) > max(_HEALTHY_BIAS, self.bias_half_width)
 
 
 def compare_with_gyro(smoothed: SmoothedMotion, gyro: AngularVelocityTrack | None) -> GyroFinding | None:
@@ -100,13 +104,22 @@ def compare_with_gyro(smoothed: SmoothedMotion, gyro: AngularVelocityTrack | Non
         offset=float(offset),
         offset_half_width=float(max(1.96 * spread, 0.01)),
         bias=bias,
-        bias_half_width=float(1.96 * np.std(medians) / np.sqrt(max(1, len(medians)))) if len(medians) > 2 else 0.05,
+        bias_half_width=_mean_half_width(medians),
         spread=float(np.median(np.abs(everything))),
         spread_without=float(np.median(np.abs(everything - bias))),
         correlation=correlation,
         axis=axis,
         sign=sign,
+        resolution=0.5e-9 * float(np.median(np.diff(smoothed.motion.stamps)) + np.median(np.diff(gyro.stamps))),
     )
+
+
+def _mean_half_width(values: list[float]) -> float:
+    """Half-width of the 95 % interval of the mean, by Student's distribution; infinite for fewer than two values."""
+    count = len(values)
+    if count < 2:
+        return float("inf")
+    return float(student.ppf(0.975, count - 1) * np.std(values, ddof=1) / np.sqrt(count))
 
 
 def _gyro_rate(times: np.ndarray, clock: np.ndarray, rates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
