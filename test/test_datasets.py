@@ -121,6 +121,39 @@ def test_the_real_continuous_log_becomes_a_bag(tmp_path, real_data):
     assert np.diff(bag.motion.stamps).max() * 1e-9 < 0.4
 
 
+def test_a_table_of_windows_is_read_like_their_arrays(tmp_path):
+    """The data frame that DRIVE publishes, written as CSV: one row for each window, one column for each sample."""
+    windows_file(tmp_path / "windows.npz")
+    with np.load(tmp_path / "windows.npz") as content:
+        fields = {name: content[name] for name in content.files if name != "dt"}
+    columns = {"calib_step": ["0"] * len(fields["cmd_left"])}
+    for name, values in fields.items():
+        if values.ndim == 1:
+            # As pandas writes booleans and numbers.
+            columns[name] = [
+                str(value > 0.5) if name == "steady_state_mask" else repr(float(value)) for value in values
+            ]
+            continue
+        for number in range(values.shape[1]):
+            title = f"{'imu_yaw' if name == 'imu_yaw_rate' else name}_{number}"
+            columns[title] = [repr(float(value)) for value in values[:, number]]
+    lines = [",".join(columns), *(",".join(row) for row in zip(*columns.values(), strict=True))]
+    (tmp_path / "windows.csv").write_text("\n".join(lines))
+    array, table = (DriveRecording.open(tmp_path / f"windows.{kind}") for kind in ("npz", "csv"))
+    assert len(array.runs) == len(table.runs)
+    for one, other in zip(array.runs, table.runs, strict=True):
+        np.testing.assert_allclose(one.positions, other.positions, atol=1e-6)
+        # The arrays keep the time step in single precision.
+        np.testing.assert_allclose(one.stamps - one.stamps[0], other.stamps - other.stamps[0], rtol=1e-6)
+        np.testing.assert_allclose(one.gyro, other.gyro)
+    (tmp_path / "lacking.csv").write_text("\n".join(line.replace("icp_yaw_7,", "x,") for line in lines))
+    with pytest.raises(DatasetError, match="got no column icp_yaw_7"):
+        DriveRecording.open(tmp_path / "lacking.csv")
+    (tmp_path / "short.csv").write_text("\n".join([lines[0], "1,2,3"]))
+    with pytest.raises(DatasetError, match="line 2: got 3 columns"):
+        DriveRecording.open(tmp_path / "short.csv")
+
+
 @given(st.binary(max_size=200), st.sampled_from(["x.npz", "x.csv", "x.csv.gz", "x.txt"]))
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_random_bytes_are_rejected_by_name(tmp_path, data, name):

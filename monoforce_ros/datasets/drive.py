@@ -1,8 +1,9 @@
 """DRIVE: commands and measured motion of Clearpath robots (github.com/norlab-ulaval/DRIVE).
 
-Two formats are read: ``.npz`` files of 2 s windows at 20 Hz, three for each command held for 6 s, and continuous
-``.csv(.gz)`` logs. The gyro's sign and the delay of the lidar's poses are estimated by comparing the two; poses that
-are repeated until the next one arrives are dropped, and windows are joined by their order and masks.
+Two formats are read: 2 s windows at 20 Hz, three for each command held for 6 s (``.npz``, or a ``.csv(.gz)`` table with
+a row each), and continuous ``.csv(.gz)`` logs. The gyro's sign and the delay of the lidar's poses are estimated by
+comparing the two; poses that are repeated until the next one arrives are dropped, and windows are joined by their order
+and masks.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import csv
 import gzip
 import zipfile
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,6 +29,8 @@ START_STAMP = 1_700_000_000 * 10**9
 """Stamp of the first sample of windows, which have no time [ns]."""
 PAUSE = 4.0
 """Time between runs of windows in a bag [s], longer than any gap that is interpolated."""
+WINDOW_LENGTH = 2.0
+"""Length of a window [s]."""
 LARGEST_FILE = 1_000_000_000
 """Size of unpacked data beyond which a file is rejected [bytes]."""
 
@@ -38,6 +42,7 @@ _COLUMNS = (
     "ros_time", "meas_left_vel", "meas_right_vel", "cmd_vel_x", "cmd_vel_omega", "icp_pos_x", "icp_pos_y",
     "icp_pos_z", "icp_quat_x", "icp_quat_y", "icp_quat_z", "icp_quat_w", "imu_z",
 )  # fmt: skip
+_TRUTH = {"True": 1.0, "False": 0.0}
 _LONGEST_REPEAT = 0.25
 _LAGS = np.arange(-10, 61) * 0.05
 """Candidate delays [s]."""
@@ -257,6 +262,11 @@ def _open_windows(path: Path) -> DriveRecording:
         if isinstance(error, DatasetError):
             raise
         raise DatasetError(f"{path}: not readable: {error}") from error
+    return _runs_of_windows(path, data)
+
+
+def _runs_of_windows(path: Path, data: dict[str, np.ndarray]) -> DriveRecording:
+    """Join windows to runs; ``data`` has the fields ``[windows, samples]``, the masks ``[windows]`` and ``dt`` [s]."""
     shapes = {data[name].shape for name in _FIELDS}
     if len(shapes) != 1 or len(next(iter(shapes))) != 2 or min(next(iter(shapes))) < 2:
         raise DatasetError(f"{path}: got shapes {sorted(shapes)}, expected [windows, samples] for all")
@@ -314,6 +324,40 @@ def _join(data: dict[str, np.ndarray], members: list[int], begin: int, step: int
     )
 
 
+def _window_table(path: Path, names: list[str], rows: Iterator[list[str]]) -> dict[str, np.ndarray]:
+    """Windows from a table with one row each and columns ``FIELD_0``, ``FIELD_1``, … as the dataset publishes them."""
+    index = {name: number for number, name in enumerate(names)}
+    count = sum(name.startswith("cmd_left_") and name[9:].isdigit() for name in names)
+    wanted = {
+        field: [f"{'imu_yaw' if field == 'imu_yaw_rate' else field}_{number}" for number in range(count)]
+        for field in _FIELDS
+    } | {mask: [mask] for mask in ("steady_state_mask", "transitory_state_mask")}
+    missing = sorted({name for columns in wanted.values() for name in columns} - set(index))
+    if missing:
+        raise DatasetError(
+            f"{path}: got no column {', '.join(missing[:4])}{' …' if len(missing) > 4 else ''}; expected windows of "
+            f"DRIVE with {count} samples each"
+        )
+    table: list[list[float]] = []
+    read = 0
+    columns = [index[name] for names in wanted.values() for name in names]
+    for number, row in enumerate(rows, start=2):
+        read += sum(map(len, row)) + len(row)
+        if read > LARGEST_FILE:
+            raise DatasetError(f"{path}: more than {LARGEST_FILE} bytes of text")
+        if len(row) <= max(columns):
+            raise DatasetError(f"{path}, line {number}: got {len(row)} columns, expected {len(index)}")
+        # Masks are written as 1.0 or True.
+        cells = [row[column] for column in columns]
+        table.append([_TRUTH[cell] if cell in _TRUTH else float(cell or "nan") for cell in cells])
+    values = np.array(table).reshape(len(table), len(columns))
+    edges = np.cumsum([len(names) for names in wanted.values()])[:-1]
+    data = dict(zip(wanted, np.split(values, edges, axis=1), strict=True))
+    for mask in ("steady_state_mask", "transitory_state_mask"):
+        data[mask] = data[mask][:, 0]
+    return data | {"dt": np.array(WINDOW_LENGTH / count)}
+
+
 def _open_log(path: Path) -> DriveRecording:
     unpack = gzip.open if path.suffix == ".gz" else open
     rows: list[list[float]] = []
@@ -323,6 +367,8 @@ def _open_log(path: Path) -> DriveRecording:
         with unpack(path, "rt", encoding="utf-8", newline="") as stream:
             reader = csv.reader(stream)
             names = next(reader, [])
+            if "cmd_left_0" in names:
+                return _runs_of_windows(path, _window_table(path, names, reader))
             missing = sorted(set(_COLUMNS) - set(names))
             if missing:
                 raise DatasetError(f"{path}: got no column {', '.join(missing)}; expected a continuous log of DRIVE")
