@@ -205,6 +205,7 @@ class Search:
         self._own = dict(robot.effects)
         self._excluded = set(excluded)
         self._fits: dict[tuple[str, ...], Fit] = {}
+        self._screenings: dict[tuple[tuple[str | float, ...], ...], tuple[float, list[_Screened]]] = {}
 
     def run(self, most_effects: int) -> Outcome:
         """Add effects while a further one is significant, then test each in the presence of the others."""
@@ -352,11 +353,12 @@ class Search:
         strongest = min((test for test in tests if test.gain > least), key=lambda test: test.adjusted, default=None)
         p, name = (1.0, "") if strongest is None else (strongest.adjusted, strongest.name)
         healthy = self.nominal
-        if healthy is not None and healthy.segments > 1 and trial.loss - healthy.loss > least:
-            size = _size_p(trial.loss, healthy)
-            p, name = (p, name) if p < size else (size, "residuals that are too large")
-        # Two tests: the smaller p-value of two has twice the rate.
-        return FitTest(min(1.0, 2.0 * p), name, tuple(tests))
+        if healthy is not None and healthy.segments > 1:
+            if trial.loss - healthy.loss > least and (size := _size_p(trial.loss, healthy)) < p:
+                p, name = size, "residuals that are too large"
+            # Two tests: the smaller p-value of two has twice the rate.
+            p = min(1.0, 2.0 * p)
+        return FitTest(p, name, tuple(tests))
 
     def formula_directions(self, base: Effects) -> list[Direction]:
         """Change of the residuals by each term of a formula in addition to a base."""
@@ -417,6 +419,9 @@ class Search:
 
     def _screened(self, base: Effects, number: str) -> tuple[float, list[_Screened]]:
         """Loss of ``base``, and a quick fit and test of every further effect, smallest loss first."""
+        key = tuple((name, *values.values()) for name, values in base)
+        if key in self._screenings:
+            return self._screenings[key]
         before = float(robust(self._coarse.residuals([base])[0] / self._coarse_scale).mean())
         names = {name for name, _ in base}
         fits: list[Fit] = []
@@ -429,7 +434,8 @@ class Search:
         residual = self.predictions.residuals([base])[0] / self.scale
         tests = self._tested(base, residual, [self.influence(base, fit.effects[-1]) for fit in fits])
         screened = [_Screened(fit.effects, float(fit.loss.mean()), test) for fit, test in zip(fits, tests, strict=True)]
-        return before, sorted(screened, key=lambda entry: entry.loss)
+        self._screenings[key] = (before, sorted(screened, key=lambda entry: entry.loss))
+        return self._screenings[key]
 
     def influence(self, base: Effects, effect: tuple[str, Mapping[str, float]]) -> Direction:
         """Change of the residuals by an effect in addition to a base, one column for each parameter that was fitted."""
