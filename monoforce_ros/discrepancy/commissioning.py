@@ -57,7 +57,7 @@ def commission(
     robot: RobotModel,
     *,
     samples: Sequence[float] = (0.5, 1.0, 1.5, 2.0),
-    stride: float = 0.5,
+    stride: float = 1.0,
     progress: Callable[[float, str], None] = lambda share, step: None,
 ) -> tuple[tuple[EffectEstimate, ...], NominalModel]:
     """Fit to recordings of a healthy robot all that it takes to predict them.
@@ -141,14 +141,12 @@ def _fitted(entry: _Prepared, effects: Effects, fixed: int) -> Fit:
 def _further(robot: RobotModel, entry: _Prepared, effects: Effects) -> Effects:
     """The effects that one recording needs in addition."""
     fitted = replace(robot, effects=tuple({**dict(robot.effects), **dict(effects)}.items()))
-    data = replace(entry.data, starts=entry.data.starts[::2])
-    predictions = Predictions(fitted, data)
-    floor = entry.floor[::2]
-    residuals = np.nan_to_num(predictions.residuals([()])[0])
+    floor = entry.floor
+    residuals = np.nan_to_num(Predictions(fitted, entry.data).residuals([()])[0])
     spread = np.quantile(np.abs(residuals), 0.683, axis=0)
     # Scaled by what is left, so that a recording is judged by its own size of errors.
     scale = np.sqrt(residual_scale(floor, None) ** 2 + np.maximum(spread**2 - (floor**2).mean(axis=0), 0.0))
-    search = Search(fitted, data, scale, excluded=[name for name, _ in effects])
+    search = Search(fitted, entry.data, scale, excluded=[name for name, _ in effects])
     best = search.run(_MOST_EFFECTS).best
     return search.refit(best.effects).effects if best.effects else ()
 

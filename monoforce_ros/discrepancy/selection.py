@@ -205,7 +205,7 @@ class Search:
         self._own = dict(robot.effects)
         self._excluded = set(excluded)
         self._fits: dict[tuple[str, ...], Fit] = {}
-        self._screenings: dict[tuple[tuple[str | float, ...], ...], tuple[float, list[_Screened]]] = {}
+        self._screenings: dict[tuple[tuple[object, ...], ...], tuple[float, list[_Screened]]] = {}
 
     def run(self, most_effects: int) -> Outcome:
         """Add effects while a further one is significant, then test each in the presence of the others."""
