@@ -41,7 +41,7 @@ from monoforce_ros.discrepancy.hypothesis import (
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.report import effect_entry, report_content
 from monoforce_ros.discrepancy.selection import Search
-from monoforce_ros.discrepancy.terrain_evidence import supporting_terrain, terrain_uncertainty
+from monoforce_ros.discrepancy.terrain_evidence import supporting_terrain, terrain_uncertainty, traced_terrain
 from monoforce_ros.discrepancy.wheels import compare_with_wheels
 from monoforce_ros.effects.catalogue import CATALOGUE, drive_speeds, recorded_commands, recorded_motion
 from monoforce_ros.evaluation.recording_evaluation import PHYSICS, evaluate_recording
@@ -529,6 +529,24 @@ def test_the_ground_under_grass_is_traced_where_the_robot_drove(husky):
         axis=-1
     )
     assert (found.height.numpy()[far > 3.0] == np.float32(0.3)).all()
+
+
+def test_ground_without_a_map_is_traced_along_the_poses(husky):
+    grid = Grid.square(24.0, 0.1)
+    x, y = np.meshgrid(grid.x, grid.y)
+    hills = torch.as_tensor(0.15 * np.sin(0.8 * x) * np.cos(0.6 * y), dtype=torch.float32)
+    truth = TerrainMap.from_height(hills, grid)
+    speeds = torch.tensor([[[0.8, 1.0]]]).repeat(1, 800, 1)
+    start = State.at_rest(0.25)
+    result = rollout(truth, husky, speeds, start, with_forces=False)
+    stamps = np.arange(800) * 10_000_000
+    rotations = Rotation.from_matrix(result.rotation[0].double().numpy())
+    zeros = np.zeros((800, 3))
+    motion = MotionTrack(stamps, result.position[0].double().numpy(), rotations.as_quat(), zeros, zeros)
+    traced = traced_terrain(motion, husky, grid)
+    rows, columns, _ = grid.cells(motion.positions[200:, :2])
+    error = (traced.height - hills).numpy()[rows, columns]
+    assert np.abs(error).max() < 0.06 < np.ptp(hills.numpy()[rows, columns])
 
 
 @pytest.fixture(scope="module")

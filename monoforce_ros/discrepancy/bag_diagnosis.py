@@ -21,7 +21,7 @@ from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.nominal_residual import residual_complaint
 from monoforce_ros.discrepancy.report import effect_entry, write_diagnosis
 from monoforce_ros.discrepancy.step_errors import compare_after_steps
-from monoforce_ros.discrepancy.terrain_evidence import supporting_terrain
+from monoforce_ros.discrepancy.terrain_evidence import supporting_terrain, traced_terrain
 from monoforce_ros.discrepancy.verdict import Verdict
 from monoforce_ros.discrepancy.wheels import compare_with_wheels
 from monoforce_ros.effects import CATALOGUE
@@ -72,8 +72,8 @@ def read_evidence(bag: Path, robot: RobotModel, terrain: str, topics: Topics = T
     Args:
         bag: the recording.
         robot: its own body is removed from the lidar's sweeps.
-        terrain: ``auto`` (see :func:`choose_ground`), ``flat``, ``lidar`` (all sweeps of the recording as one map) or a
-            file of ``fit_terrain``.
+        terrain: ``auto`` (see :func:`choose_ground`), ``flat``, ``lidar`` (all sweeps of the recording as one map),
+            ``traced`` (by the wheels along the poses) or a file of ``fit_terrain``.
         topics: topic names that replace detection by type.
 
     Raises:
@@ -93,13 +93,16 @@ def read_with_ground(
     ground = choose_ground(terrain, recording, smoothed, robot)
     if ground.source == "flat":
         return evidence, recording, ground
-    if ground.source != "lidar":
+    if ground.source not in ("lidar", "traced"):
         terrain_map, pose = load_terrain(Path(ground.source))
         return replace(evidence, terrain=terrain_map, odometry_from_terrain=pose), recording, ground
     motion = smoothed.motion
     low, high = motion.positions.min(axis=0)[:2] - _MARGIN, motion.positions.max(axis=0)[:2] + _MARGIN
     columns, rows = np.ceil((high - low) / 0.1).astype(int) + 1
     grid = Grid(int(rows), int(columns), 0.1, (float(low[0]), float(low[1])))
+    if ground.source == "traced":
+        terrain_map = traced_terrain(motion, robot, grid)
+        return replace(evidence, terrain=terrain_map, odometry_from_terrain=np.eye(4)), recording, ground
     maps, parts = split_maps(recording, motion, robot, grid)
     whole, even, odd = (supporting_terrain(part, motion, robot) for part in (maps, *parts))
     evidence = replace(evidence, terrain=whole, odometry_from_terrain=np.eye(4), split_maps=(even, odd))

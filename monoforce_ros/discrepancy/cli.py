@@ -44,9 +44,10 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--terrain",
         default="auto",
-        metavar="auto|flat|lidar|FILE",
-        help="ground of the recording: from the lidar where the bag has clouds and else level (auto), level, mapped "
-        "from the lidar, or a file of fit_terrain (%(default)s)",
+        metavar="auto|flat|lidar|traced|FILE",
+        help="ground of the recording: level (flat), mapped from the lidar, traced by the wheels along the poses, a "
+        "file of fit_terrain, or what the bag holds (auto): clouds, else poses where they show slopes, else level "
+        "(%(default)s)",
     )
     parser.add_argument("--out", type=Path, required=True, help="folder for the reports")
     parser.add_argument(

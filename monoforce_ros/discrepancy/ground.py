@@ -29,7 +29,7 @@ class Ground:
     """The terrain that a recording is compared on."""
 
     source: str
-    """``flat``, ``lidar`` or a file."""
+    """``flat``, ``lidar``, ``traced`` or a file."""
     description: str
     """For reports: what was taken and why."""
     complaint: str = ""
@@ -45,13 +45,15 @@ def choose_ground(terrain: str, recording: Recording, smoothed: SmoothedMotion, 
     """The terrain of a recording: as asked for, or for ``auto`` from what the bag holds.
 
     Args:
-        terrain: ``auto``, ``flat``, ``lidar`` or a file of ``fit_terrain``.
+        terrain: ``auto``, ``flat``, ``lidar``, ``traced`` or a file of ``fit_terrain``.
         recording: its clouds serve as map where there are any and their sensor's pose is known.
         smoothed: the measured motion, whose roll, pitch and heights show whether ground is level.
         robot: its file may know the pose of the lidar.
     """
     if terrain == "lidar":
         return Ground(terrain, f"lidar map of {len(recording.clouds)} sweeps")
+    if terrain == "traced":
+        return Ground(terrain, "traced by the wheels along the measured poses")
     if terrain not in ("auto", "flat"):
         return Ground(terrain, f"map {Path(terrain).name}")
     reason = "no clouds in the bag"
@@ -67,6 +69,9 @@ def choose_ground(terrain: str, recording: Recording, smoothed: SmoothedMotion, 
     slope, plane = slope_of(smoothed)
     said = "as asked for" if terrain == "flat" else reason
     complaint = ""
+    if terrain == "auto" and slope > LEVEL_SLOPE and plane <= _SHARE_OF_PLANE:
+        degrees = np.degrees(slope)
+        return Ground("traced", f"traced by the wheels: slopes of {degrees:.1f}° by the poses, and {reason}")
     if slope > LEVEL_SLOPE:
         remedy = "use --terrain lidar or a map" if recording.clouds else "record a lidar, or give a map of fit_terrain"
         what = f"the ground is not level (slopes of {np.degrees(slope):.1f}° by the poses, root mean square)"

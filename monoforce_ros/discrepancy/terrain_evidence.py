@@ -13,16 +13,31 @@ from monoforce_ros.core import MotionTrack
 from monoforce_ros.discrepancy.hypothesis import EvidenceWindows, Predictions
 from monoforce_ros.physics import rest_depth
 from monoforce_ros.robots import RobotModel
-from monoforce_ros.terrain import TerrainMap
+from monoforce_ros.terrain import Grid, TerrainMap
 
-_REACH = 1.5
-"""Distance from the driven cells within which the traced ground replaces the visible one [m]: a robot's width, so that
-predictions that leave the measured path by less still find supporting ground."""
+_FULL_WITHIN, _REACH = 0.5, 1.5
+"""Distance from the driven cells within which the traced ground replaces the visible one, and at which it has faded out
+[m]: predictions that leave the measured path by half a robot's width still find the supporting ground."""
 _SMOOTHING = 0.1
 """Standard deviation of the smoothing of the traced correction [m]: a cell."""
 
 
-def supporting_terrain(visible: TerrainMap, motion: MotionTrack, robot: RobotModel) -> TerrainMap:
+def traced_terrain(motion: MotionTrack, robot: RobotModel, grid: Grid) -> TerrainMap:
+    """The ground as the wheels traced it, for a recording without a map: heights under the driven path.
+
+    Args:
+        motion: smoothed poses of the base frame, whose z axis is against gravity.
+        robot: its wheels or tracks.
+        grid: cells in the odometry frame.
+    """
+    level = torch.full((grid.rows, grid.columns), float(np.median(motion.positions[:, 2])))
+    traced = supporting_terrain(TerrainMap.from_height(level, grid), motion, robot, reach=np.inf)
+    return TerrainMap.from_height(traced.height, grid)
+
+
+def supporting_terrain(
+    visible: TerrainMap, motion: MotionTrack, robot: RobotModel, *, reach: float = _REACH
+) -> TerrainMap:
     """The map with the ground that carried the robot in place of the visible one where it drove.
 
     A lidar sees the top of vegetation, the wheels trace the ground below. ``geometric_height`` stays the visible one,
@@ -33,6 +48,7 @@ def supporting_terrain(visible: TerrainMap, motion: MotionTrack, robot: RobotMod
         visible: map in the odometry frame.
         motion: smoothed poses of the base frame.
         robot: its wheels or tracks.
+        reach: distance from the path at which the difference has faded out [m]; infinite: it does not fade.
     """
     grid = visible.grid
     underside = robot.points[robot.point_tangents[:, 0] < -0.97].double().numpy()
@@ -54,7 +70,8 @@ def supporting_terrain(visible: TerrainMap, motion: MotionTrack, robot: RobotMod
     traced.ravel()[flat[starts]] = True
     distance, nearest = distance_transform_edt(~traced, sampling=grid.resolution, return_indices=True)
     spread = gaussian_filter(change[nearest[0], nearest[1]], _SMOOTHING / grid.resolution)
-    spread = np.where(traced, change, spread) * np.clip(1.0 - distance / _REACH, 0.0, 1.0)
+    fading = 1.0 if np.isinf(reach) else np.clip((reach - distance) / (reach - _FULL_WITHIN), 0.0, 1.0)
+    spread = np.where(traced, change, spread) * fading
     height = visible.height + torch.from_numpy(spread.astype(np.float32))
     return replace(visible, height=height)
 
