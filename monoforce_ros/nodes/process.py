@@ -45,15 +45,19 @@ def run_node[NodeType: Node](
     try:
         initialise(arguments)
         node = make_node()
+    except KeyboardInterrupt:
+        rclpy.try_shutdown()
+        return 0
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         rclpy.try_shutdown()
         return 1
-    for warning in check_parameter_files(words, node.get_fully_qualified_name()):
-        node.get_logger().warning(warning)
     executor = SingleThreadedExecutor()
-    executor.add_node(node)
     try:
+        executor.add_node(node)
+        # Reading files takes a moment, in which a signal may come.
+        for warning in check_parameter_files(words, node.get_fully_qualified_name()):
+            node.get_logger().warning(warning)
         work(node, executor)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
