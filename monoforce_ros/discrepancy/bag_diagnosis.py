@@ -88,6 +88,7 @@ def read_with_ground(
 ) -> tuple[Evidence, Recording, Ground]:
     """As :func:`read_evidence`, and which ground was taken."""
     recording = Recording.open(bag, odometry=topics.odometry, commands=topics.commands, cloud=topics.cloud)
+    recording = recording.in_base_frame(robot.base_frame)
     smoothed = smooth(recording.motion)
     evidence = Evidence(smoothed, recording.commands, gyro=recording.angular_velocity, wheels=recording.wheels)
     ground = choose_ground(terrain, recording, smoothed, robot)

@@ -1,0 +1,139 @@
+"""Frames: transforms between named frames, and where a robot's sensors and its odometry are on it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+
+class FrameError(ValueError):
+    """Two frames are not connected; the message names both and where the path between them breaks."""
+
+
+class TransformTree:
+    """Transforms between named frames, as on /tf; a recording may even give a frame several parents.
+
+    Leading slashes of names are ignored, as in tf2. :meth:`find` may run while another thread adds transforms.
+    """
+
+    def __init__(self, transforms: Mapping[tuple[str, str], np.ndarray] | None = None):
+        # Neighbours of each frame; the matrix is the pose of the child in the parent, and the flag tells whether the
+        # neighbour is the child.
+        self._neighbours: dict[str, dict[str, tuple[np.ndarray, bool]]] = {}
+        for (parent, child), matrix in (transforms or {}).items():
+            self.add(parent, child, matrix)
+
+    def add(self, parent: str, child: str, matrix: np.ndarray) -> None:
+        """Set the pose ``[4, 4]`` of a child in its parent's frame; replaces an earlier one."""
+        parent, child = parent.lstrip("/"), child.lstrip("/")
+        self._neighbours.setdefault(parent, {})[child] = matrix, True
+        self._neighbours.setdefault(child, {})[parent] = matrix, False
+
+    @property
+    def frames(self) -> set[str]:
+        """Names of all frames."""
+        return set(self._neighbours)
+
+    def find(self, target: str, source: str) -> np.ndarray | None:
+        """Pose ``[4, 4]`` of ``source`` in ``target``; None if they are not connected."""
+        return self._reached(target.lstrip("/"), source.lstrip("/")).get(source.lstrip("/"))
+
+    def missing_path(self, target: str, source: str) -> str:
+        """Why :meth:`find` returns None, in words."""
+        target, source = target.lstrip("/"), source.lstrip("/")
+        unknown = [repr(frame) for frame in (target, source) if frame not in self.frames]
+        if unknown:
+            known = ", ".join(sorted(self.frames)) or "none"
+            return f"no transform has {' or '.join(unknown)} (frames there: {known})"
+        near_target, near_source = (", ".join(sorted(set(self._reached(f)) - {f})) for f in (target, source))
+        return (
+            f"{target!r} is connected with {near_target}, and {source!r} with {near_source}: a transform between these "
+            "is missing"
+        )
+
+    def _reached(self, start: str, end: str = "") -> dict[str, np.ndarray]:
+        """Pose in ``start`` of every frame connected with it; the search ends early at ``end``."""
+        reached = {start: np.eye(4)}
+        frontier = [start]
+        while frontier and end not in reached:
+            following = []
+            for frame in frontier:
+                # Copied at once: another thread may add a frame.
+                for neighbour, (matrix, downwards) in list(self._neighbours.get(frame, {}).items()):
+                    if neighbour not in reached:
+                        reached[neighbour] = reached[frame] @ (matrix if downwards else np.linalg.inv(matrix))
+                        following.append(neighbour)
+            frontier = following
+        return reached
+
+
+@dataclass(frozen=True)
+class RobotFrames:
+    """Poses on a robot in its base frame: from transforms, else from its file.
+
+    Names may have a prefix per robot (``robot1/base_link``): names without one are also looked for with the prefix of
+    the frame that is asked for.
+    """
+
+    base_frame: str
+    """The frame that the lengths in the robot's file refer to."""
+    sensors: Mapping[str, Any] = field(default_factory=dict)
+    """Poses ``[4, 4]`` of sensors by frame, from the robot's file."""
+    odometry_child_pose: np.ndarray | None = None
+    """Pose ``[4, 4]`` of the odometry's child frame, if it is given instead of looked up."""
+
+    def base_name(self, frame: str, known: Iterable[str]) -> str:
+        """The base frame's name beside a frame: with that frame's prefix, unless only the bare name is known."""
+        bare, prefixed = self.base_frame.lstrip("/"), _prefixed(self.base_frame, frame)
+        frames = {*known, frame.lstrip("/")}
+        return prefixed if prefixed in frames or bare not in frames else bare
+
+    def sensor_pose(self, frame: str, transforms: TransformTree) -> np.ndarray:
+        """Pose ``[4, 4]`` of a sensor's frame in the base frame.
+
+        Raises:
+            FrameError: neither the transforms nor the robot's file have it.
+        """
+        frame = frame.lstrip("/")
+        base = self.base_name(frame, transforms.frames)
+        pose = transforms.find(base, frame)
+        if pose is not None:
+            return pose
+        for name in (frame, frame.rpartition("/")[2]):
+            if name in self.sensors:
+                return np.asarray(self.sensors[name], np.float64)
+        raise FrameError(
+            f"the pose of frame {frame!r} on the robot is unknown: add it to the robot file under `sensors` (frames "
+            f"there: {sorted(self.sensors)}), or publish the path from {base!r} to {frame!r} on /tf_static: "
+            f"{transforms.missing_path(base, frame)}"
+        )
+
+    def odometry_child(self, frame: str, transforms: TransformTree) -> np.ndarray:
+        """Pose ``[4, 4]`` of the odometry's child frame in the base frame. An empty name means the base frame.
+
+        Raises:
+            FrameError: it is another frame, and neither given nor connected with the base frame.
+        """
+        frame = frame.lstrip("/")
+        if self.odometry_child_pose is not None:
+            return self.odometry_child_pose
+        base = self.base_name(frame, transforms.frames)
+        if frame in ("", base):
+            return np.eye(4)
+        pose = transforms.find(base, frame)
+        if pose is None:
+            raise FrameError(
+                f"odometry describes the frame {frame!r}, lengths in the robot file refer to {base!r}, and the offset "
+                f"between them is unknown: {transforms.missing_path(base, frame)}. Publish it on /tf_static, give it "
+                "as `odometry_child_pose`, or name the robot's frame in `base_frame`"
+            )
+        return pose
+
+
+def _prefixed(name: str, like: str) -> str:
+    """A name with the prefix of another one, unless it has a prefix itself."""
+    name, prefix = name.lstrip("/"), like.lstrip("/").rpartition("/")[0]
+    return f"{prefix}/{name}" if prefix and "/" not in name else name
