@@ -2,10 +2,12 @@
 # Creates .venv with the locked packages and builds the package with colcon.
 # Finished steps are marked by stamp files, so repeated calls are fast.
 #   scripts/set_up.sh environment | build | interfaces | graphics
+#   MONOFORCE_ENVIRONMENT=lowest scripts/set_up.sh build     the same with the lowest supported versions, beside the others
 set -euo pipefail
 cd "$(dirname "$0")/.."
 root=$PWD
-venv=$root/.venv
+# shellcheck source=environment.sh
+source scripts/environment.sh
 
 say() { printf '[set-up] %s\n' "$*"; }
 
@@ -31,12 +33,12 @@ find_python() {
 
 environment() {
   local started=$SECONDS lock_hash python
-  lock_hash=$(sha256sum requirements.lock | cut -d' ' -f1)
+  lock_hash=$(sha256sum "$lock" | cut -d' ' -f1)
   if [ -f "$venv/.locked" ] && [ "$(cat "$venv/.locked")" = "$lock_hash" ]; then
     say "the environment is up to date"
     return
   fi
-  # Recreate .venv when the lock file changes: removing one of several packages that share a folder, such as the ROS
+  # Recreate the environment when the lock file changes: removing one of several packages that share a folder, such as the ROS
   # packages, breaks the others.
   if [ -f "$venv/.locked" ] || ! is_python_312 "$venv/bin/python"; then
     if ! python=$(find_python); then
@@ -51,53 +53,46 @@ environment() {
 TEXT
       exit 1
     fi
-    say "creating .venv with $python"
+    say "creating ${venv##*/} with $python"
     rm -rf "$venv"
     "$python" -m venv "$venv"
   fi
   local uv_version
-  uv_version=$(sed -n 's/^uv==\([^ ;]*\).*/\1/p' requirements.lock)
+  uv_version=$(sed -n 's/^uv==\([^ ;]*\).*/\1/p' "$lock")
   say "installing uv $uv_version"
   "$venv/bin/python" -m pip install --quiet --disable-pip-version-check "uv==$uv_version"
-  say "installing $(grep -c '^[a-z0-9].*==' requirements.lock) locked packages (several GB, most of it torch's CUDA libraries)"
+  say "installing $(grep -c '^[a-z0-9].*==' "$lock") locked packages (several GB, most of it torch's CUDA libraries)"
   # Compile bytecode once, or every start of a node compiles all of torch if Python may not write bytecode.
-  "$venv/bin/uv" pip sync --quiet --compile-bytecode --python "$venv/bin/python" requirements.lock
+  "$venv/bin/uv" pip sync --quiet --compile-bytecode --python "$venv/bin/python" "$lock"
   printf '%s' "$lock_hash" >"$venv/.locked"
   say "environment ready after $((SECONDS - started)) s"
 }
 
-# rosidl and ament search AMENT_PREFIX_PATH, which the wheels do not set. The guard variable marks the library path as
-# set up and must be removed together with it.
-ros_environment() {
-  unset _ROS_WHEELS_BOOTSTRAP_COMPLETE
-  export AMENT_PREFIX_PATH="$venv${AMENT_PREFIX_PATH:+:$AMENT_PREFIX_PATH}"
-  export PATH="$venv/bin:$PATH"
-}
-
 build() {
-  local stamp=install/.built started=$SECONDS
+  local stamp=$install_base/.built started=$SECONDS
   if [ -f "$stamp" ] && [ -z "$(find package.xml setup.py setup.cfg resource config launch msg_defs bags models monoforce_ros \
     -newer "$stamp" -not -name '*.pyc' -not -name __pycache__ -print -quit)" ]; then
     say "the build is up to date"
     return
   fi
-  ros_environment
+  use_ros_wheels
   say "building with colcon"
   # Files removed from the source must not stay installed.
-  rm -rf build/monoforce_ros install/monoforce_ros
+  rm -rf "$build_base/monoforce_ros" "$install_base/monoforce_ros"
   mkdir -p out
-  if ! colcon --log-base log build --event-handlers console_cohesion- >out/colcon_build.log 2>&1; then
+  if ! colcon --log-base log build --build-base "$build_base" --install-base "$install_base" \
+    --event-handlers console_cohesion- >out/colcon_build.log 2>&1; then
     cat out/colcon_build.log >&2
     exit 1
   fi
-  "$venv/bin/python" -m compileall -q install/monoforce_ros/lib
+  "$venv/bin/python" -m compileall -q "$install_base/monoforce_ros/lib"
   touch "$stamp"
-  say "built into install/ after $((SECONDS - started)) s"
+  say "built into $install_base/ after $((SECONDS - started)) s"
 }
 
 # Builds the typed messages for planners, next to monoforce_ros in install/. Only this step needs a C++ compiler.
 interfaces() {
-  local stamp=install/.interfaces source=msg_defs/monoforce_msgs started=$SECONDS headers arrays
+  local stamp=$install_base/.interfaces source=msg_defs/monoforce_msgs started=$SECONDS headers arrays
   if [ -f "$stamp" ] && [ -z "$(find "$source" -type f -newer "$stamp" -print -quit)" ]; then
     say "the message package is up to date"
     return
@@ -106,7 +101,7 @@ interfaces() {
     say "no C++ compiler: monoforce_msgs is not built, its tests will be skipped (sudo apt install g++)"
     return
   fi
-  ros_environment
+  use_ros_wheels
   # Exported CMake targets of the wheels contain paths of the machine that built them; replace these.
   headers=$("$venv/bin/python" -c 'import sysconfig; print(sysconfig.get_paths()["include"])')
   arrays=$("$venv/bin/python" -c 'import numpy; print(numpy.get_include())')
@@ -118,7 +113,7 @@ interfaces() {
     -e "s#/opt/python/[^;\"]*/include/python3[.0-9]*#$headers#g" -e "s#/opt/python/[^;\"]*/numpy/[^;\"]*include#$arrays#g"
   say "building monoforce_msgs"
   mkdir -p out
-  if ! colcon --log-base log build --base-paths "$source" --build-base build --install-base install \
+  if ! colcon --log-base log build --base-paths "$source" --build-base "$build_base" --install-base "$install_base" \
     --event-handlers console_cohesion- --cmake-args -G Ninja -DBUILD_TESTING=OFF -DCMAKE_BUILD_TYPE=Release \
     -DPython3_EXECUTABLE="$venv/bin/python" >out/interfaces.log 2>&1; then
     cat out/interfaces.log >&2

@@ -2,6 +2,7 @@
 
 import ast
 import re
+import shutil
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
@@ -70,7 +71,7 @@ def test_the_licence_and_the_dependencies_are_stated():
     ros = {name for name in imported if name.endswith(("_msgs", "_interfaces")) or name == "rclpy"}
     assert ros <= depends
     # Dependencies outside ROS are installed by rosdep or pip, and must be listed for one of them.
-    named = {name.removeprefix("python3-") for name in depends} | set(re.findall(r'"([a-z-]+)",', SETUP))
+    named = {name.removeprefix("python3-") for name in depends} | set(re.findall(r'"([a-z-]+)>=', SETUP))
     others = {"cv2": "opencv", "yaml": "yaml", "warp": "warp-lang"}
     third = {others.get(name, name) for name in imported - set(sys.stdlib_module_names) - ros - {"monoforce_ros"}}
     assert third - {"tf2_ros", "ament_index_python"} <= named
@@ -143,6 +144,7 @@ def test_the_set_up_says_what_to_install_where_there_is_no_python(tmp_path):
     (tmp_path / "scripts" / "set_up.sh").write_text(
         script.replace("is_python_312() {\n", "is_python_312() {\n  return 1\n")
     )
+    shutil.copy(ROOT / "scripts" / "environment.sh", tmp_path / "scripts")
     (tmp_path / "requirements.lock").write_text("uv==0\n")
     ended = subprocess.run(
         ["bash", str(tmp_path / "scripts" / "set_up.sh"), "environment"], capture_output=True, text=True, timeout=60
