@@ -90,15 +90,16 @@ build() {
   say "built into $install_base/ after $((SECONDS - started)) s"
 }
 
-# Builds the typed messages for planners, next to monoforce_ros in install/. Only this step needs a C++ compiler.
+# Builds the typed messages for planners, and those messages of ROS packages that are not on PyPI, next to monoforce_ros
+# in install/. Only this step needs a C++ compiler.
 interfaces() {
-  local stamp=$install_base/.interfaces source=msg_defs/monoforce_msgs started=$SECONDS headers arrays
-  if [ -f "$stamp" ] && [ -z "$(find "$source" -type f -newer "$stamp" -print -quit)" ]; then
-    say "the message package is up to date"
+  local stamp=$install_base/.interfaces started=$SECONDS headers arrays package packages=()
+  if [ -f "$stamp" ] && [ -z "$(find msg_defs -type f -newer "$stamp" -print -quit)" ]; then
+    say "the message packages are up to date"
     return
   fi
   if ! command -v c++ >/dev/null; then
-    say "no C++ compiler: monoforce_msgs is not built, its tests will be skipped (sudo apt install g++)"
+    say "no C++ compiler: messages are not built, their tests will be skipped (sudo apt install g++)"
     return
   fi
   use_ros_wheels
@@ -106,21 +107,26 @@ interfaces() {
   headers=$("$venv/bin/python" -c 'import sysconfig; print(sysconfig.get_paths()["include"])')
   arrays=$("$venv/bin/python" -c 'import numpy; print(numpy.get_include())')
   if [ ! -f "$headers/Python.h" ]; then
-    say "no headers of Python in $headers: monoforce_msgs is not built, its tests will be skipped (sudo apt install python3-dev)"
+    say "no headers of Python in $headers: messages are not built, their tests will be skipped (sudo apt install python3-dev)"
     return
   fi
   { grep -rlZ '"/opt/python/' "$venv"/share/*/cmake || true; } | xargs -0r sed -i \
     -e "s#/opt/python/[^;\"]*/include/python3[.0-9]*#$headers#g" -e "s#/opt/python/[^;\"]*/numpy/[^;\"]*include#$arrays#g"
-  say "building monoforce_msgs"
+  # An installed ROS has the complete packages.
+  for package in msg_defs/*/package.xml; do
+    package=$(dirname "$package")
+    "$venv/bin/python" -c "import $(basename "$package").msg" 2>/dev/null || packages+=("$package")
+  done
+  say "building ${packages[*]#msg_defs/}"
   mkdir -p out
-  if ! colcon --log-base log build --base-paths "$source" --build-base "$build_base" --install-base "$install_base" \
+  if ! colcon --log-base log build --base-paths "${packages[@]}" --build-base "$build_base" --install-base "$install_base" \
     --event-handlers console_cohesion- --cmake-args -G Ninja -DBUILD_TESTING=OFF -DCMAKE_BUILD_TYPE=Release \
     -DPython3_EXECUTABLE="$venv/bin/python" >out/interfaces.log 2>&1; then
     cat out/interfaces.log >&2
     exit 1
   fi
   touch "$stamp"
-  say "monoforce_msgs built after $((SECONDS - started)) s"
+  say "messages built after $((SECONDS - started)) s"
 }
 
 # Only rendering camera images of synthetic worlds needs a GL library.

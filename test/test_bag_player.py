@@ -9,7 +9,10 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image
 
 from monoforce_ros.bags import BagReader, BagWriter, builders
+from monoforce_ros.core import pose_matrix
+from monoforce_ros.messages import message_class
 from monoforce_ros.messages.decoding import stamp_of
+from monoforce_ros.nodes.frames import TransformListener
 
 START = 1_700_000_000_000_000_000
 COUNT = 60
@@ -91,6 +94,45 @@ def test_a_loop_goes_on_until_interrupted(start, peer, bag):
     images.close()
     first = [stamp_of(m) for m in images.messages].count(START)
     assert first >= 2
+
+
+@pytest.fixture(scope="module")
+def tf_type():
+    kind = message_class("tf2_msgs/msg/TFMessage")
+    if kind is None:
+        pytest.skip("tf2_msgs is not installed (make interfaces builds it)")
+    return kind
+
+
+def write_motion(path, *, tf: bool):
+    with BagWriter(path) as writer:
+        lidar = {"lidar": pose_matrix([1, 2, 3, 0, 0, 0])}
+        writer.write("/tf_static", builders.transforms(START, "base_link", lidar), START)
+        for i in range(60):
+            at = START + 10**9 + i * 50_000_000
+            odometry = builders.odometry(at, "odom", "base_link", [0.1 * i, 0, 0], [0, 0, 0, 1], [0] * 3, [0] * 3)
+            writer.write("/odom", odometry, at)
+            if tf:
+                writer.write("/tf", builders.transforms(at, "odom", {"base_link": pose_matrix([7, 0, 0, 0, 0, 0])}), at)
+    return path
+
+
+@pytest.mark.parametrize("tf", [True, False])
+def test_transforms_are_played_or_derived_from_odometry(start, peer, tf_type, tmp_path, tf):
+    player = start("bag_player", write_motion(tmp_path / "bag", tf=tf), "--start", "2", "--wait", "10", "--quiet")
+    transforms = TransformListener(peer.node)
+    assert finish(peer, player) == 0
+    assert "not played" not in player.output and ("derived from /odom" in player.output) != tf
+    # The static transform lies before the start.
+    assert transforms.tree.find("base_link", "lidar")[:3, 3].tolist() == [1.0, 2.0, 3.0]
+    assert transforms.tree.find("odom", "base_link")[0, 3] == pytest.approx(7.0 if tf else 5.9)
+
+
+def test_no_tf_is_derived_on_request(start, peer, tf_type, tmp_path):
+    player = start("bag_player", write_motion(tmp_path / "bag", tf=False), "--no-tf", "--rate", "5", "--quiet")
+    transforms = TransformListener(peer.node)
+    assert finish(peer, player) == 0
+    assert transforms.tree.find("odom", "base_link") is None
 
 
 def damaged(bag, tmp_path, damage):

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import BagWriter, builders
-from monoforce_ros.core import CommandTrack, MotionTrack
+from monoforce_ros.core import CommandTrack, MotionTrack, pose_matrix
 from monoforce_ros.evaluation.check import BagCheck, check_bag, check_text, command_delay
 from monoforce_ros.evaluation.findings import Level
 from monoforce_ros.robots import load_robot
@@ -21,7 +21,19 @@ def husky():
     return load_robot("husky")
 
 
-def write(path, *, delay=0.2, commands=True, clock=0.0, gap=False, info=True, frame="base_link", sign=1.0, camera=True):
+def write(
+    path,
+    *,
+    delay=0.2,
+    commands=True,
+    clock=0.0,
+    gap=False,
+    info=True,
+    frame="base_link",
+    sign=1.0,
+    camera=True,
+    **extra,
+):
     """Twenty seconds of a recording in which motion follows commands by ``delay``."""
     times = np.arange(0.0, 20.0, 0.05)
 
@@ -32,7 +44,9 @@ def write(path, *, delay=0.2, commands=True, clock=0.0, gap=False, info=True, fr
     speed = commanded(times - delay)[0]
     place = np.cumsum(np.stack([speed * np.cos(heading), speed * np.sin(heading)], axis=1), axis=0) * 0.05
     with BagWriter(path) as bag:
-        bag.write("/tf_static", builders.static_transforms(START, "base_link", {"lidar": np.eye(4)}), START)
+        bag.write(
+            "/tf_static", builders.transforms(START, "base_link", {"lidar": np.eye(4)} | extra.get("extra", {})), START
+        )
         for i, time in enumerate(times):
             at = START + round(1e9 * time)
             if not (gap and 8.0 < time < 11.0):
@@ -91,8 +105,9 @@ def test_a_good_bag_is_complete_and_its_rates_are_reported(tmp_path, husky):
         ({"info": False}, Level.WARNING, "no CameraInfo on /camera_front/camera_info"),
         (
             {"frame": "imu"},
-            Level.WARNING,
-            "odometry describes the frame 'imu', but the robot's base frame is 'base_link'",
+            Level.MISSING,
+            "odometry describes the frame 'imu', lengths in the robot file refer to 'base_link', and the offset "
+            "between them is unknown: no transform has 'imu'",
         ),
         ({"sign": -1.0}, Level.WARNING, "the opposite sign of its poses"),
     ],
@@ -101,6 +116,18 @@ def test_each_fault_is_reported(tmp_path, husky, fault, level, message):
     check = check_bag(write(tmp_path / "drive", **fault), husky)
     assert re.search(message, texts(check, level))
     assert check.usable == (level is not Level.MISSING)
+
+
+def test_an_offset_that_the_bag_knows_is_reported_and_applied(tmp_path, husky):
+    bag = write(
+        tmp_path / "drive", frame="base_footprint", extra={"base_footprint": pose_matrix([0, 0, -0.13, 0, 0, 0])}
+    )
+    check = check_bag(bag, husky)
+    assert check.usable
+    applied = "frames: base_link is at (0.000, 0.000, 0.130) m and turned by 0.0° in base_footprint"
+    assert applied in texts(check, Level.OK)
+    given = check_bag(write(tmp_path / "given", frame="gps"), husky, pose_matrix([0.5, 0, 0, 0, 0, 0]))
+    assert given.usable and "base_link is at (-0.500, 0.000, 0.000) m" in texts(given, Level.OK)
 
 
 def test_the_exit_status_is_1_for_an_unusable_bag(tmp_path, executables, ros_environment, real_data):

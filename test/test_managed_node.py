@@ -98,6 +98,26 @@ def test_a_node_that_cannot_be_configured_keeps_running_and_logs_the_reason(peer
     assert process.stop() == 0
 
 
+def test_the_robot_may_change_while_the_node_is_unconfigured(peer, start):
+    process = start(
+        "predictor", "--ros-args", "-p", "autostart:=false", "-p", "terrain_source:=flat", "-r", "__node:=changing"
+    )
+    process.wait_for("waiting to be configured")
+    assert set_parameters(peer, "/changing", robot="warthog").successful
+    # It is never a managed node's own business to start by itself later.
+    assert "read-only" in set_parameters(peer, "/changing", autostart=True).reason.lower()
+    assert change(peer, "/changing", Transition.TRANSITION_CONFIGURE)
+    refused = set_parameters(peer, "/changing", robot="husky")
+    assert not refused.successful and "robot is read-only while the node is configured" in refused.reason
+    assert change(peer, "/changing", Transition.TRANSITION_ACTIVATE)
+    process.wait_for("predicting 5 s ahead for warthog")
+    assert change(peer, "/changing", Transition.TRANSITION_DEACTIVATE)
+    assert change(peer, "/changing", Transition.TRANSITION_CLEANUP)
+    assert set_parameters(peer, "/changing", robot="no_such_robot").successful
+    assert not change(peer, "/changing", Transition.TRANSITION_CONFIGURE)
+    assert process.stop() == 0
+
+
 BROKEN = """
 import sys, rclpy
 from monoforce_ros.nodes.managed import ManagedNode
@@ -172,10 +192,11 @@ def test_parameters_change_while_it_runs_all_or_none(peer, tunable):
 
 
 def test_every_parameter_is_described_with_its_range(peer, tunable):
-    request = DescribeParameters.Request(names=["rate", "weight_roll", "robot"])
-    rate, weight, robot = call(peer, DescribeParameters, "/tunable/describe_parameters", request).descriptors
+    request = DescribeParameters.Request(names=["rate", "weight_roll", "robot", "autostart"])
+    rate, weight, robot, autostart = call(peer, DescribeParameters, "/tunable/describe_parameters", request).descriptors
     assert "Largest rate" in rate.description and rate.floating_point_range[0].to_value == 100.0
-    assert not rate.read_only and not weight.read_only and robot.read_only
+    assert not rate.read_only and not weight.read_only and autostart.read_only
+    assert not robot.read_only and robot.additional_constraints == "read-only while the node is configured"
 
 
 def test_a_changed_rate_is_kept_to(peer, tunable):

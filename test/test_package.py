@@ -1,6 +1,5 @@
 """The package as seen by ROS tools, and the documents that are generated from its files."""
 
-import ast
 import re
 import shutil
 import subprocess
@@ -11,7 +10,7 @@ from pathlib import Path
 import pytest
 from conftest import INSTALLED, ROOT
 
-from monoforce_ros.nodes.parameters import read_parameter_file
+from monoforce_ros.nodes.schema import read_schema
 
 SETUP = (ROOT / "setup.py").read_text()
 EXECUTABLES = [
@@ -88,7 +87,7 @@ def test_only_nodes_and_messages_import_rclpy():
 
 def parameter_table() -> list[str]:
     rows = ["| parameter | default | range | meaning |", "|---|---|---|---|"]
-    for entry in read_parameter_file(ROOT / "config" / "predictor.yaml"):
+    for entry in read_schema(ROOT / "config" / "predictor.schema.yaml"):
         unit = f" {entry.unit}" if entry.unit else ""
         default = ", ".join(map(str, entry.default)) if isinstance(entry.default, list) else entry.default
         default = str(default).lower() if isinstance(default, bool) else default
@@ -151,21 +150,3 @@ def test_the_set_up_says_what_to_install_where_there_is_no_python(tmp_path):
     )
     assert ended.returncode == 1
     assert "No working Python 3.12" in ended.stderr and "apt install python3.12" in ended.stderr
-
-
-def test_launch_arguments_are_parameters_with_their_defaults():
-    """ROS's launch is not on PyPI: the file is read here, not run."""
-    tree = ast.parse((ROOT / "launch" / "predictor.launch.py").read_text())
-    (table,) = [n.value for n in tree.body if isinstance(n, ast.Assign) and n.targets[0].id == "ARGUMENTS"]
-    known = {entry.name: entry for entry in read_parameter_file(ROOT / "config" / "predictor.yaml")}
-    kinds = {"str": "string", "int": "integer", "bool": "bool"}
-    seen = set()
-    for key, value in zip(table.keys, table.values, strict=True):
-        default, kind, meaning = value.elts
-        if isinstance(kind, ast.Constant) or key.value == "use_sim_time":
-            continue
-        entry = known[key.value]
-        seen.add(key.value)
-        assert kinds[kind.id] == entry.type and default.value == str(entry.default).replace("True", "true")
-        assert len(meaning.value) > 5
-    assert {"robot", "terrain_source", "candidates", "autostart"} <= seen

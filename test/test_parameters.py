@@ -4,7 +4,9 @@ import pytest
 import rclpy
 from conftest import ROOT
 
-from monoforce_ros.nodes.parameters import ParameterEntry, declare_parameters, parameter_help, read_parameter_file
+from monoforce_ros.nodes.parameter_files import parameter_file_text, read_sections, section_matches
+from monoforce_ros.nodes.parameters import declare_parameters, parameter_help
+from monoforce_ros.nodes.schema import SCHEMAS, ParameterEntry, read_schema
 
 ENTRY = ParameterEntry("retention", "double", 1.5, "How long.", 0.0, 10.0, "s", formerly="memory")
 PLAIN = ParameterEntry("mode", "string", "fast", "Which.", choices=("fast", "slow"))
@@ -64,7 +66,59 @@ def test_the_help_names_deprecated_parameters():
 
 @pytest.mark.parametrize("name", ["predictor", "path_selector"])
 def test_parameter_files_have_unique_names_and_full_sentences(name):
-    entries = read_parameter_file(ROOT / "config" / f"{name}.yaml")
+    entries = read_schema(ROOT / "config" / f"{name}.schema.yaml")
     names = [entry.name for entry in entries] + [entry.formerly for entry in entries if entry.formerly]
     assert len(names) == len(set(names))
     assert all(entry.description[-1] == "." and len(entry.description) > 10 for entry in entries)
+
+
+@pytest.mark.parametrize("name", SCHEMAS)
+def test_the_shipped_parameter_files_are_what_the_schemas_say(name):
+    entries = read_schema(ROOT / "config" / f"{name}.schema.yaml")
+    file = ROOT / "config" / f"{name}.params.yaml"
+    advice = "renew it: scripts/run.sh python -m monoforce_ros.nodes.parameter_files"
+    assert file.read_text() == parameter_file_text(name, entries), advice
+    (section,) = read_sections(file).items()
+    assert section == ("/**", {entry.name: entry.default for entry in entries if entry.default is not None})
+
+
+@pytest.mark.parametrize(
+    ("kind", "text", "value"),
+    [("integer", "32", 32), ("double", "2", 2.0), ("double", "1e3", 1000.0), ("bool", "true", True),
+     ("string", "7", "7"), ("double_array", "[0, 0.5]", [0.0, 0.5]), ("string_array", "[a, b]", ["a", "b"])],
+)  # fmt: skip
+def test_texts_become_values_of_the_parameter_s_type(kind, text, value):
+    parsed = ParameterEntry("x", kind, None, "Anything.").parsed(text)
+    assert parsed == value and type(parsed) is type(value)
+
+
+@pytest.mark.parametrize(
+    ("entry", "text", "expected"),
+    [
+        (ParameterEntry("count", "integer", 0, "How many.", 0, 512), "abc", "got 'abc', expected an integer 0 … 512"),
+        (ParameterEntry("count", "integer", 0, "How many.", 0, 512), "700", "got 700, expected an integer 0 … 512"),
+        (ParameterEntry("on", "bool", True, "Whether."), "yess", "on: got 'yess', expected true or false"),
+        (ENTRY, "nan", "retention: got nan, expected a number 0 … 10 s"),
+        (PLAIN, "medium", "mode: got 'medium', expected one of fast, slow"),
+        (ParameterEntry("pose", "double_array", None, "Where.", size=6), "[1.0]", r"got \[1.0\], expected a list of 6"),
+    ],
+)  # fmt: skip
+def test_values_that_do_not_fit_are_answered_with_what_would(entry, text, expected):
+    with pytest.raises(ValueError, match=expected):
+        entry.parsed(text)
+
+
+def test_an_unknown_parameter_is_answered_with_the_nearest_name(declared):
+    with pytest.raises(ValueError, match="unknown parameter 'retension'; did you mean 'retention'"):
+        declared("retension:=3.0")
+
+
+def test_sections_match_nodes_as_in_ros(tmp_path):
+    file = tmp_path / "file.yaml"
+    file.write_text("left:\n  predictor:\n    ros__parameters: {a: 1}\n/*/other:\n  ros__parameters: {b: 2}\n")
+    sections = read_sections(file)
+    assert sections == {"/left/predictor": {"a": 1}, "/*/other": {"b": 2}}
+    assert section_matches("/left/predictor", "/left/predictor")
+    assert not section_matches("/predictor", "/left/predictor")
+    assert section_matches("/*/other", "/left/other") and not section_matches("/*/other", "/a/left/other")
+    assert section_matches("/**", "/left/other") and section_matches("/**/other", "/other")

@@ -169,5 +169,5 @@ def test_the_encoder_has_its_own_number_of_threads_and_the_previous_one_is_resto
 
 
 def test_terrain_sources_are_those_that_the_node_offers():
-    schema = yaml.safe_load((ROOT / "config" / "predictor.yaml").read_text())
+    schema = yaml.safe_load((ROOT / "config" / "predictor.schema.yaml").read_text())
     assert sorted(schema["terrain_source"]["choices"]) == sorted(SOURCES)

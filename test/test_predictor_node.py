@@ -60,6 +60,32 @@ def test_outputs_carry_the_stamp_and_frame_of_their_input(peer, predictor):
     assert abs(first_time.z - (0.3 - 0.14)) < 0.05
 
 
+def test_the_first_prediction_is_logged_and_inputs_are_visible_before_they_are_published(peer, start):
+    process = start("predictor", "--ros-args", "-r", "__ns:=/apart", "-p", "terrain_source:=lidar_camera")
+    process.wait_for("predicting 5 s ahead for husky")
+    expected = {
+        "/apart/odom": "nav_msgs/msg/Odometry",
+        "/apart/cmd_vel": "geometry_msgs/msg/TwistStamped",
+        "/apart/points": "sensor_msgs/msg/PointCloud2",
+        "/apart/camera_front/image_raw/compressed": "sensor_msgs/msg/CompressedImage",
+        "/apart/camera_front/camera_info": "sensor_msgs/msg/CameraInfo",
+    }
+
+    def seen() -> dict:
+        listed = dict(peer.node.get_subscriber_names_and_types_by_node("predictor", "/apart"))
+        return {topic: listed.get(topic, [""])[0] for topic in expected}
+
+    assert peer.until(lambda: seen() == expected, 10.0), seen()
+    assert "first prediction" not in process.output
+    assert process.stop() == 0
+
+
+def test_the_first_prediction_is_logged_once(peer, predictor):
+    healthy(peer, predictor)
+    (line,) = [line for line in predictor.output.splitlines() if "first prediction" in line]
+    assert "5 s ahead, in frame 'odom', published on /predicted/path" in line
+
+
 def refused(peer, predictor, part: str, text: str, seconds: float = 1.4, **bad) -> None:
     """Feed bad input: a diagnostic names it, nothing is predicted, the node survives and then recovers."""
     healthy(peer, predictor)

@@ -9,6 +9,10 @@ from nav_msgs.msg import Odometry
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import PointCloud2
 
+from monoforce_ros.messages import message_class
+from monoforce_ros.nodes.frames import TransformListener
+from monoforce_ros.robots import load_robot
+
 
 @pytest.fixture(scope="module")
 def simulator(start):
@@ -49,6 +53,16 @@ def test_it_follows_commands_and_stops_without_them(peer, simulator, heard):
     cloud = heard["points"][-1]
     assert cloud.header.frame_id == "lidar" and cloud.width * cloud.height > 500
     peer.node.destroy_publisher(publisher)
+
+
+def test_it_publishes_the_transforms_that_viewers_need(peer, simulator, heard):
+    if message_class("tf2_msgs/msg/TFMessage") is None:
+        pytest.skip("tf2_msgs is not installed (make interfaces builds it)")
+    transforms = TransformListener(peer.node)
+    assert peer.until(lambda: transforms.tree.find("odom", "lidar") is not None, 10.0), transforms.tree.frames
+    husky = load_robot("husky")
+    np.testing.assert_allclose(transforms.tree.find("base_link", "lidar"), husky.sensors["lidar"], atol=1e-6)
+    assert np.linalg.norm(transforms.tree.find("odom", "base_link")[:2, 3] - place(heard["odom"][-1])) < 0.2
 
 
 def test_predictor_and_selector_drive_it_to_a_goal(peer, simulator, heard, start):

@@ -183,10 +183,10 @@ def point_cloud(stamp: int, frame_id: str, points: np.ndarray, height: int = 1) 
     )
 
 
-def static_transforms(stamp: int, parent: str, transforms: Mapping[str, np.ndarray]) -> Message:
+def transforms(stamp: int, parent: str, children: Mapping[str, np.ndarray]) -> Message:
     """``tf2_msgs/TFMessage`` of child frames; each matrix is ``[4, 4]``, parent ← child."""
     entries = []
-    for child, matrix in transforms.items():
+    for child, matrix in children.items():
         matrix = np.asarray(matrix, np.float64)
         transform = _make(
             "geometry_msgs/msg/Transform",
@@ -202,6 +202,10 @@ def static_transforms(stamp: int, parent: str, transforms: Mapping[str, np.ndarr
             )
         )
     return _make("tf2_msgs/msg/TFMessage", transforms=entries)
+
+
+static_transforms = transforms
+"""The message on /tf_static is that on /tf."""
 
 
 def string(text: str) -> Message:

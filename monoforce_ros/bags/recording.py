@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +15,11 @@ from monoforce_ros.core import (
     AngularVelocityTrack,
     CameraModel,
     CommandTrack,
+    FrameError,
     MotionState,
     MotionTrack,
+    RobotFrames,
+    TransformTree,
     WheelTrack,
     nearest_stamp,
 )
@@ -29,6 +32,9 @@ IMAGES = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 IMU, JOINTS = "sensor_msgs/msg/Imu", "sensor_msgs/msg/JointState"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
+FIXED = 0.01
+"""Largest change of a transform on /tf between frames that are fixed to each other [m, rad]: a joint that moves less
+displaces what is measured by less than odometry's own error."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +60,7 @@ class Recording:
     cameras: dict[str, CameraModel]
     """Camera model of each image topic that has a CameraInfo topic."""
     static_transforms: dict[tuple[str, str], np.ndarray]
+    """Poses ``[4, 4]`` by parent and child frame: those on /tf_static, and those on /tf that hold still."""
     topics: dict[str, str]
     """Topic used for each of ``odometry``, ``commands``, ``cloud``, ``imu`` and ``joints``."""
     warnings: tuple[str, ...] = ()
@@ -136,7 +143,7 @@ class Recording:
         return find_transform(self.static_transforms, base_frame, frame_id)
 
     def sensor_pose(self, frame_id: str, base_frame: str, known: Mapping[str, object]) -> np.ndarray:
-        """Pose ``[4, 4]`` of a sensor in the base frame: from the bag's static transforms, else from ``known``.
+        """Pose ``[4, 4]`` of a sensor in the base frame: from the bag's transforms, else from ``known``.
 
         Args:
             frame_id: frame of the sensor.
@@ -146,15 +153,29 @@ class Recording:
         Raises:
             BagError: neither has the frame.
         """
-        pose = self.base_from(frame_id, base_frame)
-        if pose is not None:
-            return pose
-        if frame_id in known:
-            return np.asarray(known[frame_id], np.float64)
-        raise BagError(
-            f"{self.path}: the pose of {frame_id!r} on the robot is neither in the bag's /tf_static nor in the robot "
-            f"file, which has {sorted(known)}"
-        )
+        try:
+            return RobotFrames(base_frame, known).sensor_pose(frame_id, TransformTree(self.static_transforms))
+        except FrameError as error:
+            raise BagError(f"{self.path}: {error}") from error
+
+    def in_base_frame(self, base_frame: str, odometry_child_pose: np.ndarray | None = None) -> Recording:
+        """The recording with the motion of the robot's base instead of that of the odometry's child frame.
+
+        Args:
+            base_frame: frame that lengths in the robot file refer to.
+            odometry_child_pose: pose ``[4, 4]`` of the odometry's child frame in it; by default from the bag's
+                transforms.
+
+        Raises:
+            BagError: the frames differ, and the bag has no path between them.
+        """
+        frames = RobotFrames(base_frame, odometry_child_pose=odometry_child_pose)
+        child, tree = self.motion.child_frame_id, TransformTree(self.static_transforms)
+        try:
+            pose = frames.odometry_child(child, tree)
+        except FrameError as error:
+            raise BagError(f"{self.path}: {error}") from error
+        return replace(self, motion=self.motion.of_base(pose, frames.base_name(child, tree.frames)))
 
     def _decoded(self, frames: Sequence[Frame]) -> Iterator[tuple[Frame, Message]]:
         """Messages of frames of one topic, each once, in the order of the bag."""
@@ -187,19 +208,7 @@ def nearest_frame(frames: Sequence[Frame], stamp: int, *, limit: float = np.inf)
 
 def find_transform(transforms: dict[tuple[str, str], np.ndarray], parent: str, child: str) -> np.ndarray | None:
     """``[4, 4]`` parent ← child along any chain of transforms, or None if they are not connected."""
-    parent, child = parent.lstrip("/"), child.lstrip("/")
-    reached = {parent: np.eye(4)}
-    frontier = [parent]
-    while frontier:
-        frame = frontier.pop()
-        if frame == child:
-            return reached[frame]
-        for (upper, lower), matrix in transforms.items():
-            for start, end, step in ((upper, lower, matrix), (lower, upper, np.linalg.inv(matrix))):
-                if start == frame and end not in reached:
-                    reached[end] = reached[frame] @ step
-                    frontier.append(end)
-    return None
+    return TransformTree(transforms).find(parent, child)
 
 
 def camera_info_topic(image_topic: str) -> str:
@@ -239,6 +248,7 @@ class _Collector:
         self.indexed: dict[str, list[Frame]] = {}
         self.cameras: dict[str, CameraModel] = {}
         self.transforms: dict[tuple[str, str], np.ndarray] = {}
+        self._moving: set[tuple[str, str]] = set()
         self.warnings: list[str] = []
 
     def take(self, message: BagMessage) -> None:
@@ -268,8 +278,7 @@ class _Collector:
                 if message.topic not in self.cameras:
                     self.cameras[message.topic] = decoding.decode_camera_info(decoded)
             elif message.message_type == TRANSFORMS:
-                if message.topic.endswith("tf_static"):
-                    self.transforms.update(decoding.decode_transforms(decoded))
+                self._take_transforms(decoding.decode_transforms(decoded), message.topic.endswith("tf_static"))
             else:
                 self.indexed.setdefault(message.topic, []).append(
                     Frame(message.topic, decoding.stamp_of(decoded), message.received)
@@ -277,6 +286,17 @@ class _Collector:
         except ValueError as error:
             if len(self.warnings) < 20:
                 self.warnings.append(f"{message.topic}: {error}")
+
+    def _take_transforms(self, found: dict[tuple[str, str], np.ndarray], static: bool) -> None:
+        """Keep static transforms and, of moving ones, those that hold still: frames fixed on the robot."""
+        for frames, matrix in found.items():
+            if static:
+                self.transforms[frames] = matrix
+            elif frames not in self._moving:
+                first = self.transforms.setdefault(frames, matrix)
+                if np.abs(first - matrix).max() > FIXED:
+                    self._moving.add(frames)
+                    del self.transforms[frames]
 
     def recording(self, image_topics: list[str]) -> Recording:
         if not self.states:

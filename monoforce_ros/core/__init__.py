@@ -3,7 +3,15 @@
 from monoforce_ros.core.alignment import DelayCorrelation, Delayed, largest_spread, nearest_stamp
 from monoforce_ros.core.camera import CameraModel
 from monoforce_ros.core.files import atomic_path, unfinished_path, write_bytes, write_text
-from monoforce_ros.core.geometry import homogeneous, quaternions, small_rotation, transform_points, wrap_angle
+from monoforce_ros.core.frames import FrameError, RobotFrames, TransformTree
+from monoforce_ros.core.geometry import (
+    homogeneous,
+    pose_matrix,
+    quaternions,
+    small_rotation,
+    transform_points,
+    wrap_angle,
+)
 from monoforce_ros.core.lazy import lazy_exports
 from monoforce_ros.core.regimes import FAST_SHARE, motion_regimes
 from monoforce_ros.core.shared_files import share_directory
@@ -26,9 +34,12 @@ __all__ = [
     "CommandTrack",
     "DelayCorrelation",
     "Delayed",
+    "FrameError",
     "MotionState",
     "MotionTrack",
+    "RobotFrames",
     "StaleDataError",
+    "TransformTree",
     "WheelTrack",
     "atomic_path",
     "homogeneous",
@@ -37,6 +48,7 @@ __all__ = [
     "lazy_exports",
     "motion_regimes",
     "nearest_stamp",
+    "pose_matrix",
     "quaternions",
     "share_directory",
     "small_rotation",

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 
 def quaternions(rotations: np.ndarray) -> np.ndarray:
@@ -36,6 +38,13 @@ def homogeneous(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
     matrix[:3, :3] = rotation
     matrix[:3, 3] = translation
     return matrix
+
+
+def pose_matrix(values: Sequence[float]) -> np.ndarray:
+    """``[4, 4]`` transform of x, y, z [m] and roll, pitch, yaw [rad] about fixed axes, as in URDF."""
+    if len(values) != 6:
+        raise ValueError(f"pose: got {len(values)} numbers, expected x, y, z, roll, pitch, yaw")
+    return homogeneous(Rotation.from_euler("xyz", values[3:]).as_matrix(), np.asarray(values[:3], float))
 
 
 def transform_points(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:

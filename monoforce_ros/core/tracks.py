@@ -45,6 +45,19 @@ class MotionState:
         position = self.position + self.rotation @ half @ self.linear_velocity * seconds
         return replace(self, position=position, rotation=self.rotation @ turn)
 
+    def of_base(self, base_from_child: np.ndarray) -> MotionState:
+        """The motion of the base, if this is the motion of a frame with pose ``[4, 4]`` in the base frame."""
+        child_from_base = np.linalg.inv(base_from_child)
+        turn = base_from_child[:3, :3]
+        lever = child_from_base[:3, 3]
+        return replace(
+            self,
+            position=self.position + self.rotation @ lever,
+            rotation=self.rotation @ child_from_base[:3, :3],
+            linear_velocity=turn @ (self.linear_velocity + np.cross(self.angular_velocity, lever)),
+            angular_velocity=turn @ self.angular_velocity,
+        )
+
     @property
     def odometry_from_base(self) -> np.ndarray:
         """Homogeneous transform ``[4, 4]``."""
@@ -121,6 +134,27 @@ class MotionTrack:
             rotation=Slerp([0.0, 1.0], pair)(fraction).as_matrix(),
             linear_velocity=blend(self.linear_velocities),
             angular_velocity=blend(self.angular_velocities),
+        )
+
+    def of_base(self, base_from_child: np.ndarray, base_frame: str) -> MotionTrack:
+        """The motion of the base, if this is the motion of a frame with pose ``[4, 4]`` in the base frame.
+
+        Args:
+            base_from_child: pose of the frame that was measured.
+            base_frame: name of the base frame.
+        """
+        if np.allclose(base_from_child, np.eye(4), atol=1e-9):
+            return replace(self, child_frame_id=base_frame)
+        child_from_base = np.linalg.inv(base_from_child)
+        turn, lever = base_from_child[:3, :3], child_from_base[:3, 3]
+        rotations = Rotation.from_quat(self.quaternions)
+        return replace(
+            self,
+            positions=self.positions + rotations.apply(lever),
+            quaternions=(rotations * Rotation.from_matrix(child_from_base[:3, :3])).as_quat(),
+            linear_velocities=(self.linear_velocities + np.cross(self.angular_velocities, lever)) @ turn.T,
+            angular_velocities=self.angular_velocities @ turn.T,
+            child_frame_id=base_frame,
         )
 
     def base_between(self, start: int, end: int, *, maximum_gap: float = 0.5) -> np.ndarray:

@@ -35,12 +35,14 @@ class BagCheck:
         return not any(finding.level is Level.MISSING for finding in self.findings)
 
 
-def check_bag(path: str | Path, robot: RobotModel) -> BagCheck:
+def check_bag(path: str | Path, robot: RobotModel, odometry_child_pose: np.ndarray | None = None) -> BagCheck:
     """Read a bag once and report its contents, missing data and faults.
 
     Args:
         path: the bag.
         robot: its file may define sensor poses that the bag lacks; commands are compared with its limits.
+        odometry_child_pose: pose ``[4, 4]`` of the odometry's child frame in the base frame; by default from the bag's
+            transforms.
 
     Raises:
         BagError: nothing of the bag can be read.
@@ -58,14 +60,16 @@ def check_bag(path: str | Path, robot: RobotModel) -> BagCheck:
             findings.append(warning(str(error)))
     for topic in topics.values():
         findings += topic.findings()
-    findings += _contents(path, robot, topics.values())
+    findings += _contents(path, robot, topics.values(), odometry_child_pose)
     return BagCheck(
         Path(path), duration, tuple(sorted(topics.values(), key=lambda topic: topic.topic)),
         tuple(sorted(findings, key=lambda finding: finding.level.rank)),
     )  # fmt: skip
 
 
-def _contents(path: str | Path, robot: RobotModel, topics: Collection[TopicCheck]) -> Iterator[Finding]:
+def _contents(
+    path: str | Path, robot: RobotModel, topics: Collection[TopicCheck], odometry_child_pose: np.ndarray | None
+) -> Iterator[Finding]:
     """Findings about the odometry, commands and sensors of a bag."""
     try:
         recording = Recording.open(path)
@@ -75,11 +79,13 @@ def _contents(path: str | Path, robot: RobotModel, topics: Collection[TopicCheck
     motion = recording.motion
     span = (int(motion.stamps[-1]) - int(motion.stamps[0])) * NANOSECOND
     yield ok(f"odometry {recording.topics['odometry']}: {motion.frame_id} → {motion.child_frame_id}, {span:.1f} s")
-    if motion.child_frame_id != robot.base_frame:
-        yield warning(
-            f"odometry describes the frame {motion.child_frame_id!r}, but the robot's base frame is "
-            f"{robot.base_frame!r}: set base_frame in the robot's file, or transform the odometry"
-        )
+    try:
+        recording = recording.in_base_frame(robot.base_frame, odometry_child_pose)
+    except BagError as error:
+        yield missing(f"frames: {error}")
+    else:
+        yield from _offset_findings(motion, recording.motion)
+        motion = recording.motion
     smoothed = smooth(motion)
     yield from _motion_findings(recording, smoothed, span)
     if len(recording.commands):
@@ -92,6 +98,20 @@ def _contents(path: str | Path, robot: RobotModel, topics: Collection[TopicCheck
         yield note("neither clouds nor images can be used: only `--terrain flat` is possible")
     if not any(topic.message_type == IMU for topic in topics):
         yield note("no IMU: a gyro bias or a delayed pose clock is harder to identify")
+
+
+def _offset_findings(measured: MotionTrack, base: MotionTrack) -> Iterator[Finding]:
+    """How the base lies relative to the frame that the odometry describes."""
+    if measured.child_frame_id == base.child_frame_id:
+        return
+    turn = Rotation.from_quat(measured.quaternions[0]).inv()
+    # Rounded, and without the sign of a negative zero.
+    x, y, z = np.round(turn.apply(base.positions[0] - measured.positions[0]), 3) + 0.0
+    angle = float((turn * Rotation.from_quat(base.quaternions[0])).magnitude())
+    yield ok(
+        f"frames: {base.child_frame_id} is at ({x:.3f}, {y:.3f}, {z:.3f}) m and turned by {np.degrees(angle):.1f}° in "
+        f"{measured.child_frame_id}; this offset is applied to the odometry"
+    )
 
 
 def _cloud_findings(recording: Recording, robot: RobotModel) -> Iterator[Finding]:

@@ -79,7 +79,7 @@ def evaluate_sequence(bag: Path, robot: RobotModel, systems: Sequence[System]) -
     Raises:
         BagError, CheckpointError, EvaluationError: the bag or a checkpoint cannot be used.
     """
-    recording = Recording.open(bag)
+    recording = Recording.open(bag).in_base_frame(robot.base_frame)
     evaluations: dict[str, RecordingEvaluation] = {}
     for system in systems:
         if system.key in (FLAT.key, CONSTANT.key):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -121,6 +121,65 @@ def occupancy_grid(
     writer.fields("fII", resolution, columns, rows)
     writer.fields("ddddddd", *origin, 0.0, 0.0, 0.0, 1.0)
     writer.sequence(np.asarray(data, np.int8).reshape(-1), 1)
+    return writer.bytes()
+
+
+def grid_map(
+    stamp: int,
+    frame_id: str,
+    resolution: float,
+    origin: tuple[float, float],
+    layers: Mapping[str, np.ndarray],
+    basic_layers: Sequence[str],
+) -> bytes:
+    """``grid_map_msgs/GridMap`` of layers ``[rows, columns]`` along the axes of the frame; NaN is unknown.
+
+    grid_map's first cell has the largest x and y, its row index runs against x and its column index against y, and its
+    arrays are column-major.
+
+    Args:
+        stamp: [ns].
+        frame_id: frame of the map.
+        resolution: edge of a cell [m].
+        origin: x and y of the corner of cell (0, 0) of the layers [m].
+        layers: values by name, all of one shape, indexed ``[row = y, column = x]``.
+        basic_layers: layers without which a cell is unknown.
+    """
+    rows, columns = next(iter(layers.values())).shape
+    writer = CdrWriter()
+    writer.header(stamp, frame_id)
+    length = columns * resolution, rows * resolution
+    writer.fields("ddd", resolution, *length)
+    writer.fields("ddddddd", origin[0] + 0.5 * length[0], origin[1] + 0.5 * length[1], 0.0, 0.0, 0.0, 0.0, 1.0)
+    writer.strings(tuple(layers))
+    writer.strings(tuple(basic_layers))
+    writer.fields("I", len(layers))
+    for values in layers.values():
+        writer.fields("I", 2)
+        # Columns of the message are rows of the layer, along y.
+        for label, size, stride in (("column_index", rows, rows * columns), ("row_index", columns, columns)):
+            writer.string(label)
+            writer.fields("II", size, stride)
+        writer.fields("I", 0)
+        writer.sequence(np.asarray(values[::-1, ::-1], "<f4").reshape(-1), 4)
+    writer.fields("HH", 0, 0)
+    return writer.bytes()
+
+
+def costmap_filter_info(stamp: int, kind: int, mask_topic: str, base: float, multiplier: float) -> bytes:
+    """``nav2_msgs/CostmapFilterInfo``: a cell of the mask means ``data * multiplier + base``.
+
+    Args:
+        stamp: [ns].
+        kind: 0 keepout, 1 speed limit in per cent, 2 speed limit in m/s, 3 binary.
+        mask_topic: topic of the ``nav_msgs/OccupancyGrid``.
+        base, multiplier: conversion of the mask's values.
+    """
+    writer = CdrWriter()
+    writer.header(stamp, "")
+    writer.fields("B", kind)
+    writer.string(mask_topic)
+    writer.fields("ff", base, multiplier)
     return writer.bytes()
 
 

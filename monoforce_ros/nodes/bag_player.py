@@ -12,12 +12,16 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
-from rclpy.utilities import remove_ros_args
 from rosgraph_msgs.msg import Clock
 
-from monoforce_ros.bags import BagError, BagReader
+from monoforce_ros.bags import BagError, BagMessage, BagReader, type_store
 from monoforce_ros.core import share_directory
 from monoforce_ros.messages import message_class
+from monoforce_ros.nodes.arguments import NodeArgumentParser, own_arguments
+from monoforce_ros.nodes.frames import TRANSFORMS
+from monoforce_ros.nodes.odometry_transform import odometry_transform
+from monoforce_ros.nodes.parameters import refuse_unknown_parameters
+from monoforce_ros.nodes.process import initialise
 from monoforce_ros.reporting import progress_bar
 
 # Fast DDS 2 (Jazzy) reads the first, Fast DDS 3 the second.
@@ -25,7 +29,7 @@ _PROFILES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 
 
 def _arguments(arguments: list[str]) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
+    parser = NodeArgumentParser(
         prog="bag_player", description="Publish the messages of a bag (ROS 2 or ROS 1) with their recorded timing."
     )
     parser.add_argument("bag", nargs="?", help="rosbag2 folder or ROS 1 .bag file (default: the demo bag)")
@@ -37,6 +41,11 @@ def _arguments(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--topics", nargs="+", default=None, metavar="TOPIC", help="play only these topics")
     parser.add_argument(
         "--wait", type=float, default=3.0, help="seconds to wait for the first subscriber before playing (default 3)"
+    )
+    parser.add_argument(
+        "--no-tf",
+        action="store_true",
+        help="do not derive /tf from the odometry of a bag without /tf",
     )
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     options = parser.parse_args(arguments)
@@ -52,6 +61,7 @@ class BagPlayer(Node):
 
     def __init__(self, bag: BagReader, options: argparse.Namespace):
         super().__init__("bag_player")
+        refuse_unknown_parameters(self)
         self.bag = bag
         self.options = options
         self.playable: dict[str, Publisher] = {}
@@ -62,9 +72,9 @@ class BagPlayer(Node):
             if message_type_class is None:
                 self.get_logger().warning(f"{topic} is not played: {message_type} is not installed")
                 continue
-            latched = topic.rsplit("/", 1)[-1] == "tf_static"
+            latched = _is_static(topic)
             quality = QoSProfile(
-                depth=10,
+                depth=100 if latched else 10,
                 reliability=ReliabilityPolicy.RELIABLE,
                 durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
             )
@@ -73,6 +83,18 @@ class BagPlayer(Node):
         if missing:
             raise BagError(f"{bag.path} has no topics {missing}; its topics are {sorted(bag.topics)}")
         self.clock = self.create_publisher(Clock, "/clock", 10) if options.clock else None
+        self._odometry, self._transforms = self._prepare_transforms()
+
+    def _prepare_transforms(self) -> tuple[str, Publisher | None]:
+        """The odometry topic whose poses are published on /tf, and the publisher; None if there is nothing to do."""
+        played = [topic for topic in self.bag.of_type("nav_msgs/msg/Odometry") if topic in self.playable]
+        recorded = [topic for topic in self.bag.of_type(TRANSFORMS) if not _is_static(topic)]
+        kind = message_class(TRANSFORMS)
+        if self.options.no_tf or recorded or not played or kind is None:
+            return "", None
+        topic = max(played, key=lambda name: self.bag.counts[name])
+        self.get_logger().info(f"the bag has no /tf: it is derived from {topic} (--no-tf disables this)")
+        return topic, self.create_publisher(kind, "/tf", 100)
 
     def wait_for_subscribers(self) -> None:
         """Wait for a first subscriber, and then a little longer for further ones."""
@@ -95,8 +117,26 @@ class BagPlayer(Node):
                 break
         return published
 
+    def _publish_earlier_transforms(self, start: int) -> None:
+        """Publish the static transforms before the start: they hold from then on."""
+        static = [topic for topic in self.playable if _is_static(topic)]
+        for message in self.bag.messages(static, stop=start) if static and start > self.bag.start else ():
+            self.playable[message.topic].publish(message.cdr())
+
+    def _publish_pose(self, message: BagMessage) -> None:
+        """Publish an odometry message's pose on /tf."""
+        if self._transforms is None or message.topic != self._odometry:
+            return
+        try:
+            transform = odometry_transform(message.decode())
+        except ValueError as error:
+            self.get_logger().warning(f"/tf: {error}", throttle_duration_sec=10.0)
+            return
+        self._transforms.publish(bytes(type_store().serialize_cdr(transform, TRANSFORMS)))
+
     def _play_once(self) -> int:
         start = self.bag.start + int(self.options.start * 1e9)
+        self._publish_earlier_transforms(start)
         length = self.options.duration if self.options.duration is not None else (self.bag.end - start) * 1e-9
         stop = start + int(length * 1e9)
         published = 0
@@ -118,6 +158,7 @@ class BagPlayer(Node):
                     now = Clock()
                     now.clock.sec, now.clock.nanosec = divmod(message.received, 10**9)
                     self.clock.publish(now)
+                self._publish_pose(message)
                 self.playable[message.topic].publish(message.cdr())
                 published += 1
                 bar.update(elapsed - bar.n)
@@ -133,15 +174,19 @@ class BagPlayer(Node):
             time.sleep(min(remaining, 0.1))
 
 
+def _is_static(topic: str) -> bool:
+    return topic.rsplit("/", 1)[-1] == "tf_static"
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run the player; see ``--help``."""
     command_line = sys.argv if arguments is None else ["bag_player", *arguments]
-    options = _arguments(remove_ros_args(command_line)[1:])
+    options = _arguments(own_arguments(command_line[1:]))
     # Raw images do not fit into the default shared memory segment; this must be set before the first node.
     for variable in _PROFILES:
         os.environ.setdefault(variable, str(share_directory() / "config" / "fastdds_large_messages.xml"))
-    rclpy.init(args=command_line, signal_handler_options=SignalHandlerOptions.ALL)
     try:
+        initialise(command_line, SignalHandlerOptions.ALL)
         with BagReader(options.bag or share_directory() / "bags" / "demo") as bag:
             player = BagPlayer(bag, options)
             player.get_logger().info(
@@ -158,7 +203,7 @@ def main(arguments: list[str] | None = None) -> int:
                     publisher.wait_for_all_acked(rclpy.duration.Duration(seconds=1.0))
             player.linger()
             player.destroy_node()
-    except BagError as error:
+    except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

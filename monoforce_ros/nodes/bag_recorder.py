@@ -11,14 +11,16 @@ import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.utilities import remove_ros_args
 
 from monoforce_ros.bags import BagWriter
 from monoforce_ros.messages import message_class
+from monoforce_ros.nodes.arguments import NodeArgumentParser, own_arguments
+from monoforce_ros.nodes.parameters import refuse_unknown_parameters
+from monoforce_ros.nodes.process import initialise
 
 
 def _arguments(arguments: list[str]) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
+    parser = NodeArgumentParser(
         prog="bag_recorder", description="Record topics into a rosbag2 bag until interrupted (SIGINT or SIGTERM)."
     )
     parser.add_argument("out", help="folder of the bag; must not exist")
@@ -33,6 +35,7 @@ class BagRecorder(Node):
 
     def __init__(self, bag: BagWriter, topics: list[str] | None):
         super().__init__("bag_recorder")
+        refuse_unknown_parameters(self)
         self._bag = bag
         self._topics = topics
         self._subscribed: set[str] = set()
@@ -78,8 +81,12 @@ class BagRecorder(Node):
 def main(arguments: list[str] | None = None) -> int:
     """Run the recorder; see ``--help``."""
     command_line = sys.argv if arguments is None else ["bag_recorder", *arguments]
-    options = _arguments(remove_ros_args(command_line)[1:])
-    rclpy.init(args=command_line)
+    options = _arguments(own_arguments(command_line[1:]))
+    try:
+        initialise(command_line)
+    except ValueError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
     for unfinished in BagWriter.unfinished(options.out):
         print(f"an earlier recording was killed and is in {unfinished}; it can be read as it is", file=sys.stderr)
     try:

@@ -9,7 +9,7 @@ from matplotlib import colormaps
 from monoforce_ros.core import MotionState, quaternions, transform_points
 from monoforce_ros.messages import CdrWriter, encoding
 from monoforce_ros.physics import Rollout
-from monoforce_ros.planning import WAYPOINTS, Assessment, Occupancy
+from monoforce_ros.planning import WAYPOINTS, Assessment
 from monoforce_ros.prediction import HORIZONS, GapSummary, Prediction, Spread, usable_steps
 from monoforce_ros.robots import RobotModel
 
@@ -204,8 +204,3 @@ def live_gap(found: GapSummary) -> bytes:
     count = np.full(len(HORIZONS), found.count)
     values = np.column_stack([HORIZONS, found.position, found.heading, found.floor, count])
     return encoding.float_table("horizon", columns, values)
-
-
-def occupancy_grid(stamp: int, found: Occupancy, frame_id: str) -> bytes:
-    """``nav_msgs/OccupancyGrid``, aligned with the axes of the frame."""
-    return encoding.occupancy_grid(stamp, frame_id, found.resolution, (*found.origin, found.height), found.data)

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import torch
-from nav_msgs.msg import OccupancyGrid, Path
+from nav_msgs.msg import Path
 from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Float32MultiArray
@@ -28,7 +28,6 @@ from monoforce_ros.planning import (
     assess,
     fan_of_arcs,
     force_every,
-    occupancy,
     over_horizon,
     refine,
 )
@@ -66,7 +65,6 @@ class CandidateOutput:
             "candidates": node.create_publisher(MarkerArray, "predicted/candidates", 1),
             "candidate_costs": node.create_publisher(PointCloud2, "predicted/candidate_costs", 1),
             "best_path": node.create_publisher(Path, "predicted/best_path", 1),
-            "occupancy": node.create_publisher(OccupancyGrid, "predicted/occupancy", 1),
         }
         # If the message package is built, planners get everything in one typed message.
         if typed := message_class(TYPED_MESSAGE):
@@ -109,7 +107,7 @@ class CandidateOutput:
         sequences = self._sequences()
         if not len(sequences):
             return
-        motion, terrain, settings = prediction.motion, prediction.terrain, self._settings
+        motion, settings = prediction.motion, self._settings
         # Candidates take effect after the delay; the last command holds until then.
         delay = min(round(settings.candidate_delay / self._predictor.options.time_step), self._predictor.steps - 1)
         start, steps = self._predictor.history + delay, self._predictor.steps - delay
@@ -122,13 +120,9 @@ class CandidateOutput:
             refined_rollout, refined_assessment = self._assess(prediction, refined)
             twists = np.concatenate([twists, refined])
             rollout, assessment = rollout.joined(refined_rollout), assessment.joined(refined_assessment)
-        grid = occupancy(
-            terrain, motion.odometry_from_terrain, slope_limit=settings.slope_limit, step_limit=settings.step_limit
-        )
         data = {
             "candidates": messages.candidate_markers(motion, rollout, assessment, frame_id),
             "candidate_costs": messages.candidate_costs(motion, rollout, twists[:, start], assessment, frame_id),
-            "occupancy": messages.occupancy_grid(motion.stamp, grid, frame_id),
         }
         if assessment.best is not None:
             data["best_path"] = messages.best_path(motion, rollout, assessment.best, frame_id, settings.path_time_step)

@@ -1,58 +1,47 @@
-"""Sensor poses on the robot: from /tf_static if tf2 is installed, otherwise from the robot file."""
+"""TransformListener: the transforms on /tf and /tf_static, without waiting for any."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
 
-import numpy as np
-from geometry_msgs.msg import Transform
 from rclpy.node import Node
-from rclpy.time import Time
-from scipy.spatial.transform import Rotation
+from rclpy.qos import DurabilityPolicy, QoSProfile
 
-from monoforce_ros.messages import MessageError
-from monoforce_ros.robots import RobotModel
+from monoforce_ros.core import TransformTree
+from monoforce_ros.messages import MessageError, decoding, message_class
 
-if TYPE_CHECKING:
-    from tf2_ros import Buffer as TransformBuffer
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
 
 
-class SensorFrames:
-    """Poses of sensor frames in the robot's base frame.
+class TransformListener:
+    """Keeps the newest transform of every frame on ``/tf`` and ``/tf_static``.
 
-    tf2 is part of every ROS installation but not of the Python wheels, so it is used if it can be imported.
-    ``/tf_static`` takes precedence over the robot file, which describes the model, not the individual robot.
+    tf2's own listener keeps a history and needs tf2_ros; the newest transforms suffice for frames fixed on the robot
+    and for slowly corrected ones such as ``map`` to ``odom``. Without the package tf2_msgs there are none.
+
+    Args:
+        node: the node that subscribes; its executor calls the listener. Remappings such as ``/tf:=tf`` apply.
     """
 
-    def __init__(self, node: Node, robot: RobotModel):
-        self._robot = robot
-        self._buffer: TransformBuffer | None = None
-        try:
-            from tf2_ros import Buffer, TransformListener
-        except ImportError:
+    def __init__(self, node: Node):
+        self.tree = TransformTree()
+        self._node = node
+        kind = message_class(TRANSFORMS)
+        self.available = kind is not None
+        """Whether transforms can be received at all."""
+        if kind is None:
             return
-        self._buffer = Buffer()
-        # The node's own executor spins the listener; the look-ups below never wait.
-        self._listener = TransformListener(self._buffer, node)
-
-    def base_from(self, frame_id: str) -> np.ndarray:
-        """Pose ``[4, 4]`` of a frame in the base frame; raises ``MessageError``, which lists the known frames."""
-        frame = frame_id.lstrip("/")
-        if frame == self._robot.base_frame:
-            return np.eye(4)
-        if self._buffer is not None and self._buffer.can_transform(self._robot.base_frame, frame, Time()):
-            return _matrix(self._buffer.lookup_transform(self._robot.base_frame, frame, Time()).transform)
-        if frame in self._robot.sensors:
-            return self._robot.sensors[frame].double().numpy()
-        raise MessageError(
-            f"the pose of frame {frame_id!r} on the robot is unknown: add it to the robot file under `sensors` "
-            f"(frames there: {sorted(self._robot.sensors)}) or publish it on /tf_static"
+        latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._subscriptions = (
+            node.create_subscription(kind, "/tf", self._on_transforms, QoSProfile(depth=100)),
+            node.create_subscription(kind, "/tf_static", self._on_transforms, latched),
         )
 
-
-def _matrix(transform: Transform) -> np.ndarray:
-    rotation, translation = transform.rotation, transform.translation
-    matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_quat([rotation.x, rotation.y, rotation.z, rotation.w]).as_matrix()
-    matrix[:3, 3] = [translation.x, translation.y, translation.z]
-    return matrix
+    def _on_transforms(self, message: Any) -> None:
+        try:
+            found = decoding.decode_transforms(message)
+        except MessageError as error:
+            self._node.get_logger().warning(f"/tf: {error}", throttle_duration_sec=10.0)
+            return
+        for (parent, child), matrix in found.items():
+            self.tree.add(parent, child, matrix)

@@ -22,6 +22,8 @@ class ManagedNode(LifecycleNode):
         self._failure: Exception | None = None
         self._entities_before: set[int] = set()
         self._active = self._autostarting = False
+        self.configured = False
+        """Whether the node is set up, or being set up."""
 
     def set_up(self) -> None:
         """Get ready to work.
@@ -54,6 +56,7 @@ class ManagedNode(LifecycleNode):
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Set up; back to unconfigured if that fails."""
         self._entities_before = {id(entity) for entity in self._entities()}
+        self.configured = True
         try:
             self.set_up()
         except (ValueError, OSError) as error:
@@ -122,6 +125,7 @@ class ManagedNode(LifecycleNode):
         return [*self.publishers, *self.subscriptions, *self.timers]
 
     def _clean_up(self) -> None:
+        self.configured = False
         created = [entity for entity in self._entities() if id(entity) not in self._entities_before]
         for entity in created:
             if isinstance(entity, Timer):

@@ -1,73 +1,74 @@
-"""Node parameters from a YAML file with the type, default, range and meaning of each."""
+"""Parameters of a node: declared from its schema, checked, and followed while the node runs."""
 
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Callable, Iterable
 from types import SimpleNamespace
 
-import yaml
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-ParameterValue = bool | int | float | str | list[float] | list[str]
+from monoforce_ros.nodes.schema import SCHEMAS, ParameterEntry, ParameterValue, nearest, read_schema, schema_path
+
+_OF_EVERY_NODE = ("use_sim_time", "start_type_description_service", "qos_overrides.")
+"""Parameters that rclpy itself declares or understands; the last one is a prefix."""
+_SOMETIMES = "read-only while the node is configured"
 
 
-@dataclass(frozen=True)
-class ParameterEntry:
-    """A parameter as the YAML file describes it."""
-
-    name: str
-    type: str
-    """``bool``, ``integer``, ``double``, ``string``, ``double_array`` or ``string_array``."""
-    default: ParameterValue
-    description: str
-    minimum: float | None = None
-    maximum: float | None = None
-    unit: str = ""
-    choices: tuple[str, ...] = ()
-    dynamic: bool = False
-    """Whether it may be changed while the node runs."""
-    formerly: str = ""
-    """Deprecated name under which a value is still accepted at start-up."""
-
-    @property
-    def range_text(self) -> str:
-        """The allowed values as text."""
-        if self.choices:
-            return " | ".join(self.choices)
-        return "" if self.minimum is None else f"{self.minimum:g} … {self.maximum:g}"
-
-
-def read_parameter_file(path: Path) -> list[ParameterEntry]:
-    """Entries of a parameter file, in its order."""
-    content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    return [
-        ParameterEntry(name, **{**entry, "choices": tuple(entry.get("choices", ()))}) for name, entry in content.items()
-    ]
-
-
-def declare_parameters(node: Node, entries: list[ParameterEntry]) -> SimpleNamespace:
+def declare_parameters(node: Node, entries: list[ParameterEntry], *, changeable: Iterable[str] = ()) -> SimpleNamespace:
     """Declare the entries on a node and return their values.
 
     A value given under a deprecated name replaces the default and is logged as a warning; a value under the current
     name takes precedence.
 
+    Args:
+        node: node that gets the parameters.
+        entries: their definitions.
+        changeable: names of parameters that are not dynamic but may change at times; :func:`follow_changes` decides
+            when.
+
     Raises:
-        ValueError: a value has the wrong type or is outside its range or choices.
+        ValueError: a value has the wrong type or is outside its range or choices, or a value was given for a
+            parameter that does not exist.
     """
+    refuse_unknown_parameters(node, entries)
+    changeable = frozenset(changeable)
     values = SimpleNamespace()
     for entry in entries:
         default = entry.default
         if entry.formerly and (old := _deprecated_value(node, entry)) is not None:
             node.get_logger().warning(f"parameter '{entry.formerly}' is deprecated: use '{entry.name}'")
             default = old
-        setattr(values, entry.name, _declare(node, entry, entry.name, default))
+        read_only = not entry.dynamic and entry.name not in changeable
+        setattr(values, entry.name, _declare(node, entry, entry.name, default, read_only=read_only))
     return values
+
+
+def refuse_unknown_parameters(node: Node, entries: Iterable[ParameterEntry] = ()) -> None:
+    """Raise ``ValueError`` if a value was given for a parameter that the node does not have.
+
+    Parameters of the package's other nodes are only logged: several nodes may share a file with the key ``/**``.
+    """
+    known = {name for entry in entries for name in (entry.name, entry.formerly) if name}
+    others = {entry.name: other for other in SCHEMAS for entry in read_schema(schema_path(other))}
+    unused = []
+    # rclpy keeps the values given on the command line and in files only here.
+    for name in node._parameter_overrides:
+        if name in known or name.startswith(_OF_EVERY_NODE):
+            continue
+        if not known:
+            raise ValueError(
+                f"unknown parameter {name!r}: {node.get_name()} has no parameters; --help lists its options"
+            )
+        if name not in others:
+            raise ValueError(f"unknown parameter {name!r}{nearest(name, known)} --help lists all parameters")
+        unused.append(name)
+    if unused:
+        owners = " and ".join(sorted({others[name] for name in unused}))
+        node.get_logger().warning(f"not used by this node: {', '.join(sorted(unused))} (of {owners})")
 
 
 def _deprecated_value(node: Node, entry: ParameterEntry) -> ParameterValue | None:
@@ -77,12 +78,14 @@ def _deprecated_value(node: Node, entry: ParameterEntry) -> ParameterValue | Non
     return value
 
 
-def _declare(node: Node, entry: ParameterEntry, name: str, default: ParameterValue | None) -> ParameterValue | None:
+def _declare(
+    node: Node, entry: ParameterEntry, name: str, default: ParameterValue | None, *, read_only: bool = False
+) -> ParameterValue | None:
     """Declare a parameter under a name and return its value; without a default, None if no value was given."""
     descriptor = ParameterDescriptor(
         description=f"{entry.description}{f' [{entry.unit}]' if entry.unit else ''}",
-        additional_constraints=entry.range_text if entry.choices else "",
-        read_only=default is not None and not entry.dynamic,
+        additional_constraints=entry.range_text if entry.choices else "" if read_only or entry.dynamic else _SOMETIMES,
+        read_only=read_only,
     )
     if entry.type == "integer":
         descriptor.integer_range = [IntegerRange(from_value=entry.minimum, to_value=entry.maximum, step=1)]
@@ -96,6 +99,8 @@ def _declare(node: Node, entry: ParameterEntry, name: str, default: ParameterVal
     except (InvalidParameterTypeException, InvalidParameterValueException) as error:
         expected = f"{entry.type} {entry.range_text}".strip()
         raise ValueError(f"parameter {name}: {error}; expected {expected} {entry.unit}".rstrip()) from error
+    if entry.size and value is not None and len(value) != entry.size:
+        raise ValueError(f"parameter {name}: got {len(value)} values, expected {entry.expected}")
     if entry.choices and value is not None and value not in entry.choices:
         raise ValueError(f"parameter {name}: got {value!r}, expected one of {list(entry.choices)}")
     return value
@@ -106,14 +111,16 @@ def follow_changes(
     entries: list[ParameterEntry],
     current: Callable[[], SimpleNamespace],
     change: Callable[[SimpleNamespace], None],
+    fixed: Callable[[str], str] = lambda name: "",
 ) -> None:
-    """Check changes of dynamic parameters together, and apply either all of them or none.
+    """Check changes of parameters together, and apply either all of them or none.
 
     Args:
         node: node with the parameters.
         entries: definitions of the parameters.
         current: returns the values in use, as :func:`declare_parameters` does.
         change: applies all values, with the changes among them; raises ``ValueError`` if it refuses them.
+        fixed: why a parameter that is not dynamic may not change now; empty if it may.
     """
     known = {entry.name: entry for entry in entries}
 
@@ -123,6 +130,8 @@ def follow_changes(
             entry = known.get(parameter.name)
             if entry is None:
                 continue
+            if not entry.dynamic and (reason := fixed(entry.name)):
+                return SetParametersResult(successful=False, reason=reason)
             if entry.choices and parameter.value not in entry.choices:
                 reason = f"{entry.name}: got {parameter.value!r}, expected one of {list(entry.choices)}"
                 return SetParametersResult(successful=False, reason=reason)
@@ -146,6 +155,7 @@ def parameter_help(executable: str, entries: list[ParameterEntry]) -> str:
     for entry in entries:
         limits = f" ({entry.range_text}{f' {entry.unit}' if entry.unit else ''})" if entry.range_text else ""
         formerly = f" (formerly {entry.formerly}, deprecated)" if entry.formerly else ""
-        lines.append(f"  {entry.name}:={entry.default}{limits}{formerly}")
+        default = "" if entry.default is None else entry.default
+        lines.append(f"  {entry.name}:={default}{limits}{formerly}")
         lines += textwrap.wrap(entry.description, 100, initial_indent="      ", subsequent_indent="      ")
     return "\n".join(lines)

@@ -1,27 +1,59 @@
-"""path_selector: drives the robot to a goal with the predictor's candidates; an example of their use."""
+"""path_selector: drives the robot to a goal, or along a plan, with the predictor's candidates."""
 
 from __future__ import annotations
 
 import sys
 import time
+from dataclasses import dataclass
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped, TwistStamped
-from nav_msgs.msg import OccupancyGrid, Odometry
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 
-from monoforce_ros.core import NANOSECOND, MotionState, share_directory
+from monoforce_ros.core import NANOSECOND, FrameError, MotionState, RobotFrames, pose_matrix, transform_points
 from monoforce_ros.messages import decoding
+from monoforce_ros.nodes.command_output import CommandOutput
+from monoforce_ros.nodes.frames import TransformListener
 from monoforce_ros.nodes.health import ERROR, OK, WARN, Health
-from monoforce_ros.nodes.parameters import declare_parameters, parameter_help, read_parameter_file
-from monoforce_ros.nodes.process import run_node
-from monoforce_ros.planning import CostToGo, SelectionWeights, cost_to_go, select_candidate
+from monoforce_ros.nodes.parameters import declare_parameters
+from monoforce_ros.nodes.process import run_schema_node
+from monoforce_ros.nodes.progress_check import WINDOW, ProgressCheck
+from monoforce_ros.nodes.schema import read_schema, schema_path
+from monoforce_ros.nodes.subscriptions import AdaptiveSubscription
+from monoforce_ros.planning import CostToGo, SelectionWeights, cost_to_go, plan_target, select_candidate
 
-PARAMETER_FILE = share_directory() / "config" / "path_selector.yaml"
 PART = "choice"
 DISTANCE = "distance to the goal [m]"
+
+
+@dataclass(frozen=True)
+class Course:
+    """Where to drive: a plan, or a goal as a plan of one point."""
+
+    frame_id: str
+    points: np.ndarray
+    """``[n, 3]`` [m]; the last one is the goal."""
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """The predictor's candidates."""
+
+    stamp: int
+    """[ns]."""
+    frame_id: str
+    fields: dict[str, np.ndarray]
+
+
+class Stop(Exception):  # noqa: N818  (no error: the robot has to stand)
+    """The robot has to stop; the message says why, ``reason`` is a short key of it."""
+
+    def __init__(self, message: str, reason: str):
+        super().__init__(message)
+        self.reason = reason
 
 
 class PathSelectorNode(Node):
@@ -29,7 +61,7 @@ class PathSelectorNode(Node):
 
     def __init__(self) -> None:
         super().__init__("path_selector")
-        self.settings = settings = declare_parameters(self, read_parameter_file(PARAMETER_FILE))
+        self.settings = settings = declare_parameters(self, read_schema(schema_path("path_selector")))
         self.weights = SelectionWeights(
             settings.weight_cost,
             settings.weight_distance,
@@ -37,118 +69,250 @@ class PathSelectorNode(Node):
             settings.weight_clearance,
             settings.weight_change,
         )
-        self.health = Health(self, [PART])
-        self._goal: tuple[np.ndarray, str] | None = None
+        self.frames = RobotFrames(
+            settings.base_frame,
+            odometry_child_pose=pose_matrix(settings.odometry_child_pose) if settings.odometry_child_pose else None,
+        )
+        self.health = Health(self, ["odometry", "candidates", PART])
+        self.transforms = TransformListener(self)
+        self._course: Course | None = None
         self._motion: MotionState | None = None
-        self._odometry_arrival = 0.0
-        self._candidates: tuple[int, str, dict[str, np.ndarray]] | None = None
+        self._odometry_frame = self._base_name = ""
+        self._offset_problem = ""
+        self._started = time.monotonic()
+        self._arrivals: dict[str, float] = {}
+        self._candidates: Candidates | None = None
         self._moving = False
         self._last_command = (0.0, 0.0)
+        self._progress = ProgressCheck()
         self._map: tuple[np.ndarray, float, np.ndarray] | None = None
+        self._map_frame = ""
         self._cost_to_go: CostToGo | None = None
-        self._commands = self.create_publisher(TwistStamped, settings.command_topic, 10)
-        newest = QoSProfile(depth=1)
-        self._inputs = (
-            self.create_subscription(PoseStamped, settings.goal_topic, self._on_goal, newest),
-            self.create_subscription(Odometry, settings.odometry_topic, self._on_odometry, newest),
-            self.create_subscription(PointCloud2, settings.candidate_topic, self._on_candidates, newest),
-            self.create_subscription(OccupancyGrid, settings.occupancy_topic, self._on_occupancy, newest),
-        )
+        self._commands = CommandOutput(self, settings.command_topic, settings.command_type)
+        self._inputs = {
+            "odometry": self._subscribe(settings.odometry_topic, "nav_msgs/msg/Odometry", Odometry, self._on_odometry),
+            "candidates": self._subscribe(
+                settings.candidate_topic, "sensor_msgs/msg/PointCloud2", PointCloud2, self._on_candidates
+            ),
+            "occupancy": self._subscribe(
+                settings.occupancy_topic, "nav_msgs/msg/OccupancyGrid", OccupancyGrid, self._on_occupancy
+            ),
+        }
+        wanted = ("plan", settings.plan_topic) if settings.plan_topic else ("goal", settings.goal_topic)
+        kind, callback = (Path, self._on_plan) if settings.plan_topic else (PoseStamped, self._on_goal)
+        # Goals are sent once: a subscription that is replaced on discovery might miss one. Of a reliable publisher each
+        # arrives twice, which changes nothing.
+        self._goal_inputs = [
+            self.create_subscription(kind, wanted[1], callback, QoSProfile(depth=1, reliability=reliability))
+            for reliability in (ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT)
+        ]
         self._command_timer = self.create_timer(1.0 / settings.rate, self._publish_command)
-        self.get_logger().info(f"waiting for a goal on {self.resolve_topic_name(settings.goal_topic)}")
+        self._watch_timer = self.create_timer(0.5, self._watch_inputs)
+        waiting = f"waiting for a {wanted[0]} on {self.resolve_topic_name(wanted[1])}"
+        self.health.report(PART, OK, waiting, reason="waiting")
+        self.get_logger().info(waiting)
+        if not self.transforms.available:
+            self.get_logger().info("tf2_msgs is not installed: goals must be in the odometry frame")
+
+    def _subscribe(self, topic: str, name: str, kind: type, callback) -> AdaptiveSubscription:  # type: ignore[no-untyped-def]
+        return AdaptiveSubscription(self, topic, {name: kind}, callback, depth=1)
 
     def _on_goal(self, message: PoseStamped) -> None:
-        position = np.array([message.pose.position.x, message.pose.position.y])
-        if not np.isfinite(position).all():
-            self.health.report(PART, ERROR, f"the goal {position.tolist()} is not finite and is ignored", reason="goal")
+        place = message.pose.position
+        self._set_course(message.header.frame_id, np.array([[place.x, place.y, place.z]]), "goal")
+
+    def _on_plan(self, message: Path) -> None:
+        places = [pose.pose.position for pose in message.poses]
+        if not places:
+            self._course = None
+            self.health.report(PART, OK, "the plan is empty: standing", reason="empty plan")
             return
-        self._goal, self._cost_to_go = (position, message.header.frame_id), None
-        self.get_logger().info(f"driving to ({position[0]:.2f}, {position[1]:.2f})")
+        frame = message.header.frame_id or message.poses[0].header.frame_id
+        self._set_course(frame, np.array([[place.x, place.y, place.z] for place in places]), "plan")
+
+    def _set_course(self, frame_id: str, points: np.ndarray, kind: str) -> None:
+        if not np.isfinite(points).all():
+            message = f"the {kind} {points[-1, :2].tolist()} is not finite and is ignored"
+            self.health.report(PART, ERROR, message, reason="goal")
+            return
+        previous, self._course = self._course, Course(frame_id, points)
+        if previous is None or not np.array_equal(previous.points[-1], points[-1]):
+            end = points[-1]
+            self.get_logger().info(f"new {kind}: to ({end[0]:.2f}, {end[1]:.2f}) in frame {frame_id or 'odometry'!r}")
+            self._progress.clear()
 
     def _on_odometry(self, message: Odometry) -> None:
         try:
-            self._motion, self._odometry_arrival = decoding.decode_odometry(message)[0], time.monotonic()
+            state, frame_id, child = decoding.decode_odometry(message)
         except decoding.MessageError as error:
-            self.health.report(PART, ERROR, f"odometry: {error}", reason="odometry")
+            self.health.report("odometry", ERROR, str(error), reason="unusable")
+            return
+        self._arrivals["odometry"] = time.monotonic()
+        self._odometry_frame = frame_id
+        try:
+            self._motion = state.of_base(self.frames.odometry_child(child, self.transforms.tree))
+        except FrameError as error:
+            self._offset_problem = str(error)
+            self.health.report("odometry", ERROR, self._offset_problem, reason="frame")
+            return
+        self._offset_problem = ""
+        self._base_name = self.frames.base_name(child, self.transforms.tree.frames)
+        self.health.report("odometry", OK, "receiving odometry")
 
     def _on_candidates(self, message: PointCloud2) -> None:
         try:
             fields = decoding.decode_fields(message)
         except decoding.MessageError as error:
-            self.health.report(PART, ERROR, f"candidates: {error}", reason="candidates")
+            self.health.report("candidates", ERROR, str(error), reason="unusable")
             return
-        self._candidates = decoding.stamp_of(message), message.header.frame_id, fields
+        self._arrivals["candidates"] = time.monotonic()
+        self._candidates = Candidates(decoding.stamp_of(message), message.header.frame_id, fields)
+        self.health.report("candidates", OK, "receiving candidates")
 
     def _on_occupancy(self, message: OccupancyGrid) -> None:
         try:
             self._map, self._cost_to_go = decoding.decode_occupancy(message), None
         except decoding.MessageError as error:
-            self.health.report(PART, ERROR, str(error), reason="occupancy")
+            self.health.report("occupancy", ERROR, str(error), reason="unusable")
+            return
+        self._map_frame = message.header.frame_id
+        self.health.report("occupancy", OK, "receiving occupancy")
+
+    def _watch_inputs(self) -> None:
+        now = time.monotonic()
+        for part in ("odometry", "candidates"):
+            silence = now - self._arrivals.get(part, self._started)
+            if silence > self.settings.data_timeout:
+                cause = self._inputs[part].silence_cause
+                message = f"no messages for {silence:.1f} s ({cause})"
+                self.health.report(part, WARN, message, reason=f"silent, {cause}")
 
     def _publish_command(self) -> None:
         command = self._command()
+        if command is None:
+            self._progress.clear()
         # Without a goal nothing is published; a robot that was moving is commanded to stop first.
         if command is None and not self._moving:
             return
-        speed, rate = self._last_command = command or (0.0, 0.0)
-        self._moving = command is not None or self._goal is not None
-        message = TwistStamped()
-        message.header.stamp = self.get_clock().now().to_msg()
-        message.header.frame_id = "base_link"
-        message.twist.linear.x, message.twist.angular.z = speed, rate
-        self._commands.publish(message)
+        self._last_command = command or (0.0, 0.0)
+        self._moving = command is not None or self._course is not None
+        self._commands.publish(*self._last_command, self._base_name or self.settings.base_frame)
 
     def _command(self) -> tuple[float, float] | None:
         """Speed [m/s] and yaw rate [rad/s] to publish; None to stop."""
-        if self._goal is None or self._motion is None:
-            return None
-        goal, goal_frame = self._goal
-        distance = float(np.linalg.norm(goal - self._motion.position[:2]))
-        if distance < self.settings.goal_tolerance:
-            self._goal = None
-            self.health.report(PART, OK, f"the goal is reached: {distance:.2f} m away", reason="reached")
-            return None
-        # Stamps cannot detect this: without odometry there are no new candidates either, so their age stays constant.
-        silence = time.monotonic() - self._odometry_arrival
-        if silence > self.settings.timeout:
-            self._report_stop(f"no odometry for {silence:.1f} s: the position is unknown", "silent")
-            return None
-        if self._candidates is None:
-            self._report_stop("no candidates received: is the predictor running with `candidates`?", "none")
-            return None
-        stamp, frame, fields = self._candidates
-        if goal_frame.lstrip("/") not in ("", frame.lstrip("/")):
-            self._report_stop(f"the goal is in frame {goal_frame!r}, candidates are in {frame!r}", "frame")
-            return None
-        age = (self._motion.stamp - stamp) * NANOSECOND
-        if abs(age) > self.settings.timeout:
-            self._report_stop(f"candidates are {age:.2f} s old, the limit is {self.settings.timeout:g} s", "late")
+        if self._course is None:
             return None
         try:
-            if self._cost_to_go is None and self._map is not None:
-                self._cost_to_go = cost_to_go(*self._map, goal, radius=self.settings.robot_radius)
-            position = self._motion.position[:2]
-            best = select_candidate(fields, position, goal, self.weights, self._cost_to_go, self._last_command)
-        except ValueError as error:
-            self._report_stop(str(error), "fields")
+            return self._drive(self._course)
+        except Stop as stop:
+            self.health.report(PART, WARN, f"stopped: {stop}", reason=stop.reason)
             return None
-        if best is None:
-            self._report_stop("no candidate is feasible", "infeasible")
-            return None
-        self.health.report(PART, OK, "driving to the goal", reason="driving", **{DISTANCE: f"{distance:.2f}"})
-        return float(fields["speed"][best]), float(fields["yaw_rate"][best])
 
-    def _report_stop(self, cause: str, reason: str) -> None:
-        self.health.report(PART, WARN, f"stopped: {cause}", reason=reason)
+    def _drive(self, course: Course) -> tuple[float, float] | None:
+        """The best candidate's command; None if the goal is reached.
+
+        Raises:
+            Stop: there is no reliable command.
+        """
+        motion = self._usable_motion()
+        plan = self._in_odometry(course)[:, :2]
+        position = motion.position[:2]
+        target, remaining = plan_target(plan, position, self.settings.plan_lookahead)
+        distance = float(np.linalg.norm(plan[-1] - position))
+        # A plan that comes back to its start is not finished there.
+        if distance < self.settings.goal_tolerance and remaining < self.settings.plan_lookahead:
+            self._course = None
+            self.health.report(PART, OK, f"the goal is reached: {distance:.2f} m away", reason="reached")
+            return None
+        candidates = self._usable_candidates(motion)
+        if deaf := self._commands.deaf:
+            raise Stop(f"{deaf}: is the base running, and is `command_topic` right?", "deaf")
+        try:
+            best = select_candidate(
+                candidates.fields, position, target, self.weights, self._cost_to(target), self._last_command
+            )
+        except ValueError as error:
+            raise Stop(str(error), "fields") from error
+        if best is None:
+            raise Stop("no candidate is feasible", "infeasible")
+        command = float(candidates.fields["speed"][best]), float(candidates.fields["yaw_rate"][best])
+        self._progress.add(time.monotonic(), command, position, motion.heading)
+        self._report_driving(distance, command)
+        return command
+
+    def _usable_motion(self) -> MotionState:
+        """The newest motion of the base; raises ``Stop`` if it is missing, old or of an unknown frame."""
+        source = self._inputs["odometry"]
+        if self._offset_problem:
+            raise Stop(self._offset_problem, "child frame")
+        if self._motion is None:
+            raise Stop(f"no odometry: the position is unknown ({source.silence_cause})", "no odometry")
+        # Stamps cannot detect this: without odometry there are no new candidates either, so their age stays constant.
+        silence = time.monotonic() - self._arrivals["odometry"]
+        if silence > self.settings.timeout:
+            raise Stop(f"no odometry for {silence:.1f} s: the position is unknown ({source.silence_cause})", "silent")
+        return self._motion
+
+    def _in_odometry(self, course: Course) -> np.ndarray:
+        """Points of the course ``[n, 3]`` in the odometry frame; raises ``Stop`` if /tf does not connect the frames."""
+        goal_frame, odometry_frame = course.frame_id.lstrip("/"), self._odometry_frame.lstrip("/")
+        if goal_frame in ("", odometry_frame):
+            return course.points
+        pose = self.transforms.tree.find(odometry_frame, goal_frame)
+        if pose is None:
+            reason = "tf2_msgs is not installed, so that /tf cannot be read"
+            if self.transforms.available:
+                reason = self.transforms.tree.missing_path(odometry_frame, goal_frame)
+            raise Stop(f"the goal is in frame {goal_frame!r}, odometry in {odometry_frame!r}: {reason}", "frame")
+        return transform_points(pose, course.points)
+
+    def _usable_candidates(self, motion: MotionState) -> Candidates:
+        """The newest candidates; raises ``Stop`` if they are missing, old or in another frame than the odometry."""
+        candidates = self._candidates
+        if candidates is None:
+            cause = self._inputs["candidates"].silence_cause
+            raise Stop(f"no candidates received: is the predictor running with `candidates`? ({cause})", "none")
+        if candidates.frame_id.lstrip("/") != self._odometry_frame.lstrip("/"):
+            frames = f"candidates are in frame {candidates.frame_id!r}, odometry in {self._odometry_frame!r}"
+            raise Stop(f"{frames}: give predictor and path_selector the same `odometry_topic`", "candidate frame")
+        age = (motion.stamp - candidates.stamp) * NANOSECOND
+        if abs(age) > self.settings.timeout:
+            raise Stop(f"candidates are {age:.2f} s old, the limit is {self.settings.timeout:g} s", "late")
+        return candidates
+
+    def _cost_to(self, target: np.ndarray) -> CostToGo | None:
+        """Path lengths around obstacles to a target; None without a map in the odometry frame."""
+        if self._map is None:
+            return None
+        if self._map_frame.lstrip("/") != self._odometry_frame.lstrip("/"):
+            message = f"not used: it is in frame {self._map_frame!r}, odometry in {self._odometry_frame!r}"
+            self.health.report("occupancy", WARN, message, reason="frame")
+            return None
+        found = self._cost_to_go
+        # Within a cell of the search the path is the same.
+        if found is None or float(np.linalg.norm(found.goal - target)) > found.resolution:
+            found = cost_to_go(*self._map, target, radius=self.settings.robot_radius)
+            self._cost_to_go = found
+        return found
+
+    def _report_driving(self, distance: float, command: tuple[float, float]) -> None:
+        """Say that the robot drives only if its odometry shows it."""
+        moving, values = self._progress.moving, {DISTANCE: f"{distance:.2f}"}
+        if moving:
+            self.health.report(PART, OK, "driving to the goal", reason="driving", **values)
+        elif moving is None:
+            message = "commands are sent, odometry shows no motion yet"
+            self.health.report(PART, OK, message, reason="starting", **values)
+        else:
+            sent = f"{command[0]:.2f} m/s and {command[1]:.2f} rad/s are sent to {self._commands.topic}"
+            types = ", ".join(self._commands.types)
+            message = f"the robot does not move: {sent} ({types}), odometry has shown no motion for {WINDOW:g} s"
+            self.health.report(PART, WARN, message, reason="no motion", **values)
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the node; ``--help`` lists its parameters, which config/path_selector.yaml defines."""
-    command_line = sys.argv[1:] if arguments is None else arguments
-    if {"-h", "--help"} & set(command_line):
-        print(parameter_help("path_selector", read_parameter_file(PARAMETER_FILE)))
-        return 0
-    return run_node(PathSelectorNode, arguments)
+    """Run the node; ``--help`` lists its parameters, which config/path_selector.schema.yaml defines."""
+    return run_schema_node("path_selector", PathSelectorNode, arguments)
 
 
 if __name__ == "__main__":

@@ -19,21 +19,23 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from visualization_msgs.msg import MarkerArray
 
 from monoforce_ros.bags import camera_info_topic
-from monoforce_ros.core import CommandTrack, share_directory
+from monoforce_ros.core import CommandTrack, FrameError, RobotFrames, pose_matrix
 from monoforce_ros.effects import corrected_commands, corrected_motion
 from monoforce_ros.messages import decoding
 from monoforce_ros.nodes import prediction_messages as encoders
 from monoforce_ros.nodes.background_worker import BackgroundWorker
 from monoforce_ros.nodes.candidate_output import CandidateOutput
+from monoforce_ros.nodes.costmap_output import CostmapOutput
 from monoforce_ros.nodes.ensemble_output import EnsembleOutput
-from monoforce_ros.nodes.frames import SensorFrames
+from monoforce_ros.nodes.frames import TransformListener
 from monoforce_ros.nodes.health import ERROR, OK, STALE, WARN, Health
 from monoforce_ros.nodes.inputs import Inputs, Received
 from monoforce_ros.nodes.managed import ManagedNode
 from monoforce_ros.nodes.monitor_output import MonitorOutput
-from monoforce_ros.nodes.parameters import declare_parameters, follow_changes, parameter_help, read_parameter_file
-from monoforce_ros.nodes.process import run_node
+from monoforce_ros.nodes.parameters import declare_parameters, follow_changes
+from monoforce_ros.nodes.process import run_schema_node
 from monoforce_ros.nodes.rate_limiter import RateLimiter
+from monoforce_ros.nodes.schema import read_schema, schema_path
 from monoforce_ros.nodes.sensor_decoder import LIDAR, SensorDecoder
 from monoforce_ros.nodes.subscriptions import AdaptiveSubscription
 from monoforce_ros.perception import TerrainSource, choose_terrain_source
@@ -41,8 +43,6 @@ from monoforce_ros.physics import PhysicsOptions
 from monoforce_ros.prediction import FORCE_INTERVAL, Prediction, Predictor
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainDefaults
-
-PARAMETER_FILE = share_directory() / "config" / "predictor.yaml"
 
 
 @dataclass(frozen=True)
@@ -63,12 +63,14 @@ class PredictorNode(ManagedNode):
 
     def __init__(self) -> None:
         super().__init__("predictor")
-        entries = read_parameter_file(PARAMETER_FILE)
-        self.settings = declare_parameters(self, entries)
+        entries = read_schema(schema_path("predictor"))
+        changeable = [entry.name for entry in entries if entry.name != "autostart"]
+        self.settings = declare_parameters(self, entries, changeable=changeable)
         self.candidates: CandidateOutput | None = None
         self.ensemble: EnsembleOutput | None = None
+        self.costmap: CostmapOutput | None = None
         self._comparison: BackgroundWorker[ComparisonJob] | None = None
-        follow_changes(self, entries, lambda: self.settings, self._change_settings)
+        follow_changes(self, entries, lambda: self.settings, self._change_settings, self._fixed)
         if self.settings.autostart:
             self.autostart()
         else:
@@ -89,7 +91,13 @@ class PredictorNode(ManagedNode):
         self.predictor.warm_up()
         self.sensor_topics = self._sensor_topics()
         self.health = Health(self, ["odometry", "commands", *self.sensor_topics, "prediction", "live gap"])
-        self.decoder = SensorDecoder(SensorFrames(self, self.robot), self.health)
+        self.frames = RobotFrames(
+            settings.base_frame or self.robot.base_frame,
+            {name: pose.double().numpy() for name, pose in self.robot.sensors.items()},
+            pose_matrix(settings.odometry_child_pose) if settings.odometry_child_pose else None,
+        )
+        self.transforms = TransformListener(self)
+        self.decoder = SensorDecoder(self.frames, self.transforms.tree, self.health)
         self.inputs = Inputs(
             list(self.sensor_topics.values()),
             slop=settings.camera_slop,
@@ -105,6 +113,7 @@ class PredictorNode(ManagedNode):
         with_candidates = settings.candidates or settings.candidate_topic
         self.candidates = CandidateOutput(self, self.predictor, settings, self.health) if with_candidates else None
         self.ensemble = EnsembleOutput(self, self.predictor, settings) if settings.ensemble else None
+        self.costmap = CostmapOutput(self, settings, always=bool(with_candidates))
         self._subscribe()
         reliabilities = {"reliable": ReliabilityPolicy.RELIABLE, "best_effort": ReliabilityPolicy.BEST_EFFORT}
         newest = QoSProfile(depth=1, reliability=reliabilities[settings.output_qos], history=HistoryPolicy.KEEP_LAST)
@@ -120,9 +129,7 @@ class PredictorNode(ManagedNode):
         self._started = self._last_prediction = time.monotonic()
         self._watch = self.create_timer(0.5, self._watch_inputs)
         self._running = True
-        self._comparison = None
-        if self.candidates is not None or self.ensemble is not None:
-            self._comparison = BackgroundWorker("comparison", self._compare, self.settings.comparison_niceness)
+        self._comparison = BackgroundWorker("comparison", self._compare, self.settings.comparison_niceness)
         self._worker = threading.Thread(target=self._work, name="prediction", daemon=True)
         self._worker.start()
         settings = self.settings
@@ -142,12 +149,23 @@ class PredictorNode(ManagedNode):
         if self.context.ok():
             self.health.report("prediction", STALE, "deactivated: no predictions", reason="deactivated")
 
+    def _fixed(self, name: str) -> str:
+        """Why a parameter that is not dynamic may not change now; empty while the node is unconfigured."""
+        if not self.configured:
+            return ""
+        return f"{name} is read-only while the node is configured: deactivate and clean up first (ros2 lifecycle set)"
+
     def _change_settings(self, changed: SimpleNamespace) -> None:
         """Apply changed parameters, all or none; raises ``ValueError`` if they are out of range."""
+        if not self.configured:
+            self.settings = changed
+            return
         if self.candidates is not None:
             self.candidates.apply(changed)
         if self.ensemble is not None:
             self.ensemble.apply(changed)
+        if self.costmap is not None:
+            self.costmap.apply(changed)
         self.settings = changed
 
     def _terrain_source(self) -> TerrainSource:
@@ -189,6 +207,7 @@ class PredictorNode(ManagedNode):
                 {"geometry_msgs/msg/TwistStamped": TwistStamped, "geometry_msgs/msg/Twist": Twist},
                 self._on_command,
                 depth=small,
+                follow_listeners=True,
             ),
         }
         images = {"sensor_msgs/msg/CompressedImage": CompressedImage, "sensor_msgs/msg/Image": Image}
@@ -218,17 +237,13 @@ class PredictorNode(ManagedNode):
         except decoding.MessageError as error:
             self.health.report("odometry", ERROR, str(error), reason="unusable")
             return
-        self.inputs.add_motion("odometry", state, frame_id, child_frame_id)
-        if child_frame_id.lstrip("/") not in ("", self.robot.base_frame):
-            self.health.report(
-                "odometry",
-                WARN,
-                f"its child frame is {child_frame_id!r}, the base frame of the robot file {self.robot.base_frame!r}: "
-                "the offset between these frames is ignored",
-                reason="frame",
-            )
-        else:
-            self.health.report("odometry", OK, "receiving odometry")
+        try:
+            pose = self.frames.odometry_child(child_frame_id, self.transforms.tree)
+        except FrameError as error:
+            self.health.report("odometry", ERROR, str(error), reason="frame")
+            return
+        self.inputs.add_motion("odometry", state.of_base(pose), frame_id, child_frame_id)
+        self.health.report("odometry", OK, "receiving odometry")
 
     def _on_command(self, message: Twist | TwistStamped) -> None:
         self._arrivals["commands"] = time.monotonic()
@@ -266,12 +281,7 @@ class PredictorNode(ManagedNode):
             silence = now - self._arrivals.get(part, self._started)
             if part.endswith(" info") or silence < limit:
                 continue
-            if subscription.wrong_type:
-                cause = f"{subscription.topic} has the unsupported type {subscription.wrong_type}"
-            elif not (count := subscription.publishers):
-                cause = f"{subscription.topic}: no publisher"
-            else:
-                cause = f"{subscription.topic}: {count} publisher{'s' if count > 1 else ''}, no messages"
+            cause = subscription.silence_cause
             if part == "commands":
                 level, message = WARN, f"no commands for {silence:.1f} s; assuming zero velocity ({cause})"
             else:
@@ -346,13 +356,21 @@ class PredictorNode(ManagedNode):
             self.health.report("prediction", ERROR, f"nothing published: {text}", reason=type(error).__name__)
             return
         self._predictions += 1
+        if self._predictions == 1:
+            topic = self.resolve_topic_name("predicted/path")
+            self.get_logger().info(
+                f"first prediction: {self.settings.horizon:g} s ahead, in frame {frame_id!r}, published on {topic} "
+                f"{1e3 * (time.monotonic() - started):.0f} ms after its data were complete"
+            )
         self._last_prediction = time.monotonic()
         self._durations = [*self._durations[-199:], time.monotonic() - started]
         self.health.report("prediction", OK, "predicting", latency_ms=f"{1e3 * self._durations[-1]:.0f}")
 
     def _compare(self, job: ComparisonJob) -> None:
-        """Publish candidates and ensemble of a prediction while the next one is made."""
+        """Publish candidates, ensemble and costmap of a prediction while the next one is made."""
         try:
+            if self.costmap is not None:
+                self.costmap.publish(job.prediction, job.frame_id)
             if self.candidates is not None:
                 self.candidates.publish(job.prediction, job.commands, job.frame_id)
             if self.ensemble is not None:
@@ -360,6 +378,8 @@ class PredictorNode(ManagedNode):
         except Exception as error:  # no input may end the node
             text = _explained(error)
             self.health.report("comparison", ERROR, f"nothing published: {text}", reason=type(error).__name__)
+            return
+        if self.candidates is None and self.ensemble is None:
             return
         dropped = self._comparison.dropped if self._comparison is not None else 0
         self.health.report("comparison", OK, "candidates and ensemble are up to date", skipped_predictions=dropped)
@@ -375,14 +395,10 @@ def _explained(error: Exception) -> str:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the predictor node; ``--help`` lists its parameters, which config/predictor.yaml defines."""
-    command_line = sys.argv[1:] if arguments is None else arguments
-    if {"-h", "--help"} & set(command_line):
-        print(parameter_help("predictor", read_parameter_file(PARAMETER_FILE)))
-        return 0
+    """Run the node; ``--help`` lists its parameters, which config/predictor.schema.yaml defines."""
     # The physics consists of many small operations, which are fastest on one thread; the encoder has its own setting.
     torch.set_num_threads(1)
-    return run_node(PredictorNode, arguments)
+    return run_schema_node("predictor", PredictorNode, arguments)
 
 
 if __name__ == "__main__":

@@ -8,6 +8,17 @@ from collections.abc import Callable
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+from monoforce_ros.nodes.arguments import (
+    check_parameter_files,
+    command_line,
+    parameter_files,
+    refuse_stray_arguments,
+)
+from monoforce_ros.nodes.parameter_files import read_sections
+from monoforce_ros.nodes.parameters import parameter_help
+from monoforce_ros.nodes.schema import read_schema, schema_path
 
 
 def _spin(node: Node, executor: SingleThreadedExecutor) -> None:
@@ -27,16 +38,19 @@ def run_node[NodeType: Node](
         work: spins the node; the default only processes callbacks.
 
     Returns:
-        exit status: 0 after a regular end, 1 if the node could not start (its ``ValueError`` or ``OSError`` is
-        printed as one line).
+        exit status: 0 after a regular end, 1 if the node could not start (its ``ValueError`` or ``OSError``, or an
+        error in the command line, is printed as one line).
     """
-    rclpy.init(args=arguments)
+    words = command_line(arguments)
     try:
+        initialise(arguments)
         node = make_node()
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         rclpy.try_shutdown()
         return 1
+    for warning in check_parameter_files(words, node.get_fully_qualified_name()):
+        node.get_logger().warning(warning)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     try:
@@ -52,3 +66,40 @@ def run_node[NodeType: Node](
         node.destroy_node()
         rclpy.try_shutdown()
     return 0
+
+
+def run_schema_node[NodeType: Node](
+    name: str, make_node: Callable[[], NodeType], arguments: list[str] | None = None
+) -> int:
+    """Run a node whose command line holds nothing but ROS arguments, or print its parameters for ``--help``.
+
+    Args:
+        name: name of the executable and of its schema.
+        make_node: creates the node.
+        arguments: arguments of the command line.
+
+    Returns:
+        exit status, as :func:`run_node`; 1 also for an argument that is not ROS's.
+    """
+    words, entries = command_line(arguments), read_schema(schema_path(name))
+    if {"-h", "--help"} & set(words):
+        print(parameter_help(name, entries))
+        return 0
+    try:
+        refuse_stray_arguments(words, (entry.name for entry in entries))
+    except ValueError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return run_node(make_node, arguments)
+
+
+def initialise(arguments: list[str] | None, signals: SignalHandlerOptions | None = None) -> None:
+    """Initialise rclpy; what it cannot parse in the command line becomes a ``ValueError``."""
+    for path in parameter_files(command_line(arguments)):
+        read_sections(path)
+    try:
+        rclpy.init(args=arguments, signal_handler_options=signals)
+    except RuntimeError as error:
+        # rcl's messages end with the place in its source code.
+        reason = str(error).partition(", at /")[0]
+        raise ValueError(f"the ROS arguments cannot be read: {reason}; expected --ros-args -p NAME:=VALUE") from error

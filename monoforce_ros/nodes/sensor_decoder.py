@@ -7,9 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from monoforce_ros.core import NANOSECOND, CameraModel, MotionTrack, transform_points
+from monoforce_ros.core import NANOSECOND, CameraModel, MotionTrack, RobotFrames, TransformTree, transform_points
 from monoforce_ros.messages import MessageError, decoding
-from monoforce_ros.nodes.frames import SensorFrames
 from monoforce_ros.nodes.health import ERROR, OK, Health
 from monoforce_ros.nodes.inputs import Received
 from monoforce_ros.perception import Observation
@@ -24,11 +23,12 @@ class SensorDecoder:
 
     Args:
         frames: poses of the sensors on the robot.
+        transforms: transforms received so far.
         health: receives reports on unusable messages.
     """
 
-    def __init__(self, frames: SensorFrames, health: Health):
-        self._frames, self._health = frames, health
+    def __init__(self, frames: RobotFrames, transforms: TransformTree, health: Health):
+        self._frames, self._transforms, self._health = frames, transforms, health
         self._info_topics: dict[str, str] = {}
         self._cameras: dict[str, CameraModel | MessageError] = {}
 
@@ -65,7 +65,7 @@ class SensorDecoder:
             if part == "odometry":
                 continue
             try:
-                pose = self._frames.base_from(entry.message.header.frame_id)
+                pose = self._frames.sensor_pose(entry.message.header.frame_id, self._transforms)
                 pose = track.base_between(entry.stamp, stamp, maximum_gap=maximum_gap) @ pose
                 if part == LIDAR:
                     cloud = transform_points(pose, decoding.decode_cloud(entry.message))

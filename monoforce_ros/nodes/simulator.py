@@ -12,10 +12,14 @@ from geometry_msgs.msg import Twist, TwistStamped
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.utilities import remove_ros_args
+from rclpy.qos import DurabilityPolicy, QoSProfile
 
-from monoforce_ros.bags import type_store
+from monoforce_ros.bags import builders, type_store
 from monoforce_ros.messages import decoding, message_class
+from monoforce_ros.nodes.arguments import NodeArgumentParser, own_arguments
+from monoforce_ros.nodes.frames import TRANSFORMS
+from monoforce_ros.nodes.odometry_transform import odometry_transform
+from monoforce_ros.nodes.parameters import refuse_unknown_parameters
 from monoforce_ros.nodes.process import run_node
 from monoforce_ros.nodes.subscriptions import AdaptiveSubscription
 from monoforce_ros.synthetic import GROUNDS, LiveSettings, LiveWorld
@@ -29,7 +33,7 @@ _MAXIMUM_LAG = 0.5
 
 
 def _arguments(arguments: list[str]) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
+    parser = NodeArgumentParser(
         prog="simulator",
         description="Drive a simulated robot through ROS: cmd_vel in; odom, points and images out.",
     )
@@ -56,6 +60,7 @@ class SimulatorNode(Node):
 
     def __init__(self, world: LiveWorld, options: argparse.Namespace):
         super().__init__("simulator")
+        refuse_unknown_parameters(self)
         self._world = world
         self._options = options
         self._outputs: dict[str, Publisher] = {}
@@ -66,7 +71,17 @@ class SimulatorNode(Node):
             {"geometry_msgs/msg/TwistStamped": TwistStamped, "geometry_msgs/msg/Twist": Twist},
             self._on_command,
             depth=5,
+            follow_listeners=True,
         )
+        if message_class(TRANSFORMS) is None:
+            self.get_logger().info("tf2_msgs is not installed: no transforms are published on /tf")
+        else:
+            latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+            self._outputs["/tf_static"] = self.create_publisher(message_class(TRANSFORMS), "/tf_static", latched)
+            self._outputs["/tf"] = self.create_publisher(message_class(TRANSFORMS), "/tf", 100)
+            stamp = self.get_clock().now().nanoseconds
+            sensors = builders.transforms(stamp, world.robot.base_frame, world.robot.sensors)
+            self._publish("/tf_static", sensors)
         self._next_output = dict.fromkeys(("odometry", "cloud", "images"), 0.0)
 
     def _on_command(self, message: Twist | TwistStamped) -> None:
@@ -97,7 +112,10 @@ class SimulatorNode(Node):
                 self._publish(f"{frame}/camera_info", info)
                 self._publish(f"{frame}/image_raw/compressed", image)
         if self._due("odometry", _ODOMETRY_RATE):
-            self._publish("odom", world.odometry(stamp))
+            odometry = world.odometry(stamp)
+            self._publish("odom", odometry)
+            if "/tf" in self._outputs:
+                self._publish("/tf", odometry_transform(odometry))
 
     def _due(self, name: str, rate: float) -> bool:
         if not rate or self._world.time < self._next_output[name] - 1e-6:
@@ -131,7 +149,7 @@ def _settings(options: argparse.Namespace) -> LiveSettings:
 def main(arguments: list[str] | None = None) -> int:
     """Run the simulator; see ``--help``."""
     command_line = sys.argv if arguments is None else ["simulator", *arguments]
-    options = _arguments(remove_ros_args(command_line)[1:])
+    options = _arguments(own_arguments(command_line[1:]))
     try:
         world = LiveWorld(_settings(options))
     except (ValueError, OSError, RuntimeError) as error:

@@ -1,8 +1,9 @@
-"""Subscriptions that detect the message type of their topic."""
+"""Subscriptions that follow the message type, reliability and durability of their topic's publishers."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from rclpy.node import Node
@@ -11,12 +12,21 @@ from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 
+@dataclass(frozen=True)
+class _Offer:
+    """What a subscription asks for."""
+
+    type: str
+    reliability: ReliabilityPolicy
+    durability: DurabilityPolicy
+
+
 class AdaptiveSubscription:
-    """Subscribes to a topic as soon as one of several message types is published on it.
+    """Subscribes at once, and again as soon as publishers turn out to offer another type or quality of service.
 
     Robots publish ``Twist`` or ``TwistStamped``, ``Image`` or ``CompressedImage``, under any name; detecting the type
-    saves users a parameter. The ROS graph is queried twice a second, so that a change of the publishers' type or
-    reliability is followed.
+    saves users a parameter. The ROS graph is queried twice a second, so that a change of the publishers' type,
+    reliability or durability is followed.
 
     Args:
         node: the node that subscribes.
@@ -26,17 +36,20 @@ class AdaptiveSubscription:
         depth: depth of the queue.
         reliability: ``reliable``, ``best_effort``, or ``auto``: reliable if every publisher offers it, as large
             best-effort messages are easily lost, otherwise best effort, which works with every publisher.
+        follow_listeners: of several possible types, take the one that other nodes listen to. For commands: a base that
+            listens to one type shows which one is meant.
     """
 
     def __init__(
         self,
         node: Node,
         topic: str,
-        types: dict[str, type],
+        types: Mapping[str, type],
         callback: Callable[[Any], None],
         *,
         depth: int,
         reliability: str = "auto",
+        follow_listeners: bool = False,
     ):
         self._node = node
         self.topic = node.resolve_topic_name(topic)
@@ -44,8 +57,9 @@ class AdaptiveSubscription:
         self._callback = callback
         self._depth = depth
         self._reliability = reliability
+        self._follow_listeners = follow_listeners
         self._subscription: Subscription | None = None
-        self._subscribed: tuple[str, ReliabilityPolicy] | None = None
+        self._subscribed: _Offer | None = None
         self.wrong_type = ""
         """Types on the topic if none of them is usable."""
         self._timer = node.create_timer(0.5, self._update)
@@ -56,25 +70,69 @@ class AdaptiveSubscription:
         """Number of publishers on the topic."""
         return self._node.count_publishers(self.topic)
 
+    @property
+    def silence_cause(self) -> str:
+        """Why there are no messages, as far as the ROS graph shows."""
+        if self.wrong_type:
+            return f"{self.topic} has the unsupported type {self.wrong_type}"
+        if not (count := self.publishers):
+            return f"{self.topic}: no publisher"
+        return f"{self.topic}: {count} publisher{'s' if count > 1 else ''}, no messages"
+
     def _update(self) -> None:
         publishers = self._node.get_publishers_info_by_topic(self.topic)
         offered = {info.topic_type for info in publishers}
         usable = [name for name in self._types if name in offered]
         self.wrong_type = "" if usable or not offered else ", ".join(sorted(offered))
-        if not usable:
+        if self.wrong_type:
             return
-        wanted = usable[0], self._select_reliability(publishers)
+        wanted = _Offer(self._select_type(usable), self._select_reliability(publishers), _durability(publishers))
+        if not publishers and self._subscribed is not None:
+            # A publisher that is gone may come back: nothing but its type can have changed.
+            wanted = _Offer(wanted.type, self._subscribed.reliability, self._subscribed.durability)
         if self._subscribed == wanted:
             return
         if self._subscription is not None:
             self._node.destroy_subscription(self._subscription)
         self._subscribed = wanted
-        quality = QoSProfile(depth=self._depth, reliability=wanted[1], durability=DurabilityPolicy.VOLATILE)
-        self._subscription = self._node.create_subscription(self._types[wanted[0]], self.topic, self._callback, quality)
+        quality = QoSProfile(depth=self._depth, reliability=wanted.reliability, durability=wanted.durability)
+        self._subscription = self._node.create_subscription(
+            self._types[wanted.type], self.topic, self._callback, quality
+        )
+
+    def _select_type(self, offered: list[str]) -> str:
+        """The type to subscribe to, of those that publishers offer, or of all if there are none."""
+        possible = offered or ([self._subscribed.type] if self._subscribed else list(self._types))
+        if not self._follow_listeners:
+            return possible[0]
+        possible = offered or list(self._types)
+        listened = other_listeners(self._node, self.topic)
+        wanted = [name for name in possible if name in listened]
+        # Nodes that adapt, as this one does, start with the first type: a listener to the last one chose it.
+        return wanted[-1] if wanted else possible[0]
 
     def _select_reliability(self, publishers: list[TopicEndpointInfo]) -> ReliabilityPolicy:
         if self._reliability == "auto":
-            reliable = all(p.qos_profile.reliability == ReliabilityPolicy.RELIABLE for p in publishers)
+            # Before there are publishers, best effort receives from each that may come.
+            reliable = bool(publishers) and all(
+                p.qos_profile.reliability == ReliabilityPolicy.RELIABLE for p in publishers
+            )
         else:
             reliable = self._reliability == "reliable"
         return ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+
+
+def _durability(publishers: list[TopicEndpointInfo]) -> DurabilityPolicy:
+    """Transient local if every publisher offers it, for the last message sent before the subscription."""
+    latched = bool(publishers) and all(p.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in publishers)
+    return DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+
+
+def other_listeners(node: Node, topic: str) -> set[str]:
+    """Message types that other nodes subscribe to on a topic."""
+    own = node.get_name(), node.get_namespace()
+    return {
+        info.topic_type
+        for info in node.get_subscriptions_info_by_topic(topic)
+        if (info.node_name, info.node_namespace) != own
+    }

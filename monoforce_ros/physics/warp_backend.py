@@ -26,6 +26,7 @@ from monoforce_ros.physics.warp_kernels import (
     summarise_kernel,
     types,
 )
+from monoforce_ros.physics.warp_start import start_warp
 from monoforce_ros.terrain import Grid
 
 CPU_THREADS = 2
@@ -39,7 +40,7 @@ CHUNK = 8
 _TANGENTIAL = {"none": NO_FRICTION, "coulomb": COULOMB, "sigmoid": SIGMOID}
 _threads: ThreadPoolExecutor | None = None
 
-wp.init()
+start_warp()
 
 
 def integrate(

@@ -8,7 +8,8 @@ if TYPE_CHECKING:
     from monoforce_ros.planning.candidates import CandidateSettings, fan_of_arcs, over_horizon
     from monoforce_ros.planning.costs import TERMS, Assessment, CostWeights, Limits, assess, force_every
     from monoforce_ros.planning.goal_planner import CostToGo, cost_to_go
-    from monoforce_ros.planning.occupancy_grid import Occupancy, occupancy
+    from monoforce_ros.planning.occupancy_grid import AlignedGrid, Occupancy, occupancy, speed_mask
+    from monoforce_ros.planning.plan_follower import plan_target
     from monoforce_ros.planning.refinement import Refinement, refine
     from monoforce_ros.planning.selection import WAYPOINTS, SelectionWeights, select_candidate
 else:
@@ -33,9 +34,12 @@ else:
                 "cost_to_go",
             ),
             "occupancy_grid": (
+                "AlignedGrid",
+                "speed_mask",
                 "Occupancy",
                 "occupancy",
             ),
+            "plan_follower": ("plan_target",),
             "refinement": (
                 "Refinement",
                 "refine",
@@ -51,6 +55,7 @@ else:
 __all__ = [
     "TERMS",
     "WAYPOINTS",
+    "AlignedGrid",
     "Assessment",
     "CandidateSettings",
     "CostToGo",
@@ -65,6 +70,8 @@ __all__ = [
     "force_every",
     "occupancy",
     "over_horizon",
+    "plan_target",
     "refine",
     "select_candidate",
+    "speed_mask",
 ]

@@ -8,15 +8,23 @@ import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter
 
 from monoforce_ros.planning.goal_planner import LETHAL, UNKNOWN
-from monoforce_ros.terrain import TerrainMap
+from monoforce_ros.terrain import Grid, TerrainMap
 
 _SLOPE_BASE = 0.5
 """Length over which slopes are measured [m]."""
 
 
+GRADED = LETHAL - 2
+"""Largest cost of a cell that is not lethal: Nav2 reads the value between as inscribed in an obstacle."""
+
+
 @dataclass(frozen=True)
-class Occupancy:
-    """A grid of costs, aligned with the axes of the odometry frame as costmaps require."""
+class AlignedGrid:
+    """Cells along the axes of the odometry frame that cover a map at any heading.
+
+    Their number depends on the map's size alone, and their corners lie on multiples of the resolution: a costmap that
+    follows such grids need not be resized, and its cells do not shift.
+    """
 
     resolution: float
     """Edge of a cell [m]."""
@@ -24,8 +32,56 @@ class Occupancy:
     """x and y of the corner of cell (0, 0) in the odometry frame [m]."""
     height: float
     """z of the robot's base in the odometry frame [m]."""
+    rows: np.ndarray
+    """Row of the map at each cell ``[n, n]``."""
+    columns: np.ndarray
+    """Column of the map at each cell ``[n, n]``."""
+    inside: np.ndarray
+    """Whether each cell lies on the map ``[n, n]``."""
+
+    @classmethod
+    def around(cls, grid: Grid, odometry_from_terrain: np.ndarray) -> AlignedGrid:
+        """The grid for a map with pose ``[4, 4]``, level."""
+        left, right, bottom, top = grid.extent
+        # The circle about the robot through the furthest corner, and a cell for the robot's place within its own.
+        reach = np.hypot(max(-left, right), max(-bottom, top))
+        half = int(np.ceil(reach / grid.resolution)) + 1
+        place = odometry_from_terrain[:2, 3]
+        low = np.floor(place / grid.resolution) - half
+        x = (low[0] + np.arange(2 * half) + 0.5) * grid.resolution
+        y = (low[1] + np.arange(2 * half) + 0.5) * grid.resolution
+        there = np.stack(np.meshgrid(x, y), axis=-1) - place
+        rows, columns, inside = grid.cells(there @ odometry_from_terrain[:2, :2])
+        origin = float(low[0] * grid.resolution), float(low[1] * grid.resolution)
+        return cls(grid.resolution, origin, float(odometry_from_terrain[2, 3]), rows, columns, inside)
+
+    def resampled(self, values: np.ndarray, outside: float) -> np.ndarray:
+        """Values of the map's cells ``[rows, columns]`` at these cells, by nearest neighbour ``[n, n]``."""
+        return np.where(self.inside, values[self.rows, self.columns], outside).astype(values.dtype)
+
+
+@dataclass(frozen=True)
+class Occupancy:
+    """Costs of the cells of an aligned grid."""
+
+    grid: AlignedGrid
     data: np.ndarray
     """Costs ``[rows, columns]`` int8."""
+
+    @property
+    def resolution(self) -> float:
+        """Edge of a cell [m]."""
+        return self.grid.resolution
+
+    @property
+    def origin(self) -> tuple[float, float]:
+        """x and y of the corner of cell (0, 0) in the odometry frame [m]."""
+        return self.grid.origin
+
+    @property
+    def height(self) -> float:
+        """z of the robot's base in the odometry frame [m]."""
+        return self.grid.height
 
 
 def occupancy(
@@ -55,22 +111,23 @@ def occupancy(
     span = maximum_filter(height, 3, mode="nearest") - minimum_filter(height, 3, mode="nearest")
     step = np.maximum(0.0, span - 2.0 * grid.resolution * np.tan(np.minimum(slope, 1.4)))
     share = np.maximum(slope / slope_limit, step / step_limit)
-    cost = np.where(share >= 1.0, LETHAL, np.minimum(LETHAL - 1, np.rint(100.0 * share))).astype(np.int8)
+    cost = np.where(share >= 1.0, LETHAL, np.minimum(GRADED, np.rint(100.0 * share))).astype(np.int8)
     cost = np.where(terrain.measured_nearby(), cost, UNKNOWN).astype(np.int8)
-    return _aligned(cost, terrain, odometry_from_terrain)
+    aligned = AlignedGrid.around(grid, odometry_from_terrain)
+    return Occupancy(aligned, aligned.resampled(cost, UNKNOWN))
 
 
-def _aligned(cost: np.ndarray, terrain: TerrainMap, pose: np.ndarray) -> Occupancy:
-    """The map resampled along the axes of the odometry frame by nearest neighbour."""
-    grid = terrain.grid
-    left, right, bottom, top = grid.extent
-    corners = np.array([[left, bottom], [left, top], [right, bottom], [right, top]]) @ pose[:2, :2].T + pose[:2, 3]
-    low = np.floor(corners.min(axis=0) / grid.resolution)
-    high = np.ceil(corners.max(axis=0) / grid.resolution)
-    columns, rows = (high - low).astype(int)
-    x = (low[0] + np.arange(columns) + 0.5) * grid.resolution
-    y = (low[1] + np.arange(rows) + 0.5) * grid.resolution
-    there = np.stack(np.meshgrid(x, y), axis=-1) - pose[:2, 3]
-    row, column, inside = grid.cells(there @ pose[:2, :2])
-    data = np.where(inside, cost[row, column], UNKNOWN).astype(np.int8)
-    return Occupancy(grid.resolution, (low[0] * grid.resolution, low[1] * grid.resolution), float(pose[2, 3]), data)
+SLOWEST = 20
+"""Speed limit on a lethal cell, in per cent of the largest speed: a robot that got there has to leave again. Not 0,
+which Nav2 reads as no limit."""
+
+
+def speed_mask(found: Occupancy) -> np.ndarray:
+    """Speed limits in per cent of the largest speed for Nav2's speed filter ``[rows, columns]`` int8; 0 is no limit.
+
+    The limit falls linearly with the cost, to :data:`SLOWEST` on lethal cells. Unknown cells, such as those in the
+    sensors' blind spot beneath the robot, have no limit: the filter accepts no unknown ones.
+    """
+    cost = np.clip(found.data, 0, LETHAL).astype(float)
+    limit = np.rint(100.0 - (100.0 - SLOWEST) * cost / LETHAL)
+    return np.where(found.data <= 0, 0, limit).astype(np.int8)

@@ -1,0 +1,89 @@
+"""Arguments of a node's command line, checked before ROS reads them, so that none is ignored."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import NoReturn, override
+
+from monoforce_ros.nodes.parameter_files import read_sections, section_matches
+from monoforce_ros.nodes.schema import most_similar, nearest
+
+
+class NodeArgumentParser(argparse.ArgumentParser):
+    """An argument parser that refuses abbreviations and names the most similar option for an unknown one."""
+
+    def __init__(self, *, prog: str, description: str):
+        super().__init__(prog=prog, description=description, allow_abbrev=False)
+
+    @override
+    def error(self, message: str) -> NoReturn:
+        unknown = message.removeprefix("unrecognized arguments: ").split()
+        if message.startswith("unrecognized arguments: "):
+            message += nearest(unknown[0].split("=")[0], self._option_string_actions)
+        super().error(message)
+
+
+def own_arguments(arguments: Sequence[str]) -> list[str]:
+    """The words of a command line that are not between ``--ros-args`` and ``--``.
+
+    ROS's own function also takes ``NAME:=VALUE`` outside of them, as a remapping that nothing asked for, and fails on
+    arguments that it cannot read.
+    """
+    own, of_ros = [], False
+    for word in arguments:
+        if word == "--ros-args" or (of_ros and word == "--"):
+            of_ros = not of_ros or word == "--ros-args"
+        elif not of_ros:
+            own.append(word)
+    return own
+
+
+def refuse_stray_arguments(arguments: Sequence[str], parameters: Iterable[str]) -> None:
+    """Raise ``ValueError`` for an argument that is neither ROS's own nor ``--help``.
+
+    Args:
+        arguments: the command line without the executable.
+        parameters: names of the node's parameters, to suggest the one that was meant.
+    """
+    stray = own_arguments(arguments)
+    if not stray:
+        return
+    word = stray[0]
+    name = word.lstrip("-").replace("-", "_").partition("=")[0].rstrip(":")
+    meant = next(iter(most_similar(name, parameters)), "NAME")
+    raise ValueError(f"unexpected argument {word!r}: parameters are given as --ros-args -p {meant}:=VALUE")
+
+
+def check_parameter_files(arguments: Sequence[str], node: str) -> list[str]:
+    """Warnings about parameter files on the command line without a section for the node.
+
+    Args:
+        arguments: the command line.
+        node: fully qualified name of the node.
+
+    Raises:
+        ValueError: a file is missing or is no parameter file.
+    """
+    warnings = []
+    for path in parameter_files(arguments):
+        sections = read_sections(path)
+        if not any(section_matches(section, node) for section in sections):
+            warnings.append(
+                f"{path} has no parameters for {node}: its sections are {', '.join(sorted(sections))}; expected {node} "
+                "or /**"
+            )
+    return warnings
+
+
+def parameter_files(arguments: Sequence[str]) -> list[Path]:
+    """Files given by ``--params-file``."""
+    return [Path(path) for word, path in pairwise(arguments) if word == "--params-file"]
+
+
+def command_line(arguments: Sequence[str] | None) -> list[str]:
+    """The given arguments, or those of the process without the executable."""
+    return list(sys.argv[1:] if arguments is None else arguments)

@@ -1,0 +1,110 @@
+"""Parameter files: generated from a schema with every default, and read as ROS reads them.
+
+``python -m monoforce_ros.nodes.parameter_files`` writes ``config/*.params.yaml`` of the current folder.
+"""
+
+from __future__ import annotations
+
+import sys
+import textwrap
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from monoforce_ros.core import write_text
+from monoforce_ros.nodes.schema import SCHEMAS, ParameterEntry, read_schema
+
+_WIDTH = 110
+
+
+def parameter_file_text(node: str, entries: Sequence[ParameterEntry]) -> str:
+    """A commented file with every parameter of a node at its default, for any node name and namespace."""
+    lines = [
+        f"# Parameters of the {node} with their defaults. Copy the file, delete what you do not change, and use it by",
+        f"#   ros2 run monoforce_ros {node} --ros-args --params-file FILE",
+        f"# Generated from {node}.schema.yaml by: python -m monoforce_ros.nodes.parameter_files",
+        "/**:",
+        "  ros__parameters:",
+    ]
+    for entry in entries:
+        limits = f" [{entry.unit}]" if entry.unit else ""
+        limits += f" ({entry.range_text})" if entry.range_text else ""
+        live = " Can be changed while the node runs." if entry.dynamic else ""
+        text = f"{entry.description}{limits}{live}"
+        lines += textwrap.wrap(text, _WIDTH, initial_indent="    # ", subsequent_indent="    # ")
+        if entry.default is None:
+            example = ", ".join(["0.0"] * max(entry.size, 1))
+            lines.append(f"    # {entry.name}: [{example}]")
+        else:
+            lines.append(f"    {entry.name}: {_yaml(entry.default)}")
+    return "\n".join(lines) + "\n"
+
+
+def _yaml(value: Any) -> str:
+    """A value in YAML on one line, which ROS's own parser reads with the same type."""
+    if isinstance(value, list):
+        return f"[{', '.join(map(_yaml, value))}]"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f'"{value}"' if isinstance(value, str) else repr(value)
+
+
+def read_sections(path: Path) -> dict[str, dict[str, Any]]:
+    """Sections of a parameter file: fully qualified node name, possibly with wildcards → parameters.
+
+    Nested keys such as ``left: predictor:`` are joined, and a name without a leading slash gets one, as ROS does.
+
+    Raises:
+        ValueError: the file is missing, not YAML, or has no ``ros__parameters``.
+    """
+    example = (
+        "expected '/**:', under it 'ros__parameters:', and under that NAME: VALUE, as in config/predictor.params.yaml"
+    )
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"parameter file {path}: {error.strerror}; give the path of an existing file") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"parameter file {path} is not YAML: {error}") from error
+    sections: dict[str, dict[str, Any]] = {}
+    _collect(content, "", sections)
+    if not sections:
+        raise ValueError(f"parameter file {path} has no 'ros__parameters': {example}")
+    return sections
+
+
+def _collect(content: Any, name: str, sections: dict[str, dict[str, Any]]) -> None:
+    if not isinstance(content, Mapping):
+        return
+    for key, value in content.items():
+        if key == "ros__parameters":
+            sections[name or "/**"] = dict(value) if isinstance(value, Mapping) else {}
+        else:
+            _collect(value, f"{name}/{str(key).strip('/')}", sections)
+
+
+def section_matches(section: str, node: str) -> bool:
+    """Whether a section is for a node, both fully qualified; ``*`` is one part of the name, ``**`` any number."""
+
+    def match(pattern: list[str], parts: list[str]) -> bool:
+        if not pattern:
+            return not parts
+        if pattern[0] == "**":
+            return any(match(pattern[1:], parts[skipped:]) for skipped in range(len(parts) + 1))
+        return bool(parts) and pattern[0] in ("*", parts[0]) and match(pattern[1:], parts[1:])
+
+    return match(section.strip("/").split("/"), node.strip("/").split("/"))
+
+
+def main() -> int:
+    """Write the parameter files of ``config/`` in the current folder."""
+    for node in SCHEMAS:
+        entries = read_schema(Path("config") / f"{node}.schema.yaml")
+        write_text(Path("config") / f"{node}.params.yaml", parameter_file_text(node, entries))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

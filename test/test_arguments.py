@@ -1,0 +1,100 @@
+"""Command lines of the nodes: nothing on them is ignored, and what is wrong is answered with the nearest right name."""
+
+import subprocess
+
+import pytest
+from conftest import ROOT
+
+from monoforce_ros.nodes.arguments import check_parameter_files, own_arguments, parameter_files, refuse_stray_arguments
+
+KNOWN = ("robot", "terrain_source", "rate")
+
+
+@pytest.mark.parametrize(
+    ("words", "own"),
+    [
+        (["--ros-args", "-p", "robot:=husky"], []),
+        (["robot:=husky"], ["robot:=husky"]),
+        (["a", "--ros-args", "-r", "x:=y", "--", "b"], ["a", "b"]),
+        (["--ros-args", "-p", "broken", "--", "--ros-args", "-p", "c"], []),
+    ],
+)
+def test_own_arguments_are_those_outside_of_ros_args(words, own):
+    assert own_arguments(words) == own
+
+
+@pytest.mark.parametrize(
+    ("word", "meant"),
+    [("--robot", "robot"), ("robot:=husky", "robot"), ("--terain-source=flat", "terrain_source"), ("7", "NAME")],
+)
+def test_a_stray_argument_is_answered_with_how_to_give_the_parameter(word, meant):
+    with pytest.raises(ValueError, match=rf"unexpected argument '{word}'.*--ros-args -p {meant}:=VALUE"):
+        refuse_stray_arguments([word, "--ros-args", "-p", "rate:=3.0"], KNOWN)
+
+
+def test_a_file_without_a_section_for_the_node_is_reported(tmp_path):
+    file = tmp_path / "parameters.yaml"
+    file.write_text("predictor:\n  ros__parameters:\n    rate: 3.0\n")
+    words = ["--ros-args", "--params-file", str(file)]
+    assert parameter_files(words) == [file]
+    assert check_parameter_files(words, "/predictor") == []
+    (warning,) = check_parameter_files(words, "/left/predictor")
+    assert "has no parameters for /left/predictor: its sections are /predictor" in warning
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        (
+            "predictor --robot husky",
+            "unexpected argument '--robot': parameters are given as --ros-args -p robot:=VALUE",
+        ),
+        ("predictor robot:=husky", "unexpected argument 'robot:=husky'"),
+        (
+            "predictor --ros-args -p terrain_sourse:=camera",
+            "unknown parameter 'terrain_sourse'; did you mean 'terrain_source'?",
+        ),
+        ("predictor --ros-args -p robot=husky", "the ROS arguments cannot be read"),
+        ("predictor --ros-args --params-file {schema}", "has no 'ros__parameters': expected '/**:'"),
+        ("predictor --ros-args --params-file /nowhere.yaml", "parameter file /nowhere.yaml: No such file"),
+        (
+            "path_selector --ros-args -p weight_distence:=1.0",
+            "unknown parameter 'weight_distence'; did you mean 'weight_distance'?",
+        ),
+        ("simulator --fat", "unrecognized arguments: --fat; did you mean '--flat'?"),
+        ("bag_player --rte 3", "unrecognized arguments: --rte; did you mean '--rate'?"),
+        ("bag_player --ros-args -p rate:=3.0", "unknown parameter 'rate': bag_player has no parameters"),
+        ("bag_recorder {out} --ros-args -p topics:=odom", "unknown parameter 'topics': bag_recorder has no parameters"),
+        ("bag_recorder {out} --topic odom", "unrecognized arguments: --topic odom; did you mean '--topics'?"),
+    ],
+)
+def test_a_wrong_command_line_ends_the_start_in_one_line(executables, ros_environment, tmp_path, command, message):
+    filled = command.format(schema=ROOT / "config" / "predictor.schema.yaml", out=tmp_path / "bag")
+    name, *words = filled.split()
+    done = subprocess.run(
+        [str(executables / name), *words],
+        env=ros_environment, capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+    assert done.returncode in (1, 2)
+    assert message in done.stderr and "Traceback" not in done.stderr
+    assert len([line for line in done.stderr.splitlines() if "error: " in line]) == 1
+
+
+@pytest.mark.parametrize("node", ["predictor", "path_selector"])
+def test_the_shipped_parameter_file_loads_under_any_name_and_namespace(start, node):
+    process = start(
+        node, "--ros-args", "--params-file", ROOT / "config" / f"{node}.params.yaml", "-r", "__ns:=/left",
+        "-r", "__node:=renamed",
+    )  # fmt: skip
+    process.wait_for("predicting 5 s ahead for husky" if node == "predictor" else "waiting for a goal", 120.0)
+    assert "no parameters for" not in process.output and "not used" not in process.output
+    assert process.stop() == 0
+
+
+def test_a_value_of_a_parameter_file_arrives_and_those_of_the_other_node_are_named(start, tmp_path):
+    file = tmp_path / "both.yaml"
+    file.write_text("/**:\n  ros__parameters:\n    goal_topic: here\n    terrain_source: flat\n")
+    process = start("path_selector", "--ros-args", "--params-file", file)
+    process.wait_for("waiting for a goal on /here")
+    assert "not used by this node: terrain_source (of predictor)" in process.output
+    assert process.stop() == 0

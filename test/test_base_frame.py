@@ -1,0 +1,105 @@
+"""Recordings whose odometry describes another frame than the one that lengths in the robot file refer to."""
+
+import subprocess
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from monoforce_ros.bags import BagError, BagWriter, Recording, builders
+from monoforce_ros.core import pose_matrix
+from monoforce_ros.evaluation import evaluate_recording
+from monoforce_ros.perception import FlatTerrain
+from monoforce_ros.physics import PhysicsOptions
+from monoforce_ros.prediction import Predictor
+from monoforce_ros.robots import load_robot
+from monoforce_ros.terrain import Grid, TerrainDefaults
+
+START = 1_700_000_000_000_000_000
+FOOTPRINT = pose_matrix([0.1, 0.0, -0.1323, 0.0, 0.0, 0.2])
+"""Pose of the odometry's child frame in base_link."""
+
+
+@pytest.fixture(scope="module")
+def recording(demo_bag) -> Recording:
+    return Recording.open(demo_bag)
+
+
+@pytest.fixture(scope="module")
+def displaced(recording) -> Recording:
+    """The same drive, as odometry of base_footprint tells it, with its place on the robot in the transforms."""
+    motion = recording.motion.of_base(np.linalg.inv(FOOTPRINT), "base_footprint")
+    transforms = recording.static_transforms | {("base_link", "base_footprint"): FOOTPRINT}
+    return replace(recording, motion=motion, static_transforms=transforms)
+
+
+def test_the_offset_restores_the_base_s_motion(recording, displaced):
+    found = displaced.in_base_frame("base_link").motion
+    np.testing.assert_allclose(found.positions, recording.motion.positions, atol=1e-9)
+    np.testing.assert_allclose(found.linear_velocities, recording.motion.linear_velocities, atol=1e-9)
+    assert found.child_frame_id == "base_link"
+    given = replace(displaced, static_transforms={}).in_base_frame("base_link", FOOTPRINT)
+    np.testing.assert_allclose(given.motion.positions, recording.motion.positions, atol=1e-9)
+
+
+def test_an_unknown_offset_is_refused_with_both_frames_and_the_missing_path(displaced):
+    lost = replace(displaced, static_transforms={})
+    with pytest.raises(BagError, match="frame 'base_footprint'.*refer to 'base_link'.*no transform has 'base_link' or"):
+        lost.in_base_frame("base_link")
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_errors_do_not_depend_on_the_frame_of_the_odometry(recording, displaced):
+    robot = load_robot("husky")
+    grid = Grid.square(12.8, 0.1)
+    predictor = Predictor(
+        robot, FlatTerrain(robot, grid, TerrainDefaults()), horizon=1.0, options=PhysicsOptions(time_step=0.01)
+    )
+
+    def error(of: Recording) -> float:
+        found = evaluate_recording(of, predictor, horizons=(1.0,), stride=1.0, quiet=True)
+        return float(np.nanmedian(found.errors("physics")[0][:, -1]))
+
+    right = error(recording)
+    assert error(displaced.in_base_frame("base_link")) == pytest.approx(right, abs=1e-4)
+    # Without the offset the prediction starts beside the robot, and turned.
+    assert error(displaced) > right + 0.02
+
+
+def write(path, child: str, moving: bool):
+    """Odometry of ``child`` and its place on /tf, fixed or moving."""
+    with BagWriter(path) as bag:
+        for i in range(100):
+            at = START + i * 50_000_000
+            odometry = builders.odometry(at, "odom", child, [0.02 * i, 0, 0], [0, 0, 0, 1], [0.4, 0, 0], [0] * 3)
+            bag.write("/odom", odometry, at)
+            height = 0.1 + (0.002 * i if moving else 0.0)
+            bag.write("/tf", builders.transforms(at, child, {"base_link": pose_matrix([0, 0, height, 0, 0, 0])}), at)
+            bag.write("/tf", builders.transforms(at, "odom", {child: pose_matrix([0.02 * i, 0, 0, 0, 0, 0])}), at)
+            bag.write("/cmd_vel", builders.twist(0.4, 0.0), at)
+    return path
+
+
+def test_transforms_on_tf_count_if_they_hold_still(tmp_path):
+    fixed = Recording.open(write(tmp_path / "fixed", "base_footprint", False))
+    assert fixed.in_base_frame("base_link").motion.positions[0, 2] == pytest.approx(0.1)
+    moving = Recording.open(write(tmp_path / "moving", "base_footprint", True))
+    with pytest.raises(BagError, match="offset between them is unknown"):
+        moving.in_base_frame("base_link")
+
+
+def test_evaluate_takes_the_offset_from_its_options(tmp_path, executables, ros_environment):
+    bag = write(tmp_path / "moving", "base_footprint", True)
+    command = [executables / "evaluate", "--check", bag]
+
+    def run(*options: str):
+        return subprocess.run(
+            [*command, *options], env=ros_environment, capture_output=True, text=True, timeout=120, check=False
+        )
+
+    refused = run()
+    assert refused.returncode == 1 and "the offset between them is unknown" in refused.stdout
+    given = run("--odometry-child-pose", "0", "0", "-0.1", "0", "0", "0")
+    assert given.returncode == 0 and "base_link is at (0.000, 0.000, 0.100) m" in given.stdout
+    named = run("--base-frame", "base_footprint")
+    assert named.returncode == 0 and "odom → base_footprint" in named.stdout

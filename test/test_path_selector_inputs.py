@@ -1,0 +1,257 @@
+"""What path_selector says and does for each of its inputs: missing, of another type, quality of service or frame."""
+
+import time
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
+from nav_msgs.msg import Odometry, Path
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import PointCloud2
+
+from monoforce_ros.bags import builders, type_store
+from monoforce_ros.core import pose_matrix
+from monoforce_ros.messages import encoding, message_class
+from monoforce_ros.nodes.progress_check import ProgressCheck
+from monoforce_ros.planning import WAYPOINTS, plan_target
+
+BEST_EFFORT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+OK, WARN = 0, 1
+
+
+class Robot:
+    """The surroundings of a selector: odometry, candidates that turn left, go straight and turn right, and a base."""
+
+    def __init__(self, peer, prefix: str):
+        self.peer, self.prefix = peer, prefix
+        node = peer.node
+        self.odometry = node.create_publisher(Odometry, f"/{prefix}/odom", BEST_EFFORT)
+        self.candidates = node.create_publisher(PointCloud2, f"/{prefix}/predicted/candidate_costs", 1)
+        self.goals = node.create_publisher(PoseStamped, f"/{prefix}/goal_pose", 1)
+        self.place, self.heading, self.speed = np.zeros(2), 0.0, 0.0
+        self.child, self.frame = "base_link", "odom"
+        self.commands: list = []
+        self.base = None
+
+    def listen(self, kind: type) -> None:
+        """Become a base that listens to one type of command."""
+        node = self.peer.node
+        if self.base is not None:
+            node.destroy_subscription(self.base)
+        self.commands.clear()
+        self.base = node.create_subscription(kind, f"/{self.prefix}/cmd_vel", self.commands.append, BEST_EFFORT)
+
+    def send_goal(self, x: float, y: float, frame: str = "odom") -> None:
+        assert self.peer.until(lambda: self.goals.get_subscription_count() > 1, 10.0)
+        goal = PoseStamped()
+        goal.header.frame_id = frame
+        goal.pose.position.x, goal.pose.position.y = x, y
+        self.goals.publish(goal)
+
+    def live(self, seconds: float, *, odometry: bool = True, candidates: bool = True, until=None) -> bool:
+        """Publish odometry at 20 Hz and candidates at 5 Hz, until a condition holds or time is over."""
+        end, step = time.monotonic() + seconds, 0
+        while time.monotonic() < end:
+            self.peer.now += 50_000_000
+            self.place = self.place + 0.05 * self.speed * np.array([np.cos(self.heading), np.sin(self.heading)])
+            stamp = self.peer.now
+            if odometry:
+                turn = [0, 0, np.sin(self.heading / 2), np.cos(self.heading / 2)]
+                message = builders.odometry(stamp, self.frame, self.child, [*self.place, 0], turn, [0] * 3, [0] * 3)
+                self.odometry.publish(bytes(type_store().serialize_cdr(message, message.__msgtype__)))
+            if candidates and step % 4 == 0:
+                self.candidates.publish(self._fan(stamp))
+            step += 1
+            self.peer.spin(0.05)
+            if until is not None and until():
+                return True
+        return until is None
+
+    def _fan(self, stamp: int) -> bytes:
+        angles = self.heading + np.array([0.8, 0.0, -0.8])
+        fields = {"x": self.place[0] + 2 * np.cos(angles), "y": self.place[1] + 2 * np.sin(angles), "z": np.zeros(3)}
+        fields |= {"heading": angles, "speed": np.full(3, 0.5), "yaw_rate": np.array([0.4, 0.0, -0.4])}
+        fields |= {"cost": np.zeros(3), "feasible": np.ones(3)}
+        for share in WAYPOINTS:
+            along = share / 100
+            fields |= {f"x_{share}": self.place[0] + along * (fields["x"] - self.place[0])}
+            fields |= {f"y_{share}": self.place[1] + along * (fields["y"] - self.place[1])}
+        return encoding.point_cloud(stamp, self.frame, fields)
+
+    def status(self, part: str = "choice") -> tuple[int, str]:
+        for array in reversed(self.peer.received["/diagnostics"]):
+            for entry in array.status:
+                if entry.name == f"{self.prefix}/path_selector: {part}":
+                    return int.from_bytes(entry.level, "little"), entry.message
+        return -1, ""
+
+    def says(self, text: str, part: str = "choice"):
+        return lambda: text in self.status(part)[1]
+
+    @property
+    def driven(self) -> bool:
+        twist = getattr(self.commands[-1], "twist", self.commands[-1]) if self.commands else Twist()
+        return twist.linear.x > 0.0
+
+
+@pytest.fixture
+def robot(peer, start, request):
+    """A robot in a namespace of its own, with a selector that may have one parameter."""
+    prefix = f"robot{abs(hash(request.node.name)) % 10**6}"
+    arguments = ["-p", request.param] if hasattr(request, "param") else []
+    process = start("path_selector", "--ros-args", "-r", f"__ns:=/{prefix}", *arguments)
+    process.wait_for("waiting for a")
+    robot = Robot(peer, prefix)
+    robot.process = process
+    yield robot
+    assert process.stop() == 0
+    assert "Traceback" not in process.output
+
+
+def test_without_odometry_it_says_so_and_claims_nothing(robot):
+    robot.listen(TwistStamped)
+    robot.send_goal(5.0, 0.0)
+    assert robot.live(10.0, odometry=False, until=robot.says("stopped: no odometry: the position is unknown"))
+    assert robot.live(5.0, odometry=False, until=lambda: robot.status("odometry")[0] == WARN)
+    assert "no messages for" in robot.status("odometry")[1]
+    assert not robot.driven and "driving" not in robot.process.output
+
+
+def test_best_effort_odometry_is_received_and_a_moving_robot_drives(robot):
+    robot.listen(TwistStamped)
+    robot.send_goal(50.0, 0.0)
+    assert robot.live(10.0, until=lambda: robot.driven), robot.status()
+    robot.speed = 0.5
+    assert robot.live(10.0, until=robot.says("driving to the goal")), robot.status()
+    assert robot.status()[0] == OK
+
+
+def test_a_robot_that_stands_is_not_said_to_drive(robot):
+    robot.listen(TwistStamped)
+    robot.send_goal(50.0, 0.0)
+    assert robot.live(15.0, until=robot.says("the robot does not move: 0.50 m/s")), robot.status()
+    assert robot.status()[0] == WARN and "driving" not in robot.process.output
+
+
+@pytest.mark.parametrize("kind", [Twist, TwistStamped])
+def test_commands_have_the_type_that_the_base_listens_to(robot, kind):
+    robot.listen(kind)
+    robot.send_goal(50.0, 0.0)
+    assert robot.live(10.0, until=lambda: robot.driven), robot.status()
+    names = [info.topic_type for info in robot.peer.node.get_publishers_info_by_topic(f"/{robot.prefix}/cmd_vel")]
+    assert names == [f"geometry_msgs/msg/{kind.__name__}"]
+    # The base is exchanged for one of the other type.
+    other = Twist if kind is TwistStamped else TwistStamped
+    robot.listen(other)
+    assert robot.live(10.0, until=lambda: robot.driven), robot.status()
+    assert isinstance(robot.commands[-1], other)
+
+
+def test_commands_that_nobody_hears_are_no_drive(robot):
+    robot.send_goal(50.0, 0.0)
+    assert robot.live(10.0, until=robot.says(f"stopped: nothing listens to /{robot.prefix}/cmd_vel")), robot.status()
+    assert "driving" not in robot.process.output
+
+
+@pytest.mark.parametrize("robot", ["command_type:=twist"], indirect=True)
+def test_a_fixed_type_that_the_base_does_not_expect_is_named(robot):
+    robot.listen(TwistStamped)
+    robot.send_goal(50.0, 0.0)
+    expected = "its listeners expect geometry_msgs/msg/TwistStamped"
+    assert robot.live(10.0, until=robot.says(expected)), robot.status()
+
+
+def test_the_frame_of_a_goal_comes_before_its_distance(robot):
+    robot.listen(TwistStamped)
+    robot.place = np.array([3.0, 4.0])
+    # In its own frame the goal is where the robot stands; what that means in the odometry frame is unknown.
+    robot.send_goal(3.0, 4.0, frame="map")
+    assert robot.live(10.0, until=robot.says("the goal is in frame 'map', odometry in 'odom'")), robot.status()
+    assert not robot.driven and "reached" not in robot.process.output
+
+
+def test_goals_in_the_map_are_transformed_by_tf(robot):
+    kind = message_class("tf2_msgs/msg/TFMessage")
+    if kind is None:
+        pytest.skip("tf2_msgs is not installed (make interfaces builds it)")
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    transforms = robot.peer.node.create_publisher(kind, "/tf_static", latched)
+    # The map is turned by a quarter: what lies ahead of the robot there is to its right in the odometry frame.
+    pose = pose_matrix([1.0, 2.0, 0.0, 0.0, 0.0, np.pi / 2])
+    message = builders.transforms(robot.peer.now, "map_2", {"odom": pose})
+    transforms.publish(bytes(type_store().serialize_cdr(message, message.__msgtype__)))
+    robot.listen(Twist)
+    robot.send_goal(10.0, 2.0, frame="map_2")
+    assert robot.live(10.0, until=lambda: robot.driven), robot.status()
+    assert robot.commands[-1].angular.z < 0.0
+    # It is reached where the map says: (1, 7) in the map is 5 m ahead in the odometry frame.
+    robot.place = np.array([5.0, 0.1])
+    robot.send_goal(1.0, 7.0, frame="map_2")
+    assert robot.live(10.0, until=robot.says("the goal is reached: 0.10 m away")), robot.status()
+
+
+@pytest.mark.parametrize("robot", ["odometry_child_pose:=[2.0, 0.0, 0.0, 0.0, 0.0, 0.0]"], indirect=True)
+def test_the_offset_of_the_odometry_s_frame_counts(robot):
+    robot.listen(Twist)
+    robot.child = "gps"
+    robot.place = np.array([7.0, 0.0])
+    robot.send_goal(5.0, 0.2)
+    assert robot.live(10.0, until=robot.says("the goal is reached: 0.20 m away")), robot.status()
+
+
+def test_odometry_of_an_unknown_frame_names_both_frames_and_the_missing_path(robot):
+    robot.listen(Twist)
+    robot.child = "gps"
+    robot.send_goal(5.0, 0.0)
+    assert robot.live(10.0, until=robot.says("odometry describes the frame 'gps'")), robot.status()
+    assert "refer to 'base_link'" in robot.status()[1] and "no transform has 'base_link' or 'gps'" in robot.status()[1]
+    assert not robot.driven
+
+
+@pytest.mark.parametrize("robot", ["plan_topic:=plan"], indirect=True)
+def test_it_follows_a_plan_instead_of_heading_for_its_end(robot):
+    robot.listen(Twist)
+    plans = robot.peer.node.create_publisher(Path, f"/{robot.prefix}/plan", 1)
+    assert robot.peer.until(lambda: plans.get_subscription_count() > 1, 10.0)
+    plan = Path()
+    plan.header.frame_id = "odom"
+    # Left first, although the end lies to the right.
+    for x, y in ((0.0, 0.0), (1.0, 1.0), (3.0, 6.0), (6.0, 6.0), (6.0, -9.0)):
+        pose = PoseStamped()
+        pose.pose.position.x, pose.pose.position.y = x, y
+        plan.poses.append(pose)
+    plans.publish(plan)
+    assert robot.live(10.0, until=lambda: robot.driven), robot.status()
+    assert robot.commands[-1].angular.z > 0.0
+    plans.publish(Path())
+    assert robot.live(10.0, until=lambda: not robot.driven) and "the plan is empty" in robot.status()[1]
+
+
+def test_the_target_lies_ahead_on_the_plan():
+    plan = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0], [0.0, 0.2]])
+    target, remaining = plan_target(plan, np.array([1.0, 0.3]), 2.0)
+    np.testing.assert_allclose(target, [3.0, 0.0])
+    assert remaining == pytest.approx(3.0 + 4.0 + 4.0 + 3.8)
+    np.testing.assert_allclose(plan_target(plan, np.array([3.5, 0.1]), 2.0)[0], [4.0, 1.5])
+    # At the start of a loop its end is as near, and must not be taken for the robot's place on it.
+    assert plan_target(plan, np.array([0.0, 0.1]), 2.0)[1] > 14.0
+    np.testing.assert_allclose(plan_target(plan, np.array([0.0, 3.0]), 9.0)[0], [0.0, 0.2])
+    assert plan_target(plan[:1], np.array([9.0, 9.0]), 1.0)[1] == 0.0
+    with pytest.raises(ValueError, match="at least one finite position"):
+        plan_target(np.array([[np.nan, 0.0]]), np.zeros(2), 1.0)
+
+
+@pytest.mark.parametrize(("speed", "moving"), [(0.5, True), (0.1, True), (0.0, False), (0.005, False)])
+def test_progress_is_what_odometry_shows_of_the_commanded_motion(speed, moving):
+    check = ProgressCheck()
+    for step in range(30):
+        check.add(0.1 * step, (0.5, 0.0), np.array([0.1 * step * speed, 0.0]), 0.0)
+    assert check.moving is moving
+    check.clear()
+    assert check.moving is None
+    for step in range(30):
+        check.add(0.1 * step, (0.0, 0.0), np.zeros(2), 0.0)
+    assert check.moving is None, "a robot that is commanded to stand does not fail to move"
+    for step in range(30, 60):
+        check.add(0.1 * step, (0.0, 0.6), np.zeros(2), 0.1 * step * 0.4)
+    assert check.moving, "turning on the spot is motion"
