@@ -112,11 +112,17 @@ interfaces() {
   fi
   { grep -rlZ '"/opt/python/' "$venv"/share/*/cmake || true; } | xargs -0r sed -i \
     -e "s#/opt/python/[^;\"]*/include/python3[.0-9]*#$headers#g" -e "s#/opt/python/[^;\"]*/numpy/[^;\"]*include#$arrays#g"
-  # An installed ROS has the complete packages.
+  # An installed ROS has the complete packages; what an earlier call built into install/ does not count.
   for package in msg_defs/*/package.xml; do
     package=$(dirname "$package")
-    "$venv/bin/python" -c "import $(basename "$package").msg" 2>/dev/null || packages+=("$package")
+    "$venv/bin/python" -c "import sys, $(basename "$package").msg as m; sys.exit(m.__file__.startswith('$root/$install_base/'))" \
+      2>/dev/null || packages+=("$package")
   done
+  if [ ${#packages[@]} = 0 ]; then
+    say "every message package is installed"
+    touch "$stamp"
+    return
+  fi
   say "building ${packages[*]#msg_defs/}"
   mkdir -p out
   if ! colcon --log-base log build --base-paths "${packages[@]}" --build-base "$build_base" --install-base "$install_base" \

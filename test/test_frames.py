@@ -37,8 +37,14 @@ def test_a_path_is_found_up_and_down_the_tree(tree):
 
 
 def test_a_missing_path_says_where_it_breaks(tree):
-    assert "'base_link' is below 'odom' and 'moon' below 'earth'" in tree.missing_path("base_link", "moon")
+    found = tree.missing_path("base_link", "moon")
+    assert found.startswith("'base_link' is connected with base_footprint, lidar, odom, and 'moon' with earth")
     assert "no transform has 'nowhere' (frames there: base_footprint" in tree.missing_path("lidar", "nowhere")
+
+
+def test_a_frame_with_two_parents_connects_both(tree):
+    tree.add("camera", "lidar", at(1.0))
+    assert tree.find("base_link", "camera") is not None and tree.find("odom", "lidar") is not None
 
 
 def test_a_loop_does_not_hang(tree):

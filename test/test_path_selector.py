@@ -71,6 +71,8 @@ def test_the_robot_is_sent_towards_its_goal(peer, nodes, sent):
 
 def test_it_goes_around_a_wall(peer, nodes, sent):
     send(peer, 9.0, 2.0)
+    # On a busy machine predictions of the world without the wall are still under way.
+    peer.drive(2.4, cloud=walled, speed=0.0)
     command = moves(peer, sent, cloud=walled, speed=0.0)
     assert abs(command.twist.angular.z) > 0.2
 

@@ -147,6 +147,29 @@ def test_commands_have_the_type_that_the_base_listens_to(robot, kind):
     assert isinstance(robot.commands[-1], other)
 
 
+def test_a_predictor_beside_the_base_hears_the_base_s_type(robot, start):
+    """The predictor listens to commands, too: it must not make the selector publish a type that the base ignores."""
+    predictor = start("predictor", "--ros-args", "-r", f"__ns:=/{robot.prefix}", "-p", "terrain_source:=flat")
+    predictor.wait_for("with terrain from flat", 120.0)
+    robot.listen(Twist)
+    robot.send_goal(50.0, 0.0)
+    topic, node = f"/{robot.prefix}/cmd_vel", robot.peer.node
+
+    def settled() -> bool:
+        sent = [info.topic_type for info in node.get_publishers_info_by_topic(topic)]
+        heard = {info.topic_type for info in node.get_subscriptions_info_by_topic(topic)}
+        return robot.driven and sent == ["geometry_msgs/msg/Twist"] and heard == {"geometry_msgs/msg/Twist"}
+
+    assert robot.live(20.0, until=settled), robot.status()
+
+    def heard() -> bool:
+        statuses = [entry for array in robot.peer.received["/diagnostics"] for entry in array.status]
+        return any(s.name.endswith("predictor: commands") and s.message == "receiving commands" for s in statuses)
+
+    assert robot.live(10.0, until=heard)
+    assert predictor.stop() == 0
+
+
 def test_commands_that_nobody_hears_are_no_drive(robot):
     robot.send_goal(50.0, 0.0)
     assert robot.live(10.0, until=robot.says(f"stopped: nothing listens to /{robot.prefix}/cmd_vel")), robot.status()

@@ -14,36 +14,32 @@ class FrameError(ValueError):
 
 
 class TransformTree:
-    """Transforms between named frames, as on /tf: each frame has one parent.
+    """Transforms between named frames, as on /tf; a recording may even give a frame several parents.
 
-    Leading slashes of names are ignored, as in tf2. Not thread-safe, except that :meth:`find` may run while another
-    thread adds transforms.
+    Leading slashes of names are ignored, as in tf2. :meth:`find` may run while another thread adds transforms.
     """
 
     def __init__(self, transforms: Mapping[tuple[str, str], np.ndarray] | None = None):
-        self._parents: dict[str, tuple[str, np.ndarray]] = {}
+        # Neighbours of each frame; the matrix is the pose of the child in the parent, and the flag tells whether the
+        # neighbour is the child.
+        self._neighbours: dict[str, dict[str, tuple[np.ndarray, bool]]] = {}
         for (parent, child), matrix in (transforms or {}).items():
             self.add(parent, child, matrix)
 
     def add(self, parent: str, child: str, matrix: np.ndarray) -> None:
         """Set the pose ``[4, 4]`` of a child in its parent's frame; replaces an earlier one."""
-        self._parents[child.lstrip("/")] = parent.lstrip("/"), matrix
+        parent, child = parent.lstrip("/"), child.lstrip("/")
+        self._neighbours.setdefault(parent, {})[child] = matrix, True
+        self._neighbours.setdefault(child, {})[parent] = matrix, False
 
     @property
     def frames(self) -> set[str]:
         """Names of all frames."""
-        # Copied at once: another thread may add a frame.
-        parents = list(self._parents.items())
-        return {child for child, _ in parents} | {parent for _, (parent, _) in parents}
+        return set(self._neighbours)
 
     def find(self, target: str, source: str) -> np.ndarray | None:
         """Pose ``[4, 4]`` of ``source`` in ``target``; None if they are not connected."""
-        up_from_target = self._path_up(target.lstrip("/"))
-        up_from_source = self._path_up(source.lstrip("/"))
-        common = next((frame for frame in up_from_source if frame in up_from_target), None)
-        if common is None:
-            return None
-        return np.asarray(np.linalg.inv(up_from_target[common]) @ up_from_source[common])
+        return self._reached(target.lstrip("/"), source.lstrip("/")).get(source.lstrip("/"))
 
     def missing_path(self, target: str, source: str) -> str:
         """Why :meth:`find` returns None, in words."""
@@ -52,23 +48,26 @@ class TransformTree:
         if unknown:
             known = ", ".join(sorted(self.frames)) or "none"
             return f"no transform has {' or '.join(unknown)} (frames there: {known})"
-        roots = [list(self._path_up(frame))[-1] for frame in (target, source)]
+        near_target, near_source = (", ".join(sorted(set(self._reached(f)) - {f})) for f in (target, source))
         return (
-            f"{target!r} is below {roots[0]!r} and {source!r} below {roots[1]!r}: a transform between these trees is "
-            "missing"
+            f"{target!r} is connected with {near_target}, and {source!r} with {near_source}: a transform between these "
+            "is missing"
         )
 
-    def _path_up(self, frame: str) -> dict[str, np.ndarray]:
-        """The frame and its ancestors, each with the pose of ``frame`` in it, up to the root (or to a loop)."""
-        path = {frame: np.eye(4)}
-        here = frame
-        while here in self._parents:
-            parent, matrix = self._parents[here]
-            if parent in path:
-                break
-            path[parent] = matrix @ path[here]
-            here = parent
-        return path
+    def _reached(self, start: str, end: str = "") -> dict[str, np.ndarray]:
+        """Pose in ``start`` of every frame connected with it; the search ends early at ``end``."""
+        reached = {start: np.eye(4)}
+        frontier = [start]
+        while frontier and end not in reached:
+            following = []
+            for frame in frontier:
+                # Copied at once: another thread may add a frame.
+                for neighbour, (matrix, downwards) in list(self._neighbours.get(frame, {}).items()):
+                    if neighbour not in reached:
+                        reached[neighbour] = reached[frame] @ (matrix if downwards else np.linalg.inv(matrix))
+                        following.append(neighbour)
+            frontier = following
+        return reached
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,14 @@ from monoforce_ros.nodes.subscriptions import other_listeners
 
 STAMPED, PLAIN = "geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist"
 _CLASSES = {STAMPED: TwistStamped, PLAIN: Twist}
-_CHOICES = {"twist_stamped": (STAMPED,), "twist": (PLAIN,)}
+_CHOICES = {"twist_stamped": STAMPED, "twist": PLAIN}
 
 
 class CommandOutput:
-    """Publishes ``TwistStamped``, ``Twist``, or both if different nodes listen to different ones.
+    """Publishes ``TwistStamped`` or ``Twist``.
+
+    Fast DDS allows a process one type per topic. Where listeners expect both, ``Twist`` is published: nodes that adapt,
+    as this package's do, start with ``TwistStamped``, so that a listener to ``Twist`` is one that needs it.
 
     Args:
         node: the node that publishes.
@@ -25,21 +28,18 @@ class CommandOutput:
     def __init__(self, node: Node, topic: str, kind: str):
         self._node = node
         self.topic = node.resolve_topic_name(topic)
-        self._fixed = _CHOICES.get(kind, ())
-        self._publishers: dict[str, Publisher] = {}
+        self._fixed = _CHOICES.get(kind, "")
+        self.type = ""
+        """Message type that is published; empty while it changes."""
+        self._publisher: Publisher | None = None
         self._listened: set[str] = set()
         self._timer = node.create_timer(0.5, self._update)
         self._update()
 
     @property
-    def types(self) -> tuple[str, ...]:
-        """Message types that are published."""
-        return tuple(self._publishers)
-
-    @property
     def deaf(self) -> str:
         """Why no other node hears the commands; empty if one does."""
-        if self._listened & set(self._publishers):
+        if self.type in self._listened:
             return ""
         if self._listened:
             return f"{self.topic}: its listeners expect {', '.join(sorted(self._listened))}"
@@ -47,24 +47,32 @@ class CommandOutput:
 
     def publish(self, speed: float, yaw_rate: float, frame_id: str) -> None:
         """Publish forward speed [m/s] and yaw rate [rad/s]."""
+        if self._publisher is None:
+            return
         twist = Twist()
         twist.linear.x, twist.angular.z = speed, yaw_rate
-        for kind, publisher in self._publishers.items():
-            if kind == PLAIN:
-                publisher.publish(twist)
-                continue
-            message = TwistStamped(twist=twist)
-            message.header.stamp = self._node.get_clock().now().to_msg()
-            message.header.frame_id = frame_id
-            publisher.publish(message)
+        if self.type == PLAIN:
+            self._publisher.publish(twist)
+            return
+        message = TwistStamped(twist=twist)
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        message.header.frame_id = frame_id
+        self._publisher.publish(message)
 
     def _update(self) -> None:
         self._listened = other_listeners(self._node, self.topic)
-        wanted = self._fixed or tuple(kind for kind in _CLASSES if kind in self._listened)
         # While nobody listens, the last type stays: a base that restarts asks for the same one.
-        wanted = wanted or self.types or (STAMPED,)
-        for kind in set(self._publishers) - set(wanted):
-            self._node.destroy_publisher(self._publishers.pop(kind))
-        for kind in wanted:
-            if kind not in self._publishers:
-                self._publishers[kind] = self._node.create_publisher(_CLASSES[kind], self.topic, 10)
+        wanted = next((kind for kind in (PLAIN, STAMPED) if kind in self._listened), self.type or STAMPED)
+        wanted = self._fixed or wanted
+        if wanted == self.type:
+            return
+        if self._publisher is not None:
+            self._node.destroy_publisher(self._publisher)
+        self.type, self._publisher = "", None
+        try:
+            self._publisher = self._node.create_publisher(_CLASSES[wanted], self.topic, 10)
+        except RuntimeError as error:
+            # The middleware may still be removing the publisher of the other type: the next call tries again.
+            self._node.get_logger().debug(f"{self.topic}: {error}")
+            return
+        self.type = wanted

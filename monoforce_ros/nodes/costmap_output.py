@@ -57,6 +57,8 @@ class CostmapOutput:
 
     def publish(self, prediction: Prediction, frame_id: str) -> None:
         """Publish the map of a prediction; ``frame_id`` is that of the odometry."""
+        if not self._node.context.ok():
+            return
         with_map = self._grid_map is not None and self._grid_map.get_subscription_count() > 0
         with_mask = self._mask is not None and self._mask.get_subscription_count() > 0
         if not (self._always or with_map or with_mask or self._occupancy.get_subscription_count()):

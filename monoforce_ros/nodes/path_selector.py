@@ -305,8 +305,8 @@ class PathSelectorNode(Node):
             self.health.report(PART, OK, message, reason="starting", **values)
         else:
             sent = f"{command[0]:.2f} m/s and {command[1]:.2f} rad/s are sent to {self._commands.topic}"
-            types = ", ".join(self._commands.types)
-            message = f"the robot does not move: {sent} ({types}), odometry has shown no motion for {WINDOW:g} s"
+            kind = self._commands.type
+            message = f"the robot does not move: {sent} ({kind}), odometry has shown no motion for {WINDOW:g} s"
             self.health.report(PART, WARN, message, reason="no motion", **values)
 
 

@@ -376,6 +376,8 @@ class PredictorNode(ManagedNode):
             if self.ensemble is not None:
                 self.ensemble.publish(job.prediction, job.twists, job.frame_id)
         except Exception as error:  # no input may end the node
+            if not self.context.ok():
+                return  # a signal has shut rclpy down meanwhile
             text = _explained(error)
             self.health.report("comparison", ERROR, f"nothing published: {text}", reason=type(error).__name__)
             return

@@ -94,11 +94,18 @@ class AdaptiveSubscription:
             return
         if self._subscription is not None:
             self._node.destroy_subscription(self._subscription)
-        self._subscribed = wanted
+        self._subscription = self._subscribed = None
         quality = QoSProfile(depth=self._depth, reliability=wanted.reliability, durability=wanted.durability)
-        self._subscription = self._node.create_subscription(
-            self._types[wanted.type], self.topic, self._callback, quality
-        )
+        try:
+            self._subscription = self._node.create_subscription(
+                self._types[wanted.type], self.topic, self._callback, quality
+            )
+        except RuntimeError as error:
+            # A process has one type per topic, and the middleware may still be removing the former subscription: the
+            # next call tries again.
+            self._node.get_logger().debug(f"{self.topic}: {error}")
+            return
+        self._subscribed = wanted
 
     def _select_type(self, offered: list[str]) -> str:
         """The type to subscribe to, of those that publishers offer, or of all if there are none."""

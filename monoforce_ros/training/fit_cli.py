@@ -145,6 +145,7 @@ def _fit_bag(
     bag: Path, robot: RobotModel, settings: FitSettings, options: argparse.Namespace
 ) -> list[FittedTrajectory]:
     recording = Recording.open(bag, odometry=options.odometry, commands=options.commands, cloud=options.cloud)
+    recording = recording.in_base_frame(robot.base_frame)
     for complaint in recording.warnings[:3]:
         print(f"fit_terrain: {complaint}", file=sys.stderr)
     if not len(recording.commands):

@@ -88,6 +88,7 @@ def _samples(
     image_topics: Sequence[str],
 ) -> RecordingSamples:
     recording = Recording.open(bag)
+    recording = recording.in_base_frame(robot.base_frame)
     topics = tuple(image_topics) or tuple(topic for topic in recording.images if topic in recording.cameras)
     unknown = [topic for topic in topics if topic not in recording.images or topic not in recording.cameras]
     if unknown or not topics:
