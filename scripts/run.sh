@@ -3,18 +3,18 @@
 # If COMMAND is an installed executable of the package, it is run from install/, like `ros2 run`.
 set -euo pipefail
 root=$(cd "$(dirname "$0")/.." && pwd)
-unset _ROS_WHEELS_BOOTSTRAP_COMPLETE
-export AMENT_PREFIX_PATH="$root/.venv${AMENT_PREFIX_PATH:+:$AMENT_PREFIX_PATH}"
-export PATH="$root/.venv/bin:$PATH"
-if [ -f "$root/install/setup.bash" ]; then
+# shellcheck source=environment.sh
+source "$root/scripts/environment.sh"
+use_ros_wheels
+if [ -f "$root/$install_base/setup.bash" ]; then
   set +u
-  # shellcheck disable=SC1091
-  source "$root/install/setup.bash"
+  # shellcheck disable=SC1090,SC1091
+  source "$root/$install_base/setup.bash"
   set -u
 fi
-if [ -x "$root/install/monoforce_ros/lib/monoforce_ros/${1:-}" ]; then
-  command=$root/install/monoforce_ros/lib/monoforce_ros/$1
+executable=$root/$install_base/monoforce_ros/lib/monoforce_ros/${1:-}
+if [ -f "$executable" ] && [ -x "$executable" ]; then
   shift
-  exec "$command" "$@"
+  exec "$executable" "$@"
 fi
 exec "$@"

@@ -2,10 +2,12 @@
 # Creates .venv with the locked packages and builds the package with colcon.
 # Finished steps are marked by stamp files, so repeated calls are fast.
 #   scripts/set_up.sh environment | build | interfaces | graphics
+#   MONOFORCE_ENVIRONMENT=lowest scripts/set_up.sh build     the same with the lowest supported versions, beside the others
 set -euo pipefail
 cd "$(dirname "$0")/.."
 root=$PWD
-venv=$root/.venv
+# shellcheck source=environment.sh
+source scripts/environment.sh
 
 say() { printf '[set-up] %s\n' "$*"; }
 
@@ -31,12 +33,12 @@ find_python() {
 
 environment() {
   local started=$SECONDS lock_hash python
-  lock_hash=$(sha256sum requirements.lock | cut -d' ' -f1)
+  lock_hash=$(sha256sum "$lock" | cut -d' ' -f1)
   if [ -f "$venv/.locked" ] && [ "$(cat "$venv/.locked")" = "$lock_hash" ]; then
     say "the environment is up to date"
     return
   fi
-  # Recreate .venv when the lock file changes: removing one of several packages that share a folder, such as the ROS
+  # Recreate the environment when the lock file changes: removing one of several packages that share a folder, such as the ROS
   # packages, breaks the others.
   if [ -f "$venv/.locked" ] || ! is_python_312 "$venv/bin/python"; then
     if ! python=$(find_python); then
@@ -51,54 +53,47 @@ environment() {
 TEXT
       exit 1
     fi
-    say "creating .venv with $python"
+    say "creating ${venv##*/} with $python"
     rm -rf "$venv"
     "$python" -m venv "$venv"
   fi
   local uv_version
-  uv_version=$(sed -n 's/^uv==\([^ ;]*\).*/\1/p' requirements.lock)
+  uv_version=$(sed -n 's/^uv==\([^ ;]*\).*/\1/p' "$lock")
   say "installing uv $uv_version"
   "$venv/bin/python" -m pip install --quiet --disable-pip-version-check "uv==$uv_version"
-  say "installing $(grep -c '^[a-z0-9].*==' requirements.lock) locked packages (several GB, most of it torch's CUDA libraries)"
+  say "installing $(grep -c '^[a-z0-9].*==' "$lock") locked packages (several GB, most of it torch's CUDA libraries)"
   # Compile bytecode once, or every start of a node compiles all of torch if Python may not write bytecode.
-  "$venv/bin/uv" pip sync --quiet --compile-bytecode --python "$venv/bin/python" requirements.lock
+  "$venv/bin/uv" pip sync --quiet --compile-bytecode --python "$venv/bin/python" "$lock"
   printf '%s' "$lock_hash" >"$venv/.locked"
   say "environment ready after $((SECONDS - started)) s"
 }
 
-# rosidl and ament search AMENT_PREFIX_PATH, which the wheels do not set. The guard variable marks the library path as
-# set up and must be removed together with it.
-ros_environment() {
-  unset _ROS_WHEELS_BOOTSTRAP_COMPLETE
-  export AMENT_PREFIX_PATH="$venv${AMENT_PREFIX_PATH:+:$AMENT_PREFIX_PATH}"
-  export PATH="$venv/bin:$PATH"
-}
-
 build() {
-  local stamp=install/.built started=$SECONDS
+  local stamp=$install_base/.built started=$SECONDS
   if [ -f "$stamp" ] && [ -z "$(find package.xml setup.py setup.cfg resource config launch msg_defs bags models monoforce_ros \
     -newer "$stamp" -not -name '*.pyc' -not -name __pycache__ -print -quit)" ]; then
     say "the build is up to date"
     return
   fi
-  ros_environment
+  use_ros_wheels
   say "building with colcon"
   # Files removed from the source must not stay installed.
-  rm -rf build/monoforce_ros install/monoforce_ros
+  rm -rf "$build_base/monoforce_ros" "$install_base/monoforce_ros"
   mkdir -p out
-  if ! colcon --log-base log build --event-handlers console_cohesion- >out/colcon_build.log 2>&1; then
+  if ! colcon --log-base log build --build-base "$build_base" --install-base "$install_base" \
+    --event-handlers console_cohesion- >out/colcon_build.log 2>&1; then
     cat out/colcon_build.log >&2
     exit 1
   fi
-  "$venv/bin/python" -m compileall -q install/monoforce_ros/lib
+  "$venv/bin/python" -m compileall -q "$install_base/monoforce_ros/lib"
   touch "$stamp"
-  say "built into install/ after $((SECONDS - started)) s"
+  say "built into $install_base/ after $((SECONDS - started)) s"
 }
 
 # Builds the typed messages for planners, and those messages of ROS packages that are not on PyPI, next to monoforce_ros
 # in install/. Only this step needs a C++ compiler.
 interfaces() {
-  local stamp=install/.interfaces started=$SECONDS headers arrays package packages=()
+  local stamp=$install_base/.interfaces started=$SECONDS headers arrays package packages=()
   if [ -f "$stamp" ] && [ -z "$(find msg_defs -type f -newer "$stamp" -print -quit)" ]; then
     say "the message packages are up to date"
     return
@@ -107,7 +102,7 @@ interfaces() {
     say "no C++ compiler: messages are not built, their tests will be skipped (sudo apt install g++)"
     return
   fi
-  ros_environment
+  use_ros_wheels
   # Exported CMake targets of the wheels contain paths of the machine that built them; replace these.
   headers=$("$venv/bin/python" -c 'import sysconfig; print(sysconfig.get_paths()["include"])')
   arrays=$("$venv/bin/python" -c 'import numpy; print(numpy.get_include())')
@@ -120,7 +115,7 @@ interfaces() {
   # An installed ROS has the complete packages; what an earlier call built into install/ does not count.
   for package in msg_defs/*/package.xml; do
     package=$(dirname "$package")
-    "$venv/bin/python" -c "import sys, $(basename "$package").msg as m; sys.exit(m.__file__.startswith('$root/install/'))" \
+    "$venv/bin/python" -c "import sys, $(basename "$package").msg as m; sys.exit(m.__file__.startswith('$root/$install_base/'))" \
       2>/dev/null || packages+=("$package")
   done
   if [ ${#packages[@]} = 0 ]; then
@@ -130,7 +125,7 @@ interfaces() {
   fi
   say "building ${packages[*]#msg_defs/}"
   mkdir -p out
-  if ! colcon --log-base log build --base-paths "${packages[@]}" --build-base build --install-base install \
+  if ! colcon --log-base log build --base-paths "${packages[@]}" --build-base "$build_base" --install-base "$install_base" \
     --event-handlers console_cohesion- --cmake-args -G Ninja -DBUILD_TESTING=OFF -DCMAKE_BUILD_TYPE=Release \
     -DPython3_EXECUTABLE="$venv/bin/python" >out/interfaces.log 2>&1; then
     cat out/interfaces.log >&2

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 ROOT = Path(__file__).resolve().parent.parent
-INSTALLED = ROOT / "install" / "monoforce_ros"
+INSTALLED = Path(os.environ.get("MONOFORCE_INSTALL", ROOT / "install")) / "monoforce_ros"
 
 # Many small tensors: a pool of threads only adds waiting, above all when several processes share two cores.
 torch.set_num_threads(1)

@@ -91,7 +91,7 @@ def test_unknown_backends_are_named():
         rollout(bumps(0), robot, speeds, state, backend="abacus")
 
 
-def test_planted_friction_and_centre_of_mass_are_recovered_by_gradient_descent():
+def test_unknown_friction_and_centre_of_mass_are_recovered_by_gradient_descent():
     robot, _, state = batch(6, 120)
     twists = torch.tensor([[0.5, 1.0], [0.8, -1.0], [0.0, 1.5], [0.6, 0.5], [-0.5, 0.8], [1.0, 0.0]]).double()
     speeds = robot.drive_speeds(twists[:, None].expand(6, 120, 2))
@@ -120,7 +120,7 @@ def test_planted_friction_and_centre_of_mass_are_recovered_by_gradient_descent()
     np.testing.assert_allclose(guess.detach().numpy(), truth.numpy(), atol=0.02)
 
 
-def test_a_planted_control_is_recovered_from_its_trajectory():
+def test_an_unknown_control_is_recovered_from_its_trajectory():
     robot, _, state = batch(1, 100)
     truth = robot.drive_speeds(torch.tensor([0.7, 0.6]).double().expand(1, 100, 2))
     target = rollout(bumps(0), robot, truth, state, with_forces=False)

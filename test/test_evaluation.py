@@ -5,6 +5,7 @@ import subprocess
 
 import numpy as np
 import pytest
+from scipy.integrate import trapezoid
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import BagWriter, Recording, builders
@@ -53,8 +54,8 @@ def test_the_baseline_follows_an_arc(rate):
     poses = constant_velocity(state, times)
     fine = np.linspace(0, 3, 30_001)
     heading = 0.4 + rate * fine
-    x = 1.0 + np.trapezoid(1.5 * np.cos(heading), fine)
-    y = 2.0 + np.trapezoid(1.5 * np.sin(heading), fine)
+    x = 1.0 + trapezoid(1.5 * np.cos(heading), fine)
+    y = 2.0 + trapezoid(1.5 * np.sin(heading), fine)
     np.testing.assert_allclose(poses.positions[-1], [x, y, 3.0], atol=1e-6)
     assert np.arctan2(poses.rotations[-1, 1, 0], poses.rotations[-1, 0, 0]) == pytest.approx(heading[-1])
 

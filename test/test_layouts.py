@@ -1,4 +1,4 @@
-"""Layouts of RViz and Foxglove show the outputs of the node, with matching names and types."""
+"""Layouts of RViz and Foxglove show the outputs of the nodes, with matching names, types and durability."""
 
 import json
 import re
@@ -6,7 +6,10 @@ import re
 import yaml
 from conftest import ROOT
 
-TYPES = {
+from monoforce_ros.nodes.schema import read_schema
+
+# Display of RViz: type of the messages that it draws.
+RVIZ = {
     "rviz_default_plugins/PointCloud2": "PointCloud2",
     "rviz_default_plugins/GridCells": "GridCells",
     "rviz_default_plugins/Map": "OccupancyGrid",
@@ -14,36 +17,90 @@ TYPES = {
     "rviz_default_plugins/Path": "Path",
     "rviz_default_plugins/Odometry": "Odometry",
 }
+# What Foxglove's 3D panel draws of the nodes' types: no GridCells.
+FOXGLOVE = {"PointCloud2", "OccupancyGrid", "MarkerArray", "Path", "Odometry"}
+# Tables of numbers, and messages for other programs, are not for a 3D view.
+NOT_DRAWN = {"candidate_costs", "candidate_rollouts", "path_spread", "live_gap", "speed_filter_info", "grid_map"}
 
 
-def published() -> dict[str, str]:
-    """Topic → type of every publisher in the code of the nodes, and of the odometry input."""
-    found = {"/odom": "Odometry", "/diagnostics": "DiagnosticArray"}
+def published() -> dict[str, tuple[str, bool]]:
+    """Topic → type, whether it is latched, of every predicted output in the code of the nodes."""
+    found = {}
     for file in (ROOT / "monoforce_ros" / "nodes").glob("*.py"):
-        for kind, topic in re.findall(r"create_publisher\((\w+), \"(predicted/\w+)\"", file.read_text()):
-            found[f"/{topic}"] = kind
+        for kind, topic, quality in re.findall(
+            r"create_publisher\((\w+), \"(predicted/\w+)\", (\w+)\)", file.read_text()
+        ):
+            found[f"/{topic}"] = (kind, quality == "latched")
     return found
 
 
+def inputs() -> dict[str, str]:
+    """Topics that the nodes read by default, with their types."""
+    defaults = {entry.name: entry.default for entry in read_schema(ROOT / "config" / "predictor.schema.yaml")}
+    return {f"/{defaults['odometry_topic']}": "Odometry", f"/{defaults['cloud_topic']}": "PointCloud2"}
+
+
+def rviz() -> dict:
+    return yaml.safe_load((ROOT / "config" / "rviz" / "predictor.rviz").read_text())["Visualization Manager"]
+
+
+def foxglove() -> dict:
+    return json.loads((ROOT / "config" / "foxglove" / "predictor.json").read_text())
+
+
+def goal_topic() -> str:
+    parameters = read_schema(ROOT / "config" / "path_selector.schema.yaml")
+    return next(f"/{entry.default}" for entry in parameters if entry.name == "goal_topic")
+
+
 def test_rviz_shows_every_output_with_its_type():
-    content = yaml.safe_load((ROOT / "config" / "rviz" / "predictor.rviz").read_text())
-    displays = [d for d in content["Visualization Manager"]["Displays"] if "Topic" in d]
-    shown = {display["Topic"]["Value"]: TYPES[display["Class"]] for display in displays}
+    displays = [d for d in rviz()["Displays"] if "Topic" in d]
+    shown = {display["Topic"]["Value"]: RVIZ[display["Class"]] for display in displays}
+    outputs = {topic: kind for topic, (kind, _) in published().items()}
+    known = outputs | inputs()
+    assert shown == {topic: known.get(topic) for topic in shown}
+    assert len(outputs) > 8
+    assert set(outputs) - set(shown) == {f"/predicted/{name}" for name in NOT_DRAWN} & set(outputs)
+
+
+def test_rviz_gets_the_last_message_of_latched_topics():
     outputs = published()
-    assert shown == {topic: outputs[topic] for topic in shown}
-    # Tables of numbers are not for a 3D view.
-    tables = {"candidate_costs", "candidate_rollouts", "path_spread", "live_gap"}
-    assert set(outputs) - set(shown) == {"/diagnostics", *(f"/predicted/{name}" for name in tables)}
+    for display in rviz()["Displays"]:
+        topic = display.get("Topic", {}).get("Value")
+        if topic in outputs:
+            latched = display["Topic"]["Durability Policy"] == "Transient Local"
+            assert latched == outputs[topic][1], topic
 
 
-def test_foxglove_shows_topics_that_exist():
-    layout = json.loads((ROOT / "config" / "foxglove" / "predictor.json").read_text())
-    panels = layout["configById"]
-    assert set(panels["3D!predictor"]["topics"]) <= set(published())
+def test_rviz_receives_best_effort_inputs():
+    (cloud,) = [d for d in rviz()["Displays"] if d.get("Topic", {}).get("Value") == "/points"]
+    assert cloud["Topic"]["Reliability Policy"] == "Best Effort"
+
+
+def test_goals_of_both_layouts_reach_path_selector():
+    (tool,) = [t for t in rviz()["Tools"] if t["Class"] == "rviz_default_plugins/SetGoal"]
+    assert tool["Topic"]["Value"] == goal_topic()
+    publish = foxglove()["configById"]["3D!predictor"]["publish"]
+    assert (publish["type"], publish["poseTopic"]) == ("pose", goal_topic())
+
+
+def test_foxglove_shows_topics_that_exist_and_that_it_can_draw():
+    panels = foxglove()["configById"]
+    outputs = {topic: kind for topic, (kind, _) in published().items()}
+    known = outputs | inputs()
+    shown = set(panels["3D!predictor"]["topics"])
+    assert {known.get(topic) for topic in shown} <= FOXGLOVE
+    drawable = {topic for topic, kind in outputs.items() if kind in FOXGLOVE}
+    assert drawable - shown == {f"/predicted/{name}" for name in NOT_DRAWN} & drawable
     assert panels["DiagnosticSummary!predictor"]["topicToRender"] == "/diagnostics"
-    assert panels["RawMessages!gap"]["topicPath"] in published()
+    assert panels["RawMessages!gap"]["topicPath"] in outputs
 
     def panels_of(node):
         return [node] if isinstance(node, str) else panels_of(node["first"]) + panels_of(node["second"])
 
-    assert sorted(panels_of(layout["layout"])) == sorted(panels)
+    assert sorted(panels_of(foxglove()["layout"])) == sorted(panels)
+
+
+def test_both_layouts_follow_the_robot():
+    assert rviz()["Views"]["Current"]["Target Frame"] == "base_link"
+    assert foxglove()["configById"]["3D!predictor"]["followTf"] == "base_link"

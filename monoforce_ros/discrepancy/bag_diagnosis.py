@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from monoforce_ros.bags import Recording, smooth
+from monoforce_ros.bags import BagError, Recording, smooth
 from monoforce_ros.discrepancy.comparison import GapRow, compare, gap_table
 from monoforce_ros.discrepancy.credibility import complaint
 from monoforce_ros.discrepancy.diagnosis import Diagnosis, DiagnosisSettings, diagnose
@@ -88,7 +88,12 @@ def read_with_ground(
 ) -> tuple[Evidence, Recording, Ground]:
     """As :func:`read_evidence`, and which ground was taken."""
     recording = Recording.open(bag, odometry=topics.odometry, commands=topics.commands, cloud=topics.cloud)
-    recording = recording.in_base_frame(robot.base_frame)
+    try:
+        recording = recording.in_base_frame(robot.base_frame)
+    except BagError as error:
+        # The poses may still be those of the base; where they are not, the offset is identified as a lever arm.
+        text = f"{error}. The odometry is taken for that of the base; an offset would appear as sensor_lever_arm"
+        recording = replace(recording, warnings=(*recording.warnings, text))
     smoothed = smooth(recording.motion)
     evidence = Evidence(smoothed, recording.commands, gyro=recording.angular_velocity, wheels=recording.wheels)
     ground = choose_ground(terrain, recording, smoothed, robot)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import BagError, BagReader, Recording, SmoothedMotion, camera_info_topic, smooth
 from monoforce_ros.core import NANOSECOND, MotionTrack

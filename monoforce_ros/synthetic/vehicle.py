@@ -142,7 +142,9 @@ class Vehicle:
         for wheel in self.wheels:
             self._add_wheel(spec, base, wheel, wheel_mass)
         imu = self.sensors.get("imu_link", np.eye(4))
-        base.add_site(name=IMU_SITE, pos=imu[:3, 3], quat=_quaternion_wxyz(imu[:3, :3]), group=GROUP)
+        base.add_site(
+            name=IMU_SITE, pos=imu[:3, 3], quat=_quaternion_wxyz(Rotation.from_matrix(imu[:3, :3])), group=GROUP
+        )
         spec.add_sensor(
             name="accelerometer",
             type=mujoco.mjtSensor.mjSENS_ACCELEROMETER,
@@ -181,7 +183,7 @@ class Vehicle:
         tyre.springref = -self.mass * _GRAVITY / len(self.wheels) / stiffness
         axle = body.add_joint(name=wheel.joint, type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 1, 0])
         axle.armature = share * _GEAR_INERTIA
-        lying = Rotation.from_euler("x", 90, degrees=True).as_quat(scalar_first=True)
+        lying = _quaternion_wxyz(Rotation.from_euler("x", 90, degrees=True))
         size = [wheel.radius, wheel.width / 2, 0.0]
         # The tyre's friction takes priority over the ground's, so that it can vary with position.
         body.add_geom(
@@ -239,5 +241,6 @@ def _rigid(pose: np.ndarray) -> np.ndarray:
     return pose
 
 
-def _quaternion_wxyz(rotation: np.ndarray) -> np.ndarray:
-    return Rotation.from_matrix(rotation).as_quat(scalar_first=True)
+def _quaternion_wxyz(rotation: Rotation) -> np.ndarray:
+    # SciPy puts the scalar last; its option scalar_first is newer than Ubuntu 24.04's SciPy 1.11.
+    return np.roll(rotation.as_quat(), 1)

@@ -82,9 +82,8 @@ def build_model(
 def _add_camera(spec: mujoco.MjSpec, frame: str, pose: np.ndarray, field_of_view: float) -> None:
     # An optical frame looks along z with y down, a MuJoCo camera along -z with y up.
     flipped = Rotation.from_matrix(pose[:3, :3] @ np.diag([1.0, -1.0, -1.0]))
-    spec.body(vehicle.BODY).add_camera(
-        name=frame, pos=pose[:3, 3], quat=flipped.as_quat(scalar_first=True), fovy=math.degrees(field_of_view)
-    )
+    scalar_first = np.roll(flipped.as_quat(), 1)
+    spec.body(vehicle.BODY).add_camera(name=frame, pos=pose[:3, 3], quat=scalar_first, fovy=math.degrees(field_of_view))
 
 
 def _add_ground(spec: mujoco.MjSpec, scenery: Scenery) -> None:
