@@ -215,7 +215,7 @@ def run_any(options: argparse.Namespace, titles: dict[str, str]) -> None:
         predictor = Predictor(robot, source, horizon=ANY_HORIZON)
         driven = np.array([predicted(predictor, scene, ANY_SPEED)[0] for scene in scenes])
         rows.append(any_row(title, scenes, driven))
-    lines = ["| terrain | precision | recall | walls | posts | soft vegetation | stops too far (median) |"]
+    lines = ["| terrain | precision | recall | walls | posts | soft vegetation | stop error (median) |"]
     lines += ["|---|---|---|---|---|---|---|"]
     for row in rows:
         kinds = " | ".join(f"{row[kind][0]} predicted, {row[kind][1]} true of {row[kind][2]}" for kind in AHEAD_KINDS)

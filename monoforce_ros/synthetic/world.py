@@ -35,6 +35,7 @@ _SPAWN_HEIGHT = 0.05
 # The rendered ground is coarser than the collision ground by this factor, to save triangles.
 _DRAWN_STEP = 2
 _TILE_SIZE = 5.0
+_WIDE_LENS_NEAR = 0.015
 
 
 def build_model(
@@ -64,6 +65,9 @@ def build_model(
         materials = _add_materials(spec, paint)
         _add_drawn_ground(spec, scenery, paint.turf, random_stream(seed, "short grass"))
         _add_light(spec, paint.light)
+        if look is not None:
+            # The corner of a fisheye image close above the ground sees points of little depth.
+            spec.visual.map.znear = _WIDE_LENS_NEAR
         if paint.surroundings is not None:
             _add_surroundings(spec, scenery.ground, paint.surroundings)
     for index, rock in enumerate(scenery.rocks):
