@@ -23,7 +23,7 @@ _COEFFICIENTS = {
 _NUMBERS = {4: "four", 5: "five", 8: "eight"}
 _LARGEST_SLOPE = 4.0
 """Largest x / z of a pixel's ray: the image is rendered by a pinhole camera."""
-_WIDEST_DRAWN = 1.8
+_WIDEST_DRAWN = 1.4
 """Largest edge of a fisheye's rendered image, relative to the image."""
 
 
