@@ -405,7 +405,7 @@ def test_the_command_line_refuses_what_does_not_fit(tmp_path, executables, ros_e
         (["--style", "varied", "--set", "vegetation.height=9"], "vegetation.height: got '9'"),
     ):
         command = [executables / "synthesize", tmp_path / "x", "--duration", "0.2", *arguments]
-        done = subprocess.run(command, env=ros_environment, capture_output=True, text=True, timeout=60, check=False)
+        done = subprocess.run(command, env=ros_environment, capture_output=True, text=True, timeout=120, check=False)
         assert done.returncode == 1 and said in done.stderr and "Traceback" not in done.stderr
 
 
