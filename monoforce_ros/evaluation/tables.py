@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -71,10 +71,18 @@ FLAT = System("flat", "level ground", "none")
 CONSTANT = System("constant", "constant velocity", "odometry")
 
 
-def evaluate_sequence(bag: Path, robot: RobotModel, systems: Sequence[System]) -> dict[str, SequenceErrors]:
+def evaluate_sequence(
+    bag: Path, robot: RobotModel, systems: Sequence[System], sources: Mapping[str, TerrainSource] | None = None
+) -> dict[str, SequenceErrors]:
     """Errors of each system on one recording, over the same windows.
 
     Windows of all systems start at the same times, and end where the measured robot leaves the map.
+
+    Args:
+        bag: the recording.
+        robot: its robot.
+        systems: what to compare.
+        sources: terrain sources of systems that have neither a checkpoint nor a name of their own, by key.
 
     Raises:
         BagError, CheckpointError, EvaluationError: the bag or a checkpoint cannot be used.
@@ -84,7 +92,7 @@ def evaluate_sequence(bag: Path, robot: RobotModel, systems: Sequence[System]) -
     for system in systems:
         if system.key in (FLAT.key, CONSTANT.key):
             continue
-        source = terrain_source(system, robot)
+        source = (sources or {}).get(system.key) or terrain_source(system, robot)
         topics = tuple(recording.images) if "camera" in source.sensors else ()
         evaluations[system.key] = evaluate_recording(
             recording, Predictor(robot, source, horizon=HORIZON), image_topics=topics,

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from monoforce_ros.synthetic.sensors import CameraSettings, LidarSettings
     from monoforce_ros.synthetic.simulation import Simulation
     from monoforce_ros.synthetic.terrain_shape import GROUNDS, TerrainSettings
+    from monoforce_ros.synthetic.varied.settings import STYLES, WorldSettings
+    from monoforce_ros.synthetic.varied.wall_ahead import AHEAD_KINDS, WallAhead, draw_wall_ahead
+    from monoforce_ros.synthetic.varied.world import VariedWorld, draw_world
     from monoforce_ros.synthetic.vehicle import Vehicle
     from monoforce_ros.synthetic.world import TIME_STEP, build_model
 else:
@@ -36,13 +39,18 @@ else:
             "sensors": ("CameraSettings", "LidarSettings"),
             "simulation": ("Simulation",),
             "terrain_shape": ("GROUNDS", "TerrainSettings"),
+            "varied.settings": ("STYLES", "WorldSettings"),
+            "varied.wall_ahead": ("AHEAD_KINDS", "WallAhead", "draw_wall_ahead"),
+            "varied.world": ("VariedWorld", "draw_world"),
             "vehicle": ("Vehicle",),
             "world": ("TIME_STEP", "build_model"),
         },
     )
 
 __all__ = [
+    "AHEAD_KINDS",
     "GROUNDS",
+    "STYLES",
     "TIME_STEP",
     "WALL_THICKNESS",
     "CameraSettings",
@@ -56,10 +64,15 @@ __all__ = [
     "Scenery",
     "Simulation",
     "TerrainSettings",
+    "VariedWorld",
     "Vehicle",
+    "WallAhead",
+    "WorldSettings",
     "build_model",
     "build_scenery",
     "draw_hidden",
+    "draw_wall_ahead",
+    "draw_world",
     "parse_hidden",
     "random_stream",
     "record",

@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,6 +20,7 @@ from monoforce_ros.synthetic.terrain_shape import GROUNDS
 
 if TYPE_CHECKING:
     from monoforce_ros.synthetic.recording import RecordingSettings
+    from monoforce_ros.synthetic.varied.settings import WorldSettings
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -30,11 +32,30 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("out", type=Path, metavar="OUT", help="folder of the bag")
     parser.add_argument("--seed", type=int, default=DEFAULT_SEED, help="seed of world, commands, noise (%(default)s)")
     parser.add_argument("--duration", type=float, default=10.0, metavar="SECONDS", help="(%(default)s)")
-    parser.add_argument("--robot", default="husky", metavar="NAME|FILE.yaml", help="(%(default)s)")
-    parser.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap", help="(%(default)s)")
-    parser.add_argument("--camera", default="320x240", metavar="WIDTHxHEIGHT|none", help="(%(default)s)")
     parser.add_argument(
-        "--cameras", type=int, metavar="1-4", help="number of cameras: front, left, right, rear (the robot's)"
+        "--style",
+        choices=("nature", "varied", "textures"),
+        default="nature",
+        help="nature: one kind of landscape; varied: everything is drawn from wide ranges, for training; textures: as "
+        "varied, with random patterns on every surface (%(default)s)",
+    )
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="GROUP.SETTING=VALUE|LOW..HIGH|NAMES",
+        help="narrow a setting of varied or textures, such as vegetation.height=0.2..0.5; repeatable; `--set list` "
+        "lists all settings with their ranges",
+    )
+    parser.add_argument("--robot", metavar="NAME|FILE.yaml", help="(husky; drawn by varied and textures)")
+    parser.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap", help="(%(default)s)")
+    parser.add_argument("--camera", metavar="WIDTHxHEIGHT|none", help="(320x240; drawn by varied and textures)")
+    parser.add_argument(
+        "--cameras",
+        type=int,
+        metavar="1-6",
+        help="number of cameras: up to 4 for front, left, right, rear (the robot's); up to 6 anywhere for varied and "
+        "textures (drawn)",
     )
     parser.add_argument(
         "--distortion", metavar="K1,K2,P1,P2,K3", help="lens distortion of every camera, such as -0.3,0.1,0,0,0 (none)"
@@ -105,6 +126,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.hide == ["list"]:
         return _list_faults()
+    if options.set == ["list"]:
+        return _list_settings()
     outs = [options.out]
     if options.count is not None:
         if not 1 <= options.count <= 10_000:
@@ -126,6 +149,14 @@ def _list_faults() -> int:
     for name, fault in sorted(FAULTS.items()):
         values = ", ".join(f"{n} = {p.default:g} ({p.low:g} to {p.high:g})" for n, p in fault.parameters.items())
         print(f"{name}: {values}\n    {(fault.__doc__ or '').splitlines()[0]}")
+    return 0
+
+
+def _list_settings() -> int:
+    from monoforce_ros.synthetic.varied.settings import WorldSettings
+
+    for name, distribution in WorldSettings().distributions().items():
+        print(f"{name}: {distribution}")
     return 0
 
 
@@ -161,7 +192,9 @@ def _settings(options: argparse.Namespace) -> RecordingSettings:
     from monoforce_ros.synthetic.sensors import CameraSettings, LidarSettings
     from monoforce_ros.synthetic.terrain_shape import TerrainSettings
 
-    camera, lidar = _size(options.camera, "--camera"), _size(options.lidar, "--lidar")
+    world = _world(options)
+    camera = _size(options.camera or "320x240", "--camera")
+    lidar = _size(options.lidar, "--lidar")
     odometry = OdometrySettings()
     if options.odometry != "truth":
         name, _, noise = options.odometry.partition(":")
@@ -181,21 +214,57 @@ def _settings(options: argparse.Namespace) -> RecordingSettings:
     return RecordingSettings(
         seed=options.seed,
         duration=options.duration,
-        robot=options.robot,
+        robot=options.robot or "husky",
         commands=options.commands,
         terrain=TerrainSettings(
             roughness=options.terrain_roughness, flat=options.flat, bare=options.bare, ground=options.ground
         ),
         camera=camera
         and CameraSettings(width=camera[0], height=camera[1], rate=options.camera_rate, distortion=distortion),
-        cameras=options.cameras,
+        cameras=None if world is not None else options.cameras,
         lidar=lidar and LidarSettings(rings=lidar[0], columns=lidar[1], rate=options.lidar_rate),
         odometry=odometry,
         hidden=hidden,
         storage=options.storage,
         labels=options.labels,
         overwrite=options.force,
+        world=world,
     )
+
+
+def _world(options: argparse.Namespace) -> WorldSettings | None:
+    """Ranges of a randomised world, narrowed by the options; None for style ``nature``."""
+    from monoforce_ros.synthetic.varied.distribution import Choice, Uniform
+    from monoforce_ros.synthetic.varied.settings import WorldSettings
+
+    assignments = {}
+    for text in options.set:
+        name, equals, value = text.partition("=")
+        if not equals:
+            raise ValueError(f"--set: got {text!r}, expected GROUP.SETTING=VALUE; `--set list` lists all settings")
+        assignments[name.strip()] = value.strip()
+    if options.style == "nature":
+        if assignments:
+            raise ValueError(f"--set {options.set[0]}: style nature has no such settings; add --style varied")
+        return None
+    fixed = {
+        "--ground": options.ground != "mixed", "--flat": options.flat, "--bare": options.bare,
+        "--terrain-roughness": options.terrain_roughness != 1.0, "--distortion": bool(options.distortion),
+    }  # fmt: skip
+    for option, is_given in fixed.items():
+        if is_given:
+            raise ValueError(f"{option}: applies to --style nature only; use --set, `--set list` lists the settings")
+    settings = WorldSettings.of_style(options.style).narrowed(assignments)
+    rig = replace(settings.rig, rate=Uniform(options.camera_rate, options.camera_rate))
+    if options.camera not in (None, "none"):
+        _size(options.camera, "--camera")
+        rig = replace(rig, size=Choice((options.camera,)))
+    if options.cameras is not None:
+        if not 1 <= options.cameras <= 6:
+            raise ValueError(f"--cameras: got {options.cameras}, expected 1 to 6")
+        rig = replace(rig, count=Choice((str(options.cameras),)))
+    robot = settings.robot if options.robot is None else replace(settings.robot, kind=Choice((options.robot,)))
+    return replace(settings, rig=rig, robot=robot)
 
 
 def _record_one(out: Path, options: argparse.Namespace) -> int:

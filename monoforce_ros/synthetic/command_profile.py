@@ -100,6 +100,7 @@ class WanderingDriver:
     _STEERING_GAIN = 1.3
     _SLOWEST, _FASTEST = 0.3, 1.0
     _SHARPEST_TURN = 1.3
+    _SWAY = 0.45
     _ACCELERATION, _YAW_ACCELERATION = 0.8, 2.5
 
     def __init__(self, route: Route, random: np.random.Generator):
@@ -119,7 +120,7 @@ class WanderingDriver:
             self._is_step = time > 0.0 and self._random.uniform() < 0.4
             self._next_speed = time + self._random.uniform(1.2, 2.8)
         if time >= self._next_sway:
-            self._sway = self._random.uniform(-0.45, 0.45)
+            self._sway = self._random.uniform(-self._SWAY, self._SWAY)
             self._next_sway = time + self._random.uniform(0.6, 1.4)
         self._station = self._route.advance(self._station, position)
         target, _ = self._route.at(self._station + self._LOOKAHEAD)

@@ -12,7 +12,7 @@ from monoforce_ros.synthetic.course import CourseSettings, build_course
 from monoforce_ros.synthetic.odometry import Odometry, OdometrySettings
 from monoforce_ros.synthetic.random_streams import DEFAULT_SEED, random_stream
 from monoforce_ros.synthetic.recording import CAMERA_PREFIX, LIDAR_FRAME, ODOM_FRAME
-from monoforce_ros.synthetic.scenery import build_scenery
+from monoforce_ros.synthetic.scenery import Scenery, build_scenery
 from monoforce_ros.synthetic.sensors import Camera, CameraSettings, Lidar, LidarSettings, encode_jpeg
 from monoforce_ros.synthetic.simulation import Simulation
 from monoforce_ros.synthetic.terrain_shape import TerrainSettings
@@ -29,6 +29,8 @@ class LiveSettings:
     terrain: TerrainSettings = field(default_factory=TerrainSettings)
     course: CourseSettings | None = None
     """An obstacle course instead of the terrain's world."""
+    scenery: Scenery | None = None
+    """A world that was laid out already, instead of the terrain's or the course's."""
     camera: CameraSettings | None = None
     """None renders no images."""
     lidar: LidarSettings | None = field(default_factory=LidarSettings)
@@ -46,7 +48,9 @@ class LiveWorld:
     def __init__(self, settings: LiveSettings):
         self.settings = settings
         self.robot = Vehicle.load(settings.robot)
-        if settings.course is not None:
+        if settings.scenery is not None:
+            scenery = settings.scenery
+        elif settings.course is not None:
             scenery = build_course(settings.course, settings.seed)
         else:
             scenery = build_scenery(settings.terrain, settings.seed)

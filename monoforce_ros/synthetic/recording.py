@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import BagWriter, builders
+from monoforce_ros.core import write_text
 from monoforce_ros.synthetic.command_profile import CommandProfile, make_profile
 from monoforce_ros.synthetic.fault import Fault
 from monoforce_ros.synthetic.faults import VegetationDrag
@@ -21,10 +23,13 @@ from monoforce_ros.synthetic.hidden import write_truth
 from monoforce_ros.synthetic.labels import world_labels, write_labels
 from monoforce_ros.synthetic.odometry import Odometry, OdometrySettings
 from monoforce_ros.synthetic.random_streams import DEFAULT_SEED, random_stream
+from monoforce_ros.synthetic.recorded_camera import RecordedCamera
 from monoforce_ros.synthetic.scenery import Scenery, build_scenery
 from monoforce_ros.synthetic.sensors import Camera, CameraSettings, Imu, ImuSettings, Lidar, LidarSettings, encode_jpeg
 from monoforce_ros.synthetic.simulation import Simulation
 from monoforce_ros.synthetic.terrain_shape import TerrainSettings
+from monoforce_ros.synthetic.varied.settings import WorldSettings
+from monoforce_ros.synthetic.varied.world import draw_world
 from monoforce_ros.synthetic.vehicle import Vehicle
 from monoforce_ros.synthetic.world import TIME_STEP, build_model
 
@@ -65,6 +70,9 @@ class RecordingSettings:
         storage: ``mcap`` or ``sqlite3``.
         labels: write the world's ground truth next to the bag.
         overwrite: replace an existing bag.
+        world: ranges that a randomised world is drawn from, with its robot and cameras; ``robot``, ``terrain``,
+            ``cameras`` and the settings of ``camera`` then have no effect, and ``commands`` named ``random`` follow
+            that world's track. None is a world of ``terrain``.
     """
 
     seed: int = DEFAULT_SEED
@@ -81,6 +89,7 @@ class RecordingSettings:
     storage: str = "mcap"
     labels: bool = False
     overwrite: bool = False
+    world: WorldSettings | None = None
 
     def __post_init__(self):
         if not 0 <= self.seed < 2**32:
@@ -127,14 +136,26 @@ def record(out: Path, settings: RecordingSettings, progress: Callable[[float], o
         RobotFileError: the robot file is invalid.
         ValueError: a setting is invalid.
     """
-    robot = Vehicle.load(settings.robot)
-    if settings.camera is not None and settings.cameras is not None:
-        robot = dataclasses.replace(robot, sensors=_with_cameras(robot, settings.cameras))
+    if settings.world is None:
+        description = None
+        robot = Vehicle.load(settings.robot)
+        if settings.camera is not None and settings.cameras is not None:
+            robot = dataclasses.replace(robot, sensors=_with_cameras(robot, settings.cameras))
+        rig = _robots_cameras(robot, settings.camera)
+    else:
+        world = draw_world(settings.world, settings.seed)
+        description = world.description
+        robot = world.robot()
+        rig = () if settings.camera is None else world.rig(robot)
+        robot = dataclasses.replace(robot, sensors=_with_rig(robot, rig))
     with BagWriter(out, storage=settings.storage, overwrite=settings.overwrite) as bag:
-        scenery = build_scenery(settings.terrain, settings.seed)
-        random = random_stream(settings.seed, "commands")
-        profile = make_profile(settings.commands, scenery.route, random, robot.maximum_speed)
-        session = _Session(bag, settings, robot, scenery, profile)
+        scenery = build_scenery(settings.terrain, settings.seed) if settings.world is None else world.scenery
+        if settings.world is not None and settings.commands == "random":
+            profile = world.driver(robot)
+        else:
+            random = random_stream(settings.seed, "commands")
+            profile = make_profile(settings.commands, scenery.route, random, robot.maximum_speed)
+        session = _Session(bag, settings, robot, scenery, profile, rig)
         try:
             summary = session.run(progress or (lambda seconds: None))
         finally:
@@ -143,22 +164,41 @@ def record(out: Path, settings: RecordingSettings, progress: Callable[[float], o
             write_labels(out, world_labels(scenery, session.simulation.odom_origin) | session.truth())
         if settings.hidden is not None:
             write_truth(out, settings.hidden, settings.seed)
+        if description is not None:
+            write_text(world_file(out), json.dumps(description | _rig_description(robot, rig), indent=1) + "\n")
     return summary
+
+
+def world_file(bag: Path) -> Path:
+    """Path of the description of a bag's randomised world, next to the bag."""
+    return bag.with_name(f"{bag.name}.world.json")
+
+
+def _rig_description(robot: Vehicle, rig: Sequence[RecordedCamera]) -> dict[str, object]:
+    views = [camera.settings.horizontal_field_of_view for camera in rig]
+    return {
+        "robot": robot.name,
+        "cameras": len(rig),
+        "field_of_view_deg": [round(math.degrees(view), 1) for view in views],
+        "camera_height": [round(float(camera.pose[2, 3] + robot.clearance), 3) for camera in rig],
+        "distortion_model": [camera.settings.distortion_model for camera in rig],
+    }
 
 
 class _Session:
     """One recording: a simulation and its sensors."""
 
     def __init__(
-        self, bag: BagWriter, settings: RecordingSettings, robot: Vehicle, scenery: Scenery, profile: CommandProfile
+        self,
+        bag: BagWriter,
+        settings: RecordingSettings,
+        robot: Vehicle,
+        scenery: Scenery,
+        profile: CommandProfile,
+        rig: Sequence[RecordedCamera],
     ):
         self._bag, self._settings, self._robot, self._profile = bag, settings, robot, profile
-        fields_of_view: dict[str, float] = {}
-        if settings.camera is not None:
-            frames = [frame for frame in robot.sensors if frame.startswith(CAMERA_PREFIX)]
-            if not frames:
-                robot.sensor(f"{CAMERA_PREFIX}_front", "--camera none")
-            fields_of_view = dict.fromkeys(frames, settings.camera.vertical_field_of_view)
+        fields_of_view = {camera.frame: camera.settings.vertical_field_of_view for camera in rig}
         lidar_pose = None if settings.lidar is None else robot.sensor(LIDAR_FRAME, "--lidar none")
         hidden = settings.hidden or ()
         model = build_model(scenery, robot, settings.seed, fields_of_view, hidden)
@@ -185,9 +225,9 @@ class _Session:
             self._lidar = Lidar(model, lidar_pose, settings.lidar, random_stream(settings.seed, "lidar"))
             self._tasks.append((settings.lidar.rate, self._write_cloud))
         self._cameras: list[Camera] = []
-        if settings.camera is not None:
-            self._cameras = [Camera(model, frame, settings.camera) for frame in fields_of_view]
-            self._tasks.append((settings.camera.rate, self._write_images))
+        if rig:
+            self._cameras = [Camera(model, entry.frame, entry.settings, entry.imaging) for entry in rig]
+            self._tasks.append((rig[0].settings.rate, self._write_images))
         self._messages: dict[str, int] = {}
 
     @property
@@ -306,10 +346,27 @@ class _Session:
                 return builders.compressed_image(stamp, frame, "jpeg", encode_jpeg(pixels, quality))
 
             info = builders.camera_info(
-                stamp, frame, settings.width, settings.height, settings.matrix, settings.distortion or [0.0] * 5
-            )
+                stamp, frame, settings.width, settings.height, settings.matrix, settings.distortion or [0.0] * 5,
+                settings.distortion_model,
+            )  # fmt: skip
             self._write(f"/{frame}/image_raw/compressed", self._workers.submit(encode))
             self._write(f"/{frame}/camera_info", info)
+
+
+def _robots_cameras(robot: Vehicle, settings: CameraSettings | None) -> tuple[RecordedCamera, ...]:
+    """The cameras of the robot's file."""
+    if settings is None:
+        return ()
+    frames = [frame for frame in robot.sensors if frame.startswith(CAMERA_PREFIX)]
+    if not frames:
+        robot.sensor(f"{CAMERA_PREFIX}_front", "--camera none")
+    return tuple(RecordedCamera(frame, robot.sensors[frame], settings) for frame in frames)
+
+
+def _with_rig(robot: Vehicle, rig: Sequence[RecordedCamera]) -> Mapping[str, np.ndarray]:
+    """The robot's sensors with the cameras of a rig instead of its own."""
+    sensors = {frame: pose for frame, pose in robot.sensors.items() if not frame.startswith(CAMERA_PREFIX)}
+    return sensors | {camera.frame: camera.pose for camera in rig}
 
 
 def _with_cameras(robot: Vehicle, count: int) -> Mapping[str, np.ndarray]:

@@ -33,6 +33,16 @@ class Route:
         control[_FIXED_POINTS:] += random.uniform(-0.5, 0.5, control[_FIXED_POINTS:].shape)
         # The last point before the start is fixed, since it sets the heading at the start.
         control[-1] = _CONTROL_POINTS[-1] * [1.0, 0.0]
+        self._pass_through(control)
+
+    @classmethod
+    def through(cls, control: np.ndarray) -> Route:
+        """A route through control points ``[n, 2]`` [m], from the first one on and back to it."""
+        route = cls.__new__(cls)
+        route._pass_through(control)
+        return route
+
+    def _pass_through(self, control: np.ndarray) -> None:
         knots = np.vstack([control, control[:1]])
         chords = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(knots, axis=0), axis=1))])
         spline = CubicSpline(chords, knots, bc_type="periodic")

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from monoforce_ros.synthetic import shapes
+from monoforce_ros.synthetic.obstacle import Obstacle
+from monoforce_ros.synthetic.paint import Paint
 from monoforce_ros.synthetic.random_streams import random_stream
 from monoforce_ros.synthetic.route import Route
 from monoforce_ros.synthetic.terrain_shape import HeightField, Kerb, Ramp, TerrainSettings, build_ground
@@ -59,6 +62,8 @@ class GroundPatch:
 
     Attributes:
         area: outline.
+        cores: height of firm cores inside vegetation above the ground, on its grid [m], which neither cameras nor the
+            lidar see; None without any.
         friction: factor on the friction of ordinary ground [-].
         kind: ``mud`` or ``gravel``.
     """
@@ -95,9 +100,25 @@ class Wall:
         return (np.abs(along) <= self.size[0] / 2 + margin) & (np.abs(across) <= self.size[1] / 2 + margin)
 
 
+class Appearance(Protocol):
+    """How a world looks."""
+
+    def paint(self, scenery: Scenery) -> Paint:
+        """Colours, sky and light of a world."""
+        ...
+
+
 @dataclass(frozen=True)
 class Scenery:
-    """Everything in a world except the robot; positions in world coordinates [m]."""
+    """Everything in a world except the robot; positions in world coordinates [m].
+
+    Attributes:
+        obstacles: objects of randomised worlds, which have materials of their own.
+        cores: height of firm cores inside vegetation above the ground, on its grid [m], which neither cameras nor the
+            lidar see; None without any.
+        friction: factor on the friction of ordinary ground over the whole ground; None leaves it to ``patches``.
+        appearance: colours of a randomised world; None stands for those of :func:`textures.nature`.
+    """
 
     ground: HeightField
     route: Route
@@ -108,6 +129,25 @@ class Scenery:
     kerbs: tuple[Kerb, ...] = ()
     patches: tuple[GroundPatch, ...] = ()
     walls: tuple[Wall, ...] = ()
+    obstacles: tuple[Obstacle, ...] = ()
+    cores: HeightField | None = None
+    friction: HeightField | None = None
+    appearance: Appearance | None = None
+
+    @property
+    def support(self) -> HeightField:
+        """The ground that carries and stops wheels: the ground and the firm cores of plants."""
+        if self.cores is None:
+            return self.ground
+        return HeightField(self.ground.heights + self.cores.heights, self.ground.resolution, self.ground.origin)
+
+    @property
+    def surface(self) -> HeightField:
+        """The ground that cameras and the lidar see: a soft layer, such as snow, lies on the one that carries."""
+        layer = self.grass.layer
+        if layer is None:
+            return self.ground
+        return HeightField(self.ground.heights + layer.heights, self.ground.resolution, self.ground.origin)
 
 
 def build_scenery(settings: TerrainSettings, seed: int) -> Scenery:

@@ -14,10 +14,22 @@ import numpy as np
 from monoforce_ros.synthetic import world
 from monoforce_ros.synthetic.graphics import HOW_TO_DRAW, DrawingError, mujoco
 
+# Coefficients by distortion model, in the order of sensor_msgs/CameraInfo.
+_COEFFICIENTS = {
+    "plumb_bob": ("k1", "k2", "p1", "p2", "k3"),
+    "rational_polynomial": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "equidistant": ("k1", "k2", "k3", "k4"),
+}
+_NUMBERS = {4: "four", 5: "five", 8: "eight"}
+_LARGEST_SLOPE = 4.0
+"""Largest x / z of a pixel's ray: the image is rendered by a pinhole camera."""
+_WIDEST_DRAWN = 1.4
+"""Largest edge of a fisheye's rendered image, relative to the image."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class CameraSettings:
-    """A pinhole camera with optional lens distortion.
+    """A camera with optional lens distortion.
 
     Attributes:
         width: width of the image [pixels].
@@ -25,7 +37,9 @@ class CameraSettings:
         field_of_view: horizontal field of view [rad].
         rate: images per second [Hz].
         quality: quality of the JPEG files, 1 to 100.
-        distortion: k1, k2, p1, p2, k3 of OpenCV's plumb-bob model; empty for none.
+        distortion: coefficients of the distortion model: k1, k2, p1, p2, k3 of ``plumb_bob``, also k4, k5, k6 of
+            ``rational_polynomial``, or k1 to k4 of ``equidistant``; empty for none.
+        distortion_model: one of :data:`monoforce_ros.core.DISTORTION_MODELS`.
         oversampling: rendered pixels per image pixel along each side, for anti-aliasing; 0 selects 2 for images up to
             400 pixels wide and 1 for larger ones.
     """
@@ -37,6 +51,7 @@ class CameraSettings:
     quality: int = 85
     distortion: tuple[float, ...] = ()
     oversampling: int = 0
+    distortion_model: str = "plumb_bob"
 
     def __post_init__(self):
         for name in ("width", "height"):
@@ -52,55 +67,97 @@ class CameraSettings:
             object.__setattr__(self, "oversampling", 2 if self.width <= 400 else 1)
         if not 1 <= self.oversampling <= 4:
             raise ValueError(f"camera oversampling: got {self.oversampling}, expected 1 to 4")
-        if len(self.distortion) not in (0, 5) or not all(abs(value) <= 1.0 for value in self.distortion):
-            raise ValueError(f"camera distortion: got {self.distortion}, expected five numbers k1, k2, p1, p2, k3")
+        if self.distortion_model not in _COEFFICIENTS:
+            raise ValueError(
+                f"camera distortion_model: got {self.distortion_model!r}, expected one of {', '.join(_COEFFICIENTS)}"
+            )
+        names = _COEFFICIENTS[self.distortion_model]
+        if len(self.distortion) not in (0, len(names)) or not all(abs(value) <= 1.0 for value in self.distortion):
+            raise ValueError(
+                f"camera distortion: got {self.distortion}, expected {_NUMBERS[len(names)]} numbers {', '.join(names)}"
+            )
         if self.distortion:
             self._check_distortion()
 
     @property
     def matrix(self) -> np.ndarray:
-        """Camera matrix ``[3, 3]`` [pixels]; the centre of the first pixel is (0, 0)."""
-        focal = self.width / 2 / math.tan(self.field_of_view / 2)
+        """Camera matrix ``[3, 3]`` [pixels]; the centre of the first pixel is (0, 0).
+
+        The field of view is that of the lens without the distortion's coefficients: of a pinhole, or of an ideal
+        equidistant fisheye.
+        """
+        half = self.field_of_view / 2
+        focal = self.width / 2 / (half if self._is_fisheye else math.tan(half))
         return np.array([[focal, 0, (self.width - 1) / 2], [0, focal, (self.height - 1) / 2], [0, 0, 1]])
 
     @property
     def drawn_size(self) -> tuple[int, int]:
         """Width and height [pixels] of the rendered image, which has no distortion."""
-        reach = np.abs(self._rays()).reshape(-1, 2).max(axis=0) if self.distortion else None
         size = np.array([self.width, self.height])
-        if reach is not None:
-            size = 2 * np.ceil(reach * self.matrix[0, 0]).astype(int) + 2
+        if self.distortion:
+            reach = np.nanmax(np.abs(self._rays()).reshape(-1, 2), axis=0)
+            size = 2 * np.ceil(reach * self._drawn_focal).astype(int) + 2
         width, height = self.oversampling * size
         return int(width), int(height)
 
     @property
     def vertical_field_of_view(self) -> float:
         """Of the rendered image [rad]."""
-        return 2 * math.atan(self.drawn_size[1] / self.oversampling / 2 / self.matrix[1, 1])
+        return 2 * math.atan(self.drawn_size[1] / self.oversampling / 2 / self._drawn_focal)
+
+    @property
+    def horizontal_field_of_view(self) -> float:
+        """Angle between the rays of the outermost pixels of the middle row [rad]."""
+        if not self.distortion:
+            return self.field_of_view
+        slopes = self._rays()[self.height // 2, :, 0]
+        return float(math.atan(np.nanmax(slopes)) - math.atan(np.nanmin(slopes)))
 
     def drawn_pixels(self) -> np.ndarray | None:
-        """Where each pixel lies in the rendered image, ``[height, width, 2]`` float32; None without distortion."""
+        """Where each pixel lies in the rendered image, ``[height, width, 2]`` float32; None without distortion.
+
+        Pixels outside the lens' circle lie outside the rendered image.
+        """
         if not self.distortion:
             return None
         middle = (np.array(self.drawn_size) - 1) / 2
-        return (self._rays() * self.matrix[0, 0] * self.oversampling + middle).astype(np.float32)
+        places = self._rays() * self._drawn_focal * self.oversampling + middle
+        return np.nan_to_num(places, nan=-10.0).astype(np.float32)
+
+    @property
+    def _is_fisheye(self) -> bool:
+        return self.distortion_model == "equidistant"
+
+    @property
+    def _drawn_focal(self) -> float:
+        """Focal length of the rendered image [pixels]; a wide lens is rendered with fewer pixels in its middle."""
+        focal = float(self.matrix[0, 0])
+        if not self._is_fisheye:
+            return focal
+        reach = np.nanmax(np.abs(self._rays()).reshape(-1, 2), axis=0)
+        return min(focal, _WIDEST_DRAWN * min(self.width / 2 / reach[0], self.height / 2 / reach[1]))
 
     def _rays(self) -> np.ndarray:
-        """Direction x / z, y / z of each pixel, ``[height, width, 2]``."""
+        """Direction x / z, y / z of each pixel, ``[height, width, 2]``; NaN outside a fisheye's circle."""
         columns, rows = np.meshgrid(np.arange(self.width, dtype=float), np.arange(self.height, dtype=float))
         pixels = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2)
-        rays = cv2.undistortPoints(pixels, self.matrix, np.array(self.distortion))
+        if self._is_fisheye:
+            rays = cv2.fisheye.undistortPoints(pixels, self.matrix, np.array(self.distortion))
+            # A pinhole camera renders no wider cone: the image is black beyond it, like outside a real lens' circle.
+            outward = (rays * (pixels - self.matrix[:2, 2])).sum(axis=-1, keepdims=True) >= 0.0
+            rays = np.where(outward & (np.abs(rays).max(axis=-1, keepdims=True) < _LARGEST_SLOPE), rays, np.nan)
+        else:
+            rays = cv2.undistortPoints(pixels, self.matrix, np.array(self.distortion))
         return rays.reshape(self.height, self.width, 2)
 
     def _check_distortion(self) -> None:
         rays = self._rays()
-        back, _ = cv2.projectPoints(
-            np.concatenate([rays, np.ones_like(rays[..., :1])], axis=-1).reshape(-1, 3), np.zeros(3), np.zeros(3),
-            self.matrix, np.array(self.distortion),
-        )  # fmt: skip
+        points = np.concatenate([rays, np.ones_like(rays[..., :1])], axis=-1).reshape(-1, 1, 3)
+        project = cv2.fisheye.projectPoints if self._is_fisheye else cv2.projectPoints
+        back, _ = project(points, np.zeros(3), np.zeros(3), self.matrix, np.array(self.distortion))
         rows, columns = np.mgrid[: self.height, : self.width]
-        error = np.abs(back.reshape(self.height, self.width, 2) - np.stack([columns, rows], axis=-1)).max()
-        if not error < 0.2 or np.abs(rays).max() > 4.0:
+        error = np.nanmax(np.abs(back.reshape(self.height, self.width, 2) - np.stack([columns, rows], axis=-1)))
+        if not error < 0.2 or np.nanmax(np.abs(rays)) > _LARGEST_SLOPE:
             raise ValueError(
                 f"camera distortion: got {self.distortion}, which folds the image; expected a weaker distortion"
             )
@@ -109,13 +166,26 @@ class CameraSettings:
 class Camera:
     """Renders the images of one of the robot's cameras.
 
+    Args:
+        model: the world.
+        frame: name of the camera in it.
+        settings: resolution, lens and rate.
+        imaging: what the camera does to a perfect image ``[height, width, 3]`` uint8; None for nothing.
+
     Raises:
         DrawingError: no graphics library can render.
     """
 
-    def __init__(self, model: mujoco.MjModel, frame: str, settings: CameraSettings):
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        frame: str,
+        settings: CameraSettings,
+        imaging: Callable[[np.ndarray], np.ndarray] | None = None,
+    ):
         self.frame = frame
         self.settings = settings
+        self._imaging = imaging
         # A copy of the model, in which geometry outside the view is hidden without affecting the lidar.
         self._model = copy.copy(model)
         self._groups = model.geom_group.copy()
@@ -124,6 +194,8 @@ class Camera:
         width, height = settings.drawn_size
         self._size = width, height
         self._pixels = settings.drawn_pixels()
+        upright = math.tan(settings.vertical_field_of_view / 2)
+        self._half_diagonal = math.atan(math.hypot(width, height) / height * upright)
         self._model.vis.global_.offwidth, self._model.vis.global_.offheight = width, height
         if not hasattr(mujoco, "GLContext"):
             raise DrawingError(f"no graphics library for camera images was found; {HOW_TO_DRAW}")
@@ -137,6 +209,10 @@ class Camera:
 
     def capture(self, data: mujoco.MjData) -> np.ndarray:
         """RGB image ``[height, width, 3]`` uint8 of a state whose kinematics are up to date."""
+        pixels = self._rendered(data)
+        return pixels if self._imaging is None else self._imaging(pixels)
+
+    def _rendered(self, data: mujoco.MjData) -> np.ndarray:
         self._hide_outside_view(data)
         self._renderer.update_scene(data, self.frame, self._options)
         flags = self._renderer.scene.flags
@@ -162,8 +238,7 @@ class Camera:
         along = centres @ forward
         across = np.linalg.norm(centres - along[:, None] * forward, axis=1)
         # Outside the cone around the image's corners by more than the bounding sphere's radius.
-        half_diagonal = math.atan(math.hypot(*self._size) / 2 / self.settings.oversampling / self.settings.matrix[0, 0])
-        outside = across * math.cos(half_diagonal) - along * math.sin(half_diagonal) > radii
+        outside = across * math.cos(self._half_diagonal) - along * math.sin(self._half_diagonal) > radii
         groups = self._groups.copy()
         groups[self._static[outside]] = world.COLLISION_GROUND_GROUP
         self._model.geom_group[:] = groups

@@ -27,6 +27,10 @@ class Shape:
     normals: np.ndarray
     texture_coordinates: np.ndarray
 
+    def turned(self, rotation: np.ndarray) -> Shape:
+        """The same shape, turned about the origin by a matrix ``[3, 3]``."""
+        return Shape(self.vertices @ rotation.T, self.faces, self.normals @ rotation.T, self.texture_coordinates)
+
     def moved(self, offset: np.ndarray) -> Shape:
         """The same shape, shifted by ``offset`` ``[3]`` [m]."""
         return Shape(self.vertices + offset, self.faces, self.normals, self.texture_coordinates)
@@ -109,10 +113,13 @@ def box(size: np.ndarray, heading: float) -> Shape:
 
 def trunk(radius: float, height: float) -> Shape:
     """A tapered stem standing at the origin, closed at both ends (convex)."""
-    sides = 10
+    return _prism(radius, 0.6, height, 10)
+
+
+def _prism(radius: float, taper: float, height: float, sides: int) -> Shape:
     angles = np.arange(sides + 1) / sides * 2 * math.pi
     rim = np.stack([np.cos(angles), np.sin(angles), np.zeros(sides + 1)], axis=1)
-    bottom, top = rim * radius * [1, 1, 0], rim * radius * 0.6 + height * _UP
+    bottom, top = rim * radius * [1, 1, 0], rim * radius * taper + height * _UP
     vertices = np.concatenate([bottom, top, [[0, 0, 0]], [height * _UP]])
     normals = np.concatenate([rim, rim, [-_UP], [_UP]])
     around = np.arange(sides + 1) / sides
@@ -193,6 +200,37 @@ def blades(
     strip = np.array([[0, 1, 3], [0, 3, 2], [2, 3, 4]])
     faces = (strip[None] + 5 * np.arange(count)[:, None, None]).reshape(-1, 3)
     return Shape(vertices.reshape(-1, 3), faces, np.repeat(normal, 5, axis=0), coordinates.reshape(-1, 2))
+
+
+def twigs(roots: np.ndarray, heights: np.ndarray, leaf: float, lean: np.ndarray, random: np.random.Generator) -> Shape:
+    """Leaves at any height above roots ``[n, 3]``; arguments as for :func:`blades`, ``leaf`` is their length [m]."""
+    count = len(roots)
+    level = random.uniform(0.1, 1.0, count)
+    bend = np.concatenate([lean * (level * heights)[:, None], (level * heights)[:, None]], axis=1)
+    directions = _unit(random.standard_normal((count, 3)) + 0.5 * _UP)
+    second = _unit(np.cross(directions, random.standard_normal((count, 3))))
+    normals = _unit(_UP + 0.6 * random.standard_normal((count, 3)))
+    sizes = leaf * random.uniform(0.6, 1.3, (count, 1))
+    return _leaves(roots + bend, directions * sizes, 0.5 * second * sizes, normals, 0.15 + 0.75 * level, random)
+
+
+def bush(radius: float, height: float, leaves: int, random: np.random.Generator) -> Shape:
+    """Leaves in a dome that stands at the origin."""
+    directions = _random_directions(leaves, random)
+    directions[:, 2] = np.abs(directions[:, 2])
+    bumpy = 1.0 + 0.2 * np.sin(directions @ random.uniform(2.0, 6.0, 3) + random.uniform(0.0, 6.3))
+    centres = directions * np.array([radius, radius, height]) * (bumpy * random.uniform(0.55, 1.0, leaves))[:, None]
+    first = np.cross(directions, random.standard_normal((leaves, 3)))
+    second = np.cross(directions, first) + 0.4 * random.standard_normal((leaves, 3))
+    sizes = 1.6 * math.sqrt(radius * height / leaves) * random.uniform(0.6, 1.3, (leaves, 1))
+    normals = _unit(directions + 0.4 * random.standard_normal((leaves, 3)))
+    brightness = np.clip(0.35 + 0.4 * directions[:, 2] + random.normal(0.0, 0.15, leaves), 0.0, 1.0)
+    return _leaves(centres, _unit(first) * sizes, 0.6 * _unit(second) * sizes, normals, brightness, random)
+
+
+def cylinder(radius: float, length: float, *, sides: int = 12) -> Shape:
+    """A closed cylinder that stands at the origin; the texture wraps around it once and repeats every metre."""
+    return _prism(radius, 1.0, length, sides)
 
 
 def upper_surface(vertices: np.ndarray, positions: np.ndarray) -> np.ndarray:

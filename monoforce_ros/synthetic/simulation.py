@@ -19,6 +19,8 @@ from monoforce_ros.synthetic.vehicle import Vehicle
 _SETTLING_TIME = 1.5
 _LARGEST_TILT = math.radians(55.0)
 _EDGE_MARGIN = 1.5
+# A map of friction is read this often: a wheel moves less than 2 cm in between.
+_STEPS_PER_FRICTION = 5
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,7 @@ class Simulation:
         x, y = scenery.ground.grid()
         positions = np.stack([x, y], axis=-1)
         reach = 2 * round((np.linalg.norm([w.centre[:2] for w in robot.wheels], axis=1).max() + 0.3) / self._cell) + 1
-        self._near_grass = maximum_filter(scenery.grass.canopy.heights > 0.0, reach)
+        self._near_grass = maximum_filter(scenery.grass.soft_cells, reach)
         in_patch = np.zeros(x.shape, bool)
         for patch in scenery.patches:
             in_patch |= patch.contains(positions)
@@ -196,6 +198,12 @@ class Simulation:
 
     def _set_friction(self) -> None:
         """Set the friction of each tyre to that of the ground below it."""
+        friction = self._scenery.friction
+        if friction is not None:
+            if self.steps % _STEPS_PER_FRICTION == 0:
+                factors = friction.nearest(self.data.xpos[self.wheel_bodies, :2])
+                self.model.geom_friction[self.tyres, 0] = self.tyre_friction * factors
+            return
         near = self._is_near(self._near_patch)
         if not near and not self._on_patch:
             return

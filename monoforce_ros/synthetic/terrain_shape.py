@@ -150,6 +150,12 @@ class HeightField:
         smaller, larger = np.minimum(x, y), np.maximum(x, y)
         return low + (larger - smaller) * (corner - low) + smaller * (high - low)
 
+    def nearest(self, positions: np.ndarray) -> np.ndarray:
+        """Value of the nearest cell at world positions ``[..., 2]``; clamped at the edge."""
+        cells = np.nan_to_num((np.asarray(positions) - self.origin) / self.resolution)
+        cells = np.clip(np.rint(cells).astype(int), 0, self.heights.shape[0] - 1)
+        return self.heights[cells[..., 1], cells[..., 0]]
+
     def triangles(self, step: int = 1) -> tuple[np.ndarray, np.ndarray]:
         """Vertices ``[n, 3]`` [m] and faces ``[m, 3]`` of every ``step``-th height, counter-clockwise from above."""
         x, y = (axis[::step, ::step] for axis in self.grid())

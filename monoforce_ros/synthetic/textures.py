@@ -5,6 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from monoforce_ros.synthetic.paint import Light, Paint
+from monoforce_ros.synthetic.random_streams import random_stream
 from monoforce_ros.synthetic.scenery import Scenery
 
 TO_SUN = np.array([0.36, 0.62, 0.70]) / np.linalg.norm([0.36, 0.62, 0.70])
@@ -30,6 +32,22 @@ def noise(pixels: int, coarsest: int, random: np.random.Generator, fall_off: flo
         total += weight * cv2.resize(layer, (pixels, pixels), interpolation=cv2.INTER_CUBIC)
         weight, cells = weight * fall_off, 2 * cells
     return total / (2.0 * total.std())
+
+
+def nature(scenery: Scenery, seed: int) -> Paint:
+    """Colours of a world of :func:`monoforce_ros.synthetic.scenery.build_scenery`."""
+    ground, turf = paint_ground(scenery, random_stream(seed, "ground colours"))
+    materials = {
+        "ground": ground,
+        "rock": rock_texture(random_stream(seed, "rock colours")),
+        "wall": wall_texture(random_stream(seed, "wall colours")),
+        "bark": bark_texture(random_stream(seed, "bark colours")),
+        "grass": grass_palette(),
+        "broad": leaf_palette(),
+        "conifer": needle_palette(),
+    }
+    light = Light(TO_SUN, (0.86, 0.80, 0.70), (0.40, 0.43, 0.47), HAZE_COLOUR, 8.0, 75.0)
+    return Paint(turf, materials, sky_texture(random_stream(seed, "sky colours")), light)
 
 
 def paint_ground(scenery: Scenery, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -64,7 +82,7 @@ def paint_ground(scenery: Scenery, random: np.random.Generator) -> tuple[np.ndar
         colours = _blend(colours, _MUD if patch.kind == "mud" else _GRAVEL * (1.0 + 0.08 * fine[..., None]), inside)
         bare = np.maximum(bare, inside)
     colours = _blend(colours, 0.75 * _MOSS, np.clip(_resized(scenery.grass.canopy.heights, count) / 0.25, 0.0, 1.0))
-    colours *= ((1.0 - 0.52 * _shadows(scenery, 2 * count)[::2, ::2]) * (1.0 + 0.15 * fine))[..., None]
+    colours *= ((1.0 - 0.52 * shadows(scenery, 2 * count, TO_SUN)[::2, ::2]) * (1.0 + 0.15 * fine))[..., None]
 
     coarse = np.clip(255 * colours, 0, 255).astype(np.uint8)
     image = cv2.resize(coarse, (_GROUND_PIXELS, _GROUND_PIXELS), interpolation=cv2.INTER_CUBIC)
@@ -172,10 +190,10 @@ def sky_texture(random: np.random.Generator, pixels: int = 256) -> np.ndarray:
     return np.clip(255 * np.concatenate(images), 0, 255).astype(np.uint8)
 
 
-def _shadows(scenery: Scenery, count: int) -> np.ndarray:
-    """Shadow on the ground, 0 (lit) to 1 (dark), ``[count, count]``."""
+def shadows(scenery: Scenery, count: int, to_sun: np.ndarray) -> np.ndarray:
+    """Shadow on the ground, 0 (lit) to 1 (dark), ``[count, count]``; ``to_sun`` is the unit vector towards the sun."""
     field = scenery.ground
-    shift = -TO_SUN[:2] / TO_SUN[2]
+    shift = -to_sun[:2] / to_sun[2]
     scale = count / (2 * field.half_size)
     shade = np.zeros((count, count), np.float32)
 
@@ -189,6 +207,10 @@ def _shadows(scenery: Scenery, count: int) -> np.ndarray:
         polygon(rock.vertices[rock.vertices[:, 2] > level - 0.02], level, shade)
     for tree in scenery.trees:
         polygon(tree.stem.vertices, float(tree.base[2]), shade)
+    for obstacle in scenery.obstacles:
+        for part in obstacle.parts:
+            if part.is_solid and part.is_visible:
+                polygon(part.shape.vertices, float(field.height_at(obstacle.position)), shade)
     crowns = np.zeros_like(shade)
     for tree in scenery.trees:
         leaves = tree.crown.vertices

@@ -81,11 +81,13 @@ class Grass:
         settings: height, density and stiffness.
         canopy: height of the canopy above the ground, on the ground's grid.
         tiles: meshes of blades, one for each patch.
+        layer: thickness of a soft layer on the ground, such as snow, on the ground's grid; None without one.
     """
 
     settings: GrassSettings
     canopy: HeightField
     tiles: tuple[shapes.Shape, ...]
+    layer: HeightField | None = None
 
     @classmethod
     def grow(
@@ -108,6 +110,12 @@ class Grass:
         heights *= 1.0 + 0.12 * uneven / uneven.std()
         canopy = HeightField(heights, ground.resolution, ground.origin)
         return cls(settings, canopy, tuple(_blades_of(patch, canopy, ground, settings, random) for patch in patches))
+
+    @property
+    def soft_cells(self) -> np.ndarray:
+        """Cells of the ground's grid on which wheels may feel forces."""
+        cells = self.canopy.heights > 0.0
+        return cells if self.layer is None else cells | (self.layer.heights > 0.0)
 
     def height_at(self, positions: np.ndarray) -> np.ndarray:
         """Height of the canopy above the ground [m] at world positions ``[..., 2]``."""

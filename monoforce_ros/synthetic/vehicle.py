@@ -29,6 +29,8 @@ _GEAR_INERTIA = 0.4
 _WHEELS_MASS_FRACTION = 0.12
 # Spacing of the small wheels that model a track, in wheel radii; close enough to climb like a belt.
 _TRACK_WHEEL_DISTANCE = 1.1
+# Three wheels of a flipper touch each other; five take twice as long to simulate.
+_FLIPPER_WHEELS = 3
 _GRAVITY = 9.81
 
 
@@ -66,6 +68,7 @@ class Vehicle:
         inertia: ``[3, 3]`` about the centre of mass [kg m²].
         hull: centre ``[3]`` and edge lengths ``[3]`` of each box [m].
         sensors: ``[4, 4]`` pose of each sensor frame, base ← sensor.
+        colour: of its body ``[3]`` in 0..1.
     """
 
     name: str
@@ -78,23 +81,25 @@ class Vehicle:
     sensors: Mapping[str, np.ndarray]
     maximum_speed: float
     maximum_yaw_rate: float
+    colour: tuple[float, float, float] = (0.92, 0.72, 0.10)
 
     @classmethod
     def load(cls, name_or_file: str | Path) -> Vehicle:
         """Read a robot by name or file; each track becomes a row of small wheels that turn together.
 
+        Flippers stand still at the angles of the file, with a row of wheels each.
+
         Raises:
-            RobotFileError: the file is invalid or has flippers.
+            RobotFileError: the file is invalid.
         """
         robot: RobotModel = load_robot(name_or_file)
-        path = robot_file(name_or_file)
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-        if content.get("flippers"):
-            raise RobotFileError(f"{path}: flippers: synthetic worlds can simulate robots on wheels and tracks only")
+        content = yaml.safe_load(robot_file(name_or_file).read_text(encoding="utf-8"))
         offsets = dict(zip(robot.drive_names, robot.drive_offsets.tolist(), strict=True))
         wheels = [_wheel(wheel, offsets) for wheel in content.get("wheels", [])]
         for track in content.get("tracks", []):
             wheels += _track_wheels(track, offsets)
+        for flipper in content.get("flippers", []):
+            wheels += _flipper_wheels(flipper, offsets)
         hull = tuple((np.array(box["centre"], float), np.array(box["size"], float)) for box in content.get("hull", []))
         return cls(
             name=robot.name,
@@ -137,7 +142,7 @@ class Vehicle:
         self._set_inertia(base, wheel_mass)
         for centre, size in self.hull:
             base.add_geom(
-                type=mujoco.mjtGeom.mjGEOM_BOX, pos=centre, size=size / 2, rgba=[0.92, 0.72, 0.10, 1], **_collides()
+                type=mujoco.mjtGeom.mjGEOM_BOX, pos=centre, size=size / 2, rgba=[*self.colour, 1], **_collides()
             )
         for wheel in self.wheels:
             self._add_wheel(spec, base, wheel, wheel_mass)
@@ -217,6 +222,21 @@ def _track_wheels(track: Mapping, offsets: Mapping[str, float]) -> list[Wheel]:
             float(track["width"]),
         )
         for index, offset in enumerate(offsets_x)
+    ]  # fmt: skip
+
+
+def _flipper_wheels(flipper: Mapping, offsets: Mapping[str, float]) -> list[Wheel]:
+    """Wheels along a flipper at its angle, from the root to the smaller tip."""
+    joint, length, angle = np.array(flipper["joint"], float), float(flipper["length"]), float(flipper.get("angle", 0.0))
+    root, tip = float(flipper["root_radius"]), float(flipper["tip_radius"])
+    forward = 1.0 if flipper["end"] == "front" else -1.0
+    direction = np.array([forward * np.cos(angle), 0.0, np.sin(angle)])
+    return [
+        Wheel(
+            f"{flipper['name']}_{index}", offsets[str(flipper["drive"])], joint + share * length * direction,
+            root + share * (tip - root), float(flipper["width"]),
+        )
+        for index, share in enumerate(np.linspace(0.0, 1.0, _FLIPPER_WHEELS))
     ]  # fmt: skip
 
 

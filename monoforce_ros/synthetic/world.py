@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from monoforce_ros.synthetic import textures, vehicle
 from monoforce_ros.synthetic.fault import Fault
 from monoforce_ros.synthetic.graphics import mujoco
+from monoforce_ros.synthetic.paint import Light, Paint
 from monoforce_ros.synthetic.random_streams import random_stream
 from monoforce_ros.synthetic.scenery import Scenery
 from monoforce_ros.synthetic.shapes import Shape
@@ -34,6 +35,7 @@ _SPAWN_HEIGHT = 0.05
 # The rendered ground is coarser than the collision ground by this factor, to save triangles.
 _DRAWN_STEP = 2
 _TILE_SIZE = 5.0
+_WIDE_LENS_NEAR = 0.015
 
 
 def build_model(
@@ -58,10 +60,16 @@ def build_model(
     _add_ground(spec, scenery)
     materials: set[str] = set()
     if cameras:
-        colours, cover = textures.paint_ground(scenery, random_stream(seed, "ground colours"))
-        materials = _add_materials(spec, colours, seed)
-        _add_drawn_ground(spec, scenery, cover, random_stream(seed, "short grass"))
-        _add_light(spec)
+        look = scenery.appearance
+        paint = textures.nature(scenery, seed) if look is None else look.paint(scenery)
+        materials = _add_materials(spec, paint)
+        _add_drawn_ground(spec, scenery, paint.turf, random_stream(seed, "short grass"))
+        _add_light(spec, paint.light)
+        if look is not None:
+            # The corner of a fisheye image close above the ground sees points of little depth.
+            spec.visual.map.znear = _WIDE_LENS_NEAR
+        if paint.surroundings is not None:
+            _add_surroundings(spec, scenery.ground, paint.surroundings)
     for index, rock in enumerate(scenery.rocks):
         _add_shape(spec, f"rock_{index}", rock, "rock", materials, SOLID_GROUP, solid=True)
     for index, wall in enumerate(scenery.walls):
@@ -71,6 +79,13 @@ def build_model(
         _add_shape(spec, f"crown_{index}", tree.crown, tree.foliage, materials, SOLID_GROUP, solid=False)
     for index, tile in enumerate(scenery.grass.tiles):
         _add_shape(spec, f"grass_{index}", tile, "grass", materials, GRASS_GROUP, solid=False)
+    for index, obstacle in enumerate(scenery.obstacles):
+        for number, part in enumerate(obstacle.parts):
+            # What neither cameras nor rays see belongs to the group of the collision ground.
+            visible_group = SOLID_GROUP if part.is_solid else GRASS_GROUP
+            group = visible_group if part.is_visible else COLLISION_GROUND_GROUP
+            name = f"{obstacle.kind}_{index}_{number}"
+            _add_shape(spec, name, part.shape, part.material, materials, group, solid=part.is_solid)
     robot.add_to(spec, robot.clearance + _SPAWN_HEIGHT)
     for frame, field_of_view in cameras.items():
         _add_camera(spec, frame, robot.sensors[frame], field_of_view)
@@ -87,7 +102,7 @@ def _add_camera(spec: mujoco.MjSpec, frame: str, pose: np.ndarray, field_of_view
 
 
 def _add_ground(spec: mujoco.MjSpec, scenery: Scenery) -> None:
-    ground = scenery.ground
+    ground = scenery.support
     lowest = float(ground.heights.min())
     # MuJoCo divides by the range of heights, which is zero for level ground.
     span = max(float(np.ptp(ground.heights)), 1e-3)
@@ -106,7 +121,7 @@ def _add_ground(spec: mujoco.MjSpec, scenery: Scenery) -> None:
         contype=1,
         conaffinity=2,
     )
-    vertices, faces = ground.triangles()
+    vertices, faces = scenery.surface.triangles()
     spec.add_mesh(
         name="ray_ground",
         uservert=vertices.ravel(),
@@ -118,9 +133,11 @@ def _add_ground(spec: mujoco.MjSpec, scenery: Scenery) -> None:
     )
 
 
-def _add_drawn_ground(spec: mujoco.MjSpec, scenery: Scenery, cover: np.ndarray, random: np.random.Generator) -> None:
+def _add_drawn_ground(
+    spec: mujoco.MjSpec, scenery: Scenery, turf_cover: np.ndarray, random: np.random.Generator
+) -> None:
     """Add the ground for images in tiles, so that a camera can skip those out of view."""
-    ground = scenery.ground
+    ground = scenery.surface
     count = ground.heights.shape[0]
     tile = _DRAWN_STEP * round(_TILE_SIZE / ground.resolution / _DRAWN_STEP)
     normals = ground.normals()
@@ -135,7 +152,7 @@ def _add_drawn_ground(spec: mujoco.MjSpec, scenery: Scenery, cover: np.ndarray, 
             name = f"drawn_ground_{row}_{column}"
             shape = Shape(vertices, faces, shading, coordinates)
             _add_shape(spec, name, shape, "ground", {"ground"}, DRAWN_GROUND_GROUP, solid=False)
-            turf = short_grass(ground, scenery.route, cover, part, random)
+            turf = short_grass(ground, scenery.route, turf_cover, part, random)
             _add_shape(spec, f"turf_{row}_{column}", turf, "grass", {"grass"}, DRAWN_GROUND_GROUP, solid=False)
 
 
@@ -160,17 +177,8 @@ def _add_shape(
         geom.material = material
 
 
-def _add_materials(spec: mujoco.MjSpec, ground: np.ndarray, seed: int) -> set[str]:
-    images = {
-        "ground": ground,
-        "rock": textures.rock_texture(random_stream(seed, "rock colours")),
-        "wall": textures.wall_texture(random_stream(seed, "wall colours")),
-        "bark": textures.bark_texture(random_stream(seed, "bark colours")),
-        "grass": textures.grass_palette(),
-        "broad": textures.leaf_palette(),
-        "conifer": textures.needle_palette(),
-    }
-    for name, image in images.items():
+def _add_materials(spec: mujoco.MjSpec, paint: Paint) -> set[str]:
+    for name, image in paint.materials.items():
         texture = spec.add_texture(
             name=name,
             type=mujoco.mjtTexture.mjTEXTURE_2D,
@@ -181,35 +189,43 @@ def _add_materials(spec: mujoco.MjSpec, ground: np.ndarray, seed: int) -> set[st
         texture.data = image.tobytes()
         material = spec.add_material(name=name, specular=0.0, shininess=0.0)
         material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
-    sky = textures.sky_texture(random_stream(seed, "sky colours"))
     texture = spec.add_texture(
         name="sky",
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-        width=sky.shape[1],
-        height=sky.shape[0],
+        width=paint.sky.shape[1],
+        height=paint.sky.shape[0],
         nchannel=3,
     )
-    texture.data = sky.tobytes()
-    return set(images)
+    texture.data = paint.sky.tobytes()
+    return set(paint.materials)
 
 
-def _add_light(spec: mujoco.MjSpec) -> None:
+def _add_surroundings(spec: mujoco.MjSpec, ground: HeightField, colour: tuple[float, float, float]) -> None:
+    """Add a plane that the world lies on, so that its edge does not end in the sky."""
+    position = [*ground.centre, float(ground.heights.min()) - 0.05]
+    spec.worldbody.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_PLANE, pos=position, size=[200.0, 200.0, 1.0],
+        rgba=[*colour, 1.0], group=DRAWN_GROUND_GROUP, contype=0, conaffinity=0,
+    )  # fmt: skip
+
+
+def _add_light(spec: mujoco.MjSpec, light: Light) -> None:
     spec.worldbody.add_light(
         type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
-        dir=-textures.TO_SUN,
-        pos=20.0 * textures.TO_SUN,
-        diffuse=[0.86, 0.80, 0.70],
+        dir=-light.to_sun,
+        pos=20.0 * light.to_sun,
+        diffuse=light.sun,
         specular=[0.0, 0.0, 0.0],
         castshadow=False,
     )
-    spec.visual.headlight.ambient = [0.40, 0.43, 0.47]
+    spec.visual.headlight.ambient = light.ambient
     spec.visual.headlight.diffuse = [0.06, 0.06, 0.06]
     spec.visual.headlight.specular = [0.0, 0.0, 0.0]
     # Cameras oversample instead, which smooths edges at a third of the cost.
     spec.visual.quality.offsamples = 0
-    spec.visual.rgba.fog = [*textures.HAZE_COLOUR, 1.0]
+    spec.visual.rgba.fog = [*light.haze, 1.0]
     spec.stat.extent = 1.0
-    spec.visual.map.fogstart = 8.0
-    spec.visual.map.fogend = 75.0
+    spec.visual.map.fogstart = light.haze_start
+    spec.visual.map.fogend = light.haze_end
     spec.visual.map.znear = 0.05
-    spec.visual.map.zfar = 90.0
+    spec.visual.map.zfar = max(90.0, 1.1 * light.haze_end)

@@ -1,0 +1,372 @@
+"""The protocol of docs/protocol.md: errors of terrain sources in worlds that neither training nor choices have seen.
+
+    scripts/run.sh python benchmarks/terrain.py --out FOLDER [--quick] [--checkpoint SYSTEM=FILE ...] [--seed N]
+        [--docs FILE]
+
+records randomised worlds of the reporting seeds, evaluates every system on them with the paper's physics alone and with
+vegetation drag, and writes the tables, their strata and a log: date, commit, digests of the checkpoints, and how often
+the reporting seeds were used. Recorded worlds are kept in the folder: an interrupted run continues where it stopped.
+Give a system one checkpoint per training seed; without --checkpoint the shipped encoder is tested.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import torch
+from scipy.ndimage import map_coordinates
+from tqdm import tqdm
+
+from monoforce_ros.bags import BagError
+from monoforce_ros.core import MotionState, write_text
+from monoforce_ros.evaluation import EvaluationError
+from monoforce_ros.evaluation.tables import CONSTANT, FLAT, LIDAR, SequenceErrors, System, evaluate_sequence
+from monoforce_ros.perception import Observation
+from monoforce_ros.reporting import write_between
+from monoforce_ros.robots import RobotModel, load_robot
+from monoforce_ros.synthetic import CameraSettings, LidarSettings, RecordingSettings, WorldSettings, record
+from monoforce_ros.synthetic.labels import labels_file
+from monoforce_ros.synthetic.recording import world_file
+from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@dataclass(frozen=True)
+class SeedRange:
+    """Generator seeds for one purpose."""
+
+    purpose: str
+    first: int
+    count: int
+
+    def __contains__(self, seed: int) -> bool:
+        """Whether a seed belongs to the purpose."""
+        return self.first <= seed < self.first + self.count
+
+
+TRAINING = SeedRange("training", 420_000, 10_000)
+CHOOSING = SeedRange("choosing", 430_000, 10_000)
+REPORTING = SeedRange("reporting", 440_000, 10_000)
+
+BOUND = System("true_support", "true support height (bound)", "ground truth")
+LEARNED = {
+    "shipped": ("shipped encoder, images → H_t", "images"),
+    "lidar_hg": ("lidar → H_g [22]", "point cloud"),
+    "lidar_ht": ("lidar → H_t", "point cloud"),
+    "lss": ("images → H_g, LSS [9]", "images"),
+    "monoforce": ("images → H_t, MonoForce", "images"),
+    "no_geometric": ("MonoForce without geometric loss", "images"),
+    "no_terrain": ("MonoForce without terrain loss", "images"),
+}
+"""Title and input of each learned system, by its name."""
+_RESAMPLES = 4000
+_LIDAR = LidarSettings(rings=32, columns=360, rate=5.0)
+# The robots' own physics differ: drag was fitted for the Husky only.
+DRAG_ROBOT = ROOT / "models" / "husky_in_grass.yaml"
+
+
+@dataclass(frozen=True)
+class TrueSupport:
+    """The ground that carries the robot, from a world's labels: no encoder can do better with this physics.
+
+    Attributes:
+        labels: of :func:`monoforce_ros.synthetic.labels.world_labels`.
+        grid: of the maps.
+        material: of the ground, as other sources without material use it.
+    """
+
+    labels: Mapping[str, np.ndarray]
+    grid: Grid
+    material: TerrainDefaults
+    sensors: ClassVar[tuple[str, ...]] = ("lidar",)
+
+    def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
+        """True heights around the robot in the terrain frame."""
+        x, y = np.meshgrid(self.grid.x, self.grid.y)
+        transform = motion.odometry_from_terrain
+        places = np.stack([x, y], axis=-1) @ transform[:2, :2].T + transform[:2, 3]
+        cells = (places - self.labels["origin"]) / float(self.labels["resolution"])
+
+        def sampled(name: str) -> torch.Tensor:
+            values = map_coordinates(self.labels[name], [cells[..., 1], cells[..., 0]], order=1, mode="nearest")
+            return torch.as_tensor(values - transform[2, 3], dtype=torch.float32)
+
+        terrain = TerrainMap.from_height(sampled("support_height"), self.grid, material=self.material)
+        return replace(terrain, geometric_height=sampled("visible_height"))
+
+
+@dataclass(frozen=True)
+class Result:
+    """Errors of a system with one of its checkpoints on one world."""
+
+    system: str
+    checkpoint: str
+    world: int
+    physics: str
+    position: float
+    """Δx [m]."""
+    rotation: float
+    """ΔR [deg]."""
+    windows: int
+    strata: dict[str, str]
+
+
+def strata(described: Mapping[str, object]) -> dict[str, str]:
+    """Stratum of a world by each criterion, from the description beside its bag."""
+
+    def bands(name: str, limits: Sequence[float], unit: str) -> str:
+        value = described[name]
+        assert isinstance(value, int | float)
+        edges = [f"{limit:g}" for limit in limits]
+        for index, limit in enumerate(limits):
+            if value < limit:
+                return f"below {edges[0]} {unit}" if index == 0 else f"{edges[index - 1]} to {edges[index]} {unit}"
+        return f"{edges[-1]} {unit} or more"
+
+    views = described["field_of_view_deg"]
+    assert isinstance(views, list)
+    return {
+        "vegetation height": bands("vegetation_height", (0.05, 0.4, 0.8), "m"),
+        "slope": bands("slope_deg", (4.0, 8.0), "°"),
+        "light": str(described["sky"]),
+        "ground misleads": "yes" if described["misleading_ground"] else "no",
+        "cameras": str(described["cameras"]),
+        "field of view": "none" if not views else ("below 75°" if max(views) < 75.0 else "75° or more"),
+        "robot": str(described["robot"]),
+    }
+
+
+def record_world(folder: Path, seed: int, settings: WorldSettings, duration: float) -> Path:
+    """Record a world of the reporting set, unless it is there."""
+    out = folder / f"{seed}"
+    if not (labels_file(out).exists() and world_file(out).exists()):
+        record(
+            out,
+            RecordingSettings(
+                seed=seed, duration=duration, world=settings, camera=CameraSettings(), lidar=_LIDAR, labels=True,
+                overwrite=True,
+            ),
+        )  # fmt: skip
+    return out
+
+
+def evaluate_world(bag: Path, checkpoints: Mapping[str, Sequence[Path]], physics: Sequence[str]) -> list[Result]:
+    """Errors of every system and checkpoint on one world, with each kind of physics."""
+    described = json.loads(world_file(bag).read_text())
+    systems: list[System] = [LIDAR, BOUND]
+    for name, files in checkpoints.items():
+        title, sensor = LEARNED[name]
+        systems += [System(f"{name}@{index}", title, sensor, file) for index, file in enumerate(files)]
+    systems += [FLAT, CONSTANT]
+    results = []
+    with np.load(labels_file(bag)) as stored:
+        labels = {name: stored[name] for name in ("support_height", "visible_height", "origin", "resolution")}
+    for name in physics:
+        robot = with_physics(load_robot(described["robot"]), name)
+        truth = TrueSupport(labels, Grid.square(), TerrainDefaults())
+        errors: dict[str, SequenceErrors] = evaluate_sequence(bag, robot, systems, {BOUND.key: truth})
+        for system in systems:
+            key, _, checkpoint = system.key.partition("@")
+            found = errors[system.key]
+            results.append(
+                Result(
+                    key, checkpoint, int(described["seed"]), name, found.position, found.rotation, found.windows,
+                    strata(described),
+                )
+            )  # fmt: skip
+    return results
+
+
+PHYSICS: dict[str, Callable[[RobotModel], RobotModel]] = {
+    "paper": lambda robot: replace(robot, effects=()),
+    "vegetation drag": lambda robot: replace(robot, effects=load_robot(str(DRAG_ROBOT)).effects),
+}
+"""Robots with the paper's physics alone, and with the drag of vegetation fitted in other worlds."""
+
+
+def with_physics(robot: RobotModel, name: str) -> RobotModel:
+    """The robot with one of :data:`PHYSICS`."""
+    return PHYSICS[name](robot)
+
+
+def interval(results: Sequence[Result], measure: str) -> tuple[float, float, float]:
+    """Mean over worlds and training seeds, with a 95 % interval by resampling both.
+
+    Worlds and training seeds are independent; windows of one world are not.
+    """
+    worlds = sorted({result.world for result in results})
+    runs = sorted({result.checkpoint for result in results})
+    table = np.full((len(worlds), len(runs)), np.nan)
+    for result in results:
+        table[worlds.index(result.world), runs.index(result.checkpoint)] = getattr(result, measure)
+    table = table[np.isfinite(table).all(axis=1)]
+    if not len(table):
+        return float("nan"), float("nan"), float("nan")
+    random = np.random.default_rng(0)
+    means = [
+        table[random.integers(0, len(table), len(table))][:, random.integers(0, len(runs), len(runs))].mean()
+        for _ in range(_RESAMPLES)
+    ]
+    low, high = np.quantile(means, (0.025, 0.975))
+    return float(table.mean()), float(low), float(high)
+
+
+def table(results: Sequence[Result]) -> str:
+    """Markdown table of all systems, for each kind of physics."""
+    titles = {LIDAR.key: LIDAR, FLAT.key: FLAT, CONSTANT.key: CONSTANT, BOUND.key: BOUND} | {
+        key: System(key, *listed) for key, listed in LEARNED.items()
+    }
+    lines = []
+    for physics in dict.fromkeys(result.physics for result in results):
+        chosen = [result for result in results if result.physics == physics]
+        worlds = {result.world for result in chosen}
+        windows = sum(result.windows for result in chosen if result.system == LIDAR.key)
+        lines += [f"**Physics: {physics}**: {len(worlds)} worlds, {windows} windows of 5 s", ""]
+        lines += ["| input | terrain | training seeds | Δx [m] | ΔR [deg] |", "|---|---|---|---|---|"]
+        for key in dict.fromkeys(result.system for result in chosen):
+            own = [result for result in chosen if result.system == key]
+            seeds = len({result.checkpoint for result in own if result.checkpoint}) or "–"
+            cells = []
+            for measure, digits in (("position", 3), ("rotation", 2)):
+                mean, low, high = interval(own, measure)
+                cells.append(f"{mean:.{digits}f} ({low:.{digits}f} – {high:.{digits}f})")
+            lines.append(f"| {titles[key].input} | {titles[key].title} | {seeds} | {cells[0]} | {cells[1]} |")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def strata_table(results: Sequence[Result], physics: str) -> str:
+    """Markdown table of Δx by stratum, with the number of worlds."""
+    chosen = [result for result in results if result.physics == physics]
+    systems = list(dict.fromkeys(result.system for result in chosen))
+    lines = [f"| criterion | stratum | worlds | {' | '.join(systems)} |", "|---" * (3 + len(systems)) + "|"]
+    for criterion in chosen[0].strata:
+        for stratum in sorted({result.strata[criterion] for result in chosen}):
+            own = [result for result in chosen if result.strata[criterion] == stratum]
+            cells = [f"{interval([r for r in own if r.system == key], 'position')[0]:.3f}" for key in systems]
+            count = len({result.world for result in own})
+            lines.append(f"| {criterion} | {stratum} | {count} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def digest(path: Path) -> str:
+    """SHA-256 of a file, its first 16 digits."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+
+
+def log_use(log: Path, entry: dict[str, object]) -> int:
+    """Append an entry; returns how often its reporting seeds have been used, this time included."""
+    earlier = [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
+    seeds = set(entry["seeds"])  # type: ignore[call-overload]
+    used = 1 + sum(bool(seeds & set(other["seeds"])) for other in earlier)
+    listed = [*earlier, entry | {"times_used": used}]
+    write_text(log, "".join(json.dumps(line) + "\n" for line in listed))
+    return used
+
+
+def commit() -> str:
+    """Commit of the source, with a mark if it was changed since."""
+    done = subprocess.run(
+        ["git", "describe", "--always", "--dirty", "--abbrev=12"], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    return done.stdout.strip() or "unknown"
+
+
+def reporting_seeds(first: int, count: int) -> list[int]:
+    """Seeds of the reporting set.
+
+    Raises:
+        ValueError: a seed belongs to training or choosing.
+    """
+    seeds = list(range(first, first + count))
+    for other in (TRAINING, CHOOSING):
+        taken = [seed for seed in seeds if seed in other]
+        if taken:
+            raise ValueError(
+                f"--seed: got {first}, whose seeds {taken[0]} to {taken[-1]} are for {other.purpose}; expected "
+                f"{REPORTING.first} or any seed outside {TRAINING.first} to {CHOOSING.first + CHOOSING.count - 1}"
+            )
+    return seeds
+
+
+def parse_checkpoints(listed: Sequence[str]) -> dict[str, list[Path]]:
+    """Checkpoints by system; without any, the shipped encoder.
+
+    Raises:
+        ValueError: an entry is no ``SYSTEM=FILE`` of a known system and an existing file.
+    """
+    found: dict[str, list[Path]] = {}
+    for text in listed or [f"shipped={ROOT / 'models' / 'terrain_encoder.safetensors'}"]:
+        name, _, file = text.partition("=")
+        if name not in LEARNED or not Path(file).is_file():
+            raise ValueError(f"--checkpoint: got {text!r}, expected SYSTEM=FILE with one of {', '.join(LEARNED)}")
+        found.setdefault(name, []).append(Path(file))
+    return found
+
+
+def main() -> int:
+    """Run the benchmark; returns the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="worlds, tables and log")
+    parser.add_argument("--quick", action="store_true", help="few short worlds, for a regular check")
+    parser.add_argument("--worlds", type=int, help="number of worlds (40; with --quick 6)")
+    parser.add_argument("--duration", type=float, help="of a recording [s] (40; with --quick 12)")
+    parser.add_argument("--seed", type=int, default=REPORTING.first, help="first reporting seed (%(default)s)")
+    parser.add_argument("--checkpoint", action="append", default=[], metavar="SYSTEM=FILE",
+                        help=f"repeat for other systems and training seeds; systems: {', '.join(LEARNED)}")  # fmt: skip
+    parser.add_argument("--docs", type=Path, help="write the tables between the comments of this document")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    try:
+        seeds = reporting_seeds(options.seed, options.worlds or (6 if options.quick else 40))
+        checkpoints = parse_checkpoints(options.checkpoint)
+    except ValueError as error:
+        print(f"terrain: {error}", file=sys.stderr)
+        return 1
+    duration = options.duration or (12.0 if options.quick else 40.0)
+    results: list[Result] = []
+    skipped: dict[int, str] = {}
+    for seed in tqdm(seeds, desc="worlds"):
+        bag = record_world(options.out / "worlds", seed, WorldSettings(), duration)
+        try:
+            results += evaluate_world(bag, checkpoints, tuple(PHYSICS))
+        except (BagError, EvaluationError) as error:
+            skipped[seed] = str(error)
+    if not results:
+        print(f"terrain: no world could be evaluated: {next(iter(skipped.values()))}", file=sys.stderr)
+        return 1
+    text = table(results)
+    by_strata = "\n\n".join(f"Δx [m], physics: {name}\n\n{strata_table(results, name)}" for name in PHYSICS)
+    entry: dict[str, object] = {
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "commit": commit(),
+        "seeds": seeds,
+        "skipped": skipped,
+        "duration_s": duration,
+        "checkpoints": {name: [digest(file) for file in files] for name, files in checkpoints.items()},
+    }
+    used = log_use(options.out / "terrain.log.jsonl", entry)
+    write_text(options.out / "terrain.md", f"{text}\n{by_strata}\n")
+    write_text(options.out / "terrain.json", json.dumps([asdict(result) for result in results], indent=1))
+    if options.docs is not None:
+        write_between(options.docs, "terrain", f"{text}\n{by_strata}")
+    print(text)
+    print(
+        f"{options.out / 'terrain.md'}; these seeds were used {used} time(s), see {options.out / 'terrain.log.jsonl'}"
+    )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

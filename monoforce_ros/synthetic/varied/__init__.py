@@ -1,0 +1,1 @@
+"""Randomised worlds: everything that a network could learn by heart is drawn from wide ranges."""

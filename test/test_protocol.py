@@ -1,0 +1,119 @@
+"""The protocol of benchmarks/terrain.py: seeds that do not mix, intervals over worlds and seeds, a log of every use."""
+
+import json
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import terrain
+import wall
+from conftest import ROOT
+from scipy.spatial.transform import Rotation
+
+from monoforce_ros.robots import load_robot
+from monoforce_ros.terrain import Grid, TerrainDefaults
+
+
+def result(system, checkpoint, world, position, **changed):
+    values = {"physics": "paper", "rotation": 10 * position, "windows": 5, "strata": {"robot": "husky"}} | changed
+    return terrain.Result(system=system, checkpoint=checkpoint, world=world, position=position, **values)
+
+
+def test_seeds_of_the_purposes_are_disjoint_and_reporting_refuses_the_others():
+    ranges = (terrain.TRAINING, terrain.CHOOSING, terrain.REPORTING)
+    for first in ranges:
+        for second in ranges:
+            assert first is second or not any(seed in second for seed in (first.first, first.first + first.count - 1))
+    assert terrain.reporting_seeds(440_000, 3) == [440_000, 440_001, 440_002]
+    with pytest.raises(ValueError, match="seeds 429999 to 429999 are for training"):
+        terrain.reporting_seeds(429_999, 1)
+    with pytest.raises(ValueError, match="are for choosing; expected 440000"):
+        terrain.reporting_seeds(439_998, 5)
+
+
+def test_intervals_cover_worlds_and_training_seeds():
+    worlds = [result("lss", "0", world, 0.1 + 0.01 * world) for world in range(10)]
+    mean, low, high = terrain.interval(worlds, "position")
+    assert mean == pytest.approx(0.145) and low < 0.13 and high > 0.16
+    # Training seeds that disagree widen the interval although worlds are the same.
+    disagreeing = [result("lss", str(run), w, value) for run, value in ((0, 0.1), (1, 0.3)) for w in range(10)]
+    mean, low, high = terrain.interval(disagreeing, "position")
+    assert (mean, low, high) == (pytest.approx(0.2), pytest.approx(0.1), pytest.approx(0.3))
+    # A world that one run could not evaluate counts for none.
+    assert terrain.interval([*disagreeing, result("lss", "0", 99, 5.0)], "position")[0] == pytest.approx(0.2)
+
+
+def test_the_log_counts_how_often_seeds_were_used(tmp_path):
+    log = tmp_path / "terrain.log.jsonl"
+    assert terrain.log_use(log, {"seeds": [1, 2]}) == 1
+    assert terrain.log_use(log, {"seeds": [3]}) == 1
+    assert terrain.log_use(log, {"seeds": [2, 3]}) == 3
+    lines = [json.loads(line) for line in log.read_text().splitlines()]
+    assert [line["times_used"] for line in lines] == [1, 1, 3]
+
+
+def test_tables_have_a_row_for_every_system_and_stratum():
+    rows = [result(key, "", world, 0.1, strata={"robot": name}) for key in ("lidar", "true_support", "flat")
+            for world, name in enumerate(("husky", "marv", "marv"))]  # fmt: skip
+    text = terrain.table(rows)
+    assert "3 worlds, 15 windows" in text and "true support height (bound)" in text and "level ground" in text
+    assert "| robot | marv | 2 |" in terrain.strata_table(rows, "paper")
+
+
+def test_worlds_are_sorted_into_strata():
+    described = {
+        "vegetation_height": 0.5, "slope_deg": 9.0, "sky": "dusk", "misleading_ground": True, "cameras": 2,
+        "field_of_view_deg": [60.0, 120.0], "robot": "marv",
+    }  # fmt: skip
+    found = terrain.strata(described)
+    assert found["vegetation height"] == "0.4 to 0.8 m" and found["slope"] == "8 ° or more"
+    assert found["field of view"] == "75° or more" and found["ground misleads"] == "yes"
+
+
+def test_the_bound_reads_true_heights_in_the_terrain_frame():
+    columns = np.mgrid[:201, :201][1]
+    labels = {
+        "support_height": (0.1 * (0.1 * columns - 10.0)).astype(np.float32),
+        "visible_height": (0.1 * (0.1 * columns - 10.0) + 0.3).astype(np.float32),
+        "origin": np.array([-10.0, -10.0]), "resolution": np.array(0.1),
+    }  # fmt: skip
+    source = terrain.TrueSupport(labels, Grid.square(), TerrainDefaults())
+    transform = np.eye(4)
+    transform[:3, :3] = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    transform[:3, 3] = [2.0, 1.0, 0.5]
+    found = source.terrain(None, SimpleNamespace(odometry_from_terrain=transform))
+    # Two metres to the right of a robot that faces along y are at x = 4 m, where the ground is at 0.4 m.
+    row, column = np.argmin(np.abs(np.asarray(found.grid.y) + 2.0)), np.argmin(np.abs(np.asarray(found.grid.x)))
+    expected = 0.1 * (2.0 - float(np.asarray(found.grid.y)[row])) - 0.5
+    assert float(found.height[row, column]) == pytest.approx(expected, abs=1e-3)
+    assert float(found.geometric_height[row, column]) == pytest.approx(expected + 0.3, abs=1e-3)
+
+
+def test_physics_differ_by_the_drag_of_vegetation():
+    robot = load_robot("tradr")
+    assert terrain.with_physics(robot, "paper").effects == ()
+    assert [name for name, _ in terrain.with_physics(robot, "vegetation drag").effects] == ["vegetation_drag"]
+
+
+def test_wrong_arguments_are_named(tmp_path):
+    with pytest.raises(ValueError, match="expected SYSTEM=FILE with one of shipped, lidar_hg"):
+        terrain.parse_checkpoints(["best=x"])
+    assert list(terrain.parse_checkpoints([])) == ["shipped"]
+    command = [sys.executable, "benchmarks/terrain.py", "--out", str(tmp_path), "--seed", "420000"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=250, check=False)
+    assert done.returncode == 1 and "are for training" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_precision_and_recall_of_stops():
+    def scene(kind, driven):
+        ahead = SimpleNamespace(kind=kind)
+        return wall.AnyScene(ahead, None, None, driven)
+
+    scenes = [scene("wall", 2.0), scene("wall", 6.3), scene("post", 3.0), scene("vegetation", 6.3)]
+    row = wall.any_row("x", scenes, np.array([1.8, 6.4, 6.4, 3.0]))
+    assert (row["stops"], row["predicted"], row["found"]) == (2, 2, 1)
+    assert row["precision"] == row["recall"] == 0.5
+    assert row["stop_error_m"] == pytest.approx(-0.2)
+    assert row["vegetation"] == [1, 0, 1] and row["wall"] == [1, 1, 2]
