@@ -75,7 +75,7 @@ def diagnose_case(case: Case, work: Path, judged: Judged) -> dict | None:
         status, message, seconds, cpu = _diagnose([*arguments, "--out", str(out), "--quiet"], judged)
         report = out / "report.json"
         row |= {"seconds": seconds, "cpu_seconds": cpu, "report": str(out / "report.html")}
-        if status == 0 and report.exists():
+        if status in (0, 3) and report.exists():  # 3: the recording cannot be diagnosed
             content = json.loads(report.read_text())
             keys = ("verdict", "effects", "gap", "held_out", "numbers", "remarks", "advice")
             row |= {key: content[key] for key in keys if key in content}

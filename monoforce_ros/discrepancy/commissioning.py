@@ -26,7 +26,7 @@ from monoforce_ros.discrepancy.preflight import complaints
 from monoforce_ros.discrepancy.score_test import variation
 from monoforce_ros.discrepancy.selection import BLOCK, Search, blocks_of
 from monoforce_ros.discrepancy.terrain_evidence import terrain_uncertainty
-from monoforce_ros.discrepancy.wheels import WheelFinding, compare_with_wheels
+from monoforce_ros.discrepancy.wheels import WheelFinding, changed_drives, compare_with_wheels
 from monoforce_ros.effects import CATALOGUE, identifiable_effects
 from monoforce_ros.robots import RobotModel
 
@@ -38,7 +38,7 @@ _SEGMENT = 2 * BLOCK
 """Length of the segments between which the healthy robot varies [s]: two blocks, so that most kinds of motion occur in
 each."""
 _FEWEST_SEGMENTS = 3
-_MOST_EFFECTS = 3
+_MOST_EFFECTS = 4
 """Effects of the catalogue that commissioning adds to those that every robot needs."""
 
 
@@ -83,18 +83,18 @@ def commission(
     for number, evidence in enumerate(recordings):
         progress(0.3 * number / len(recordings), "reading the noise")
         prepared.append(_prepare(evidence, robot, np.array(samples), stride))
-    drives = _drives([compare_with_wheels(e.commands, e.wheels, robot) for e in recordings])
-    chosen = (*drives, *(entry for entry in COMMISSIONED if entry[0] not in dict(drives)))
-    fits = [_fitted(entry, chosen, len(drives)) for entry in prepared]
+    fits = [_fitted(entry, COMMISSIONED) for entry in prepared]
+    chosen = COMMISSIONED
     found: list[tuple[str, Mapping[str, float]]] = []
     for number, (entry, fit) in enumerate(zip(prepared, fits, strict=True)):
         progress(0.3 + 0.4 * number / len(prepared), "searching for further effects")
-        found += _further(robot, entry, fit.effects)
+        wheels = compare_with_wheels(recordings[number].commands, recordings[number].wheels, robot)
+        found += _further(robot, entry, fit.effects, wheels)
     counted = [name for name, _ in found]
     further = {name: values for name, values in found if counted.count(name) > 0.5 * len(prepared)}
     if further:
         chosen = (*chosen, *further.items())
-        fits = [_fitted(entry, chosen, len(drives)) for entry in prepared]
+        fits = [_fitted(entry, chosen) for entry in prepared]
     values = np.median([flat(fit.effects) for fit in fits], axis=0)
     merged = replace(fits[0], effects=with_values(fits[0].effects, values))
     progress(0.8, "variation between segments")
@@ -117,36 +117,22 @@ def _prepare(evidence: Evidence, robot: RobotModel, samples: np.ndarray, stride:
     return _Prepared(data, Predictions(robot, data), floor)
 
 
-def _drives(findings: Sequence[WheelFinding | None]) -> Effects:
-    """What the wheels of more than half of the recordings show of the drives, at the median of their values."""
-    measured = [dict(finding.effects) for finding in findings if finding is not None]
-    names = [name for name in dict.fromkeys(name for shown in measured for name in shown)]
-    kept = []
-    for name in names:
-        values = [next(iter(shown[name].items())) for shown in measured if name in shown]
-        if len(values) > 0.5 * len(findings):
-            kept.append((name, {values[0][0]: float(np.median([value for _, value in values]))}))
-    return tuple(kept)
-
-
-def _fitted(entry: _Prepared, effects: Effects, fixed: int) -> Fit:
-    """The effects fitted to one recording, without the first ``fixed`` ones."""
+def _fitted(entry: _Prepared, effects: Effects) -> Fit:
     # Blocks are roughly independent, windows within a block are not: the prior weighs as much as one block.
     prior = 1.0 / len(np.unique(blocks_of(entry.data.starts)))
-    return fit_effects(
-        entry.predictions, [effects], residual_scale(entry.floor, None), iterations=12, free=fixed, prior=prior
-    )
+    return fit_effects(entry.predictions, [effects], residual_scale(entry.floor, None), iterations=12, prior=prior)
 
 
-def _further(robot: RobotModel, entry: _Prepared, effects: Effects) -> Effects:
-    """The effects that one recording needs in addition."""
+def _further(robot: RobotModel, entry: _Prepared, effects: Effects, wheels: WheelFinding | None) -> Effects:
+    """The effects that one recording needs in addition; wheels suggest what the drives do, and what they do not."""
     fitted = replace(robot, effects=tuple({**dict(robot.effects), **dict(effects)}.items()))
     floor = entry.floor
     residuals = np.nan_to_num(Predictions(fitted, entry.data).residuals([()])[0])
     spread = np.quantile(np.abs(residuals), 0.683, axis=0)
     # Scaled by what is left, so that a recording is judged by its own size of errors.
     scale = np.sqrt(residual_scale(floor, None) ** 2 + np.maximum(spread**2 - (floor**2).mean(axis=0), 0.0))
-    search = Search(fitted, entry.data, scale, excluded=[name for name, _ in effects])
+    hints, unchanged = ((), ()) if wheels is None else changed_drives(wheels, fitted)
+    search = Search(fitted, entry.data, scale, hints=hints, excluded=[*unchanged, *(name for name, _ in effects)])
     best = search.run(_MOST_EFFECTS).best
     return search.refit(best.effects).effects if best.effects else ()
 

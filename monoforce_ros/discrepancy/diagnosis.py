@@ -47,8 +47,8 @@ from monoforce_ros.discrepancy.terrain_evidence import terrain_uncertainty
 from monoforce_ros.discrepancy.thresholds import Thresholds
 from monoforce_ros.discrepancy.verdict import Decision, Findings, Losses, Verdict, decide
 from monoforce_ros.discrepancy.wheel_motion import undriven_stretches, wheels_without_motion
-from monoforce_ros.discrepancy.wheels import WheelFinding, compare_with_wheels
-from monoforce_ros.effects import CATALOGUE, wheel_effects
+from monoforce_ros.discrepancy.wheels import WheelFinding, changed_drives, compare_with_wheels
+from monoforce_ros.effects import CATALOGUE
 from monoforce_ros.robots import RobotModel
 
 
@@ -157,7 +157,18 @@ def diagnose(
     thresholds = settings.thresholds
     gyro = compare_with_gyro(smoothed, evidence.gyro)
     wheels = compare_with_wheels(evidence.commands, evidence.wheels, robot)
-    known = _measured_effects(gyro, wheels, robot)
+    # The gyro measures the offset of the pose clock, or that there is none.
+    excluded: tuple[str, ...] = () if gyro is None else ("pose_clock_offset",)
+    hints: Effects = ()
+    if nominal is None and not any(CATALOGUE[name].stage == "command" for name, _ in robot.effects):
+        known = _measured_effects(gyro, wheels, robot)
+    else:
+        # A commissioned file knows how the drives respond. What the wheels show may be different now, or only look so:
+        # the motion decides, against how much it varies on the healthy robot.
+        known = _measured_effects(gyro, None, robot)
+        if wheels is not None:
+            hints, unchanged = changed_drives(wheels, robot)
+            excluded += unchanged
     steps = _Steps(progress, 0.05, 0.85)
 
     def searched(part: np.ndarray) -> Search:
@@ -168,8 +179,8 @@ def diagnose(
             residual_scale(uncertainty[part], nominal),
             nominal=nominal,
             known=known,
-            # The gyro measures the offset of the pose clock, or that there is none.
-            excluded=() if gyro is None else ("pose_clock_offset",),
+            hints=hints,
+            excluded=excluded,
             thresholds=thresholds,
             seed=settings.seed,
             progress=steps,
@@ -221,7 +232,7 @@ def diagnose(
     known_parts: tuple[EffectEstimate, ...] = ()
     if decision.parts is not None:
         partial = _estimated(search, search.refit(decision.parts.effects), outcome)
-        known_parts = tuple(_with_measured_interval(estimate, gyro, wheels) for estimate in partial)
+        known_parts = tuple(_with_measured_interval(estimate, search, gyro, wheels) for estimate in partial)
     # Values for the robot's file are fitted to the whole recording.
     effects: tuple[EffectEstimate, ...] = ()
     fitted: Effects = ()
@@ -229,7 +240,7 @@ def diagnose(
         whole = search.refit(decision.trial.effects)
         estimates = _estimated(search, whole, outcome)
         fitted = whole.effects
-        effects = tuple(_with_measured_interval(estimates[i], gyro, wheels) for i in search.ranked(whole))
+        effects = tuple(_with_measured_interval(estimates[i], search, gyro, wheels) for i in search.ranked(whole))
     if gyro is not None and gyro.biased and _accepts_bias(decision, robot):
         effects, gap = (*effects, _bias_estimate(gyro)), {**gap, "yaw_rate_gyro": _bias_row(gyro)}
         remarks = (*decision.remarks, "the gyro measures a rotation that the poses do not show")
@@ -302,42 +313,11 @@ def _estimated(search: Search, fit: Fit, outcome: Outcome) -> tuple[EffectEstima
 
 
 def _measured_effects(gyro: GyroFinding | None, wheels: WheelFinding | None, robot: RobotModel) -> Effects:
-    """Effects that the gyro and the wheel speeds measure and the robot's file does not hold, that of the gyro first."""
+    """Effects that the gyro and the wheel speeds measure, that of the gyro first."""
     measured: Effects = ()
     if gyro is not None and gyro.poses_late and "pose_clock_offset" not in dict(robot.effects):
         measured = (("pose_clock_offset", {"offset": gyro.offset}),)
-    return measured if wheels is None else measured + changed_drives(wheels, robot)
-
-
-def changed_drives(wheels: WheelFinding, robot: RobotModel) -> Effects:
-    """What the wheels show of the drives, in place of the file's values; empty where they confirm those.
-
-    The wheels measure the whole response to a command, with what the file holds of it already. Where one value differs
-    by more than its confidence interval, all of them are taken from the wheels: they were fitted together.
-    """
-    in_file = dict(robot.effects)
-    shown = dict(wheels.effects)
-    different = False
-    complete: list[tuple[str, Mapping[str, float]]] = []
-    for effect in wheel_effects():
-        response = effect.wheel_response
-        assert response is not None
-        neutral = next(p.neutral for p in effect.parameters if p.name == response.parameter)
-        expected = float(in_file.get(effect.name, {}).get(response.parameter, neutral))
-        found = shown.get(effect.name)
-        value = neutral if found is None else float(found[response.parameter])
-        half_width = 0.0
-        if found is not None:
-            half_width = wheels.half_widths[[name for name, _ in wheels.effects].index(effect.name)]
-        if value != expected and (found is not None or effect.name in in_file):
-            # Of an effect that the wheels do not show the half-width is unknown: the largest one stands for it.
-            limit = half_width if found is not None else max(wheels.half_widths, default=np.inf)
-            different |= abs(value - expected) > limit
-            if np.isfinite(value):
-                complete.append((effect.name, {response.parameter: value}))
-        elif found is not None:
-            complete.append((effect.name, dict(found)))
-    return tuple(complete) if different else ()
+    return measured if wheels is None else measured + wheels.effects
 
 
 def _refine_clock(search: Search, gyro: GyroFinding) -> None:
@@ -352,9 +332,11 @@ def _refine_clock(search: Search, gyro: GyroFinding) -> None:
 
 
 def _with_measured_interval(
-    estimate: EffectEstimate, gyro: GyroFinding | None, wheels: WheelFinding | None
+    estimate: EffectEstimate, search: Search, gyro: GyroFinding | None, wheels: WheelFinding | None
 ) -> EffectEstimate:
     """The estimate with the confidence interval of the gyro or of the wheels where these measured it."""
+    if estimate.name not in dict(search.known):
+        return estimate
     if gyro is not None and estimate.name == "pose_clock_offset":
         half_width = gyro.offset_half_width
     elif wheels is not None and estimate.name in dict(wheels.effects):

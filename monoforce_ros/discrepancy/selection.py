@@ -158,6 +158,7 @@ class Search:
         scale: expected size of a residual, ``[W, K, 3]``.
         nominal: what commissioning learned; None for a robot that was never commissioned.
         known: effects that another sensor measured: they always act and keep their values.
+        hints: values that another sensor suggests; fits start there, too.
         excluded: effects that another sensor rules out.
         thresholds: error rates.
         progress: called with a description of the next step.
@@ -171,6 +172,7 @@ class Search:
         *,
         nominal: NominalModel | None = None,
         known: Effects = (),
+        hints: Effects = (),
         excluded: Sequence[str] = (),
         thresholds: Thresholds = Thresholds(),  # noqa: B008
         seed: int = 0,
@@ -203,6 +205,7 @@ class Search:
                 )
             )
         self._own = dict(robot.effects)
+        self._hints = dict(hints)
         self._excluded = set(excluded)
         self._fits: dict[tuple[str, ...], Fit] = {}
         self._screenings: dict[tuple[tuple[object, ...], ...], tuple[float, list[_Screened]]] = {}
@@ -555,6 +558,8 @@ class Search:
             known = {key: float(value) for key, value in dict(self._own[name]).items()}
             starts = [((name, {**known, **dict(values)}),) for ((_, values),) in starts]
             starts.append(((name, {key: known.get(key, value) for key, value in starts[0][0][1].items()}),))
+        if name in self._hints:
+            starts.append(((name, {**dict(starts[0][0][1]), **dict(self._hints[name])}),))
         return starts
 
 

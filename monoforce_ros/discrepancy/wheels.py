@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -117,6 +117,31 @@ def compare_with_wheels(commands: CommandTrack, wheels: WheelTrack | None, robot
         used_blocks=len(blocks),
         all_blocks=len(found),
     )
+
+
+def changed_drives(wheels: WheelFinding, robot: RobotModel) -> tuple[Effects, tuple[str, ...]]:
+    """Where the wheels differ from what the robot's file says of its drives.
+
+    Returns:
+        the effects whose value differs from the file's by more than its confidence interval, with the values of the
+        wheels; and the names of the other effects that wheels show, which did not change.
+    """
+    in_file, shown = dict(robot.effects), dict(wheels.effects)
+    half_widths = dict(zip(shown, wheels.half_widths, strict=True))
+    changed: list[tuple[str, Mapping[str, float]]] = []
+    unchanged = []
+    for effect in wheel_effects():
+        response = _response(effect.name)
+        neutral = next(p.neutral for p in effect.parameters if p.name == response.parameter)
+        expected = float(in_file.get(effect.name, {}).get(response.parameter, neutral))
+        value = float(shown[effect.name][response.parameter]) if effect.name in shown else neutral
+        # Of an effect that the wheels do not show the half-width is unknown: the largest one stands for it.
+        half_width = half_widths.get(effect.name, max(wheels.half_widths, default=0.0))
+        if value == expected or abs(value - expected) <= half_width:
+            unchanged.append(effect.name)
+        elif np.isfinite(value):
+            changed.append((effect.name, {response.parameter: value}))
+    return tuple(changed), tuple(unchanged)
 
 
 @dataclass(frozen=True)
