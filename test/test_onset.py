@@ -1,0 +1,84 @@
+"""Onset: an effect that begins in the middle of a recording is dated; one that always acts is not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from monoforce_ros.core import CommandTrack, MotionTrack, WheelTrack
+from monoforce_ros.discrepancy.hypothesis import EvidenceWindows, window_starts
+from monoforce_ros.discrepancy.onset import find_onset
+from monoforce_ros.discrepancy.selection import Search
+from monoforce_ros.discrepancy.wheels import WheelFinding, changed_drives, compare_with_wheels
+from monoforce_ros.effects import drive_speeds
+from monoforce_ros.physics import State, rollout
+from monoforce_ros.robots import load_robot
+from monoforce_ros.terrain import Grid, TerrainMap
+
+SAMPLES = np.array([0.5, 1.0, 1.5, 2.0])
+SECONDS, ONSET = 72.0, 40.0
+
+
+def _recording(begins: float) -> EvidenceWindows:
+    """Drives that reach three quarters of the commanded speed from a time on."""
+    husky = load_robot("husky")
+    random = np.random.default_rng(2)
+    steps = round(SECONDS / 0.01)
+    commanded = np.repeat(random.uniform([0.1, -0.8], [0.9, 0.8], (round(SECONDS / 1.5), 2)), 150, axis=0)[:steps]
+    speeds = drive_speeds(husky, torch.as_tensor(commanded[None], dtype=torch.float32), 0.01)
+    acting = torch.arange(steps)[None, :, None] * 0.01 >= begins
+    level = TerrainMap.flat(Grid.square(2.0, 1.0))
+    result = rollout(level, husky, torch.where(acting, 0.75 * speeds, speeds), State.at_rest(0.13), with_forces=False)
+    rotations = Rotation.from_matrix(result.rotation[0, ::5].double().numpy())
+    motion = MotionTrack(
+        stamps=np.arange(len(rotations), dtype=np.int64) * 50_000_000,
+        positions=result.position[0, ::5].double().numpy(),
+        quaternions=rotations.as_quat(),
+        linear_velocities=rotations.inv().apply(result.velocity[0, ::5].double().numpy()),
+        angular_velocities=rotations.inv().apply(result.angular_velocity[0, ::5].double().numpy()),
+    )
+    commands = CommandTrack(np.arange(steps, dtype=np.int64) * 10_000_000, commanded)
+    starts = window_starts(motion, [slice(0, len(motion))], 2.0, 1.0)
+    return EvidenceWindows(motion, commands, starts, 2.0, SAMPLES)
+
+
+@pytest.mark.parametrize("begins", [ONSET, 0.0])
+def test_an_effect_that_begins_is_dated(begins):
+    data = _recording(begins)
+    search = Search(load_robot("husky"), data, np.tile([0.01, 0.01, 0.005], (4, 1)))
+    trial = search.judge((("drive_gain", {"gain": 0.8}),))
+    onset = find_onset(search, trial)
+    if begins:
+        assert onset is not None
+        # A window, and a quarter of a block between the onsets that are tried.
+        assert (onset.stamp - data.motion.stamps[0]) * 1e-9 == pytest.approx(ONSET, abs=3.0)
+    else:
+        assert onset is None
+
+
+def test_wheels_that_confirm_the_file_show_no_change():
+    husky = replace(load_robot("husky"), effects=(("command_delay", {"delay": 0.2}),))
+
+    def finding(delay):
+        return WheelFinding((("command_delay", {"delay": delay}),), (0.03,), 0.2, 0.1, 6.0)
+
+    changed, unchanged = changed_drives(finding(0.22), husky)
+    assert changed == () and "command_delay" in unchanged and "actuator_deadband" in unchanged
+    changed, unchanged = changed_drives(finding(0.35), husky)
+    assert dict(changed) == {"command_delay": {"delay": 0.35}} and "command_delay" not in unchanged
+
+
+def test_wheels_that_show_no_delay_contradict_a_file_that_has_one():
+    husky = replace(load_robot("husky"), effects=(("command_delay", {"delay": 0.3}),))
+    random = np.random.default_rng(1)
+    twists = np.repeat(random.uniform([-0.5, -0.8], [0.9, 0.8], (40, 2)), 150, axis=0)
+    stamps = np.arange(len(twists), dtype=np.int64) * 10_000_000
+    half = 0.5 * float((husky.drive_offsets.max() - husky.drive_offsets.min()).abs())
+    speeds = np.stack([twists[:, 0] - half * twists[:, 1], twists[:, 0] + half * twists[:, 1]], axis=1) / 0.165
+    wheels = WheelTrack(stamps[::5], (speeds + 0.02 * random.standard_normal(speeds.shape))[::5])
+    found = compare_with_wheels(CommandTrack(stamps, twists), wheels, husky)
+    assert found is not None
+    changed, _ = changed_drives(found, husky)
+    assert dict(changed)["command_delay"]["delay"] == pytest.approx(0.0, abs=0.05)
