@@ -101,7 +101,11 @@ def scores(rows: Sequence[Row]) -> dict[str, dict]:
         for table in row.get("held_out", {}).values()
         if (value := closed_share(table)) is not None
     ]
+    sizes = [row["numbers"] for row in empty if "loss_of_a_healthy_robot" in row.get("numbers", {})]
+    logarithms = [np.log(size["loss_before"] / size["loss_of_a_healthy_robot"]) for size in sizes]
     return {
+        # Calibrates ``drive_spread`` of discrepancy/thresholds.py.
+        "drive_spread": {"value": float(np.sqrt(np.mean(np.square(logarithms)))) if sizes else None, "of": len(sizes)},
         "singles_named": share([row for row in singles if found_all(row)], singles),
         "singles_named_exactly": share([row for row in singles if named_exactly(row)], singles),
         "pairs_named": share([row for row in pairs if found_all(row)], pairs),

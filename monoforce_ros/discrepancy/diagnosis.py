@@ -191,9 +191,15 @@ def diagnose(
 
     search = searched(np.ones(len(starts), bool))
     outcome = search.run(settings.max_effects)
-    if outcome.fit.p <= thresholds.fit_rate and (onset := find_onset(search, outcome.best)) is not None:
-        late = starts >= onset.stamp
-        if late.sum() >= FEWEST_WINDOWS:
+    if outcome.fit.p <= thresholds.fit_rate:
+        trial = outcome.best
+        second = starts >= np.median(starts)
+        if not trial.effects and second.sum() >= FEWEST_WINDOWS:
+            # An effect that begins late may be too weak over the whole recording.
+            trial = search.judge(searched(second).run(1).best.effects)
+        onset = find_onset(search, trial)
+        late = starts >= (starts[0] if onset is None else onset.stamp)
+        if onset is not None and late.sum() >= FEWEST_WINDOWS:
             left_out = (
                 *left_out,
                 f"it begins {onset.since_start:.0f} s after the start: what follows describes the time after that",

@@ -357,7 +357,13 @@ class Search:
         p, name = (1.0, "") if strongest is None else (strongest.adjusted, strongest.name)
         healthy = self.nominal
         if healthy is not None and healthy.segments > 1:
-            if trial.loss - healthy.loss > least and (size := _size_p(trial.loss, healthy)) < p:
+            above = np.log(max(trial.loss, 1e-9) / healthy.loss)
+            deviation = float(np.hypot(healthy.loss_spread, self.thresholds.drive_spread))
+            size = float(student_distribution.sf(above / deviation, healthy.segments - 1))
+            if above < deviation:
+                # What is about as small as on the healthy robot is nothing that is missing.
+                p, name = 1.0, ""
+            if trial.loss - healthy.loss > least and size < p:
                 p, name = size, "residuals that are too large"
             # Two tests: the smaller p-value of two has twice the rate.
             p = min(1.0, 2.0 * p)
@@ -566,11 +572,3 @@ class Search:
 def _parameter_count(trial: Trial) -> int:
     """Parameters of the effect that was added last."""
     return len(CATALOGUE[trial.names[-1]].identified)
-
-
-def _size_p(loss: float, nominal: NominalModel) -> float:
-    """p-value of the mean loss of a healthy recording, whose logarithm varies like that of the healthy segments."""
-    spread = nominal.loss_spread * np.sqrt(1.0 + 1.0 / nominal.segments)
-    return float(
-        student_distribution.sf(np.log(max(loss, 1e-9) / nominal.loss) / max(spread, 1e-3), nominal.segments - 1)
-    )

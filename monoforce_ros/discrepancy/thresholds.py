@@ -19,6 +19,10 @@ class Thresholds:
         draws: draws from the null distribution. The standard error of a rate of 2.5 % is 0.8 % with 400 draws.
         block: length of blocks that count as independent [s]: twice the window of 2 s, so that windows of different
             blocks share at most one window's motion.
+        drive_spread: standard deviation of the logarithm of the mean loss between healthy drives of one robot. The
+            segments of one commissioning drive do not show it: another drive has other commands and ground. Measured
+            on empty drives of the benchmark's choosing set, which prints it (``benchmarks/platforms/run.py --kind
+            empty``, ``drive_spread``).
         smallest_share: smallest share of the nominal model's loss that an explanation must remove, or a rest must make
             up, to be reported: the loss is quadratic, so a twentieth of it is an error of less than a quarter (√0.05)
             of the error that was there.
@@ -31,4 +35,5 @@ class Thresholds:
     confidence: float = 0.95
     draws: int = 400
     block: float = 4.0
+    drive_spread: float = 0.55
     smallest_share: float = 0.05
