@@ -254,4 +254,7 @@ def test_a_jacked_up_husky_is_told_from_one_on_wet_grass(husky, real_data):
         assert drives["yaw_rate_limit"]["limit"] == pytest.approx(1.0, abs=0.05)
         assert drives["acceleration_limit"]["limit"] == pytest.approx(1.9, abs=0.25)
         assert drives["yaw_acceleration_limit"]["limit"] == pytest.approx(1.9, abs=0.2)
-        assert 0.05 < drives["command_delay"]["delay"] < 0.25
+        # At 7 Hz wheels hardly tell a dead time from a lag; both together are the time that they follow late.
+        late = drives.get("command_delay", {"delay": 0.0})["delay"]
+        late += drives.get("actuator_lag", {"time_constant": 0.0})["time_constant"]
+        assert 0.05 < late < 0.25

@@ -87,14 +87,15 @@ class Decision:
 def fits(findings: Findings, thresholds: Thresholds) -> bool:
     """Whether what the best effects leave looks like the healthy robot.
 
-    Of a robot that was never commissioned nobody knows how large its errors should be. Its effects keep their names
-    unless a formula in addition to them explains more than half of what they leave.
+    Of a robot that was never commissioned nobody knows how large its errors should be. Its effects keep their names if
+    they explain most of the loss, and a formula in addition to them does not explain most of the rest.
     """
     if findings.fit.p > thresholds.fit_rate:
         return True
     if findings.commissioned or not findings.best.effects:
         return False
-    return findings.formula_gain[1] <= 0 or findings.formula_gain[0] < 0.5 * findings.best.loss
+    most = findings.best.loss < 0.5 * findings.nominal.loss
+    return most and (findings.formula_gain[1] <= 0 or findings.formula_gain[0] < 0.5 * findings.best.loss)
 
 
 def decide(findings: Findings, thresholds: Thresholds = Thresholds()) -> Decision:  # noqa: B008
