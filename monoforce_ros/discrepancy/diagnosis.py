@@ -217,6 +217,11 @@ def diagnose(
     )  # fmt: skip
     if findings.fit.p <= thresholds.fit_rate:
         learned = search.learn(outcome.best.effects)
+        if len(outcome.best.effects) > len(search.known):
+            alone = search.learn()
+            _, low = paired(alone.held_out_loss, learned.held_out_loss, data.starts, thresholds.comparison_rate)
+            # A formula that predicts as well without the effects takes their place.
+            learned = learned if low > 0 else alone
         gain = paired(outcome.best.held_out_loss, learned.held_out_loss, data.starts, thresholds.comparison_rate)
         findings = replace(findings, formula=learned, formula_gain=gain)
     decision = decide(findings, thresholds)
