@@ -104,6 +104,13 @@ def test_every_verdict_has_a_sentence_a_page_and_a_tone(verdict):
         assert "no known effect" in top.sentence and "torque_z = 231 vx" in top.findings[0]
 
 
+def test_a_model_that_misses_the_healthy_robot_does_not_say_that_nothing_is_wrong():
+    nothing = Diagnosis(Verdict.NO_DISCREPANCY)
+    assert headline(nothing, []).sentence.startswith("Nothing is wrong")
+    top = headline(nothing, ["the commissioned model misses the healthy robot by 17 cm"])
+    assert top.tone is Tone.PARTLY and "with doubts" in top.sentence
+
+
 def test_doubts_take_the_green_away():
     ground = "the ground is not level, and there is no map of it"
     top = headline(diagnosed((0.5, 0.06), (8.0, 1.0)), [ground])

@@ -120,7 +120,10 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
     if diagnosis.verdict == Verdict.NO_DISCREPANCY:
         return Headline(
             Tone.PARTLY if complaints else Tone.GOOD,
-            "Nothing is wrong: the robot moves as its model predicts.",
+            # A model that misses the healthy robot by much cannot say that nothing is wrong.
+            "No change was found, with doubts: the errors are as large as the healthy robot's."
+            if complaints
+            else "Nothing is wrong: the robot moves as its model predicts.",
             "",
             (),
             tuple(complaints),
