@@ -1,6 +1,6 @@
 """Draws one camera image from each of many randomised worlds: scripts/run.sh python scripts/draw_worlds.py [--out FILE]
 
-Each robot stands at a random place of its track. Look at the result: two worlds should be told apart at a glance.
+Each robot stands at a random place of its track. Look at the result: two worlds should differ at a glance.
 """
 
 from __future__ import annotations

@@ -127,7 +127,7 @@ class Tether(Injection):
     Attributes:
         stiffness: [N/m].
         slack: its free length [m].
-        largest: tension at which the drum gives way [N].
+        largest: tension at which the drum slips [N].
     """
 
     stiffness: float = 0.0

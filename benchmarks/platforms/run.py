@@ -1,6 +1,6 @@
 """Judge ``diagnose`` on drives of platforms drawn at random, recorded by two engines unrelated to the package.
 
-    scripts/run.sh python benchmarks/platforms/run.py --work /work/platforms --set choosing --kind empty --limit 10
+    scripts/run.sh python benchmarks/platforms/run.py --work out/platforms --set choosing --kind empty --limit 10
 
 Recordings are made once; a case whose result exists is not diagnosed again. Results are kept by version of the judged
 code. See README.md beside this file.

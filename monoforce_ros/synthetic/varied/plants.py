@@ -165,7 +165,7 @@ def draw_vegetation(
             full[cells] = height
             for name, strength in strengths.items():
                 values[name][cells] = strength
-    # Ground that gives way below and between the plants.
+    # Soft ground below and between the plants.
     layer = areas.depth
     open_ground = (full == 0.0) & (layer > 0.0)
     for name in values:

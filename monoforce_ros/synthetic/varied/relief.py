@@ -131,7 +131,7 @@ def _with_ramp(
         random.uniform(1.3, 2.6), random.uniform(0.3, 1.2),
     )  # fmt: skip
     added = ramp.height_at(x, y)
-    # Hills under the ramp would deform it; it stands on the height of its middle.
+    # Hills under the ramp would deform it: its base has the height of the ground at its middle.
     near = gaussian_filter((added > 0.0).astype(float), 0.5 / RESOLUTION)
     base = float(heights[np.unravel_index(np.argmin((x - centre[0]) ** 2 + (y - centre[1]) ** 2), x.shape)])
     return heights + 0.8 * near * (base - heights) + gaussian_filter(added, 0.05 / RESOLUTION)
