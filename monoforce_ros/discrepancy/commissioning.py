@@ -9,7 +9,6 @@ import numpy as np
 
 from monoforce_ros.discrepancy.estimates import EffectEstimate
 from monoforce_ros.discrepancy.fit import (
-    OUTLIER,
     Fit,
     estimate_effects,
     first_values,
@@ -17,6 +16,7 @@ from monoforce_ros.discrepancy.fit import (
     flat,
     jacobian,
     robust,
+    robust_weights,
     with_values,
 )
 from monoforce_ros.discrepancy.gap import noise_floor, noisy_motions, residual_scale
@@ -162,7 +162,7 @@ def _nominal(prepared: Sequence[_Prepared], effects: Effects) -> NominalModel:
         window_losses = robust(scaled)
         losses += [float(window_losses[numbers == number].mean()) for number in np.unique(numbers)]
         segments.append(len(np.unique(numbers)))
-        weights = np.minimum(1.0, OUTLIER / np.maximum(np.abs(scaled), 1e-9))
+        weights = robust_weights(scaled)
         metric = scale / nominal.scale
         # A coefficient of a fitted effect does not count as fitted here: its change is the variation.
         for name, columns, known in _directions(entry, effects, scale):

@@ -11,6 +11,7 @@ from scipy.stats import t as student_distribution
 from monoforce_ros.core import huber
 from monoforce_ros.discrepancy.estimates import EffectEstimate, ParameterEstimate
 from monoforce_ros.discrepancy.hypothesis import Effects, EvidenceWindows, Predictions
+from monoforce_ros.discrepancy.score_test import block_numbers
 from monoforce_ros.effects import CATALOGUE, Effect
 
 OUTLIER = 3.0
@@ -48,6 +49,11 @@ def robust(scaled: np.ndarray) -> np.ndarray:
     A prediction that is not finite gets a large residual.
     """
     return np.minimum(huber(np.nan_to_num(scaled, nan=_NOT_FINITE), OUTLIER), 1e6).mean(axis=(-1, -2))
+
+
+def robust_weights(scaled: np.ndarray) -> np.ndarray:
+    """Weights by which least squares have the derivative of the Huber loss of scaled residuals."""
+    return np.minimum(1.0, OUTLIER / np.maximum(np.abs(np.nan_to_num(scaled)), 1e-9))
 
 
 def flat(effects: Effects) -> np.ndarray:
@@ -124,7 +130,7 @@ def fit_effects(
     for _ in range(iterations if fixed < len(values) else 0):
         rows = jacobian(predictions, current, residual, scale, fixed)
         used = np.nan_to_num(residual).ravel()
-        weight = np.minimum(1.0, OUTLIER / np.maximum(np.abs(used), 1e-9))
+        weight = robust_weights(used)
         gradient = rows @ (weight * used)
         curvature = (rows * weight) @ rows.T
         if prior:
@@ -148,7 +154,13 @@ def fit_effects(
     if rows is not None and rows.any():
         covariance[fixed:, fixed:] = _covariance(rows, residual, typical[fixed:], predictions.data)
     derivatives = None if rows is None else rows.reshape(-1, *residual.shape)
-    return Fit(current, robust(residual), covariance, derivatives, len(np.unique(_block_numbers(predictions.data))))
+    return Fit(
+        current,
+        robust(residual),
+        covariance,
+        derivatives,
+        len(np.unique(block_numbers(predictions.data.starts, _BLOCK))),
+    )
 
 
 def jacobian(
@@ -188,20 +200,16 @@ def _covariance(jacobian: np.ndarray, residual: np.ndarray, typical: np.ndarray,
     spread of the per-block scores therefore measures the uncertainty even where the model is wrong in other ways.
     """
     used = np.nan_to_num(residual)
-    weight = np.minimum(1.0, OUTLIER / np.maximum(np.abs(used), 1e-9))
+    weight = robust_weights(used)
     count = len(used)
     rows = jacobian.reshape(len(jacobian), count, -1)
     scores = np.einsum("pwk,wk->wp", rows, (weight * used).reshape(count, -1))
-    blocks = _block_numbers(data)
+    blocks = block_numbers(data.starts, _BLOCK)
     block_scores = np.array([scores[blocks == block].sum(axis=0) for block in np.unique(blocks)])
     information = np.einsum("pwk,qwk->pq", rows * weight.reshape(1, count, -1), rows)
     inverse = np.linalg.pinv(information + 1e-9 * np.eye(len(information)) * np.trace(information))
     small_sample = len(block_scores) / max(1, len(block_scores) - len(typical))
     return small_sample * inverse @ (block_scores.T @ block_scores) @ inverse * np.outer(typical, typical)
-
-
-def _block_numbers(data: EvidenceWindows) -> np.ndarray:
-    return ((data.starts - data.starts[0]) // round(_BLOCK * 1e9)).astype(int)
 
 
 def first_values(effect: Effect) -> list[Effects]:

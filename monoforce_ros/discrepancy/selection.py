@@ -17,7 +17,6 @@ from scipy.stats import t as student_distribution
 from monoforce_ros.discrepancy.credibility import complaint
 from monoforce_ros.discrepancy.estimates import EffectEstimate
 from monoforce_ros.discrepancy.fit import (
-    OUTLIER,
     Fit,
     estimate_effects,
     first_values,
@@ -25,6 +24,7 @@ from monoforce_ros.discrepancy.fit import (
     flat,
     jacobian,
     robust,
+    robust_weights,
     scales,
     without,
 )
@@ -208,6 +208,7 @@ class Search:
         self._hints = dict(hints)
         self._excluded = set(excluded)
         self._fits: dict[tuple[str, ...], Fit] = {}
+        self._last: tuple[tuple[tuple[object, ...], ...], np.ndarray] | None = None
         self._screenings: dict[tuple[tuple[object, ...], ...], tuple[float, list[_Screened]]] = {}
 
     def run(self, most_effects: int) -> Outcome:
@@ -350,7 +351,7 @@ class Search:
         self._progress("testing what is left")
         base = self.refit(trial.effects).effects if trial.effects else ()
         directions = [*self.formula_directions(base), *self._varying_directions(base)]
-        residual = self.predictions.residuals([base])[0] / self.scale
+        residual = self._scaled(base)
         tests = self._tested(base, residual, directions)
         least = self.thresholds.smallest_share * nominal.loss
         strongest = min((test for test in tests if test.gain > least), key=lambda test: test.adjusted, default=None)
@@ -394,7 +395,7 @@ class Search:
             "with the direction of turning": turning - turning.mean(),
         }
         directions = []
-        rolled = self.predictions.residuals([base])[0] / self.scale
+        rolled = self._scaled(base)
         for name, _ in base[len(self.known) :]:
             change = rolled - self.predictions.residuals([without(base, name)])[0] / self.scale
             directions += [
@@ -416,7 +417,7 @@ class Search:
             skipped = sum(len(values) for _, values in base[:fixed])
             rows = jacobian(self.predictions, base, residual, self.scale, skipped)
             fitted = rows.reshape(free, *residual.shape)
-        weights = np.minimum(1.0, OUTLIER / np.maximum(np.abs(np.nan_to_num(residual)), 1e-9))
+        weights = robust_weights(residual)
         return score_tests(
             residual, weights, self._blocks, directions, fitted=fitted, metric=self._metric,
             draws=self.thresholds.draws, seed=self._seed,
@@ -428,7 +429,7 @@ class Search:
 
     def _screened(self, base: Effects, number: str) -> tuple[float, list[_Screened]]:
         """Loss of ``base``, and a quick fit and test of every further effect, smallest loss first."""
-        key = tuple((name, *values.values()) for name, values in base)
+        key = _key(base)
         if key in self._screenings:
             return self._screenings[key]
         before = float(robust(self._coarse.residuals([base])[0] / self._coarse_scale).mean())
@@ -440,11 +441,18 @@ class Search:
             self._progress(f"{number}{effect.name}")
             starts = [base + start for start in self._starts(effect)]
             fits.append(fit_effects(self._coarse, starts, self._coarse_scale, iterations=3, free=len(base)))
-        residual = self.predictions.residuals([base])[0] / self.scale
+        residual = self._scaled(base)
         tests = self._tested(base, residual, [self.influence(base, fit.effects[-1]) for fit in fits])
         screened = [_Screened(fit.effects, float(fit.loss.mean()), test) for fit, test in zip(fits, tests, strict=True)]
         self._screenings[key] = (before, sorted(screened, key=lambda entry: entry.loss))
         return self._screenings[key]
+
+    def _scaled(self, effects: Effects) -> np.ndarray:
+        """Scaled residuals of the whole recording, ``[W, K, 3]``; those of the last effects are kept."""
+        key = _key(effects)
+        if self._last is None or self._last[0] != key:
+            self._last = key, self.predictions.residuals([effects])[0] / self.scale
+        return self._last[1]
 
     def influence(self, base: Effects, effect: tuple[str, Mapping[str, float]]) -> Direction:
         """Change of the residuals by an effect in addition to a base, one column for each parameter that was fitted."""
@@ -453,7 +461,7 @@ class Search:
         # The recording is corrected for measurement effects of the file: what is found adds to them.
         in_file = {} if CATALOGUE[name].stage == "measurement" else dict(self._own.get(name, {}))
         own = {key: float(value) for key, value in in_file.items()}
-        hypotheses: list[Effects] = [base]
+        hypotheses: list[Effects] = []
         if len(values) == 1:
             hypotheses.append((*base, effect))
         else:
@@ -465,9 +473,8 @@ class Search:
                 if not known[key].low <= changed <= known[key].high:
                     changed = neutral[key] - (changed - neutral[key])
                 hypotheses.append((*base, (name, {**neutral, key: changed})))
-        rolled = self.predictions.residuals(hypotheses[:1]) / self.scale
-        changed_rows = self.predictions.residuals(hypotheses[1:]) / self.scale
-        return self._direction(name, np.nan_to_num(changed_rows - rolled))
+        changed_rows = self.predictions.residuals(hypotheses) / self.scale
+        return self._direction(name, np.nan_to_num(changed_rows - self._scaled(base)))
 
     def _round(self, best: Trial, number: int, nominal: Trial, rate: float) -> tuple[list[Trial], list[CandidateScore]]:
         """Trials with one more effect that is significant, smallest held-out loss first, and the scores of all."""
@@ -511,7 +518,7 @@ class Search:
         for name in best.names[len(self.known) : -1]:
             fewer = self.judge(without(best.effects, name))
             base = self.refit(fewer.effects).effects
-            residual = self.predictions.residuals([base])[0] / self.scale
+            residual = self._scaled(base)
             effect = next(entry for entry in best.effects if entry[0] == name)
             (test,) = self._tested(base, residual, [self.influence(base, effect)])
             if test.p > self.thresholds.further_rate or self._gain(fewer, best)[1] <= 0:
@@ -551,7 +558,7 @@ class Search:
             if other is None:
                 continue
             base = self.refit(trial.effects).effects
-            residual = self.predictions.residuals([base])[0] / self.scale
+            residual = self._scaled(base)
             (test,) = self._tested(base, residual, [self._direction(effect, np.nan_to_num(chosen - residual)[None])])
             if test.p > self.thresholds.comparison_rate or separating_sensor(other, effect):
                 found.append(other)
@@ -567,6 +574,11 @@ class Search:
         if name in self._hints:
             starts.append(((name, {**dict(starts[0][0][1]), **dict(self._hints[name])}),))
         return starts
+
+
+def _key(effects: Effects) -> tuple[tuple[object, ...], ...]:
+    """Names and values of effects, hashable."""
+    return tuple((name, *values.values()) for name, values in effects)
 
 
 def _parameter_count(trial: Trial) -> int:

@@ -7,13 +7,12 @@ from dataclasses import replace
 import numpy as np
 import torch
 from scipy.ndimage import distance_transform_edt, gaussian_filter
-from scipy.spatial.transform import Rotation
 
 from monoforce_ros.core import MotionTrack
 from monoforce_ros.discrepancy.hypothesis import EvidenceWindows, Predictions
-from monoforce_ros.physics import rest_depth
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import Grid, TerrainMap
+from monoforce_ros.training import traced_heights
 
 _FULL_WITHIN, _REACH = 0.5, 1.5
 """Distance from the driven cells within which the traced ground replaces the visible one, and at which it has faded out
@@ -51,23 +50,10 @@ def supporting_terrain(
         reach: distance from the path at which the difference has faded out [m]; infinite: it does not fade.
     """
     grid = visible.grid
-    underside = robot.points[robot.point_tangents[:, 0] < -0.97].double().numpy()
-    rotations = Rotation.from_quat(motion.quaternions).as_matrix()
-    points = (np.einsum("tij,nj->tni", rotations, underside) + motion.positions[:, None]).reshape(-1, 3)
-    points[:, 2] += rest_depth(robot, float(visible.stiffness.median()))
-    rows, columns, inside = grid.cells(points[:, :2])
-    flat, heights = (rows * grid.columns + columns)[inside], points[inside, 2]
-    if not len(flat):
+    heights, traced = traced_heights(motion, robot, np.eye(4), grid, float(visible.stiffness.median()))
+    if not traced.any():
         return visible
-    order = np.lexsort((heights, flat))
-    flat, heights = flat[order], heights[order]
-    starts = np.flatnonzero(np.r_[True, flat[1:] != flat[:-1]])
-    # A low quantile: a wheel may hang above a cell that another wheel touches.
-    middle = starts + np.diff(np.r_[starts, len(flat)]) // 4
-    seen = visible.height.double().numpy()
-    change, traced = np.zeros(seen.shape), np.zeros(seen.shape, bool)
-    change.ravel()[flat[starts]] = heights[middle] - seen.ravel()[flat[starts]]
-    traced.ravel()[flat[starts]] = True
+    change = np.where(traced, heights - visible.height.double().numpy(), 0.0)
     distance, nearest = distance_transform_edt(~traced, sampling=grid.resolution, return_indices=True)
     spread = gaussian_filter(change[nearest[0], nearest[1]], _SMOOTHING / grid.resolution)
     fading = 1.0 if np.isinf(reach) else np.clip((reach - distance) / (reach - _FULL_WITHIN), 0.0, 1.0)

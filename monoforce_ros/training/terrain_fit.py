@@ -147,7 +147,7 @@ def fit_terrain(
     windows = cut_windows(
         local, commands, length=settings.chunk, stride=settings.chunk, sample_time=_SAMPLE_TIME, maximum_gap=0.5
     )
-    traced, contact_mask = _trace(local, robot, pose, grid, material.stiffness)
+    traced, contact_mask = traced_heights(local, robot, pose, grid, material.stiffness)
     initial = _initial_heights(traced, contact_mask, visible)
     geometric = initial if visible is None else visible.geometric_height.numpy()
     chunks = _Chunks(windows, robot, pose)
@@ -313,7 +313,7 @@ def _positions(motion: MotionTrack, start: int, length: float) -> np.ndarray:
     return transform_points(np.linalg.inv(trajectory_frame(motion, start)), _within(motion, start, length).positions)
 
 
-def _trace(
+def traced_heights(
     motion: MotionTrack, robot: RobotModel, pose: np.ndarray, grid: Grid, stiffness: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Heights traced by the undersides of wheels and tracks ``[rows, columns]`` [m], and the contact mask."""
