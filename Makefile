@@ -3,11 +3,13 @@
 # make test-lowest  run the tests without nodes with the lowest supported versions (Ubuntu 24.04's), in .venv-lowest
 # make interfaces build monoforce_msgs, the typed message for planners, into install/ (takes a C++ compiler)
 # make bench  run the benchmarks
-# make diagnosis  measure diagnose on hidden effects and real drives (an hour), write the tables of docs/discrepancy.md
+# make diagnosis  measure diagnose on drawn platforms in two engines (up to six hours, resumable), on hidden effects and
+#                 real drives (an hour), write the tables of docs/discrepancy.md
+# make diagnosis-quick  measure diagnose on six drawn platforms (about 15 minutes), write nothing to the documents
 # make checkpoint train the shipped terrain encoder on synthetic worlds, from nothing (an hour and a half)
 # make tables     compare terrain sources on worlds that no training saw, as the paper's tables do (two hours)
 SHELL := /bin/bash
-.PHONY: demo test test-lowest interfaces bench diagnosis checkpoint tables lint environment build graphics lock clean help
+.PHONY: demo test test-lowest interfaces bench diagnosis diagnosis-quick engines checkpoint tables lint environment build graphics lock clean help
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
@@ -62,9 +64,16 @@ bench: build interfaces
 	@scripts/run.sh python benchmarks/encoder.py --json out/encoder.json
 
 DRIVES ?= $(or $(MONOFORCE_REAL_DATA),../shared/data)/drive
-diagnosis: build graphics
+engines:
 	@.venv/bin/uv pip install --quiet --python .venv/bin/python -r benchmarks/requirements.txt
+	@.venv/bin/uv pip install --quiet --python .venv/bin/python --no-deps -r benchmarks/engines.txt
+
+diagnosis-quick: build engines
+	@scripts/run.sh python benchmarks/platforms/run.py --quick
+
+diagnosis: build graphics engines
 	@mkdir -p out
+	@scripts/run.sh python benchmarks/platforms/run.py --set reporting --baselines --json out/platforms.json --docs docs/discrepancy.md
 	@scripts/run.sh python benchmarks/hidden_effects.py --baselines --json out/hidden_effects.json --docs docs/discrepancy.md
 	@if [ -d "$(DRIVES)" ]; then scripts/run.sh python benchmarks/warthog_reports.py "$(DRIVES)" \
 	  --json out/warthog.json --docs docs/discrepancy.md; else echo "[diagnosis] no real drives at $(DRIVES)"; fi

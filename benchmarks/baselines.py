@@ -20,7 +20,7 @@ from monoforce_ros.discrepancy.commissioning import COMMISSIONED
 from monoforce_ros.discrepancy.fit import fit_effects
 from monoforce_ros.discrepancy.gap import relative_motion
 from monoforce_ros.discrepancy.hypothesis import Evidence, EvidenceWindows, Predictions, sample_motion
-from monoforce_ros.discrepancy.selection import folds_of
+from monoforce_ros.discrepancy.trial import folds_of
 from monoforce_ros.robots import RobotModel
 
 _STEP = 0.05

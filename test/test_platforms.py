@@ -235,7 +235,7 @@ def test_the_gap_counts_drives_on_which_nothing_was_added():
 
 
 def test_newton_drives_side_by_side_on_level_ground_and_hills():
-    newton_engine = pytest.importorskip("newton_engine", reason="newton is in benchmarks/requirements.txt")
+    newton_engine = pytest.importorskip("newton_engine", reason="newton is in benchmarks/engines.txt")
     platform = draw_platform(1)
     hills = draw_hills(5, platform.friction)
     commands = np.tile([0.5 * platform.maximum_speed, 0.0], (40, 1))

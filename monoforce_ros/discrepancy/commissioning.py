@@ -21,11 +21,12 @@ from monoforce_ros.discrepancy.fit import (
 )
 from monoforce_ros.discrepancy.gap import noise_floor, noisy_motions, residual_scale
 from monoforce_ros.discrepancy.hypothesis import Effects, Evidence, EvidenceWindows, Predictions, window_starts
-from monoforce_ros.discrepancy.nominal import NominalModel
+from monoforce_ros.discrepancy.nominal import SEGMENT, NominalModel
 from monoforce_ros.discrepancy.preflight import complaints
 from monoforce_ros.discrepancy.score_test import variation
-from monoforce_ros.discrepancy.selection import BLOCK, Search, blocks_of
+from monoforce_ros.discrepancy.selection import Search
 from monoforce_ros.discrepancy.terrain_evidence import terrain_uncertainty
+from monoforce_ros.discrepancy.trial import blocks_of
 from monoforce_ros.discrepancy.wheels import WheelFinding, changed_drives, compare_with_wheels
 from monoforce_ros.effects import CATALOGUE, identifiable_effects
 from monoforce_ros.robots import RobotModel
@@ -34,9 +35,6 @@ COMMISSIONED: Effects = tuple(
     (effect.name, dict(effect.commissioning_start)) for effect in CATALOGUE.values() if effect.commissioning_start
 )
 """Effects that every robot needs, with the values at which their fit starts."""
-_SEGMENT = 2 * BLOCK
-"""Length of the segments between which the healthy robot varies [s]: two blocks, so that most kinds of motion occur in
-each."""
 _FEWEST_SEGMENTS = 3
 _MOST_EFFECTS = 4
 """Effects of the catalogue that commissioning adds to those that every robot needs."""
@@ -62,9 +60,9 @@ def commission(
 ) -> tuple[tuple[EffectEstimate, ...], NominalModel]:
     """Fit to recordings of a healthy robot all that it takes to predict them.
 
-    Friction, effective track width and servo response are always fitted; of the other effects those that are
-    significant in more than half of the recordings. They are no faults: they become the nominal model, with which later
-    recordings are compared.
+    What every robot has is always fitted (:data:`COMMISSIONED`), each value drawn towards neutral by a prior that
+    weighs as much as one block; of the other effects those that are significant in more than half of the recordings.
+    They are no faults: they become the nominal model, with which later recordings are compared.
 
     Args:
         recordings: recordings of the healthy robot.
@@ -154,7 +152,7 @@ def _nominal(prepared: Sequence[_Prepared], effects: Effects) -> NominalModel:
         scale = residual_scale(entry.floor, nominal)
         starts = entry.data.starts
         length = max(float(starts[-1] - starts[0]) * 1e-9 + entry.data.horizon, 1.0)
-        count = max(_FEWEST_SEGMENTS, round(length / _SEGMENT))
+        count = max(_FEWEST_SEGMENTS, round(length / SEGMENT))
         numbers = np.minimum(((starts - starts[0]) * count) // max(int(starts[-1] - starts[0]), 1), count - 1).astype(
             int
         )
@@ -164,9 +162,9 @@ def _nominal(prepared: Sequence[_Prepared], effects: Effects) -> NominalModel:
         segments.append(len(np.unique(numbers)))
         weights = robust_weights(scaled)
         metric = scale / nominal.scale
-        # A coefficient of a fitted effect does not count as fitted here: its change is the variation.
-        for name, columns, known in _directions(entry, effects, scale):
-            within = variation(scaled, weights, numbers, columns, known, metric)
+        # Nothing counts as fitted here: a later recording is tested with the values of the file, too.
+        for name, columns in _directions(entry, effects, scale):
+            within = variation(scaled, weights, numbers, columns, metric)
             if within is not None:
                 changes.setdefault(name, []).append(within)
     return replace(
@@ -178,15 +176,15 @@ def _nominal(prepared: Sequence[_Prepared], effects: Effects) -> NominalModel:
     )
 
 
-def _directions(entry: _Prepared, effects: Effects, scale: np.ndarray) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Influence of every effect and of every term of a formula, with those of the fitted effects to project out."""
+def _directions(entry: _Prepared, effects: Effects, scale: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
+    """Influence of every effect and of every term of a formula."""
     predictions = entry.predictions
     base = predictions.residuals([effects])[0] / scale
     rows = np.nan_to_num(jacobian(predictions, effects, base, scale, 0)).reshape(-1, *base.shape)
     owners = [name for name, values in effects for _ in values]
     for name in dict.fromkeys(owners):
         own = np.array([owner == name for owner in owners])
-        yield name, rows[own], rows[~own]
+        yield name, rows[own]
     search = Search(predictions.robot, entry.data, scale)
     present = {name for name, _ in effects}
     for effect in identifiable_effects():
@@ -196,6 +194,6 @@ def _directions(entry: _Prepared, effects: Effects, scale: np.ndarray) -> Iterat
         # The influence of an effect is not linear: the larger variation of two values counts.
         for start in (starts[len(starts) // 2 - 1], starts[len(starts) // 2]):
             direction = search.influence(effects, start[0])
-            yield effect.name, direction.columns, rows
+            yield effect.name, direction.columns
     for direction in search.formula_directions(effects):
-        yield direction.name, direction.columns, rows
+        yield direction.name, direction.columns

@@ -15,7 +15,7 @@ from monoforce_ros.bags import SmoothedMotion
 from monoforce_ros.core import MotionTrack
 from monoforce_ros.discrepancy.gap import find_regimes, noise_residuals, relative_motion
 from monoforce_ros.discrepancy.hypothesis import Effects, EvidenceWindows, Predictions, window_starts
-from monoforce_ros.discrepancy.selection import BLOCK, blocks_of, folds_of
+from monoforce_ros.discrepancy.trial import BLOCK, blocks_of, folds_of
 from monoforce_ros.robots import RobotModel
 
 HORIZONS = (1.0, 2.0, 5.0)

@@ -42,9 +42,10 @@ from monoforce_ros.discrepancy.kinematic_baseline import StepComparison
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.onset import find_onset
 from monoforce_ros.discrepancy.preflight import FEWEST_WINDOWS, advice, complaints
-from monoforce_ros.discrepancy.selection import BLOCK, HEALTHY_LOSS, CandidateScore, Outcome, Search, Trial, paired
+from monoforce_ros.discrepancy.selection import Search
 from monoforce_ros.discrepancy.terrain_evidence import terrain_uncertainty
 from monoforce_ros.discrepancy.thresholds import Thresholds
+from monoforce_ros.discrepancy.trial import BLOCK, HEALTHY_LOSS, CandidateScore, Outcome, Trial, paired
 from monoforce_ros.discrepancy.verdict import Decision, Findings, Losses, Verdict, decide
 from monoforce_ros.discrepancy.wheel_motion import undriven_stretches, wheels_without_motion
 from monoforce_ros.discrepancy.wheels import WheelFinding, changed_drives, compare_with_wheels
@@ -225,6 +226,7 @@ def diagnose(
         gain = paired(outcome.best.held_out_loss, learned.held_out_loss, data.starts, thresholds.comparison_rate)
         findings = replace(findings, formula=learned, formula_gain=gain)
     decision = decide(findings, thresholds)
+    decision = replace(decision, losses=replace(decision.losses, variance_ratio=outcome.variance_ratio))
     progress(0.88, "comparing before and after")
 
     def compared_with(trial: Trial | None) -> list[Comparison]:

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from monoforce_ros.discrepancy.moderation import VariancePrior
+from monoforce_ros.effects import CATALOGUE
 from monoforce_ros.robots import RobotFileError, read_commissioning, read_nominal_residual, robot_file
 
+SEGMENT = 16.0
+"""Length of the segments between which the healthy robot varies [s]: two blocks of cross-validation, so that most kinds
+of motion occur in each."""
 SMALLEST = np.array([0.01, 0.01, np.radians(0.3)])
 """Residuals below this are insignificant even on noise-free data [m, m, rad]."""
 
@@ -35,9 +41,32 @@ class NominalModel:
         """Unit of ``variation``, ``[K, 3]`` [m, m, rad]."""
         return np.sqrt(self.residual**2 + SMALLEST**2)
 
-    def variation_of(self, name: str) -> float:
-        """Of an effect; of one that commissioning did not know, the largest."""
-        return float(self.variation.get(name, max(self.variation.values(), default=0.0)))
+    @cached_property
+    def prior(self) -> VariancePrior:
+        """What the variations of all directions have in common: of one coefficient, in squared nominal units."""
+        squares = [value**2 / _coefficients(name) for name, value in self.variation.items()]
+        return VariancePrior.of(squares, max(self.segments - 1, 1))
+
+    def variation_of(self, name: str, drive_share: float) -> tuple[float, float]:
+        """Variation of an effect on a healthy recording, in units of ``scale``, and its degrees of freedom.
+
+        It comes from the robot file, which is a mean over its segments, and from what differs between recordings. What
+        varies within the recording shows there.
+
+        Args:
+            name: of an effect or of a term of a formula.
+            drive_share: variance between recordings, as a share of that between segments.
+        """
+        if not self.variation or not self.segments:
+            return 0.0, 0.0
+        variance, degrees = self.between_segments(name)
+        return float(np.sqrt((drive_share + 1.0 / self.segments) * _coefficients(name) * variance)), degrees
+
+    def between_segments(self, name: str) -> tuple[float, float]:
+        """Moderated variance of the change by one coefficient between segments, and its degrees of freedom."""
+        own = self.variation.get(name)
+        square = None if own is None else own**2 / _coefficients(name)
+        return self.prior.moderated(square, max(self.segments - 1, 1))
 
     def entry(self, samples: tuple[float, ...]) -> dict[str, Any]:
         """The entry ``commissioning`` of a robot file."""
@@ -76,3 +105,9 @@ class NominalModel:
                 "more; commission the robot again"
             )
         return cls(residual, variation, segments, *numbers)
+
+
+def _coefficients(name: str) -> int:
+    """Number of coefficients of a direction: parameters of an effect, one of a term of a formula."""
+    effect = CATALOGUE.get(name)
+    return 1 if effect is None else max(len(effect.identified), 1)

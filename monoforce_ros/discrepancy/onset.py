@@ -8,7 +8,8 @@ import numpy as np
 
 from monoforce_ros.discrepancy.fit import fit_effects, robust
 from monoforce_ros.discrepancy.hypothesis import Predictions
-from monoforce_ros.discrepancy.selection import BLOCK, Search, Trial, paired
+from monoforce_ros.discrepancy.selection import Search
+from monoforce_ros.discrepancy.trial import BLOCK, Trial, paired
 
 _FEWEST_BLOCKS = 3
 """Blocks before and after an onset: fewer do not show that anything changed."""

@@ -96,6 +96,7 @@ def _loss_entries(losses: Losses | None) -> dict[str, float]:
         "share_explained": losses.share_explained,
         "loss_by_formula": losses.by_formula,
         "p_rest": losses.p_rest,
+        "variance_ratio": losses.variance_ratio,
     }
     return {key: value for key, value in entries.items() if value is not None}
 

@@ -35,8 +35,8 @@ class Direction:
     """Change of the scaled residuals by a unit of each coefficient, ``[q, W, K, C]``."""
     variation: float = 0.0
     """RMS change in this direction on the healthy robot, in nominal units."""
-    segments: int = 0
-    """Number of healthy segments from which ``variation`` was estimated; 0 if it is unknown."""
+    degrees: float = 0.0
+    """Degrees of freedom with which ``variation`` was estimated; 0 if it is unknown."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +56,8 @@ class ScoreResult:
     """p-value for the strongest of all directions that were tested together."""
     gain: float
     """Mean reduction of the loss by the coefficients, to first order."""
+    excess: float = 0.0
+    """Mean square change by a coefficient beyond what its own blocks explain, in squared nominal units."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,10 @@ class _Scores:
     """Covariance of the coefficients on the healthy robot, ``[q, q]``."""
     blocks: float
     """Number of blocks that inform the estimate."""
-    segments: int
+    nominal_degrees: float
+    """Degrees of freedom of ``nominal``."""
+    squares: np.ndarray
+    """Mean squares and products of the changes in nominal units, ``[q, q]``."""
     crossed: np.ndarray
     """Deviations if the residuals of each block (second index) had occurred in each other one, ``[B, B, q]``."""
     transplanted: np.ndarray
@@ -85,6 +90,12 @@ class _Scores:
     def count(self) -> int:
         """Number of blocks."""
         return len(self.information)
+
+    def excess(self, covariance: np.ndarray) -> float:
+        """Mean square change by a coefficient in nominal units, less that by the sampling part of a covariance."""
+        sampling = covariance - self.nominal
+        estimate = self.estimate
+        return float(estimate @ self.squares @ estimate - np.trace(sampling @ self.squares)) / len(estimate)
 
     def smallest_p(self, signed: np.ndarray, nominal: np.ndarray) -> np.ndarray:
         """p-values ``[N]`` of drawn block scores ``[N, B, q]`` and drawn nominal coefficients ``[N, q]``."""
@@ -112,7 +123,7 @@ class _Scores:
         inverse = np.linalg.inv(total + (_RIDGE * size)[:, None, None] * np.eye(q))
         statistic = np.einsum("np,npq,nq->n", estimates, inverse, estimates) / q
         share = np.clip(np.trace(inverse @ sampling, axis1=1, axis2=2) / q, 0.0, 1.0)
-        degrees = 1.0 / (share**2 / np.maximum(blocks - q, 1.0) + (1.0 - share) ** 2 / max(self.segments, 1))
+        degrees = 1.0 / (share**2 / np.maximum(blocks - q, 1.0) + (1.0 - share) ** 2 / max(self.nominal_degrees, 1.0))
         return f_distribution.sf(statistic, q, np.maximum(degrees, 1.0)), total, degrees
 
 
@@ -180,6 +191,7 @@ def score_tests(
                 float(p[0]),
                 max(adjusted, float(p[0])),
                 0.5 * float(scores.estimate @ scores.information.sum(axis=0) @ scores.estimate) / used.size,
+                scores.excess(covariance[0]),
             )
         )
     return results
@@ -190,7 +202,6 @@ def variation(
     weights: np.ndarray,
     segments: np.ndarray,
     columns: np.ndarray,
-    fitted: np.ndarray | None,
     metric: np.ndarray | float = 1.0,
 ) -> float | None:
     """RMS change by a direction's coefficients as they vary over the segments of a healthy recording, in nominal units.
@@ -202,16 +213,16 @@ def variation(
         weights: robust weights, ``[W, K, C]``.
         segments: number of the segment of each window, ``[W]``.
         columns: ``[q, W, K, C]``.
-        fitted: changes by fitted parameters, ``[p, W, K, C]``.
         metric: factor from the scale of the residuals to nominal units.
     """
-    known = np.zeros((0, residuals.size)) if fitted is None else np.nan_to_num(fitted).reshape(len(fitted), -1)
     _, index = np.unique(segments, return_inverse=True)
     if len(columns) > 1:
         # One at a time: a handful of segments does not determine several coefficients together.
-        single = [variation(residuals, weights, segments, column[None], fitted, metric) for column in columns]
+        single = [variation(residuals, weights, segments, column[None], metric) for column in columns]
         return None if None in single else float(np.linalg.norm(np.array(single, float)))
-    scores = _scores(Direction("", columns), np.nan_to_num(residuals), weights, index, known, np.ones(()))
+    scores = _scores(
+        Direction("", columns), np.nan_to_num(residuals), weights, index, np.zeros((0, residuals.size)), np.ones(())
+    )
     if scores is None:
         return None
     flat = (np.nan_to_num(columns) * metric).reshape(len(columns), -1)
@@ -262,19 +273,18 @@ def _scores(
     if informed < q + 1.0:
         # Nothing is repeated: the motion that shows this direction occurred in one block only.
         return None
-    nominal = np.zeros((q, q))
-    if direction.variation > 0.0:
-        scaled = (columns * metric).reshape(q, -1)
-        squares = scaled @ scaled.T / scaled.shape[1]
-        squares += _RIDGE * np.trace(squares) * np.eye(q)
-        nominal = direction.variation**2 / q * np.linalg.inv(squares)
+    # The part that fitted parameters do not do: whatever its shape, the healthy robot varies by about as much.
+    scaled = (flat.reshape(columns.shape) * metric).reshape(q, -1)
+    squares = scaled @ scaled.T / scaled.shape[1]
+    squares += _RIDGE * np.trace(squares) * np.eye(q)
+    nominal = direction.variation**2 / q * np.linalg.inv(squares)
     deviations = scores - np.einsum("bpq,q->bp", information, estimate)
     around = target + shaped_weight * np.einsum("p,pwk->wk", estimate, shaped)
     crossed = _crossed_scores(shaped, around, index)
     transplanted = inverse @ (np.einsum("bcp,bcq->pq", crossed, crossed) / count) @ inverse
     return _Scores(
-        direction.name, information, inverse, deviations, estimate, nominal, informed, direction.segments,
-        crossed, transplanted,
+        direction.name, information, inverse, deviations, estimate, nominal, informed, direction.degrees,
+        squares, crossed, transplanted,
     )  # fmt: skip
 
 

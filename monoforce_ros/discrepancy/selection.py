@@ -9,7 +9,7 @@ further one is significant in the presence of the others; then each is tested ag
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import t as student_distribution
@@ -33,105 +33,16 @@ from monoforce_ros.discrepancy.learned import learned_terms
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.score_test import Direction, ScoreResult, block_numbers, score_tests
 from monoforce_ros.discrepancy.thresholds import Thresholds
+from monoforce_ros.discrepancy.trial import FOLDS, CandidateScore, FitTest, Outcome, Trial, folds_of, paired
 from monoforce_ros.effects import CATALOGUE, Effect, identifiable_effects, separating_sensor
 from monoforce_ros.robots import RobotModel
 
-HEALTHY_LOSS = 0.5
-"""Robust loss of residuals as large as their scale: half the square of a standard deviation."""
-_FOLDS = 2
-BLOCK = 8.0
-"""Length of the blocks that are held out together [s]: longer than a window."""
 _JUDGED = 6
 """Significant effects that are cross-validated in one round, those with the smallest screening loss first."""
 _ALTERNATIVES = 2
 """Combinations that do not begin with the best single effect and are tried where that one leads to no good fit."""
 _SMALLEST_SECANT = 0.1
 """Smallest distance from neutral, in typical sizes, at which the influence of one of several parameters is taken."""
-
-
-@dataclass(frozen=True)
-class Trial:
-    """Effects that were fitted and judged by their held-out loss."""
-
-    effects: Effects
-    """With the values of the fold whose fit has the smaller loss."""
-    parts: tuple[Effects, ...]
-    """Effects fitted with each fold left out."""
-    held_out_loss: np.ndarray
-    """Loss of each window with the effects fitted without its fold, ``[W]``."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Of the effects."""
-        return tuple(name for name, _ in self.effects)
-
-    @property
-    def loss(self) -> float:
-        """Mean held-out loss."""
-        return float(self.held_out_loss.mean())
-
-
-@dataclass(frozen=True)
-class CandidateScore:
-    """The score of one candidate effect in one round of the search."""
-
-    name: str
-    round: int
-    """From 1 on."""
-    gain: float
-    """Reduction of the loss: held out where ``judged``, else of the screening fit."""
-    p: float
-    """p-value of the effect, adjusted for all candidates of the round."""
-    judged: bool
-    """Whether the candidate was cross-validated."""
-
-
-@dataclass(frozen=True)
-class FitTest:
-    """Whether what effects leave unexplained looks like a healthy robot."""
-
-    p: float
-    """Smallest adjusted p-value."""
-    strongest: str
-    """What the residuals contain most significantly."""
-    tests: tuple[ScoreResult, ...] = ()
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """The result of a search."""
-
-    nominal: Trial
-    best: Trial
-    """The nominal trial where no effect was added."""
-    fit: FitTest
-    """Of the best trial."""
-    tried: tuple[CandidateScore, ...] = ()
-    indistinguishable: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    """By selected effect: others that explain the recording about as well in its place."""
-
-
-def folds_of(starts: np.ndarray) -> np.ndarray:
-    """Fold of each window: alternating blocks."""
-    return ((starts - starts[0]) // round(BLOCK * 1e9)).astype(int) % _FOLDS
-
-
-def blocks_of(starts: np.ndarray) -> np.ndarray:
-    """Number of the half block in which each window starts."""
-    return block_numbers(starts, 0.5 * BLOCK)
-
-
-def paired(
-    before: np.ndarray, after: np.ndarray, starts: np.ndarray, rate: float, seed: int = 0
-) -> tuple[float, float]:
-    """Mean gain of a trial over another one, and its lower bound at a one-sided error rate (bootstrap over blocks)."""
-    blocks = blocks_of(starts)
-    numbers = np.unique(blocks)
-    # Clipped, so that a few windows that no effect explains do not dominate.
-    difference = np.clip(before - after, -50.0, 50.0)
-    sums = np.array([difference[blocks == block].sum() for block in numbers]) / len(starts)
-    picked = np.random.default_rng(seed).integers(0, len(sums), (2000, len(sums)))
-    return float(sums.sum()), float(np.quantile(sums[picked].sum(axis=1), rate))
 
 
 @dataclass(frozen=True)
@@ -192,7 +103,7 @@ class Search:
         # A window that reaches into the next block shares motion with windows of the held-out fold.
         ends = folds_of(np.r_[starts[0], starts + round(data.horizon * 1e9)])[1:]
         self._split = []
-        for held_out in range(_FOLDS):
+        for held_out in range(FOLDS):
             fitted = (folds != held_out) & (ends != held_out)
             if fitted.sum() < 4:
                 fitted = folds != held_out
@@ -208,22 +119,25 @@ class Search:
         self._hints = dict(hints)
         self._excluded = set(excluded)
         self._fits: dict[tuple[str, ...], Fit] = {}
-        self._last: tuple[tuple[tuple[object, ...], ...], np.ndarray] | None = None
+        self._rolled: dict[tuple[tuple[object, ...], ...], np.ndarray] = {}
+        self.variance_ratio: float | None = None
+        """Mean variance of the candidates' influence beyond what this recording and the robot file explain, as a share
+        of that between segments."""
         self._screenings: dict[tuple[tuple[object, ...], ...], tuple[float, list[_Screened]]] = {}
 
     def run(self, most_effects: int) -> Outcome:
         """Add effects while a further one is significant, then test each in the presence of the others."""
-        nominal = Trial((), ((),) * _FOLDS, self.loss_of(()))
+        nominal = Trial((), ((),) * FOLDS, self.loss_of(()))
         start = nominal
         if self.known:
-            start = Trial(self.known, (self.known,) * _FOLDS, self.loss_of(self.known))
+            start = Trial(self.known, (self.known,) * FOLDS, self.loss_of(self.known))
             _, low = self._gain(start, nominal)
             if low > 0:
                 # The motion contradicts the measurement of the other sensor.
                 self.known, start = (), nominal
         judged, tried = self._round(start, 1, nominal, self.thresholds.effect_rate)
         if not judged:
-            return Outcome(nominal, start, self.fit_test(start, nominal), tuple(tried))
+            return Outcome(nominal, start, self.fit_test(start, nominal), tuple(tried), self.variance_ratio)
         best, listed = self._extended(self._preferred(judged), nominal, most_effects)
         tried += listed
         fit = self.fit_test(best, nominal)
@@ -239,7 +153,7 @@ class Search:
         exchanged, indistinguishable = self._exchanged(best)
         if exchanged is not best:
             best, fit = exchanged, self.fit_test(exchanged, nominal)
-        return Outcome(nominal, best, fit, tuple(tried), indistinguishable)
+        return Outcome(nominal, best, fit, tuple(tried), self.variance_ratio, indistinguishable)
 
     def _extended(self, best: Trial, nominal: Trial, most_effects: int) -> tuple[Trial, list[CandidateScore]]:
         """Add effects one at a time while a further one is significant."""
@@ -306,7 +220,11 @@ class Search:
             columns = (fit.derivatives[place - fixed] * self._metric).reshape(len(values), -1)
             squares = columns @ columns.T / columns.shape[1]
             squares += 1e-6 * np.trace(squares) * np.eye(len(values)) + 1e-12 * np.eye(len(values))
-            spread = self.nominal.variation_of(name) ** 2 / len(values) * np.linalg.inv(squares)
+            spread = (
+                self.nominal.variation_of(name, self.thresholds.drive_share)[0] ** 2
+                / len(values)
+                * np.linalg.inv(squares)
+            )
             variances[place] = np.diag(spread) * typical[place] ** 2
         return variances
 
@@ -356,12 +274,13 @@ class Search:
         least = self.thresholds.smallest_share * nominal.loss
         strongest = min((test for test in tests if test.gain > least), key=lambda test: test.adjusted, default=None)
         p, name = (1.0, "") if strongest is None else (strongest.adjusted, strongest.name)
-        healthy = self.nominal
+        healthy, spread = self.nominal, self.thresholds.drive_spread
         if healthy is not None and healthy.segments > 1:
-            above = np.log(max(trial.loss, 1e-9) / healthy.loss)
-            deviation = float(np.hypot(healthy.loss_spread, self.thresholds.drive_spread))
-            size = float(student_distribution.sf(above / deviation, healthy.segments - 1))
-            if above < deviation:
+            # An effect of the right kind leaves some of what it does: no formula is exact.
+            expected = healthy.loss + 0.5 * self.thresholds.model_error**2 * self._mean_square(base)
+            above = np.log(max(trial.loss, 1e-9) / expected)
+            size = float(student_distribution.sf(above / spread, self.thresholds.calibration_degrees))
+            if above < spread:
                 # What is about as small as on the healthy robot is nothing that is missing.
                 p, name = 1.0, ""
             if trial.loss - healthy.loss > least and size < p:
@@ -380,7 +299,7 @@ class Search:
         trials += [(*base, (learned.name, {**neutral, key: step})) for key in keys]
         rolled = self.predictions.residuals(trials) / self.scale
         return [
-            self._direction(f"{learned.name} {key}", (row - rolled[0])[None])
+            self._direction(f"{learned.name} {key}", (row - rolled[0])[None], base)
             for key, row in zip(keys, rolled[1:], strict=True)
         ]
 
@@ -399,15 +318,27 @@ class Search:
         for name, _ in base[len(self.known) :]:
             change = rolled - self.predictions.residuals([without(base, name)])[0] / self.scale
             directions += [
-                replace(self._direction(name, (factor[:, None, None] * change)[None]), name=f"{name} changes {regime}")
+                replace(
+                    self._direction(name, (factor[:, None, None] * change)[None], base), name=f"{name} changes {regime}"
+                )
                 for regime, factor in regimes.items()
             ]
         return directions
 
-    def _direction(self, name: str, columns: np.ndarray) -> Direction:
+    def _direction(self, name: str, columns: np.ndarray, base: Effects = ()) -> Direction:
+        """A direction with how much it varies on the healthy robot, and by errors of the base's effects."""
+        error = self.thresholds.model_error * np.sqrt(self._mean_square(base, self._metric) if len(base) else 0.0)
         if self.nominal is None:
-            return Direction(name, columns)
-        return Direction(name, columns, self.nominal.variation_of(name), self.nominal.segments)
+            return Direction(name, columns, float(error), self.thresholds.calibration_degrees)
+        variation, degrees = self.nominal.variation_of(name, self.thresholds.drive_share)
+        return Direction(name, columns, float(np.hypot(variation, error)), degrees)
+
+    def _mean_square(self, base: Effects, metric: np.ndarray | float = 1.0) -> float:
+        """Mean square of what effects in addition to those measured by sensors change, in units of the scale."""
+        if len(base) <= self.fixed_count(base):
+            return 0.0
+        change = self._scaled(base) - self._scaled(base[: self.fixed_count(base)])
+        return float(np.mean((np.nan_to_num(change) * metric) ** 2))
 
     def _tested(self, base: Effects, residual: np.ndarray, directions: Sequence[Direction]) -> list[ScoreResult]:
         fixed = self.fixed_count(base)
@@ -444,15 +375,21 @@ class Search:
         residual = self._scaled(base)
         tests = self._tested(base, residual, [self.influence(base, fit.effects[-1]) for fit in fits])
         screened = [_Screened(fit.effects, float(fit.loss.mean()), test) for fit, test in zip(fits, tests, strict=True)]
+        if base == self.known and self.nominal is not None and self.nominal.segments:
+            ratios = [test.excess / self.nominal.between_segments(test.name)[0] for test in tests if test.p < 1.0]
+            share = 1.0 / self.nominal.segments
+            self.variance_ratio = float(np.mean(ratios)) - share if ratios else None
         self._screenings[key] = (before, sorted(screened, key=lambda entry: entry.loss))
         return self._screenings[key]
 
     def _scaled(self, effects: Effects) -> np.ndarray:
-        """Scaled residuals of the whole recording, ``[W, K, 3]``; those of the last effects are kept."""
+        """Scaled residuals of the whole recording, ``[W, K, 3]``; the last ones are kept."""
         key = _key(effects)
-        if self._last is None or self._last[0] != key:
-            self._last = key, self.predictions.residuals([effects])[0] / self.scale
-        return self._last[1]
+        if key not in self._rolled:
+            if len(self._rolled) > 8:
+                self._rolled.pop(next(iter(self._rolled)))
+            self._rolled[key] = self.predictions.residuals([effects])[0] / self.scale
+        return self._rolled[key]
 
     def influence(self, base: Effects, effect: tuple[str, Mapping[str, float]]) -> Direction:
         """Change of the residuals by an effect in addition to a base, one column for each parameter that was fitted."""
@@ -474,7 +411,7 @@ class Search:
                     changed = neutral[key] - (changed - neutral[key])
                 hypotheses.append((*base, (name, {**neutral, key: changed})))
         changed_rows = self.predictions.residuals(hypotheses) / self.scale
-        return self._direction(name, np.nan_to_num(changed_rows - self._scaled(base)))
+        return self._direction(name, np.nan_to_num(changed_rows - self._scaled(base)), base)
 
     def _round(self, best: Trial, number: int, nominal: Trial, rate: float) -> tuple[list[Trial], list[CandidateScore]]:
         """Trials with one more effect that is significant, smallest held-out loss first, and the scores of all."""
@@ -559,7 +496,9 @@ class Search:
                 continue
             base = self.refit(trial.effects).effects
             residual = self._scaled(base)
-            (test,) = self._tested(base, residual, [self._direction(effect, np.nan_to_num(chosen - residual)[None])])
+            (test,) = self._tested(
+                base, residual, [self._direction(effect, np.nan_to_num(chosen - residual)[None], base)]
+            )
             if test.p > self.thresholds.comparison_rate or separating_sensor(other, effect):
                 found.append(other)
         return found

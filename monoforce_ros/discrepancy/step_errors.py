@@ -8,7 +8,7 @@ from monoforce_ros.discrepancy.fit import fit_effects
 from monoforce_ros.discrepancy.gap import residual_scale
 from monoforce_ros.discrepancy.hypothesis import Effects, Evidence, Predictions, corrected_evidence, window_starts
 from monoforce_ros.discrepancy.kinematic_baseline import HORIZON, StepComparison, compare_on_steps, step_starts
-from monoforce_ros.discrepancy.selection import folds_of
+from monoforce_ros.discrepancy.trial import folds_of
 from monoforce_ros.robots import RobotModel
 
 _MOST = 120

@@ -23,6 +23,12 @@ class Thresholds:
             segments of one commissioning drive do not show it: another drive has other commands and ground. Measured
             on empty drives of the benchmark's choosing set, which prints it (``benchmarks/platforms/run.py --kind
             empty``, ``drive_spread``).
+        drive_share: variance of an effect's influence between healthy drives of one robot, as a share of that between
+            segments of its commissioning drive. Measured like ``drive_spread``, and printed beside it.
+        calibration_degrees: degrees of freedom of these two, the number of empty drives on which they were measured.
+        model_error: error of an effect's formula as a share of what the effect changes, root mean square in any one
+            direction. Strong effects leave more than the healthy robot's variation: no formula holds exactly on another
+            engine or robot.
         smallest_share: smallest share of the nominal model's loss that an explanation must remove, or a rest must make
             up, to be reported: the loss is quadratic, so a twentieth of it is an error of less than a quarter (√0.05)
             of the error that was there.
@@ -36,4 +42,7 @@ class Thresholds:
     draws: int = 400
     block: float = 4.0
     drive_spread: float = 0.55
+    calibration_degrees: float = 12.0
+    drive_share: float = 1.25
+    model_error: float = 0.15
     smallest_share: float = 0.05

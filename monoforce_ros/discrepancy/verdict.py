@@ -7,8 +7,8 @@ from enum import StrEnum
 
 from monoforce_ros.discrepancy.hypothesis import Effects
 from monoforce_ros.discrepancy.learned import LEARNED, formula
-from monoforce_ros.discrepancy.selection import FitTest, Trial
 from monoforce_ros.discrepancy.thresholds import Thresholds
+from monoforce_ros.discrepancy.trial import FitTest, Trial
 
 
 class Verdict(StrEnum):
@@ -37,6 +37,9 @@ class Losses:
     """Held-out loss of the best formula."""
     p_rest: float | None = None
     """p-value of the test that what is left looks like the healthy robot."""
+    variance_ratio: float | None = None
+    """Variance of the effects' influence beyond that within the recording, as a share of that between segments of
+    commissioning recordings."""
 
 
 @dataclass(frozen=True)

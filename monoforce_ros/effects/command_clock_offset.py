@@ -19,9 +19,15 @@ class CommandClockOffset(Effect):
     formula = "stamp ← stamp + offset"
     source = "unsynchronised clocks"
     parameters = (Parameter("offset", "s", 0.0, -2.0, 2.0, 0.2, "recorded minus true time"),)
+    identified = ("offset",)
+    manoeuvre = "stops and starts"
     separated_by_sensor: ClassVar = {
         "pose_clock_offset": "record an IMU: its gyro shows whether the poses or the base are late"
     }
+
+    def first_values(self) -> list[dict[str, float]]:
+        """Early and late commands: a late base is a delay as well, an early one only this."""
+        return [{"offset": value} for value in (-0.2, 0.1, 0.3)]
 
     def commands(self, commands: CommandTrack, values: Mapping[str, float]) -> CommandTrack:
         """Commands as recorded under this effect."""

@@ -31,6 +31,7 @@ class CommandDelay(Effect):
     order = 10
     identified = ("delay",)
     manoeuvre = "steps of the speed from standing"
+    commissioning_start: ClassVar = {"delay": 0.03}
     separated_by: ClassVar = {"actuator_lag": "steps of the speed from standing"}
     # Motion and commands alone cannot separate a clock offset of either from a delay of the base.
     separated_by_sensor: ClassVar = {

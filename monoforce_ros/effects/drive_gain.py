@@ -21,6 +21,7 @@ class DriveGain(Effect):
     order = 50
     identified = ("gain",)
     manoeuvre = "slow and fast stretches straight ahead"
+    commissioning_start: ClassVar = {"gain": 1.0}
     separated_by: ClassVar = {
         "viscous_drag": "slow and fast stretches straight ahead",
         "rolling_resistance": "slow and fast stretches straight ahead",

@@ -26,6 +26,7 @@ class RotationCentre(Effect):
     parameters = (Parameter("x", "m", 0.0, -0.5, 0.5, 0.1, "centre of mass forward of the modelled one"),)
     identified = ("x",)
     manoeuvre = "turns on the spot to both sides"
+    commissioning_start: ClassVar = {"x": 0.0}
     separated_by: ClassVar = {
         "payload": "driving up and across a slope, and hard starts",
         "sensor_lever_arm": "turns on the spot and fast wide arcs",

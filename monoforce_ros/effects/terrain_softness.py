@@ -20,6 +20,7 @@ class TerrainSoftness(Effect):
     parameters = (Parameter("factor", "-", 1.0, 0.1, 100.0, 3.0, "mapped over true stiffness"),)
     identified = ("factor",)
     manoeuvre = "over bumps and edges, slow and fast"
+    commissioning_start: ClassVar = {"factor": 1.0}
     separated_by: ClassVar = {
         "rolling_resistance": "over bumps and on level ground",
         "payload": "over bumps, and hard starts",

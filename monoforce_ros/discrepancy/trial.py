@@ -1,0 +1,104 @@
+"""Trial: effects judged on held-out blocks of a recording, and the results of a search over them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from monoforce_ros.discrepancy.hypothesis import Effects
+from monoforce_ros.discrepancy.score_test import ScoreResult, block_numbers
+
+HEALTHY_LOSS = 0.5
+"""Robust loss of residuals as large as their scale: half the square of a standard deviation."""
+FOLDS = 2
+BLOCK = 8.0
+"""Length of the blocks that are held out together [s]: longer than a window."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Effects that were fitted and judged by their held-out loss."""
+
+    effects: Effects
+    """With the values of the fold whose fit has the smaller loss."""
+    parts: tuple[Effects, ...]
+    """Effects fitted with each fold left out."""
+    held_out_loss: np.ndarray
+    """Loss of each window with the effects fitted without its fold, ``[W]``."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the effects."""
+        return tuple(name for name, _ in self.effects)
+
+    @property
+    def loss(self) -> float:
+        """Mean held-out loss."""
+        return float(self.held_out_loss.mean())
+
+
+@dataclass(frozen=True)
+class CandidateScore:
+    """The score of one candidate effect in one round of the search."""
+
+    name: str
+    round: int
+    """From 1 on."""
+    gain: float
+    """Reduction of the loss: held out where ``judged``, else of the screening fit."""
+    p: float
+    """p-value of the effect, adjusted for all candidates of the round."""
+    judged: bool
+    """Whether the candidate was cross-validated."""
+
+
+@dataclass(frozen=True)
+class FitTest:
+    """Whether what effects leave unexplained looks like a healthy robot."""
+
+    p: float
+    """Smallest adjusted p-value."""
+    strongest: str
+    """What the residuals contain most significantly."""
+    tests: tuple[ScoreResult, ...] = ()
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The result of a search."""
+
+    nominal: Trial
+    best: Trial
+    """The nominal trial where no effect was added."""
+    fit: FitTest
+    """Of the best trial."""
+    tried: tuple[CandidateScore, ...] = ()
+    variance_ratio: float | None = None
+    """See :class:`Search`; on healthy recordings its mean is ``drive_share`` of the thresholds."""
+    indistinguishable: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    """By selected effect: others that explain the recording about as well in its place."""
+
+
+def folds_of(starts: np.ndarray) -> np.ndarray:
+    """Fold of each window: alternating blocks."""
+    return ((starts - starts[0]) // round(BLOCK * 1e9)).astype(int) % FOLDS
+
+
+def blocks_of(starts: np.ndarray) -> np.ndarray:
+    """Number of the half block in which each window starts."""
+    return block_numbers(starts, 0.5 * BLOCK)
+
+
+def paired(
+    before: np.ndarray, after: np.ndarray, starts: np.ndarray, rate: float, seed: int = 0
+) -> tuple[float, float]:
+    """Mean gain of a trial over another one, and its lower bound at a one-sided error rate (bootstrap over blocks)."""
+    blocks = blocks_of(starts)
+    numbers = np.unique(blocks)
+    # Clipped, so that a few windows that no effect explains do not dominate.
+    difference = np.clip(before - after, -50.0, 50.0)
+    sums = np.array([difference[blocks == block].sum() for block in numbers]) / len(starts)
+    picked = np.random.default_rng(seed).integers(0, len(sums), (2000, len(sums)))
+    return float(sums.sum()), float(np.quantile(sums[picked].sum(axis=1), rate))
