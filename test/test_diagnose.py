@@ -98,6 +98,7 @@ def simulated_recording(husky, effects, seconds=24.0):
         ("turning_scrub", {"track_width_factor": 1.3}),
         ("sensor_lever_arm", {"x": 0.35, "y": -0.1}),
         ("pose_clock_offset", {"offset": 0.17}),
+        ("command_clock_offset", {"offset": 0.21}),
     ],
 )
 def test_injected_parameters_are_recovered_by_the_fit(husky, name, parameters):
@@ -111,6 +112,8 @@ def test_injected_parameters_are_recovered_by_the_fit(husky, name, parameters):
         assert dict(fit.effects)[name][key] == pytest.approx(value, rel=0.05, abs=0.012)
     after = np.abs(predictions.residuals([fit.effects])[0]).mean()
     assert after < 0.2 * before
+    # Finite differences show every parameter, so that it gets an interval.
+    assert (np.diag(fit.covariance) > 0).all()
 
 
 def test_effects_are_ranked_by_leave_one_out_loss(husky):

@@ -176,7 +176,12 @@ def jacobian(
         fixed: number of leading parameters that are left out.
     """
     values, typical = flat(current), scales(current)
-    steps = 3e-2 * typical
+    resolutions = [
+        {parameter.name: parameter.resolution for parameter in CATALOGUE[name].parameters}[key]
+        for name, parameters in current
+        for key in parameters
+    ]
+    steps = np.maximum(3e-2 * typical, resolutions)
     units = np.eye(len(values))
     # Step away from bounds, and from neutral values beyond which an effect is undefined.
     shifted_effects, actual = [], []

@@ -18,7 +18,8 @@ class CommandClockOffset(Effect):
     summary = "The clock that stamps commands is ahead by the offset."
     formula = "stamp ← stamp + offset"
     source = "unsynchronised clocks"
-    parameters = (Parameter("offset", "s", 0.0, -2.0, 2.0, 0.2, "recorded minus true time"),)
+    # Commands are held between stamps: an offset of less than some steps of a rollout may change nothing.
+    parameters = (Parameter("offset", "s", 0.0, -2.0, 2.0, 0.2, "recorded minus true time", resolution=0.03),)
     identified = ("offset",)
     manoeuvre = "stops and starts"
     separated_by_sensor: ClassVar = {

@@ -32,6 +32,8 @@ class Parameter:
     scale: float
     """Typical deviation from neutral: standard deviation of the prior."""
     meaning: str
+    resolution: float = 0.0
+    """Smallest change that predictions show; finite differences are at least as large."""
 
 
 @dataclass(frozen=True)
