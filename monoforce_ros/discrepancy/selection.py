@@ -135,17 +135,17 @@ class Search:
             if low > 0:
                 # The motion contradicts the measurement of the other sensor.
                 self.known, start = (), nominal
-        judged, tried = self._round(start, 1, nominal, self.thresholds.effect_rate)
+        judged, tried = self._round(start, 1, self.thresholds.effect_rate)
         if not judged:
             return Outcome(nominal, start, self.fit_test(start, nominal), tuple(tried), self.variance_ratio)
-        best, listed = self._extended(self._preferred(judged), nominal, most_effects)
+        best, listed = self._extended(self._preferred(judged), most_effects)
         tried += listed
         fit = self.fit_test(best, nominal)
         for other in [trial for trial in judged if trial.names[-1] not in best.names][:_ALTERNATIVES]:
             # The effect that explains most alone need not be part of the best combination.
             if fit.p > self.thresholds.fit_rate or most_effects < 2:
                 break
-            extended, listed = self._extended(other, nominal, most_effects)
+            extended, listed = self._extended(other, most_effects)
             tried += listed
             gain, low = self._gain(best, extended)
             if low > 0 and gain > self.thresholds.smallest_share * nominal.loss:
@@ -155,11 +155,11 @@ class Search:
             best, fit = exchanged, self.fit_test(exchanged, nominal)
         return Outcome(nominal, best, fit, tuple(tried), self.variance_ratio, indistinguishable)
 
-    def _extended(self, best: Trial, nominal: Trial, most_effects: int) -> tuple[Trial, list[CandidateScore]]:
+    def _extended(self, best: Trial, most_effects: int) -> tuple[Trial, list[CandidateScore]]:
         """Add effects one at a time while a further one is significant."""
         tried: list[CandidateScore] = []
         for step in range(1, most_effects):
-            judged, listed = self._round(best, step + 1, nominal, self.thresholds.further_rate)
+            judged, listed = self._round(best, step + 1, self.thresholds.further_rate)
             tried += listed
             if not judged:
                 break
@@ -326,7 +326,11 @@ class Search:
         return directions
 
     def _direction(self, name: str, columns: np.ndarray, base: Effects = ()) -> Direction:
-        """A direction with how much it varies on the healthy robot, and by errors of the base's effects."""
+        """A direction with how much it varies on the healthy robot, and by errors of effects that explain a recording.
+
+        A further effect is not compared with these errors: it may be weak beside the first one, and what it removes on
+        held-out blocks shows that it is there.
+        """
         error = self.thresholds.model_error * np.sqrt(self._mean_square(base, self._metric) if len(base) else 0.0)
         if self.nominal is None:
             return Direction(name, columns, float(error), self.thresholds.calibration_degrees)
@@ -411,9 +415,9 @@ class Search:
                     changed = neutral[key] - (changed - neutral[key])
                 hypotheses.append((*base, (name, {**neutral, key: changed})))
         changed_rows = self.predictions.residuals(hypotheses) / self.scale
-        return self._direction(name, np.nan_to_num(changed_rows - self._scaled(base)), base)
+        return self._direction(name, np.nan_to_num(changed_rows - self._scaled(base)))
 
-    def _round(self, best: Trial, number: int, nominal: Trial, rate: float) -> tuple[list[Trial], list[CandidateScore]]:
+    def _round(self, best: Trial, number: int, rate: float) -> tuple[list[Trial], list[CandidateScore]]:
         """Trials with one more effect that is significant, smallest held-out loss first, and the scores of all."""
         base = self.refit(best.effects).effects if best.effects else ()
         before, screened = self._screened(base, f"{number}: ")
@@ -429,7 +433,7 @@ class Search:
             listed.append(
                 CandidateScore(entry.name, number, float(gain), entry.test.adjusted, judged=trial is not None)
             )
-        least = self.thresholds.smallest_share * nominal.loss
+        least = self.thresholds.smallest_share * best.loss
         kept = []
         for trial in judged:
             gain, low = self._gain(best, trial)
@@ -496,9 +500,7 @@ class Search:
                 continue
             base = self.refit(trial.effects).effects
             residual = self._scaled(base)
-            (test,) = self._tested(
-                base, residual, [self._direction(effect, np.nan_to_num(chosen - residual)[None], base)]
-            )
+            (test,) = self._tested(base, residual, [self._direction(effect, np.nan_to_num(chosen - residual)[None])])
             if test.p > self.thresholds.comparison_rate or separating_sensor(other, effect):
                 found.append(other)
         return found

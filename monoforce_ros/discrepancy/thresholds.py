@@ -29,9 +29,9 @@ class Thresholds:
         model_error: error of an effect's formula as a share of what the effect changes, root mean square in any one
             direction. Strong effects leave more than the healthy robot's variation: no formula holds exactly on another
             engine or robot.
-        smallest_share: smallest share of the nominal model's loss that an explanation must remove, or a rest must make
-            up, to be reported: the loss is quadratic, so a twentieth of it is an error of less than a quarter (√0.05)
-            of the error that was there.
+        smallest_share: smallest share of a loss that an effect must remove (of the loss without it), or a rest must
+            make up (of the nominal model's), to be reported: the loss is quadratic, so a twentieth of it is an error of
+            less than a quarter (√0.05) of the error that was there.
     """
 
     effect_rate: float = 0.025
