@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from monoforce_ros.discrepancy.clocks import GyroFinding, compare_with_gyro
+from monoforce_ros.discrepancy.clocks import compare_with_gyro
 from monoforce_ros.discrepancy.comparison import (
     Comparison,
     GapRow,
@@ -19,7 +19,7 @@ from monoforce_ros.discrepancy.comparison import (
     measured_paths,
     regime_table,
 )
-from monoforce_ros.discrepancy.estimates import EffectEstimate, ParameterEstimate
+from monoforce_ros.discrepancy.estimates import EffectEstimate
 from monoforce_ros.discrepancy.fit import Fit
 from monoforce_ros.discrepancy.gap import (
     Localisation,
@@ -43,12 +43,20 @@ from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.onset import find_onset
 from monoforce_ros.discrepancy.preflight import FEWEST_WINDOWS, advice, complaints
 from monoforce_ros.discrepancy.selection import Search
+from monoforce_ros.discrepancy.sensor_findings import (
+    accepts_bias,
+    bias_estimate,
+    bias_row,
+    measured_effects,
+    refine_clock,
+    with_measured_interval,
+)
 from monoforce_ros.discrepancy.terrain_evidence import terrain_uncertainty
 from monoforce_ros.discrepancy.thresholds import Thresholds
 from monoforce_ros.discrepancy.trial import BLOCK, HEALTHY_LOSS, CandidateScore, Outcome, Trial, paired
-from monoforce_ros.discrepancy.verdict import Decision, Findings, Losses, Verdict, decide
+from monoforce_ros.discrepancy.verdict import Findings, Losses, Verdict, decide
 from monoforce_ros.discrepancy.wheel_motion import undriven_stretches, wheels_without_motion
-from monoforce_ros.discrepancy.wheels import WheelFinding, changed_drives, compare_with_wheels
+from monoforce_ros.discrepancy.wheels import changed_drives, compare_with_wheels
 from monoforce_ros.effects import CATALOGUE
 from monoforce_ros.robots import RobotModel
 
@@ -162,11 +170,11 @@ def diagnose(
     excluded: tuple[str, ...] = () if gyro is None else ("pose_clock_offset",)
     hints: Effects = ()
     if nominal is None and not any(CATALOGUE[name].stage == "command" for name, _ in robot.effects):
-        known = _measured_effects(gyro, wheels, robot)
+        known = measured_effects(gyro, wheels, robot)
     else:
         # A commissioned file knows how the drives respond. What the wheels show may be different now, or only look so:
         # the motion decides, against how much it varies on the healthy robot.
-        known = _measured_effects(gyro, None, robot)
+        known = measured_effects(gyro, None, robot)
         if wheels is not None:
             hints, unchanged = changed_drives(wheels, robot)
             excluded += unchanged
@@ -187,7 +195,7 @@ def diagnose(
             progress=steps,
         )
         if gyro is not None and wheels is not None:
-            _refine_clock(search, gyro)
+            refine_clock(search, gyro)
         return search
 
     search = searched(np.ones(len(starts), bool))
@@ -245,7 +253,7 @@ def diagnose(
     known_parts: tuple[EffectEstimate, ...] = ()
     if decision.parts is not None:
         partial = _estimated(search, search.refit(decision.parts.effects), outcome)
-        known_parts = tuple(_with_measured_interval(estimate, search, gyro, wheels) for estimate in partial)
+        known_parts = tuple(with_measured_interval(estimate, search, gyro, wheels) for estimate in partial)
     # Values for the robot's file are fitted to the whole recording.
     effects: tuple[EffectEstimate, ...] = ()
     fitted: Effects = ()
@@ -253,9 +261,9 @@ def diagnose(
         whole = search.refit(decision.trial.effects)
         estimates = _estimated(search, whole, outcome)
         fitted = whole.effects
-        effects = tuple(_with_measured_interval(estimates[i], search, gyro, wheels) for i in search.ranked(whole))
-    if gyro is not None and gyro.biased and _accepts_bias(decision, robot):
-        effects, gap = (*effects, _bias_estimate(gyro)), {**gap, "yaw_rate_gyro": _bias_row(gyro)}
+        effects = tuple(with_measured_interval(estimates[i], search, gyro, wheels) for i in search.ranked(whole))
+    if gyro is not None and gyro.biased and accepts_bias(decision, robot):
+        effects, gap = (*effects, bias_estimate(gyro)), {**gap, "yaw_rate_gyro": bias_row(gyro)}
         remarks = (*decision.remarks, "the gyro measures a rotation that the poses do not show")
         decision = replace(decision, verdict=Verdict.EFFECT_FOUND, remarks=remarks)
     if left_out:
@@ -323,67 +331,6 @@ def _estimated(search: Search, fit: Fit, outcome: Outcome) -> tuple[EffectEstima
             estimate = replace(estimate, parameters=shifted)
         result.append(estimate)
     return tuple(result)
-
-
-def _measured_effects(gyro: GyroFinding | None, wheels: WheelFinding | None, robot: RobotModel) -> Effects:
-    """Effects that the gyro and the wheel speeds measure, that of the gyro first."""
-    measured: Effects = ()
-    if gyro is not None and gyro.poses_late and "pose_clock_offset" not in dict(robot.effects):
-        measured = (("pose_clock_offset", {"offset": gyro.offset}),)
-    return measured if wheels is None else measured + wheels.effects
-
-
-def _refine_clock(search: Search, gyro: GyroFinding) -> None:
-    """Improve the gyro's estimate of the pose clock by the motion, now that the delay of the drives is known."""
-    if not search.known or search.known[0][0] != "pose_clock_offset":
-        return
-    offsets = gyro.offset + gyro.offset_half_width * np.linspace(-1.5, 1.5, 13)
-    tried: Sequence[Effects] = [
-        (("pose_clock_offset", {"offset": float(offset)}), *search.known[1:]) for offset in offsets
-    ]
-    search.known = min(tried, key=lambda effects: float(search.loss_of(effects).mean()))
-
-
-def _with_measured_interval(
-    estimate: EffectEstimate, search: Search, gyro: GyroFinding | None, wheels: WheelFinding | None
-) -> EffectEstimate:
-    """The estimate with the confidence interval of the gyro or of the wheels where these measured it."""
-    if estimate.name not in dict(search.known):
-        return estimate
-    if gyro is not None and estimate.name == "pose_clock_offset":
-        half_width = gyro.offset_half_width
-    elif wheels is not None and estimate.name in dict(wheels.effects):
-        names = [name for name, _ in wheels.effects]
-        half_width = wheels.half_widths[names.index(estimate.name)]
-    else:
-        return estimate
-    parameters = {key: value.with_half_width(half_width) for key, value in estimate.parameters.items()}
-    return EffectEstimate(estimate.name, parameters)
-
-
-def _accepts_bias(decision: Decision, robot: RobotModel) -> bool:
-    """Whether a gyro bias can be added to the decision."""
-    accepting = (Verdict.NO_DISCREPANCY, Verdict.EFFECT_FOUND)
-    return decision.verdict in accepting and "gyro_bias" not in dict(robot.effects)
-
-
-def _bias_estimate(gyro: GyroFinding) -> EffectEstimate:
-    bias = ParameterEstimate(gyro.bias, gyro.bias, gyro.bias, "rad/s").with_half_width(gyro.bias_half_width)
-    return EffectEstimate("gyro_bias", {"bias": bias})
-
-
-def _bias_row(gyro: GyroFinding) -> GapRow:
-    """Difference of the yaw rates of gyro and poses, without and with the bias."""
-    gain = abs(gyro.bias)
-    return GapRow(
-        horizon=0.0,
-        before=gyro.spread,
-        after=gyro.spread_without,
-        gain_low=gain - gyro.bias_half_width,
-        gain_high=gain + gyro.bias_half_width,
-        unit="rad/s",
-        noise=gyro.spread_without,
-    )
 
 
 class _Steps:

@@ -1,0 +1,78 @@
+"""Sensor findings: what gyro and wheel speeds measure, as effects and estimates of a diagnosis."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from monoforce_ros.discrepancy.clocks import GyroFinding
+from monoforce_ros.discrepancy.comparison import GapRow
+from monoforce_ros.discrepancy.estimates import EffectEstimate, ParameterEstimate
+from monoforce_ros.discrepancy.hypothesis import Effects
+from monoforce_ros.discrepancy.selection import Search
+from monoforce_ros.discrepancy.verdict import Decision, Verdict
+from monoforce_ros.discrepancy.wheels import WheelFinding
+from monoforce_ros.robots import RobotModel
+
+
+def measured_effects(gyro: GyroFinding | None, wheels: WheelFinding | None, robot: RobotModel) -> Effects:
+    """Effects that the gyro and the wheel speeds measure, that of the gyro first."""
+    measured: Effects = ()
+    if gyro is not None and gyro.poses_late and "pose_clock_offset" not in dict(robot.effects):
+        measured = (("pose_clock_offset", {"offset": gyro.offset}),)
+    return measured if wheels is None else measured + wheels.effects
+
+
+def refine_clock(search: Search, gyro: GyroFinding) -> None:
+    """Improve the gyro's estimate of the pose clock by the motion, now that the delay of the drives is known."""
+    if not search.known or search.known[0][0] != "pose_clock_offset":
+        return
+    offsets = gyro.offset + gyro.offset_half_width * np.linspace(-1.5, 1.5, 13)
+    tried: Sequence[Effects] = [
+        (("pose_clock_offset", {"offset": float(offset)}), *search.known[1:]) for offset in offsets
+    ]
+    search.known = min(tried, key=lambda effects: float(search.loss_of(effects).mean()))
+
+
+def with_measured_interval(
+    estimate: EffectEstimate, search: Search, gyro: GyroFinding | None, wheels: WheelFinding | None
+) -> EffectEstimate:
+    """The estimate with the confidence interval of the gyro or of the wheels where these measured it."""
+    if estimate.name not in dict(search.known):
+        return estimate
+    if gyro is not None and estimate.name == "pose_clock_offset":
+        half_width = gyro.offset_half_width
+    elif wheels is not None and estimate.name in dict(wheels.effects):
+        names = [name for name, _ in wheels.effects]
+        half_width = wheels.half_widths[names.index(estimate.name)]
+    else:
+        return estimate
+    parameters = {key: value.with_half_width(half_width) for key, value in estimate.parameters.items()}
+    return EffectEstimate(estimate.name, parameters)
+
+
+def accepts_bias(decision: Decision, robot: RobotModel) -> bool:
+    """Whether a gyro bias can be added to the decision."""
+    accepting = (Verdict.NO_DISCREPANCY, Verdict.EFFECT_FOUND)
+    return decision.verdict in accepting and "gyro_bias" not in dict(robot.effects)
+
+
+def bias_estimate(gyro: GyroFinding) -> EffectEstimate:
+    """The gyro's bias with its interval."""
+    bias = ParameterEstimate(gyro.bias, gyro.bias, gyro.bias, "rad/s").with_half_width(gyro.bias_half_width)
+    return EffectEstimate("gyro_bias", {"bias": bias})
+
+
+def bias_row(gyro: GyroFinding) -> GapRow:
+    """Difference of the yaw rates of gyro and poses, without and with the bias."""
+    gain = abs(gyro.bias)
+    return GapRow(
+        horizon=0.0,
+        before=gyro.spread,
+        after=gyro.spread_without,
+        gain_low=gain - gyro.bias_half_width,
+        gain_high=gain + gyro.bias_half_width,
+        unit="rad/s",
+        noise=gyro.spread_without,
+    )
