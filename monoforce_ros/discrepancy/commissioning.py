@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from monoforce_ros.discrepancy.directions import Directions
 from monoforce_ros.discrepancy.estimates import EffectEstimate
 from monoforce_ros.discrepancy.fit import (
     Fit,
@@ -26,6 +27,7 @@ from monoforce_ros.discrepancy.preflight import complaints
 from monoforce_ros.discrepancy.score_test import variation
 from monoforce_ros.discrepancy.selection import Search
 from monoforce_ros.discrepancy.terrain_evidence import terrain_uncertainty
+from monoforce_ros.discrepancy.thresholds import Thresholds
 from monoforce_ros.discrepancy.trial import blocks_of
 from monoforce_ros.discrepancy.wheels import WheelFinding, changed_drives, compare_with_wheels
 from monoforce_ros.effects import CATALOGUE, identifiable_effects
@@ -185,7 +187,7 @@ def _directions(entry: _Prepared, effects: Effects, scale: np.ndarray) -> Iterat
     for name in dict.fromkeys(owners):
         own = np.array([owner == name for owner in owners])
         yield name, rows[own]
-    search = Search(predictions.robot, entry.data, scale)
+    directions = Directions(predictions, scale, None, Thresholds())
     present = {name for name, _ in effects}
     for effect in identifiable_effects():
         if effect.name in present:
@@ -193,7 +195,7 @@ def _directions(entry: _Prepared, effects: Effects, scale: np.ndarray) -> Iterat
         starts = first_values(effect)
         # The influence of an effect is not linear: the larger variation of two values counts.
         for start in (starts[len(starts) // 2 - 1], starts[len(starts) // 2]):
-            direction = search.influence(effects, start[0])
+            direction = directions.influence(effects, start[0])
             yield effect.name, direction.columns
-    for direction in search.formula_directions(effects):
+    for direction in directions.of_formula(effects):
         yield direction.name, direction.columns

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.stats import t as student_distribution
 
 from monoforce_ros.discrepancy.credibility import complaint
+from monoforce_ros.discrepancy.directions import Directions
 from monoforce_ros.discrepancy.estimates import EffectEstimate
 from monoforce_ros.discrepancy.fit import (
     Fit,
@@ -41,8 +42,6 @@ _JUDGED = 6
 """Significant effects that are cross-validated in one round, those with the smallest screening loss first."""
 _ALTERNATIVES = 2
 """Combinations that do not begin with the best single effect and are tried where that one leads to no good fit."""
-_SMALLEST_SECANT = 0.1
-"""Smallest distance from neutral, in typical sizes, at which the influence of one of several parameters is taken."""
 
 
 @dataclass(frozen=True)
@@ -93,12 +92,12 @@ class Search:
         self.scale = np.broadcast_to(scale, (len(data.starts), len(data.samples), 3))
         self.known = known
         self.predictions = Predictions(robot, data)
+        self.directions = Directions(self.predictions, self.scale, nominal, thresholds)
         self._seed, self._progress = seed, progress
         starts = data.starts
         self._coarse = Predictions(robot, replace(data, starts=starts[::2]))
         self._coarse_scale = self.scale[::2]
         self._blocks = block_numbers(starts, thresholds.block)
-        self._metric = 1.0 if nominal is None else self.scale / nominal.scale
         folds = folds_of(starts)
         # A window that reaches into the next block shares motion with windows of the held-out fold.
         ends = folds_of(np.r_[starts[0], starts + round(data.horizon * 1e9)])[1:]
@@ -119,7 +118,6 @@ class Search:
         self._hints = dict(hints)
         self._excluded = set(excluded)
         self._fits: dict[tuple[str, ...], Fit] = {}
-        self._rolled: dict[tuple[tuple[object, ...], ...], np.ndarray] = {}
         self.variance_ratio: float | None = None
         """Mean variance of the candidates' influence beyond what this recording and the robot file explain, as a share
         of that between segments."""
@@ -217,7 +215,7 @@ class Search:
             at += len(values)
             if place[0] < fixed:
                 continue
-            columns = (fit.derivatives[place - fixed] * self._metric).reshape(len(values), -1)
+            columns = (fit.derivatives[place - fixed] * self.directions.metric).reshape(len(values), -1)
             squares = columns @ columns.T / columns.shape[1]
             squares += 1e-6 * np.trace(squares) * np.eye(len(values)) + 1e-12 * np.eye(len(values))
             spread = (
@@ -268,8 +266,9 @@ class Search:
         """
         self._progress("testing what is left")
         base = self.refit(trial.effects).effects if trial.effects else ()
-        directions = [*self.formula_directions(base), *self._varying_directions(base)]
-        residual = self._scaled(base)
+        fixed = self.fixed_count(base)
+        directions = [*self.directions.of_formula(base, fixed), *self.directions.of_changes(base, fixed)]
+        residual = self.directions.scaled(base)
         tests = self._tested(base, residual, directions)
         least = self.thresholds.smallest_share * nominal.loss
         strongest = min((test for test in tests if test.gain > least), key=lambda test: test.adjusted, default=None)
@@ -277,7 +276,7 @@ class Search:
         healthy, spread = self.nominal, self.thresholds.drive_spread
         if healthy is not None and healthy.segments > 1:
             # An effect of the right kind leaves some of what it does: no formula is exact.
-            expected = healthy.loss + 0.5 * self.thresholds.model_error**2 * self._mean_square(base)
+            expected = healthy.loss + 0.5 * self.thresholds.model_error**2 * self.directions.mean_square(base, fixed)
             above = np.log(max(trial.loss, 1e-9) / expected)
             size = float(student_distribution.sf(above / spread, self.thresholds.calibration_degrees))
             if above < spread:
@@ -289,61 +288,6 @@ class Search:
             p = min(1.0, 2.0 * p)
         return FitTest(p, name, tuple(tests))
 
-    def formula_directions(self, base: Effects) -> list[Direction]:
-        """Change of the residuals by each term of a formula in addition to a base."""
-        learned = CATALOGUE["learned_term"]
-        keys = [parameter.name for parameter in learned.parameters]
-        step = 0.02 * 9.81 * float(self.robot.mass.mean())
-        neutral = dict.fromkeys(keys, 0.0)
-        trials: list[Effects] = [(*base, (learned.name, neutral))]
-        trials += [(*base, (learned.name, {**neutral, key: step})) for key in keys]
-        rolled = self.predictions.residuals(trials) / self.scale
-        return [
-            self._direction(f"{learned.name} {key}", (row - rolled[0])[None], base)
-            for key, row in zip(keys, rolled[1:], strict=True)
-        ]
-
-    def _varying_directions(self, base: Effects) -> list[Direction]:
-        starts = self.data.starts
-        time = (starts - starts.mean()) / max(float(np.ptp(starts)), 1.0)
-        twists = self.data.commands.sample(starts + round(0.5 * self.data.horizon * 1e9))
-        speed, turning = np.abs(twists[:, 0]), np.sign(twists[:, 1])
-        regimes = {
-            "over the recording": time / max(float(time.std()), 1e-9),
-            "with the speed": (speed - speed.mean()) / max(float(speed.std()), 1e-9),
-            "with the direction of turning": turning - turning.mean(),
-        }
-        directions = []
-        rolled = self._scaled(base)
-        for name, _ in base[len(self.known) :]:
-            change = rolled - self.predictions.residuals([without(base, name)])[0] / self.scale
-            directions += [
-                replace(
-                    self._direction(name, (factor[:, None, None] * change)[None], base), name=f"{name} changes {regime}"
-                )
-                for regime, factor in regimes.items()
-            ]
-        return directions
-
-    def _direction(self, name: str, columns: np.ndarray, base: Effects = ()) -> Direction:
-        """A direction with how much it varies on the healthy robot, and by errors of effects that explain a recording.
-
-        A further effect is not compared with these errors: it may be weak beside the first one, and what it removes on
-        held-out blocks shows that it is there.
-        """
-        error = self.thresholds.model_error * np.sqrt(self._mean_square(base, self._metric) if len(base) else 0.0)
-        if self.nominal is None:
-            return Direction(name, columns, float(error), self.thresholds.calibration_degrees)
-        variation, degrees = self.nominal.variation_of(name, self.thresholds.drive_share)
-        return Direction(name, columns, float(np.hypot(variation, error)), degrees)
-
-    def _mean_square(self, base: Effects, metric: np.ndarray | float = 1.0) -> float:
-        """Mean square of what effects in addition to those measured by sensors change, in units of the scale."""
-        if len(base) <= self.fixed_count(base):
-            return 0.0
-        change = self._scaled(base) - self._scaled(base[: self.fixed_count(base)])
-        return float(np.mean((np.nan_to_num(change) * metric) ** 2))
-
     def _tested(self, base: Effects, residual: np.ndarray, directions: Sequence[Direction]) -> list[ScoreResult]:
         fixed = self.fixed_count(base)
         free = sum(len(values) for _, values in base[fixed:])
@@ -354,7 +298,7 @@ class Search:
             fitted = rows.reshape(free, *residual.shape)
         weights = robust_weights(residual)
         return score_tests(
-            residual, weights, self._blocks, directions, fitted=fitted, metric=self._metric,
+            residual, weights, self._blocks, directions, fitted=fitted, metric=self.directions.metric,
             draws=self.thresholds.draws, seed=self._seed,
         )  # fmt: skip
 
@@ -376,8 +320,8 @@ class Search:
             self._progress(f"{number}{effect.name}")
             starts = [base + start for start in self._starts(effect)]
             fits.append(fit_effects(self._coarse, starts, self._coarse_scale, iterations=3, free=len(base)))
-        residual = self._scaled(base)
-        tests = self._tested(base, residual, [self.influence(base, fit.effects[-1]) for fit in fits])
+        residual = self.directions.scaled(base)
+        tests = self._tested(base, residual, [self.directions.influence(base, fit.effects[-1]) for fit in fits])
         screened = [_Screened(fit.effects, float(fit.loss.mean()), test) for fit, test in zip(fits, tests, strict=True)]
         if base == self.known and self.nominal is not None and self.nominal.segments:
             ratios = [test.excess / self.nominal.between_segments(test.name)[0] for test in tests if test.p < 1.0]
@@ -385,37 +329,6 @@ class Search:
             self.variance_ratio = float(np.mean(ratios)) - share if ratios else None
         self._screenings[key] = (before, sorted(screened, key=lambda entry: entry.loss))
         return self._screenings[key]
-
-    def _scaled(self, effects: Effects) -> np.ndarray:
-        """Scaled residuals of the whole recording, ``[W, K, 3]``; the last ones are kept."""
-        key = _key(effects)
-        if key not in self._rolled:
-            if len(self._rolled) > 8:
-                self._rolled.pop(next(iter(self._rolled)))
-            self._rolled[key] = self.predictions.residuals([effects])[0] / self.scale
-        return self._rolled[key]
-
-    def influence(self, base: Effects, effect: tuple[str, Mapping[str, float]]) -> Direction:
-        """Change of the residuals by an effect in addition to a base, one column for each parameter that was fitted."""
-        name, values = effect
-        known = {parameter.name: parameter for parameter in CATALOGUE[name].parameters}
-        # The recording is corrected for measurement effects of the file: what is found adds to them.
-        in_file = {} if CATALOGUE[name].stage == "measurement" else dict(self._own.get(name, {}))
-        own = {key: float(value) for key, value in in_file.items()}
-        hypotheses: list[Effects] = []
-        if len(values) == 1:
-            hypotheses.append((*base, effect))
-        else:
-            neutral = {key: own.get(key, known[key].neutral) for key in values}
-            for key, value in values.items():
-                least = _SMALLEST_SECANT * known[key].scale
-                away = value - neutral[key]
-                changed = value if abs(away) > least else neutral[key] + (least if away >= 0 else -least)
-                if not known[key].low <= changed <= known[key].high:
-                    changed = neutral[key] - (changed - neutral[key])
-                hypotheses.append((*base, (name, {**neutral, key: changed})))
-        changed_rows = self.predictions.residuals(hypotheses) / self.scale
-        return self._direction(name, np.nan_to_num(changed_rows - self._scaled(base)))
 
     def _round(self, best: Trial, number: int, rate: float) -> tuple[list[Trial], list[CandidateScore]]:
         """Trials with one more effect that is significant, smallest held-out loss first, and the scores of all."""
@@ -464,9 +377,9 @@ class Search:
         for name in best.names[len(self.known) : -1]:
             fewer = self.judge(without(best.effects, name))
             base = self.refit(fewer.effects).effects
-            residual = self._scaled(base)
+            residual = self.directions.scaled(base)
             effect = next(entry for entry in best.effects if entry[0] == name)
-            (test,) = self._tested(base, residual, [self.influence(base, effect)])
+            (test,) = self._tested(base, residual, [self.directions.influence(base, effect)])
             if test.p > self.thresholds.further_rate or not self._pays(fewer, best):
                 best = fewer
         return best
@@ -504,8 +417,10 @@ class Search:
             if other is None:
                 continue
             base = self.refit(trial.effects).effects
-            residual = self._scaled(base)
-            (test,) = self._tested(base, residual, [self._direction(effect, np.nan_to_num(chosen - residual)[None])])
+            residual = self.directions.scaled(base)
+            (test,) = self._tested(
+                base, residual, [self.directions.direction(effect, np.nan_to_num(chosen - residual)[None])]
+            )
             if test.p > self.thresholds.comparison_rate or separating_sensor(other, effect):
                 found.append(other)
         return found

@@ -1,0 +1,133 @@
+"""Directions: changes of a recording's residuals by effects, by terms of a formula, and by effects that change."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from monoforce_ros.discrepancy.fit import without
+from monoforce_ros.discrepancy.hypothesis import Effects, Predictions
+from monoforce_ros.discrepancy.nominal import NominalModel
+from monoforce_ros.discrepancy.score_test import Direction
+from monoforce_ros.discrepancy.thresholds import Thresholds
+from monoforce_ros.effects import CATALOGUE
+
+_SMALLEST_SECANT = 0.1
+"""Smallest distance from neutral, in typical sizes, at which the influence of one of several parameters is taken."""
+_FORMULA_STEP = 0.02
+"""Of a term of a formula, as a share of the robot's weight."""
+_KEPT = 8
+"""Residuals of this many hypotheses are kept."""
+
+
+class Directions:
+    """Directions on one recording, each with how much it varies on the healthy robot.
+
+    Args:
+        predictions: of the robot with the effects of its file.
+        scale: expected size of a residual, ``[W, K, 3]``.
+        nominal: what commissioning learned; None for a robot that was never commissioned.
+        thresholds: shares of variances.
+    """
+
+    def __init__(
+        self, predictions: Predictions, scale: np.ndarray, nominal: NominalModel | None, thresholds: Thresholds
+    ):
+        self.predictions, self.scale, self.nominal = predictions, scale, nominal
+        self.metric = 1.0 if nominal is None else scale / nominal.scale
+        self._thresholds = thresholds
+        self._own = dict(predictions.robot.effects)
+        self._rolled: dict[tuple[tuple[object, ...], ...], np.ndarray] = {}
+
+    def scaled(self, effects: Effects) -> np.ndarray:
+        """Scaled residuals, ``[W, K, 3]``; the last ones are kept."""
+        key = tuple((name, *values.values()) for name, values in effects)
+        if key not in self._rolled:
+            if len(self._rolled) >= _KEPT:
+                self._rolled.pop(next(iter(self._rolled)))
+            self._rolled[key] = self.predictions.residuals([effects])[0] / self.scale
+        return self._rolled[key]
+
+    def direction(self, name: str, columns: np.ndarray, error: float = 0.0) -> Direction:
+        """A direction ``[q, W, K, 3]`` with how much it varies on the healthy robot.
+
+        Args:
+            name: of an effect or of a term of a formula.
+            columns: change of the scaled residuals by each coefficient.
+            error: mean square of what errors of other effects do, in nominal units.
+        """
+        added = self._thresholds.model_error * float(np.sqrt(error))
+        if self.nominal is None:
+            return Direction(name, columns, added, self._thresholds.calibration_degrees)
+        variation, degrees = self.nominal.variation_of(name, self._thresholds.drive_share)
+        return Direction(name, columns, float(np.hypot(variation, added)), degrees)
+
+    def influence(self, base: Effects, effect: tuple[str, Mapping[str, float]]) -> Direction:
+        """Change of the residuals by an effect in addition to a base, one column for each parameter that was fitted.
+
+        It is not compared with errors of the base's effects: it may be weak beside them, and what it removes on
+        held-out blocks shows that it is there.
+        """
+        name, values = effect
+        known = {parameter.name: parameter for parameter in CATALOGUE[name].parameters}
+        # The recording is corrected for measurement effects of the file: what is found adds to them.
+        in_file = {} if CATALOGUE[name].stage == "measurement" else dict(self._own.get(name, {}))
+        own = {key: float(value) for key, value in in_file.items()}
+        hypotheses: list[Effects] = []
+        if len(values) == 1:
+            hypotheses.append((*base, effect))
+        else:
+            neutral = {key: own.get(key, known[key].neutral) for key in values}
+            for key, value in values.items():
+                least = _SMALLEST_SECANT * known[key].scale
+                away = value - neutral[key]
+                changed = value if abs(away) > least else neutral[key] + (least if away >= 0 else -least)
+                if not known[key].low <= changed <= known[key].high:
+                    changed = neutral[key] - (changed - neutral[key])
+                hypotheses.append((*base, (name, {**neutral, key: changed})))
+        changed_rows = self.predictions.residuals(hypotheses) / self.scale
+        return self.direction(name, np.nan_to_num(changed_rows - self.scaled(base)))
+
+    def of_formula(self, base: Effects, fixed: int = 0) -> list[Direction]:
+        """Change of the residuals by each term of a formula in addition to a base, ``fixed`` of which were measured."""
+        learned = CATALOGUE["learned_term"]
+        keys = [parameter.name for parameter in learned.parameters]
+        step = _FORMULA_STEP * 9.81 * float(self.predictions.robot.mass.mean())
+        neutral = dict.fromkeys(keys, 0.0)
+        trials: list[Effects] = [(*base, (learned.name, neutral))]
+        trials += [(*base, (learned.name, {**neutral, key: step})) for key in keys]
+        rolled = self.predictions.residuals(trials) / self.scale
+        error = self.mean_square(base, fixed, self.metric)
+        return [
+            self.direction(f"{learned.name} {key}", (row - rolled[0])[None], error)
+            for key, row in zip(keys, rolled[1:], strict=True)
+        ]
+
+    def of_changes(self, base: Effects, fixed: int = 0) -> list[Direction]:
+        """A change of each effect of a base over the recording, with the speed and with the direction of turning."""
+        data = self.predictions.data
+        time = (data.starts - data.starts.mean()) / max(float(np.ptp(data.starts)), 1.0)
+        twists = data.commands.sample(data.starts + round(0.5 * data.horizon * 1e9))
+        speed, turning = np.abs(twists[:, 0]), np.sign(twists[:, 1])
+        regimes = {
+            "over the recording": time / max(float(time.std()), 1e-9),
+            "with the speed": (speed - speed.mean()) / max(float(speed.std()), 1e-9),
+            "with the direction of turning": turning - turning.mean(),
+        }
+        directions = []
+        error = self.mean_square(base, fixed, self.metric)
+        for name, _ in base[fixed:]:
+            change = self.scaled(base) - self.predictions.residuals([without(base, name)])[0] / self.scale
+            for regime, factor in regimes.items():
+                direction = self.direction(name, (factor[:, None, None] * change)[None], error)
+                directions.append(replace(direction, name=f"{name} changes {regime}"))
+        return directions
+
+    def mean_square(self, base: Effects, fixed: int, metric: np.ndarray | float = 1.0) -> float:
+        """Mean square of what effects change in addition to the first ``fixed`` ones, in units of the scale."""
+        if len(base) <= fixed:
+            return 0.0
+        change = self.scaled(base) - self.scaled(base[:fixed])
+        return float(np.mean((np.nan_to_num(change) * metric) ** 2))
