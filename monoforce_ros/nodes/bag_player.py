@@ -16,7 +16,7 @@ from rosgraph_msgs.msg import Clock
 
 from monoforce_ros.bags import BagError, BagMessage, BagReader, type_store
 from monoforce_ros.core import share_directory
-from monoforce_ros.messages import message_class
+from monoforce_ros.messages import message_class, missing_package
 from monoforce_ros.nodes.arguments import NodeArgumentParser, own_arguments
 from monoforce_ros.nodes.frames import TRANSFORMS
 from monoforce_ros.nodes.odometry_transform import odometry_transform
@@ -70,7 +70,7 @@ class BagPlayer(Node):
                 continue
             message_type_class = message_class(message_type)
             if message_type_class is None:
-                self.get_logger().warning(f"{topic} is not played: {message_type} is not installed")
+                self.get_logger().warning(f"{topic} is not played: {missing_package(message_type)}")
                 continue
             latched = _is_static(topic)
             quality = QoSProfile(
