@@ -93,14 +93,18 @@ class BagPlayer(Node):
         if self.options.no_tf or recorded or not played or kind is None:
             return "", None
         topic = max(played, key=lambda name: self.bag.counts[name])
-        self.get_logger().info(f"the bag has no /tf: it is derived from {topic} (--no-tf disables this)")
-        return topic, self.create_publisher(kind, "/tf", 100)
+        # A robot in a namespace may have a /tf of its own; then its static transforms are there, too.
+        static = sorted(topic for topic in self.playable if _is_static(topic))
+        target = static[0].removesuffix("_static") if static else "/tf"
+        self.get_logger().info(f"the bag has no {target}: it is derived from {topic} (--no-tf disables this)")
+        return topic, self.create_publisher(kind, target, 100)
 
     def wait_for_subscribers(self) -> None:
         """Wait for a first subscriber, and then a little longer for further ones."""
         deadline = time.monotonic() + self.options.wait
         while time.monotonic() < deadline and self.context.ok():
-            if any(publisher.get_subscription_count() for publisher in self.playable.values()):
+            publishers = [*self.playable.values(), *filter(None, [self._transforms])]
+            if any(publisher.get_subscription_count() for publisher in publishers):
                 self._sleep(min(1.0, self.options.wait))
                 return
             self._sleep(0.05)
