@@ -136,7 +136,9 @@ class PathSelectorNode(Node):
             self.health.report(PART, ERROR, message, reason="goal")
             return
         previous, self._course = self._course, Course(frame_id, points)
-        if previous is None or not np.array_equal(previous.points[-1], points[-1]):
+        # A plan is sent again and again; the same numbers in another frame are another goal.
+        same = previous is not None and (previous.frame_id, *previous.points[-1]) == (frame_id, *points[-1])
+        if not same:
             end = points[-1]
             self.get_logger().info(f"new {kind}: to ({end[0]:.2f}, {end[1]:.2f}) in frame {frame_id or 'odometry'!r}")
             self._progress.clear()
