@@ -157,7 +157,9 @@ def diagnose_bag(
     if diagnosis.verdict == Verdict.NOT_IDENTIFIABLE:
         diagnosis = _with_wheels(diagnosis, evidence, model)
     robot_file = None
-    if diagnosis.effects and all(not complaint(effect, _in_file(model, effect.name)) for effect in diagnosis.effects):
+    # On ground that no map shows slopes pass for effects: nothing of that belongs into a robot file.
+    credible = bool(diagnosis.effects) and not ground.unknown
+    if credible and all(not complaint(effect, _in_file(model, effect.name)) for effect in diagnosis.effects):
         effects = [effect_entry(effect) for effect in diagnosis.effects]
         robot_file = write_robot(robot, found_file, effects, [bag], data)
     elif found_file.exists():
