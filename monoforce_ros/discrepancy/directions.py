@@ -58,9 +58,9 @@ class Directions:
             columns: change of the scaled residuals by each coefficient.
             error: mean square of what errors of other effects do, in nominal units.
         """
-        added = self._thresholds.model_error * float(np.sqrt(error))
         if self.nominal is None:
-            return Direction(name, columns, added, self._thresholds.calibration_degrees)
+            return Direction(name, columns)
+        added = self._thresholds.model_error * float(np.sqrt(error))
         variation, degrees = self.nominal.variation_of(name, self._thresholds.drive_share)
         return Direction(name, columns, float(np.hypot(variation, added)), degrees)
 
