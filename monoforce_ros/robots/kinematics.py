@@ -47,6 +47,11 @@ class SteeredDrive:
         return self.kind != ACKERMANN
 
     @property
+    def wheelbase(self) -> float:
+        """Largest distance of a steered wheel from the axle about which the robot turns [m]: that of the bicycle."""
+        return float((self.joint_places[:, 0] - self.reference_x).abs().max())
+
+    @property
     def maximum_curvature(self) -> float:
         """Largest curvature that the steering reaches with all wheels about one centre [1/m] (``ackermann``)."""
         ahead = (self.joint_places[:, 0] - self.reference_x).abs().double()
