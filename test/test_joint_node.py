@@ -49,7 +49,7 @@ def ends(peer):
 def predicted(peer, predictor, **given):
     """Feed data until predictions are made from them."""
     peer.begin()
-    for _ in range(6):
+    for _ in range(12):
         drive(peer, **given)
         if peer.received["/predicted/path"] and peer.until(
             lambda: peer.status("prediction") == (OK, "predicting"), 1.0

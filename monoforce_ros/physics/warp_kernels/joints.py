@@ -127,7 +127,8 @@ def joint_functions(double: bool) -> JointFunctions:
             links.frames[thread, slot, link, 2] = turned * (
                 wp.cross(turning, middle) + work.frames[thread, slot, link, 2] - middle_rate
             )
-            if link > 0:
+            # Only coordinates need the axes.
+            if link > 0 and joints.size > 0:
                 links.frames[thread, slot, link, 3] = turned * work.frames[thread, slot, link, 3]
                 links.frames[thread, slot, link, 4] = turned * (work.frames[thread, slot, link, 4] - middle)
                 links.frames[thread, slot, link, 5] = turned * (work.frames[thread, slot, link, 5] - middle)
