@@ -23,6 +23,9 @@ from monoforce_ros.robots import Controls, RobotFileError, load_robot, robot_fil
 from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap
 
 STEP = 0.01
+
+# The adjoint in double precision takes a minute to compile on an idle core, once.
+pytestmark = pytest.mark.timeout(900)
 GRAVITY = 9.81
 SPRING = {"name": "s", "wheel": "front_left", "stiffness": 1e3, "damping": 1.0}
 

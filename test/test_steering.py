@@ -14,6 +14,9 @@ from monoforce_ros.terrain import TerrainMap
 
 STEP = 0.01
 
+# The adjoint in double precision takes a minute to compile on an idle core, once.
+pytestmark = pytest.mark.timeout(900)
+
 
 def twists(robot, forward, yaw_rate=0.0, lateral=None, steps=400):
     listed = [forward, yaw_rate] + ([] if lateral is None else [lateral])
