@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from monoforce_ros.bags import SmoothedMotion
 from monoforce_ros.core import AngularVelocityTrack, CommandTrack, MotionTrack, WheelTrack, wrap_angle
-from monoforce_ros.effects import CATALOGUE, corrected_commands, corrected_motion, drive_speeds
+from monoforce_ros.effects import CATALOGUE, controls, corrected_commands, corrected_motion
 from monoforce_ros.physics import PhysicsOptions, State, TerrainLookup, rest_depth, rollout
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import Grid, TerrainMap
@@ -276,7 +276,7 @@ class Predictions:
         count, width = len(hypotheses), len(self.data.starts)
         robot = replace(self.robot, effects=self._joined(hypotheses, width))
         with torch.no_grad():
-            speeds = drive_speeds(
+            given = controls(
                 robot,
                 windows.twists.repeat(count, 1, 1),
                 self.options.time_step,
@@ -288,7 +288,7 @@ class Predictions:
                 windows.velocity.repeat(count, 1),
                 windows.angular_velocity.repeat(count, 1),
             )
-            result = rollout(self._terrain, robot, speeds, state, options=self.options, with_forces=False)
+            result = rollout(self._terrain, robot, given, state, options=self.options, with_forces=False)
         positions = result.position[:, self._index].double().numpy().reshape(count, width, -1, 3)
         rotations = result.rotation[:, self._index].double().numpy().reshape(count, width, -1, 3, 3)
         displacement = np.einsum("wji,hwkj->hwki", windows.frames, positions - windows.places[None, :, None])

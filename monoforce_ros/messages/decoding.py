@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -244,6 +245,45 @@ def decode_wheel_speeds(message: Any) -> np.ndarray | None:
         return None
     values = np.array([np.mean(speeds) for speeds in sides.values()])
     return values if np.isfinite(values).all() else None
+
+
+def decode_joints(message: Any, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    """``sensor_msgs/JointState`` → angles [rad] and rates [rad/s] of the named joints, each ``[J]``, in their order.
+
+    Other joints are ignored. What the message does not contain is NaN: joints that it does not name, and rates or
+    angles of a message without velocities or positions.
+
+    Raises ``MessageError`` if no joint is known, a list has another length than the names, or a value is not finite.
+    """
+    index = {str(name): place for place, name in enumerate(message.name)}
+    known = [name for name in names if name in index]
+    if not known:
+        raise MessageError(f"joint states: got the joints {sorted(index)}, expected some of {sorted(names)}")
+    found = []
+    for label, given in (("position", message.position), ("velocity", message.velocity)):
+        values = np.asarray(given, np.float64)
+        if len(values) not in (0, len(message.name)):
+            raise MessageError(f"joint states: got {len(values)} values of {label} for {len(message.name)} names")
+        listed = np.array([values[index[name]] if name in index and len(values) else np.nan for name in names])
+        bad = [name for name in known if len(values) and not np.isfinite(values[index[name]])]
+        if bad:
+            raise MessageError(f"joint states: got no finite {label} of {bad}, expected finite numbers")
+        found.append(listed)
+    return found[0], found[1]
+
+
+def decode_ackermann(message: Any, wheelbase: float) -> np.ndarray:
+    """``ackermann_msgs/AckermannDriveStamped`` → forward speed [m/s] and yaw rate [rad/s], ``[2]``.
+
+    The yaw rate is that of the bicycle model with ``wheelbase`` [m]; at standstill a steering angle is lost.
+    """
+    drive = getattr(message, "drive", message)
+    speed, angle = float(drive.speed), float(drive.steering_angle)
+    if not (np.isfinite(speed) and np.isfinite(angle)) or abs(angle) >= 0.5 * np.pi:
+        raise MessageError(
+            f"command: got speed {speed}, steering angle {angle}; expected finite numbers, the angle within ±π/2"
+        )
+    return np.array([speed, speed * np.tan(angle) / wheelbase])
 
 
 def decode_command(message: Any) -> np.ndarray:

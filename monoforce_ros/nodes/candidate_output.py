@@ -157,8 +157,9 @@ class CandidateOutput:
     def _assess(self, prediction: Prediction, twists: np.ndarray) -> tuple[Rollout, Assessment]:
         motions = [prediction.motion] * len(twists)
         rollout = self._predictor.roll_out(
-            prediction.terrain, motions, twists, with_forces=False, with_contact=True, force_every=self._force_every
-        )
+            prediction.terrain, motions, twists, with_forces=False, with_contact=True, force_every=self._force_every,
+            joints=prediction.joints,
+        )  # fmt: skip
         commanded = torch.from_numpy(twists[:, self._predictor.history :]).float()
         robot = self._predictor.robot
         weights, limits = self._weights, self._limits

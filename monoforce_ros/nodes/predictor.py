@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import sys
 import threading
@@ -15,7 +16,7 @@ import torch
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import GridCells, Odometry, Path
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState, PointCloud2
 from visualization_msgs.msg import MarkerArray
 
 from monoforce_ros.bags import camera_info_topic
@@ -30,6 +31,7 @@ from monoforce_ros.nodes.ensemble_output import EnsembleOutput
 from monoforce_ros.nodes.frames import TransformListener
 from monoforce_ros.nodes.health import ERROR, OK, STALE, WARN, Health
 from monoforce_ros.nodes.inputs import Inputs, Received
+from monoforce_ros.nodes.joint_input import JointInput
 from monoforce_ros.nodes.managed import ManagedNode
 from monoforce_ros.nodes.monitor_output import MonitorOutput
 from monoforce_ros.nodes.parameters import declare_parameters, follow_changes
@@ -106,6 +108,10 @@ class PredictorNode(ManagedNode):
             patience=settings.data_timeout,
             on_time_jump=self._on_time_jump,
         )
+        self.joints: JointInput | None = None
+        if self.robot.joints:
+            continues = settings.flipper_motion == "continue"
+            self.joints = JointInput(self.robot, continues=continues, timeout=settings.odometry_timeout)
         self._arrivals: dict[str, float] = {}
         self._started = time.monotonic()
         self._predictions = 0
@@ -206,12 +212,19 @@ class PredictorNode(ManagedNode):
             "commands": AdaptiveSubscription(
                 self,
                 settings.command_topic,
-                {"geometry_msgs/msg/TwistStamped": TwistStamped, "geometry_msgs/msg/Twist": Twist},
+                self._command_types(),
                 self._on_command,
                 depth=small,
                 follow_listeners=True,
             ),
         }
+        if self.joints is not None:
+            kinds = {"sensor_msgs/msg/JointState": JointState}
+            # These inputs are optional: their silence is not a fault.
+            self._joint_subscriptions = [
+                AdaptiveSubscription(self, topic, kinds, partial(self._on_joints, part), depth=small)
+                for part, topic in (("joints", settings.joint_topic), ("flippers", settings.flipper_command_topic))
+            ]
         images = {"sensor_msgs/msg/CompressedImage": CompressedImage, "sensor_msgs/msg/Image": Image}
         info_topics = iter([*settings.camera_info_topics, *[""] * len(self.sensor_topics)])
         for part, topic in self.sensor_topics.items():
@@ -229,6 +242,16 @@ class PredictorNode(ManagedNode):
                 )
                 self.decoder.add_camera(part, info.topic)
                 self._subscriptions_by_part[f"{part} info"] = info
+
+    def _command_types(self) -> dict[str, type]:
+        types: dict[str, type] = {"geometry_msgs/msg/TwistStamped": TwistStamped, "geometry_msgs/msg/Twist": Twist}
+        if self.robot.steered is not None:
+            try:
+                ackermann = importlib.import_module("ackermann_msgs.msg")
+            except ImportError:
+                return types
+            types["ackermann_msgs/msg/AckermannDriveStamped"] = ackermann.AckermannDriveStamped
+        return types
 
     # Callbacks decode small messages, keep large ones undecoded, and never raise.
 
@@ -250,12 +273,27 @@ class PredictorNode(ManagedNode):
     def _on_command(self, message: Twist | TwistStamped) -> None:
         self._arrivals["commands"] = time.monotonic()
         try:
-            twist = decoding.decode_command(message)
+            if hasattr(message, "drive") and self.robot.steered is not None:
+                twist = decoding.decode_ackermann(message, self.robot.steered.wheelbase)
+            else:
+                twist = decoding.decode_command(message)
         except decoding.MessageError as error:
             self.health.report("commands", ERROR, str(error), reason="unusable")
             return
         self.inputs.add_command("commands", decoding.stamp_of(message), twist)
         self.health.report("commands", OK, "receiving commands")
+
+    def _on_joints(self, part: str, message: JointState) -> None:
+        assert self.joints is not None
+        try:
+            if part == "joints":
+                self.joints.measure(message)
+            else:
+                self.joints.command(message)
+        except decoding.MessageError as error:
+            self.health.report(part, ERROR, str(error), reason="unusable")
+            return
+        self.health.report(part, OK, f"receiving {part}")
 
     def _on_sensor(self, part: str, message: PointCloud2 | Image | CompressedImage) -> None:
         self._arrivals[part] = time.monotonic()
@@ -269,6 +307,8 @@ class PredictorNode(ManagedNode):
 
     def _on_time_jump(self, topic: str, seconds: float) -> None:
         self.monitor.clear()
+        if self.joints is not None:
+            self.joints.clear()
         self.health.report(
             "prediction",
             WARN,
@@ -341,7 +381,10 @@ class PredictorNode(ManagedNode):
             stamps = np.minimum(self.predictor.command_stamps(stamp), stamp)
             commands = corrected_commands(self.inputs.commands(), self.robot.effects)
             twists = commands.sample(stamps, timeout=self.settings.command_timeout)
-            prediction = self.predictor.predict(observation, motion, twists, force_every=self._force_every)
+            joints = None if self.joints is None else self.joints.at(stamp)
+            prediction = self.predictor.predict(
+                observation, motion, twists, force_every=self._force_every, joints=joints
+            )
             if not bool(prediction.rollout.valid.all()):
                 raise ValueError("the rollout diverged")
             frame_id = self.inputs.frame_id or "odom"

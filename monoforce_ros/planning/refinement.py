@@ -87,7 +87,7 @@ def refine(
         motions = [prediction.motion] * len(change)
         rolled = predictor.differentiable_roll_out(
             prediction.terrain, motions, twists, start_states(motions), robot, with_forces=False,
-            with_contact=True, force_every=every,
+            with_contact=True, force_every=every, joints=prediction.joints,
         )  # fmt: skip
         found = assess(
             rolled, prediction.terrain, robot, twists[:, predictor.history :], weights=weights, limits=limits

@@ -9,6 +9,7 @@ from monoforce_ros.prediction.geometry import (
     force_steps,
     usable_steps,
 )
+from monoforce_ros.prediction.joint_motion import JointMotion
 from monoforce_ros.prediction.monitor import HORIZONS, GapSummary, LiveGap
 from monoforce_ros.prediction.predictor import Prediction, Predictor, start_states
 
@@ -19,6 +20,7 @@ __all__ = [
     "HORIZONS",
     "EnsembleSettings",
     "GapSummary",
+    "JointMotion",
     "LiveGap",
     "Prediction",
     "Predictor",

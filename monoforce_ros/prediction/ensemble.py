@@ -103,7 +103,9 @@ def spread(predictor: Predictor, prediction: Prediction, twists: np.ndarray, set
     terrain = prediction.terrain
     commands = torch.as_tensor(twists, dtype=torch.float32).expand(count, -1, -1)
     with torch.no_grad():
-        rolled = predictor.differentiable_roll_out(terrain, motions, commands, start, robot, with_forces=False)
+        rolled = predictor.differentiable_roll_out(
+            terrain, motions, commands, start, robot, with_forces=False, joints=prediction.joints
+        )
     finite = (rolled.valid & torch.isfinite(rolled.position).all(dim=(1, 2))).numpy()
     if finite.sum() < max(2, count // 2):
         raise ValueError(f"{count - int(finite.sum())} of {count} members of the ensemble diverged")

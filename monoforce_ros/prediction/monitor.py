@@ -98,7 +98,9 @@ class LiveGap:
             return None
         prediction = self._waiting.popleft()
         twists = commands.sample(self.predictor.command_stamps(prediction.stamp))
-        rolled = self.predictor.roll_out(prediction.terrain, [prediction.motion], twists[None], with_forces=False)
+        rolled = self.predictor.roll_out(
+            prediction.terrain, [prediction.motion], twists[None], with_forces=False, joints=prediction.joints
+        )
         again = Prediction(prediction.motion, prediction.terrain, rolled)
         sample = _compared(again, motion, twists[self.predictor.history :], self.predictor)
         self._noise = odometry_noise(motion)

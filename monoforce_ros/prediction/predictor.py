@@ -8,9 +8,10 @@ import numpy as np
 import torch
 
 from monoforce_ros.core import MotionState, transform_points
-from monoforce_ros.effects import drive_speeds, turned_effects
+from monoforce_ros.effects import controls, turned_effects
 from monoforce_ros.perception import Observation, TerrainSource
 from monoforce_ros.physics import PhysicsOptions, Rollout, State, rollout
+from monoforce_ros.prediction.joint_motion import JointMotion
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import Grid, TerrainMap
 
@@ -24,6 +25,8 @@ class Prediction:
     terrain: TerrainMap
     rollout: Rollout
     """Motion and forces in the terrain frame, a batch of one."""
+    joints: JointMotion | None = None
+    """Measured joints at the start; None: steering from earlier commands, flippers as in the robot's file."""
 
     @property
     def stamp(self) -> int:
@@ -94,7 +97,13 @@ class Predictor:
         return stamp + np.rint(steps * self.options.time_step * 1e9).astype(np.int64)
 
     def predict(
-        self, observation: Observation, motion: MotionState, twists: np.ndarray, *, force_every: int = 1
+        self,
+        observation: Observation,
+        motion: MotionState,
+        twists: np.ndarray,
+        *,
+        force_every: int = 1,
+        joints: JointMotion | None = None,
     ) -> Prediction:
         """Predict from one observation.
 
@@ -103,9 +112,11 @@ class Predictor:
             motion: the robot's state at the same time.
             twists: commanded forward speed [m/s] and yaw rate [rad/s] at ``command_stamps``, ``[history + T, 2]``.
             force_every: interval of the steps at which contact forces are returned.
+            joints: measured joints at the same time.
         """
         terrain = self.source.terrain(observation, motion)
-        return Prediction(motion, terrain, self.roll_out(terrain, [motion], twists[None], force_every=force_every))
+        rolled = self.roll_out(terrain, [motion], twists[None], force_every=force_every, joints=joints)
+        return Prediction(motion, terrain, rolled, joints)
 
     def roll_out(
         self,
@@ -116,6 +127,7 @@ class Predictor:
         with_forces: bool = True,
         with_contact: bool = False,
         force_every: int = 1,
+        joints: JointMotion | None = None,
     ) -> Rollout:
         """Roll out motions ``[B]`` under twists ``[B, history + T, 2]`` on one map or a batch of maps."""
         with torch.no_grad():
@@ -123,7 +135,7 @@ class Predictor:
             start = start_states(motions)
             return self.differentiable_roll_out(
                 terrain, motions, commands, start, self.robot,
-                with_forces=with_forces, with_contact=with_contact, force_every=force_every,
+                with_forces=with_forces, with_contact=with_contact, force_every=force_every, joints=joints,
             )  # fmt: skip
 
     def differentiable_roll_out(
@@ -131,18 +143,24 @@ class Predictor:
         terrain: TerrainMap,
         motions: list[MotionState],
         twists: torch.Tensor,
-        start: State,
+        state: State,
         robot: RobotModel,
         *,
         with_forces: bool = True,
         with_contact: bool = False,
         force_every: int = 1,
+        joints: JointMotion | None = None,
     ) -> Rollout:
         """As :meth:`roll_out` but with gradients, for given start states and a given variant of the robot."""
-        speeds = drive_speeds(robot, twists, self.options.time_step, history=self.history)
+        batch, step = len(twists), self.options.time_step
+        start, flippers = None, None
+        if joints is not None:
+            start = torch.as_tensor(joints.start, dtype=torch.float32).expand(batch, -1)
+            flippers = joints.flippers(batch, twists.shape[1] - self.history, step)
+        given = controls(robot, twists, step, history=self.history, joint_start=start, flippers=flippers)
         # The terrain frame turns with the robot's heading; effects fixed in the odometry frame are rotated into it.
         heading = torch.tensor([motion.heading for motion in motions], dtype=torch.float32)
         return rollout(
-            terrain, turned_effects(robot, heading), speeds, start, options=self.options, with_forces=with_forces,
+            terrain, turned_effects(robot, heading), given, state, options=self.options, with_forces=with_forces,
             with_contact=with_contact, force_every=force_every,
         )  # fmt: skip

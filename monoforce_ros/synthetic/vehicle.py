@@ -93,6 +93,11 @@ class Vehicle:
             RobotFileError: the file is invalid.
         """
         robot: RobotModel = load_robot(name_or_file)
+        if robot.steered is not None or robot.point_grip is not None:
+            raise RobotFileError(
+                f"robot {robot.name}: drive.kind: the simulator drives robots of the kind 'skid' without free wheels; "
+                "benchmarks/mujoco_drives.py has a model with steering and casters"
+            )
         content = yaml.safe_load(robot_file(name_or_file).read_text(encoding="utf-8"))
         offsets = dict(zip(robot.drive_names, robot.drive_offsets.tolist(), strict=True))
         wheels = [_wheel(wheel, offsets) for wheel in content.get("wheels", [])]

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from monoforce_ros.effects import drive_speeds
+from monoforce_ros.effects import controls
 from monoforce_ros.encoder import EncodedMaps, EncoderConfig
 from monoforce_ros.physics import PhysicsOptions, State, rollout
 from monoforce_ros.robots import RobotModel
@@ -146,11 +146,11 @@ def trajectory_loss(
     steps = round(CHUNK / options.time_step)
     history = targets.twists.shape[1] - steps
     with torch.no_grad():
-        speeds = drive_speeds(robot, targets.twists, options.time_step, history=history)
+        given = controls(robot, targets.twists, options.time_step, history=history)
     start = State(
         targets.positions[:, 0].clone(), targets.rotations[:, 0].clone(), targets.velocity, targets.angular_velocity
     )
-    result = rollout(terrain, robot, speeds, start, options=options, with_forces=False)
+    result = rollout(terrain, robot, given, start, options=options, with_forces=False)
     index = torch.linspace(0, steps, targets.positions.shape[1]).round().long()
     positions, rotations = result.position[:, index[1:]], result.rotation[:, index[1:]]
     translation, rotation = trajectory_residual(

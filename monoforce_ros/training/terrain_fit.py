@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from monoforce_ros.bags import Windows, cut_windows
 from monoforce_ros.core import CommandTrack, MotionTrack, homogeneous, transform_points
-from monoforce_ros.effects import drive_speeds
+from monoforce_ros.effects import controls
 from monoforce_ros.physics import PhysicsOptions, State, rest_depth, rollout
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap, fill_holes
@@ -199,12 +199,12 @@ class _Chunks:
             angular_velocity=tensor((rotation @ windows.angular_velocities[:, 0, :, None])[..., 0]),
         )
         with torch.no_grad():
-            self.speeds = drive_speeds(robot, tensor(windows.twists), self.options.time_step, history=windows.history)
+            self.controls = controls(robot, tensor(windows.twists), self.options.time_step, history=windows.history)
 
     def roll_out(self, terrain: TerrainMap, backend: str) -> tuple[Tensor, Tensor]:
         """Positions ``[chunks, K, 3]`` [m] and rotations ``[chunks, K, 3, 3]`` at the sampled times."""
         result = rollout(
-            terrain, self.robot, self.speeds, self.state, options=self.options, with_forces=False, backend=backend
+            terrain, self.robot, self.controls, self.state, options=self.options, with_forces=False, backend=backend
         )
         return result.position[:, self.index], result.rotation[:, self.index]
 

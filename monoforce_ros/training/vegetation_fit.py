@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from scipy.optimize import minimize
 
-from monoforce_ros.effects import drive_speeds
+from monoforce_ros.effects import controls
 from monoforce_ros.encoder import EncoderConfig
 from monoforce_ros.physics import PhysicsOptions, State, rollout
 from monoforce_ros.robots import RobotModel
@@ -142,9 +142,9 @@ def _loss(chunks: _ChunksInVegetation, robot: RobotModel, coefficient: float, yi
     robot = replace(robot, effects=(*others, (EFFECT, {"coefficient": coefficient, "yield_speed": yield_speed})))
     options, found = PhysicsOptions(), chunks.targets
     steps = round(CHUNK / options.time_step)
-    speeds = drive_speeds(robot, found.twists, options.time_step, history=found.twists.shape[1] - steps)
+    given = controls(robot, found.twists, options.time_step, history=found.twists.shape[1] - steps)
     start = State(found.positions[:, 0].clone(), found.rotations[:, 0].clone(), found.velocity, found.angular_velocity)
-    result = rollout(chunks.terrain, robot, speeds, start, options=options, with_forces=False)
+    result = rollout(chunks.terrain, robot, given, start, options=options, with_forces=False)
     translation = (result.position[:, -1, :2] - found.positions[:, -1, :2]) / _HORIZONTAL_SCALE
     relative = result.rotation[:, -1].transpose(-1, -2) @ found.rotations[:, -1]
     heading = torch.atan2(relative[:, 1, 0], relative[:, 0, 0])[:, None] / _HEADING_SCALE

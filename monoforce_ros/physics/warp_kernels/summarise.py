@@ -14,8 +14,8 @@ def summarise_kernel(double: bool) -> Any:
     """The kernel in float64 (``double``) or float32."""
     t = types(double)
     functions = contact_functions(double)
-    state_at, may_touch, touch_ground, over_the_step = (
-        functions.state_at, functions.may_touch, functions.touch_ground, functions.over_the_step
+    state_at, may_touch, touch_ground, belt_speed, over_the_step = (
+        functions.state_at, functions.may_touch, functions.touch_ground, functions.belt_speed, functions.over_the_step
     )  # fmt: skip
     scalar, vec3 = t.scalar, t.vec3
     Ground, Body, Robots, States, Options = t.Ground, t.Body, t.Robots, t.States, t.Options
@@ -52,9 +52,13 @@ def summarise_kernel(double: bool) -> Any:
             if may_touch(ground, page, middle, body.cluster_radii[cluster]):
                 for i in range(body.cluster_edges[cluster], body.cluster_edges[cluster + 1]):
                     arm = turned * (body.points[i] - offset)
-                    touch = touch_ground(ground, body, robots, options, page, b, step, i, state, arm)
+                    touch = touch_ground(
+                        ground, body, robots, options, page, b, i, state.position + arm,
+                        state.linear + wp.cross(state.angular, arm), turned, belt_speed(body, robots, b, step, i),
+                        scalar(1.0),
+                    )  # fmt: skip
                     if touch.active == 1:
-                        acted = over_the_step(touch, arm, change, turning_change)
+                        acted = over_the_step(touch, change + wp.cross(turning_change, arm))
                         tangential = acted[1] * touch.along + acted[2] * touch.across
                         whole = whole + acted[0] * touch.normal + tangential
                         if touch.normal[2] < steep:
