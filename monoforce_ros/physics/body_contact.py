@@ -23,6 +23,8 @@ class BodyContact:
     """Body points relative to the centre of mass in base axes, ``[B, 3, N]`` [m]."""
     tangents: Tensor
     """Direction in which each point's surface moves, ``[3, N]`` in base axes."""
+    outward: Tensor
+    """Unit normal of the hull at each point, zero on belts, ``[3, N]`` in base axes."""
     areas: Tensor
     """Area of each point, ``[N]`` [m²]."""
     weights: Tensor
@@ -50,6 +52,7 @@ class BodyContact:
             lookup=TerrainLookup(problem.terrain, options.lookup, problem.batch_size, problem.vegetation),
             points=problem.points.T - problem.centre_of_mass[..., None],
             tangents=problem.point_tangents.T,
+            outward=problem.point_outward.T,
             areas=problem.point_areas,
             weights=problem.mass[:, None] * options.gravity * share,
             # Index -1, the hull, selects the zero at the end.
@@ -96,6 +99,7 @@ class BodyContact:
             points,
             velocity[..., None] + spun,
             belt,
+            rotation @ self.outward,
             rotation[..., 1],
             self.areas,
             self.weights,

@@ -55,7 +55,7 @@ def integrate_kernel(double: bool) -> Any:
         b = first_trajectory + thread
         page = wp.min(b, ground.height.shape[0] - 1)
         offset = robots.centre_of_mass[b]
-        count = body.cluster_radii.shape[0]
+        count = body.group_halves.shape[0]
         for step in range(steps):
             slot = step * keep
             state = state_at(states, b, step)
@@ -69,59 +69,62 @@ def integrate_kernel(double: bool) -> Any:
             mixed_x = vec3()
             mixed_y = vec3()
             mixed_z = vec3()
-            for cluster in range(count):
-                # Most clusters are above all ground within reach and are skipped.
-                middle = state.position + turned * (body.cluster_centres[cluster] - offset)
-                if may_touch(ground, page, middle, body.cluster_radii[cluster]):
-                    for i in range(body.cluster_edges[cluster], body.cluster_edges[cluster + 1]):
-                        arm = turned * (body.points[i] - offset)
-                        # Most of the remaining points are in the air.
-                        if below_ground(ground, page, options.lookup, state.position + arm):
-                            touch = touch_ground(ground, body, robots, options, page, b, step, i, state, arm)
-                            acting = (
-                                touch.force[0] * touch.normal
-                                + touch.force[1] * touch.along
-                                + touch.force[2] * touch.across
-                            )
-                            force = force + acting
-                            torque = torque + wp.cross(arm, acting)
-                            normal = touch.normal
-                            along = touch.along
-                            across = touch.across
-                            stiff = touch.gain[0] * normal
-                            rolls = touch.gain[1] * along
-                            slides = touch.gain[2] * across
-                            # Entries of the symmetric gain matrix G, of G [arm]×, and of [arm]× G [arm]×.
-                            xx = stiff[0] * normal[0] + rolls[0] * along[0] + slides[0] * across[0]
-                            yy = stiff[1] * normal[1] + rolls[1] * along[1] + slides[1] * across[1]
-                            zz = stiff[2] * normal[2] + rolls[2] * along[2] + slides[2] * across[2]
-                            yz = stiff[1] * normal[2] + rolls[1] * along[2] + slides[1] * across[2]
-                            xz = stiff[0] * normal[2] + rolls[0] * along[2] + slides[0] * across[2]
-                            xy = stiff[0] * normal[1] + rolls[0] * along[1] + slides[0] * across[1]
-                            first = vec3(
-                                xy * arm[2] - xz * arm[1], xz * arm[0] - xx * arm[2], xx * arm[1] - xy * arm[0]
-                            )
-                            second = vec3(
-                                yy * arm[2] - yz * arm[1], yz * arm[0] - xy * arm[2], xy * arm[1] - yy * arm[0]
-                            )
-                            third = vec3(
-                                yz * arm[2] - zz * arm[1], zz * arm[0] - xz * arm[2], xz * arm[1] - yz * arm[0]
-                            )
-                            diagonal = diagonal + vec3(xx, yy, zz)
-                            off_diagonal = off_diagonal + vec3(yz, xz, xy)
-                            mixed_x = mixed_x + first
-                            mixed_y = mixed_y + second
-                            mixed_z = mixed_z + third
-                            turning_diagonal = turning_diagonal + vec3(
-                                arm[1] * third[0] - arm[2] * second[0],
-                                arm[2] * first[1] - arm[0] * third[1],
-                                arm[0] * second[2] - arm[1] * first[2],
-                            )
-                            turning_off_diagonal = turning_off_diagonal + vec3(
-                                arm[2] * first[2] - arm[0] * third[2],
-                                arm[1] * third[2] - arm[2] * second[2],
-                                arm[1] * third[1] - arm[2] * second[1],
-                            )
+            for group in range(count):
+                # Most groups, and in them most clusters, are above all ground within reach and are skipped.
+                centre = state.position + turned * (body.group_centres[group] - offset)
+                if may_touch(ground, ground.group_ceiling, page, centre, turned, body.group_halves[group]):
+                    for cluster in range(body.group_edges[group], body.group_edges[group + 1]):
+                        middle = state.position + turned * (body.cluster_centres[cluster] - offset)
+                        if may_touch(ground, ground.ceiling, page, middle, turned, body.cluster_halves[cluster]):
+                            for i in range(body.cluster_edges[cluster], body.cluster_edges[cluster + 1]):
+                                arm = turned * (body.points[i] - offset)
+                                # Most of the remaining points are in the air.
+                                if below_ground(ground, page, options.lookup, state.position + arm):
+                                    touch = touch_ground(ground, body, robots, options, page, b, step, i, state, arm)
+                                    acting = (
+                                        touch.force[0] * touch.normal
+                                        + touch.force[1] * touch.along
+                                        + touch.force[2] * touch.across
+                                    )
+                                    force = force + acting
+                                    torque = torque + wp.cross(arm, acting)
+                                    normal = touch.normal
+                                    along = touch.along
+                                    across = touch.across
+                                    stiff = touch.gain[0] * normal
+                                    rolls = touch.gain[1] * along
+                                    slides = touch.gain[2] * across
+                                    # Entries of the symmetric gain matrix G, of G [arm]×, and of [arm]× G [arm]×.
+                                    xx = stiff[0] * normal[0] + rolls[0] * along[0] + slides[0] * across[0]
+                                    yy = stiff[1] * normal[1] + rolls[1] * along[1] + slides[1] * across[1]
+                                    zz = stiff[2] * normal[2] + rolls[2] * along[2] + slides[2] * across[2]
+                                    yz = stiff[1] * normal[2] + rolls[1] * along[2] + slides[1] * across[2]
+                                    xz = stiff[0] * normal[2] + rolls[0] * along[2] + slides[0] * across[2]
+                                    xy = stiff[0] * normal[1] + rolls[0] * along[1] + slides[0] * across[1]
+                                    first = vec3(
+                                        xy * arm[2] - xz * arm[1], xz * arm[0] - xx * arm[2], xx * arm[1] - xy * arm[0]
+                                    )
+                                    second = vec3(
+                                        yy * arm[2] - yz * arm[1], yz * arm[0] - xy * arm[2], xy * arm[1] - yy * arm[0]
+                                    )
+                                    third = vec3(
+                                        yz * arm[2] - zz * arm[1], zz * arm[0] - xz * arm[2], xz * arm[1] - yz * arm[0]
+                                    )
+                                    diagonal = diagonal + vec3(xx, yy, zz)
+                                    off_diagonal = off_diagonal + vec3(yz, xz, xy)
+                                    mixed_x = mixed_x + first
+                                    mixed_y = mixed_y + second
+                                    mixed_z = mixed_z + third
+                                    turning_diagonal = turning_diagonal + vec3(
+                                        arm[1] * third[0] - arm[2] * second[0],
+                                        arm[2] * first[1] - arm[0] * third[1],
+                                        arm[0] * second[2] - arm[1] * first[2],
+                                    )
+                                    turning_off_diagonal = turning_off_diagonal + vec3(
+                                        arm[2] * first[2] - arm[0] * third[2],
+                                        arm[1] * third[2] - arm[2] * second[2],
+                                        arm[1] * third[1] - arm[2] * second[1],
+                                    )
             summed[thread, slot, 0] = force
             summed[thread, slot, 1] = torque
             summed[thread, slot, 2] = diagonal
