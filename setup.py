@@ -34,7 +34,7 @@ setup(
         "matplotlib>=3.6",
         "mujoco>=3.10.0",
         "numpy>=1.26",
-        "pycollada>=0.8",
+        "pycollada>=0.9.1",
         "pyyaml>=6.0.1",
         "rosbags>=0.11.7",
         "safetensors>=0.4.3",
