@@ -29,6 +29,7 @@ class CommandDelay(Effect):
     source = "communication and controller latency"
     parameters = (Parameter("delay", "s", 0.0, 0.0, 2.0, 0.2, "dead time"),)
     order = 10
+    acts_on_steering = True
     identified = ("delay",)
     manoeuvre = "steps of the speed from standing"
     separated_by: ClassVar = {"actuator_lag": "steps of the speed from standing"}

@@ -83,6 +83,8 @@ class Effect(ABC):
     order: ClassVar[int | None] = None
     """Position among the effects on commands, smallest first: the base controller, electronics, mechanics, ground.
     Required for every effect that overrides :meth:`twists` or :meth:`drive_speeds`; all twists change first."""
+    acts_on_steering: ClassVar[bool] = False
+    """Whether :meth:`drive_speeds` also acts on steering angles, as a delay of all commands does."""
     identified: ClassVar[tuple[str, ...]] = ()
     """Parameters that a recording of motion and commands can identify, the most important first. If empty, ``diagnose``
     does not test this effect."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from monoforce_ros.effects import drive_speeds
+from monoforce_ros.effects import controls
 from monoforce_ros.physics import Rollout, State, rollout
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import Grid, TerrainMap
@@ -65,7 +65,7 @@ def _drive(robot: RobotModel, speed: float, yaw_rate: float) -> Rollout:
     twists = torch.tensor([[0.0, 0.0]] * round(SETTLING / STEP) + [[speed, yaw_rate]] * round(DRIVING / STEP))[None]
     terrain = TerrainMap.flat(Grid.square(max(16.0, 4.0 * (DRIVING * abs(speed) + 4.0)), 0.5))
     start = State.at_rest(robot.ground_clearance)
-    return rollout(terrain, robot, drive_speeds(robot, twists, STEP), start, force_every=10)
+    return rollout(terrain, robot, controls(robot, twists, STEP), start, force_every=10)
 
 
 def _moved(run: Rollout) -> np.ndarray:

@@ -47,7 +47,7 @@ def draw_robot(robot: RobotModel, content: Mapping[str, Any]) -> Figure:
         fontsize=14,
     )
     handles, labels = above.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=8, frameon=False, fontsize=10)
+    figure.legend(handles, labels, loc="outside lower center", ncols=8, frameon=False, fontsize=10, markerscale=1.3)
     return figure
 
 
@@ -150,8 +150,10 @@ class _Drawing:
         axes.plot(*self.centre[[a, b]], "+", color=_CENTRE, markersize=11, zorder=7, label="centre of mass")
         self.steering(axes, b)
         margin = 0.12 * self.size
+        # Arcs of steered wheels reach beyond the body.
+        beyond = margin * (2 if b == 1 and self.content.get("steering") else 1)
         axes.set(
-            xlim=(self.low[0] - margin, self.high[0] + 2 * margin), ylim=(self.low[b] - margin, self.high[b] + margin),
+            xlim=(self.low[0] - margin, self.high[0] + 2 * margin), ylim=(self.low[b] - beyond, self.high[b] + beyond),
             aspect="equal", xlabel="x [m]", ylabel="z [m]" if b == 2 else "y [m]",
         )  # fmt: skip
         for edge in ("top", "right"):
@@ -159,14 +161,17 @@ class _Drawing:
 
     def dots(self, axes: Axes, a: int, b: int) -> None:
         """Body points of the hull, then of the drives, so that these lie on top."""
-        hull = self.drives < 0
+        hull, seen = self.drives < 0, set[str]()
         axes.plot(*self.points[hull][:, [a, b]].T, ".", color=_HULL_EDGE, markersize=2.2, label="hull")
         for index, name in enumerate(self.robot.drive_names):
             chosen = self.points[self.drives == index]
             if not len(chosen):
                 continue
             colour = self.colour(name, float(np.sign(np.round(chosen[:, 1].mean(), 3))))
-            axes.plot(*chosen[:, [a, b]].T, ".", color=colour, markersize=2.6, label=f"drive {name}")
+            label = {_LEFT: "driven, left", _RIGHT: "driven, right"}.get(colour, "driven")
+            shown = "_" + label if label in seen else label
+            seen.add(label)
+            axes.plot(*chosen[:, [a, b]].T, ".", color=colour, markersize=2.6, label=shown)
 
     def steering(self, axes: Axes, b: int) -> None:
         """Arcs over which steered wheels and casters turn, seen from above."""
@@ -221,7 +226,7 @@ class _Drawing:
                 axes.add_collection3d(Poly3DCollection(faces, facecolor=colour, edgecolor=colour, alpha=0.15, lw=0.8))
             axes.scatter(*pose[:3, 3], s=45, color=colour, marker="s" if label == "camera" else "D", depthshade=False)
         axes.scatter(*self.centre, s=90, color=_CENTRE, marker="+", depthshade=False)
-        reach = 0.6 * self.size
+        reach = 0.52 * self.size
         x, y = (self.low[0] + self.high[0]) / 2, (self.low[1] + self.high[1]) / 2
         ground = [[x - reach, y - reach], [x + reach, y - reach], [x + reach, y + reach], [x - reach, y + reach]]
         plane = [[*corner, self.ground] for corner in ground]
@@ -233,7 +238,7 @@ class _Drawing:
         axes.set(
             xlim=(x - half, x + half), ylim=(y - half, y + half), zlim=(middle[2] - half * 0.7, middle[2] + half * 0.7)
         )
-        axes.set_box_aspect((1, 1, 0.7), zoom=1.25)
+        axes.set_box_aspect((1, 1, 0.7), zoom=1.1)
         axes.view_init(elev=24, azim=-52)
         axes.set_axis_off()
 

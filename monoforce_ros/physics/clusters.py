@@ -4,6 +4,7 @@ Clusters are grouped, so that a finely sampled hull in the air costs a few tests
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -59,6 +60,16 @@ class PointClusters:
     """Boxes around ranges of ``order``."""
     groups: Boxes
     """Boxes around ranges of ``clusters``."""
+
+
+def joined(parts: Sequence[Boxes]) -> Boxes:
+    """Boxes of several bodies, one body after the other."""
+    counts = torch.cat([torch.diff(boxes.edges) for boxes in parts])
+    return Boxes(
+        edges=torch.cat([counts.new_zeros(1), counts.cumsum(0)]).to(torch.int32),
+        centres=torch.cat([boxes.centres for boxes in parts]),
+        halves=torch.cat([boxes.halves for boxes in parts]),
+    )
 
 
 def point_clusters(points: Tensor) -> PointClusters:

@@ -55,6 +55,10 @@ class Contact:
     """``[B, 3 (direction), N]`` [N]."""
     gain: Tensor
     """``[B, 3 (direction), N]`` [N s/m], never negative."""
+    grip_force: Tensor
+    """Friction alone, which also acts on the belt: longitudinal, lateral, ``[B, 2, N]`` [N]."""
+    grip_gain: Tensor
+    """Its gain, ``[B, 2, N]`` [N s/m]."""
 
     @property
     def vectors(self) -> Tensor:
@@ -77,6 +81,7 @@ def contact(
     yield_speed: Tensor,
     options: PhysicsOptions,
     step_time: float | None = None,
+    grip: Tensor | None = None,
 ) -> Contact:
     """Forces on body points (paper III-C and III-D).
 
@@ -90,7 +95,7 @@ def contact(
         velocities: velocities of the body at the points, ``[B, 3, N]`` [m/s].
         belt_velocities: velocities of the belt surface relative to the body, ``[B, 3, N]`` [m/s].
         outward: unit normal of the hull at the points, zero on belts, ``[B, 3, N]``.
-        lateral: the robot's y axis, ``[B, 3]``.
+        lateral: the robot's y axis, ``[B, 3]``, or that of each point's wheel, ``[B, 3, N]``.
         areas: area of each point, ``[N]`` [m²].
         weights: share of the robot's weight m g per point, ``[B, N]`` or ``[N]`` [N] (``sigmoid`` only).
         friction_factors: longitudinal and lateral factor on the ground's friction, ``[B, 2]``.
@@ -101,6 +106,7 @@ def contact(
         options: contact laws.
         step_time: time over which the spring follows the motion [s] (default: the time step); 0 gives the
             instantaneous force.
+        grip: 0 for points of wheels that roll freely, which have no longitudinal friction, else 1, ``[N]``; None: 1.
     """
     normal = ground.normal
     if options.normal_force == "vertical":
@@ -110,7 +116,7 @@ def contact(
     touching = depth > 0
     touching_areas = areas * touching
     normal, rigid = against_hull(outward, normal)
-    lateral = lateral[..., None]
+    lateral = lateral if lateral.ndim == 3 else lateral[..., None]
     across = lateral - (lateral * normal).sum(1, keepdim=True) * normal
     across = across * torch.rsqrt((across * across).sum(1, keepdim=True) + 1e-12)
     directions = torch.stack([normal, cross(across, normal), across], dim=2)
@@ -128,6 +134,9 @@ def contact(
     normal_gain = touching_areas * damping * (pressing > 0)
 
     friction = ground.friction[:, None] * friction_factors[..., None]
+    if grip is not None:
+        held = torch.stack([grip, torch.ones_like(grip)])
+        slip, friction = slip * held, friction * held
     if options.tangential_force == "coulomb":
         per_speed = load * torch.rsqrt((slip * slip).sum(1) + options.slip_regularisation**2)
         tangential_gain = friction * per_speed[:, None]
@@ -150,4 +159,6 @@ def contact(
         directions=directions,
         force=torch.cat([pressing[:, None], tangential_force - resistance * point_velocity[:, 1:]], dim=1),
         gain=torch.cat([normal_gain[:, None], tangential_gain + resistance], dim=1),
+        grip_force=tangential_force,
+        grip_gain=tangential_gain,
     )

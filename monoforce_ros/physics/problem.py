@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from monoforce_ros.effects import applied_setup
+from monoforce_ros.physics.articulation import Articulation, BodyMass
 from monoforce_ros.physics.contact_summary import ContactSummary
 from monoforce_ros.physics.state import State
-from monoforce_ros.robots import RobotModel
+from monoforce_ros.robots import Controls, RobotModel
 from monoforce_ros.terrain import TerrainMap
 
 
@@ -58,19 +59,33 @@ class Problem:
     """Divisor of stiffness and damping [-], and vegetation drag per area, height and speed [N s/m⁴], ``[B, 2]``."""
     wrench: Tensor
     """Body-frame force and torque per feature of the motion, ``[B, 6, F]``."""
+    articulation: Articulation | None = None
+    """What moves in the body; None if nothing does."""
 
     @classmethod
-    def pose(cls, terrain: TerrainMap, robot: RobotModel, drive_speeds: Tensor, state: State) -> tuple[Problem, Tensor]:
+    def pose(
+        cls,
+        terrain: TerrainMap,
+        robot: RobotModel,
+        controls: Tensor | Controls,
+        state: State,
+        time_step: float = 0.01,
+    ) -> tuple[Problem, Tensor]:
         """The problem and a mask of the trajectories with finite inputs, ``[B]`` bool.
 
         Other trajectories are replaced by a robot at rest at the map's origin, because NaN would propagate into the
         gradient of the shared terrain.
         """
+        if isinstance(controls, Tensor):
+            controls = Controls(controls)
         batch, dtype, device = state.position.shape[0], state.position.dtype, state.position.device
         setup = applied_setup(terrain.to(dtype, device), robot.to(dtype, device))
         terrain, robot, loads = setup.terrain, setup.robot, setup.loads
+        drive_speeds = controls.drive_speeds
         values = (state.position, state.rotation, state.velocity, state.angular_velocity, drive_speeds.to(dtype))
-        finite = torch.stack([torch.isfinite(t.detach()).reshape(batch, -1).all(1) for t in values]).all(0)
+        joint_inputs = [getattr(controls, name) for name in _JOINT_INPUTS]
+        checked = [t.detach() for t in (*values, *(t for t in joint_inputs if t is not None))]
+        finite = torch.stack([torch.isfinite(t).reshape(batch, -1).all(1) for t in checked]).all(0)
         if bool(finite.all()):
             position, rotation, velocity, angular_velocity, speeds = values
         else:
@@ -79,8 +94,20 @@ class Problem:
             position, rotation, velocity, angular_velocity, speeds = (
                 torch.where(finite.view(-1, *[1] * (t.ndim - 1)), t, n) for t, n in zip(values, neutral, strict=True)
             )
+            controls = _without_invalid(controls, finite)
         centre_of_mass = robot.centre_of_mass.expand(batch, 3)
         offset = (rotation @ centre_of_mass[..., None])[..., 0]
+        drift = torch.zeros_like(offset)
+        moves = controls.joint_angles is not None or robot.moves_joints or robot.point_grip is not None
+        articulation = None
+        if moves:
+            linear, angular = (rotation.transpose(1, 2) @ torch.stack([velocity, angular_velocity], -1)).unbind(-1)
+            articulation = Articulation.of(robot, controls, speeds, linear, angular, time_step)
+        if articulation is not None:
+            body = BodyMass(robot.mass.expand(batch), centre_of_mass, robot.inertia.expand(batch, 3, 3))
+            centre, centre_rate = articulation.centres(articulation.angles[:, :1], articulation.rates[:, :1], body)
+            offset = (rotation @ centre[:, 0, :, None])[..., 0]
+            drift = (rotation @ centre_rate[:, 0, :, None])[..., 0]
         resistance = (loads.rolling_resistance, loads.linear_drag, loads.quadratic_drag, loads.vegetation_yield)
         vegetation = (terrain.geometric_height - terrain.height).clamp_min(0.0)
         factors = [robot.friction_longitudinal.expand(batch), robot.friction_lateral.expand(batch)]
@@ -88,7 +115,7 @@ class Problem:
             terrain=terrain,
             centre=position + offset,
             rotation=rotation,
-            velocity=velocity + torch.linalg.cross(angular_velocity, offset),
+            velocity=velocity + torch.linalg.cross(angular_velocity, offset) + drift,
             angular_velocity=angular_velocity,
             drive_speeds=speeds,
             points=robot.points,
@@ -105,6 +132,7 @@ class Problem:
             vegetation=vegetation,
             ground_factors=torch.stack([setup.softness.expand(batch), loads.vegetation_drag.expand(batch)], dim=-1),
             wrench=loads.wrench.expand(batch, 6, -1),
+            articulation=articulation,
         )
         return problem, finite
 
@@ -117,6 +145,11 @@ class Problem:
     def steps(self) -> int:
         """Number of time steps."""
         return self.drive_speeds.shape[1]
+
+    @property
+    def body_mass(self) -> BodyMass:
+        """Mass properties at the rest angles of the joints."""
+        return BodyMass(self.mass, self.centre_of_mass, self.inertia)
 
 
 @dataclass(frozen=True)
@@ -139,3 +172,23 @@ class Motion:
     """``[B, T, N, 3]``."""
     contact: ContactSummary | None = None
     """Sums of the forces, if the backend computed them."""
+    angles: Tensor | None = None
+    """Of the joints, ``[B, T + 1, J]``, of a robot in which something moves."""
+    rates: Tensor | None = None
+    """``[B, T + 1, J]``."""
+    belts: Tensor | None = None
+    """Surface speeds of the drives, ``[B, T + 1, D]``."""
+
+
+_JOINT_INPUTS = ("joint_angles", "joint_rates", "start_angles", "start_rates")
+
+
+def _without_invalid(controls: Controls, finite: Tensor) -> Controls:
+    """The controls with the joints of invalid trajectories at zero."""
+    changed = {}
+    for name in _JOINT_INPUTS:
+        value = getattr(controls, name)
+        if value is not None:
+            chosen = finite.view(-1, *[1] * (value.ndim - 1))
+            changed[name] = torch.where(chosen, value, torch.zeros_like(value))
+    return replace(controls, **changed)

@@ -14,7 +14,7 @@ from monoforce_ros.physics.neural_ode import OdeOptions
 from monoforce_ros.physics.options import PhysicsOptions
 from monoforce_ros.physics.problem import Motion, Problem
 from monoforce_ros.physics.state import Rollout, State
-from monoforce_ros.robots import RobotModel
+from monoforce_ros.robots import Controls, RobotModel
 from monoforce_ros.terrain import TerrainMap
 
 BACKENDS = ("auto", "torch", "warp")
@@ -23,7 +23,7 @@ BACKENDS = ("auto", "torch", "warp")
 def rollout(
     terrain: TerrainMap,
     robot: RobotModel,
-    drive_speeds: Tensor,
+    drive_speeds: Tensor | Controls,
     state: State,
     *,
     options: PhysicsOptions = PhysicsOptions(),  # noqa: B008  (frozen)
@@ -45,7 +45,8 @@ def rollout(
     Args:
         terrain: one map for all trajectories, or a batch ``[B]`` of maps.
         robot: robot; physical quantities may have a batch dimension.
-        drive_speeds: surface speed of each drive during each step [m/s], ``[B, T, D]``.
+        drive_speeds: surface speed of each drive during each step [m/s], ``[B, T, D]``, or these with the angles of the
+            robot's joints. Without angles, steering and flippers stay where they are.
         state: start states, ``[B]``.
         with_forces: whether to return per-point forces (memory grows with B · T · N).
         with_contact: whether to return their sums over the body, which cost little without gradients.
@@ -59,6 +60,8 @@ def rollout(
         ValueError: inconsistent shapes, or a backend that is not available.
     """
     batch = state.position.shape[0]
+    controls = Controls(drive_speeds) if isinstance(drive_speeds, Tensor) else drive_speeds
+    drive_speeds = controls.drive_speeds
     if force_every < 1:
         raise ValueError(f"forces of every {force_every} steps: expected 1 or more")
     if drive_speeds.ndim != 3 or drive_speeds.shape[0] != batch or drive_speeds.shape[2] != robot.number_of_drives:
@@ -66,10 +69,16 @@ def rollout(
             f"drive speeds: got shape {tuple(drive_speeds.shape)}, expected [{batch}, T, {robot.number_of_drives}] "
             f"for the drives {robot.drive_names}"
         )
+    _check_joints(robot, controls, (batch, drive_speeds.shape[1]))
     if terrain.batch_size not in (None, 1, batch):
         raise ValueError(f"terrain: got a batch of {terrain.batch_size} maps, expected 1 or {batch}")
-    problem, finite = Problem.pose(terrain, robot, drive_speeds, state)
+    problem, finite = Problem.pose(terrain, robot, controls, state, options.time_step)
     if ode is not None:
+        if problem.articulation is not None:
+            raise ValueError(
+                f"ode: got a robot with moving joints, free wheels or motor limits ({robot.name}), which the "
+                "Neural-ODE variant does not integrate; use rollout() without ode"
+            )
         motion = neural_ode.integrate(problem, options, ode, with_forces or with_contact, force_every)
     else:
         motion = _backend(backend).integrate(problem, options, with_forces, with_contact, force_every)
@@ -84,6 +93,23 @@ def rollout(
     if with_forces:
         return replace(result, contact=contact)
     return replace(result, contact=contact, normal_forces=None, tangential_forces=None, forces=None)
+
+
+def _check_joints(robot: RobotModel, controls: Controls, shape: tuple[int, int]) -> None:
+    batch, steps = shape
+    number = len(robot.joints)
+    for name, expected in (
+        ("joint_angles", (batch, steps, number)),
+        ("joint_rates", (batch, steps, number)),
+        ("start_angles", (batch, number)),
+        ("start_rates", (batch, number)),
+    ):
+        value = getattr(controls, name)
+        if value is not None and tuple(value.shape) != expected:
+            raise ValueError(
+                f"controls, {name}: got shape {tuple(value.shape)}, expected {list(expected)} for the joints "
+                f"{robot.joint_names}"
+            )
 
 
 class _Backend(Protocol):
@@ -107,9 +133,15 @@ def _backend(name: str) -> _Backend:
 
 
 def _result(problem: Problem, motion: Motion, finite: Tensor, options: PhysicsOptions) -> Rollout:
-    offset = (motion.rotation @ problem.centre_of_mass[:, None, :, None])[..., 0]
+    if problem.articulation is None or motion.angles is None or motion.rates is None:
+        offset = (motion.rotation @ problem.centre_of_mass[:, None, :, None])[..., 0]
+        velocity = motion.velocity - torch.linalg.cross(motion.angular_velocity, offset)
+    else:
+        centre, rate = problem.articulation.centres(motion.angles, motion.rates, problem.body_mass)
+        offset = (motion.rotation @ centre[..., None])[..., 0]
+        drift = (motion.rotation @ rate[..., None])[..., 0]
+        velocity = motion.velocity - torch.linalg.cross(motion.angular_velocity, offset) - drift
     position = motion.centre - offset
-    velocity = motion.velocity - torch.linalg.cross(motion.angular_velocity, offset)
     states = (position, motion.rotation, velocity, motion.angular_velocity)
     valid = finite & torch.stack([torch.isfinite(t.detach()).flatten(1).all(1) for t in states]).all(0)
 
@@ -135,6 +167,9 @@ def _result(problem: Problem, motion: Motion, finite: Tensor, options: PhysicsOp
         normal_forces=mark_optional(motion.normal_forces),
         tangential_forces=mark_optional(motion.tangential_forces),
         forces=mark_optional(motion.forces),
+        joint_angles=mark_optional(motion.angles),
+        joint_rates=mark_optional(motion.rates),
+        drive_speeds=mark_optional(motion.belts),
         contact=motion.contact
         and ContactSummary(*(mark(getattr(motion.contact, f.name)) for f in fields(motion.contact))),
     )

@@ -79,6 +79,14 @@ class Rollout:
     """Total contact force on each body point during each step [N], ``[B, T, N, 3]`` in terrain axes."""
     contact: ContactSummary | None = None
     """The forces summed over the body's points, ``[B, T, …]``."""
+    joint_angles: Tensor | None = None
+    """Angles of the joints [rad], ``[B, T + 1, J]``; None if nothing moves in the robot."""
+    joint_rates: Tensor | None = None
+    """``[B, T + 1, J]`` [rad/s]."""
+    drive_speeds: Tensor | None = None
+    """Surface speed of each drive [m/s], ``[B, T + 1, D]``; below its command where the motor's limits are reached."""
+    joint_torques: Tensor | None = None
+    """Torque of each joint's motor or spring against contact forces and weight [N m], ``[B, T, J]``, with forces."""
     force_every: int = 1
     """Forces and their sums are those of every n-th step; their dimension ``T`` is smaller by this factor."""
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from monoforce_ros.physics import torch_joints
 from monoforce_ros.physics.body_contact import BodyContact
 from monoforce_ros.physics.loads import LoadModel
 from monoforce_ros.physics.options import PhysicsOptions
@@ -18,6 +19,8 @@ def integrate(
     problem: Problem, options: PhysicsOptions, with_forces: bool, with_contact: bool = False, force_every: int = 1
 ) -> Motion:
     """Integrate with autograd recording each step; see :func:`monoforce_ros.physics.rollout`."""
+    if problem.articulation is not None:
+        return torch_joints.integrate(problem, problem.articulation, options, with_forces or with_contact, force_every)
     dtype, device = problem.centre.dtype, problem.centre.device
     step_time = options.time_step
     body, loads = BodyContact.of(problem, options), LoadModel.of(problem, options.gravity)

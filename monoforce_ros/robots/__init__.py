@@ -1,9 +1,14 @@
 """Robot models: body points, drives, mass properties and sensors, read from and written to YAML files, or from URDF."""
 
-from monoforce_ros.robots.loader import RobotFileError, load_robot, robot_file, shipped_robots
+from monoforce_ros.robots.checks import RobotFileError
+from monoforce_ros.robots.controls import Controls
+from monoforce_ros.robots.joint import Coordinate, Joint
+from monoforce_ros.robots.kinematics import SteeredDrive
+from monoforce_ros.robots.loader import load_robot, robot_file, shipped_robots
 from monoforce_ros.robots.mass import add_point_mass
 from monoforce_ros.robots.robot_copy import fingerprint, read_commissioning, read_nominal_residual, write_robot
 from monoforce_ros.robots.robot_model import Flipper, RobotModel
+from monoforce_ros.robots.servo import servo_response
 from monoforce_ros.robots.urdf import (
     Conversion,
     ConversionOptions,
@@ -14,12 +19,16 @@ from monoforce_ros.robots.urdf import (
 )
 
 __all__ = [
+    "Controls",
     "Conversion",
     "ConversionOptions",
+    "Coordinate",
     "Description",
     "Flipper",
+    "Joint",
     "RobotFileError",
     "RobotModel",
+    "SteeredDrive",
     "UrdfError",
     "add_point_mass",
     "convert_description",
@@ -29,6 +38,7 @@ __all__ = [
     "read_description",
     "read_nominal_residual",
     "robot_file",
+    "servo_response",
     "shipped_robots",
     "write_robot",
 ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from monoforce_ros.core import share_directory
 from monoforce_ros.robots.belt import belt_outline
+from monoforce_ros.robots.checks import FieldChecks, RobotFileError
 from monoforce_ros.robots.hull import box_samples
+from monoforce_ros.robots.joint_reader import JointReader, WheelEntry
 from monoforce_ros.robots.robot_model import Flipper, RobotModel
 
 MAXIMUM_FILE_BYTES = 1_000_000
@@ -24,12 +26,9 @@ DEFAULT_SPACING = 0.05
 _VALUE_KEYS = {"value", "low", "high", "unit"}
 _TOP_KEYS = {
     "name", "description", "base_frame", "mass", "centre_of_mass", "inertia", "inertia_box", "command", "friction",
-    "wheels", "tracks", "flippers", "hull", "sensors", "effects", "commissioning",
+    "wheels", "tracks", "flippers", "hull", "sensors", "effects", "commissioning", "drive", "steering", "casters",
+    "suspension", "rockers", "motors",
 }  # fmt: skip
-
-
-class RobotFileError(ValueError):
-    """The robot file is invalid; the message names the file, the field, the value and what was expected."""
 
 
 def shipped_robots() -> list[str]:
@@ -75,67 +74,42 @@ def load_robot(name_or_file: str | Path, *, spacing: float = DEFAULT_SPACING) ->
     return _Reader(path).robot(content, spacing)
 
 
-class _Reader:
+class _Reader(FieldChecks):
     """Converts parsed YAML into a RobotModel; every error names the file and the field."""
-
-    def __init__(self, path: Path):
-        self.path = path
-
-    def fail(self, where: str, got: object, expected: str) -> RobotFileError:
-        return RobotFileError(f"{self.path}: {where}: got {got!r}, expected {expected}")
-
-    def mapping(self, content: Any, where: str, known: set[str], required: Sequence[str] = ()) -> Mapping[str, Any]:
-        if not isinstance(content, Mapping):
-            raise self.fail(where, content, "a mapping")
-        for key in content:
-            if key not in known:
-                raise self.fail(where, key, f"one of the keys {sorted(known)}")
-        for key in required:
-            if key not in content:
-                raise self.fail(where, sorted(content), f"the key {key!r}, which is missing")
-        return content
-
-    def number(self, value: Any, where: str, low: float, high: float, unit: str) -> float:
-        if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-            raise self.fail(where, value, f"a number from {low:g} to {high:g} {unit}")
-        return float(value)
-
-    def vector(self, value: Any, where: str, count: int, bound: float, unit: str) -> np.ndarray:
-        if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != count:
-            raise self.fail(where, value, f"a list of {count} numbers [{unit}]")
-        return np.array([self.number(v, f"{where}[{i}]", -bound, bound, unit) for i, v in enumerate(value)])
-
-    def items(self, content: Any, where: str) -> Sequence[Any]:
-        if not isinstance(content, Sequence) or isinstance(content, str):
-            raise self.fail(where, content, "a list")
-        return content
 
     def robot(self, content: Any, spacing: float) -> RobotModel:
         top = self.mapping(content, "the file", _TOP_KEYS, ["name", "mass", "command"])
         mass = self.number(top["mass"], "mass", 0.1, 1e5, "kg")
         command = self.mapping(
-            top["command"], "command", {"track_width", "maximum_speed", "maximum_yaw_rate"}, ["track_width"]
+            top["command"],
+            "command",
+            {"track_width", "maximum_speed", "maximum_yaw_rate", "maximum_lateral_speed"},
+            ["track_width"],
         )
         track_width = self.number(command["track_width"], "command.track_width", 0.05, 10.0, "m")
         friction = self.mapping(top.get("friction", {}), "friction", {"longitudinal", "lateral"})
+        centre_of_mass = self.vector(top.get("centre_of_mass", [0, 0, 0]), "centre_of_mass", 3, 5.0, "m")
+        listed = self.items(top.get("wheels", []), "wheels")
+        entries = [self.wheel(wheel, f"wheels[{index}]") for index, wheel in enumerate(listed)]
+        moving = JointReader(self, top, entries, mass, centre_of_mass)
         samples = _Samples()
-        for index, wheel in enumerate(self.items(top.get("wheels", []), "wheels")):
-            self.wheel(wheel, f"wheels[{index}]", samples, spacing)
+        for index, (wheel, entry) in enumerate(zip(listed, entries, strict=True)):
+            self.sample_wheel(wheel, f"wheels[{index}]", entry, moving, samples, spacing)
         for index, track in enumerate(self.items(top.get("tracks", []), "tracks")):
             self.track(track, f"tracks[{index}]", samples, spacing)
         for index, flipper in enumerate(self.items(top.get("flippers", []), "flippers")):
-            self.flipper(flipper, f"flippers[{index}]", samples, spacing)
-        if not samples.drives:
+            self.flipper(flipper, f"flippers[{index}]", moving, samples, spacing)
+        if not samples.radii:
             raise self.fail("wheels, tracks, flippers", "none", "at least one driven wheel, track or flipper")
         for index, box in enumerate(self.items(top.get("hull", []), "hull")):
             self.box(box, f"hull[{index}]", samples, spacing)
-        areas = np.concatenate(samples.areas)
-        drive_sides = np.array(
-            [
-                np.sign(np.mean(np.concatenate(samples.points)[np.concatenate(samples.point_drives) == index, 1]))
-                for index in range(len(samples.drives))
-            ]
-        )
+        points, point_drives = np.concatenate(samples.points), np.concatenate(samples.point_drives)
+        middles = [points[point_drives == index].mean(axis=0) for index in range(len(samples.drives))]
+        # Wheels that are steered or roll freely are where they are; the base controller knows one track width.
+        drive_offsets = [
+            middle[1] if moving.steers or name in samples.free else np.sign(middle[1]) * track_width / 2
+            for name, middle in zip(samples.drives, middles, strict=True)
+        ]
 
         def tensor(values: Any) -> torch.Tensor:
             return torch.as_tensor(values, dtype=torch.float32)
@@ -144,15 +118,15 @@ class _Reader:
             name=str(top["name"]),
             base_frame=str(top.get("base_frame", "base_link")),
             mass=tensor(mass),
-            centre_of_mass=tensor(self.vector(top.get("centre_of_mass", [0, 0, 0]), "centre_of_mass", 3, 5.0, "m")),
+            centre_of_mass=tensor(centre_of_mass),
             inertia=tensor(self.inertia(top, mass)),
-            points=tensor(np.concatenate(samples.points)),
-            point_areas=tensor(areas),
+            points=tensor(points),
+            point_areas=tensor(np.concatenate(samples.areas)),
             point_tangents=tensor(np.concatenate(samples.tangents)),
-            point_drives=torch.as_tensor(np.concatenate(samples.point_drives), dtype=torch.int64),
+            point_drives=torch.as_tensor(point_drives, dtype=torch.int64),
             point_outward=tensor(np.concatenate(samples.outward)),
             drive_names=tuple(samples.drives),
-            drive_offsets=tensor(drive_sides * track_width / 2),
+            drive_offsets=tensor(drive_offsets),
             friction_longitudinal=tensor(
                 self.number(friction.get("longitudinal", 1.0), "friction.longitudinal", 0.0, 10.0, "-")
             ),
@@ -170,6 +144,17 @@ class _Reader:
             flippers=tuple(samples.flippers),
             flipper_angles=tensor(samples.angles),
             point_flippers=torch.as_tensor(np.concatenate(samples.point_flippers), dtype=torch.int64),
+            joints=tuple(moving.joints),
+            joint_angles=tensor([0.0] * (len(moving.joints) - len(samples.angles)) + samples.angles),
+            point_joints=torch.as_tensor(np.concatenate(samples.point_joints), dtype=torch.int64),
+            point_grip=tensor([0.0 if d >= 0 and samples.drives[d] in samples.free else 1.0 for d in point_drives])
+            if samples.free
+            else None,
+            motors=moving.motors(samples.members, samples.radii, len(samples.drives)),
+            steered=moving.steered_drive(middles, samples.drives),
+            maximum_lateral_speed=self.number(
+                command.get("maximum_lateral_speed", math.inf), "command.maximum_lateral_speed", 0.01, math.inf, "m/s"
+            ),
         )
 
     def effects(self, content: Any) -> tuple[tuple[str, dict[str, float]], ...]:
@@ -223,11 +208,37 @@ class _Reader:
             )
         return matrix
 
-    def wheel(self, content: Any, where: str, samples: _Samples, spacing: float) -> None:
+    def wheel(self, content: Any, where: str) -> WheelEntry:
         keys = {"name", "drive", "centre", "radius", "width"}
         wheel = self.mapping(content, where, keys, sorted(keys))
-        radius = self.number(wheel["radius"], f"{where}.radius", 0.01, 3.0, "m")
-        self.belt(wheel, where, (0.0, radius, radius), samples, spacing)
+        return WheelEntry(
+            str(wheel["name"]),
+            None if wheel.get("drive") is None else str(wheel["drive"]),
+            self.vector(wheel["centre"], f"{where}.centre", 3, 20.0, "m"),
+            self.number(wheel["radius"], f"{where}.radius", 0.01, 3.0, "m"),
+        )
+
+    def sample_wheel(
+        self,
+        content: Mapping[str, Any],
+        where: str,
+        wheel: WheelEntry,
+        moving: JointReader,
+        samples: _Samples,
+        spacing: float,
+    ) -> None:
+        # A wheel of a steered robot turns at the speed of its own path, and so does one that rolls freely.
+        own = wheel.name if moving.steers or wheel.drive is None else wheel.drive
+        first = len(samples.points)
+        self.belt({**content, "drive": own}, where, (0.0, wheel.radius, wheel.radius), samples, spacing)
+        samples.point_joints[first][:] = moving.carrier.get(wheel.name, -1)
+        if wheel.drive is None:
+            samples.free.add(own)
+        else:
+            samples.radii.setdefault(wheel.drive, wheel.radius)
+            index = samples.drives.index(own)
+            if index not in samples.members.setdefault(wheel.drive, []):
+                samples.members[wheel.drive].append(index)
 
     def track(self, content: Any, where: str, samples: _Samples, spacing: float) -> None:
         keys = {"name", "drive", "centre", "length", "radius", "width"}
@@ -235,10 +246,12 @@ class _Reader:
         radius = self.number(track["radius"], f"{where}.radius", 0.01, 3.0, "m")
         length = self.number(track["length"], f"{where}.length", 0.01, 20.0, "m")
         self.belt(track, where, (length, radius, radius), samples, spacing)
+        samples.drives_with(str(track["drive"]), radius)
 
-    def flipper(self, content: Any, where: str, samples: _Samples, spacing: float) -> None:
+    def flipper(self, content: Any, where: str, moving: JointReader, samples: _Samples, spacing: float) -> None:
         keys = {"name", "drive", "end", "joint", "length", "root_radius", "tip_radius", "width", "mass", "angle"}
-        entry = self.mapping(content, where, keys, sorted(keys))
+        servo = {"limits", "maximum_rate", "time_constant", "maximum_torque", "maximum_power"}
+        entry = self.mapping(content, where, keys | servo, sorted(keys))
         if entry["end"] not in ("front", "rear"):
             raise self.fail(f"{where}.end", entry["end"], "front or rear")
         joint = self.vector(entry["joint"], f"{where}.joint", 3, 20.0, "m")
@@ -260,7 +273,10 @@ class _Reader:
         turn = flipper.turned(torch.tensor(angle, dtype=torch.float64)).numpy()
         samples.points[first] = joint + samples.points[first] @ turn.T
         samples.tangents[first] = samples.tangents[first] @ turn.T
+        samples.drives_with(str(entry["drive"]), root)
         samples.point_flippers[first][:] = len(samples.flippers)
+        samples.point_joints[first][:] = len(moving.joints)
+        moving.joints.append(moving.flipper(entry, where, joint, angle, length))
         samples.flippers.append(flipper)
         samples.angles.append(angle)
 
@@ -326,6 +342,10 @@ class _Samples:
         self.point_drives: list[np.ndarray] = []
         self.outward: list[np.ndarray] = []
         self.point_flippers: list[np.ndarray] = []
+        self.point_joints: list[np.ndarray] = []
+        self.radii: dict[str, float] = {}
+        self.members: dict[str, list[int]] = {}
+        self.free: set[str] = set()
         self.drives: list[str] = []
         self.flippers: list[Flipper] = []
         self.angles: list[float] = []
@@ -345,4 +365,10 @@ class _Samples:
         self.tangents.append(tangents)
         self.outward.append(np.zeros_like(points) if outward is None else outward)
         self.point_flippers.append(np.full(len(points), -1))
+        self.point_joints.append(np.full(len(points), -1))
         self.point_drives.append(np.full(len(points), -1 if drive is None else self.drives.index(str(drive))))
+
+    def drives_with(self, drive: str, radius: float) -> None:
+        """A track's or flipper's drive and the radius at which it turns the belt [m]."""
+        self.radii.setdefault(drive, radius)
+        self.members.setdefault(drive, [self.drives.index(drive)])

@@ -10,6 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from monoforce_ros.robots.joint import Coordinate, Joint
+from monoforce_ros.robots.kinematics import SteeredDrive
 from monoforce_ros.robots.mass import add_point_mass
 
 
@@ -86,6 +88,20 @@ class RobotModel:
     """Effects of the robot: names and parameter values, see :mod:`monoforce_ros.effects`."""
     effect_intervals: tuple[tuple[str, Mapping[str, tuple[float, float]]], ...] = ()
     """95 % confidence intervals of effect parameters, where known."""
+    joints: tuple[Joint, ...] = ()
+    """What moves in the body: springs and rockers first, which may carry others; flippers last."""
+    joint_angles: Tensor | None = None
+    """Angles of the joints at which the points are given [rad], ``[J]``."""
+    point_joints: Tensor | None = None
+    """Index of the joint that carries each point, ``[N]`` int64; -1 on the body."""
+    point_grip: Tensor | None = None
+    """0 for points of wheels that roll freely, 1 elsewhere, ``[N]``; None: 1."""
+    motors: tuple[Coordinate | None, ...] = ()
+    """Limits of each drive, at the rim of its wheels (m for rad, N for N m); empty: none has any."""
+    steered: SteeredDrive | None = None
+    """Inverse kinematics of a robot that steers wheels; None: it turns by different speeds of its sides."""
+    maximum_lateral_speed: float = float("inf")
+    """Largest commanded lateral speed [m/s]."""
 
     @property
     def number_of_drives(self) -> int:
@@ -118,7 +134,19 @@ class RobotModel:
             point_drives=self.point_drives[keep],
             point_flippers=flippers,
             point_outward=outward,
+            point_joints=None if self.point_joints is None else self.point_joints[keep],
+            point_grip=None if self.point_grip is None else self.point_grip[keep],
         )
+
+    @property
+    def moves_joints(self) -> bool:
+        """Whether a joint or drive responds to forces, so that its motion is part of every rollout."""
+        return any(joint.dynamics is not None for joint in self.joints) or any(self.motors)
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints."""
+        return tuple(joint.name for joint in self.joints)
 
     @property
     def ground_clearance(self) -> float:
@@ -136,6 +164,7 @@ class RobotModel:
         angles = angles.to(self.points)
         points, tangents = self.points.clone(), self.point_tangents.clone()
         mass, centre, inertia = self.mass, self.centre_of_mass, self.inertia
+        turns = (angles.detach() - current.detach()).tolist()
         for index, flipper in enumerate(self.flippers):
             before, after = flipper.turned(current[index]), flipper.turned(angles[index])
             turn = after @ before.T
@@ -147,8 +176,15 @@ class RobotModel:
             for sign, pose in ((-1.0, before), (1.0, after)):
                 place = joint + flipper.centre * pose[:, 0]
                 mass, centre, inertia = add_point_mass(mass, centre, inertia, sign * flipper_mass, place)
+        joint_angles, joints = self.joint_angles, self.joints
+        if joint_angles is not None and self.flippers:
+            joint_angles = torch.cat([joint_angles[: -len(self.flippers)], angles])
+            moved = [joint.turned(angle) for joint, angle in zip(self.joints[-len(angles) :], turns, strict=True)]
+            joints = (*self.joints[: -len(angles)], *moved)
         return replace(
             self,
+            joints=joints,
+            joint_angles=joint_angles,
             points=points,
             point_tangents=tangents,
             mass=mass,
@@ -158,22 +194,34 @@ class RobotModel:
         )
 
     def limited_twist(self, twist: Tensor) -> Tensor:
-        """A commanded twist ``[..., 2]`` [m/s, rad/s], limited to the robot's maximum speed and yaw rate."""
+        """A commanded twist ``[..., 2]`` or ``[..., 3]`` (forward, yaw rate, lateral) within the robot's limits."""
         forward = twist[..., :1].clamp(-self.maximum_speed, self.maximum_speed)
-        yaw_rate = twist[..., 1:].clamp(-self.maximum_yaw_rate, self.maximum_yaw_rate)
-        return torch.cat([forward, yaw_rate], dim=-1)
+        yaw_rate = twist[..., 1:2].clamp(-self.maximum_yaw_rate, self.maximum_yaw_rate)
+        lateral = twist[..., 2:].clamp(-self.maximum_lateral_speed, self.maximum_lateral_speed)
+        return torch.cat([forward, yaw_rate, lateral], dim=-1)
 
     def drive_speeds(self, twist: Tensor) -> Tensor:
         """Ideal drive speeds of a commanded twist, limited to the robot's maximum speeds.
 
         Args:
-            twist: forward speed [m/s] and yaw rate [rad/s], ``[..., 2]``.
+            twist: forward speed [m/s], yaw rate [rad/s] and, optionally, lateral speed [m/s], ``[..., 2]`` or
+                ``[..., 3]``.
 
         Returns:
             surface speed of each drive [m/s], ``[..., D]``, positive forward.
         """
-        forward, yaw_rate = self.limited_twist(twist).split(1, dim=-1)
-        return forward - yaw_rate * self.drive_offsets.to(twist)
+        return self.command(twist)[0]
+
+    def command(self, twist: Tensor) -> tuple[Tensor, Tensor]:
+        """Ideal drive speeds ``[..., D]`` [m/s] and steering angles ``[..., S]`` [rad] of a commanded twist.
+
+        Steering angles are in the order of ``steered.joints``; ``S`` is 0 for a robot that does not steer.
+        """
+        limited = self.limited_twist(twist)
+        if self.steered is not None:
+            return self.steered.command(limited)
+        forward, yaw_rate = limited[..., :1], limited[..., 1:2]
+        return forward - yaw_rate * self.drive_offsets.to(twist), limited[..., :0]
 
     def to(self, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> RobotModel:
         """The same robot with its floating-point tensors in another precision or on another device."""

@@ -24,6 +24,7 @@ class ContactFunctions:
     may_touch: Any
     below_ground: Any
     touch_ground: Any
+    belt_speed: Any
     over_the_step: Any
 
 
@@ -31,7 +32,7 @@ class ContactFunctions:
 def contact_functions(double: bool) -> ContactFunctions:
     """Device functions in float64 (``double``) or float32."""
     t = types(double)
-    scalar, vec3, vec4, mat33 = t.scalar, t.vec3, t.vec4, t.mat33
+    scalar, vec2, vec3, vec4, mat33 = t.scalar, t.vec2, t.vec3, t.vec4, t.mat33
     Ground, Body, Robots, States, State, Options, Touch = (
         t.Ground, t.Body, t.Robots, t.States, t.State, t.Options, t.Touch
     )  # fmt: skip
@@ -102,13 +103,16 @@ def contact_functions(double: bool) -> ContactFunctions:
         options: Options,
         page: int,
         b: int,
-        step: int,
         i: int,
-        state: State,
-        arm: vec3,
+        point: vec3,
+        velocity: vec3,
+        turned: mat33,
+        speed: scalar,
+        grip: scalar,
     ) -> Touch:
+        # ``turned`` is the rotation of the link that carries the point, ``speed`` that of its belt. The grip is 0 on
+        # wheels that roll freely.
         touch = Touch()
-        point = state.position + arm
         raw_x = (point[0] - ground.origin_x) * ground.inverse_resolution
         raw_y = (point[1] - ground.origin_y) * ground.inverse_resolution
         column = corner(raw_x, ground.columns)
@@ -161,7 +165,6 @@ def contact_functions(double: bool) -> ContactFunctions:
             area = body.areas[i]
             factors = robots.friction[b]
             ground_factors = robots.ground_factors[b]
-            turned = state.rotation
             # Faces of the hull meet steep ground stiffly, and it pushes them inwards.
             depth = gap * normal[2]
             outward = turned * body.outward[i]
@@ -174,9 +177,7 @@ def contact_functions(double: bool) -> ContactFunctions:
             stiffness = material[0] / ground_factors[0] * rigid
             ground_damping = material[1] / ground_factors[0] * rigid
             resistance = robots.resistance[b]
-            velocity = state.linear + wp.cross(state.angular, arm)
-            # The hull has no drive; its tangents are zero.
-            belt = turned * (body.tangents[i] * robots.speeds[b, step, wp.max(body.drives[i], 0)])
+            belt = turned * (body.tangents[i] * speed)
             lateral = vec3(turned[0, 1], turned[1, 1], turned[2, 1])
             approach = -wp.dot(velocity, normal)
             spring = stiffness * depth
@@ -190,9 +191,9 @@ def contact_functions(double: bool) -> ContactFunctions:
             along = wp.cross(across, normal)
             velocity_along = wp.dot(velocity, along)
             velocity_across = wp.dot(velocity, across)
-            slip_along = velocity_along + wp.dot(belt, along)
+            slip_along = grip * (velocity_along + wp.dot(belt, along))
             slip_across = velocity_across + wp.dot(belt, across)
-            friction_along = material[2] * factors[0]
+            friction_along = grip * material[2] * factors[0]
             friction_across = material[2] * factors[1]
             force_along = scalar(0.0)
             force_across = scalar(0.0)
@@ -212,9 +213,13 @@ def contact_functions(double: bool) -> ContactFunctions:
                 force_across = friction_across * weight * (active_across - scalar(0.5))
                 gain_along = friction_along * weight * active_along * (scalar(1.0) - active_along)
                 gain_across = friction_across * weight * active_across * (scalar(1.0) - active_across)
+            touch.grip_force = vec2(force_along, force_across)
+            touch.grip_gain = vec2(gain_along, gain_across)
             # Rolling resistance and vegetation depend on the velocity of the body, not on slip.
-            speed = wp.sqrt(velocity_along * velocity_along + velocity_across * velocity_across + options.slip_square)
-            resistance_across = area * (ground_factors[1] * material[3]) * (scalar(1.0) + resistance[3] / speed)
+            over_ground = wp.sqrt(
+                velocity_along * velocity_along + velocity_across * velocity_across + options.slip_square
+            )
+            resistance_across = area * (ground_factors[1] * material[3]) * (scalar(1.0) + resistance[3] / over_ground)
             rolling = resistance[0] * load / wp.sqrt(velocity_along * velocity_along + options.slip_square)
             resistance_along = rolling + resistance_across
             force_along = force_along - resistance_along * velocity_along
@@ -230,13 +235,17 @@ def contact_functions(double: bool) -> ContactFunctions:
         return touch
 
     @wp.func
-    def over_the_step(touch: Touch, arm: vec3, change: vec3, turning_change: vec3) -> vec3:
+    def belt_speed(body: Body, robots: Robots, b: int, step: int, i: int) -> scalar:
+        # The hull has no drive; its tangents are zero.
+        return robots.speeds[b, step, wp.max(body.drives[i], 0)]
+
+    @wp.func
+    def over_the_step(touch: Touch, velocity_change: vec3) -> vec3:
         # The forces over the step, after the point's change of velocity has reduced them.
-        velocity_change = change + wp.cross(turning_change, arm)
         return vec3(
             wp.max(touch.force[0] - touch.gain[0] * wp.dot(touch.normal, velocity_change), scalar(0.0)),
             touch.force[1] - touch.gain[1] * wp.dot(touch.along, velocity_change),
             touch.force[2] - touch.gain[2] * wp.dot(touch.across, velocity_change),
         )
 
-    return ContactFunctions(state_at, may_touch, below_ground, touch_ground, over_the_step)
+    return ContactFunctions(state_at, may_touch, below_ground, touch_ground, belt_speed, over_the_step)

@@ -14,7 +14,9 @@ def forces_kernel(double: bool) -> Any:
     """The kernel in float64 (``double``) or float32."""
     t = types(double)
     functions = contact_functions(double)
-    state_at, touch_ground, over_the_step = functions.state_at, functions.touch_ground, functions.over_the_step
+    state_at, touch_ground, belt_speed, over_the_step = (
+        functions.state_at, functions.touch_ground, functions.belt_speed, functions.over_the_step
+    )  # fmt: skip
     scalar, vec3 = t.scalar, t.vec3
     Ground, Body, Robots, States, Options = t.Ground, t.Body, t.Robots, t.States, t.Options
 
@@ -37,14 +39,15 @@ def forces_kernel(double: bool) -> Any:
         page = wp.min(b, ground.height.shape[0] - 1)
         state = state_at(states, b, step)
         arm = state.rotation * (body.points[i] - robots.centre_of_mass[b])
-        touch = touch_ground(ground, body, robots, options, page, b, step, i, state, arm)
+        touch = touch_ground(
+            ground, body, robots, options, page, b, i, state.position + arm,
+            state.linear + wp.cross(state.angular, arm), state.rotation, belt_speed(body, robots, b, step, i),
+            scalar(1.0),
+        )  # fmt: skip
         if touch.active == 1:
-            acted = over_the_step(
-                touch,
-                arm,
-                states.velocity[b, step + 1] - state.linear,
-                states.angular_velocity[b, step + 1] - state.angular,
-            )
+            turning_change = states.angular_velocity[b, step + 1] - state.angular
+            change = states.velocity[b, step + 1] - state.linear + wp.cross(turning_change, arm)
+            acted = over_the_step(touch, change)
             normal_forces[b, slot, i] = acted[0]
             tangential = acted[1] * touch.along + acted[2] * touch.across
             tangential_forces[b, slot, i] = tangential

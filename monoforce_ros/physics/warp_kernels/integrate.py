@@ -10,6 +10,7 @@ from typing import Any
 
 import warp as wp
 
+from monoforce_ros.physics.warp_kernels.body import body_functions
 from monoforce_ros.physics.warp_kernels.contact import contact_functions
 from monoforce_ros.physics.warp_kernels.loads import external_loads
 from monoforce_ros.physics.warp_kernels.structs import types
@@ -21,23 +22,15 @@ def integrate_kernel(double: bool) -> Any:
     t = types(double)
     functions = contact_functions(double)
     loads_at = external_loads(double)
-    state_at, may_touch, below_ground, touch_ground = (
-        functions.state_at, functions.may_touch, functions.below_ground, functions.touch_ground
+    rigid = body_functions(double)
+    state_at, may_touch, below_ground, touch_ground, belt_speed = (
+        functions.state_at, functions.may_touch, functions.below_ground, functions.touch_ground, functions.belt_speed
     )  # fmt: skip
-    scalar, vec3, mat33 = t.scalar, t.vec3, t.mat33
+    exponential, gains_of, upper_block, lower_block, solved, Blocks = (
+        rigid.exponential, rigid.gains_of, rigid.upper_block, rigid.lower_block, rigid.solved, rigid.Blocks
+    )  # fmt: skip
+    scalar, vec3 = t.scalar, t.vec3
     Ground, Body, Robots, States, Options = t.Ground, t.Body, t.Robots, t.States, t.Options
-
-    @wp.func
-    def exponential(turn: vec3) -> mat33:
-        square = wp.dot(turn, turn)
-        first = scalar(1.0) - square / scalar(6.0)
-        second = scalar(0.5) - square / scalar(24.0)
-        if square >= scalar(1.0e-8):
-            angle = wp.sqrt(square)
-            first = wp.sin(angle) / angle
-            second = (scalar(1.0) - wp.cos(angle)) / square
-        cross = wp.skew(turn)
-        return wp.identity(n=3, dtype=scalar) + first * cross + second * (cross * cross)
 
     @wp.kernel(module="unique")
     def integrate(
@@ -80,7 +73,11 @@ def integrate_kernel(double: bool) -> Any:
                                 arm = turned * (body.points[i] - offset)
                                 # Most of the remaining points are in the air.
                                 if below_ground(ground, page, options.lookup, state.position + arm):
-                                    touch = touch_ground(ground, body, robots, options, page, b, step, i, state, arm)
+                                    touch = touch_ground(
+                                        ground, body, robots, options, page, b, i, state.position + arm,
+                                        state.linear + wp.cross(state.angular, arm), turned,
+                                        belt_speed(body, robots, b, step, i), scalar(1.0),
+                                    )  # fmt: skip
                                     acting = (
                                         touch.force[0] * touch.normal
                                         + touch.force[1] * touch.along
@@ -88,43 +85,14 @@ def integrate_kernel(double: bool) -> Any:
                                     )
                                     force = force + acting
                                     torque = torque + wp.cross(arm, acting)
-                                    normal = touch.normal
-                                    along = touch.along
-                                    across = touch.across
-                                    stiff = touch.gain[0] * normal
-                                    rolls = touch.gain[1] * along
-                                    slides = touch.gain[2] * across
-                                    # Entries of the symmetric gain matrix G, of G [arm]×, and of [arm]× G [arm]×.
-                                    xx = stiff[0] * normal[0] + rolls[0] * along[0] + slides[0] * across[0]
-                                    yy = stiff[1] * normal[1] + rolls[1] * along[1] + slides[1] * across[1]
-                                    zz = stiff[2] * normal[2] + rolls[2] * along[2] + slides[2] * across[2]
-                                    yz = stiff[1] * normal[2] + rolls[1] * along[2] + slides[1] * across[2]
-                                    xz = stiff[0] * normal[2] + rolls[0] * along[2] + slides[0] * across[2]
-                                    xy = stiff[0] * normal[1] + rolls[0] * along[1] + slides[0] * across[1]
-                                    first = vec3(
-                                        xy * arm[2] - xz * arm[1], xz * arm[0] - xx * arm[2], xx * arm[1] - xy * arm[0]
-                                    )
-                                    second = vec3(
-                                        yy * arm[2] - yz * arm[1], yz * arm[0] - xy * arm[2], xy * arm[1] - yy * arm[0]
-                                    )
-                                    third = vec3(
-                                        yz * arm[2] - zz * arm[1], zz * arm[0] - xz * arm[2], xz * arm[1] - yz * arm[0]
-                                    )
-                                    diagonal = diagonal + vec3(xx, yy, zz)
-                                    off_diagonal = off_diagonal + vec3(yz, xz, xy)
-                                    mixed_x = mixed_x + first
-                                    mixed_y = mixed_y + second
-                                    mixed_z = mixed_z + third
-                                    turning_diagonal = turning_diagonal + vec3(
-                                        arm[1] * third[0] - arm[2] * second[0],
-                                        arm[2] * first[1] - arm[0] * third[1],
-                                        arm[0] * second[2] - arm[1] * first[2],
-                                    )
-                                    turning_off_diagonal = turning_off_diagonal + vec3(
-                                        arm[2] * first[2] - arm[0] * third[2],
-                                        arm[1] * third[2] - arm[2] * second[2],
-                                        arm[1] * third[1] - arm[2] * second[1],
-                                    )
+                                    gains = gains_of(touch, arm)
+                                    diagonal = diagonal + gains.diagonal
+                                    off_diagonal = off_diagonal + gains.off_diagonal
+                                    mixed_x = mixed_x + gains.mixed_x
+                                    mixed_y = mixed_y + gains.mixed_y
+                                    mixed_z = mixed_z + gains.mixed_z
+                                    turning_diagonal = turning_diagonal + gains.turning_diagonal
+                                    turning_off_diagonal = turning_off_diagonal + gains.turning_off_diagonal
             summed[thread, slot, 0] = force
             summed[thread, slot, 1] = torque
             summed[thread, slot, 2] = diagonal
@@ -138,33 +106,20 @@ def integrate_kernel(double: bool) -> Any:
             loads = loads_at(robots, options, b, state)
             total_force = summed[thread, slot, 0] + loads.force
             total_torque = summed[thread, slot, 1] + loads.torque
-            d = summed[thread, slot, 2]
-            o = summed[thread, slot, 3]
-            td = summed[thread, slot, 4]
-            to = summed[thread, slot, 5]
             h = options.time_step
             world_inertia = turned * robots.inertia[b] * wp.transpose(turned)
             total_torque = total_torque - wp.cross(state.angular, world_inertia * state.angular)
-            m = robots.mass[b] + h * loads.drag
-            upper = mat33(
-                m + h * d[0], h * o[2], h * o[1],
-                h * o[2], m + h * d[1], h * o[0],
-                h * o[1], h * o[0], m + h * d[2],
-            )  # fmt: skip
-            # Velocities of points are v - [arm]× ω, hence the signs.
-            lower = world_inertia - h * mat33(
-                td[0], to[2], to[1],
-                to[2], td[1], to[0],
-                to[1], to[0], td[2],
-            )  # fmt: skip
-            side = -h * wp.matrix_from_rows(summed[thread, slot, 6], summed[thread, slot, 7], summed[thread, slot, 8])
-            inverse = wp.inverse(upper)
-            reduced = wp.transpose(side) * inverse
-            right = h * total_force
-            turn_change = wp.inverse(lower - reduced * side) * (h * total_torque - reduced * right)
-            change = inverse * (right - side * turn_change)
-            new_linear = state.linear + change
-            new_angular = state.angular + turn_change
+            blocks = Blocks()
+            blocks.upper = upper_block(
+                robots.mass[b] + h * loads.drag, h, summed[thread, slot, 2], summed[thread, slot, 3]
+            )
+            blocks.lower = lower_block(world_inertia, h, summed[thread, slot, 4], summed[thread, slot, 5])
+            blocks.side = -h * wp.matrix_from_rows(
+                summed[thread, slot, 6], summed[thread, slot, 7], summed[thread, slot, 8]
+            )
+            change = solved(blocks, h * total_force, h * total_torque)
+            new_linear = state.linear + change.linear
+            new_angular = state.angular + change.angular
             states.velocity[b, step + 1] = new_linear
             states.angular_velocity[b, step + 1] = new_angular
             states.centre[b, step + 1] = state.position + h * new_linear

@@ -37,6 +37,7 @@ def external_loads(double: bool) -> Any:
             wp.sin(tilt[1]), -wp.sin(tilt[0]) * level, wp.cos(tilt[0]) * level
         )
         drag = resistance[1] + resistance[2] * wp.sqrt(wp.dot(linear, linear) + scalar(SMALLEST_SPEED_SQUARE))
+        loads.weight = weight
         loads.force = weight - drag * linear + turned * vec3(extra[0], extra[1], extra[2])
         loads.torque = turned * vec3(extra[3], extra[4], extra[5])
         loads.drag = drag

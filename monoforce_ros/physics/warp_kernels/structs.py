@@ -32,6 +32,8 @@ class Types:
     Options: Any
     Touch: Any
     Loads: Any
+    Joints: Any
+    Links: Any
 
 
 @cache
@@ -90,6 +92,9 @@ def types(double: bool) -> Types:
         rotation: wp.array2d(dtype=mat33)
         velocity: wp.array2d(dtype=vec3)
         angular_velocity: wp.array2d(dtype=vec3)
+        angles: wp.array3d(dtype=scalar)  # of joints, [B, T + 1, J]; these three only where something moves
+        rates: wp.array3d(dtype=scalar)
+        belts: wp.array3d(dtype=scalar)  # of drives, [B, T + 1, D]
 
     @wp.struct
     class State:  # of one trajectory at one step
@@ -115,12 +120,38 @@ def types(double: bool) -> Types:
         across: vec3
         force: vec3  # along normal, along, across
         gain: vec3
+        grip_force: vec2  # friction alone, which also acts on the belt
+        grip_gain: vec2
 
     @wp.struct
     class Loads:  # other than contact, about the centre of mass
         force: vec3
         torque: vec3
         drag: scalar
+        weight: vec3
+
+    @wp.struct
+    class Joints:  # J joints, then D drives; K of them with dynamics
+        number: int  # J
+        size: int  # K
+        axes: wp.array(dtype=vec3)  # [J]
+        origins: wp.array(dtype=vec3)
+        places: wp.array(dtype=vec3)
+        masses: wp.array(dtype=scalar)
+        rest: wp.array(dtype=scalar)
+        slides: wp.array(dtype=wp.int32)
+        parents: wp.array(dtype=wp.int32)
+        coordinates: wp.array(dtype=wp.int32)  # [J + D], -1 without dynamics
+        parameters: wp.array2d(dtype=scalar)  # [J + D, 11]
+        links: wp.array(dtype=wp.int32)  # of each point
+        grip: wp.array(dtype=scalar)  # of each point
+        target_angles: wp.array3d(dtype=scalar)  # [B, T, J]
+        target_rates: wp.array3d(dtype=scalar)
+
+    @wp.struct
+    class Links:  # [threads, slots, L], in terrain axes relative to the centre of mass
+        turns: wp.array3d(dtype=mat33)
+        frames: wp.array4d(dtype=vec3)  # shift, spin, drift, axis, origin, place
 
     return Types(
         scalar,
@@ -138,4 +169,6 @@ def types(double: bool) -> Types:
         Options,
         Touch,
         Loads,
+        Joints,
+        Links,
     )

@@ -14,8 +14,8 @@ def summarise_kernel(double: bool) -> Any:
     """The kernel in float64 (``double``) or float32."""
     t = types(double)
     functions = contact_functions(double)
-    state_at, may_touch, touch_ground, over_the_step = (
-        functions.state_at, functions.may_touch, functions.touch_ground, functions.over_the_step
+    state_at, may_touch, touch_ground, belt_speed, over_the_step = (
+        functions.state_at, functions.may_touch, functions.touch_ground, functions.belt_speed, functions.over_the_step
     )  # fmt: skip
     scalar, vec3 = t.scalar, t.vec3
     Ground, Body, Robots, States, Options = t.Ground, t.Body, t.Robots, t.States, t.Options
@@ -48,6 +48,7 @@ def summarise_kernel(double: bool) -> Any:
         push = vec3()
         whole = vec3()
         for group in range(body.group_halves.shape[0]):
+            # Most groups, and in them most clusters, are above all ground within reach and are skipped.
             centre = state.position + turned * (body.group_centres[group] - offset)
             if may_touch(ground, ground.group_ceiling, page, centre, turned, body.group_halves[group]):
                 for cluster in range(body.group_edges[group], body.group_edges[group + 1]):
@@ -55,9 +56,13 @@ def summarise_kernel(double: bool) -> Any:
                     if may_touch(ground, ground.ceiling, page, middle, turned, body.cluster_halves[cluster]):
                         for i in range(body.cluster_edges[cluster], body.cluster_edges[cluster + 1]):
                             arm = turned * (body.points[i] - offset)
-                            touch = touch_ground(ground, body, robots, options, page, b, step, i, state, arm)
+                            touch = touch_ground(
+                                ground, body, robots, options, page, b, i, state.position + arm,
+                                state.linear + wp.cross(state.angular, arm), turned,
+                                belt_speed(body, robots, b, step, i), scalar(1.0),
+                            )  # fmt: skip
                             if touch.active == 1:
-                                acted = over_the_step(touch, arm, change, turning_change)
+                                acted = over_the_step(touch, change + wp.cross(turning_change, arm))
                                 tangential = acted[1] * touch.along + acted[2] * touch.across
                                 whole = whole + acted[0] * touch.normal + tangential
                                 if touch.normal[2] < steep:

@@ -1,0 +1,365 @@
+"""Articulation: joints, free wheels and motors of a rollout, and the poses of the links that they move.
+
+A link is what one joint moves; link 0 is the body, link j + 1 belongs to joint j. Joints and drives with dynamics are
+the coordinates of a system that is solved together with the body's six velocities.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from monoforce_ros.physics.rotation import exponential_map
+from monoforce_ros.robots import Controls, Coordinate, RobotModel
+
+PARAMETERS = (
+    "inertia", "stiffness", "damping", "preload", "stall_torque", "no_load_rate", "maximum_torque", "maximum_power",
+    "low", "high", "stop_stiffness",
+)  # fmt: skip
+"""Columns of :attr:`Articulation.parameters`, fields of :class:`Coordinate`."""
+UNLIMITED = 1e30
+"""Stands for infinity: a product with zero stays zero."""
+SLOWEST = 1e-3
+"""Smallest rate at which a power limits a torque [rad/s or m/s]; below it the torque limits do."""
+
+
+@dataclass(frozen=True)
+class Articulation:
+    """What moves in the body; ``J`` joints, ``D`` drives, ``K`` of them with dynamics."""
+
+    axes: Tensor
+    """``[J, 3]``."""
+    origins: Tensor
+    """``[J, 3]`` [m]."""
+    places: Tensor
+    """Centre of each joint's mass at the rest angles, ``[J, 3]`` [m]."""
+    masses: Tensor
+    """``[J]`` [kg]."""
+    rest: Tensor
+    """Angles at which the robot's points are given, ``[J]`` [rad]."""
+    slides: tuple[bool, ...]
+    parents: tuple[int, ...]
+    point_links: Tensor
+    """Link of each point, ``[N]`` int64."""
+    grip: Tensor
+    """0 for points of wheels that roll freely, else 1, ``[N]``."""
+    coordinates: tuple[int, ...]
+    """Index of each joint, then of each drive, among the coordinates; -1 without dynamics. ``J + D`` entries."""
+    parameters: Tensor
+    """Dynamics of each joint and drive, ``[J + D, 11]``, see :data:`PARAMETERS`."""
+    target_angles: Tensor
+    """``[B, T, J]`` [rad]."""
+    target_rates: Tensor
+    """``[B, T, J]`` [rad/s]."""
+    angles: Tensor
+    """Angles at all steps ``[B, T + 1, J]`` [rad]; of joints with dynamics, the start matters only."""
+    rates: Tensor
+    """``[B, T + 1, J]`` [rad/s], likewise."""
+    belts: Tensor
+    """Surface speeds of the drives ``[B, T + 1, D]`` [m/s], likewise."""
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates."""
+        return max(self.coordinates, default=-1) + 1
+
+    @property
+    def dynamic_joints(self) -> list[int]:
+        """Joints with dynamics."""
+        return [joint for joint in range(len(self.slides)) if self.coordinates[joint] >= 0]
+
+    @property
+    def dynamic_drives(self) -> list[int]:
+        """Drives with dynamics."""
+        joints = len(self.slides)
+        return [drive for drive, index in enumerate(self.coordinates[joints:]) if index >= 0]
+
+    @classmethod
+    def of(
+        cls, robot: RobotModel, controls: Controls, speeds: Tensor, velocity: Tensor, rates: Tensor, time_step: float
+    ) -> Articulation | None:
+        """What moves in a robot under controls; None if nothing does.
+
+        Args:
+            robot: robot, in the precision of the rollout.
+            controls: angles and rates of its joints.
+            speeds: drive speeds, finite, ``[B, T, D]`` [m/s].
+            velocity: velocity of the base frame's origin at the start in base axes, ``[B, 3]`` [m/s].
+            rates: angular velocity at the start in base axes, ``[B, 3]`` [rad/s].
+            time_step: [s].
+        """
+        commanded = controls.joint_angles is not None and bool(robot.joints)
+        if not commanded and not robot.moves_joints and robot.point_grip is None:
+            return None
+        batch, steps, drives = speeds.shape
+        joints, like = robot.joints, robot.points
+        number = len(joints)
+        rest = like.new_zeros(0) if robot.joint_angles is None else robot.joint_angles.to(like)
+        targets = rest.expand(batch, steps, number) if controls.joint_angles is None else controls.joint_angles
+        target_rates = torch.zeros_like(targets) if controls.joint_rates is None else controls.joint_rates
+        targets, target_rates = targets.to(speeds), target_rates.to(speeds)
+        motors = robot.motors or (None,) * drives
+        dynamics = [*(joint.dynamics for joint in joints), *motors]
+        coordinates, found = [], 0
+        for entry in dynamics:
+            coordinates.append(found if entry is not None else -1)
+            found += entry is not None
+        first = targets[:, 0] if steps else rest.expand(batch, number)
+        start = first if controls.start_angles is None else controls.start_angles.to(speeds)
+        start_rates = torch.zeros_like(start) if controls.start_rates is None else controls.start_rates.to(speeds)
+        free = torch.tensor([joint.dynamics is not None for joint in joints], device=like.device, dtype=torch.bool)
+        powered = torch.tensor([motor is not None for motor in motors], device=like.device)
+        point_joints = robot.point_joints
+        built = cls(
+            axes=_table(like, [joint.axis for joint in joints]),
+            origins=_table(like, [joint.origin for joint in joints]),
+            places=_table(like, [joint.place for joint in joints]),
+            masses=like.new_tensor([joint.mass for joint in joints]),
+            rest=rest,
+            slides=tuple(joint.slides for joint in joints),
+            parents=tuple(joint.parent for joint in joints),
+            point_links=torch.zeros_like(robot.point_drives) if point_joints is None else point_joints + 1,
+            grip=torch.ones_like(robot.point_areas) if robot.point_grip is None else robot.point_grip.to(like),
+            coordinates=tuple(coordinates),
+            parameters=_parameters(like, dynamics),
+            target_angles=targets,
+            target_rates=target_rates,
+            angles=_history(targets, start, free, target_rates, time_step),
+            rates=_history(target_rates, start_rates, free),
+            belts=speeds.new_zeros(batch, steps + 1, drives),
+        )
+        rolling = built._rolling_speeds(robot, velocity, rates)
+        return replace(built, belts=_history(speeds, rolling, powered))
+
+    def _rolling_speeds(self, robot: RobotModel, velocity: Tensor, rates: Tensor) -> Tensor:
+        """Surface speeds at which the drives roll at the start, ``[B, D]`` [m/s], from the motion in base axes."""
+        turns = self.poses(self.angles[:, 0], self.rates[:, 0], None).turns
+        listed = []
+        for drive in range(len(self.coordinates) - len(self.slides)):
+            chosen = robot.point_drives == drive
+            middle = robot.points[chosen].mean(dim=0)
+            ahead = turns[:, self.point_links[chosen][0], :, 0]
+            moving = velocity + torch.linalg.cross(rates, middle.expand_as(rates))
+            listed.append((moving * ahead).sum(-1))
+        return torch.stack(listed, dim=-1)
+
+    def poses(self, angles: Tensor, rates: Tensor, body: BodyMass | None) -> LinkPoses:
+        """Poses of all links in base axes relative to the centre of mass.
+
+        Args:
+            angles: ``[B, J]`` [rad].
+            rates: ``[B, J]`` [rad/s].
+            body: mass properties at the rest angles; None neglects that they change, about the base frame.
+        """
+        batch, like = angles.shape[0], angles
+        zero, identity = like.new_zeros(batch, 3), torch.eye(3, dtype=like.dtype, device=like.device)
+        turns, shifts, spins, drifts = [identity.expand(batch, 3, 3)], [zero], [zero], [zero]
+        axes, origins, places, place_rates = [], [], [], []
+        for joint, (slides, parent) in enumerate(zip(self.slides, self.parents, strict=True)):
+            carrier = parent + 1
+            axis = turns[carrier] @ self.axes[joint]
+            origin = turns[carrier] @ self.origins[joint] + shifts[carrier]
+            moved = (angles[:, joint] - self.rest[joint])[:, None]
+            speed = rates[:, joint, None]
+            if slides:
+                turns.append(turns[carrier])
+                shifts.append(shifts[carrier] + axis * moved)
+                spins.append(spins[carrier])
+                drifts.append(drifts[carrier] + axis * speed)
+            else:
+                turn = exponential_map(axis * moved) @ turns[carrier]
+                turns.append(turn)
+                shifts.append(origin - turn @ self.origins[joint])
+                spins.append(spins[carrier] + axis * speed)
+                drifts.append(drifts[carrier] - torch.linalg.cross(axis * speed, origin))
+            axes.append(axis)
+            origins.append(origin)
+            place = turns[-1] @ self.places[joint] + shifts[-1]
+            places.append(place)
+            place_rates.append(torch.linalg.cross(spins[-1], place) + drifts[-1])
+        if body is None:
+            centre, centre_rate, inertia = zero, zero, identity.expand(batch, 3, 3)
+        else:
+            centre, centre_rate = body.centre, zero
+            inertia = body.inertia
+            for joint, (place, rate) in enumerate(zip(places, place_rates, strict=True)):
+                share = (self.masses[joint] / body.mass)[:, None]
+                centre = centre + share * (place - self.places[joint])
+                centre_rate = centre_rate + share * rate
+                before, after = self.places[joint] - body.centre, place - body.centre
+                inertia = inertia + self.masses[joint] * (_square(after) - _square(before))
+            # The sum is about the centre of mass at the rest angles.
+            inertia = inertia - body.mass[:, None, None] * _square(centre - body.centre)
+        return LinkPoses(
+            turns=torch.stack(turns, 1),
+            shifts=torch.stack([shift - centre for shift in shifts], 1),
+            spins=torch.stack(spins, 1),
+            drifts=torch.stack(
+                [
+                    torch.linalg.cross(spin, centre) + drift - centre_rate
+                    for spin, drift in zip(spins, drifts, strict=True)
+                ],
+                1,
+            ),
+            axes=_stacked(axes, zero),
+            origins=_stacked([origin - centre for origin in origins], zero),
+            places=_stacked([place - centre for place in places], zero),
+            centre=centre,
+            centre_rate=centre_rate,
+            inertia=inertia,
+        )
+
+    def centres(self, angles: Tensor, rates: Tensor, body: BodyMass) -> tuple[Tensor, Tensor]:
+        """Centre of mass in the base frame and its velocity at all steps, each ``[B, S, 3]``.
+
+        Args:
+            angles, rates: of the joints, ``[B, S, J]``.
+            body: mass properties at the rest angles.
+        """
+        batch, steps, _ = angles.shape
+        if not bool((self.masses > 0).any()):
+            centre = body.centre[:, None].expand(batch, steps, 3)
+            return centre, torch.zeros_like(centre)
+        poses = self.poses(angles.flatten(0, 1), rates.flatten(0, 1), body.repeated(steps))
+        return poses.centre.unflatten(0, (batch, steps)), poses.centre_rate.unflatten(0, (batch, steps))
+
+    def world_poses(self, angles: Tensor, rates: Tensor, rotation: Tensor, body: BodyMass) -> LinkPoses:
+        """Poses in terrain axes at many steps, as a batch ``[B S]``.
+
+        Args:
+            angles, rates: ``[B, S, J]``.
+            rotation: terrain ← base, ``[B, S, 3, 3]``.
+            body: mass properties at the rest angles.
+        """
+        poses = self.poses(angles.flatten(0, 1), rates.flatten(0, 1), body.repeated(angles.shape[1]))
+        return poses.turned(rotation.flatten(0, 1))
+
+    def carried_by(self, joint: int) -> Tensor:
+        """Which points a joint moves, itself or through a joint that it carries, ``[N]`` bool."""
+        links = [joint + 1, *(other + 1 for other, parent in enumerate(self.parents) if parent == joint)]
+        return torch.isin(self.point_links, torch.tensor(links, device=self.point_links.device))
+
+
+@dataclass(frozen=True)
+class BodyMass:
+    """Mass properties of the whole robot at the rest angles of its joints."""
+
+    mass: Tensor
+    """``[B]`` [kg]."""
+    centre: Tensor
+    """Centre of mass in the base frame, ``[B, 3]`` [m]."""
+    inertia: Tensor
+    """About it in base axes, ``[B, 3, 3]`` [kg m²]."""
+
+    def repeated(self, steps: int) -> BodyMass:
+        """The same for each of ``steps`` steps of a trajectory, ``[B S]``."""
+        return BodyMass(*(value.repeat_interleave(steps, 0) for value in (self.mass, self.centre, self.inertia)))
+
+
+@dataclass(frozen=True)
+class LinkPoses:
+    """Links and joints at one time, in base axes; positions are relative to the centre of mass."""
+
+    turns: Tensor
+    """Rotation base ← link, ``[B, L, 3, 3]``."""
+    shifts: Tensor
+    """Position of the link's points: ``turns @ point + shifts``, ``[B, L, 3]`` [m]."""
+    spins: Tensor
+    """Angular velocity relative to the body, ``[B, L, 3]`` [rad/s]."""
+    drifts: Tensor
+    """Velocity of the link where the centre of mass is, relative to the body moving with it, ``[B, L, 3]`` [m/s]."""
+    axes: Tensor
+    """``[B, J, 3]``."""
+    origins: Tensor
+    """A point on each axis, ``[B, J, 3]`` [m]."""
+    places: Tensor
+    """Centres of the joints' masses, ``[B, J, 3]`` [m]."""
+    centre: Tensor
+    """Centre of mass in the base frame, ``[B, 3]`` [m]."""
+    centre_rate: Tensor
+    """Its velocity in the base frame, ``[B, 3]`` [m/s]."""
+    inertia: Tensor
+    """About the centre of mass, ``[B, 3, 3]`` [kg m²]."""
+
+    def turned(self, rotation: Tensor) -> LinkPoses:
+        """The same with all but ``centre`` and ``centre_rate`` in terrain axes; ``rotation`` ``[B, 3, 3]``."""
+        across = rotation.transpose(1, 2)
+        return LinkPoses(
+            turns=rotation[:, None] @ self.turns,
+            shifts=self.shifts @ across,
+            spins=self.spins @ across,
+            drifts=self.drifts @ across,
+            axes=self.axes @ across,
+            origins=self.origins @ across,
+            places=self.places @ across,
+            centre=self.centre,
+            centre_rate=self.centre_rate,
+            inertia=rotation @ self.inertia @ across,
+        )
+
+
+def coordinate_torque(
+    parameters: Tensor, angle: Tensor, rate: Tensor, target: Tensor, target_rate: Tensor, time_step: float
+) -> tuple[Tensor, Tensor]:
+    """Torque of springs, servos and stops, and the rate at which it decreases with the coordinate's rate.
+
+    Linearly implicit like the contact forces: springs act at the position after the step.
+
+    Args:
+        parameters: ``[K, 11]``, see :data:`PARAMETERS`.
+        angle, rate, target, target_rate: ``[B, K]``.
+        time_step: [s].
+
+    Returns:
+        torque ``[B, K]`` [N m] and gain ``[B, K]`` [N m s/rad], never negative.
+    """
+    _, stiffness, damping, preload, stall, no_load, strongest, power, low, high, stop = parameters.unbind(-1)
+    gain = damping + time_step * stiffness
+    demand = stiffness * (target - angle) + gain * (target_rate - rate)
+    sign = torch.where(demand >= 0, 1.0, -1.0).to(demand)
+    forward = (sign * rate).clamp_min(0.0)
+    curve = stall * (1.0 - forward / no_load).clamp_min(0.0)
+    by_power = power / forward.clamp_min(SLOWEST)
+    limit = torch.minimum(torch.minimum(curve, by_power), strongest.expand_as(curve))
+    saturated = demand.abs() > limit
+    falls = torch.where((curve <= limit) & (forward > 0) & (forward < no_load), stall / no_load, 0.0)
+    falls = falls + torch.where((by_power <= limit) & (forward > SLOWEST), by_power / forward.clamp_min(SLOWEST), 0.0)
+    torque = torch.where(saturated, sign * limit, demand) - preload
+    gain = torch.where(saturated, falls, gain)
+    ahead = angle + time_step * rate
+    beyond = torch.where(angle > high, ahead - high, torch.where(angle < low, ahead - low, 0.0))
+    outside = (angle > high) | (angle < low)
+    return torque - stop * beyond, gain + torch.where(outside, time_step * stop, 0.0)
+
+
+def _square(arm: Tensor) -> Tensor:
+    """``|r|² 1 - r rᵀ`` ``[B, 3, 3]`` (or ``[3, 3]``) of arms ``[B, 3]``: the inertia of a unit mass."""
+    identity = torch.eye(3, dtype=arm.dtype, device=arm.device)
+    return (arm * arm).sum(-1)[..., None, None] * identity - arm[..., :, None] * arm[..., None, :]
+
+
+def _stacked(listed: list[Tensor], like: Tensor) -> Tensor:
+    return torch.stack(listed, 1) if listed else like.new_zeros(like.shape[0], 0, 3)
+
+
+def _table(like: Tensor, rows: list[tuple[float, float, float]]) -> Tensor:
+    return like.new_tensor(rows).reshape(len(rows), 3)
+
+
+def _parameters(like: Tensor, dynamics: list[Coordinate | None]) -> Tensor:
+    rows = [[getattr(entry or Coordinate(1.0), name) for name in PARAMETERS] for entry in dynamics]
+    return like.new_tensor(rows).reshape(len(rows), len(PARAMETERS)).clamp(-UNLIMITED, UNLIMITED)
+
+
+def _history(
+    targets: Tensor, start: Tensor, dynamic: Tensor, rates: Tensor | None = None, time_step: float = 0.0
+) -> Tensor:
+    """Values at all steps ``[B, T + 1, J]``: those prescribed, and the start of those with dynamics."""
+    if not targets.shape[1]:
+        return start[:, None]
+    last = targets[:, -1:] if rates is None else targets[:, -1:] + time_step * rates[:, -1:]
+    prescribed = torch.cat([targets, last], dim=1)
+    first = torch.cat([start[:, None], torch.zeros_like(targets)], dim=1)
+    return torch.where(dynamic, first, prescribed)

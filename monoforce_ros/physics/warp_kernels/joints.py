@@ -1,0 +1,281 @@
+"""Links and coordinates of robots in which something moves, as device functions (formulas of ``articulation.py``).
+
+Values that a loop sums go through arrays before they are used further, see ``integrate.py``.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from monoforce_ros.physics.warp_kernels.body import body_functions
+from monoforce_ros.physics.warp_kernels.structs import types
+
+SLOWEST = 1e-3
+SHIFT, SPIN, DRIFT, AXIS, ORIGIN, PLACE = range(6)
+"""Columns of a link's frames."""
+TORQUE, GAIN, CONTACT, FORWARD, CHANGE = range(5)
+"""Columns of the values of a coordinate."""
+
+
+@dataclass(frozen=True)
+class JointFunctions:
+    """Device functions and structs of one precision."""
+
+    pose_links: Any
+    torque_at: Any
+    couple: Any
+    clear: Any
+    solve: Any
+    Work: Any
+
+
+@cache
+def joint_functions(double: bool) -> JointFunctions:
+    """Device functions in float64 (``double``) or float32."""
+    t = types(double)
+    exponential = body_functions(double).exponential
+    scalar, vec2, vec3, mat33 = t.scalar, t.vec2, t.vec3, t.mat33
+    Robots, States, Joints, Links, Touch, Body = t.Robots, t.States, t.Joints, t.Links, t.Touch, t.Body
+
+    @wp.struct
+    class Work:  # [threads, slots, …]
+        turns: wp.array3d(dtype=mat33)  # of links, in base axes
+        frames: wp.array4d(dtype=vec3)
+        centre: wp.array3d(dtype=vec3)  # centre of mass and its rate, in base axes
+        inertia: wp.array2d(dtype=mat33)
+        block: wp.array4d(dtype=scalar)  # of the body in the system, [6, 6]
+        joined: wp.array4d(dtype=scalar)  # contact gains between coordinates, then body and coordinates, [K + 6, K]
+        pivots: wp.array4d(dtype=scalar)  # of the factorisation L D Lᵀ, [K + 6, K + 6]
+        factor: wp.array4d(dtype=scalar)
+        values: wp.array4d(dtype=scalar)  # of each coordinate, then of the body, [K + 6, 5]
+
+    @wp.func
+    def square(arm: vec3) -> mat33:
+        return wp.dot(arm, arm) * wp.identity(n=3, dtype=scalar) - wp.outer(arm, arm)
+
+    @wp.func
+    def pose_links(
+        joints: Joints,
+        robots: Robots,
+        states: States,
+        work: Work,
+        links: Links,
+        b: int,
+        step: int,
+        thread: int,
+        slot: int,
+        turned: mat33,
+    ):
+        work.turns[thread, slot, 0] = wp.identity(n=3, dtype=scalar)
+        work.frames[thread, slot, 0, 0] = vec3()
+        work.frames[thread, slot, 0, 1] = vec3()
+        work.frames[thread, slot, 0, 2] = vec3()
+        nominal = robots.centre_of_mass[b]
+        centre = robots.centre_of_mass[b]
+        centre_rate = vec3()
+        inertia = robots.inertia[b]
+        for j in range(joints.number):
+            carrier = joints.parents[j] + 1
+            carried = work.turns[thread, slot, carrier]
+            shift = work.frames[thread, slot, carrier, 0]
+            spin = work.frames[thread, slot, carrier, 1]
+            drift = work.frames[thread, slot, carrier, 2]
+            axis = carried * joints.axes[j]
+            origin = carried * joints.origins[j] + shift
+            moved = (states.angles[b, step, j] - joints.rest[j]) * axis
+            rate = states.rates[b, step, j] * axis
+            if joints.slides[j] == 1:
+                work.turns[thread, slot, j + 1] = carried
+                work.frames[thread, slot, j + 1, 0] = shift + moved
+                work.frames[thread, slot, j + 1, 1] = spin
+                work.frames[thread, slot, j + 1, 2] = drift + rate
+            else:
+                turn = exponential(moved) * carried
+                work.turns[thread, slot, j + 1] = turn
+                work.frames[thread, slot, j + 1, 0] = origin - turn * joints.origins[j]
+                work.frames[thread, slot, j + 1, 1] = spin + rate
+                work.frames[thread, slot, j + 1, 2] = drift - wp.cross(rate, origin)
+            work.frames[thread, slot, j + 1, 3] = axis
+            work.frames[thread, slot, j + 1, 4] = origin
+            mass = joints.masses[j]
+            if mass > scalar(0.0):
+                start = joints.places[j]
+                place = work.turns[thread, slot, j + 1] * start + work.frames[thread, slot, j + 1, 0]
+                speed = wp.cross(work.frames[thread, slot, j + 1, 1], place) + work.frames[thread, slot, j + 1, 2]
+                work.frames[thread, slot, j + 1, 5] = place
+                share = mass / robots.mass[b]
+                centre = centre + share * (place - start)
+                centre_rate = centre_rate + share * speed
+                inertia = inertia + mass * (square(place - nominal) - square(start - nominal))
+        work.centre[thread, slot, 0] = centre
+        work.centre[thread, slot, 1] = centre_rate
+        work.inertia[thread, slot] = inertia
+        middle = work.centre[thread, slot, 0]
+        middle_rate = work.centre[thread, slot, 1]
+        for link in range(joints.number + 1):
+            links.turns[thread, slot, link] = turned * work.turns[thread, slot, link]
+            turning = work.frames[thread, slot, link, 1]
+            links.frames[thread, slot, link, 0] = turned * (work.frames[thread, slot, link, 0] - middle)
+            links.frames[thread, slot, link, 1] = turned * turning
+            links.frames[thread, slot, link, 2] = turned * (
+                wp.cross(turning, middle) + work.frames[thread, slot, link, 2] - middle_rate
+            )
+            if link > 0:
+                links.frames[thread, slot, link, 3] = turned * work.frames[thread, slot, link, 3]
+                links.frames[thread, slot, link, 4] = turned * (work.frames[thread, slot, link, 4] - middle)
+                links.frames[thread, slot, link, 5] = turned * (work.frames[thread, slot, link, 5] - middle)
+
+    @wp.func
+    def torque_at(
+        joints: Joints, entry: int, angle: scalar, rate: scalar, target: scalar, target_rate: scalar, h: scalar
+    ) -> vec2:
+        # Torque of springs, servos and stops, and the rate at which it decreases with the coordinate's rate.
+        gain = joints.parameters[entry, 2] + h * joints.parameters[entry, 1]
+        demand = joints.parameters[entry, 1] * (target - angle) + gain * (target_rate - rate)
+        sign = wp.where(demand >= scalar(0.0), scalar(1.0), scalar(-1.0))
+        forward = wp.max(sign * rate, scalar(0.0))
+        stall = joints.parameters[entry, 4]
+        no_load = joints.parameters[entry, 5]
+        curve = stall * wp.max(scalar(1.0) - forward / no_load, scalar(0.0))
+        moving = wp.max(forward, scalar(SLOWEST))
+        by_power = joints.parameters[entry, 7] / moving
+        limit = wp.min(wp.min(curve, by_power), joints.parameters[entry, 6])
+        torque = demand
+        if wp.abs(demand) > limit:
+            torque = sign * limit
+            gain = scalar(0.0)
+            if curve <= limit and forward > scalar(0.0) and forward < no_load:
+                gain = gain + stall / no_load
+            if by_power <= limit and forward > scalar(SLOWEST):
+                gain = gain + by_power / moving
+        torque = torque - joints.parameters[entry, 3]
+        low = joints.parameters[entry, 8]
+        high = joints.parameters[entry, 9]
+        stop = joints.parameters[entry, 10]
+        ahead = angle + h * rate
+        if angle > high:
+            torque = torque - stop * (ahead - high)
+            gain = gain + h * stop
+        if angle < low:
+            torque = torque - stop * (ahead - low)
+            gain = gain + h * stop
+        return vec2(torque, gain)
+
+    @wp.func
+    def motion_along(joints: Joints, links: Links, thread: int, slot: int, j: int, touch: Touch, arm: vec3) -> vec3:
+        # Velocity of a point along the contact's directions for a unit rate of the joint.
+        axis = links.frames[thread, slot, j + 1, 3]
+        move = axis
+        if joints.slides[j] == 0:
+            move = wp.cross(axis, arm - links.frames[thread, slot, j + 1, 4])
+        return vec3(wp.dot(touch.normal, move), wp.dot(touch.along, move), wp.dot(touch.across, move))
+
+    @wp.func
+    def join_body(work: Work, thread: int, slot: int, size: int, k: int, linear: vec3, arm: vec3):
+        angular = wp.cross(arm, linear)
+        for r in range(3):
+            wp.atomic_add(work.joined, thread, slot, size + r, k, linear[r])
+            wp.atomic_add(work.joined, thread, slot, size + 3 + r, k, angular[r])
+
+    @wp.func
+    def join_joint(work: Work, thread: int, slot: int, size: int, k: int, motion: vec3, touch: Touch, arm: vec3):
+        weighted = wp.cw_mul(touch.gain, motion)
+        wp.atomic_add(work.values, thread, slot, k, 2, wp.dot(motion, touch.force))
+        wp.atomic_add(work.joined, thread, slot, k, k, wp.dot(weighted, motion))
+        linear = weighted[0] * touch.normal + weighted[1] * touch.along + weighted[2] * touch.across
+        join_body(work, thread, slot, size, k, linear, arm)
+
+    @wp.func
+    def couple(
+        joints: Joints,
+        body: Body,
+        links: Links,
+        work: Work,
+        thread: int,
+        slot: int,
+        link: int,
+        i: int,
+        touch: Touch,
+        arm: vec3,
+    ):
+        # Forces and gains of a touching point on what moves it: its joint, the joint's carrier, its drive.
+        size = joints.size
+        own = -1
+        carrier = -1
+        own_motion = vec3()
+        carrier_motion = vec3()
+        if link > 0:
+            own = joints.coordinates[link - 1]
+            if joints.parents[link - 1] >= 0:
+                carrier = joints.coordinates[joints.parents[link - 1]]
+        if own >= 0:
+            own_motion = motion_along(joints, links, thread, slot, link - 1, touch, arm)
+            join_joint(work, thread, slot, size, own, own_motion, touch, arm)
+        if carrier >= 0:
+            carrier_motion = motion_along(joints, links, thread, slot, joints.parents[link - 1], touch, arm)
+            join_joint(work, thread, slot, size, carrier, carrier_motion, touch, arm)
+            if own >= 0:
+                shared = wp.dot(wp.cw_mul(touch.gain, own_motion), carrier_motion)
+                wp.atomic_add(work.joined, thread, slot, own, carrier, shared)
+        if body.drives[i] >= 0:
+            drive = joints.coordinates[joints.number + body.drives[i]]
+            if drive >= 0:
+                belt = links.turns[thread, slot, link] * body.tangents[i]
+                slips = vec2(wp.dot(belt, touch.along), wp.dot(belt, touch.across))
+                weighted = wp.cw_mul(touch.grip_gain, slips)
+                wp.atomic_add(work.values, thread, slot, drive, 2, wp.dot(slips, touch.grip_force))
+                wp.atomic_add(work.joined, thread, slot, drive, drive, wp.dot(weighted, slips))
+                join_body(work, thread, slot, size, drive, weighted[0] * touch.along + weighted[1] * touch.across, arm)
+                if own >= 0:
+                    shared = weighted[0] * own_motion[1] + weighted[1] * own_motion[2]
+                    wp.atomic_add(work.joined, thread, slot, drive, own, shared)
+                if carrier >= 0:
+                    shared = weighted[0] * carrier_motion[1] + weighted[1] * carrier_motion[2]
+                    wp.atomic_add(work.joined, thread, slot, drive, carrier, shared)
+
+    @wp.func
+    def clear(joints: Joints, work: Work, thread: int, slot: int):
+        size = joints.size
+        for k in range(size):
+            work.values[thread, slot, k, 2] = scalar(0.0)
+            for r in range(size + 6):
+                work.joined[thread, slot, r, k] = scalar(0.0)
+
+    @wp.func
+    def solve(joints: Joints, work: Work, thread: int, slot: int, h: scalar):
+        # The system of coordinates and body by L D Lᵀ. Right sides of the body are in its TORQUE column.
+        size = joints.size
+        total = size + 6
+        for i in range(total):
+            for j in range(i + 1):
+                entry = scalar(0.0)
+                if j < size:
+                    entry = h * work.joined[thread, slot, i, j]
+                else:
+                    entry = work.block[thread, slot, i - size, j - size]
+                if i == j and i < size:
+                    entry = entry + work.values[thread, slot, i, 1]
+                for k in range(j):
+                    entry = entry - (
+                        work.factor[thread, slot, i, k]
+                        * work.factor[thread, slot, j, k]
+                        * work.pivots[thread, slot, k, k]
+                    )
+                work.pivots[thread, slot, i, j] = entry
+                if j < i:
+                    work.factor[thread, slot, i, j] = work.pivots[thread, slot, i, j] / work.pivots[thread, slot, j, j]
+        for i in range(total):
+            reduced = work.values[thread, slot, i, 0]
+            for k in range(i):
+                reduced = reduced - work.factor[thread, slot, i, k] * work.values[thread, slot, k, 3]
+            work.values[thread, slot, i, 3] = reduced
+        for n in range(total):
+            i = total - 1 - n
+            found = work.values[thread, slot, i, 3] / work.pivots[thread, slot, i, i]
+            for k in range(i + 1, total):
+                found = found - work.factor[thread, slot, k, i] * work.values[thread, slot, k, 4]
+            work.values[thread, slot, i, 4] = found
+
+    return JointFunctions(pose_links, torque_at, couple, clear, solve, Work)

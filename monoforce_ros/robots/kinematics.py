@@ -1,0 +1,108 @@
+"""Kinematics: wheel speeds and steering angles of a commanded motion, for each kind of drive."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+SKID, DIFFERENTIAL, ACKERMANN, FOUR_WHEEL_STEERING, INDEPENDENT = (
+    "skid", "differential", "ackermann", "four_wheel_steering", "independent",
+)  # fmt: skip
+DRIVE_KINDS = (SKID, DIFFERENTIAL, ACKERMANN, FOUR_WHEEL_STEERING, INDEPENDENT)
+STEERED_KINDS = (ACKERMANN, FOUR_WHEEL_STEERING, INDEPENDENT)
+
+STANDSTILL = 1e-3
+"""Speed below which a robot stands, and its steering is straight [m/s]; commands are not that fine."""
+_WIDEST = 0.95
+"""Largest curvature times half the track, so that no wheel stands in the centre of the turn."""
+
+
+@dataclass(frozen=True)
+class SteeredDrive:
+    """Inverse kinematics of steered wheels, as in ros2_controllers' steering controllers; lengths in the base frame.
+
+    ``ackermann`` turns all wheels about one centre on the axle at ``reference_x``. The other kinds turn every wheel
+    along its own velocity, which includes a lateral motion.
+    """
+
+    kind: str
+    drive_places: Tensor
+    """Centre of each drive's wheel, ``[D, 2]`` (x, y) [m]."""
+    drive_joints: tuple[int, ...]
+    """Index in ``joints`` of the joint that steers each drive's wheel; -1 if none does."""
+    joints: tuple[int, ...]
+    """Indices of the steering joints in the robot's joints, ``S`` of them."""
+    joint_places: Tensor
+    """Pivot of each steering joint, ``[S, 2]`` (x, y) [m]."""
+    joint_limits: Tensor
+    """Largest angle of each to either side, ``[S]`` [rad]."""
+    reference_x: float
+    """Position of the axle about which the robot turns (``ackermann``), or of the point that a command means [m]."""
+
+    @property
+    def crabs(self) -> bool:
+        """Whether the robot can move sideways."""
+        return self.kind != ACKERMANN
+
+    @property
+    def maximum_curvature(self) -> float:
+        """Largest curvature that the steering reaches with all wheels about one centre [1/m] (``ackermann``)."""
+        ahead = (self.joint_places[:, 0] - self.reference_x).abs().double()
+        aside = self.joint_places[:, 1].abs().double()
+        slope = torch.tan(self.joint_limits.double().clamp(max=1.57))
+        steers = ahead > 1e-6
+        if not bool(steers.any()):
+            return 0.0
+        reached = float((slope / (ahead + slope * aside))[steers].min())
+        widest = float(torch.cat([aside, self.drive_places[:, 1].abs().double()]).max())
+        return min(reached, _WIDEST / widest) if widest > 0 else reached
+
+    def command(self, twist: Tensor) -> tuple[Tensor, Tensor]:
+        """Drive speeds ``[..., D]`` [m/s] and steering angles ``[..., S]`` [rad] of a commanded motion.
+
+        Args:
+            twist: forward speed [m/s], yaw rate [rad/s] and, optionally, lateral speed [m/s], ``[..., 2]`` or
+                ``[..., 3]``; ``ackermann`` ignores the lateral speed.
+        """
+        return self._about_one_centre(twist) if self.kind == ACKERMANN else self._along_its_velocity(twist)
+
+    def steering_of_drives(self, angles: Tensor) -> Tensor:
+        """Steering angle of each drive's wheel ``[..., D]`` from those of the joints ``[..., S]``; 0 if not steered."""
+        padded = torch.cat([angles, torch.zeros_like(angles[..., :1])], dim=-1)
+        return padded[..., list(self.drive_joints)]
+
+    def _about_one_centre(self, twist: Tensor) -> tuple[Tensor, Tensor]:
+        forward, yaw_rate = twist[..., :1], twist[..., 1:2]
+        drives = forward.abs() > STANDSTILL
+        limit = self.maximum_curvature
+        curvature = torch.where(drives, yaw_rate / torch.where(drives, forward, 1.0), 0.0).clamp(-limit, limit)
+        places = self.joint_places.to(twist)
+        angles = torch.atan2(curvature * (places[:, 0] - self.reference_x), 1.0 - curvature * places[:, 1])
+        wheels = self.drive_places.to(twist)
+        along, across = 1.0 - curvature * wheels[:, 1], curvature * (wheels[:, 0] - self.reference_x)
+        turned = self.steering_of_drives(angles)
+        return forward * (along * torch.cos(turned) + across * torch.sin(turned)), angles
+
+    def _along_its_velocity(self, twist: Tensor) -> tuple[Tensor, Tensor]:
+        forward, yaw_rate = twist[..., :1], twist[..., 1:2]
+        lateral = twist[..., 2:3] if twist.shape[-1] > 2 else torch.zeros_like(forward)
+
+        def velocities(places: Tensor) -> tuple[Tensor, Tensor]:
+            return forward - yaw_rate * places[:, 1], lateral + yaw_rate * (places[:, 0] - self.reference_x)
+
+        along, across = velocities(self.joint_places.to(twist))
+        moves = torch.hypot(along.detach(), across.detach()) > STANDSTILL
+        # The wheel's line has no direction: it never turns by more than a right angle, and rolls backwards instead.
+        backwards = along < 0
+        angles = torch.where(
+            moves,
+            torch.atan2(torch.where(backwards, -across, across), torch.where(moves, along.abs(), 1.0)),
+            0.0,
+        )
+        limits = self.joint_limits.to(twist)
+        angles = torch.minimum(torch.maximum(angles, -limits), limits)
+        along, across = velocities(self.drive_places.to(twist))
+        turned = self.steering_of_drives(angles)
+        return along * torch.cos(turned) + across * torch.sin(turned), angles
