@@ -236,6 +236,40 @@ class Articulation:
         poses = self.poses(angles.flatten(0, 1), rates.flatten(0, 1), body.repeated(angles.shape[1]))
         return poses.turned(rotation.flatten(0, 1))
 
+    def torques(
+        self, angles: Tensor, rates: Tensor, rotation: Tensor, body: BodyMass, points: Tensor, loads: JointLoads
+    ) -> Tensor:
+        """Torque with which each joint's motor, spring or bearing balances contact and weight, ``[B, S, J]`` [N m].
+
+        Accelerations of the joint's own mass are neglected.
+
+        Args:
+            angles, rates: ``[B, S, J]``.
+            rotation: terrain ← base, ``[B, S, 3, 3]``.
+            body: mass properties at the rest angles.
+            points: body points at the rest angles, ``[N, 3]`` [m].
+            loads: what acts on the links.
+        """
+        batch, steps, number = angles.shape
+        poses = self.world_poses(angles, rates, rotation, body)
+        forces = loads.forces.flatten(0, 1)
+        turns = poses.turns[:, self.point_links]
+        arms = (turns @ points[..., None])[..., 0] + poses.shifts[:, self.point_links]
+        weight = loads.gravity.repeat_interleave(steps, 0)
+        found = []
+        for joint in range(number):
+            axis, origin = poses.axes[:, joint], poses.origins[:, joint]
+            carried = self.carried_by(joint)
+            acting, levers = forces[:, carried], arms[:, carried] - origin[:, None]
+            hanging = self.masses[joint] * weight
+            if self.slides[joint]:
+                total = acting.sum(1) + hanging
+            else:
+                total = torch.linalg.cross(levers, acting).sum(1)
+                total = total + torch.linalg.cross(poses.places[:, joint] - origin, hanging)
+            found.append(-(total * axis).sum(-1))
+        return torch.stack(found, -1).unflatten(0, (batch, steps)) if found else angles.new_zeros(batch, steps, 0)
+
     def carried_by(self, joint: int) -> Tensor:
         """Which points a joint moves, itself or through a joint that it carries, ``[N]`` bool."""
         links = [joint + 1, *(other + 1 for other, parent in enumerate(self.parents) if parent == joint)]
@@ -256,6 +290,16 @@ class BodyMass:
     def repeated(self, steps: int) -> BodyMass:
         """The same for each of ``steps`` steps of a trajectory, ``[B S]``."""
         return BodyMass(*(value.repeat_interleave(steps, 0) for value in (self.mass, self.centre, self.inertia)))
+
+
+@dataclass(frozen=True)
+class JointLoads:
+    """What acts on the links of a robot."""
+
+    forces: Tensor
+    """Contact force on each point in terrain axes, ``[B, S, N, 3]`` [N]."""
+    gravity: Tensor
+    """Acceleration in terrain axes, ``[B, 3]`` [m/s²]."""
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,9 @@ import torch
 from torch import Tensor
 
 from monoforce_ros.physics import neural_ode, torch_backend
+from monoforce_ros.physics.articulation import Articulation, JointLoads
 from monoforce_ros.physics.contact_summary import ContactSummary
+from monoforce_ros.physics.loads import tilted_gravity
 from monoforce_ros.physics.neural_ode import OdeOptions
 from monoforce_ros.physics.options import PhysicsOptions
 from monoforce_ros.physics.problem import Motion, Problem
@@ -83,6 +85,10 @@ def rollout(
     else:
         motion = _backend(backend).integrate(problem, options, with_forces, with_contact, force_every)
     result = replace(_result(problem, motion, finite, options), force_every=force_every)
+    if problem.articulation is not None and motion.forces is not None and with_forces:
+        result = replace(
+            result, joint_torques=_joint_torques(problem, problem.articulation, motion, options, force_every)
+        )
     normal, tangential, forces = result.normal_forces, result.tangential_forces, result.forces
     if not with_contact or result.contact is not None or normal is None or tangential is None or forces is None:
         return result
@@ -93,6 +99,17 @@ def rollout(
     if with_forces:
         return replace(result, contact=contact)
     return replace(result, contact=contact, normal_forces=None, tangential_forces=None, forces=None)
+
+
+def _joint_torques(
+    problem: Problem, moving: Articulation, motion: Motion, options: PhysicsOptions, every: int
+) -> Tensor | None:
+    if motion.forces is None or motion.angles is None or motion.rates is None or not moving.slides:
+        return None
+    loads = JointLoads(motion.forces, tilted_gravity(problem.gravity_tilt, options.gravity))
+    part = slice(None, -1, every)
+    states = (motion.angles[:, part], motion.rates[:, part], motion.rotation[:, part])
+    return moving.torques(*states, problem.body_mass, problem.points, loads)
 
 
 def _check_joints(robot: RobotModel, controls: Controls, shape: tuple[int, int]) -> None:

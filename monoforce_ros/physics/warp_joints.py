@@ -203,8 +203,9 @@ class _Integrate(torch.autograd.Function):
             history[:, 0] = value
             states.append(history)
         states += [value.clone() for value in start[_BODY_STATES:]]
-        _launch(fixed, joints, inputs, states)
-        if any(ctx.needs_input_grad):
+        differentiable = any(ctx.needs_input_grad)
+        _launch(fixed, joints, inputs, states, differentiable=differentiable)
+        if differentiable:
             ctx.fixed, ctx.joints = fixed, joints
             ctx.save_for_backward(*inputs, *states)
         return tuple(states)
@@ -229,8 +230,9 @@ class _Forces(torch.autograd.Function):
         normal = speeds.new_zeros((batch, steps, count))
         tangential = speeds.new_zeros((batch, steps, count, 3))
         outputs = (normal, tangential, torch.zeros_like(tangential))
-        _launch_forces(fixed, joints, every, listed, outputs)
-        if any(ctx.needs_input_grad):
+        differentiable = any(ctx.needs_input_grad)
+        _launch_forces(fixed, joints, every, listed, outputs, differentiable=differentiable)
+        if differentiable:
             ctx.fixed, ctx.joints, ctx.every = fixed, joints, every
             ctx.save_for_backward(*listed, *outputs)
         return outputs
@@ -263,6 +265,9 @@ def _scratch(joints: _Joints, kinds: Any, like: Tensor, width: int, slots: int, 
     work.joined = array(kinds.scalar, dense, inner)
     work.pivots, work.factor = array(kinds.scalar, dense, dense), array(kinds.scalar, dense, dense)
     work.values = array(kinds.scalar, dense, 5)
+    if gradients:
+        work.block_gradient, work.joined_gradient = work.block.grad, work.joined.grad
+        work.values_gradient = work.values.grad
     return [posed, work, array(kinds.vec3, 9, 3)]
 
 
@@ -272,6 +277,7 @@ def _launch(
     inputs: Sequence[Tensor],
     states: Sequence[Tensor],
     *,
+    differentiable: bool = True,
     state_gradients: Sequence[Tensor] | None = None,
 ) -> list[Tensor]:
     """Launch the integration, or with ``state_gradients`` its adjoint, which returns the inputs' gradients."""
@@ -279,7 +285,7 @@ def _launch(
     backward = state_gradients is not None
     device = str(inputs[0].device)
     double, kinds = precision(inputs[0])
-    kernel = integrate_joints_kernel(double)
+    kernel = integrate_joints_kernel(double, differentiable)
     # Computed before the threads start; otherwise each would compute it.
     fixed.ceilings(inputs[0])
 
@@ -308,6 +314,7 @@ def _launch_forces(
     tensors: Sequence[Tensor],
     outputs: Sequence[Tensor],
     *,
+    differentiable: bool = True,
     output_gradients: Sequence[Tensor] | None = None,
 ) -> list[Tensor]:
     """Launch the forces of every n-th step, or with ``output_gradients`` their adjoint, which returns the gradients."""
@@ -316,7 +323,7 @@ def _launch_forces(
     number = len(INPUTS) + 2
     inputs, states, links = tensors[:number], tensors[number:-2], tensors[-2:]
     double, kinds = precision(tensors[0])
-    kernel = forces_joints_kernel(double)
+    kernel = forces_joints_kernel(double, differentiable)
     fixed.ceilings(inputs[0])
 
     def work(part: tuple[int, int]) -> list[Tensor]:

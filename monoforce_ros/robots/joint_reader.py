@@ -172,7 +172,7 @@ class JointReader:
         load = self._load_at_rest(wheel)
         low, high = -math.inf, math.inf
         if "travel" in entry:
-            low, high = self.checks.vector(entry["travel"], f"{where}.travel", 2, 5.0, "m")
+            low, high = self.checks.vector(entry["travel"], f"{where}.travel", 2, 5.0, "m").tolist()
             if not low < 0.0 < high:
                 raise self.checks.fail(f"{where}.travel", [low, high], "a negative and a positive number [m]")
         dynamics = Coordinate(
@@ -232,7 +232,7 @@ class JointReader:
         front = entry["end"] == "front"
         low, high = -math.inf, math.inf
         if "limits" in entry:
-            low, high = self.checks.vector(entry["limits"], f"{where}.limits", 2, 7.0, "rad")
+            low, high = self.checks.vector(entry["limits"], f"{where}.limits", 2, 7.0, "rad").tolist()
             if not low <= angle <= high:
                 raise self.checks.fail(f"{where}.angle", angle, f"an angle within its limits [{low:g}, {high:g}]")
         mass = self.checks.number(entry["mass"], f"{where}.mass", 0.0, 1e4, "kg")

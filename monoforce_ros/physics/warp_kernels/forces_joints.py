@@ -10,8 +10,8 @@ from monoforce_ros.physics.warp_kernels.structs import types
 
 
 @cache
-def forces_joints_kernel(double: bool) -> Any:
-    """The kernel in float64 (``double``) or float32."""
+def forces_joints_kernel(double: bool, differentiable: bool) -> Any:
+    """The kernel in float64 (``double``) or float32, with its adjoint or, compiled sooner, without."""
     t = types(double)
     functions = contact_functions(double)
     state_at, touch_ground, over_the_step = functions.state_at, functions.touch_ground, functions.over_the_step
@@ -32,7 +32,7 @@ def forces_joints_kernel(double: bool) -> Any:
                 result = change * wp.cross(axis, arm - links.frames[b, slot, j + 1, 4])
         return result
 
-    @wp.kernel(module="unique")
+    @wp.kernel(module="unique", enable_backward=differentiable)
     def forces_joints(
         first_trajectory: int,
         every: int,

@@ -13,8 +13,8 @@ from monoforce_ros.physics.warp_kernels.structs import types
 
 
 @cache
-def integrate_joints_kernel(double: bool) -> Any:
-    """The kernel in float64 (``double``) or float32."""
+def integrate_joints_kernel(double: bool, differentiable: bool) -> Any:
+    """The kernel in float64 (``double``) or float32, with its adjoint or, compiled sooner, without."""
     t = types(double)
     functions, rigid, moving = contact_functions(double), body_functions(double), joint_functions(double)
     loads_at = external_loads(double)
@@ -31,7 +31,7 @@ def integrate_joints_kernel(double: bool) -> Any:
     Ground, Body, Robots, States, Options = t.Ground, t.Body, t.Robots, t.States, t.Options
     Joints, Links = t.Joints, t.Links
 
-    @wp.kernel(module="unique")
+    @wp.kernel(module="unique", enable_backward=differentiable)
     def integrate_joints(
         first_trajectory: int,
         steps: int,

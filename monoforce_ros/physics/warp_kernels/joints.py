@@ -50,6 +50,11 @@ def joint_functions(double: bool) -> JointFunctions:
         pivots: wp.array4d(dtype=scalar)  # of the factorisation L D Lᵀ, [K + 6, K + 6]
         factor: wp.array4d(dtype=scalar)
         values: wp.array4d(dtype=scalar)  # of each coordinate, then of the body, [K + 6, 5]
+        block_gradient: wp.array4d(
+            dtype=scalar
+        )  # memory of the gradients of these three, for the adjoint of the solver
+        joined_gradient: wp.array4d(dtype=scalar)
+        values_gradient: wp.array4d(dtype=scalar)
 
     @wp.func
     def square(arm: vec3) -> mat33:
@@ -277,5 +282,86 @@ def joint_functions(double: bool) -> JointFunctions:
             for k in range(i + 1, total):
                 found = found - work.factor[thread, slot, k, i] * work.values[thread, slot, k, 4]
             work.values[thread, slot, i, 4] = found
+
+    @wp.func_grad(solve)
+    def adjoint_solve(joints: Joints, work: Work, thread: int, slot: int, h: scalar):
+        # With A x = r: the gradient of r is μ = A⁻¹ x̄, that of A is -μ xᵀ. The factors are those of the solution.
+        size = joints.size
+        total = size + 6
+        for i in range(total):
+            reduced = work.values_gradient[thread, slot, i, 4]
+            for k in range(i):
+                reduced = reduced - work.factor[thread, slot, i, k] * work.values[thread, slot, k, 3]
+            work.values[thread, slot, i, 3] = reduced
+        for n in range(total):
+            i = total - 1 - n
+            found = work.values[thread, slot, i, 3] / work.pivots[thread, slot, i, i]
+            for k in range(i + 1, total):
+                found = found - work.factor[thread, slot, k, i] * work.values[thread, slot, k, 3]
+            work.values[thread, slot, i, 3] = found
+        for i in range(total):
+            work.values_gradient[thread, slot, i, 0] = (
+                work.values_gradient[thread, slot, i, 0] + work.values[thread, slot, i, 3]
+            )
+            for j in range(i + 1):
+                gradient = -work.values[thread, slot, i, 3] * work.values[thread, slot, j, 4]
+                if j < i:
+                    gradient = gradient - work.values[thread, slot, j, 3] * work.values[thread, slot, i, 4]
+                if j >= size:
+                    work.block_gradient[thread, slot, i - size, j - size] = (
+                        work.block_gradient[thread, slot, i - size, j - size] + gradient
+                    )
+                else:
+                    work.joined_gradient[thread, slot, i, j] = work.joined_gradient[thread, slot, i, j] + h * gradient
+                    if i == j:
+                        work.values_gradient[thread, slot, i, 1] = work.values_gradient[thread, slot, i, 1] + gradient
+
+    # The adjoint of a kernel repeats the functions that it calls before it differentiates them. These write what is
+    # still in the arrays.
+    @wp.func_replay(pose_links)
+    def repeat_poses(
+        joints: Joints,
+        robots: Robots,
+        states: States,
+        work: Work,
+        links: Links,
+        b: int,
+        step: int,
+        thread: int,
+        slot: int,
+        turned: mat33,
+    ):
+        pass
+
+    @wp.func_replay(couple)
+    def repeat_coupling(
+        joints: Joints,
+        body: Body,
+        links: Links,
+        work: Work,
+        thread: int,
+        slot: int,
+        link: int,
+        i: int,
+        touch: Touch,
+        arm: vec3,
+    ):
+        pass
+
+    @wp.func_replay(join_body)
+    def repeat_body(work: Work, thread: int, slot: int, size: int, k: int, linear: vec3, arm: vec3):
+        pass
+
+    @wp.func_replay(join_joint)
+    def repeat_joint(work: Work, thread: int, slot: int, size: int, k: int, motion: vec3, touch: Touch, arm: vec3):
+        pass
+
+    @wp.func_replay(clear)
+    def repeat_clear(joints: Joints, work: Work, thread: int, slot: int):
+        pass
+
+    @wp.func_replay(solve)
+    def repeat_solution(joints: Joints, work: Work, thread: int, slot: int, h: scalar):
+        pass
 
     return JointFunctions(pose_links, torque_at, couple, clear, solve, Work)

@@ -203,15 +203,14 @@ class _Converter:
 
     def _wheel_entry(self, wheel: WheelPart, kind: str, driven: set[str]) -> dict[str, Any]:
         shape = wheel.shape
-        entry: dict[str, Any] = {"name": wheel.name}
-        if wheel.joint.name in driven:
-            entry["drive"] = self._drive(wheel, kind)
+        drive = self._drive(wheel, kind) if wheel.joint.name in driven else None
         self.guess(
             f"wheel {wheel.name}: {wheel.reason}, radius {shape.radius:.3f} m, width {shape.width:.3f} m, "
-            f"{'drive ' + entry['drive'] if 'drive' in entry else 'rolls freely'}"
+            f"{'rolls freely' if drive is None else f'drive {drive}'}"
         )
         return {
-            **entry, "centre": _numbers(shape.centre), "radius": _number(shape.radius), "width": _number(shape.width)
+            "name": wheel.name, "drive": drive, "centre": _numbers(shape.centre), "radius": _number(shape.radius),
+            "width": _number(shape.width),
         }  # fmt: skip
 
     def _track_entry(self, track: str) -> dict[str, Any] | None:
