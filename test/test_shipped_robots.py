@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from monoforce_ros.effects import drive_speeds
+from monoforce_ros.effects import controls
 from monoforce_ros.physics import State, rollout
 from monoforce_ros.robots import load_robot, shipped_robots
 from monoforce_ros.terrain import Grid, TerrainMap
@@ -16,7 +16,7 @@ def drive(robot, speed, yaw_rate, seconds=2.0):
     """Rollout from rest under one command; the first second is for settling."""
     steps = round(seconds / 0.01)
     twists = torch.tensor([[0.0, 0.0]] * 100 + [[speed, yaw_rate]] * steps)[None]
-    return rollout(FLAT, robot, drive_speeds(robot, twists, 0.01), State.at_rest(robot.ground_clearance))
+    return rollout(FLAT, robot, controls(robot, twists, 0.01), State.at_rest(robot.ground_clearance))
 
 
 def heading(result):
@@ -42,6 +42,8 @@ def test_it_drives_straight_and_turns_to_the_side_that_is_commanded(name):
     moved = ahead.position[0, -1] - ahead.position[0, 100]
     assert 0.75 < float(moved[0]) < 1.02 and abs(float(moved[1])) < 0.02
     assert abs(heading(ahead)) < 1.0
-    left, right = drive(robot, 0.0, 0.6), drive(robot, 0.0, -0.6)
+    # A car turns only as it drives.
+    speed = 0.0 if robot.steered is None else 1.0
+    left, right = drive(robot, speed, 0.6), drive(robot, speed, -0.6)
     assert heading(left) > 3.0
     assert heading(right) == pytest.approx(-heading(left), abs=2.0)
