@@ -14,6 +14,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from monoforce_ros.terrain import Grid
+
 _LARGEST = 8
 """Largest number of points per cluster."""
 _LARGEST_GROUP = 64
@@ -37,6 +39,25 @@ class Boxes:
     def radii(self) -> Tensor:
         """Radii of spheres around the boxes [m], ``[K]``."""
         return self.halves.norm(dim=1)
+
+    def near(self, ceiling: Tensor, grid: Grid, centre: Tensor, rotation: Tensor, origin: Tensor) -> Tensor:
+        """Which boxes the ground may touch in any of several poses of a body, ``[K]`` bool.
+
+        Args:
+            ceiling: :meth:`ceiling` of the map or maps, ``[1 or B, rows, columns]`` [m].
+            grid: its grid.
+            centre: position of ``origin`` in each pose, ``[B, 3]`` [m].
+            rotation: terrain ← base, ``[B, 3, 3]``.
+            origin: a point of the body in the base frame, ``[B, 3]`` [m].
+        """
+        middles = centre[:, None] + (self.centres - origin[:, None]) @ rotation.transpose(1, 2)
+        depths = (self.halves * rotation[:, None, 2].abs()).sum(-1)
+        nodes = []
+        for axis, cells in ((1, grid.rows), (0, grid.columns)):
+            raw = torch.nan_to_num((middles[..., axis] - grid.origin[axis]) / grid.resolution)
+            nodes.append((raw.clamp(0, cells - 1) + 0.5).long())
+        pages = torch.arange(len(ceiling), device=ceiling.device)[:, None]
+        return (ceiling[pages, nodes[0], nodes[1]] > middles[..., 2] - depths).any(0)
 
     def ceiling(self, height: Tensor, resolution: float) -> Tensor:
         """Highest ground ``[B, rows, columns]`` [m] within reach of any box whose centre is nearest to each node.
