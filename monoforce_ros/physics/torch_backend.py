@@ -34,7 +34,9 @@ def integrate(
     centre, rotation = problem.centre, problem.rotation
     velocity, angular_velocity = problem.velocity, problem.angular_velocity
     history: list[tuple[Tensor, ...]] = [(centre, rotation, velocity, angular_velocity)]
-    normal_forces, tangential_forces, forces = [], [], []
+    normal_forces: list[Tensor] = []
+    tangential_forces: list[Tensor] = []
+    forces: list[Tensor] = []
     for step in range(problem.steps):
         body, chosen = contacts.near(centre, rotation)
         arms, touch = body.at(step, centre, rotation, velocity, angular_velocity)
