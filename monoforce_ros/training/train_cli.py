@@ -89,8 +89,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--samples", type=Path, metavar="DIR", help="folder for the samples extracted from the bags "
                         "(default: OUT/samples)")  # fmt: skip
     parser.add_argument("--samples-only", action="store_true", help="extract the samples and stop")
-    parser.add_argument("--sensor", choices=SENSORS, default="camera", help="input of the encoder: images; "
-                        "a lidar sweep to densify; or both, either of which may be absent (default: %(default)s)")  # fmt: skip
+    parser.add_argument("--sensor", choices=SENSORS, default="camera", help="input of the encoder: images; a lidar "
+                        "sweep to densify; or both, either of which may be absent (default: %(default)s)")  # fmt: skip
     parser.add_argument("--images", nargs="+", default=[], metavar="TOPIC", help="image topics (default: all with a "
                         "CameraInfo)")  # fmt: skip
     parser.add_argument("--period", type=float, default=SampleSettings.period, metavar="S", help="interval between "
@@ -239,7 +239,13 @@ def _adapt(options: argparse.Namespace) -> None:
     )  # fmt: skip
     with progress_bar(settings.steps, label="adapting", unit="step", quiet=options.quiet) as bar:
         adapted = adapt(
-            encoder, robot, [part[0] for part in parts], replay, options.out, settings, lambda *_: bar.update()
+            encoder,
+            robot,
+            [part[0] for part in parts],
+            replay,
+            options.out,
+            settings,
+            lambda step, losses: bar.update() and None,
         )
     result = compare(encoder, adapted, [part[1] for part in parts], judging)
     write_text(options.out / "adaptation.json", json.dumps(asdict(result), indent=1) + "\n")

@@ -133,6 +133,11 @@ class _Losses(nn.Module):
 
     def forward(self, batch: EncoderInput, targets: Targets) -> dict[str, Tensor]:
         maps = self.encoder(batch)
+        # The physics needs more digits than the encoder's convolutions.
+        with torch.autocast(batch.ground.device.type, enabled=False):
+            return self._losses(maps, batch, targets)
+
+    def _losses(self, maps: EncodedMaps, batch: EncoderInput, targets: Targets) -> dict[str, Tensor]:
         weights, losses = self.weights, {}
         if weights.geometric:
             losses["geometric"] = weights.geometric * geometric_loss(maps, targets, batch.ground, weights.prominence)
@@ -191,10 +196,14 @@ class Trainer:
         self.index = [(r, i) for r, recording in enumerate(self.recordings) for i in range(len(recording))]
         if not self.index:
             raise TrainingError("no samples to train on")
-        losses = _Losses(self.encoder, robot, settings.weights)
-        self.losses = nn.parallel.DistributedDataParallel(losses) if process.count > 1 else losses
         if isinstance(encoder, TerrainEncoder) and settings.freeze_backbone:
             encoder.freeze_backbone()
+        losses = _Losses(self.encoder, robot, settings.weights)
+        self.losses: nn.Module = losses
+        if process.count > 1:
+            # A batch may be without any image.
+            unused = encoder.config.sensor == "camera_lidar"
+            self.losses = nn.parallel.DistributedDataParallel(losses, find_unused_parameters=unused)
         backbone = list(encoder.backbone.parameters()) if isinstance(encoder, TerrainEncoder) else []
         pretrained = set(backbone)
         groups = [
