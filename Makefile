@@ -4,7 +4,7 @@
 # make interfaces build monoforce_msgs, the typed message for planners, into install/ (takes a C++ compiler)
 # make bench  run the benchmarks
 # make diagnosis  measure diagnose on hidden effects and real drives (an hour), write the tables of docs/discrepancy.md
-# make checkpoint train the shipped terrain encoder on synthetic worlds, from nothing (an hour and a half)
+# make checkpoint train the shipped terrain encoder on randomised worlds, from nothing (two hours)
 # make tables     compare terrain sources on worlds that no training saw, as the paper's tables do (two hours)
 SHELL := /bin/bash
 .PHONY: demo test test-lowest interfaces bench diagnosis checkpoint tables lint environment build graphics lock clean help

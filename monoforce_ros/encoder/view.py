@@ -66,8 +66,10 @@ class EncoderInput:
     map_of: Tensor
     """Index of each image's map ``[N]`` int64."""
     support: Tensor
-    """Plane under the wheels relative to ``ground`` [m], and where it is expected to hold, 0..1; ground that the robot
-    drove over relative to ``ground`` [m], and its mask; ``[B, 4, rows, columns]``."""
+    """Plane under the wheels relative to ``ground`` [m], fading to level ground, and its weight 0..1; ground that the
+    robot drove over relative to ``ground`` [m], and its mask; ``[B, 4, rows, columns]``. The plane fades because on
+    hills shorter than the map its slope says nothing of ground further away; given the whole plane, an encoder
+    extrapolates it."""
     ground: Tensor
     """Height of the ground under the robot in its terrain frame ``[B]`` [m]."""
     sweep: Tensor
@@ -83,7 +85,7 @@ class EncoderInput:
     def anchor(self) -> Tensor:
         """Ground that carries the robot, which predicted heights correct, relative to ``ground`` [m]
         ``[B, rows, columns]``: the plane under the wheels, and level ground further away."""
-        return self.support[:, 0] * self.support[:, 1]
+        return self.support[:, 0]
 
     def to(self, device: torch.device | str) -> EncoderInput:
         """The same on another device."""
@@ -153,7 +155,7 @@ def assemble(
         map_of=torch.zeros(count, dtype=torch.int64),
         # The mean of a cell's lowest and highest trace point is its height.
         support=torch.as_tensor(
-            np.stack([plane, near, (traced[0] + traced[1]) / 2, traced[2]])[None], dtype=torch.float32
+            np.stack([plane * near, near, (traced[0] + traced[1]) / 2, traced[2]])[None], dtype=torch.float32
         ),
         ground=torch.tensor([ground], dtype=torch.float32),
         sweep=torch.as_tensor(hits[None], dtype=torch.float32),

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -125,6 +126,36 @@ def judge(encoder: Encoder, recordings: Sequence[RecordingSamples], sensors: Aug
         obstacles=_mean(hit[obstacle]),
         clear=_mean(~hit[~obstacle]),
     )
+
+
+def calibrated(encoder: Encoder, recordings: Sequence[RecordingSamples], sensors: Augmentation = CAMERAS) -> Encoder:
+    """A copy of an encoder whose 90 % bands of H_g and H_d hold 90 % of the measured values.
+
+    Args:
+        encoder: the encoder.
+        recordings: recordings that it was not trained on.
+        sensors: sensors that the bands are to hold for; more sensors make them conservative.
+    """
+    ratios: dict[str, list[Tensor]] = {"geometric": [], "decrease": []}
+    for entry in judged_maps(encoder, recordings, sensors):
+        maps, targets, ground = entry.maps, entry.targets, entry.batch.ground[:, None, None]
+        error = (maps.geometric_height - ground).clamp(LOWEST, HIGHEST) - (targets.geometric - ground).clamp(
+            LOWEST, HIGHEST
+        )
+        known = targets.observed & maps.covered
+        ratios["geometric"].append((error.abs() / (BAND * maps.geometric_spread))[known])
+        depth = (targets.geometric - targets.supporting).clamp(0.0, HIGHEST)
+        both = known & targets.contact_mask
+        ratios["decrease"].append(((maps.decrease - depth).abs() / (BAND * maps.decrease_spread))[both])
+    factors = {}
+    for name, parts in ratios.items():
+        joined = torch.cat(parts)
+        old = getattr(encoder.config, f"{name}_spread_factor")
+        share = float(np.quantile(joined.cpu().numpy(), 0.9)) if len(joined) else 1.0
+        factors[f"{name}_spread_factor"] = min(max(old * share, 0.01), 100.0)
+    result = copy.deepcopy(encoder)
+    result.config = replace(encoder.config, **factors)
+    return result
 
 
 def _median(values: Tensor) -> float:

@@ -26,6 +26,8 @@ _PROMINENT_HEIGHT, _NEIGHBOURHOOD = 0.3, 12
 """Height over the neighbourhood's mean of a fully prominent cell [m]; half-width of the neighbourhood [cells]."""
 _OUT_OF_VIEW = 0.1
 """Weight of measured cells out of every camera's view, which can only be inferred from their surroundings."""
+_MEAN_FRICTION = -0.41
+"""Mean of the logarithm of the friction of randomised worlds, seeds 420000 to 420119."""
 _SLOPE_BASELINE = 0.6
 """Distance over which slopes are compared [m]: about the wheelbase and track width of a robot."""
 _HORIZONTAL_SCALE, _VERTICAL_SCALE, _TILT_SCALE, _HEADING_SCALE = 0.15, 0.03, np.radians(2.0), np.radians(4.0)
@@ -164,9 +166,12 @@ def depth_loss(maps: EncodedMaps, targets: Targets, depths: Tensor) -> Tensor:
 
 
 def friction_loss(maps: EncodedMaps, targets: Targets, config: EncoderConfig) -> Tensor:
-    """Huber loss of the logarithm of friction relative to the configuration's, where it is known and in view."""
+    """Huber loss of the logarithm of friction relative to average ground, where it is known and in view.
+
+    Ground of which nothing tells has the configuration's friction.
+    """
     known = torch.isfinite(targets.friction) & maps.covered
-    error = (maps.friction / config.friction).log() - torch.where(known, targets.friction, 0.0)
+    error = (maps.friction / config.friction).log() - torch.where(known, targets.friction - _MEAN_FRICTION, 0.0)
     return _mean_over_maps(functional.smooth_l1_loss(error, torch.zeros_like(error), reduction="none", beta=0.2), known)
 
 

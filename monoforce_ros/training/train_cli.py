@@ -26,10 +26,12 @@ from monoforce_ros.encoder import (
     WeightsError,
     load_encoder,
     new_encoder,
+    save_encoder,
 )
 from monoforce_ros.reporting import progress, progress_bar
 from monoforce_ros.robots import RobotFileError, RobotModel, fingerprint, load_robot, shipped_robots, write_robot
 from monoforce_ros.training.adaptation import REPLAY_WORLDS, AdaptationSettings, adapt, compare, split_recording
+from monoforce_ros.training.judgement import CAMERAS, SWEEP, calibrated
 from monoforce_ros.training.losses import LossWeights
 from monoforce_ros.training.recording_samples import RecordingSamples, SamplesError, read_samples
 from monoforce_ros.training.sample_extraction import SampleSettings, extract_samples
@@ -217,6 +219,10 @@ def _train(options: argparse.Namespace, process: Process) -> None:
         )
     with _Log(options.out, settings.steps, trainer, quiet=options.quiet or not process.first) as log:
         trainer.run(log)
+    if process.first and validation:
+        best = load_encoder(options.out / "encoder.safetensors")
+        sensors = CAMERAS if config.takes_images else SWEEP
+        save_encoder(calibrated(best, validation, sensors), options.out / "encoder.safetensors")
     if process.first:
         _write_summary(options.out, trainer, describe(config, settings, training))
 
@@ -287,7 +293,8 @@ def _encoder(options: argparse.Namespace, config: EncoderConfig) -> Encoder:
     if options.start_from is not None:
         encoder = load_encoder(options.start_from)
         found, expected = asdict(encoder.config), asdict(config)
-        names = [n for n in expected if n not in ("decreases", "edges") and expected[n] != found[n]]
+        free = ("decreases", "edges", "geometric_spread_factor", "decrease_spread_factor")
+        names = [n for n in expected if n not in free and expected[n] != found[n]]
         if names:
             differences = "; ".join(f"{name}: got {found[name]}, expected {expected[name]}" for name in names)
             raise CheckpointError(f"{options.start_from}: configuration differs from the options: {differences}")
