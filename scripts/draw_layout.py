@@ -3,7 +3,7 @@
 scripts/run.sh python scripts/draw_layout.py BAG [--out docs/first_drive.png]
 
 BAG is a recording of bag_recorder with /predicted/terrain, /predicted/path, /predicted/contact_forces and, optionally,
-/predicted/candidates and /predicted/best_path. The prediction with the longest path is drawn.
+/predicted/candidates and /predicted/best_path. The prediction with the longest paths is drawn.
 """
 
 from __future__ import annotations
@@ -55,13 +55,14 @@ def lines(marker) -> Line3DCollection:
 
 
 def draw(messages: dict[str, object]) -> Figure:
-    figure = Figure(figsize=(10, 5), layout="constrained", dpi=110, facecolor="#1c2026")
-    axes = figure.add_subplot(projection="3d", computed_zorder=False, facecolor="#1c2026")
+    figure = Figure(figsize=(10, 5), dpi=110, facecolor="#1c2026")
+    # A 3D view is drawn into a square and cut off at its edges: let the square be larger than the picture.
+    axes = figure.add_axes((-0.1, -0.7, 1.2, 2.4), projection="3d", computed_zorder=False, facecolor="#1c2026")
     points = decoding.decode_cloud(messages["terrain"])
     path = path_positions(messages["path"])
     near = np.linalg.norm(points[:, :2] - path[0, :2], axis=1) < 5.0
     points = points[near]
-    axes.scatter(*points.T, c=points[:, 2], cmap="turbo", s=16, marker="s", alpha=0.8, linewidths=0)
+    axes.scatter(*points.T, c=points[:, 2], cmap="turbo", s=30, marker="s", alpha=0.8, linewidths=0)
     for marker in getattr(messages.get("candidates"), "markers", []):
         if marker.type in (Marker.LINE_STRIP, Marker.LINE_LIST) and len(marker.points):
             axes.add_collection3d(lines(marker))
@@ -69,7 +70,7 @@ def draw(messages: dict[str, object]) -> Figure:
         axes.plot(*path_positions(messages["best_path"]).T, color="#28dc5a", linewidth=3)
     axes.plot(*path.T, color="#ffb020", linewidth=3)
     low, high = points.min(axis=0), points.max(axis=0)
-    axes.set_box_aspect(high - low, zoom=1.9)
+    axes.set_box_aspect(high - low, zoom=0.95)
     axes.view_init(elev=38, azim=np.degrees(np.arctan2(*(path[-1] - path[0])[[1, 0]])) - 150)
     axes.set_axis_off()
     return figure
@@ -85,7 +86,10 @@ def main() -> None:
         raise SystemExit(f"{options.bag} has no predictions: expected /predicted/terrain and /predicted/path")
     # Candidates follow the path in a thread of their own, and not each prediction gets them.
     complete = [entry for entry in found if "best_path" in entry] or found
-    write_bytes(options.out, figure_png(draw(max(complete, key=lambda entry: length(entry["path"])))))
+    longest = max(
+        complete, key=lambda entry: sum(length(entry[name]) for name in ("path", "best_path") if name in entry)
+    )
+    write_bytes(options.out, figure_png(draw(longest)))
     print(options.out)
 
 

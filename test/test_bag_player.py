@@ -104,10 +104,10 @@ def tf_type():
     return kind
 
 
-def write_motion(path, *, tf: bool):
+def write_motion(path, *, tf: bool, namespace: str = ""):
     with BagWriter(path) as writer:
         lidar = {"lidar": pose_matrix([1, 2, 3, 0, 0, 0])}
-        writer.write("/tf_static", builders.transforms(START, "base_link", lidar), START)
+        writer.write(f"{namespace}/tf_static", builders.transforms(START, "base_link", lidar), START)
         for i in range(60):
             at = START + 10**9 + i * 50_000_000
             odometry = builders.odometry(at, "odom", "base_link", [0.1 * i, 0, 0], [0, 0, 0, 1], [0] * 3, [0] * 3)
@@ -126,6 +126,16 @@ def test_transforms_are_played_or_derived_from_odometry(start, peer, tf_type, tm
     # The static transform lies before the start.
     assert transforms.tree.find("base_link", "lidar")[:3, 3].tolist() == [1.0, 2.0, 3.0]
     assert transforms.tree.find("odom", "base_link")[0, 3] == pytest.approx(7.0 if tf else 5.9)
+
+
+def test_transforms_of_a_robot_with_its_own_tf_stay_together(start, peer, tf_type, tmp_path):
+    bag = write_motion(tmp_path / "bag", tf=False, namespace="/left")
+    received = Listener(peer, tf_type, "/left/tf")
+    player = start("bag_player", bag, "--start", "2", "--wait", "10", "--quiet")
+    assert finish(peer, player, 90.0) == 0
+    assert "the bag has no /left/tf: it is derived from /odom" in player.output
+    assert received.messages[-1].transforms[0].child_frame_id == "base_link"
+    received.close()
 
 
 def test_no_tf_is_derived_on_request(start, peer, tf_type, tmp_path):

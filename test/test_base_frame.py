@@ -6,8 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from monoforce_ros.bags import BagError, BagWriter, Recording, builders
+from monoforce_ros.bags import BagError, BagWriter, ReadOptions, Recording, builders
 from monoforce_ros.core import pose_matrix
+from monoforce_ros.discrepancy import read_evidence
 from monoforce_ros.evaluation import evaluate_recording
 from monoforce_ros.perception import FlatTerrain
 from monoforce_ros.physics import PhysicsOptions
@@ -103,3 +104,33 @@ def test_evaluate_takes_the_offset_from_its_options(tmp_path, executables, ros_e
     assert given.returncode == 0 and "base_link is at (0.000, 0.000, 0.100) m" in given.stdout
     named = run("--base-frame", "base_footprint")
     assert named.returncode == 0 and "odom → base_footprint" in named.stdout
+
+
+def test_a_diagnosis_needs_the_offset_as_an_evaluation_does(tmp_path):
+    bag, robot = write(tmp_path / "moving", "base_footprint", True), load_robot("husky")
+    with pytest.raises(BagError, match=r"frame 'base_footprint'.*refer to 'base_link'.*--odometry-child-pose"):
+        read_evidence(bag, robot, "flat")
+    reading = ReadOptions(odometry_child_pose=(0.0, 0.0, -0.1, 0.0, 0.0, 0.0))
+    evidence, recording = read_evidence(bag, robot, "flat", reading)
+    assert recording.motion.child_frame_id == "base_link" and recording.odometry_child_frame == "base_footprint"
+    assert evidence.smoothed.motion.positions[0, 2] == pytest.approx(0.1, abs=1e-3)
+    # Another name of the same frame.
+    evidence, recording = read_evidence(bag, robot, "flat", ReadOptions(base_frame="base_footprint"))
+    assert evidence.smoothed.motion.positions[0, 2] == pytest.approx(0.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("tool", ["diagnose", "diagnose --commission", "fit_terrain", "train"])
+def test_every_tool_asks_for_the_offset_and_has_the_option_that_it_names(tool, tmp_path, executables, ros_environment):
+    bag = write(tmp_path / "moving", "base_footprint", True)
+    name, *options = tool.split()
+    command = [executables / name, *options, bag, "--out", tmp_path / "out"]
+
+    def run(*more: str) -> str:
+        return subprocess.run(
+            [*command, *more], env=ros_environment, capture_output=True, text=True, timeout=300, check=False
+        ).stderr
+
+    refused = run()
+    assert "'base_footprint'" in refused and "'base_link'" in refused and "--odometry-child-pose X Y Z" in refused
+    given = run("--odometry-child-pose", "0", "0", "-0.1", "0", "0", "0")
+    assert "offset" not in given and "usage" not in given

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from monoforce_ros.bags import BagWriter, builders
+from monoforce_ros.bags import BagWriter, ReadOptions, builders
 from monoforce_ros.core import CommandTrack, MotionTrack, pose_matrix
 from monoforce_ros.evaluation.check import BagCheck, check_bag, check_text, command_delay
 from monoforce_ros.evaluation.findings import Level
@@ -62,6 +62,8 @@ def write(
                     [0, 0, commanded(time - delay)[1]],
                 )
                 bag.write("/odom", odometry, at)
+                if extra.get("wheel_odometry") and i % 2:
+                    bag.write("/platform/odom", odometry, at)
             if commands:
                 bag.write("/cmd_vel", builders.twist_stamped(at, "base_link", *commanded(time)), at)
             if i % 4 == 0:
@@ -126,8 +128,22 @@ def test_an_offset_that_the_bag_knows_is_reported_and_applied(tmp_path, husky):
     assert check.usable
     applied = "frames: base_link is at (0.000, 0.000, 0.130) m and turned by 0.0° in base_footprint"
     assert applied in texts(check, Level.OK)
-    given = check_bag(write(tmp_path / "given", frame="gps"), husky, pose_matrix([0.5, 0, 0, 0, 0, 0]))
+    given = check_bag(
+        write(tmp_path / "given", frame="gps"), husky, ReadOptions(odometry_child_pose=(0.5, 0, 0, 0, 0, 0))
+    )
     assert given.usable and "base_link is at (-0.500, 0.000, 0.000) m" in texts(given, Level.OK)
+
+
+def test_a_choice_among_several_topics_is_reported_and_can_be_made(tmp_path, husky):
+    bag = write(tmp_path / "drive", wheel_odometry=True)
+    check = check_bag(bag, husky)
+    chosen = "odometry: /odom is used, with the most messages of its type, not /platform/odom; --odometry TOPIC selects"
+    assert check.usable and chosen in texts(check, Level.WARNING)
+    named = check_bag(bag, husky, ReadOptions(odometry="/platform/odom"))
+    assert "odometry /platform/odom: " in texts(named, Level.OK)
+    assert "is used, with the most messages" not in texts(named, Level.WARNING)
+    absent = check_bag(bag, husky, ReadOptions(odometry="/nowhere"))
+    assert not absent.usable and "topic /nowhere is absent" in texts(absent, Level.MISSING)
 
 
 def test_the_exit_status_is_1_for_an_unusable_bag(tmp_path, executables, ros_environment, real_data):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from conftest import Process
 from predictor_peer import ground_cloud
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
@@ -97,3 +98,21 @@ def test_a_pose_of_another_size_is_refused(start):
     process = start("predictor", "--ros-args", "-p", "odometry_child_pose:=[1.0, 2.0]")
     assert process.wait() == 1
     assert "odometry_child_pose: got 2 values, expected a list of 6 numbers" in process.output
+
+
+def test_without_tf2_msgs_the_nodes_say_that_tf_is_not_read(peer, executables, ros_environment, tmp_path):
+    blocked = tmp_path / "tf2_msgs"
+    blocked.mkdir()
+    (blocked / "__init__.py").write_text("raise ImportError\n")
+    environment = dict(ros_environment, PYTHONPATH=f"{tmp_path}:{ros_environment.get('PYTHONPATH', '')}")
+    command = [str(executables / "predictor"), "--ros-args", "-p", "terrain_source:=flat", "-r", "__ns:=/bare"]
+    process = Process(command, tmp_path / "predictor.log", environment)
+    try:
+        process.wait_for(
+            "/tf cannot be read: the package tf2_msgs is not installed (sudo apt install ros-jazzy-tf2-msgs"
+        )
+        feed = Feed(peer, "bare")
+        assert feed.until(lambda: "the offset between them is unknown" in feed.status("odometry")[1], 20.0)
+        assert "`make interfaces`" in feed.status("odometry")[1]
+    finally:
+        process.stop()

@@ -115,6 +115,9 @@ def test_doubts_take_the_green_away():
     ground = "the ground is not level, and there is no map of it"
     top = headline(diagnosed((0.5, 0.06), (8.0, 1.0)), [ground])
     assert top.tone is Tone.PARTLY and ground in top.doubts
+    assert top.actions[0].startswith("remove the cause of the doubt") and not any(
+        "robot file" in t for t in top.actions
+    )
     arm = effect("sensor_lever_arm", x=(0.16, -0.2, 0.5), y=(2.0, 0.17, 2.0))
     both = diagnosed((0.5, 0.06), (8.0, 1.0), effects=(DELAY, arm))
     top = headline(both)

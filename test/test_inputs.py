@@ -33,6 +33,32 @@ def test_the_newest_set_is_taken_once_odometry_has_caught_up():
     assert kept.dropped == 1
 
 
+def test_sensors_faster_than_the_lag_of_odometry_are_used_with_odometry_that_has_caught_up():
+    """A lidar at 20 Hz beside SLAM that publishes 0.15 s late: odometry never catches up with the newest cloud."""
+    kept, _ = inputs(["a"])
+    taken = []
+    for tick in range(1, 40):
+        stamp = tick * SECOND // 20
+        kept.add_sensor("a", stamp, stamp)
+        moved(kept, stamp - 3 * SECOND // 20)
+        if found := kept.take(odometry_timeout=5.0, wait=0.0):
+            taken.append(found["a"].stamp)
+    assert taken == [tick * SECOND // 20 for tick in range(1, 37)]
+    assert kept.dropped == 0
+
+
+def test_sensors_do_not_wait_for_odometry_that_never_comes():
+    kept, _ = inputs(["a"])
+    began = time.monotonic()
+    for tick in range(1, 200):
+        kept.add_sensor("a", tick * SECOND // 20, tick)
+        # The next message comes long before the timeout.
+        if taken := kept.take(odometry_timeout=0.3, wait=0.02):
+            break
+    assert taken["a"].message == tick, "the newest one is given"
+    assert 0.25 < time.monotonic() - began < 2.0
+
+
 def test_cameras_are_used_together_when_their_stamps_agree():
     kept, _ = inputs(["a", "b"], patience=5.0)
     moved(kept, 9 * SECOND)

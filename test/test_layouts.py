@@ -44,6 +44,11 @@ def rviz() -> dict:
     return yaml.safe_load((ROOT / "config" / "rviz" / "predictor.rviz").read_text())["Visualization Manager"]
 
 
+def absolute(topic: str) -> str:
+    """A topic of RViz's layout as it is without a namespace."""
+    return f"/{topic}"
+
+
 def foxglove() -> dict:
     return json.loads((ROOT / "config" / "foxglove" / "predictor.json").read_text())
 
@@ -55,7 +60,7 @@ def goal_topic() -> str:
 
 def test_rviz_shows_every_output_with_its_type():
     displays = [d for d in rviz()["Displays"] if "Topic" in d]
-    shown = {display["Topic"]["Value"]: RVIZ[display["Class"]] for display in displays}
+    shown = {absolute(display["Topic"]["Value"]): RVIZ[display["Class"]] for display in displays}
     outputs = {topic: kind for topic, (kind, _) in published().items()}
     known = outputs | inputs()
     assert shown == {topic: known.get(topic) for topic in shown}
@@ -66,20 +71,25 @@ def test_rviz_shows_every_output_with_its_type():
 def test_rviz_gets_the_last_message_of_latched_topics():
     outputs = published()
     for display in rviz()["Displays"]:
-        topic = display.get("Topic", {}).get("Value")
+        topic = absolute(display.get("Topic", {}).get("Value", ""))
         if topic in outputs:
             latched = display["Topic"]["Durability Policy"] == "Transient Local"
             assert latched == outputs[topic][1], topic
 
 
 def test_rviz_receives_best_effort_inputs():
-    (cloud,) = [d for d in rviz()["Displays"] if d.get("Topic", {}).get("Value") == "/points"]
-    assert cloud["Topic"]["Reliability Policy"] == "Best Effort"
+    shown = {absolute(d["Topic"]["Value"]): d["Topic"] for d in rviz()["Displays"] if "Topic" in d}
+    assert {shown[topic]["Reliability Policy"] for topic in inputs()} == {"Best Effort"}
+
+
+def test_rviz_shows_a_robot_in_the_namespace_that_it_is_started_in():
+    named = [entry["Topic"]["Value"] for entry in [*rviz()["Displays"], *rviz()["Tools"]] if "Topic" in entry]
+    assert len(named) > 10 and not [topic for topic in named if topic.startswith("/")]
 
 
 def test_goals_of_both_layouts_reach_path_selector():
     (tool,) = [t for t in rviz()["Tools"] if t["Class"] == "rviz_default_plugins/SetGoal"]
-    assert tool["Topic"]["Value"] == goal_topic()
+    assert absolute(tool["Topic"]["Value"]) == goal_topic()
     publish = foxglove()["configById"]["3D!predictor"]["publish"]
     assert (publish["type"], publish["poseTopic"]) == ("pose", goal_topic())
 

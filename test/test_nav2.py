@@ -13,8 +13,11 @@ from scipy.spatial.transform import Rotation
 from test_candidates_node import walled
 
 from monoforce_ros.bags import builders
+from monoforce_ros.discrepancy.estimates import EffectEstimate, ParameterEstimate
+from monoforce_ros.discrepancy.ros_export import nav2_text
 from monoforce_ros.messages import encoding, message_class
 from monoforce_ros.nodes.schema import read_schema, schema_path
+from monoforce_ros.robots import load_robot
 
 GRID_MAP, FILTER_INFO = "grid_map_msgs/msg/GridMap", "nav2_msgs/msg/CostmapFilterInfo"
 BLOCKS = [
@@ -174,6 +177,29 @@ def test_the_grid_map_holds_every_layer_where_grid_map_looks_for_it(peer, predic
     for place in ((1.0, 2.0) - 2.2 * ahead, (1.0, 2.0) + 2.2 * ahead[::-1], (1.0, 2.0) + 2.2 * ahead * [1, -1]):
         assert at("height", *place) == pytest.approx(0.3 - 0.1323, abs=0.05)
     assert at("friction", *wall) == pytest.approx(0.8) and np.isnan(at("height", *(centre + 0.49 * length)))
+
+
+def test_the_footprint_on_the_page_is_the_robot_s():
+    corners = np.array(yaml.safe_load(COSTMAP["footprint"]))
+    robot = yaml.safe_load((ROOT / "config/robots/husky.yaml").read_text())
+    length = max(part["size"][0] / 2 for part in robot["hull"])
+    width = max(wheel["centre"][1] + wheel["width"] / 2 for wheel in robot["wheels"])
+    np.testing.assert_allclose(corners.max(axis=0), [length, width], atol=0.02)
+    np.testing.assert_allclose(corners.min(axis=0), [-length, -width], atol=0.02)
+
+
+def test_the_controller_on_the_page_is_complete():
+    """MPPI without critics weighs nothing; what diagnose exports must fit under the same names."""
+    (server,) = (block["controller_server"]["ros__parameters"] for block in BLOCKS if "controller_server" in block)
+    controller = server[server["controller_plugins"][0]]
+    assert {"CostCritic", "PathFollowCritic", "GoalCritic"} <= set(controller["critics"])
+    assert controller["model_dt"] == pytest.approx(1.0 / server["controller_frequency"])
+    effects = {}
+    for name, values in {"actuator_saturation": {"limit": 0.7}, "friction_scale": {"factor": 0.6}}.items():
+        parameters = {key: ParameterEstimate(value, value, value, "-") for key, value in values.items()}
+        effects[name] = EffectEstimate(name, parameters)
+    exported = yaml.safe_load(nav2_text(load_robot("husky"), effects)[0])["controller_server"]["ros__parameters"]
+    assert set(exported["FollowPath"]) <= set(controller)
 
 
 def test_the_page_names_parameters_that_exist():

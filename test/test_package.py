@@ -1,5 +1,6 @@
 """The package as seen by ROS tools, and the documents that are generated from its files."""
 
+import os
 import re
 import shutil
 import subprocess
@@ -147,8 +148,14 @@ def test_the_set_up_says_what_to_install_where_there_is_no_python(tmp_path):
     )
     shutil.copy(ROOT / "scripts" / "environment.sh", tmp_path / "scripts")
     (tmp_path / "requirements.lock").write_text("uv==0\n")
+    # The tests themselves may run in the environment of the lowest versions.
+    environment = {name: value for name, value in os.environ.items() if name != "MONOFORCE_ENVIRONMENT"}
     ended = subprocess.run(
-        ["bash", str(tmp_path / "scripts" / "set_up.sh"), "environment"], capture_output=True, text=True, timeout=60
+        ["bash", str(tmp_path / "scripts" / "set_up.sh"), "environment"],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=60,
     )
     assert ended.returncode == 1
     assert "No working Python 3.12" in ended.stderr and "apt install python3.12" in ended.stderr

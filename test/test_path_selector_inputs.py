@@ -191,6 +191,9 @@ def test_the_frame_of_a_goal_comes_before_its_distance(robot):
     robot.send_goal(3.0, 4.0, frame="map")
     assert robot.live(10.0, until=robot.says("the goal is in frame 'map', odometry in 'odom'")), robot.status()
     assert not robot.driven and "reached" not in robot.process.output
+    # The same numbers in another frame are another goal.
+    robot.send_goal(3.0, 4.0, frame="odom")
+    assert robot.live(10.0, until=lambda: "new goal: to (3.00, 4.00) in frame 'odom'" in robot.process.output)
 
 
 def test_goals_in_the_map_are_transformed_by_tf(robot):

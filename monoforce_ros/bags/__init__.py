@@ -1,6 +1,7 @@
 """Read and write rosbag files of ROS 2 (sqlite3, mcap) and read those of ROS 1, without a ROS installation."""
 
 from monoforce_ros.bags import builders
+from monoforce_ros.bags.read_options import DETECTED, ReadOptions, add_read_options, read_options
 from monoforce_ros.bags.reader import BagError, BagMessage, BagReader
 from monoforce_ros.bags.recording import (
     CAMERA_INFO,
@@ -23,6 +24,7 @@ __all__ = [
     "CAMERA_INFO",
     "CLOUD",
     "COMMANDS",
+    "DETECTED",
     "IMAGES",
     "ODOMETRY",
     "BagError",
@@ -30,14 +32,17 @@ __all__ = [
     "BagReader",
     "BagWriter",
     "Frame",
+    "ReadOptions",
     "Recording",
     "SmoothedMotion",
     "Windows",
+    "add_read_options",
     "builders",
     "camera_info_topic",
     "cut_windows",
     "find_transform",
     "nearest_frame",
+    "read_options",
     "smooth",
     "type_store",
 ]

@@ -69,6 +69,10 @@ class Recording:
     """Measurements of the IMU, if there is one."""
     wheels: WheelTrack | None = None
     """Measured wheel speeds, if there are any."""
+    choices: tuple[str, ...] = ()
+    """Topics that were chosen among several of their type; also among the warnings."""
+    odometry_child_frame: str = ""
+    """The frame that the odometry messages describe; ``motion`` may be that of the base."""
 
     @classmethod
     def open(
@@ -98,6 +102,8 @@ class Recording:
             topics.update(image_topics, bag.of_type(CAMERA_INFO), bag.of_type(TRANSFORMS))
             collected = _Collector(bag, chosen)
             collected.warnings.extend(bag.warnings)
+            collected.choices = _choices(bag, chosen, {"odometry": odometry, "commands": commands, "cloud": cloud})
+            collected.warnings.extend(collected.choices)
             try:
                 for message in bag.messages(topics):
                     collected.take(message)
@@ -233,6 +239,19 @@ def _choose(bag: BagReader, named: str | None, message_types: tuple[str, ...]) -
     return max(candidates, key=lambda topic: bag.counts[topic], default=None)
 
 
+def _choices(bag: BagReader, chosen: Mapping[str, str | None], named: Mapping[str, str | None]) -> list[str]:
+    """What was chosen among several topics of a type, and how to choose another one."""
+    texts = []
+    for role, types in (("odometry", (ODOMETRY,)), ("commands", COMMANDS), ("cloud", (CLOUD,))):
+        others = [topic for topic in bag.of_type(*types) if topic != chosen[role] and bag.counts[topic]]
+        if others and not named[role]:
+            texts.append(
+                f"{role}: {chosen[role]} is used, with the most messages of its type, not {', '.join(others)}; "
+                f"--{role} TOPIC selects another one"
+            )
+    return texts
+
+
 class _Collector:
     """Collects the messages of one pass over a bag."""
 
@@ -250,6 +269,7 @@ class _Collector:
         self.transforms: dict[tuple[str, str], np.ndarray] = {}
         self._moving: set[tuple[str, str]] = set()
         self.warnings: list[str] = []
+        self.choices: list[str] = []
 
     def take(self, message: BagMessage) -> None:
         try:
@@ -332,6 +352,8 @@ class _Collector:
             static_transforms=self.transforms,
             topics={role: topic for role, topic in self.chosen.items() if topic},
             warnings=tuple(self.warnings),
+            choices=tuple(self.choices),
+            odometry_child_frame=self.frames[1],
             angular_velocity=self._angular_velocity_track(),
             wheels=self._wheel_track(),
         )

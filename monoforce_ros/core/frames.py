@@ -128,7 +128,8 @@ class RobotFrames:
             raise FrameError(
                 f"odometry describes the frame {frame!r}, lengths in the robot file refer to {base!r}, and the offset "
                 f"between them is unknown: {transforms.missing_path(base, frame)}. Publish it on /tf_static, give it "
-                "as `odometry_child_pose`, or name the robot's frame in `base_frame`"
+                "as `odometry_child_pose` (--odometry-child-pose X Y Z ROLL PITCH YAW), or, if the frame of the robot "
+                "file has another name here, give that name as `base_frame` (--base-frame)"
             )
         return pose
 

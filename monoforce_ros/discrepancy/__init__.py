@@ -1,6 +1,6 @@
 """Compares a robot's model with recordings and identifies the physical effects that it lacks."""
 
-from monoforce_ros.discrepancy.bag_diagnosis import BagDiagnosis, Topics, diagnose_bag, read_evidence
+from monoforce_ros.discrepancy.bag_diagnosis import BagDiagnosis, diagnose_bag, read_evidence
 from monoforce_ros.discrepancy.commissioning import commission
 from monoforce_ros.discrepancy.credibility import complaint
 from monoforce_ros.discrepancy.diagnosis import Diagnosis, DiagnosisSettings, diagnose
@@ -21,7 +21,6 @@ __all__ = [
     "Exported",
     "Ground",
     "ParameterEstimate",
-    "Topics",
     "Verdict",
     "command_delay",
     "commission",

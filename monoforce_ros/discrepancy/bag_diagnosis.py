@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from monoforce_ros.bags import BagError, Recording, smooth
+from monoforce_ros.bags import DETECTED, ReadOptions, Recording, smooth
 from monoforce_ros.discrepancy.comparison import GapRow, compare, gap_table
 from monoforce_ros.discrepancy.credibility import complaint
 from monoforce_ros.discrepancy.diagnosis import Diagnosis, DiagnosisSettings, diagnose
@@ -35,15 +35,6 @@ _MARGIN = 4.0
 
 
 @dataclass(frozen=True)
-class Topics:
-    """Names of topics; those that are None are detected by message type."""
-
-    odometry: str | None = None
-    commands: str | None = None
-    cloud: str | None = None
-
-
-@dataclass(frozen=True)
 class BagDiagnosis:
     """The diagnosis of a bag and the files written for it."""
 
@@ -66,7 +57,9 @@ class BagDiagnosis:
         return replace(self, diagnosis=replace(self.diagnosis, details=None))
 
 
-def read_evidence(bag: Path, robot: RobotModel, terrain: str, topics: Topics = Topics()) -> tuple[Evidence, Recording]:
+def read_evidence(
+    bag: Path, robot: RobotModel, terrain: str, reading: ReadOptions = DETECTED
+) -> tuple[Evidence, Recording]:
     """A bag's smoothed motion, commands and ground.
 
     Args:
@@ -74,26 +67,21 @@ def read_evidence(bag: Path, robot: RobotModel, terrain: str, topics: Topics = T
         robot: its own body is removed from the lidar's sweeps.
         terrain: ``auto`` (see :func:`choose_ground`), ``flat``, ``lidar`` (all sweeps of the recording as one map),
             ``traced`` (by the wheels along the poses) or a file of ``fit_terrain``.
-        topics: topic names that replace detection by type.
+        reading: topics and frames that replace those that the bag says.
 
     Raises:
         BagError, TerrainError, TerrainFileError: required data are missing or damaged.
     """
-    evidence, recording, _ = read_with_ground(bag, robot, terrain, topics)
+    evidence, recording, _ = read_with_ground(bag, robot, terrain, reading)
     return evidence, recording
 
 
 def read_with_ground(
-    bag: Path, robot: RobotModel, terrain: str, topics: Topics = Topics()
+    bag: Path, robot: RobotModel, terrain: str, reading: ReadOptions = DETECTED
 ) -> tuple[Evidence, Recording, Ground]:
     """As :func:`read_evidence`, and which ground was taken."""
-    recording = Recording.open(bag, odometry=topics.odometry, commands=topics.commands, cloud=topics.cloud)
-    try:
-        recording = recording.in_base_frame(robot.base_frame)
-    except BagError as error:
-        # The poses may still be those of the base; where they are not, the offset is identified as a lever arm.
-        text = f"{error}. The odometry is taken for that of the base; an offset would appear as sensor_lever_arm"
-        recording = replace(recording, warnings=(*recording.warnings, text))
+    recording = reading.open(bag, robot)
+    robot = reading.robot_in_bag(robot)
     smoothed = smooth(recording.motion)
     evidence = Evidence(smoothed, recording.commands, gyro=recording.angular_velocity, wheels=recording.wheels)
     ground = choose_ground(terrain, recording, smoothed, robot)
@@ -121,7 +109,7 @@ def diagnose_bag(
     out: Path,
     *,
     terrain: str = "auto",
-    topics: Topics = Topics(),
+    reading: ReadOptions = DETECTED,
     settings: DiagnosisSettings = DiagnosisSettings(),  # noqa: B008
     held_out: Sequence[Path] = (),
     progress: Callable[[float, str], None] = lambda share, step: None,
@@ -133,7 +121,7 @@ def diagnose_bag(
         robot: name or file of the nominal robot; a commissioned file contains the nominal residual RMS.
         out: folder of the reports.
         terrain: see :func:`read_evidence`.
-        topics: topic names that replace detection by type.
+        reading: topics and frames that replace those that the bag says.
         settings: settings of the diagnosis.
         held_out: further recordings on which errors before and after are compared; nothing is fitted to them.
         progress: called with the share of the work done and the next step.
@@ -148,7 +136,7 @@ def diagnose_bag(
     if found_file.exists() and found_file.resolve() == robot_file_of(robot).resolve():
         raise ValueError(f"{out}: got the folder of the nominal robot file {found_file.name}, expected another --out")
     progress(0.0, "reading")
-    evidence, recording, ground = read_with_ground(bag, model, terrain, topics)
+    evidence, recording, ground = read_with_ground(bag, model, terrain, reading)
     data = fingerprint([bag])
     others = _distinct_names(held_out)
     for other in others.values():
@@ -169,7 +157,9 @@ def diagnose_bag(
     if diagnosis.verdict == Verdict.NOT_IDENTIFIABLE:
         diagnosis = _with_wheels(diagnosis, evidence, model)
     robot_file = None
-    if diagnosis.effects and all(not complaint(effect, _in_file(model, effect.name)) for effect in diagnosis.effects):
+    # On ground that no map shows slopes pass for effects: nothing of that belongs into a robot file.
+    credible = bool(diagnosis.effects) and not ground.unknown
+    if credible and all(not complaint(effect, _in_file(model, effect.name)) for effect in diagnosis.effects):
         effects = [effect_entry(effect) for effect in diagnosis.effects]
         robot_file = write_robot(robot, found_file, effects, [bag], data)
     elif found_file.exists():
@@ -181,7 +171,7 @@ def diagnose_bag(
     if others:
         progress(0.97, "held-out recordings")
         tables = {
-            name: _held_out_table(path, model, diagnosis.fitted, terrain, topics) for name, path in others.items()
+            name: _held_out_table(path, model, diagnosis.fitted, terrain, reading) for name, path in others.items()
         }
         diagnosis = replace(diagnosis, held_out=tables)
     smoothed = evidence.smoothed
@@ -232,9 +222,11 @@ def _distinct_names(bags: Sequence[Path]) -> dict[str, Path]:
     return named
 
 
-def _held_out_table(bag: Path, robot: RobotModel, effects: Effects, terrain: str, topics: Topics) -> dict[str, GapRow]:
+def _held_out_table(
+    bag: Path, robot: RobotModel, effects: Effects, terrain: str, reading: ReadOptions
+) -> dict[str, GapRow]:
     """Errors without and with the effects on a recording to which nothing was fitted."""
-    evidence, _ = read_evidence(bag, robot, terrain, topics)
+    evidence, _ = read_evidence(bag, robot, terrain, reading)
     evidence = corrected_evidence(evidence, robot)
     smoothed = evidence.smoothed
     starts = window_starts(smoothed.motion, smoothed.stretches, 2.0, 1.0)

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from monoforce_ros.bags import BagError
-from monoforce_ros.discrepancy.bag_diagnosis import BagDiagnosis, Topics, diagnose_bag, read_with_ground
+from monoforce_ros.bags import BagError, add_read_options, read_options
+from monoforce_ros.discrepancy.bag_diagnosis import BagDiagnosis, diagnose_bag, read_with_ground
 from monoforce_ros.discrepancy.commissioning import commission
 from monoforce_ros.discrepancy.diagnosis import DiagnosisSettings
 from monoforce_ros.discrepancy.export import export_effects, export_target
@@ -59,9 +59,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--effects", type=int, default=4, metavar="N", help="largest number of effects to add (%(default)s)"
     )
-    parser.add_argument("--odometry", metavar="TOPIC", help="(detected by message type)")
-    parser.add_argument("--commands", metavar="TOPIC", help="(detected by message type)")
-    parser.add_argument("--cloud", metavar="TOPIC", help="(detected by message type)")
+    add_read_options(parser)
     parser.add_argument(
         "--held-out",
         nargs="+",
@@ -166,7 +164,7 @@ def _run(
         options.robot,
         out,
         terrain=options.terrain,
-        topics=Topics(options.odometry, options.commands, options.cloud),
+        reading=read_options(options),
         settings=DiagnosisSettings(max_effects=options.effects),
         held_out=options.held_out,
         progress=progress,
@@ -215,10 +213,9 @@ def _diagnose_many(options: argparse.Namespace) -> int:
 
 def _commission(options: argparse.Namespace) -> int:
     robot = load_robot(options.robot)
-    topics = Topics(options.odometry, options.commands, options.cloud)
     recordings = []
     for bag in options.bags:
-        evidence, _, ground = read_with_ground(bag, robot, options.terrain, topics)
+        evidence, _, ground = read_with_ground(bag, robot, options.terrain, read_options(options))
         recordings.append(evidence)
         print(f"{bag}: ground: {ground.description}")
         if ground.unknown:

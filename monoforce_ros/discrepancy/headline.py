@@ -140,7 +140,9 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
         if effect.indistinguishable:
             others = " or ".join(cause(other) for other in effect.indistinguishable)
             doubts.append(f"{cause(effect.name)} could as well be {others}: this recording cannot tell them apart")
-    actions = [*(remedy(effect.name) for effect in effects), *diagnosis.advice]
+    # What was found under a doubt about the recording or the ground may be nothing but its cause.
+    remedies = ["remove the cause of the doubt first, then run diagnose again"] if complaints else []
+    actions = [*(remedies or [remedy(effect.name) for effect in effects]), *diagnosis.advice]
     counted = [row for row in rows if row.counts]
     grew = [row for row in rows if row.grew]
     doubts += [_growth(row) for row in grew]

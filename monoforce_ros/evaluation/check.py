@@ -9,7 +9,16 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from monoforce_ros.bags import BagError, BagReader, Recording, SmoothedMotion, camera_info_topic, smooth
+from monoforce_ros.bags import (
+    DETECTED,
+    BagError,
+    BagReader,
+    ReadOptions,
+    Recording,
+    SmoothedMotion,
+    camera_info_topic,
+    smooth,
+)
 from monoforce_ros.core import NANOSECOND, MotionTrack
 from monoforce_ros.discrepancy import command_delay, motion_faults
 from monoforce_ros.evaluation.findings import Finding, Level, missing, note, ok, warning
@@ -34,14 +43,13 @@ class BagCheck:
         return not any(finding.level is Level.MISSING for finding in self.findings)
 
 
-def check_bag(path: str | Path, robot: RobotModel, odometry_child_pose: np.ndarray | None = None) -> BagCheck:
+def check_bag(path: str | Path, robot: RobotModel, reading: ReadOptions = DETECTED) -> BagCheck:
     """Read a bag once and report its contents, missing data and faults.
 
     Args:
         path: the bag.
         robot: its file may define sensor poses that the bag lacks; commands are compared with its limits.
-        odometry_child_pose: pose ``[4, 4]`` of the odometry's child frame in the base frame; by default from the bag's
-            transforms.
+        reading: topics and frames that replace those that the bag says.
 
     Raises:
         BagError: nothing of the bag can be read.
@@ -59,7 +67,7 @@ def check_bag(path: str | Path, robot: RobotModel, odometry_child_pose: np.ndarr
             findings.append(warning(str(error)))
     for topic in topics.values():
         findings += topic.findings()
-    findings += _contents(path, robot, topics.values(), odometry_child_pose)
+    findings += _contents(path, robot, topics.values(), reading)
     return BagCheck(
         Path(path), duration, tuple(sorted(topics.values(), key=lambda topic: topic.topic)),
         tuple(sorted(findings, key=lambda finding: finding.level.rank)),
@@ -67,19 +75,21 @@ def check_bag(path: str | Path, robot: RobotModel, odometry_child_pose: np.ndarr
 
 
 def _contents(
-    path: str | Path, robot: RobotModel, topics: Collection[TopicCheck], odometry_child_pose: np.ndarray | None
+    path: str | Path, robot: RobotModel, topics: Collection[TopicCheck], reading: ReadOptions
 ) -> Iterator[Finding]:
     """Findings about the odometry, commands and sensors of a bag."""
     try:
-        recording = Recording.open(path)
+        recording = reading.open_as_measured(path)
     except BagError as error:
         yield missing(f"odometry: {error}. Record nav_msgs/Odometry from wheels, lidar or visual SLAM")
         return
+    yield from (warning(text) for text in recording.choices)
+    robot = reading.robot_in_bag(robot)
     motion = recording.motion
     span = (int(motion.stamps[-1]) - int(motion.stamps[0])) * NANOSECOND
     yield ok(f"odometry {recording.topics['odometry']}: {motion.frame_id} → {motion.child_frame_id}, {span:.1f} s")
     try:
-        recording = recording.in_base_frame(robot.base_frame, odometry_child_pose)
+        recording = reading.at_base(recording, robot)
     except BagError as error:
         yield missing(f"frames: {error}")
     else:

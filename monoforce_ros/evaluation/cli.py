@@ -6,15 +6,14 @@ import argparse
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import override
 
 import numpy as np
 import torch
 
-from monoforce_ros.bags import BagError, Recording
-from monoforce_ros.core import pose_matrix, share_directory
+from monoforce_ros.bags import BagError, add_read_options, read_options
+from monoforce_ros.core import share_directory
 from monoforce_ros.effects import EffectError
 from monoforce_ros.encoder import CheckpointError
 from monoforce_ros.evaluation import figures
@@ -34,7 +33,7 @@ from monoforce_ros.perception import SOURCES, choose_terrain_source
 from monoforce_ros.physics import PhysicsOptions
 from monoforce_ros.prediction import Predictor
 from monoforce_ros.reporting import figure_png
-from monoforce_ros.robots import RobotFileError, RobotModel, load_robot, shipped_robots
+from monoforce_ros.robots import RobotFileError, load_robot, shipped_robots
 from monoforce_ros.terrain import TerrainDefaults
 
 
@@ -80,23 +79,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--memory", type=float, dest="retention_time", action=_FormerOption, help=argparse.SUPPRESS)
     parser.add_argument("--images", nargs="+", default=None, metavar="TOPIC", help="image topics (default: all)")
-    parser.add_argument("--odometry", default=None, metavar="TOPIC", help="odometry topic (default: detected by type)")
-    parser.add_argument("--commands", default=None, metavar="TOPIC", help="command topic (default: detected by type)")
-    parser.add_argument("--cloud", default=None, metavar="TOPIC", help="point cloud topic (default: detected by type)")
-    parser.add_argument(
-        "--base-frame",
-        default="",
-        metavar="FRAME",
-        help="the robot's base frame in the bag (default: the robot file's)",
-    )
-    parser.add_argument(
-        "--odometry-child-pose",
-        nargs=6,
-        type=float,
-        default=None,
-        metavar=("X", "Y", "Z", "ROLL", "PITCH", "YAW"),
-        help="pose of the odometry's child frame in the base frame [m, rad] (default: from the bag's transforms)",
-    )
+    add_read_options(parser)
     parser.add_argument("--horizons", nargs="+", type=float, default=[1.0, 2.0, 5.0], metavar="S",
                         help="times at which errors are reported [s] (default: 1 2 5)")  # fmt: skip
     parser.add_argument(
@@ -140,7 +123,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         if options.check:
             bag = options.bag or share_directory() / "bags" / "demo"
-            check = check_bag(bag, _robot(options), _child_pose(options))
+            check = check_bag(bag, load_robot(options.robot), read_options(options))
             print(check_text(check))
             return int(not check.usable)
         run(options)
@@ -150,27 +133,16 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
-def _robot(options: argparse.Namespace) -> RobotModel:
-    """The robot, with the name that its base frame has in the bag."""
-    robot = load_robot(options.robot)
-    return replace(robot, base_frame=options.base_frame) if options.base_frame else robot
-
-
-def _child_pose(options: argparse.Namespace) -> np.ndarray | None:
-    pose = options.odometry_child_pose
-    return None if pose is None else pose_matrix(pose)
-
-
 def run(options: argparse.Namespace) -> None:
     """Evaluate and write the reports."""
     began = time.monotonic()
     # Operations are many and small: one thread is faster than several, above all on a busy machine.
     torch.set_num_threads(1)
     bag = options.bag or share_directory() / "bags" / "demo"
-    robot = _robot(options)
-    recording = Recording.open(bag, odometry=options.odometry, commands=options.commands, cloud=options.cloud)
-    odometry_child = recording.motion.child_frame_id
-    recording = recording.in_base_frame(robot.base_frame, _child_pose(options))
+    reading = read_options(options)
+    robot = load_robot(options.robot)
+    recording = reading.open(bag, robot)
+    robot = reading.robot_in_bag(robot)
     material = TerrainDefaults(friction=options.friction)
     source = choose_terrain_source(
         options.terrain,
@@ -231,7 +203,8 @@ def run(options: argparse.Namespace) -> None:
         "terrain": options.terrain,
         "checkpoint": options.checkpoint or "–",
         "topics": ", ".join(f"{role} {topic}" for role, topic in recording.topics.items()),
-        "odometry": f"{recording.motion.frame_id} → {odometry_child}, evaluated at {recording.motion.child_frame_id}",
+        "odometry": f"{recording.motion.frame_id} → {recording.odometry_child_frame}, "
+        f"evaluated at {recording.motion.child_frame_id}",
         "friction": options.friction,
         "stride [s]": options.stride,
         "physics": str(predictor.options),

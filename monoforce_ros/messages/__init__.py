@@ -3,7 +3,7 @@
 from monoforce_ros.messages import decoding, encoding
 from monoforce_ros.messages.cdr import CdrWriter
 from monoforce_ros.messages.decoding import MessageError, stamp_of
-from monoforce_ros.messages.message_types import message_class
+from monoforce_ros.messages.message_types import message_class, missing_package
 
 __all__ = [
     "CdrWriter",
@@ -11,5 +11,6 @@ __all__ = [
     "decoding",
     "encoding",
     "message_class",
+    "missing_package",
     "stamp_of",
 ]

@@ -16,7 +16,7 @@ from rosgraph_msgs.msg import Clock
 
 from monoforce_ros.bags import BagError, BagMessage, BagReader, type_store
 from monoforce_ros.core import share_directory
-from monoforce_ros.messages import message_class
+from monoforce_ros.messages import message_class, missing_package
 from monoforce_ros.nodes.arguments import NodeArgumentParser, own_arguments
 from monoforce_ros.nodes.frames import TRANSFORMS
 from monoforce_ros.nodes.odometry_transform import odometry_transform
@@ -70,7 +70,7 @@ class BagPlayer(Node):
                 continue
             message_type_class = message_class(message_type)
             if message_type_class is None:
-                self.get_logger().warning(f"{topic} is not played: {message_type} is not installed")
+                self.get_logger().warning(f"{topic} is not played: {missing_package(message_type)}")
                 continue
             latched = _is_static(topic)
             quality = QoSProfile(
@@ -93,14 +93,18 @@ class BagPlayer(Node):
         if self.options.no_tf or recorded or not played or kind is None:
             return "", None
         topic = max(played, key=lambda name: self.bag.counts[name])
-        self.get_logger().info(f"the bag has no /tf: it is derived from {topic} (--no-tf disables this)")
-        return topic, self.create_publisher(kind, "/tf", 100)
+        # A robot in a namespace may have a /tf of its own; then its static transforms are there, too.
+        static = sorted(topic for topic in self.playable if _is_static(topic))
+        target = static[0].removesuffix("_static") if static else "/tf"
+        self.get_logger().info(f"the bag has no {target}: it is derived from {topic} (--no-tf disables this)")
+        return topic, self.create_publisher(kind, target, 100)
 
     def wait_for_subscribers(self) -> None:
         """Wait for a first subscriber, and then a little longer for further ones."""
         deadline = time.monotonic() + self.options.wait
         while time.monotonic() < deadline and self.context.ok():
-            if any(publisher.get_subscription_count() for publisher in self.playable.values()):
+            publishers = [*self.playable.values(), *filter(None, [self._transforms])]
+            if any(publisher.get_subscription_count() for publisher in publishers):
                 self._sleep(min(1.0, self.options.wait))
                 return
             self._sleep(0.05)

@@ -13,7 +13,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from monoforce_ros.bags import BagWriter
-from monoforce_ros.messages import message_class
+from monoforce_ros.messages import message_class, missing_package
 from monoforce_ros.nodes.arguments import NodeArgumentParser, own_arguments
 from monoforce_ros.nodes.parameters import refuse_unknown_parameters
 from monoforce_ros.nodes.process import initialise
@@ -54,7 +54,7 @@ class BagRecorder(Node):
             self._subscribed.add(topic)
             kind = message_class(types[0])
             if kind is None:
-                self.get_logger().warning(f"{topic} is not recorded: {types[0]} is not installed")
+                self.get_logger().warning(f"{topic} is not recorded: {missing_package(types[0])}")
                 continue
             # The strictest QoS that every publisher offers loses the fewest messages.
             reliable = all(p.qos_profile.reliability == ReliabilityPolicy.RELIABLE for p in publishers)

@@ -7,8 +7,8 @@ from typing import Any
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
-from monoforce_ros.core import TransformTree
-from monoforce_ros.messages import MessageError, decoding, message_class
+from monoforce_ros.core import FrameError, TransformTree
+from monoforce_ros.messages import MessageError, decoding, message_class, missing_package
 
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 
@@ -27,8 +27,8 @@ class TransformListener:
         self.tree = TransformTree()
         self._node = node
         kind = message_class(TRANSFORMS)
-        self.available = kind is not None
-        """Whether transforms can be received at all."""
+        self.unavailable = "" if kind is not None else f"/tf cannot be read: {missing_package(TRANSFORMS)}"
+        """Why no transforms can be received; empty where they can."""
         if kind is None:
             return
         latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -36,6 +36,10 @@ class TransformListener:
             node.create_subscription(kind, "/tf", self._on_transforms, QoSProfile(depth=100)),
             node.create_subscription(kind, "/tf_static", self._on_transforms, latched),
         )
+
+    def explained(self, error: FrameError) -> str:
+        """An error about frames, and that transforms cannot be received if that is the reason."""
+        return f"{error}. {self.unavailable}" if self.unavailable else str(error)
 
     def _on_transforms(self, message: Any) -> None:
         try:

@@ -20,6 +20,8 @@ TIME_JUMP = 1_000_000_000
 
 ODOMETRY_LAG = 30_000_000
 """Largest time by which sensor data may be newer than the odometry used with them [ns]."""
+MOST_WAITING = 16
+"""Sets of sensor messages that wait for odometry: 0.3 s of a lidar and three cameras at 10 Hz each, and some more."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,7 @@ class Inputs:
         self._commands: deque[tuple[int, np.ndarray]] = deque()
         self._newest: dict[str, Received] = {}
         self._intervals: dict[str, int] = {}
-        self._pending: dict[str, Received] = {}
+        self._waiting: deque[dict[str, Received]] = deque()
         self._first_sensor = 0.0
 
     def _admit(self, topic: str, stamp: int) -> bool:
@@ -97,7 +99,7 @@ class Inputs:
                 self._commands.popleft()
 
     def add_sensor(self, topic: str, stamp: int, message: Any) -> None:
-        """Keep a sensor's newest message; a complete set replaces the one that waits to be used."""
+        """Keep a sensor's newest message; a complete set waits for odometry."""
         with self.changed:
             if not self._admit(topic, stamp):
                 self.dropped += 1
@@ -115,33 +117,48 @@ class Inputs:
                 self._slop, (1e-9 * entry for entry in self._intervals.values())
             ):
                 return
-            self.dropped += bool(self._pending)
-            self._pending = {name: entry for name, entry in self._newest.items() if entry in live}
+            self._waiting.append({name: entry for name, entry in self._newest.items() if entry in live})
+            if len(self._waiting) > MOST_WAITING:
+                self._waiting.popleft()
+                self.dropped += 1
             self.changed.notify_all()
 
     def take(self, *, odometry_timeout: float, wait: float) -> dict[str, Received] | None:
-        """The newest complete set of sensor messages once odometry has caught up with it; None after ``wait`` [s].
+        """The newest complete set of sensor messages with which odometry has caught up; None after ``wait`` [s].
 
-        Over the last :data:`ODOMETRY_LAG` motion is extrapolated (:meth:`MotionTrack.at`), which beats waiting.
-        A set waits for odometry no longer than ``odometry_timeout`` [s].
+        Over the last :data:`ODOMETRY_LAG` motion is extrapolated (:meth:`MotionTrack.at`), which beats waiting. If
+        odometry has not caught up with any set for ``odometry_timeout`` [s], the newest one is given anyway. Sets older
+        than the one that is given are dropped.
         """
         deadline = time.monotonic() + wait
         with self.changed:
             while True:
                 now = time.monotonic()
-                if self._pending:
-                    stamp = max(entry.stamp for entry in self._pending.values())
-                    arrival = max(entry.arrival for entry in self._pending.values())
-                    caught_up = bool(self._states) and self._states[-1].stamp >= stamp - ODOMETRY_LAG
-                    if caught_up or now - arrival >= odometry_timeout:
-                        taken, self._pending = self._pending, {}
+                limit = deadline
+                if self._waiting:
+                    # The oldest set decides how long odometry is waited for: newer ones may arrive faster than that.
+                    overdue = max(entry.arrival for entry in self._waiting[0].values()) + odometry_timeout
+                    index = self._newest_with_odometry()
+                    if index is None and now >= overdue:
+                        index = len(self._waiting) - 1
+                    if index is not None:
+                        taken = self._waiting[index]
+                        self.dropped += index
+                        for _ in range(index + 1):
+                            self._waiting.popleft()
                         return taken
-                    limit = min(deadline, arrival + odometry_timeout)
-                else:
-                    limit = deadline
+                    limit = min(deadline, overdue)
                 if now >= deadline:
                     return None
                 self.changed.wait(max(0.0, limit - now) + 1e-3)
+
+    def _newest_with_odometry(self) -> int | None:
+        """Index of the newest waiting set with which odometry has caught up; None if there is none."""
+        if not self._states:
+            return None
+        latest = self._states[-1].stamp + ODOMETRY_LAG
+        ready = (max(entry.stamp for entry in waiting.values()) <= latest for waiting in self._waiting)
+        return max((index for index, is_ready in enumerate(ready) if is_ready), default=None)
 
     def take_motion(self, last: int, *, wait: float) -> dict[str, Received] | None:
         """The newest odometry as the input of a prediction, unless its stamp is ``last`` [ns].

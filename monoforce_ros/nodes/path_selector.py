@@ -111,8 +111,8 @@ class PathSelectorNode(Node):
         waiting = f"waiting for a {wanted[0]} on {self.resolve_topic_name(wanted[1])}"
         self.health.report(PART, OK, waiting, reason="waiting")
         self.get_logger().info(waiting)
-        if not self.transforms.available:
-            self.get_logger().info("tf2_msgs is not installed: goals must be in the odometry frame")
+        if self.transforms.unavailable:
+            self.get_logger().warning(f"goals must be in the odometry frame: {self.transforms.unavailable}")
 
     def _subscribe(self, topic: str, name: str, kind: type, callback) -> AdaptiveSubscription:  # type: ignore[no-untyped-def]
         return AdaptiveSubscription(self, topic, {name: kind}, callback, depth=1)
@@ -136,7 +136,9 @@ class PathSelectorNode(Node):
             self.health.report(PART, ERROR, message, reason="goal")
             return
         previous, self._course = self._course, Course(frame_id, points)
-        if previous is None or not np.array_equal(previous.points[-1], points[-1]):
+        # A plan is sent again and again; the same numbers in another frame are another goal.
+        same = previous is not None and (previous.frame_id, *previous.points[-1]) == (frame_id, *points[-1])
+        if not same:
             end = points[-1]
             self.get_logger().info(f"new {kind}: to ({end[0]:.2f}, {end[1]:.2f}) in frame {frame_id or 'odometry'!r}")
             self._progress.clear()
@@ -152,7 +154,7 @@ class PathSelectorNode(Node):
         try:
             self._motion = state.of_base(self.frames.odometry_child(child, self.transforms.tree))
         except FrameError as error:
-            self._offset_problem = str(error)
+            self._offset_problem = self.transforms.explained(error)
             self.health.report("odometry", ERROR, self._offset_problem, reason="frame")
             return
         self._offset_problem = ""
@@ -260,9 +262,7 @@ class PathSelectorNode(Node):
             return course.points
         pose = self.transforms.tree.find(odometry_frame, goal_frame)
         if pose is None:
-            reason = "tf2_msgs is not installed, so that /tf cannot be read"
-            if self.transforms.available:
-                reason = self.transforms.tree.missing_path(odometry_frame, goal_frame)
+            reason = self.transforms.unavailable or self.transforms.tree.missing_path(odometry_frame, goal_frame)
             raise Stop(f"the goal is in frame {goal_frame!r}, odometry in {odometry_frame!r}: {reason}", "frame")
         return transform_points(pose, course.points)
 

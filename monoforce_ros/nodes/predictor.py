@@ -97,6 +97,8 @@ class PredictorNode(ManagedNode):
             pose_matrix(settings.odometry_child_pose) if settings.odometry_child_pose else None,
         )
         self.transforms = TransformListener(self)
+        if self.transforms.unavailable:
+            self.get_logger().info(f"sensor poses are those of the robot file: {self.transforms.unavailable}")
         self.decoder = SensorDecoder(self.frames, self.transforms.tree, self.health)
         self.inputs = Inputs(
             list(self.sensor_topics.values()),
@@ -241,7 +243,7 @@ class PredictorNode(ManagedNode):
         try:
             pose = self.frames.odometry_child(child_frame_id, self.transforms.tree)
         except FrameError as error:
-            self.health.report("odometry", ERROR, str(error), reason="frame")
+            self.health.report("odometry", ERROR, self.transforms.explained(error), reason="frame")
             return
         self.inputs.add_motion("odometry", state.of_base(pose), frame_id, child_frame_id)
         self.health.report("odometry", OK, "receiving odometry")

@@ -15,7 +15,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from monoforce_ros.bags import builders, type_store
-from monoforce_ros.messages import decoding, message_class
+from monoforce_ros.messages import decoding, message_class, missing_package
 from monoforce_ros.nodes.arguments import NodeArgumentParser, own_arguments
 from monoforce_ros.nodes.frames import TRANSFORMS
 from monoforce_ros.nodes.odometry_transform import odometry_transform
@@ -74,7 +74,7 @@ class SimulatorNode(Node):
             follow_listeners=True,
         )
         if message_class(TRANSFORMS) is None:
-            self.get_logger().info("tf2_msgs is not installed: no transforms are published on /tf")
+            self.get_logger().warning(f"no transforms are published on /tf: {missing_package(TRANSFORMS)}")
         else:
             latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
             self._outputs["/tf_static"] = self.create_publisher(message_class(TRANSFORMS), "/tf_static", latched)

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from monoforce_ros.bags import BagError, Recording, SmoothedMotion, smooth
+from monoforce_ros.bags import BagError, Recording, SmoothedMotion, add_read_options, read_options, smooth
 from monoforce_ros.core import write_bytes, write_text
 from monoforce_ros.reporting import figure_png, progress
 from monoforce_ros.robots import RobotFileError, RobotModel, load_robot, shipped_robots
@@ -99,9 +99,7 @@ def build_parser() -> argparse.ArgumentParser:
                         "odometry's position (default: estimated)")  # fmt: skip
     parser.add_argument("--rotation-noise", type=float, metavar="DEG", help="standard deviation of the "
                         "odometry's rotation (default: estimated)")  # fmt: skip
-    parser.add_argument("--odometry", metavar="TOPIC", help="(default: detected by type)")
-    parser.add_argument("--commands", metavar="TOPIC", help="(default: detected by type)")
-    parser.add_argument("--cloud", metavar="TOPIC", help="(default: detected by type)")
+    add_read_options(parser)
     parser.add_argument("--force", action="store_true", help="fit existing maps again")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     return parser
@@ -144,8 +142,9 @@ def main(arguments: list[str] | None = None) -> int:
 def _fit_bag(
     bag: Path, robot: RobotModel, settings: FitSettings, options: argparse.Namespace
 ) -> list[FittedTrajectory]:
-    recording = Recording.open(bag, odometry=options.odometry, commands=options.commands, cloud=options.cloud)
-    recording = recording.in_base_frame(robot.base_frame)
+    reading = read_options(options)
+    recording = reading.open(bag, robot)
+    robot = reading.robot_in_bag(robot)
     for complaint in recording.warnings[:3]:
         print(f"fit_terrain: {complaint}", file=sys.stderr)
     if not len(recording.commands):
@@ -221,7 +220,8 @@ def _fingerprint(
     content = [
         str(recording.path.name), len(recording.motion), len(recording.commands), len(recording.clouds), start,
         robot.name, [round(float(v), 9) for v in robot.points.flatten()[:60]], float(robot.mass), str(robot.effects),
-        asdict(settings), options.length, options.no_lidar, options.position_noise, options.rotation_noise,
+        asdict(settings), asdict(read_options(options)), options.length, options.no_lidar, options.position_noise,
+        options.rotation_noise,
     ]  # fmt: skip
     return hashlib.sha256(json.dumps(content, default=str).encode()).hexdigest()
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from monoforce_ros.bags import BagError, Recording, cut_windows, nearest_frame, smooth
+from monoforce_ros.bags import DETECTED, BagError, ReadOptions, Recording, cut_windows, nearest_frame, smooth
 from monoforce_ros.core import CommandTrack, MotionTrack, StaleDataError, nearest_stamp, transform_points
 from monoforce_ros.effects import corrected_commands, corrected_motion
 from monoforce_ros.encoder import EncoderConfig, network_image
@@ -53,6 +53,8 @@ class SampleSettings:
     """Interval between the starts of chunks of motion [s]."""
     iterations: int = 40
     """Steps of each terrain fit."""
+    reading: ReadOptions = DETECTED
+    """Topics and frames of the recordings, where they do not say themselves."""
 
     def __post_init__(self):
         for name, low, high in (("period", 0.02, 60.0), ("chunk_period", 0.1, 10.0), ("iterations", 0, 10_000)):
@@ -90,8 +92,8 @@ def _samples(
     settings: SampleSettings,
     image_topics: Sequence[str],
 ) -> RecordingSamples:
-    recording = Recording.open(bag)
-    recording = recording.in_base_frame(robot.base_frame)
+    recording = settings.reading.open(bag, robot)
+    robot = settings.reading.robot_in_bag(robot)
     topics = tuple(image_topics) or tuple(topic for topic in recording.images if topic in recording.cameras)
     unknown = [topic for topic in topics if topic not in recording.images or topic not in recording.cameras]
     if unknown or not topics:

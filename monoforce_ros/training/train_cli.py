@@ -15,7 +15,7 @@ from typing import override
 import numpy as np
 import torch
 
-from monoforce_ros.bags import BagError
+from monoforce_ros.bags import BagError, add_read_options, read_options
 from monoforce_ros.core import write_text
 from monoforce_ros.encoder import (
     SENSORS,
@@ -95,6 +95,7 @@ def build_parser() -> argparse.ArgumentParser:
                         "sweep to densify; or both, either of which may be absent (default: %(default)s)")  # fmt: skip
     parser.add_argument("--images", nargs="+", default=[], metavar="TOPIC", help="image topics (default: all with a "
                         "CameraInfo)")  # fmt: skip
+    add_read_options(parser)
     parser.add_argument("--period", type=float, default=SampleSettings.period, metavar="S", help="interval between "
                         "samples (default: %(default)s)")  # fmt: skip
     parser.add_argument("--steps", type=int, default=TrainingSettings.steps, help="(default: %(default)s)")
@@ -351,7 +352,7 @@ def _samples(
 ) -> list[RecordingSamples]:
     """Samples of each usable bag, extracted in parallel; with a progress bar if there is a title."""
     recordings = []
-    settings = SampleSettings(period=options.period)
+    settings = SampleSettings(period=options.period, reading=read_options(options))
     folder = options.samples or options.out / "samples"
     bar = progress(bags, label=title, unit="bag", quiet=options.quiet or not title or not bags)
     with ProcessPoolExecutor(
