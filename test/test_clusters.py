@@ -15,16 +15,21 @@ from monoforce_ros.terrain import Grid, TerrainMap
 SUMS = ("load", "traction", "sides", "push", "force")
 
 
-def test_every_point_is_in_one_cluster_and_in_its_sphere():
+def test_every_point_is_in_one_cluster_and_in_its_boxes():
     points = load_robot("marv").points.double()
     found = point_clusters(points)
+    clusters, groups = found.clusters, found.groups
     assert sorted(found.order.tolist()) == list(range(len(points)))
-    assert int(found.edges[0]) == 0 and int(found.edges[-1]) == len(points)
-    for k, (first, last) in enumerate(zip(found.edges[:-1], found.edges[1:], strict=True)):
-        away = (points[found.order[first:last]] - found.centres[k]).norm(dim=1)
-        assert 1 <= len(away) <= 8 and float(away.max()) < float(found.radii[k])
+    assert int(clusters.edges[0]) == 0 and int(clusters.edges[-1]) == len(points)
+    assert int(groups.edges[0]) == 0 and int(groups.edges[-1]) == len(clusters.centres)
+    for k, (first, last) in enumerate(zip(clusters.edges[:-1], clusters.edges[1:], strict=True)):
+        away = (points[found.order[first:last]] - clusters.centres[k]).abs()
+        assert 1 <= len(away) <= 8 and bool((away < clusters.halves[k]).all())
+    for k, (first, last) in enumerate(zip(groups.edges[:-1], groups.edges[1:], strict=True)):
+        away = (points[found.order[clusters.edges[first] : clusters.edges[last]]] - groups.centres[k]).abs()
+        assert 1 <= len(away) <= 64 and bool((away < groups.halves[k]).all())
     # Small against the robot, or they tell nothing.
-    assert float(found.radii.median()) < 0.2 * float(np.ptp(points.numpy(), axis=0).max())
+    assert float(clusters.radii.median()) < 0.2 * float(np.ptp(points.numpy(), axis=0).max())
 
 
 @settings(max_examples=60, deadline=None)
@@ -35,15 +40,16 @@ def test_the_ceiling_is_never_below_ground_that_a_cluster_may_touch(seed, resolu
     height = torch.from_numpy(random.normal(size=(17, 23)))
     points = torch.from_numpy(random.normal(size=(40, 3)) * spread)
     found = point_clusters(points)
-    ceiling = found.ceiling(height[None], resolution)[0].numpy()
+    boxes = found.clusters
+    ceiling = boxes.ceiling(height[None], resolution)[0].numpy()
     turn = torch.from_numpy(np.linalg.qr(random.normal(size=(3, 3)))[0])
     place = torch.from_numpy(random.uniform(-3, 6, size=3))
 
     def nodes(x, low, cells):
         return np.clip((x - low) / resolution, 0, cells - 1)
 
-    for k, (first, last) in enumerate(zip(found.edges[:-1], found.edges[1:], strict=True)):
-        middle = (place + turn @ found.centres[k]).numpy()
+    for k, (first, last) in enumerate(zip(boxes.edges[:-1], boxes.edges[1:], strict=True)):
+        middle = (place + turn @ boxes.centres[k]).numpy()
         row = int(nodes(middle[1], grid.origin[1], 17) + 0.5)
         column = int(nodes(middle[0], grid.origin[0], 23) + 0.5)
         for x, y, _ in (place + points[found.order[first:last]] @ turn.T).numpy():

@@ -21,6 +21,7 @@ EXECUTABLES = [
     "diagnose",
     "evaluate",
     "fit_terrain",
+    "import_robot",
     "train",
     "path_selector",
     "simulator",
@@ -72,7 +73,7 @@ def test_the_licence_and_the_dependencies_are_stated():
     assert ros <= depends
     # Dependencies outside ROS are installed by rosdep or pip, and must be listed for one of them.
     named = {name.removeprefix("python3-") for name in depends} | set(re.findall(r'"([a-z-]+)>=', SETUP))
-    others = {"cv2": "opencv", "yaml": "yaml", "warp": "warp-lang"}
+    others = {"cv2": "opencv", "yaml": "yaml", "warp": "warp-lang", "mpl_toolkits": "matplotlib"}
     third = {others.get(name, name) for name in imported - set(sys.stdlib_module_names) - ros - {"monoforce_ros"}}
     assert third - {"tf2_ros", "ament_index_python"} <= named
 

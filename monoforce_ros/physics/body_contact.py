@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import itertools
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from monoforce_ros.physics.clusters import point_clusters
 from monoforce_ros.physics.contact import Contact, contact
 from monoforce_ros.physics.lookup import TerrainLookup
 from monoforce_ros.physics.options import PhysicsOptions
 from monoforce_ros.physics.problem import Problem
 from monoforce_ros.physics.rotation import cross_matrix
+
+_WORTH_TESTING = 4096
+"""Number of points of all trajectories from which the test for nearby points takes less time than it saves: with a
+Husky's 791 points the test costs 12 % of a step at B = 1, and saves 30 % at B = 32 (one thread, bumpy ground)."""
 
 
 @dataclass(frozen=True)
@@ -23,6 +29,8 @@ class BodyContact:
     """Body points relative to the centre of mass in base axes, ``[B, 3, N]`` [m]."""
     tangents: Tensor
     """Direction in which each point's surface moves, ``[3, N]`` in base axes."""
+    outward: Tensor
+    """Unit normal of the hull at each point, zero on belts, ``[3, N]`` in base axes."""
     areas: Tensor
     """Area of each point, ``[N]`` [m²]."""
     weights: Tensor
@@ -50,6 +58,7 @@ class BodyContact:
             lookup=TerrainLookup(problem.terrain, options.lookup, problem.batch_size, problem.vegetation),
             points=problem.points.T - problem.centre_of_mass[..., None],
             tangents=problem.point_tangents.T,
+            outward=problem.point_outward.T,
             areas=problem.point_areas,
             weights=problem.mass[:, None] * options.gravity * share,
             # Index -1, the hull, selects the zero at the end.
@@ -60,6 +69,18 @@ class BodyContact:
             rolling_resistance=rolling,
             yield_speed=yield_speed,
             options=options,
+        )
+
+    def part(self, chosen: Tensor) -> BodyContact:
+        """Contact of some of the points ``[n]`` (indices)."""
+        return replace(
+            self,
+            points=self.points[..., chosen],
+            tangents=self.tangents[:, chosen],
+            outward=self.outward[:, chosen],
+            areas=self.areas[chosen],
+            weights=self.weights[:, chosen],
+            drives=self.drives[chosen],
         )
 
     def at(
@@ -96,6 +117,7 @@ class BodyContact:
             points,
             velocity[..., None] + spun,
             belt,
+            rotation @ self.outward,
             rotation[..., 1],
             self.areas,
             self.weights,
@@ -106,3 +128,45 @@ class BodyContact:
             self.options,
             step_time=step_time,
         )
+
+
+class NearbyContact:
+    """Contact of the points that the ground may touch; the others, most of a body, need no computation.
+
+    Args:
+        problem: the robots and their terrain.
+        options: contact laws.
+    """
+
+    def __init__(self, problem: Problem, options: PhysicsOptions):
+        self.whole = BodyContact.of(problem, options)
+        self.count = len(problem.points)
+        self._origin = problem.centre_of_mass.detach()
+        self._grid = problem.terrain.grid
+        self._parts: dict[tuple[int, ...], tuple[BodyContact, Tensor]] = {}
+        found = point_clusters(problem.points)
+        edges, self._groups = found.clusters.edges[found.groups.edges.long()], found.groups
+        self._members = [found.order[first:last] for first, last in itertools.pairwise(edges.tolist())]
+        height = problem.terrain.height
+        self._ceiling = found.groups.ceiling(height if height.ndim == 3 else height[None], self._grid.resolution)
+
+    def near(self, centre: Tensor, rotation: Tensor) -> tuple[BodyContact, Tensor | None]:
+        """Contact of the points that may touch in any of the poses, and their indices; None stands for all.
+
+        Args:
+            centre: centre of mass, ``[B, 3]`` [m].
+            rotation: terrain ← base, ``[B, 3, 3]``.
+        """
+        # A compiled step has one shape, and a GPU would have to wait for the answer.
+        few = len(centre) * self.count < _WORTH_TESTING
+        if few or torch.compiler.is_compiling() or centre.device.type != "cpu":
+            return self.whole, None
+        touched = self._groups.near(self._ceiling, self._grid, centre.detach(), rotation.detach(), self._origin)
+        groups = tuple(torch.nonzero(touched)[:, 0].tolist()) or (0,)
+        if len(groups) == len(self._members):
+            return self.whole, None
+        if groups not in self._parts:
+            # In the order of the body, so that sums do not depend on the grouping.
+            chosen = torch.cat([self._members[group] for group in groups]).sort().values
+            self._parts[groups] = self.whole.part(chosen), chosen
+        return self._parts[groups]

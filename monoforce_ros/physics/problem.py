@@ -39,6 +39,8 @@ class Problem:
     """``[N, 3]``."""
     point_drives: Tensor
     """``[N]`` int64; -1 on the hull."""
+    point_outward: Tensor
+    """Unit normal of the hull, outwards, ``[N, 3]``; zero on belts."""
     mass: Tensor
     """``[B]`` [kg]."""
     centre_of_mass: Tensor
@@ -120,6 +122,7 @@ class Problem:
             point_areas=robot.point_areas,
             point_tangents=robot.point_tangents,
             point_drives=robot.point_drives,
+            point_outward=torch.zeros_like(robot.points) if robot.point_outward is None else robot.point_outward,
             mass=robot.mass.expand(batch),
             centre_of_mass=centre_of_mass,
             inertia=robot.inertia.expand(batch, 3, 3),

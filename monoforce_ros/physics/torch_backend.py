@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from monoforce_ros.physics import torch_joints
-from monoforce_ros.physics.body_contact import BodyContact
+from monoforce_ros.physics.body_contact import NearbyContact
 from monoforce_ros.physics.loads import LoadModel
 from monoforce_ros.physics.options import PhysicsOptions
 from monoforce_ros.physics.problem import Motion, Problem
@@ -23,7 +23,7 @@ def integrate(
         return torch_joints.integrate(problem, problem.articulation, options, with_forces or with_contact, force_every)
     dtype, device = problem.centre.dtype, problem.centre.device
     step_time = options.time_step
-    body, loads = BodyContact.of(problem, options), LoadModel.of(problem, options.gravity)
+    contacts, loads = NearbyContact(problem, options), LoadModel.of(problem, options.gravity)
     translation = problem.mass[:, None, None] * torch.eye(3, dtype=dtype, device=device)
     zero = torch.zeros_like(translation)
     linear_part = torch.diag(torch.tensor([1.0, 1.0, 1.0, 0.0, 0.0, 0.0], dtype=dtype, device=device))
@@ -34,8 +34,11 @@ def integrate(
     centre, rotation = problem.centre, problem.rotation
     velocity, angular_velocity = problem.velocity, problem.angular_velocity
     history: list[tuple[Tensor, ...]] = [(centre, rotation, velocity, angular_velocity)]
-    normal_forces, tangential_forces, forces = [], [], []
+    normal_forces: list[Tensor] = []
+    tangential_forces: list[Tensor] = []
+    forces: list[Tensor] = []
     for step in range(problem.steps):
+        body, chosen = contacts.near(centre, rotation)
         arms, touch = body.at(step, centre, rotation, velocity, angular_velocity)
         # Maps forces along the contact directions to the body's force and torque; its transpose maps the body's six
         # velocities to velocities of the points along these directions.
@@ -58,10 +61,14 @@ def integrate(
         if (with_forces or with_contact) and step % force_every == 0:
             step_force = touch.force - touch.gain * (change[:, None] @ jacobian).unflatten(2, (3, -1))[:, 0]
             normal_force = step_force[:, 0].clamp_min(0.0)
-            normal_forces.append(normal_force)
             tangential = (touch.directions[:, :, 1:] * step_force[:, None, 1:]).sum(2)
-            tangential_forces.append(tangential.transpose(1, 2))
-            forces.append((normal_force[:, None] * touch.directions[:, :, 0] + tangential).transpose(1, 2))
+            whole = normal_force[:, None] * touch.directions[:, :, 0] + tangential
+            listed = (normal_force, tangential.transpose(1, 2), whole.transpose(1, 2))
+            if chosen is not None:
+                shapes = ((problem.batch_size, contacts.count), *[(problem.batch_size, contacts.count, 3)] * 2)
+                listed = tuple(t.new_zeros(s).index_copy(1, chosen, t) for t, s in zip(listed, shapes, strict=True))
+            for history_of, entry in zip((normal_forces, tangential_forces, forces), listed, strict=True):
+                history_of.append(entry)
     centre, rotation, velocity, angular_velocity = (torch.stack(entries, 1) for entries in zip(*history, strict=True))
     motion = Motion(centre, rotation, velocity, angular_velocity)
     if not normal_forces:

@@ -114,6 +114,7 @@ class _System:
             points,
             drifts + cross(spins, arms),
             belt * speeds[:, None],
+            (turns @ problem.point_outward[..., None])[..., 0].transpose(1, 2),
             turns[..., 1].transpose(1, 2),
             body.areas,
             body.weights,

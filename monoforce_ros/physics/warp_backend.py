@@ -72,14 +72,15 @@ def integrate(
         clusters = point_clusters(problem.points)
     else:
         clusters = warp_joints.clusters_by_link(problem.points, moving.point_links)
-    fixed = Fixed(options, terrain.grid, drives[clusters.order], clusters)
+    outward = problem.point_outward
+    fixed = Fixed(options, terrain.grid, drives[clusters.order], outward[clusters.order], clusters)
     # Points of a cluster are contiguous.
     ordered = inputs(tuple(t[clusters.order] for t in sampled))
     if moving is not None:
         motion = warp_joints.integrate(problem, moving, fixed, ordered, start)
         if not problem.steps or not (with_forces or with_contact):
             return motion
-        fixed = Fixed(options, terrain.grid, drives, clusters)
+        fixed = Fixed(options, terrain.grid, drives, outward, clusters)
         return warp_joints.with_forces(motion, problem, moving, fixed, inputs(sampled), force_every)
     states: tuple[Tensor, ...] = _Integrate.apply(fixed, *ordered, *start)
     centre, rotation, velocity, angular_velocity = states
@@ -90,7 +91,7 @@ def integrate(
     if with_contact and not with_forces and not with_gradient:
         sums = _launch_summary(fixed, force_every, contiguous(ordered), contiguous(states))
         return replace(motion, contact=ContactSummary.split(sums, problem.drive_speeds.shape[2]))
-    fixed = Fixed(options, terrain.grid, drives, clusters)
+    fixed = Fixed(options, terrain.grid, drives, outward, clusters)
     normal, tangential, forces = _Forces.apply(fixed, force_every, *inputs(sampled), *states)
     return replace(motion, normal_forces=normal, tangential_forces=tangential, forces=forces)
 
@@ -157,7 +158,7 @@ def _launch(
     double, kinds = precision(inputs[0])
     kernel = integrate_kernel(double)
     # Computed before the threads start; otherwise each would compute it.
-    fixed.ceiling(inputs[0])
+    fixed.ceilings(inputs[0])
 
     def work(part: tuple[int, int]) -> list[Tensor]:
         first, count = part
@@ -203,7 +204,7 @@ def _launch_forces(
     inputs, states = tensors[: len(INPUTS)], tensors[len(INPUTS) :]
     double, kinds = precision(tensors[0])
     kernel = forces_kernel(double)
-    fixed.ceiling(inputs[0])
+    fixed.ceilings(inputs[0])
 
     def work(part: tuple[int, int]) -> list[Tensor]:
         first, count = part

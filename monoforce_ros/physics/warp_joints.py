@@ -11,7 +11,7 @@ import warp as wp
 from torch import Tensor
 
 from monoforce_ros.physics.articulation import Articulation
-from monoforce_ros.physics.clusters import PointClusters, point_clusters
+from monoforce_ros.physics.clusters import PointClusters, joined, point_clusters
 from monoforce_ros.physics.problem import Motion, Problem
 from monoforce_ros.physics.warp_kernels import (
     forces_joints_kernel,
@@ -77,18 +77,16 @@ def with_forces(
 
 
 def clusters_by_link(points: Tensor, links: Tensor) -> PointClusters:
-    """Clusters of points ``[N, 3]`` each of which belongs to one link."""
+    """Clusters of points ``[N, 3]``; each cluster and each group belongs to one link."""
     parts = []
     for link in torch.unique(links):
         chosen = torch.nonzero(links == link)[:, 0]
         found = point_clusters(points[chosen])
         parts.append((chosen[found.order], found))
-    counts = torch.cat([torch.diff(found.edges) for _, found in parts])
     return PointClusters(
         order=torch.cat([order for order, _ in parts]),
-        edges=torch.cat([counts.new_zeros(1), counts.cumsum(0)]).to(torch.int32),
-        centres=torch.cat([found.centres for _, found in parts]),
-        radii=torch.cat([found.radii for _, found in parts]),
+        clusters=joined([found.clusters for _, found in parts]),
+        groups=joined([found.groups for _, found in parts]),
     )
 
 
@@ -289,7 +287,7 @@ def _launch(
     double, kinds = precision(inputs[0])
     kernel = integrate_joints_kernel(double, differentiable)
     # Computed before the threads start; otherwise each would compute it.
-    fixed.ceiling(inputs[0])
+    fixed.ceilings(inputs[0])
 
     def work(part: tuple[int, int]) -> list[Tensor]:
         first, count = part
@@ -326,7 +324,7 @@ def _launch_forces(
     inputs, states, links = tensors[:number], tensors[number:-2], tensors[-2:]
     double, kinds = precision(tensors[0])
     kernel = forces_joints_kernel(double, differentiable)
-    fixed.ceiling(inputs[0])
+    fixed.ceilings(inputs[0])
 
     def work(part: tuple[int, int]) -> list[Tensor]:
         first, count = part

@@ -39,18 +39,21 @@ STATES = ("centre", "rotation", "velocity", "angular_velocity")
 class Fixed:
     """Inputs of a launch without gradients."""
 
-    def __init__(self, options: PhysicsOptions, grid: Grid, drives: Tensor, clusters: PointClusters):
+    def __init__(self, options: PhysicsOptions, grid: Grid, drives: Tensor, outward: Tensor, clusters: PointClusters):
         self.options = options
         self.grid = grid
         self.drives = drives.contiguous()
+        self.outward = outward.detach().contiguous()
         self.clusters = clusters
-        self._ceiling: Tensor | None = None
+        self._ceilings: tuple[Tensor, Tensor] | None = None
 
-    def ceiling(self, height: Tensor) -> Tensor:
-        """The highest ground near each node, against which clusters are tested."""
-        if self._ceiling is None:
-            self._ceiling = self.clusters.ceiling(height, self.grid.resolution).contiguous()
-        return self._ceiling
+    def ceilings(self, height: Tensor) -> tuple[Tensor, Tensor]:
+        """The highest ground near each node, against which clusters and groups are tested."""
+        if self._ceilings is None:
+            boxes, resolution = (self.clusters.clusters, self.clusters.groups), self.grid.resolution
+            fine, coarse = (box.ceiling(height, resolution).contiguous() for box in boxes)
+            self._ceilings = fine, coarse
+        return self._ceilings
 
 
 class Arguments:
@@ -91,16 +94,20 @@ class Arguments:
         clusters = fixed.clusters
         ground, body, robots, options = kinds.Ground(), kinds.Body(), kinds.Robots(), kinds.Options()
         ground.height, ground.material = self.inputs["height"], self.inputs["material"]
-        ground.ceiling = wp.from_torch(fixed.ceiling(inputs[0]), dtype=kinds.scalar)
+        ground.ceiling, ground.group_ceiling = (
+            wp.from_torch(ceiling, dtype=kinds.scalar) for ceiling in fixed.ceilings(inputs[0])
+        )
         ground.rows, ground.columns = fixed.grid.rows, fixed.grid.columns
         ground.origin_x, ground.origin_y = (kinds.scalar(value) for value in fixed.grid.origin)
         ground.inverse_resolution = kinds.scalar(1.0 / fixed.grid.resolution)
         body.points, body.areas = self.inputs["points"], self.inputs["areas"]
         body.tangents, body.share = self.inputs["tangents"], self.inputs["share"]
         body.drives = wp.from_torch(fixed.drives, dtype=wp.int32)
-        body.cluster_centres = wp.from_torch(clusters.centres, dtype=kinds.vec3)
-        body.cluster_radii = wp.from_torch(clusters.radii, dtype=kinds.scalar)
-        body.cluster_edges = wp.from_torch(clusters.edges, dtype=wp.int32)
+        body.outward = wp.from_torch(fixed.outward, dtype=kinds.vec3)
+        for name, boxes in (("cluster", clusters.clusters), ("group", clusters.groups)):
+            setattr(body, f"{name}_centres", wp.from_torch(boxes.centres, dtype=kinds.vec3))
+            setattr(body, f"{name}_halves", wp.from_torch(boxes.halves, dtype=kinds.vec3))
+            setattr(body, f"{name}_edges", wp.from_torch(boxes.edges, dtype=wp.int32))
         for name in INPUTS[6:]:
             setattr(robots, name, self.inputs[name])
         options.time_step = kinds.scalar(fixed.options.time_step)

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from monoforce_ros.core import share_directory
 from monoforce_ros.robots.belt import belt_outline
 from monoforce_ros.robots.checks import FieldChecks, RobotFileError
+from monoforce_ros.robots.hull import box_samples
 from monoforce_ros.robots.joint_reader import JointReader, WheelEntry
 from monoforce_ros.robots.robot_model import Flipper, RobotModel
 
@@ -57,7 +58,8 @@ def load_robot(name_or_file: str | Path, *, spacing: float = DEFAULT_SPACING) ->
 
     Args:
         name_or_file: a shipped robot's name or the path of a YAML file.
-        spacing: distance between body samples [m]; results depend on it only by discretisation.
+        spacing: distance between samples of belts [m]; results depend on it only by discretisation. The hull is
+            sampled at least as finely as :mod:`monoforce_ros.robots.hull` says.
 
     Raises:
         RobotFileError: the file is missing or not YAML, or a field is unknown, missing or out of its range.
@@ -122,6 +124,7 @@ class _Reader(FieldChecks):
             point_areas=tensor(np.concatenate(samples.areas)),
             point_tangents=tensor(np.concatenate(samples.tangents)),
             point_drives=torch.as_tensor(point_drives, dtype=torch.int64),
+            point_outward=tensor(np.concatenate(samples.outward)),
             drive_names=tuple(samples.drives),
             drive_offsets=tensor(drive_offsets),
             friction_longitudinal=tensor(
@@ -302,16 +305,8 @@ class _Reader(FieldChecks):
         size = self.vector(box["size"], f"{where}.size", 3, 20.0, "m")
         if (size <= 0).any():
             raise self.fail(f"{where}.size", size.tolist(), "positive edge lengths [m]")
-        # Faces are sampled more coarsely than belts, because the hull touches the ground only in unusual poses.
-        for axis in range(3):
-            first, second = (a for a in range(3) if a != axis)
-            counts = [max(2, math.ceil(size[a] / (4 * spacing))) for a in (first, second)]
-            grid = np.meshgrid(*[(np.arange(c) + 0.5) / c - 0.5 for c in counts], indexing="ij")
-            for side in (-0.5, 0.5):
-                face = np.zeros((grid[0].size, 3))
-                face[:, first], face[:, second], face[:, axis] = grid[0].ravel(), grid[1].ravel(), side
-                area = size[first] * size[second] / len(face)
-                samples.add(centre + face * size, np.full(len(face), area), np.zeros((len(face), 3)), None)
+        points, areas, normals = box_samples(size, spacing)
+        samples.add(centre + points, areas, np.zeros_like(points), None, normals)
 
     def sensors(self, content: Any) -> dict[str, torch.Tensor]:
         if not isinstance(content, Mapping):
@@ -345,6 +340,7 @@ class _Samples:
         self.areas: list[np.ndarray] = []
         self.tangents: list[np.ndarray] = []
         self.point_drives: list[np.ndarray] = []
+        self.outward: list[np.ndarray] = []
         self.point_flippers: list[np.ndarray] = []
         self.point_joints: list[np.ndarray] = []
         self.radii: dict[str, float] = {}
@@ -354,12 +350,20 @@ class _Samples:
         self.flippers: list[Flipper] = []
         self.angles: list[float] = []
 
-    def add(self, points: np.ndarray, areas: np.ndarray, tangents: np.ndarray, drive: str | None) -> None:
+    def add(
+        self,
+        points: np.ndarray,
+        areas: np.ndarray,
+        tangents: np.ndarray,
+        drive: str | None,
+        outward: np.ndarray | None = None,
+    ) -> None:
         if drive is not None and drive not in self.drives:
             self.drives.append(str(drive))
         self.points.append(points)
         self.areas.append(areas)
         self.tangents.append(tangents)
+        self.outward.append(np.zeros_like(points) if outward is None else outward)
         self.point_flippers.append(np.full(len(points), -1))
         self.point_joints.append(np.full(len(points), -1))
         self.point_drives.append(np.full(len(points), -1 if drive is None else self.drives.index(str(drive))))

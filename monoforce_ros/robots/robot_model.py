@@ -82,6 +82,8 @@ class RobotModel:
     """Angles of the flippers [rad], ``[F]``."""
     point_flippers: Tensor | None = None
     """Index of the flipper of each point, ``[N]`` int64; -1 elsewhere."""
+    point_outward: Tensor | None = None
+    """Unit normal of the hull at each point, outwards, ``[N, 3]``; zero on belts. None stands for zeros."""
     effects: tuple[tuple[str, Mapping[str, float | Tensor]], ...] = ()
     """Effects of the robot: names and parameter values, see :mod:`monoforce_ros.effects`."""
     effect_intervals: tuple[tuple[str, Mapping[str, tuple[float, float]]], ...] = ()
@@ -123,6 +125,7 @@ class RobotModel:
     def with_points(self, keep: Tensor) -> RobotModel:
         """The robot with only the points ``keep`` ``[N]`` bool; mass and inertia stay."""
         flippers = None if self.point_flippers is None else self.point_flippers[keep]
+        outward = None if self.point_outward is None else self.point_outward[keep]
         return replace(
             self,
             points=self.points[keep],
@@ -130,6 +133,7 @@ class RobotModel:
             point_tangents=self.point_tangents[keep],
             point_drives=self.point_drives[keep],
             point_flippers=flippers,
+            point_outward=outward,
             point_joints=None if self.point_joints is None else self.point_joints[keep],
             point_grip=None if self.point_grip is None else self.point_grip[keep],
         )

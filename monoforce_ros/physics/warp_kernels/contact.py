@@ -6,11 +6,14 @@ from typing import Any
 
 import warp as wp
 
+from monoforce_ros.physics.contact import RIGID_FACTOR, RIGID_SLOPE, STEEPEST_SOIL
 from monoforce_ros.physics.warp_kernels.structs import types
 
 CONSTANT_LOOKUP, BILINEAR_LOOKUP = 0, 1
 VERTICAL_FORCE, NORMAL_FORCE = 0, 1
 NO_FRICTION, COULOMB, SIGMOID = 0, 1, 2
+STEEPENING = 1.0 / (STEEPEST_SOIL - RIGID_SLOPE)
+RIGID_GAIN = RIGID_FACTOR - 1.0
 
 
 @dataclass(frozen=True)
@@ -59,10 +62,14 @@ def contact_functions(double: bool) -> ContactFunctions:
         return int(wp.clamp(raw, scalar(0.0), scalar(cells - 1)) + scalar(0.5))
 
     @wp.func
-    def may_touch(ground: Ground, page: int, middle: vec3, radius: scalar) -> bool:
+    def may_touch(
+        ground: Ground, ceiling: wp.array3d(dtype=scalar), page: int, middle: vec3, turned: mat33, halves: vec3
+    ) -> bool:
         row = nearby((middle[1] - ground.origin_y) * ground.inverse_resolution, ground.rows)
         column = nearby((middle[0] - ground.origin_x) * ground.inverse_resolution, ground.columns)
-        return ground.ceiling[page, row, column] > middle[2] - radius
+        # From the middle of a turned box to its lowest corner.
+        depth = wp.abs(turned[2, 0]) * halves[0] + wp.abs(turned[2, 1]) * halves[1] + wp.abs(turned[2, 2]) * halves[2]
+        return ceiling[page, row, column] > middle[2] - depth
 
     @wp.func
     def inside_axis(raw: scalar, cells: int) -> scalar:
@@ -158,12 +165,20 @@ def contact_functions(double: bool) -> ContactFunctions:
             area = body.areas[i]
             factors = robots.friction[b]
             ground_factors = robots.ground_factors[b]
-            stiffness = material[0] / ground_factors[0]
-            ground_damping = material[1] / ground_factors[0]
+            # Faces of the hull meet steep ground stiffly, and it pushes them inwards.
+            depth = gap * normal[2]
+            outward = turned * body.outward[i]
+            head_on = wp.dot(outward, normal)
+            steep = wp.clamp((scalar(STEEPEST_SOIL) - normal[2]) * scalar(STEEPENING), scalar(0.0), scalar(1.0))
+            if head_on > scalar(0.0):
+                mirrored = normal - scalar(2.0) * steep * head_on * outward
+                normal = mirrored * (scalar(1.0) / wp.sqrt(wp.dot(mirrored, mirrored) + scalar(1.0e-12)))
+            rigid = scalar(1.0) + scalar(RIGID_GAIN) * steep * wp.abs(head_on)
+            stiffness = material[0] / ground_factors[0] * rigid
+            ground_damping = material[1] / ground_factors[0] * rigid
             resistance = robots.resistance[b]
             belt = turned * (body.tangents[i] * speed)
             lateral = vec3(turned[0, 1], turned[1, 1], turned[2, 1])
-            depth = gap * normal[2]
             approach = -wp.dot(velocity, normal)
             spring = stiffness * depth
             load = area * wp.max(spring + ground_damping * approach, scalar(0.0))

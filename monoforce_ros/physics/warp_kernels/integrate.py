@@ -48,7 +48,7 @@ def integrate_kernel(double: bool) -> Any:
         b = first_trajectory + thread
         page = wp.min(b, ground.height.shape[0] - 1)
         offset = robots.centre_of_mass[b]
-        count = body.cluster_radii.shape[0]
+        count = body.group_halves.shape[0]
         for step in range(steps):
             slot = step * keep
             state = state_at(states, b, step)
@@ -62,34 +62,37 @@ def integrate_kernel(double: bool) -> Any:
             mixed_x = vec3()
             mixed_y = vec3()
             mixed_z = vec3()
-            for cluster in range(count):
-                # Most clusters are above all ground within reach and are skipped.
-                middle = state.position + turned * (body.cluster_centres[cluster] - offset)
-                if may_touch(ground, page, middle, body.cluster_radii[cluster]):
-                    for i in range(body.cluster_edges[cluster], body.cluster_edges[cluster + 1]):
-                        arm = turned * (body.points[i] - offset)
-                        # Most of the remaining points are in the air.
-                        if below_ground(ground, page, options.lookup, state.position + arm):
-                            touch = touch_ground(
-                                ground, body, robots, options, page, b, i, state.position + arm,
-                                state.linear + wp.cross(state.angular, arm), turned,
-                                belt_speed(body, robots, b, step, i), scalar(1.0),
-                            )  # fmt: skip
-                            acting = (
-                                touch.force[0] * touch.normal
-                                + touch.force[1] * touch.along
-                                + touch.force[2] * touch.across
-                            )
-                            force = force + acting
-                            torque = torque + wp.cross(arm, acting)
-                            gains = gains_of(touch, arm)
-                            diagonal = diagonal + gains.diagonal
-                            off_diagonal = off_diagonal + gains.off_diagonal
-                            mixed_x = mixed_x + gains.mixed_x
-                            mixed_y = mixed_y + gains.mixed_y
-                            mixed_z = mixed_z + gains.mixed_z
-                            turning_diagonal = turning_diagonal + gains.turning_diagonal
-                            turning_off_diagonal = turning_off_diagonal + gains.turning_off_diagonal
+            for group in range(count):
+                # Most groups, and in them most clusters, are above all ground within reach and are skipped.
+                centre = state.position + turned * (body.group_centres[group] - offset)
+                if may_touch(ground, ground.group_ceiling, page, centre, turned, body.group_halves[group]):
+                    for cluster in range(body.group_edges[group], body.group_edges[group + 1]):
+                        middle = state.position + turned * (body.cluster_centres[cluster] - offset)
+                        if may_touch(ground, ground.ceiling, page, middle, turned, body.cluster_halves[cluster]):
+                            for i in range(body.cluster_edges[cluster], body.cluster_edges[cluster + 1]):
+                                arm = turned * (body.points[i] - offset)
+                                # Most of the remaining points are in the air.
+                                if below_ground(ground, page, options.lookup, state.position + arm):
+                                    touch = touch_ground(
+                                        ground, body, robots, options, page, b, i, state.position + arm,
+                                        state.linear + wp.cross(state.angular, arm), turned,
+                                        belt_speed(body, robots, b, step, i), scalar(1.0),
+                                    )  # fmt: skip
+                                    acting = (
+                                        touch.force[0] * touch.normal
+                                        + touch.force[1] * touch.along
+                                        + touch.force[2] * touch.across
+                                    )
+                                    force = force + acting
+                                    torque = torque + wp.cross(arm, acting)
+                                    gains = gains_of(touch, arm)
+                                    diagonal = diagonal + gains.diagonal
+                                    off_diagonal = off_diagonal + gains.off_diagonal
+                                    mixed_x = mixed_x + gains.mixed_x
+                                    mixed_y = mixed_y + gains.mixed_y
+                                    mixed_z = mixed_z + gains.mixed_z
+                                    turning_diagonal = turning_diagonal + gains.turning_diagonal
+                                    turning_off_diagonal = turning_off_diagonal + gains.turning_off_diagonal
             summed[thread, slot, 0] = force
             summed[thread, slot, 1] = torque
             summed[thread, slot, 2] = diagonal

@@ -49,7 +49,7 @@ def integrate_joints_kernel(double: bool, differentiable: bool) -> Any:
         thread = wp.tid()
         b = first_trajectory + thread
         page = wp.min(b, ground.height.shape[0] - 1)
-        count = body.cluster_radii.shape[0]
+        count = body.group_halves.shape[0]
         drives = robots.speeds.shape[2]
         size = joints.size
         h = options.time_step
@@ -69,40 +69,44 @@ def integrate_joints_kernel(double: bool, differentiable: bool) -> Any:
             mixed_x = vec3()
             mixed_y = vec3()
             mixed_z = vec3()
-            for cluster in range(count):
-                # A cluster belongs to one link. Most clusters are above all ground within reach and are skipped.
-                link = joints.links[body.cluster_edges[cluster]]
+            for group in range(count):
+                # A group belongs to one link. Most groups, and in them most clusters, are above all ground within reach
+                # and are skipped.
+                link = joints.links[body.cluster_edges[body.group_edges[group]]]
                 turn = links.turns[thread, slot, link]
                 shift = links.frames[thread, slot, link, 0]
-                middle = state.position + turn * body.cluster_centres[cluster] + shift
-                if may_touch(ground, page, middle, body.cluster_radii[cluster]):
-                    for i in range(body.cluster_edges[cluster], body.cluster_edges[cluster + 1]):
-                        arm = turn * body.points[i] + shift
-                        # Most of the remaining points are in the air.
-                        if below_ground(ground, page, options.lookup, state.position + arm):
-                            spin = state.angular + links.frames[thread, slot, link, 1]
-                            velocity = state.linear + links.frames[thread, slot, link, 2] + wp.cross(spin, arm)
-                            touch = touch_ground(
-                                ground, body, robots, options, page, b, i, state.position + arm, velocity, turn,
-                                states.belts[b, step, wp.max(body.drives[i], 0)], joints.grip[i],
-                            )  # fmt: skip
-                            acting = (
-                                touch.force[0] * touch.normal
-                                + touch.force[1] * touch.along
-                                + touch.force[2] * touch.across
-                            )
-                            force = force + acting
-                            torque = torque + wp.cross(arm, acting)
-                            gains = gains_of(touch, arm)
-                            diagonal = diagonal + gains.diagonal
-                            off_diagonal = off_diagonal + gains.off_diagonal
-                            mixed_x = mixed_x + gains.mixed_x
-                            mixed_y = mixed_y + gains.mixed_y
-                            mixed_z = mixed_z + gains.mixed_z
-                            turning_diagonal = turning_diagonal + gains.turning_diagonal
-                            turning_off_diagonal = turning_off_diagonal + gains.turning_off_diagonal
-                            if size > 0:
-                                couple(joints, body, links, work, thread, slot, link, i, touch, arm)
+                middle = state.position + turn * body.group_centres[group] + shift
+                if may_touch(ground, ground.group_ceiling, page, middle, turn, body.group_halves[group]):
+                    for cluster in range(body.group_edges[group], body.group_edges[group + 1]):
+                        centre = state.position + turn * body.cluster_centres[cluster] + shift
+                        if may_touch(ground, ground.ceiling, page, centre, turn, body.cluster_halves[cluster]):
+                            for i in range(body.cluster_edges[cluster], body.cluster_edges[cluster + 1]):
+                                arm = turn * body.points[i] + shift
+                                # Most of the remaining points are in the air.
+                                if below_ground(ground, page, options.lookup, state.position + arm):
+                                    spin = state.angular + links.frames[thread, slot, link, 1]
+                                    velocity = state.linear + links.frames[thread, slot, link, 2] + wp.cross(spin, arm)
+                                    touch = touch_ground(
+                                        ground, body, robots, options, page, b, i, state.position + arm, velocity, turn,
+                                        states.belts[b, step, wp.max(body.drives[i], 0)], joints.grip[i],
+                                    )  # fmt: skip
+                                    acting = (
+                                        touch.force[0] * touch.normal
+                                        + touch.force[1] * touch.along
+                                        + touch.force[2] * touch.across
+                                    )
+                                    force = force + acting
+                                    torque = torque + wp.cross(arm, acting)
+                                    gains = gains_of(touch, arm)
+                                    diagonal = diagonal + gains.diagonal
+                                    off_diagonal = off_diagonal + gains.off_diagonal
+                                    mixed_x = mixed_x + gains.mixed_x
+                                    mixed_y = mixed_y + gains.mixed_y
+                                    mixed_z = mixed_z + gains.mixed_z
+                                    turning_diagonal = turning_diagonal + gains.turning_diagonal
+                                    turning_off_diagonal = turning_off_diagonal + gains.turning_off_diagonal
+                                    if size > 0:
+                                        couple(joints, body, links, work, thread, slot, link, i, touch, arm)
             summed[thread, slot, 0] = force
             summed[thread, slot, 1] = torque
             summed[thread, slot, 2] = diagonal

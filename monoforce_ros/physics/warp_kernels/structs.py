@@ -50,7 +50,8 @@ def types(double: bool) -> Types:
     @wp.struct
     class Ground:
         height: wp.array3d(dtype=scalar)  # [pages, rows, columns]
-        ceiling: wp.array3d(dtype=scalar)  # highest ground near each node
+        ceiling: wp.array3d(dtype=scalar)  # highest ground near each node, within reach of clusters
+        group_ceiling: wp.array3d(dtype=scalar)  # and of groups
         material: wp.array3d(dtype=vec4)  # stiffness, damping, friction, height of vegetation
         rows: int
         columns: int
@@ -65,9 +66,13 @@ def types(double: bool) -> Types:
         tangents: wp.array(dtype=vec3)
         share: wp.array(dtype=scalar)  # of the robot's weight
         drives: wp.array(dtype=wp.int32)  # -1 on the hull
+        outward: wp.array(dtype=vec3)  # normal of the hull, zero on belts
         cluster_centres: wp.array(dtype=vec3)
-        cluster_radii: wp.array(dtype=scalar)
+        cluster_halves: wp.array(dtype=vec3)
         cluster_edges: wp.array(dtype=wp.int32)
+        group_centres: wp.array(dtype=vec3)
+        group_halves: wp.array(dtype=vec3)
+        group_edges: wp.array(dtype=wp.int32)
 
     @wp.struct
     class Robots:  # one entry per trajectory

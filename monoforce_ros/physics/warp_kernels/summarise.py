@@ -47,31 +47,35 @@ def summarise_kernel(double: bool) -> Any:
         right = scalar(0.0)
         push = vec3()
         whole = vec3()
-        for cluster in range(body.cluster_radii.shape[0]):
-            middle = state.position + turned * (body.cluster_centres[cluster] - offset)
-            if may_touch(ground, page, middle, body.cluster_radii[cluster]):
-                for i in range(body.cluster_edges[cluster], body.cluster_edges[cluster + 1]):
-                    arm = turned * (body.points[i] - offset)
-                    touch = touch_ground(
-                        ground, body, robots, options, page, b, i, state.position + arm,
-                        state.linear + wp.cross(state.angular, arm), turned, belt_speed(body, robots, b, step, i),
-                        scalar(1.0),
-                    )  # fmt: skip
-                    if touch.active == 1:
-                        acted = over_the_step(touch, change + wp.cross(turning_change, arm))
-                        tangential = acted[1] * touch.along + acted[2] * touch.across
-                        whole = whole + acted[0] * touch.normal + tangential
-                        if touch.normal[2] < steep:
-                            push = push + acted[0] * touch.normal
-                        if body.points[i][1] > scalar(0.0):
-                            left = left + acted[0]
-                        if body.points[i][1] < scalar(0.0):
-                            right = right + acted[0]
-                        drive = wp.where(body.drives[i] >= 0, body.drives[i], number)
-                        sums[b, slot, drive] = sums[b, slot, drive] + acted[0]
-                        if body.drives[i] >= 0:
-                            place = number + 1 + drive
-                            sums[b, slot, place] = sums[b, slot, place] + wp.dot(tangential, ahead)
+        for group in range(body.group_halves.shape[0]):
+            # Most groups, and in them most clusters, are above all ground within reach and are skipped.
+            centre = state.position + turned * (body.group_centres[group] - offset)
+            if may_touch(ground, ground.group_ceiling, page, centre, turned, body.group_halves[group]):
+                for cluster in range(body.group_edges[group], body.group_edges[group + 1]):
+                    middle = state.position + turned * (body.cluster_centres[cluster] - offset)
+                    if may_touch(ground, ground.ceiling, page, middle, turned, body.cluster_halves[cluster]):
+                        for i in range(body.cluster_edges[cluster], body.cluster_edges[cluster + 1]):
+                            arm = turned * (body.points[i] - offset)
+                            touch = touch_ground(
+                                ground, body, robots, options, page, b, i, state.position + arm,
+                                state.linear + wp.cross(state.angular, arm), turned,
+                                belt_speed(body, robots, b, step, i), scalar(1.0),
+                            )  # fmt: skip
+                            if touch.active == 1:
+                                acted = over_the_step(touch, change + wp.cross(turning_change, arm))
+                                tangential = acted[1] * touch.along + acted[2] * touch.across
+                                whole = whole + acted[0] * touch.normal + tangential
+                                if touch.normal[2] < steep:
+                                    push = push + acted[0] * touch.normal
+                                if body.points[i][1] > scalar(0.0):
+                                    left = left + acted[0]
+                                if body.points[i][1] < scalar(0.0):
+                                    right = right + acted[0]
+                                drive = wp.where(body.drives[i] >= 0, body.drives[i], number)
+                                sums[b, slot, drive] = sums[b, slot, drive] + acted[0]
+                                if body.drives[i] >= 0:
+                                    place = number + 1 + drive
+                                    sums[b, slot, place] = sums[b, slot, place] + wp.dot(tangential, ahead)
         after = 2 * number + 1
         sums[b, slot, after] = left
         sums[b, slot, after + 1] = right

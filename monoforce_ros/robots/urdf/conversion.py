@@ -1,0 +1,417 @@
+"""Conversion: a robot description becomes the content of a robot file, with a list of what was guessed."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from monoforce_ros.robots.urdf.description import Description, Joint
+from monoforce_ros.robots.urdf.errors import UrdfError
+from monoforce_ros.robots.urdf.geometry import Frames, belt_shape, flipper_shape
+from monoforce_ros.robots.urdf.parts import Parts, WheelPart, find_parts
+from monoforce_ros.robots.urdf.sensors import find_sensors
+
+DRIVES = ("skid", "differential", "ackermann", "four_wheel_steering", "independent")
+_SAME_AXLE = 0.05
+"""Wheels within this distance along x share an axle [m]."""
+_LARGEST_HULL = 60
+_FASTEST = 100.0
+"""Velocity limits above this [rad/s] are placeholders: URDF requires a number even where there is no limit."""
+_LARGEST_STEERING = 1.4
+"""Steering limits above this [rad] are placeholders; beyond it a wheel is nearly across."""
+
+
+@dataclass(frozen=True)
+class ConversionOptions:
+    """What the caller says about a robot; the rest is guessed."""
+
+    name: str | None = None
+    base_frame: str | None = None
+    drive: str | None = None
+    maximum_speed: float | None = None
+    maximum_yaw_rate: float | None = None
+    hints: Mapping[str, str] = field(default_factory=dict)
+    """Kind by link or joint name, see :data:`monoforce_ros.robots.urdf.parts.HINTS`."""
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """A robot file's content, and what it rests on."""
+
+    content: Mapping[str, Any]
+    """What :func:`monoforce_ros.robots.load_robot` reads."""
+    guesses: tuple[str, ...]
+    """One line for each guess."""
+    warnings: tuple[str, ...]
+    """What is probably wrong with the description or the guesses."""
+
+
+def convert_description(description: Description, options: ConversionOptions | None = None) -> Conversion:
+    """Make a robot file's content from a description.
+
+    Raises ``UrdfError`` if the description has no masses, no wheels, tracks or flippers, or contradicts an option.
+    """
+    return _Converter(description, options or ConversionOptions()).conversion()
+
+
+class _Converter:
+    def __init__(self, description: Description, options: ConversionOptions):
+        if options.drive is not None and options.drive not in DRIVES:
+            raise UrdfError(f"drive {options.drive!r}: expected one of {', '.join(DRIVES)}")
+        self.description, self.options = description, options
+        self.guesses: list[str] = []
+        self.warnings: list[str] = []
+        self.frames = Frames(description, self._base())
+        self.parts = find_parts(self.frames, options.hints)
+
+    def fail(self, message: str) -> UrdfError:
+        return UrdfError(f"{self.description.path}: {message}")
+
+    def guess(self, text: str) -> None:
+        self.guesses.append(text)
+
+    def _base(self) -> str:
+        links = self.description.links
+        if self.options.base_frame is not None:
+            if self.options.base_frame not in links:
+                raise self.fail(
+                    f"base frame {self.options.base_frame!r}: expected one of {', '.join(list(links)[:8])}, ..."
+                )
+            return self.options.base_frame
+        found = "base_link" if "base_link" in links else self.description.root
+        self.guess(f"base frame {found}: {'by its name' if found == 'base_link' else 'the root link'}")
+        return found
+
+    def conversion(self) -> Conversion:
+        mass, centre, inertia = self._mass()
+        wheels = self.parts.wheels
+        kind = self._drive_kind()
+        content: dict[str, Any] = {
+            "name": self._name(),
+            "description": f"imported from {self.description.path.name}",
+            "base_frame": self.frames.base,
+            "mass": _number(mass),
+            "centre_of_mass": _numbers(centre),
+            "inertia": _numbers([*np.diag(inertia), inertia[0, 1], inertia[0, 2], inertia[1, 2]]),
+            "command": {},
+        }
+        if kind != "skid":
+            content["drive"] = {"kind": kind}
+        self.guesses += self.parts.notes
+        driven = self._driven(kind)
+        content["wheels"] = [self._wheel_entry(wheel, kind, driven) for wheel in wheels]
+        content["tracks"] = [entry for track in self.parts.tracks if (entry := self._track_entry(track))]
+        content["flippers"] = [self._flipper_entry(joint) for joint in self.parts.flippers]
+        content["steering"] = [self._steering_entry(wheel) for wheel in wheels if wheel.steering is not None]
+        content["casters"] = [self._caster_entry(wheel) for wheel in wheels if wheel.swivel is not None]
+        content["rockers"] = [self._rocker_entry(joint) for joint in self.parts.rockers]
+        content["hull"] = self._hull()
+        sensors, notes = find_sensors(self.frames)
+        content["sensors"] = sensors
+        self.guesses += notes
+        content["command"] = self._command(content)
+        self._check(content)
+        kept = {key: value for key, value in content.items() if value not in ([], {})}
+        return Conversion(kept, tuple(self.guesses), tuple(self.warnings))
+
+    def _name(self) -> str:
+        return re.sub(r"\W+", "_", self.options.name or self.description.name).strip("_").lower() or "robot"
+
+    def _mass(self) -> tuple[float, np.ndarray, np.ndarray]:
+        """Mass, centre of mass and inertia about it at the zero position, by the parallel-axis theorem."""
+        links = [link for name, link in self.description.links.items() if name not in self.parts.left_out]
+        heavy = [link for link in links if link.mass > 0]
+        if not heavy:
+            raise self.fail(f"none of the {len(links)} links has a mass; add inertial elements")
+        without = [name for name in self._moving_links() if self.description.links[name].mass == 0]
+        if without:
+            self.warnings.append(f"without mass: {', '.join(without[:6])}; the robot's mass may be too small")
+        poses = {link.name: self.frames.link(link.name) for link in heavy}
+        places = np.array([poses[link.name][:3, :3] @ link.centre + poses[link.name][:3, 3] for link in heavy])
+        masses = np.array([link.mass for link in heavy])
+        centre = masses @ places / masses.sum()
+        inertia = np.zeros((3, 3))
+        for link, place in zip(heavy, places, strict=True):
+            turn, arm = poses[link.name][:3, :3], place - centre
+            inertia += turn @ link.inertia @ turn.T + link.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+        moments = np.linalg.eigvalsh(inertia)
+        if moments[0] <= 0 or moments[0] + moments[1] < moments[2] * (1 - 1e-6):
+            raise self.fail(
+                f"inertia of the whole robot: principal moments {moments.round(5).tolist()} kg m², expected positive "
+                "ones, the largest at most the others' sum; correct the links' inertia elements"
+            )
+        self.guess(f"mass {masses.sum():.4g} kg: the sum over {len(heavy)} links, at the zero position of all joints")
+        return float(masses.sum()), centre, inertia
+
+    def _moving_links(self) -> list[str]:
+        return [wheel.joint.child for wheel in self.parts.wheels] + list(self.parts.tracks)
+
+    def _drive_kind(self) -> str:
+        wheels = self.parts.wheels
+        steered = [wheel for wheel in wheels if wheel.steering is not None]
+        straight = [wheel for wheel in wheels if wheel.steering is None and wheel.swivel is None]
+        if self.options.drive is not None:
+            return self.options.drive
+        if not steered:
+            casters = any(wheel.swivel is not None for wheel in wheels)
+            kind, reason = ("differential", "it has casters") if casters else ("skid", "no wheel is steered")
+        elif not straight:
+            four = len(steered) == 4
+            kind, reason = ("four_wheel_steering" if four else "independent"), f"all {len(steered)} wheels are steered"
+        else:
+            places = [wheel.shape.centre[0] for wheel in steered]
+            between = all(min(places) < wheel.shape.centre[0] < max(places) for wheel in straight)
+            if max(places) - min(places) > _SAME_AXLE and between:
+                kind, reason = "independent", "wheels in front and behind are steered, those between are not"
+            else:
+                kind, reason = "ackermann", f"{len(steered)} of {len(wheels)} wheels are steered"
+        self.guess(f"drive {kind}: {reason}")
+        return kind
+
+    def _driven(self, kind: str) -> set[str]:
+        """Joints of the wheels that a motor turns."""
+        wheels = [wheel for wheel in self.parts.wheels if wheel.swivel is None]
+        hinted = {
+            wheel.joint.name
+            for wheel in wheels
+            if "free_wheel" in (self.options.hints.get(wheel.joint.name), self.options.hints.get(wheel.joint.child))
+        }
+        named = {wheel.joint.name for wheel in wheels} & self.description.actuated
+        if named:
+            free = [wheel.name for wheel in wheels if wheel.joint.name not in named]
+            if free:
+                self.guess(f"free wheels {', '.join(free)}: no transmission or ros2_control interface names them")
+            return named - hinted
+        found = {wheel.joint.name for wheel in wheels if kind != "ackermann" or wheel.steering is None}
+        if kind == "ackermann":
+            self.guess("driven wheels: those that are not steered, because the file names no motors")
+        return (found or {wheel.joint.name for wheel in wheels}) - hinted
+
+    def _drive(self, wheel: WheelPart, kind: str) -> str:
+        """Name of a wheel's drive: its side, its axle, or its own."""
+        if kind in ("skid", "differential"):
+            return _side(wheel.shape.centre)
+        if kind == "ackermann":
+            middle = np.mean([other.shape.centre[0] for other in self.parts.wheels])
+            return "front" if wheel.shape.centre[0] > middle else "rear"
+        return wheel.name
+
+    def _wheel_entry(self, wheel: WheelPart, kind: str, driven: set[str]) -> dict[str, Any]:
+        shape = wheel.shape
+        drive = self._drive(wheel, kind) if wheel.joint.name in driven else None
+        self.guess(
+            f"wheel {wheel.name}: {wheel.reason}, radius {shape.radius:.3f} m, width {shape.width:.3f} m, "
+            f"{'rolls freely' if drive is None else f'drive {drive}'}"
+        )
+        return {
+            "name": wheel.name, "drive": drive, "centre": _numbers(shape.centre), "radius": _number(shape.radius),
+            "width": _number(shape.width),
+        }  # fmt: skip
+
+    def _track_entry(self, track: str) -> dict[str, Any] | None:
+        shape = belt_shape(self.frames, self.description.subtree(track))
+        if shape is None:
+            raise self.fail(
+                f"track {track}: no collision shapes that are longer than high; give it a box, or --hint {track}=fixed"
+            )
+        radius = (shape.rear_radius + shape.front_radius) / 2
+        centre = (shape.rear + shape.front) / 2
+        length = float(shape.front[0] - shape.rear[0])
+        self.guess(
+            f"track {track}: from {shape.source}, length {length:.3f} m between rollers of radius {radius:.3f} m"
+        )
+        return {
+            "name": track, "drive": _side(centre), "centre": _numbers(centre), "length": _number(length),
+            "radius": _number(radius), "width": _number(shape.width),
+        }  # fmt: skip
+
+    def _flipper_entry(self, joint: Joint) -> dict[str, Any]:
+        links = list(self.description.subtree(joint.child))
+        axle = self.frames.origin(joint)
+        shape = flipper_shape(self.frames, links, axle)
+        if shape is None:
+            raise self.fail(f"flipper {joint.child}: no collision shapes that are longer than high; give it a box")
+        reach = shape.front - shape.rear
+        end = "front" if self._points_forward(joint, reach) else "rear"
+        angle = math.atan2(reach[2], reach[0] if end == "front" else -reach[0])
+        mass = sum(self.description.links[name].mass for name in links)
+        length = float(np.hypot(reach[0], reach[2]))
+        centre = shape.rear
+        entry: dict[str, Any] = {
+            "name": joint.child, "drive": _side(centre), "end": end, "joint": _numbers(centre),
+            "length": _number(length),
+            "root_radius": _number(shape.rear_radius), "tip_radius": _number(shape.front_radius),
+            "width": _number(shape.width),
+            "mass": _number(mass), "angle": _number(angle),
+        }  # fmt: skip
+        entry |= self._flipper_limits(joint, end, angle)
+        self.guess(
+            f"flipper {joint.child}: from {shape.source}, {end}, length {length:.3f} m, at {math.degrees(angle):.0f}° "
+            "at the zero position"
+        )
+        return entry
+
+    def _flipper_limits(self, joint: Joint, end: str, angle: float) -> dict[str, Any]:
+        """Limits of the angle, positive upwards, and of its speed, where the file has them."""
+        entry: dict[str, Any] = {}
+        if joint.limits is not None and joint.limits[1] - joint.limits[0] < 2 * math.pi:
+            # A positive rotation about y lowers what points forward.
+            up = -np.sign(self.frames.axis(joint)[1]) * (1.0 if end == "front" else -1.0)
+            entry["limits"] = sorted(_number(angle + up * limit) for limit in joint.limits)
+        if joint.maximum_velocity is not None and joint.maximum_velocity <= _FASTEST:
+            entry["maximum_rate"] = _number(joint.maximum_velocity)
+        return entry
+
+    def _points_forward(self, joint: Joint, reach: np.ndarray) -> bool:
+        """Whether a flipper is a front one: by where it points, or where its axle is if it stands upright."""
+        if abs(reach[0]) > 0.2 * np.linalg.norm(reach):
+            return bool(reach[0] > 0)
+        places = [self.frames.origin(other)[0] for other in self.parts.flippers]
+        return bool(self.frames.origin(joint)[0] >= (min(places) + max(places)) / 2)
+
+    def _steering_entry(self, wheel: WheelPart) -> dict[str, Any]:
+        joint = wheel.steering
+        assert joint is not None
+        entry: dict[str, Any] = {"name": joint.name, "wheel": wheel.name}
+        limit = min(abs(joint.limits[0]), abs(joint.limits[1])) if joint.limits else math.inf
+        if not 0.01 < limit <= _LARGEST_STEERING:
+            self.guess(f"steering {joint.name}: no usable limit in the file, {_LARGEST_STEERING} rad")
+            limit = _LARGEST_STEERING
+        entry["maximum_angle"] = _number(limit)
+        if joint.maximum_velocity is not None and joint.maximum_velocity <= _FASTEST:
+            entry["maximum_rate"] = _number(joint.maximum_velocity)
+        entry["pivot"] = _numbers(self.frames.origin(joint))
+        self.guess(
+            f"steering {joint.name}: turns {wheel.name} about a vertical axis, {math.degrees(limit):.0f}° to each side"
+        )
+        return entry
+
+    def _caster_entry(self, wheel: WheelPart) -> dict[str, Any]:
+        joint = wheel.swivel
+        assert joint is not None
+        pivot = self.frames.origin(joint)
+        trail = float(np.linalg.norm((wheel.shape.centre - pivot)[:2]))
+        self.guess(
+            f"caster {joint.name}: swivels {wheel.name} about a vertical axis without a motor, trail {trail:.3f} m"
+        )
+        if trail < 0.005:
+            self.warnings.append(f"caster {joint.name}: without trail it does not follow; correct its origin")
+        return {"name": joint.name, "wheel": wheel.name, "pivot": _numbers(pivot)}
+
+    def _rocker_entry(self, joint: Joint) -> dict[str, Any]:
+        wheels = [w.name for w in self.parts.wheels if w.rocker is not None and w.rocker.name == joint.name]
+        entry: dict[str, Any] = {"name": joint.name, "wheels": wheels, "pivot": _numbers(self.frames.origin(joint))}
+        if abs(self.frames.axis(joint)[0]) > abs(self.frames.axis(joint)[1]):
+            entry["axis"] = [1.0, 0.0, 0.0]
+        limit = min(abs(joint.limits[0]), abs(joint.limits[1])) if joint.limits else math.inf
+        if 0.01 < limit < math.pi:
+            entry["limit"] = _number(limit)
+        self.guess(f"rocker {joint.name}: carries {', '.join(wheels)}")
+        return entry
+
+    def _hull(self) -> list[dict[str, Any]]:
+        taken = set(self.parts.left_out)
+        for wheel in self.parts.wheels:
+            taken |= set(self.description.subtree(wheel.joint.child, ("fixed",)))
+        for link in self.parts.tracks:
+            taken |= set(self.description.subtree(link))
+        for joint in self.parts.flippers:
+            taken |= set(self.description.subtree(joint.child))
+        boxes = []
+        for name, shape in self.frames.shapes(link for link in self.description.links if link not in taken):
+            points = shape.placed(self.frames.link(name))
+            low, high = points.min(axis=0), points.max(axis=0)
+            boxes.append((name, shape, low, np.maximum(high, low + 0.005)))
+        kept = []
+        for index, (name, shape, low, high) in enumerate(boxes):
+            inside = any(
+                (low >= other_low - 1e-6).all() and (high <= other_high + 1e-6).all() and (other != index)
+                and not ((high - low == other_high - other_low).all() and other > index)
+                for other, (_, _, other_low, other_high) in enumerate(boxes)
+            )  # fmt: skip
+            if not inside:
+                kept.append((name, shape, low, high))
+        if len(kept) > _LARGEST_HULL:
+            self.warnings.append(f"hull: {len(kept)} boxes, of which the {_LARGEST_HULL} largest are kept")
+            kept = sorted(kept, key=lambda entry: -float(np.prod(entry[3] - entry[2])))[:_LARGEST_HULL]
+        if not kept:
+            self.warnings.append("hull: no link of the body has a collision shape; the body cannot touch anything")
+        entries, seen = [], set[str]()
+        for name, shape, low, high in kept:
+            volume = 1.0 if shape.kind == "box" else 0.0
+            turn = np.abs((self.frames.link(name) @ shape.pose)[:3, :3])
+            if not volume or turn.max(axis=0).min() < 0.99:
+                self.guess(f"hull {name}: the box around a {shape.kind}" + (" that is turned" if volume else ""))
+            label = name if name not in seen else f"{name}_{len(seen)}"
+            seen.add(label)
+            entries.append({"name": label, "centre": _numbers((low + high) / 2), "size": _numbers(high - low)})
+        return entries
+
+    def _command(self, content: Mapping[str, Any]) -> dict[str, Any]:
+        wheels = [wheel for wheel in self.parts.wheels if wheel.swivel is None]
+        sides = [wheel.shape.centre[1] for wheel in wheels] + [entry["centre"][1] for entry in content["tracks"]]
+        sides = sides or [entry["joint"][1] for entry in content["flippers"]]
+        width = 2 * float(np.mean(np.abs(sides)))
+        command: dict[str, Any] = {"track_width": _number(max(width, 0.05))}
+        self.guess(f"track width {width:.3f} m: twice the mean distance of wheels and tracks from the centre line")
+        speed = self.options.maximum_speed
+        limits = [
+            wheel.joint.maximum_velocity * wheel.shape.radius
+            for wheel in wheels
+            if wheel.joint.maximum_velocity is not None and wheel.joint.maximum_velocity <= _FASTEST
+        ]
+        if speed is None and limits:
+            speed = float(min(limits))
+            self.guess(f"maximum speed {speed:.2f} m/s: the wheel joints' velocity limit times the radius")
+        if speed is None:
+            self.guess("maximum speed: not limited; give --maximum-speed")
+        else:
+            command["maximum_speed"] = _number(speed)
+        if self.options.maximum_yaw_rate is not None:
+            command["maximum_yaw_rate"] = _number(self.options.maximum_yaw_rate)
+        return command
+
+    def _check(self, content: Mapping[str, Any]) -> None:
+        """Warn about what usually is a mistake in a description."""
+        lows = {w["name"]: w["centre"][2] - w["radius"] for w in content["wheels"]}
+        ground = min([*lows.values(), *(t["centre"][2] - t["radius"] for t in content["tracks"])], default=None)
+        if ground is None:
+            return
+        for name, low in lows.items():
+            if low > ground + 0.02:
+                self.warnings.append(
+                    f"wheel {name} hangs {low - ground:.3f} m above the lowest one at the zero position"
+                )
+        for box in content["hull"]:
+            if box["centre"][2] - box["size"][2] / 2 < ground:
+                self.warnings.append(f"hull {box['name']} reaches below the wheels; is it a shape of the body?")
+        for wheel in content["wheels"]:
+            if wheel["width"] > 2 * wheel["radius"]:
+                self.warnings.append(f"wheel {wheel['name']} is wider than high: {wheel['width']} m")
+        along = [w["centre"][0] for w in content["wheels"]]
+        for entry in content["tracks"]:
+            along += [entry["centre"][0] - entry["length"] / 2, entry["centre"][0] + entry["length"] / 2]
+        centre = content["centre_of_mass"][0]
+        if along and not min(along) <= centre <= max(along) and not content["flippers"]:
+            self.warnings.append(f"the centre of mass, x = {centre} m, lies outside the wheelbase: the robot tips over")
+
+
+def _side(centre: np.ndarray) -> str:
+    return "left" if centre[1] > 1e-3 else "right" if centre[1] < -1e-3 else "middle"
+
+
+def _number(value: float) -> float:
+    """Rounded for reading: 10 µm, and four digits of larger numbers, are finer than any description."""
+    return float(f"{value:.6g}") if abs(value) >= 1.0 else round(float(value), 6) + 0.0
+
+
+def _numbers(values: Sequence[float] | np.ndarray) -> list[float]:
+    return [_number(float(value)) for value in values]
+
+
+__all__ = ["DRIVES", "Conversion", "ConversionOptions", "Parts", "convert_description"]

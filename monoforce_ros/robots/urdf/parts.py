@@ -1,0 +1,252 @@
+"""Parts: which joints are wheels, steering, casters, rockers, tracks and flippers, and why."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from monoforce_ros.robots.urdf.description import Joint
+from monoforce_ros.robots.urdf.errors import UrdfError
+from monoforce_ros.robots.urdf.geometry import ALIGNED, Frames, WheelShape, wheel_shape
+
+HINTS = ("wheel", "free_wheel", "steering", "caster", "rocker", "track", "flipper", "fixed", "ignore")
+_TRACK = re.compile(r"track|crawler|tread(?!s?_width)|(?<![a-z])belt", re.IGNORECASE)
+_FLIPPER = re.compile(r"flipper", re.IGNORECASE)
+_CASTER = re.compile(r"caster|castor|swivel", re.IGNORECASE)
+_TRAIL = 0.15
+"""Smallest trail of a caster in wheel radii, where neither actuation nor names tell it from steering."""
+
+
+@dataclass(frozen=True)
+class WheelPart:
+    """A wheel and the joints between it and the body."""
+
+    name: str
+    """The wheel's name in the robot file."""
+    joint: Joint
+    shape: WheelShape
+    steering: Joint | None = None
+    swivel: Joint | None = None
+    rocker: Joint | None = None
+    slider: Joint | None = None
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Joints and links by what they are."""
+
+    wheels: tuple[WheelPart, ...]
+    tracks: tuple[str, ...]
+    """Links."""
+    flippers: tuple[Joint, ...]
+    rockers: tuple[Joint, ...]
+    left_out: frozenset[str]
+    """Links that belong to none of the bodies (hint ``ignore``)."""
+    notes: tuple[str, ...]
+
+
+def find_parts(frames: Frames, hints: Mapping[str, str]) -> Parts:
+    """Sort a description's joints by axis, shape, actuation and name; ``hints`` by link or joint name go before.
+
+    Raises ``UrdfError``: a hint names nothing, a joint that moves mimics another, or nothing drives.
+    """
+    return _Finder(frames, hints).parts()
+
+
+class _Finder:
+    def __init__(self, frames: Frames, hints: Mapping[str, str]):
+        self.frames, self.description = frames, frames.description
+        self.notes: list[str] = []
+        self.hints = dict(hints)
+        known = {*self.description.links, *self.description.joints}
+        for name, kind in hints.items():
+            if name not in known:
+                raise UrdfError(f"hint {name}={kind}: the description has no link or joint of this name")
+            if kind not in HINTS:
+                raise UrdfError(f"hint {name}={kind}: expected one of {', '.join(HINTS)}")
+
+    def hint(self, joint: Joint | None, link: str) -> str | None:
+        """The hint for a joint or the link that it carries."""
+        return self.hints.get("" if joint is None else joint.name) or self.hints.get(link)
+
+    def parts(self) -> Parts:
+        ignored = frozenset(link for name in self._hinted("ignore") for link in self.description.subtree(name))
+        flippers = self._flippers(ignored)
+        taken = {link for joint in flippers for link in self.description.subtree(joint.child)} | ignored
+        tracks = self._tracks(taken)
+        taken |= {link for track in tracks for link in self.description.subtree(track)}
+        spinning = self._spinning(taken)
+        names = [_short(joint.name) for joint, _ in spinning]
+        wheels = tuple(
+            # Short names only where they stay different.
+            self._wheel(name if names.count(name) == 1 else joint.name, joint, shape)
+            for name, (joint, shape) in zip(names, spinning, strict=True)
+        )
+        if not wheels and not tracks and not flippers:
+            raise self._nothing()
+        rockers = tuple(
+            joint
+            for joint in self.description.joints.values()
+            if sum(wheel.rocker is not None and wheel.rocker.name == joint.name for wheel in wheels) >= 2
+        )
+        carrying = {joint.name for joint in rockers}
+        wheels = tuple(
+            wheel if wheel.rocker is None or wheel.rocker.name in carrying else replace(wheel, rocker=None)
+            for wheel in wheels
+        )
+        self._check_mimics(wheels, flippers)
+        self._told_still(wheels, flippers, rockers, taken)
+        return Parts(wheels, tuple(tracks), tuple(flippers), rockers, ignored, tuple(self.notes))
+
+    def _hinted(self, kind: str) -> list[str]:
+        """Links with a hint, by their own name or their joint's."""
+        found = []
+        for name, hint in self.hints.items():
+            if hint == kind:
+                found.append(self.description.joints[name].child if name in self.description.joints else name)
+        return found
+
+    def _flippers(self, ignored: frozenset[str]) -> list[Joint]:
+        found: list[Joint] = []
+        for joint in self.description.joints.values():
+            hint = self.hint(joint, joint.child)
+            if joint.child in ignored or (hint is not None and hint != "flipper"):
+                continue
+            named = _FLIPPER.search(joint.name) or _FLIPPER.search(joint.child)
+            lateral = joint.kind in ("revolute", "continuous") and abs(self.frames.axis(joint)[1]) > ALIGNED
+            if hint == "flipper" and not lateral:
+                raise UrdfError(
+                    f"{self.description.path}: joint {joint.name}: a flipper turns about a lateral axis; this one is "
+                    f"{joint.kind}, axis {np.round(self.frames.axis(joint), 2).tolist()} of the base frame"
+                )
+            carried = list(self.description.subtree(joint.child))
+            if lateral and (hint or named) and len(self.frames.points(carried)):
+                if any(joint.child in self.description.subtree(other.child) for other in found):
+                    continue
+                found.append(joint)
+                self.notes.append(f"flipper {joint.child}: {'by hint' if hint else 'by its name'}, joint {joint.name}")
+        return found
+
+    def _tracks(self, taken: set[str]) -> list[str]:
+        found: list[str] = []
+        for name in self.description.links:
+            hint = self.hint(self.description.parent_joint(name), name)
+            if name in taken or name == self.frames.base or (hint is not None and hint != "track"):
+                continue
+            inside = any(name in self.description.subtree(track) for track in found)
+            rollers = len(self.frames.points([name])) > 0
+            if not inside and (hint or (_TRACK.search(name) and rollers)):
+                found.append(name)
+                self.notes.append(f"track {name}: {'by hint' if hint else 'by its name'}")
+        return found
+
+    def _spinning(self, taken: set[str]) -> list[tuple[Joint, WheelShape]]:
+        """Joints that carry a wheel, with its shape."""
+        candidates = []
+        for joint in self.description.joints.values():
+            hint = self.hint(joint, joint.child)
+            if joint.child in taken or hint in ("fixed", "steering", "caster", "rocker"):
+                continue
+            lateral = abs(self.frames.axis(joint)[1]) > ALIGNED
+            if hint in ("wheel", "free_wheel") and not lateral:
+                raise UrdfError(f"{self.description.path}: {self._axis(joint)}; a wheel's is lateral, (0, 1, 0)")
+            if hint in ("wheel", "free_wheel") or (joint.kind == "continuous" and lateral):
+                shape = wheel_shape(self.frames, joint)
+                if shape is not None:
+                    candidates.append((joint, shape))
+        inner = {joint.child for joint, _ in candidates}
+        # What carries another wheel is a rocker, not a wheel.
+        return [
+            (joint, shape)
+            for joint, shape in candidates
+            if not any(link in inner for link in list(self.description.subtree(joint.child))[1:])
+        ]
+
+    def _wheel(self, name: str, joint: Joint, shape: WheelShape) -> WheelPart:
+        part = WheelPart(
+            name, joint, shape, reason=f"joint {joint.name} is {joint.kind} about a lateral axis, {shape.source}"
+        )
+        parent = self.description.parent_joint(joint.parent)
+        while parent is not None and parent.child != self.frames.base:
+            part = self._carried(part, parent)
+            parent = self.description.parent_joint(parent.parent)
+        return part
+
+    def _carried(self, part: WheelPart, joint: Joint) -> WheelPart:
+        """The wheel with one more joint between it and the body."""
+        hint = self.hint(joint, joint.child)
+        if joint.kind not in ("continuous", "revolute", "prismatic") or hint == "fixed":
+            return part
+        axis = np.abs(self.frames.axis(joint))
+        if joint.kind == "prismatic":
+            return replace(part, slider=joint) if axis[2] > ALIGNED else part
+        if axis[2] > ALIGNED and part.steering is None and part.swivel is None:
+            if hint == "caster" or (hint != "steering" and self._is_caster(part, joint)):
+                return replace(part, swivel=joint)
+            return replace(part, steering=joint)
+        if (axis[1] > ALIGNED or axis[0] > ALIGNED or hint == "rocker") and part.rocker is None:
+            return replace(part, rocker=joint)
+        return part
+
+    def _is_caster(self, part: WheelPart, joint: Joint) -> bool:
+        if _CASTER.search(joint.name) or _CASTER.search(joint.child):
+            return True
+        if self.description.actuated:
+            return joint.name not in self.description.actuated and joint.kind == "continuous"
+        trail = abs(part.shape.centre[0] - self.frames.origin(joint)[0])
+        return joint.kind == "continuous" and trail > _TRAIL * part.shape.radius
+
+    def _check_mimics(self, wheels: Sequence[WheelPart], flippers: Sequence[Joint]) -> None:
+        used = list(flippers)
+        for wheel in wheels:
+            used += [joint for joint in (wheel.joint, wheel.steering) if joint is not None]
+        for joint in used:
+            if joint.mimics is not None:
+                raise UrdfError(
+                    f"{self.description.path}: joint {joint.name} mimics {joint.mimics}: joints that follow others "
+                    f"are not supported; remove the mimic tag (the drive's kinematics couple the wheels), or pass "
+                    f"--hint {joint.name}=fixed"
+                )
+
+    def _told_still(
+        self, wheels: Sequence[WheelPart], flippers: Sequence[Joint], rockers: Sequence[Joint], taken: set[str]
+    ) -> None:
+        moving = {joint.name for joint in (*flippers, *rockers)}
+        for wheel in wheels:
+            used = (wheel.joint, wheel.steering, wheel.swivel)
+            moving |= {joint.name for joint in used if joint is not None}
+        for joint in self.description.joints.values():
+            if (
+                joint.kind not in ("continuous", "revolute", "prismatic")
+                or joint.name in moving
+                or joint.child in taken
+            ):
+                continue
+            if any(wheel.slider is not None and wheel.slider.name == joint.name for wheel in wheels):
+                self.notes.append(
+                    f"joint {joint.name}: a suspension held rigid, URDF has no springs; write a `suspension` entry"
+                )
+            else:
+                self.notes.append(f"joint {joint.name} ({joint.kind}): held at 0")
+
+    def _axis(self, joint: Joint) -> str:
+        axis = ", ".join(f"{value:g}" for value in np.round(self.frames.axis(joint), 2) + 0.0)
+        return f"joint {joint.name}: its axis is ({axis}) of the base frame"
+
+    def _nothing(self) -> UrdfError:
+        turning = [joint for joint in self.description.joints.values() if joint.kind == "continuous"]
+        listed = "; ".join(self._axis(joint) for joint in turning[:4]) or "there is no continuous joint"
+        return UrdfError(
+            f"{self.description.path}: no wheel, track or flipper found: {listed}. A wheel is a continuous joint about "
+            "a lateral axis, (0, 1, 0), whose link has a collision shape; name others by --hint NAME=wheel, "
+            "--track LINK or --flipper LINK, and the frame with x forward by --base-frame"
+        )
+
+
+def _short(name: str) -> str:
+    """A joint's name without the words at its end that most wheel joints have."""
+    return re.sub(r"(_wheel|_drive)?(_joint|_axle)?$", "", name) or name
