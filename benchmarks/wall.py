@@ -33,7 +33,7 @@ from tqdm import tqdm
 from monoforce_ros.core import MotionState, write_text
 from monoforce_ros.encoder import fused, load_encoder
 from monoforce_ros.messages import decoding
-from monoforce_ros.perception import CameraTerrain, LidarTerrain, Observation, TerrainSource
+from monoforce_ros.perception import EncoderTerrain, LidarTerrain, Observation, TerrainSource
 from monoforce_ros.prediction import Prediction, Predictor
 from monoforce_ros.reporting import write_between
 from monoforce_ros.robots import RobotModel, load_robot
@@ -203,12 +203,12 @@ def run_any(options: argparse.Namespace, titles: dict[str, str]) -> None:
     jobs = [(kind, options.seed + 1000 * index + i) for index, kind in enumerate(counts) for i in range(counts[kind])]
     scenes = [any_scene(*job) for job in tqdm(jobs, desc="scenes")]
     sources: dict[str, TerrainSource] = {
-        titles[key]: CameraTerrain(fused(load_encoder(getattr(options, key))), robot)
+        titles[key]: EncoderTerrain(fused(load_encoder(getattr(options, key))), robot)
         for key in ("monoforce", "no_geometric", "lss")
         if getattr(options, key)
     }
     if not sources:
-        sources["shipped encoder"] = CameraTerrain(fused(load_encoder("", "camera")), robot)
+        sources["shipped encoder"] = EncoderTerrain(fused(load_encoder("", "camera")), robot)
     sources[titles["lidar"]] = LidarTerrain(robot, Grid.square(), TerrainDefaults())
     rows = []
     for title, source in sources.items():
@@ -257,7 +257,7 @@ def main() -> None:
         return
     robot = load_robot(options.robot)
     sources = {
-        key: CameraTerrain(fused(load_encoder(getattr(options, key))), robot)
+        key: EncoderTerrain(fused(load_encoder(getattr(options, key))), robot)
         for key in ("monoforce", "no_geometric", "lss")
         if getattr(options, key)
     }

@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -24,7 +25,7 @@ from monoforce_ros.encoder import (
 from monoforce_ros.encoder.backbone import Backbone, WeightsError
 from monoforce_ros.encoder.checkpoint import shipped_checkpoint
 from monoforce_ros.encoder.lift import depth_values, feature_rays, lifted_points, map_cells, splat
-from monoforce_ros.encoder.view import EncoderInput, encoder_input, support_plane
+from monoforce_ros.encoder.view import EncoderInput, encoder_input, network_image, support_plane
 
 SMALL = EncoderConfig(image_width=128, image_height=96, map_size=6.4, resolution=0.2, depth_bins=12, map_features=8)
 FORWARD = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])  # optical axes of a camera that looks along x
@@ -55,9 +56,12 @@ def test_a_feature_at_a_depth_lands_in_the_cell_of_its_point(rotation, lens, siz
     turned = torch.from_numpy(rays @ pose[:3, :3].T)[None]
     points = lifted_points(turned, torch.from_numpy(pose[None, :3, 3]), torch.from_numpy(depths))[0].numpy()
     cells = map_cells(torch.from_numpy(points), SMALL).numpy()
-    for row, column, index in [(0, 0, 3), (3, 4, 5), (5, 7, 2)]:
+    # The whole image lies in the middle of the network's view, and keeps its aspect ratio.
+    scale = min(8 / size[0], 6 / size[1])
+    left, top = (8 - scale * size[0]) / 2, (6 - scale * size[1]) / 2
+    for row, column, index in [(0, 2, 3), (3, 4, 5), (5, 5, 2)]:
         # The point that projects onto the middle of the feature's patch of pixels, at its depth.
-        pixel = np.array([(column + 0.5) / 8 * size[0] - 0.5, (row + 0.5) / 6 * size[1] - 0.5])
+        pixel = np.array([(column + 0.5 - left) / scale - 0.5, (row + 0.5 - top) / scale - 0.5])
         place = points[index, row, column]
         in_camera = transform_points(np.linalg.inv(pose), place)
         projected, _ = seen.camera.project(in_camera[None])
@@ -110,7 +114,7 @@ def test_level_ground_is_lifted_to_its_height_without_training():
     batch = encoder_input([view()], support, SMALL)
     assert float(batch.ground[0]) == pytest.approx(-0.3) and float(batch.origins[0, 2]) == pytest.approx(0.8)
     depth, _ = encoder._lift(batch)
-    expected = (depth * encoder.depths[None, :, None, None]).sum(1)[0]
+    expected = (depth.exp() * encoder.depths[None, :, None, None]).sum(1)[0]
     # Rays steep enough to meet the ground within the depths that are looked at.
     level = -batch.origins[0, 2] / batch.rays[0, ..., 2]
     steep = (batch.rays[0, ..., 2] < 0) & (level < 4.0)
@@ -122,9 +126,11 @@ def test_the_support_plane_has_the_slope_under_the_wheels():
     x, y = np.array([0.3, 0.3, -0.3, -0.3]), np.array([0.3, -0.3, 0.3, -0.3])
     ground, plane, known = support_plane(np.column_stack([x, y, 0.2 * x - 0.1 * y - 0.4]), SMALL.grid)
     assert ground == pytest.approx(-0.4)
-    rows, columns = np.nonzero(known)
-    np.testing.assert_allclose(plane[rows, columns], 0.2 * SMALL.grid.x[columns] - 0.1 * SMALL.grid.y[rows], atol=1e-9)
-    assert not plane[known == 0].any() and support_plane(None, SMALL.grid)[0] == 0.0
+    expected = 0.2 * SMALL.grid.x[None, :] - 0.1 * SMALL.grid.y[:, None]
+    np.testing.assert_allclose(plane, expected.clip(-1.5, 1.5), atol=1e-9)
+    distance = np.hypot(SMALL.grid.x[None, :], SMALL.grid.y[:, None])
+    assert (known[distance < 1.0] == 1.0).all() and (known[distance > 2.5] == 0.0).all()
+    assert support_plane(None, SMALL.grid)[0] == 0.0
 
 
 def test_a_batch_gives_the_same_predictions_as_single_maps():
@@ -138,7 +144,7 @@ def test_a_batch_gives_the_same_predictions_as_single_maps():
             torch.testing.assert_close(encoder(entry).height[0], together.height[i], atol=1e-4, rtol=1e-4)
 
 
-@pytest.mark.parametrize("sensor", ["camera", "lidar"])
+@pytest.mark.parametrize("sensor", ["camera", "lidar", "camera_lidar"])
 def test_a_fused_encoder_predicts_the_same(sensor):
     torch.manual_seed(0)
     encoder = new_encoder(replace(SMALL, sensor=sensor))
@@ -151,15 +157,17 @@ def test_a_fused_encoder_predicts_the_same(sensor):
     quick = fused(encoder)
     assert not any(isinstance(module, torch.nn.BatchNorm2d) for module in quick.modules())
     image = np.random.default_rng(1).integers(0, 255, (96, 128, 3), np.uint8)
-    seen = np.random.default_rng(2).normal(size=(500, 3)) if sensor == "lidar" else [view(image)]
-    one, other = encoder.terrain(seen), quick.terrain(seen)
+    points = np.random.default_rng(2).normal(size=(500, 3))
+    seen = [view(image)] if "camera" in sensor else []
+    sweep = points if "lidar" in sensor else None
+    one, other = (entry.terrain(seen, sweep=sweep) for entry in (encoder, quick))
     torch.testing.assert_close(one.height, other.height, atol=1e-4, rtol=1e-4)
     torch.testing.assert_close(one.friction, other.friction, atol=1e-4, rtol=1e-4)
     convolutions = [part for part in quick.modules() if isinstance(part, torch.nn.Conv2d)]
     assert packed(quick) is quick
     # All convolutions are packed but the lift and the heads.
     assert len([part for part in quick.modules() if isinstance(part, torch.nn.Conv2d)]) <= 2 < len(convolutions)
-    again, third = quick.terrain(seen), quick.terrain(seen)
+    again, third = quick.terrain(seen, sweep=sweep), quick.terrain(seen, sweep=sweep)
     torch.testing.assert_close(one.height, again.height, atol=1e-4, rtol=1e-4)
     torch.testing.assert_close(one.friction, again.friction, atol=1e-4, rtol=1e-4)
     assert torch.equal(again.height, third.height)
@@ -218,15 +226,15 @@ def test_predictions_keep_their_signs_for_any_number_of_cameras():
         assert not bool(terrain.observed[:, terrain.grid.x < 0.0].any())
 
 
-@pytest.mark.parametrize("sensor", ["camera", "lidar"])
+@pytest.mark.parametrize("sensor", ["camera", "lidar", "camera_lidar"])
 def test_untrained_material_is_that_of_the_configuration(sensor):
     torch.manual_seed(5)
     config = replace(SMALL, sensor=sensor, friction=0.6, stiffness=1e6, damping=3e4)
     random = np.random.default_rng(1)
-    seen = (
-        random.normal(size=(500, 3)) if sensor == "lidar" else [view(random.integers(0, 255, (96, 128, 3), np.uint8))]
-    )
-    terrain = new_encoder(config).terrain(seen)
+    seen = [view(random.integers(0, 255, (96, 128, 3), np.uint8))] if "camera" in sensor else []
+    terrain = new_encoder(config).terrain(seen, sweep=random.normal(size=(500, 3)) if "lidar" in sensor else None)
+    # Heights are those of the ground that carries the robot.
+    assert float(terrain.geometric_height.abs().max()) == 0.0 and float(terrain.height.abs().max()) < 0.03
     for name in ("friction", "stiffness", "damping"):
         values = getattr(terrain, name)
         torch.testing.assert_close(values, torch.full_like(values, getattr(config, name)))
@@ -247,12 +255,65 @@ def test_a_checkpoint_survives_saving_and_loading(tmp_path):
     assert sorted(p.name for p in (tmp_path / "a").iterdir()) == ["encoder.json", "encoder.safetensors"]
 
 
-def test_the_shipped_checkpoint_is_small_and_for_cameras():
+def test_the_shipped_checkpoint_is_small_and_takes_images_and_sweeps(tmp_path):
     assert shipped_checkpoint().stat().st_size < 12e6
-    encoder = load_encoder("", "camera")
-    assert encoder.config.sensor == "camera" and encoder.config.decreases
+    for sensor in ("camera", "lidar"):
+        assert load_encoder("", sensor).config.sensor == "camera_lidar"
+    save_encoder(TerrainEncoder(SMALL), tmp_path / "camera.safetensors")
     with pytest.raises(CheckpointError, match="got an encoder for camera, expected one for lidar"):
-        load_encoder("", "lidar")
+        load_encoder(tmp_path / "camera.safetensors", "lidar")
+
+
+def test_a_checkpoint_of_an_earlier_release_is_refused(tmp_path):
+    save_encoder(TerrainEncoder(SMALL), tmp_path / "old.safetensors")
+    description = tmp_path / "old.json"
+    content = json.loads(description.read_text())
+    del content["format"]
+    description.write_text(json.dumps(content))
+    with pytest.raises(CheckpointError, match="encoder format: got 1, expected 2: it was trained with another release"):
+        load_encoder(tmp_path / "old.safetensors")
+
+
+def test_either_sensor_of_an_encoder_of_both_may_be_absent():
+    torch.manual_seed(2)
+    encoder = TerrainEncoder(replace(SMALL, sensor="camera_lidar")).eval()
+    torch.nn.init.normal_(encoder.heads.weight, std=0.2)
+    random = np.random.default_rng(3)
+    seen, sweep = [view(random.integers(0, 255, (96, 128, 3), np.uint8))], random.normal(size=(400, 3)) * [1, 1, 0.2]
+    both, images, points = (
+        encoder.terrain(seen, sweep=sweep), encoder.terrain(seen), encoder.terrain([], sweep=sweep),
+    )  # fmt: skip
+    for one, other in ((both, images), (both, points), (images, points)):
+        assert not torch.equal(one.height, other.height)
+    assert bool((both.observed | ~images.observed).all()) and bool((both.observed | ~points.observed).all())
+
+
+def test_maps_with_different_numbers_of_cameras_share_a_batch():
+    torch.manual_seed(4)
+    encoder = TerrainEncoder(replace(SMALL, sensor="camera_lidar")).eval()
+    torch.nn.init.normal_(encoder.heads.weight, std=0.2)
+    images = np.random.default_rng(1).integers(0, 255, (3, 96, 128, 3), np.uint8)
+    sweep = np.random.default_rng(2).normal(size=(300, 3))
+    alone = [
+        encoder_input([view(images[0])], None, encoder.config),
+        encoder_input([], None, encoder.config, sweep=sweep),
+        encoder_input([view(images[1]), view(images[2], size=(128, 96))], None, encoder.config, sweep=sweep),
+    ]
+    with torch.no_grad():
+        together = encoder(EncoderInput.stack(alone))
+        for i, entry in enumerate(alone):
+            torch.testing.assert_close(encoder(entry).height[0], together.height[i], atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("size", [(64, 128), (256, 96), (128, 96), (1232, 1616)])
+def test_images_keep_their_aspect_ratio(size):
+    image = np.zeros((size[1], size[0], 3), np.uint8)
+    cv2.circle(image, (size[0] // 2, size[1] // 2), min(size) // 4, (255, 255, 255), -1)
+    rows, columns = np.nonzero(network_image(image, SMALL)[..., 0] > 200)
+    assert np.ptp(rows) == pytest.approx(np.ptp(columns), abs=2)
+    empty = np.isnan(feature_rays(view(size=size).camera, 48, 64)).any(axis=-1)
+    share = min(size[0] / size[1], 4 / 3) / max(size[0] / size[1], 4 / 3)
+    assert empty.mean() == pytest.approx(1 - share, abs=0.03)
 
 
 def test_unusable_checkpoints_are_refused(tmp_path):

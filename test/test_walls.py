@@ -9,7 +9,7 @@ import torch
 import wall
 
 from monoforce_ros.encoder import fused, load_encoder
-from monoforce_ros.perception import CameraTerrain
+from monoforce_ros.perception import EncoderTerrain
 from monoforce_ros.prediction import Predictor
 from monoforce_ros.robots import load_robot
 
@@ -20,7 +20,7 @@ MISSED = {93006: "the wall 3.04 m ahead is not detected"}
 @pytest.fixture(scope="module")
 def predictor():
     robot = load_robot("husky")
-    return Predictor(robot, CameraTerrain(fused(load_encoder("", "camera")), robot), horizon=wall.HORIZON)
+    return Predictor(robot, EncoderTerrain(fused(load_encoder("", "camera")), robot), horizon=wall.HORIZON)
 
 
 @pytest.mark.parametrize(("seed", "crash"), [(seed, seed not in (93001, 93003)) for seed in range(93000, 93009)])

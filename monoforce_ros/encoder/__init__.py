@@ -2,14 +2,16 @@
 
 from monoforce_ros.encoder.backbone import WeightsError
 from monoforce_ros.encoder.checkpoint import CheckpointError, Encoder, averaged, load_encoder, new_encoder, save_encoder
-from monoforce_ros.encoder.config import EncoderConfig
-from monoforce_ros.encoder.inference import fused, packed
+from monoforce_ros.encoder.config import SENSORS, EncoderConfig
+from monoforce_ros.encoder.heads import EncodedMaps
+from monoforce_ros.encoder.inference import fused, multiplies_bfloat16, packed
 from monoforce_ros.encoder.lidar_encoder import LidarEncoder
-from monoforce_ros.encoder.lift import feature_rays
-from monoforce_ros.encoder.terrain_encoder import EncodedMaps, TerrainEncoder
+from monoforce_ros.encoder.lift import feature_rays, letterbox
+from monoforce_ros.encoder.terrain_encoder import TerrainEncoder
 from monoforce_ros.encoder.view import CameraView, EncoderInput, assemble, encoder_input, network_image
 
 __all__ = [
+    "SENSORS",
     "CameraView",
     "CheckpointError",
     "EncodedMaps",
@@ -24,7 +26,9 @@ __all__ = [
     "encoder_input",
     "feature_rays",
     "fused",
+    "letterbox",
     "load_encoder",
+    "multiplies_bfloat16",
     "network_image",
     "new_encoder",
     "packed",

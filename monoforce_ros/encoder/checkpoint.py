@@ -36,7 +36,7 @@ def shipped_checkpoint() -> Path:
 
 def new_encoder(config: EncoderConfig) -> Encoder:
     """An untrained encoder for the configuration's sensor."""
-    return TerrainEncoder(config) if config.sensor == "camera" else LidarEncoder(config)
+    return TerrainEncoder(config) if config.takes_images else LidarEncoder(config)
 
 
 def save_encoder(encoder: Encoder, path: str | Path) -> None:
@@ -55,7 +55,7 @@ def load_encoder(path: str | Path, sensor: str | None = None) -> Encoder:
 
     Args:
         path: path of the weights; the configuration is in the same folder. Empty for the shipped encoder.
-        sensor: required sensor, ``camera`` or ``lidar``; any if None.
+        sensor: required input, ``camera`` or ``lidar``; any if None. An encoder of both serves either.
 
     Raises:
         CheckpointError: a file is missing, too large, damaged, or does not match its configuration; the message names
@@ -69,10 +69,11 @@ def load_encoder(path: str | Path, sensor: str | None = None) -> Encoder:
         if file.stat().st_size > MAXIMUM_BYTES:
             raise CheckpointError(f"{file}: got {file.stat().st_size} bytes, expected at most {MAXIMUM_BYTES}")
     try:
-        config = EncoderConfig(**json.loads(description.read_text(encoding="utf-8")))
+        # Files of the first format do not name it.
+        config = EncoderConfig(**({"format": 1} | json.loads(description.read_text(encoding="utf-8"))))
     except (TypeError, ValueError) as error:
         raise CheckpointError(f"{description}: not an encoder configuration: {error}") from error
-    if sensor is not None and config.sensor != sensor:
+    if sensor is not None and sensor not in config.sensor.split("_"):
         raise CheckpointError(f"{path}: got an encoder for {config.sensor}, expected one for {sensor}")
     encoder = new_encoder(config)
     try:

@@ -6,7 +6,9 @@ from dataclasses import dataclass
 
 from monoforce_ros.terrain import Grid, TerrainDefaults
 
-SENSORS = ("camera", "lidar")
+SENSORS = ("camera", "lidar", "camera_lidar")
+FORMAT = 2
+"""Version of the network's inputs and outputs; checkpoints of other versions cannot be used."""
 BACKBONES = ("efficientnet_lite0",)
 
 FEATURE_STRIDE = 8
@@ -18,7 +20,9 @@ class EncoderConfig:
     """Everything that determines an encoder's tensors and their meaning."""
 
     sensor: str = "camera"
-    """``camera``, or ``lidar`` for the network that densifies a sweep."""
+    """``camera``; ``camera_lidar`` for images and a sweep, either of which may be absent; or ``lidar`` for the network
+    that densifies a sweep."""
+    format: int = FORMAT
     backbone: str = "efficientnet_lite0"
     image_width: int = 320
     image_height: int = 240
@@ -46,10 +50,18 @@ class EncoderConfig:
     damping: float = TerrainDefaults.damping
     friction: float = TerrainDefaults.friction
     """Material predicted by untrained heads [N/m³, N s/m³, -]."""
+    geometric_spread_factor: float = 1.0
+    decrease_spread_factor: float = 1.0
+    """Factors on the predicted spreads of H_g and H_d, calibrated on held-out samples so that 90 % bands hold 90 %."""
 
     def __post_init__(self):
         if self.sensor not in SENSORS:
             raise ValueError(f"encoder sensor: got {self.sensor!r}, expected one of {SENSORS}")
+        if self.format != FORMAT:
+            raise ValueError(
+                f"encoder format: got {self.format}, expected {FORMAT}: it was trained with another release; train it "
+                "again, or use the shipped encoder"
+            )
         if self.backbone not in BACKBONES:
             raise ValueError(f"encoder backbone: got {self.backbone!r}, expected one of {BACKBONES}")
         for name, low, high in (
@@ -62,6 +74,8 @@ class EncoderConfig:
             ("depth_maximum", 0.5, 500.0),
             ("image_features", 1, 512),
             ("map_features", 8, 512),
+            ("geometric_spread_factor", 0.01, 100.0),
+            ("decrease_spread_factor", 0.01, 100.0),
         ):
             value = getattr(self, name)
             if not isinstance(value, int | float) or isinstance(value, bool) or not low <= value <= high:
@@ -77,6 +91,16 @@ class EncoderConfig:
             raise ValueError(
                 f"encoder depth_minimum: got {self.depth_minimum} m, expected less than {self.depth_maximum} m"
             )
+
+    @property
+    def takes_images(self) -> bool:
+        """Whether images are an input."""
+        return self.sensor != "lidar"
+
+    @property
+    def takes_sweeps(self) -> bool:
+        """Whether lidar sweeps are an input."""
+        return self.sensor != "camera"
 
     @property
     def feature_rows(self) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import override
 
 import numpy as np
@@ -10,8 +11,8 @@ from torch import nn
 
 from monoforce_ros.encoder.birds_eye import BirdsEyeNetwork
 from monoforce_ros.encoder.config import EncoderConfig
-from monoforce_ros.encoder.terrain_encoder import EncodedMaps, map_heads, maps_from_heads, terrain_maps
-from monoforce_ros.encoder.view import EncoderInput, sweep_input
+from monoforce_ros.encoder.heads import EncodedMaps, map_heads, maps_from_heads, terrain_maps
+from monoforce_ros.encoder.view import SUPPORT_CHANNELS, SWEEP_CHANNELS, CameraView, EncoderInput, encoder_input
 from monoforce_ros.terrain import TerrainMap
 
 
@@ -21,8 +22,7 @@ class LidarEncoder(nn.Module):
     def __init__(self, config: EncoderConfig):
         super().__init__()
         self.config = config
-        # Lowest and highest hit, hit mask, support plane and its mask.
-        self.bird = BirdsEyeNetwork(5, config.map_features)
+        self.bird = BirdsEyeNetwork(SWEEP_CHANNELS + SUPPORT_CHANNELS, config.map_features)
         self.heads = map_heads(config.map_features)
 
     @override
@@ -33,9 +33,23 @@ class LidarEncoder(nn.Module):
         return maps_from_heads(outputs, batch, self.config, torch.ones_like(hit, dtype=torch.bool), hit)
 
     @torch.no_grad()
-    def terrain(self, points: np.ndarray, support: np.ndarray | None = None) -> TerrainMap:
-        """Terrain map from a sweep ``[n, 3]`` in the terrain frame [m]; cells with a hit count as observed."""
+    def terrain(
+        self,
+        views: Sequence[CameraView],
+        support: np.ndarray | None = None,
+        *,
+        sweep: np.ndarray | None = None,
+        trace: np.ndarray | None = None,
+    ) -> TerrainMap:
+        """Terrain map from a sweep; cells with a hit count as observed. ``views`` must be empty.
+
+        See :func:`monoforce_ros.encoder.encoder_input` for the arguments.
+        """
+        if views or sweep is None:
+            raise ValueError(
+                f"lidar encoder: got {len(views)} images and sweep {sweep is not None}, expected a sweep only"
+            )
         if self.training:
             self.eval()
-        batch = sweep_input(points, support, self.config).to(self.heads.weight.device)
+        batch = encoder_input([], support, self.config, sweep=sweep, trace=trace).to(self.heads.weight.device)
         return terrain_maps(self(batch), self.config)[0]

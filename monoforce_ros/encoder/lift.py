@@ -12,31 +12,58 @@ from torch.nn import functional
 from monoforce_ros.core import CameraModel
 from monoforce_ros.encoder.config import EncoderConfig
 
+_LARGEST_SLOPE = 5.67
+"""Largest tangent of the angle between a ray and the optical axis."""
+
 
 def depth_values(config: EncoderConfig) -> np.ndarray:
     """Depth of each bin [m], ``[bins]``, evenly spaced in the logarithm."""
     return np.geomspace(config.depth_minimum, config.depth_maximum, config.depth_bins)
 
 
-def feature_rays(camera: CameraModel, rows: int, columns: int, image_from_view: np.ndarray | None = None) -> np.ndarray:
+def letterbox(width: int, height: int, aspect: float) -> np.ndarray:
+    """Affine map ``[2, 3]`` from the network's view to an image, both in 0..1; the view contains the whole image.
+
+    The image keeps its aspect ratio and is centred; the rest of the view, outside of 0..1, is empty.
+
+    Args:
+        width, height: size of the image [px].
+        aspect: width of the view divided by its height.
+    """
+    wide = max(1.0, aspect * height / width)
+    high = max(1.0, width / (aspect * height))
+    return np.array([[wide, 0.0, 0.5 - wide / 2], [0.0, high, 0.5 - high / 2]])
+
+
+def feature_rays(camera: CameraModel, rows: int, columns: int, view_from_crop: np.ndarray | None = None) -> np.ndarray:
     """Undistorted ray through the centre of each feature cell.
 
     Args:
         camera: model of the original image.
-        rows, columns: size of the feature map that covers the whole image.
-        image_from_view: affine map ``[2, 3]`` from the network's view to the original image, both in 0..1; for
+        rows, columns: size of the feature map of the letterboxed image.
+        view_from_crop: affine map ``[2, 3]`` from a crop of the letterboxed image to the whole of it, both in 0..1; for
             training on crops.
 
     Returns:
-        ``[rows, columns, 3]`` in camera axes with z = 1: a ray times a depth is a point.
+        ``[rows, columns, 3]`` in camera axes with z = 1: a ray times a depth is a point. NaN outside of the image and
+        outside of the lens' field of view.
     """
-    if image_from_view is None:
+    if view_from_crop is None:
         matrix, distortion = (np.asarray(v, np.float64) for v in (camera.matrix, camera.distortion))
         intrinsics = (matrix.tobytes(), distortion.tobytes(), camera.distortion_model)
         return _whole_image_rays(camera.width, camera.height, *intrinsics, rows, columns)
+    return _rays(camera, rows, columns, view_from_crop)
+
+
+def _rays(camera: CameraModel, rows: int, columns: int, view_from_crop: np.ndarray) -> np.ndarray:
     x, y = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
-    x, y = (a * x + b * y + c for a, b, c in image_from_view)
-    return camera.rays(np.stack([x * camera.width - 0.5, y * camera.height - 0.5], axis=-1))
+    for affine in (view_from_crop, letterbox(camera.width, camera.height, columns / rows)):
+        x, y = (a * x + b * y + c for a, b, c in affine)
+    rays = camera.rays(np.stack([x * camera.width - 0.5, y * camera.height - 0.5], axis=-1))
+    inside = (x >= 0.0) & (x <= 1.0) & (y >= 0.0) & (y <= 1.0)
+    # Beyond this slope, 80° off the axis, a lens shows nothing that the map could use.
+    inside &= np.abs(rays[..., :2]).max(axis=-1) < _LARGEST_SLOPE
+    return np.where(inside[..., None], rays, np.nan)
 
 
 @lru_cache(maxsize=64)
@@ -45,9 +72,7 @@ def _whole_image_rays(
 ) -> np.ndarray:
     """Rays of an uncropped image, cached per camera because undistortion takes a millisecond."""
     camera = CameraModel(width, height, np.frombuffer(matrix).reshape(3, 3), np.frombuffer(distortion), model)
-    u = (np.arange(columns) + 0.5) / columns * width - 0.5
-    v = (np.arange(rows) + 0.5) / rows * height - 0.5
-    rays = camera.rays(np.stack(np.meshgrid(u, v), axis=-1))
+    rays = _rays(camera, rows, columns, np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]))
     rays.flags.writeable = False
     return rays
 

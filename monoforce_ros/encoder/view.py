@@ -15,8 +15,17 @@ from monoforce_ros.encoder.config import EncoderConfig
 from monoforce_ros.encoder.lift import feature_rays
 from monoforce_ros.terrain import Grid
 
-_SUPPORT_REACH = 1.0
-"""Distance from the robot's centre up to which the plane under its wheels describes the ground [m]."""
+_EMPTY = 127
+"""Grey level of the part of the network's view that no image covers: zero after normalisation."""
+_SUPPORT_REACH, _SUPPORT_END = 1.0, 2.5
+"""Distances from the robot's centre up to which the plane under its wheels describes the ground, and from which on
+level ground is the better guess [m]."""
+_STEEPEST = 1.5
+"""Limit of the plane's height relative to the robot's ground, as an input [m]."""
+
+
+SUPPORT_CHANNELS, SWEEP_CHANNELS = 4, 3
+"""Channels of :attr:`EncoderInput.support` and of :attr:`EncoderInput.sweep`."""
 
 
 @dataclass(frozen=True)
@@ -42,26 +51,41 @@ class CameraView:
 
 @dataclass(frozen=True)
 class EncoderInput:
-    """Input for a batch of ``B`` maps with the same number of cameras each; heights are relative to ``ground``."""
+    """Input for a batch of ``B`` maps, each with any number of cameras; heights are relative to ``ground``."""
 
     images: Tensor
-    """RGB uint8 ``[B · cameras, 3, image_height, image_width]``."""
+    """RGB uint8 ``[N, 3, image_height, image_width]``, images of all maps."""
     rays: Tensor
-    """In terrain axes, scaled to 1 m along the optical axis, ``[B · cameras, feature rows, feature columns, 3]``."""
+    """In terrain axes, scaled to 1 m along the optical axis, ``[N, feature rows, feature columns, 3]``; 0 where
+    ``seen`` is False."""
+    seen: Tensor
+    """Whether a feature lies in the image and in the lens' field of view (bool) ``[N, feature rows, feature columns]``;
+    the rest of the network's view is empty."""
     origins: Tensor
-    """Camera positions in the terrain frame, z relative to ``ground``, ``[B · cameras, 3]`` [m]."""
+    """Camera positions in the terrain frame, z relative to ``ground``, ``[N, 3]`` [m]."""
+    map_of: Tensor
+    """Index of each image's map ``[N]`` int64."""
     support: Tensor
-    """Plane under the wheels relative to ``ground`` [m], and its mask; ``[B, 2, rows, columns]``."""
+    """Plane under the wheels relative to ``ground`` [m], fading to level ground, and its weight 0..1; ground that the
+    robot drove over relative to ``ground`` [m], and its mask; ``[B, 4, rows, columns]``. The plane fades because on
+    hills shorter than the map its slope says nothing of ground further away; given the whole plane, an encoder
+    extrapolates it."""
     ground: Tensor
     """Height of the ground under the robot in its terrain frame ``[B]`` [m]."""
     sweep: Tensor
-    """Lowest and highest lidar hit of each cell relative to ``ground`` [m], and the hit mask;
-    ``[B, 3, rows, columns]``, or ``[B, 0, rows, columns]`` without a lidar."""
+    """Lowest and highest lidar hit of each cell relative to ``ground`` [m], and the hit mask, all 0 without a sweep;
+    ``[B, 3, rows, columns]``."""
 
     @property
     def maps(self) -> int:
         """Number of maps."""
         return len(self.ground)
+
+    @property
+    def anchor(self) -> Tensor:
+        """Ground that carries the robot, which predicted heights correct, relative to ``ground`` [m]
+        ``[B, rows, columns]``: the plane under the wheels, and level ground further away."""
+        return self.support[:, 0]
 
     def to(self, device: torch.device | str) -> EncoderInput:
         """The same on another device."""
@@ -69,51 +93,70 @@ class EncoderInput:
 
     @classmethod
     def stack(cls, inputs: Sequence[EncoderInput]) -> EncoderInput:
-        """A batch of inputs with the same number of cameras."""
-        return cls(**{f.name: torch.cat([getattr(entry, f.name) for entry in inputs]) for f in fields(cls)})
+        """A batch of inputs."""
+        joined = {f.name: torch.cat([getattr(entry, f.name) for entry in inputs]) for f in fields(cls)}
+        starts = np.cumsum([0, *(entry.maps for entry in inputs[:-1])])
+        joined["map_of"] = torch.cat([i.map_of + int(start) for i, start in zip(inputs, starts, strict=True)])
+        return cls(**joined)
 
 
-def encoder_input(views: Sequence[CameraView], support: np.ndarray | None, config: EncoderConfig) -> EncoderInput:
+def encoder_input(
+    views: Sequence[CameraView],
+    support: np.ndarray | None,
+    config: EncoderConfig,
+    *,
+    sweep: np.ndarray | None = None,
+    trace: np.ndarray | None = None,
+) -> EncoderInput:
     """Input for one map.
 
     Args:
-        views: one view per camera, in one terrain frame.
+        views: one view per camera, in one terrain frame; may be empty.
         support: contact points of the wheels ``[m, 3]`` in that frame [m]; without them the ground is assumed to be at
             the height of the frame's origin.
         config: configuration of the encoder.
+        sweep: lidar points ``[n, 3]`` in that frame [m], without points on the robot.
+        trace: ground that the robot has driven over ``[k, 3]`` in that frame [m].
     """
-    images = np.stack([network_image(view.image, config) for view in views])
-    rays = [
-        feature_rays(view.camera, config.feature_rows, config.feature_columns) @ view.terrain_from_camera[:3, :3].T
-        for view in views
-    ]
-    origins = np.stack([view.terrain_from_camera[:3, 3] for view in views])
-    return assemble(images, np.stack(rays), origins, support, config)
-
-
-def sweep_input(points: np.ndarray, support: np.ndarray | None, config: EncoderConfig) -> EncoderInput:
-    """Input for one map from a lidar sweep ``[n, 3]`` in the terrain frame [m], without points on the robot."""
-    none = np.zeros((0, config.image_height, config.image_width, 3), np.uint8)
-    rays = np.zeros((0, config.feature_rows, config.feature_columns, 3))
-    return assemble(none, rays, np.zeros((0, 3)), support, config, points)
+    shape = (config.feature_rows, config.feature_columns)
+    images = [network_image(view.image, config) for view in views]
+    rays = [feature_rays(view.camera, *shape) @ view.terrain_from_camera[:3, :3].T for view in views]
+    origins = [view.terrain_from_camera[:3, 3] for view in views]
+    return assemble(images, rays, origins, support, config, sweep=sweep, trace=trace)
 
 
 def assemble(
-    images: np.ndarray,
-    rays: np.ndarray,
-    origins: np.ndarray,
+    images: Sequence[np.ndarray],
+    rays: Sequence[np.ndarray],
+    origins: Sequence[np.ndarray],
     support: np.ndarray | None,
     config: EncoderConfig,
+    *,
     sweep: np.ndarray | None = None,
+    trace: np.ndarray | None = None,
 ) -> EncoderInput:
-    """Input for one map from resized images ``[cameras, height, width, 3]``, their rays and origins, and a sweep."""
-    ground, plane, known = support_plane(support, config.grid)
-    hits = np.zeros((0, *plane.shape)) if sweep is None else sweep_heights(sweep, ground, config)
+    """Input for one map from images at the network's size ``[height, width, 3]``, their rays ``[rows, columns, 3]``
+    (NaN where there is no image) and origins ``[3]``; see :func:`encoder_input`."""
+    ground, plane, near = support_plane(support, config.grid)
+    nothing = np.zeros((3, *plane.shape))
+    hits = nothing if sweep is None or not config.takes_sweeps else sweep_heights(sweep, ground, config)
+    traced = nothing if trace is None or not len(trace) else sweep_heights(trace, ground, config)
+    count = len(images)
+    size = (count, config.image_height, config.image_width, 3)
+    pixels = np.stack(images) if count else np.zeros(size, np.uint8)
+    placed = np.stack(rays) if count else np.zeros((0, config.feature_rows, config.feature_columns, 3))
+    seen = np.isfinite(placed).all(axis=-1)
+    at = np.stack(origins) if count else np.zeros((0, 3))
     return EncoderInput(
-        images=torch.from_numpy(images).permute(0, 3, 1, 2).contiguous(),
-        rays=torch.as_tensor(rays, dtype=torch.float32),
-        origins=torch.as_tensor(origins - np.array([0.0, 0.0, ground]), dtype=torch.float32),
-        support=torch.as_tensor(np.stack([plane, known])[None], dtype=torch.float32),
+        images=torch.from_numpy(pixels).permute(0, 3, 1, 2).contiguous(),
+        rays=torch.as_tensor(np.where(seen[..., None], placed, 0.0), dtype=torch.float32),
+        seen=torch.from_numpy(seen),
+        origins=torch.as_tensor(at - np.array([0.0, 0.0, ground]), dtype=torch.float32),
+        map_of=torch.zeros(count, dtype=torch.int64),
+        # The mean of a cell's lowest and highest trace point is its height.
+        support=torch.as_tensor(
+            np.stack([plane * near, near, (traced[0] + traced[1]) / 2, traced[2]])[None], dtype=torch.float32
+        ),
         ground=torch.tensor([ground], dtype=torch.float32),
         sweep=torch.as_tensor(hits[None], dtype=torch.float32),
     )
@@ -135,20 +178,31 @@ def sweep_heights(points: np.ndarray, ground: float, config: EncoderConfig) -> n
 
 
 def network_image(image: np.ndarray, config: EncoderConfig) -> np.ndarray:
-    """The image resized for the network."""
+    """The image resized for the network; it keeps its aspect ratio, the rest of the view is grey."""
     size = (config.image_width, config.image_height)
-    if (image.shape[1], image.shape[0]) == size:
+    height, width = image.shape[:2]
+    if (width, height) == size:
         return np.ascontiguousarray(image)
-    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    scale = min(size[0] / width, size[1] / height)
+    resized = cv2.resize(
+        image, (max(1, round(width * scale)), max(1, round(height * scale))), interpolation=cv2.INTER_AREA
+    )
+    if resized.shape[1::-1] == size:
+        return resized
+    view = np.full((size[1], size[0], 3), _EMPTY, np.uint8)
+    top, left = (size[1] - resized.shape[0]) // 2, (size[0] - resized.shape[1]) // 2
+    view[top : top + resized.shape[0], left : left + resized.shape[1]] = resized
+    return view
 
 
 def support_plane(support: np.ndarray | None, grid: Grid) -> tuple[float, np.ndarray, np.ndarray]:
-    """Height of the ground under the robot [m], the plane under its wheels relative to it [m], and the plane's mask."""
+    """Height of the ground under the robot [m]; the plane under its wheels relative to it [m]; where it holds, 0..1."""
     shape = (grid.rows, grid.columns)
     if support is None or len(support) < 3:
         return 0.0, np.zeros(shape), np.zeros(shape)
-    near = np.hypot(grid.x[None, :], grid.y[:, None]) < _SUPPORT_REACH
+    distance = np.hypot(grid.x[None, :], grid.y[:, None])
+    near = np.clip((_SUPPORT_END - distance) / (_SUPPORT_END - _SUPPORT_REACH), 0.0, 1.0)
     middle = support.mean(axis=0)
     slope = np.linalg.lstsq(support[:, :2] - middle[:2], support[:, 2] - middle[2], rcond=None)[0]
     plane = slope[0] * (grid.x[None, :] - middle[0]) + slope[1] * (grid.y[:, None] - middle[1])
-    return float(middle[2]), np.where(near, plane, 0.0), near.astype(float)
+    return float(middle[2]), plane.clip(-_STEEPEST, _STEEPEST), near

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from monoforce_ros.bags import Recording
-from monoforce_ros.encoder import LidarEncoder, fused, load_encoder
+from monoforce_ros.encoder import fused, load_encoder
 from monoforce_ros.evaluation.metrics import Poses, position_errors, rotation_errors
 from monoforce_ros.evaluation.recording_evaluation import (
     CONSTANT_VELOCITY,
@@ -18,7 +18,7 @@ from monoforce_ros.evaluation.recording_evaluation import (
     RecordingEvaluation,
     evaluate_recording,
 )
-from monoforce_ros.perception import CameraTerrain, LidarNetworkTerrain, TerrainSource, choose_terrain_source
+from monoforce_ros.perception import EncoderTerrain, TerrainSource, choose_terrain_source
 from monoforce_ros.prediction import Predictor
 from monoforce_ros.robots import RobotModel
 
@@ -116,9 +116,7 @@ def terrain_source(system: System, robot: RobotModel) -> TerrainSource:
     if system.with_lidar:
         return choose_terrain_source("lidar_camera", robot, checkpoint=system.checkpoint)
     encoder = fused(load_encoder(system.checkpoint))
-    if isinstance(encoder, LidarEncoder):
-        return LidarNetworkTerrain(encoder, robot)
-    return CameraTerrain(encoder, robot)
+    return EncoderTerrain(encoder, robot, ("lidar",) if system.input == "lidar" else ("camera",))
 
 
 def _sequence(name: str, evaluation: RecordingEvaluation, method: str, chosen: np.ndarray) -> SequenceErrors:

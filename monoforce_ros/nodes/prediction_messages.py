@@ -18,7 +18,10 @@ def height_map(prediction: Prediction, frame_id: str) -> bytes:
 
 
 def terrain_cloud(prediction: Prediction, frame_id: str) -> bytes:
-    """``sensor_msgs/PointCloud2``: every cell with all channels; heights are z coordinates in the odometry frame."""
+    """``sensor_msgs/PointCloud2``: every cell with all channels; heights are z coordinates in the odometry frame.
+
+    Maps of an encoder have two more: the expected absolute errors of ``geometric_height`` and of H_d [m].
+    """
     terrain, transform = prediction.terrain, prediction.motion.odometry_from_terrain
     points = cell_points(terrain, transform)
     return encoding.point_cloud(
@@ -33,6 +36,7 @@ def terrain_cloud(prediction: Prediction, frame_id: str) -> bytes:
             "damping": terrain.damping.numpy(),
             "friction": terrain.friction.numpy(),
             "observed": terrain.observed.numpy().astype(np.float32),
+            **{name: getattr(terrain, name).numpy() for name in terrain.spreads},
         },
     )
 

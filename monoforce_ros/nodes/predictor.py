@@ -40,7 +40,7 @@ from monoforce_ros.nodes.rate_limiter import RateLimiter
 from monoforce_ros.nodes.schema import read_schema, schema_path
 from monoforce_ros.nodes.sensor_decoder import LIDAR, SensorDecoder
 from monoforce_ros.nodes.subscriptions import AdaptiveSubscription
-from monoforce_ros.perception import TerrainSource, choose_terrain_source
+from monoforce_ros.perception import TerrainSource, TrustReport, choose_terrain_source
 from monoforce_ros.physics import PhysicsOptions
 from monoforce_ros.prediction import FORCE_INTERVAL, Prediction, Predictor
 from monoforce_ros.robots import load_robot
@@ -189,6 +189,7 @@ class PredictorNode(ManagedNode):
             precision=settings.encoder_precision,
             threads=min(settings.encoder_threads, os.cpu_count() or 1),
             retention_time=settings.camera_retention_time,
+            fallback=settings.camera_fallback,
         )
 
     def _sensor_topics(self) -> dict[str, str]:
@@ -400,6 +401,7 @@ class PredictorNode(ManagedNode):
             text = _explained(error)
             self.health.report("prediction", ERROR, f"nothing published: {text}", reason=type(error).__name__)
             return
+        self._report_trust()
         self._predictions += 1
         if self._predictions == 1:
             topic = self.resolve_topic_name("predicted/path")
@@ -410,6 +412,22 @@ class PredictorNode(ManagedNode):
         self._last_prediction = time.monotonic()
         self._durations = [*self._durations[-199:], time.monotonic() - started]
         self.health.report("prediction", OK, "predicting", latency_ms=f"{1e3 * self._durations[-1]:.0f}")
+
+    def _report_trust(self) -> None:
+        """Report how the encoder's earlier predictions agreed with the ground found there."""
+        report = getattr(self.predictor.source, "report", None)
+        if not isinstance(report, TrustReport):
+            return
+        values = {
+            f"error, {distance} [cm] (level ground)": f"{100 * own:.1f} ({100 * level:.1f})"
+            for distance, (own, level) in report.by_distance.items()
+        }
+        if report.trusted:
+            self.health.report("terrain", OK, report.explanation, reason="trusted")
+        else:
+            text = f"falling back, the encoder is not used: {report.explanation}"
+            self.health.report("terrain", WARN, text, reason="not trusted")
+        self.health.report_values("terrain", values)
 
     def _compare(self, job: ComparisonJob) -> None:
         """Publish candidates, ensemble and costmap of a prediction while the next one is made."""

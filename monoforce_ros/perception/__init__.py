@@ -1,22 +1,28 @@
 """Perception: terrain maps from the robot's sensors (lidar, cameras, both, or none), each behind one interface."""
 
-from monoforce_ros.perception.camera import CameraTerrain
+from monoforce_ros.perception.encoder_terrain import EncoderTerrain
 from monoforce_ros.perception.flat import FlatTerrain
 from monoforce_ros.perception.fusion import LidarCameraTerrain
 from monoforce_ros.perception.ground_alignment import support_points
-from monoforce_ros.perception.lidar import LidarNetworkTerrain, LidarTerrain
+from monoforce_ros.perception.lidar import LidarTerrain
 from monoforce_ros.perception.observation import Observation, TerrainSource
 from monoforce_ros.perception.sources import SOURCES, choose_terrain_source
+from monoforce_ros.perception.trace import DrivenGround, traced_ground
+from monoforce_ros.perception.trust import TerrainTrust, TrustedTerrain, TrustReport
 
 __all__ = [
     "SOURCES",
-    "CameraTerrain",
+    "DrivenGround",
+    "EncoderTerrain",
     "FlatTerrain",
     "LidarCameraTerrain",
-    "LidarNetworkTerrain",
     "LidarTerrain",
     "Observation",
     "TerrainSource",
+    "TerrainTrust",
+    "TrustReport",
+    "TrustedTerrain",
     "choose_terrain_source",
     "support_points",
+    "traced_ground",
 ]

@@ -1,4 +1,4 @@
-"""Terrain from a lidar: heights interpolated between the returns, or completed by a network."""
+"""Terrain from a lidar: heights interpolated between the returns."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from monoforce_ros.core import MotionState, transform_points
-from monoforce_ros.encoder import LidarEncoder
-from monoforce_ros.perception.ground_alignment import align_to_ground, support_points
+from monoforce_ros.perception.ground_alignment import support_points
 from monoforce_ros.perception.observation import Observation
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import Grid, LidarSettings, TerrainDefaults, TerrainMap, terrain_from_cloud
@@ -37,27 +36,3 @@ class LidarTerrain:
             material=self.material,
             support=support_points(self.robot, motion, self.material.stiffness),
         )
-
-
-@dataclass(frozen=True)
-class LidarNetworkTerrain:
-    """Heights that a trained network completes from one sweep (the paper's baseline [22])."""
-
-    encoder: LidarEncoder
-    robot: RobotModel
-    sensors: ClassVar[tuple[str, ...]] = ("lidar",)
-
-    @property
-    def grid(self) -> Grid:
-        """The encoder's grid."""
-        return self.encoder.config.grid
-
-    def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
-        """Completed map; see :class:`TerrainSource`."""
-        if observation.cloud is None:
-            raise ValueError("the lidar network needs a point cloud, and the observation has none")
-        cloud = observation.cloud[~self.robot.covers(observation.cloud)].astype(np.float64)
-        cloud = cloud[np.isfinite(cloud).all(axis=1)]
-        support = support_points(self.robot, motion, self.encoder.config.stiffness)
-        found = self.encoder.terrain(transform_points(motion.terrain_from_base, cloud), support)
-        return align_to_ground(found, support)

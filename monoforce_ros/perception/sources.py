@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from monoforce_ros.encoder import TerrainEncoder, fused, load_encoder, packed
-from monoforce_ros.perception.camera import CameraTerrain
+from monoforce_ros.encoder import fused, load_encoder, packed
+from monoforce_ros.perception.encoder_terrain import EncoderTerrain
 from monoforce_ros.perception.flat import FlatTerrain
 from monoforce_ros.perception.fusion import LidarCameraTerrain
 from monoforce_ros.perception.lidar import LidarTerrain
 from monoforce_ros.perception.observation import TerrainSource
 from monoforce_ros.perception.temporal_memory import TemporalMemory
+from monoforce_ros.perception.trust import TrustedTerrain
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import Grid, TerrainDefaults
 
@@ -29,6 +30,7 @@ def choose_terrain_source(
     precision: str = "float32",
     threads: int | None = None,
     retention_time: float = 0.0,
+    fallback: bool = False,
 ) -> TerrainSource:
     """A terrain source by its name, one of :data:`SOURCES`.
 
@@ -41,6 +43,8 @@ def choose_terrain_source(
         device: device of the encoder.
         precision: precision of the encoder, see :func:`monoforce_ros.encoder.fused`.
         threads: CPU threads of the encoder; by default PyTorch's current number.
+        fallback: whether sources with an encoder fall back (to level ground, or to the lidar alone) while the encoder
+            is worse than level ground; see :class:`monoforce_ros.perception.TrustedTerrain`.
         retention_time: how long terrain seen by cameras is kept after it leaves the images [s]; 0 disables it.
 
     Raises:
@@ -55,14 +59,20 @@ def choose_terrain_source(
     if kind == "lidar":
         return LidarTerrain(robot, grid, material)
     encoder = load_encoder(checkpoint, "camera")
+    sensors = ("lidar", "camera") if kind == "lidar_camera" and encoder.config.takes_sweeps else ("camera",)
     # Packed weights and half precision save time on the CPU only.
     encoder = packed(fused(encoder, precision)) if device == "cpu" else fused(encoder).to(device)
-    assert isinstance(encoder, TerrainEncoder), "checked by load_encoder"
-    camera: TerrainSource = CameraTerrain(encoder, robot, threads)
+    own = EncoderTerrain(encoder, robot, sensors, threads=threads)
+    learned: TerrainSource = own
     if retention_time:
-        camera = TemporalMemory(camera, robot, stiffness=encoder.config.stiffness, retention_time=retention_time)
-    if kind == "camera":
-        return camera
+        learned = TemporalMemory(learned, robot, stiffness=encoder.config.stiffness, retention_time=retention_time)
+    if fallback:
+        other: TerrainSource = FlatTerrain(robot, learned.grid, material)
+        if "lidar" in sensors:
+            other = LidarTerrain(robot, learned.grid, material)
+        learned = TrustedTerrain(learned, own, other)
+    if kind == "camera" or "lidar" in sensors:
+        return learned
     if kind == "lidar_camera":
-        return LidarCameraTerrain(LidarTerrain(robot, camera.grid, material), camera)
+        return LidarCameraTerrain(LidarTerrain(robot, learned.grid, material), learned)
     raise ValueError(f"terrain source {kind!r} is listed in SOURCES, and choose_terrain_source has no branch for it")

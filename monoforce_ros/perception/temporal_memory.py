@@ -11,15 +11,13 @@ import torch
 from monoforce_ros.core import NANOSECOND, CameraModel, MotionState
 from monoforce_ros.perception.ground_alignment import align_to_ground, clear_footprint, support_points
 from monoforce_ros.perception.observation import Observation, TerrainSource
+from monoforce_ros.perception.trace import continues
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import CHANNELS, Grid, TerrainMap
 
 _KEPT_WITHIN, _OBSTACLE_HEIGHT = 2.0, 0.25
 """An obstacle at least this high [m] that disappears within this distance of the robot [m] is kept: an encoder that
 sees only a part of a wall does not recognise it."""
-_JUMP = 1.0
-"""Largest distance between the measured position and the one extrapolated from the last velocity [m]; beyond it, the
-robot was moved or its odometry jumped."""
 
 
 class TemporalMemory:
@@ -76,7 +74,7 @@ class TemporalMemory:
         )
         self._cameras |= observation.cameras
         # A wrong calibration put earlier observations in the wrong place.
-        if self._previous is None or recalibrated or not _continues(motion, self._previous):
+        if self._previous is None or recalibrated or not continues(motion, self._previous):
             self._memory = _Memory(now.grid)
         else:
             self._memory.travelled += float(np.linalg.norm(motion.position - self._previous.position))
@@ -103,13 +101,6 @@ def _equal(camera: CameraModel, other: CameraModel) -> bool:
         and np.array_equal(camera.matrix, other.matrix)
         and np.array_equal(camera.distortion, other.distortion)
     )
-
-
-def _continues(motion: MotionState, previous: MotionState) -> bool:
-    """Whether the robot can have moved from the previous pose to this one in the time between."""
-    elapsed = (motion.stamp - previous.stamp) * NANOSECOND
-    expected = previous.position + previous.rotation @ previous.linear_velocity * elapsed
-    return elapsed >= 0.0 and float(np.linalg.norm(motion.position - expected)) < _JUMP * max(1.0, elapsed)
 
 
 class _Memory:

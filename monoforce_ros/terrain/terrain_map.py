@@ -13,6 +13,8 @@ from torch import Tensor
 from monoforce_ros.terrain.grid import Grid
 
 CHANNELS = ("height", "geometric_height", "stiffness", "damping", "friction")
+SPREADS = ("geometric_spread", "decrease_spread")
+"""Optional channels: how uncertain the heights are."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,10 @@ class TerrainMap:
     observed: Tensor
     """Whether a cell was measured (bool)."""
     grid: Grid
+    geometric_spread: Tensor | None = None
+    """Expected absolute error of ``geometric_height`` [m], where the source knows it."""
+    decrease_spread: Tensor | None = None
+    """Expected absolute error of H_d, the difference of the two heights [m]."""
 
     def __post_init__(self):
         shape = self.height.shape
@@ -56,7 +62,7 @@ class TerrainMap:
                 f"terrain height: got shape {tuple(shape)}, expected [B,] {self.grid.rows} rows, "
                 f"{self.grid.columns} columns"
             )
-        for name in (*CHANNELS, "observed"):
+        for name in (*CHANNELS, *self.spreads, "observed"):
             channel = getattr(self, name)
             if channel.shape != shape:
                 raise ValueError(f"terrain {name}: got shape {tuple(channel.shape)}, expected {tuple(shape)}")
@@ -67,7 +73,7 @@ class TerrainMap:
                     f"terrain {name}: {bad} of {channel.numel()} cells are not finite; fill holes by interpolation and "
                     "mark them in `observed`"
                 )
-        for name in ("stiffness", "damping", "friction"):
+        for name in ("stiffness", "damping", "friction", *self.spreads):
             smallest = float(getattr(self, name).detach().amin())
             if smallest < 0:
                 raise ValueError(f"terrain {name}: got a smallest value of {smallest:g}, expected ≥ 0")
@@ -115,7 +121,8 @@ class TerrainMap:
         """A batch ``[B, rows, columns]`` of maps on the same grid."""
         if any(entry.grid != maps[0].grid for entry in maps):
             raise ValueError("terrain maps: got different grids, expected one grid for a batch")
-        channels = {name: torch.stack([getattr(m, name) for m in maps]) for name in (*CHANNELS, "observed")}
+        spreads = [name for name in SPREADS if all(getattr(m, name) is not None for m in maps)]
+        channels = {name: torch.stack([getattr(m, name) for m in maps]) for name in (*CHANNELS, *spreads, "observed")}
         return cls(**channels, grid=maps[0].grid)
 
     def measured_nearby(self, reach: float = 0.3) -> np.ndarray:
@@ -130,12 +137,20 @@ class TerrainMap:
         return distance * self.grid.resolution <= reach + 1e-6
 
     @property
+    def spreads(self) -> tuple[str, ...]:
+        """Those of :data:`SPREADS` that this map has."""
+        return tuple(name for name in SPREADS if getattr(self, name) is not None)
+
+    @property
     def batch_size(self) -> int | None:
         """Number of maps in the batch; None for a single map."""
         return self.height.shape[0] if self.height.ndim == 3 else None
 
     def with_cells(self, cells: Tensor, values: Mapping[str, Tensor]) -> TerrainMap:
-        """A map that takes the ``values`` of each channel in ``cells`` ``[rows, columns]`` bool, which are observed."""
+        """A map that takes the ``values`` of each channel in ``cells`` ``[rows, columns]`` bool, which are observed.
+
+        Spreads stay: those of cells that are not observed now are the larger ones.
+        """
 
         def merged(name: str, channel: Tensor) -> Tensor:
             return torch.where(cells, values[name].to(channel), channel)
@@ -152,12 +167,13 @@ class TerrainMap:
 
     def repeated(self, count: int) -> TerrainMap:
         """This map ``count`` times as a batch, without a copy."""
-        channels = {name: getattr(self, name).expand(count, -1, -1) for name in (*CHANNELS, "observed")}
+        names = (*CHANNELS, *self.spreads, "observed")
+        channels = {name: getattr(self, name).expand(count, -1, -1) for name in names}
         return replace(self, **channels)
 
     def to(self, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> TerrainMap:
         """The same map in another precision or on another device."""
-        channels = {name: getattr(self, name).to(device=device, dtype=dtype) for name in CHANNELS}
+        channels = {name: getattr(self, name).to(device=device, dtype=dtype) for name in (*CHANNELS, *self.spreads)}
         observed = self.observed.to(device=device)
         if observed is self.observed and all(channel is getattr(self, name) for name, channel in channels.items()):
             return self

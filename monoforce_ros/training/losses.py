@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -26,6 +26,8 @@ _PROMINENT_HEIGHT, _NEIGHBOURHOOD = 0.3, 12
 """Height over the neighbourhood's mean of a fully prominent cell [m]; half-width of the neighbourhood [cells]."""
 _OUT_OF_VIEW = 0.1
 """Weight of measured cells out of every camera's view, which can only be inferred from their surroundings."""
+_MEAN_FRICTION = -0.41
+"""Mean of the logarithm of the friction of randomised worlds, seeds 420000 to 420119."""
 _SLOPE_BASELINE = 0.6
 """Distance over which slopes are compared [m]: about the wheelbase and track width of a robot."""
 _HORIZONTAL_SCALE, _VERTICAL_SCALE, _TILT_SCALE, _HEADING_SCALE = 0.15, 0.03, np.radians(2.0), np.radians(4.0)
@@ -50,11 +52,15 @@ class LossWeights:
     prominence: float = 3.0
     """Additional relative weight of prominent cells in the geometric loss."""
 
+    spread: float = 0.05
+    """Of the likelihood of the heights' errors, which trains their spreads only."""
+    depth: float = 0.05
+    """Of the depth along each pixel's ray that the lidar measured."""
+    friction: float = 0.1
+    """Of the logarithm of the friction, where it is known."""
+
     def __post_init__(self):
-        for name in (
-            "geometric", "terrain", "slope", "trajectory", "decrease", "measured_decrease", "prominent_decrease",
-            "prominence",
-        ):  # fmt: skip
+        for name in (entry.name for entry in fields(self)):
             if not 0.0 <= getattr(self, name) <= 1e6:
                 raise ValueError(f"loss weight {name}: got {getattr(self, name)}, expected 0 or more")
         if self.geometric == self.terrain == self.trajectory == 0.0:
@@ -123,6 +129,52 @@ def measured_decrease_loss(maps: EncodedMaps, targets: Targets) -> Tensor:
     return _huber(maps.decrease, torch.where(known, measured, 0.0), known * _view_weight(maps))
 
 
+def spread_loss(maps: EncodedMaps, targets: Targets, ground: Tensor) -> Tensor:
+    """Negative log-likelihood of the errors of H_g and H_d under Laplace distributions, as a function of their scales.
+
+    The errors have no gradient: uncertain places would otherwise count less in the heights' own losses, walls above
+    all, and the network would never learn them.
+    """
+    measured = _clamped(targets.geometric, ground)
+    error = (_clamped(maps.geometric_height, ground) - measured).detach().abs()
+    loss = _mean_over_maps(
+        error / maps.geometric_spread + maps.geometric_spread.log(), targets.observed * _view_weight(maps)
+    )
+    known = targets.contact_mask & targets.observed
+    depth = torch.where(known, (targets.geometric - targets.supporting).clamp(0.0, HIGHEST), 0.0)
+    error = (maps.decrease - depth).detach().abs()
+    return loss + _mean_over_maps(error / maps.decrease_spread + maps.decrease_spread.log(), known * _view_weight(maps))
+
+
+def depth_loss(maps: EncodedMaps, targets: Targets, depths: Tensor) -> Tensor:
+    """Cross-entropy of the depth bins along the rays of features that the lidar measured.
+
+    Args:
+        maps: predictions with depth probabilities.
+        targets: measured depths.
+        depths: depth of each bin ``[bins]`` [m].
+    """
+    if maps.depth is None or not len(targets.depth):
+        return maps.geometric_height.sum() * 0.0
+    known = (targets.depth >= depths[0]) & (targets.depth <= depths[-1])
+    # Bins are evenly spaced in the logarithm.
+    step = (depths[-1] / depths[0]).log() / (len(depths) - 1)
+    place = (targets.depth.clamp_min(float(depths[0])) / depths[0]).log() / step
+    bins = place.round().long().clamp(0, len(depths) - 1)
+    loss = -maps.depth.gather(1, bins[:, None])[:, 0]
+    return (loss * known).sum() / known.sum().clamp_min(1)
+
+
+def friction_loss(maps: EncodedMaps, targets: Targets, config: EncoderConfig) -> Tensor:
+    """Huber loss of the logarithm of friction relative to average ground, where it is known and in view.
+
+    Ground of which nothing tells has the configuration's friction.
+    """
+    known = torch.isfinite(targets.friction) & maps.covered
+    error = (maps.friction / config.friction).log() - torch.where(known, targets.friction - _MEAN_FRICTION, 0.0)
+    return _mean_over_maps(functional.smooth_l1_loss(error, torch.zeros_like(error), reduction="none", beta=0.2), known)
+
+
 def trajectory_loss(
     maps: EncodedMaps, targets: Targets, robot: RobotModel, config: EncoderConfig, options: PhysicsOptions
 ) -> Tensor:
@@ -184,11 +236,15 @@ def _prominence(targets: Targets, ground: Tensor) -> Tensor:
     """Height of measured cells over the mean of their measured neighbours, scaled to 0..1 ``[B, rows, columns]``."""
     heights = _clamped(targets.geometric, ground)
     mask = targets.observed.to(heights.dtype)
-    window = 2 * _NEIGHBOURHOOD + 1
-    summed, count = (
-        functional.avg_pool2d(values[:, None], window, 1, _NEIGHBOURHOOD)[:, 0] for values in (heights * mask, mask)
-    )
+    summed, count = (_box_mean(values, _NEIGHBOURHOOD) for values in (heights * mask, mask))
     return ((heights - summed / count.clamp_min(1e-6)) / _PROMINENT_HEIGHT).clamp(0.0, 1.0)
+
+
+def _box_mean(values: Tensor, reach: int) -> Tensor:
+    """Mean over squares of ``2 · reach + 1`` cells ``[B, rows, columns]``, zeros outside: along rows, then columns."""
+    window = 2 * reach + 1
+    along = functional.avg_pool2d(values[:, None], (window, 1), 1, (reach, 0))
+    return functional.avg_pool2d(along, (1, window), 1, (0, reach))[:, 0]
 
 
 def _shifted(values: Tensor, rows: int, columns: int) -> Tensor:
@@ -208,6 +264,7 @@ def _huber(predicted: Tensor, measured: Tensor, weight: Tensor) -> Tensor:
 
 def _mean_over_maps(error: Tensor, weight: Tensor) -> Tensor:
     """Weighted mean over the cells of each map, then the mean over maps with any weight."""
+    weight = weight.to(error.dtype)
     total = weight.sum(dim=(1, 2))
     mean = (error * weight).sum(dim=(1, 2)) / total.clamp_min(1e-6)
     weighted = total > 0

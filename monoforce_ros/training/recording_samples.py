@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import warnings
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +18,12 @@ from monoforce_ros.terrain import Grid
 
 CHUNK = 1.0
 """Length of the chunks of motion in the trajectory loss [s]."""
-SAMPLES_VERSION = 1
+SAMPLES_VERSION = 2
 MAXIMUM_BYTES = 20_000_000_000
-_SEGMENT_ARRAYS = ("odometry_from_map", "geometric", "observed", "supporting", "contact_mask")
+_SEGMENT_ARRAYS = ("odometry_from_map", "geometric", "observed", "supporting", "contact_mask", "friction")
 _SAMPLE_ARRAYS = (
-    "stamps", "odometry_from_base", "odometry_from_cameras", "support", "sweeps", "sweep_ends", "segment_of",
+    "stamps", "odometry_from_base", "odometry_from_cameras", "support", "sweeps", "sweep_ends", "traces", "trace_ends",
+    "segment_of",
 )  # fmt: skip
 _OLD_NAMES = {"felt": "contact_mask"}
 """Names of arrays in files of earlier releases, which can still be read."""
@@ -46,6 +48,8 @@ class Segment:
     """H_t* [m]."""
     contact_mask: np.ndarray
     """Cells that wheels or tracks touched (bool), where H_t* is known."""
+    friction: np.ndarray
+    """Friction relative to ordinary ground [-], where it is known; NaN elsewhere."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +94,11 @@ class RecordingSamples:
     """Concatenated points of the lidar sweep nearest to each image, in the odometry frame ``[p, 3]`` [m]."""
     sweep_ends: np.ndarray
     """End of each sample's points in ``sweeps`` ``[N]``."""
+    traces: np.ndarray
+    """Concatenated points of the ground that the robot drove over before each image, in the odometry frame ``[q, 3]``
+    [m]."""
+    trace_ends: np.ndarray
+    """End of each sample's points in ``traces`` ``[N]``."""
     segment_of: np.ndarray
     """Index of each sample's segment ``[N]``."""
     segments: tuple[Segment, ...]
@@ -100,8 +109,32 @@ class RecordingSamples:
 
     def sweep(self, index: int) -> np.ndarray:
         """Points ``[n, 3]`` of a sample's sweep in the odometry frame [m]; empty without a lidar."""
-        start = self.sweep_ends[index - 1] if index else 0
-        return self.sweeps[start : self.sweep_ends[index]]
+        return _part(self.sweeps, self.sweep_ends, index)
+
+    def trace(self, index: int) -> np.ndarray:
+        """Ground that the robot drove over before a sample ``[n, 3]``, in the odometry frame [m]."""
+        return _part(self.traces, self.trace_ends, index)
+
+    def subset(self, indices: Sequence[int]) -> RecordingSamples:
+        """Some of the samples; segments and motion stay."""
+        chosen = np.asarray(indices, np.int64)
+        sweeps, traces = ([own(int(i)) for i in chosen] for own in (self.sweep, self.trace))
+        return replace(
+            self,
+            images=self.images[chosen],
+            **{name: getattr(self, name)[chosen] for name in _OF_EACH},
+            sweeps=np.concatenate(sweeps) if sweeps else self.sweeps[:0],
+            sweep_ends=np.cumsum([len(points) for points in sweeps], dtype=np.int64),
+            traces=np.concatenate(traces) if traces else self.traces[:0],
+            trace_ends=np.cumsum([len(points) for points in traces], dtype=np.int64),
+        )
+
+
+_OF_EACH = ("stamps", "odometry_from_base", "odometry_from_cameras", "support", "segment_of")
+
+
+def _part(points: np.ndarray, ends: np.ndarray, index: int) -> np.ndarray:
+    return points[ends[index - 1] if index else 0 : ends[index]]
 
 
 def save_samples(samples: RecordingSamples, file: Path) -> None:

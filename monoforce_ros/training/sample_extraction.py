@@ -10,12 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import DETECTED, BagError, ReadOptions, Recording, cut_windows, nearest_frame, smooth
 from monoforce_ros.core import CommandTrack, MotionTrack, StaleDataError, nearest_stamp, transform_points
 from monoforce_ros.effects import corrected_commands, corrected_motion
 from monoforce_ros.encoder import EncoderConfig, network_image
-from monoforce_ros.perception import support_points
+from monoforce_ros.perception import support_points, traced_ground
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import TerrainError
 from monoforce_ros.training.recording_samples import (
@@ -36,6 +37,8 @@ _SWEEPS_BEFORE, _SWEEPS_AFTER = 2.0, 2.0
 """Sweeps this long before and after a trajectory belong to its map too [s]."""
 _MATCH = 0.1
 """Largest difference between stamps of images that belong to one sample [s]."""
+_TRACE_STEP, _TRACE_POSES = 0.1, 3000
+"""Distance between poses of the path driven before a sample [m], and the largest number of poses looked at."""
 _SWEEP_MATCH = 0.15
 """Largest difference between the stamps of a sample and its lidar sweep [s]."""
 
@@ -159,6 +162,7 @@ def _segments(
                 Segment(
                     grid, pose, terrain.geometric_height.numpy().astype(np.float32), observed,
                     terrain.height.numpy().astype(np.float32), fit.contact_mask,
+                    np.full(fit.contact_mask.shape, np.nan, np.float32),
                 ),
             )
         )  # fmt: skip
@@ -222,11 +226,25 @@ def _read_images(
     arrays = {name: np.array(values) for name, values in rows.items()}
     sweeps = _sweeps_near(recording, motion, robot, arrays["stamps"])
     joined = np.concatenate(sweeps) if sweeps else np.zeros((0, 3))
+    traces = [_trace(motion, robot, int(stamp)) for stamp in arrays["stamps"]]
     return {
         **arrays,
+        "traces": np.concatenate(traces).astype(np.float32),
+        "trace_ends": np.cumsum([len(points) for points in traces], dtype=np.int64),
         "sweeps": joined.astype(np.float32),
         "sweep_ends": np.cumsum([len(points) for points in sweeps], dtype=np.int64),
     }
+
+
+def _trace(motion: MotionTrack, robot: RobotModel, stamp: int) -> np.ndarray:
+    """Ground that the robot drove over before a time ``[k, 3]``, in the odometry frame [m]."""
+    before = motion.stamps <= stamp
+    # One pose in ten centimetres is needed, and odometry may be far denser.
+    recent = np.flatnonzero(before)[-_TRACE_POSES:]
+    poses = np.tile(np.eye(4), (len(recent), 1, 1))
+    poses[:, :3, :3] = Rotation.from_quat(motion.quaternions[recent]).as_matrix()
+    poses[:, :3, 3] = motion.positions[recent]
+    return traced_ground(robot, poses, _TRACE_STEP)
 
 
 def _sweeps_near(recording: Recording, motion: MotionTrack, robot: RobotModel, stamps: np.ndarray) -> list[np.ndarray]:

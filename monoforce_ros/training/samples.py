@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
-from monoforce_ros.core import homogeneous, transform_points
-from monoforce_ros.encoder import EncoderConfig, EncoderInput, assemble, feature_rays
+from monoforce_ros.core import CameraModel, homogeneous, transform_points
+from monoforce_ros.encoder import EncoderConfig, EncoderInput, assemble, feature_rays, letterbox
 from monoforce_ros.training.recording_samples import RecordingSamples, Segment
 
 MIRROR = np.diag([1.0, -1.0, 1.0])
@@ -39,10 +40,27 @@ class Augmentation:
     contrast: float = 1.0
     blur: float = 0.0
     """Standard deviation of the Gaussian blur [px]."""
+    cameras: tuple[float, ...] = ()
+    """Random numbers 0..1, one for each camera; see :attr:`camera_share`."""
+    camera_share: float = 1.0
+    """Cameras whose number exceeds this are left out."""
+    blank: bool = False
+    """Whether the images show nothing: their pixels are replaced by one colour or by noise."""
+    sweep_share: float = 1.0
+    """Share of the sweep's points that is kept; 0 for no sweep."""
+    sweep_seed: int = 0
+    traced: bool = True
+    """Whether the ground that the robot drove over is known."""
 
     @classmethod
-    def draw(cls, random: np.random.Generator) -> Augmentation:
-        """A random augmentation."""
+    def draw(cls, random: np.random.Generator, *, drop_sensors: bool = False) -> Augmentation:
+        """A random augmentation.
+
+        Args:
+            random: source of random numbers.
+            drop_sensors: whether to leave out cameras, sweeps, or parts of them, for encoders of both.
+        """
+        sensors = _drawn_sensors(random) if drop_sensors else {}
         brightness = random.uniform(0.7, 1.35)
         return cls(
             mirrored=bool(random.integers(2)),
@@ -53,6 +71,7 @@ class Augmentation:
             gain=tuple(brightness * random.uniform(0.9, 1.1, 3)),
             contrast=random.uniform(0.75, 1.3),
             blur=max(0.0, random.uniform(-1.0, 0.9)),
+            **sensors,
         )
 
     def image_from_view(self) -> np.ndarray:
@@ -70,6 +89,8 @@ class Augmentation:
         """The augmented image."""
         if self.is_none:
             return image
+        if self.blank:
+            return self._blank_image(image)
         height, width = image.shape[:2]
         # Pixel p lies at (p + 1/2) / size.
         scale, half = np.array([width, height], float), 0.5
@@ -84,10 +105,49 @@ class Augmentation:
         colours = (image.astype(np.float32) - 127.5) * self.contrast + 127.5
         return np.clip(colours * np.array(self.gain, np.float32), 0.0, 255.0).astype(np.uint8)
 
+    def _blank_image(self, image: np.ndarray) -> np.ndarray:
+        """An image of a covered, blinded or broken camera: one colour with noise."""
+        random = np.random.default_rng(self.sweep_seed)
+        noise = random.normal(0.0, random.choice([0.0, 4.0, 40.0]), image.shape)
+        return np.clip(random.uniform(0.0, 255.0) * np.array(self.gain) + noise, 0.0, 255.0).astype(np.uint8)
+
+    def shows(self, camera: int) -> bool:
+        """Whether a camera, by its index, is kept."""
+        return camera >= len(self.cameras) or self.cameras[camera] <= self.camera_share
+
+    def thinned(self, points: np.ndarray, sensor: np.ndarray) -> np.ndarray:
+        """The kept points ``[n, 3]`` of a sweep that was measured from ``sensor`` ``[3]``: some rings, and some points
+        of each."""
+        if self.sweep_share >= 1.0 or not len(points):
+            return points
+        random = np.random.default_rng(self.sweep_seed)
+        offset = points - sensor
+        elevation = np.degrees(np.arctan2(offset[:, 2], np.hypot(offset[:, 0], offset[:, 1])))
+        # Lidars have rings 1 to 8 degrees apart, or points without such an order.
+        spacing, phase = random.uniform(1.0, 8.0), random.uniform(0.0, 1.0)
+        ring = np.abs((elevation / spacing + phase) % 1.0 - 0.5) < 0.5 * min(1.0, 1.2 / spacing)
+        if random.uniform() < 0.3:
+            ring = np.ones(len(points), bool)
+        return points[ring & (random.uniform(size=len(points)) < self.sweep_share)]
+
     @property
     def is_none(self) -> bool:
         """Whether the augmentation is the identity."""
         return self == Augmentation()
+
+
+def _drawn_sensors(random: np.random.Generator) -> dict[str, Any]:
+    """Sensors of one sample: images in four of five, sweeps in three of five, never neither."""
+    kind = random.choice(["images", "both", "sweep"], p=[0.45, 0.35, 0.2])
+    share = {"images": 1.0, "both": 1.0, "sweep": -1.0}[str(kind)]
+    return {
+        "cameras": tuple(random.uniform(size=6)),
+        "camera_share": share if random.uniform() < 0.7 else min(share, random.uniform(0.2, 1.0)),
+        "blank": bool(random.uniform() < 0.06),
+        "sweep_share": 0.0 if kind == "images" else random.uniform(0.2, 1.0),
+        "sweep_seed": int(random.integers(2**31)),
+        "traced": bool(random.uniform() < 0.5),
+    }
 
 
 @dataclass(frozen=True)
@@ -102,6 +162,11 @@ class Targets:
     """H_t* [m]."""
     contact_mask: Tensor
     """Cells that wheels or tracks touched (bool), where H_t* is known."""
+    friction: Tensor
+    """Logarithm of the friction relative to ordinary ground [-], NaN where it is unknown."""
+    depth: Tensor
+    """Depth that the lidar measured along the ray of each feature of the images ``[N, feature rows, feature columns]``
+    [m]; 0 where it measured none."""
     map_of: Tensor
     """Index of the map of each of the ``W`` chunks of motion."""
     positions: Tensor
@@ -122,10 +187,18 @@ class Targets:
     @classmethod
     def stack(cls, targets: Sequence[Targets]) -> Targets:
         """Concatenate several batches."""
-        joined = {f.name: torch.cat([getattr(t, f.name) for t in targets]) for f in fields(cls) if f.name != "map_of"}
+        moving = [t for t in targets if len(t.map_of)] or targets[:1]
+        joined = {
+            f.name: torch.cat([getattr(t, f.name) for t in (moving if f.name in _MOTION else targets)])
+            for f in fields(cls)
+            if f.name != "map_of"
+        }
         starts = np.cumsum([0, *(len(t.geometric) for t in targets[:-1])])
         map_of = torch.cat([t.map_of + int(start) for t, start in zip(targets, starts, strict=True)])
         return cls(**joined, map_of=map_of)
+
+
+_MOTION = ("positions", "rotations", "velocity", "angular_velocity", "twists")
 
 
 def sample(
@@ -149,18 +222,63 @@ def sample(
     """
     terrain_from_odometry = np.linalg.inv(_odometry_from_terrain(recording, index, augmentation))
     affine = None if augmentation.is_none else augmentation.image_from_view()
-    rays, origins, images = [], [], []
-    for camera, pose, image in zip(
-        recording.cameras, recording.odometry_from_cameras[index], recording.images[index].numpy(), strict=True
-    ):
-        placed = terrain_from_odometry @ pose
-        rays.append(feature_rays(camera, config.feature_rows, config.feature_columns, affine) @ placed[:3, :3].T)
+    everything = transform_points(terrain_from_odometry, recording.sweep(index))
+    rays, origins, images, depths = [], [], [], []
+    shape = (config.feature_rows, config.feature_columns)
+    for number, camera in enumerate(recording.cameras if config.takes_images else ()):
+        if not augmentation.shows(number):
+            continue
+        placed = terrain_from_odometry @ recording.odometry_from_cameras[index, number]
+        directions = feature_rays(camera, *shape, affine) @ placed[:3, :3].T
+        rays.append(directions)
         origins.append(placed[:3, 3])
-        images.append(augmentation.image(image))
+        images.append(augmentation.image(recording.images[index, number].numpy()))
+        depths.append(measured_depth(everything, camera, placed, shape, affine))
     support = transform_points(terrain_from_odometry, recording.support[index])
-    sweep = transform_points(terrain_from_odometry, recording.sweep(index)) if config.sensor == "lidar" else None
-    batch = assemble(np.stack(images), np.stack(rays), np.stack(origins), support, config, sweep)
-    return batch, targets(recording, index, config, augmentation, chunks=chunks, horizon=horizon)
+    sweep, trace = None, None
+    if config.takes_sweeps and augmentation.sweep_share > 0.0:
+        # The height of the lidar is not recorded; half a metre above the base is near enough to tell rings apart.
+        sweep = augmentation.thinned(everything, np.array([0.0, 0.0, 0.5]))
+    if augmentation.traced:
+        trace = transform_points(terrain_from_odometry, recording.trace(index))
+    batch = assemble(images, rays, origins, support, config, sweep=sweep, trace=trace)
+    found = targets(recording, index, config, augmentation, chunks=chunks, horizon=horizon)
+    depth = np.stack(depths) if depths else np.zeros((0, *shape), np.float32)
+    return batch, replace(found, depth=torch.from_numpy(depth))
+
+
+def measured_depth(
+    points: np.ndarray,
+    camera: CameraModel,
+    terrain_from_camera: np.ndarray,
+    shape: tuple[int, int],
+    view_from_crop: np.ndarray | None = None,
+) -> np.ndarray:
+    """Smallest depth of lidar points that project into each feature of an image.
+
+    Args:
+        points: ``[n, 3]`` in the terrain frame [m].
+        camera: model of the original image.
+        terrain_from_camera: pose ``[4, 4]`` of the camera; left-handed if the scene is mirrored.
+        shape: rows and columns of the features.
+        view_from_crop: crop of the letterboxed image; see :func:`monoforce_ros.encoder.feature_rays`.
+
+    Returns:
+        ``[rows, columns]`` float32 [m] along the optical axis; 0 without a point.
+    """
+    rows, columns = shape
+    local = transform_points(np.linalg.inv(terrain_from_camera), points)
+    pixels, visible = camera.project(local)
+    depth = np.full(rows * columns, np.inf, np.float32)
+    if visible.any():
+        place = (pixels[visible] + 0.5) / [camera.width, camera.height]
+        for affine in (letterbox(camera.width, camera.height, columns / rows), view_from_crop):
+            if affine is not None:
+                place = np.linalg.solve(affine[:, :2], (place - affine[:, 2]).T).T
+        column, row = np.floor(place[:, 0] * columns).astype(int), np.floor(place[:, 1] * rows).astype(int)
+        inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+        np.minimum.at(depth, (row * columns + column)[inside], local[visible][inside, 2].astype(np.float32))
+    return np.where(np.isfinite(depth), depth, 0.0).reshape(rows, columns)
 
 
 def targets(
@@ -176,7 +294,8 @@ def targets(
     pose = _odometry_from_terrain(recording, index, augmentation)
     maps = _maps(recording.segments[recording.segment_of[index]], pose, config)
     motion = _motion(recording, index, np.linalg.inv(pose), augmentation.mirrored, chunks, horizon)
-    return Targets(**{name: torch.from_numpy(value) for name, value in (maps | motion).items()})
+    no_depth = {"depth": np.zeros((0, config.feature_rows, config.feature_columns), np.float32)}
+    return Targets(**{name: torch.from_numpy(value) for name, value in (maps | motion | no_depth).items()})
 
 
 def _odometry_from_terrain(recording: RecordingSamples, index: int, augmentation: Augmentation) -> np.ndarray:
@@ -209,11 +328,18 @@ def _maps(segment: Segment, odometry_from_terrain: np.ndarray, config: EncoderCo
         )
         return (resampled > 0)[None]
 
+    def nearest(values: np.ndarray) -> np.ndarray:
+        return cv2.remap(
+            values.astype(np.float32), columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT,
+            borderValue=float("nan"),
+        )  # fmt: skip
+
     return {
         "geometric": heights(segment.geometric),
         "observed": mask(segment.observed),
         "supporting": heights(segment.supporting),
         "contact_mask": mask(segment.contact_mask),
+        "friction": np.log(nearest(segment.friction)).astype(np.float32)[None],
     }
 
 

@@ -18,6 +18,7 @@ import torch
 from monoforce_ros.bags import BagError, add_read_options, read_options
 from monoforce_ros.core import write_text
 from monoforce_ros.encoder import (
+    SENSORS,
     CheckpointError,
     Encoder,
     EncoderConfig,
@@ -25,14 +26,20 @@ from monoforce_ros.encoder import (
     WeightsError,
     load_encoder,
     new_encoder,
+    save_encoder,
 )
 from monoforce_ros.reporting import progress, progress_bar
 from monoforce_ros.robots import RobotFileError, RobotModel, fingerprint, load_robot, shipped_robots, write_robot
+from monoforce_ros.training.adaptation import REPLAY_WORLDS, AdaptationSettings, adapt, compare, split_recording
+from monoforce_ros.training.judgement import CAMERAS, SWEEP, calibrated
 from monoforce_ros.training.losses import LossWeights
 from monoforce_ros.training.recording_samples import RecordingSamples, SamplesError, read_samples
 from monoforce_ros.training.sample_extraction import SampleSettings, extract_samples
 from monoforce_ros.training.trainer import Process, Trainer, TrainingError, TrainingSettings, describe
 from monoforce_ros.training.vegetation_fit import EFFECT, fit_vegetation
+from monoforce_ros.training.world_samples import FIRST_WORLD, world_samples
+
+_HELD_OUT_WORLDS = 430_000
 
 
 class _RenamedOption(argparse.Action):
@@ -72,16 +79,20 @@ def build_parser() -> argparse.ArgumentParser:
         description="Train the terrain encoder on recordings of images, odometry, commands and lidar sweeps. The same "
         "command resumes an interrupted training. Use torchrun to train with several processes.",
     )
-    parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 folders or ROS 1 .bag files")
+    parser.add_argument("bags", nargs="*", type=Path, metavar="BAG", help="rosbag2 folders or ROS 1 .bag files")
     parser.add_argument("--out", type=Path, help="folder for the checkpoint, logs and saved state")
     parser.add_argument("--held-out", nargs="+", type=Path, default=[], metavar="BAG", help="recordings to "
                         "validate on (default: every eighth bag)")  # fmt: skip
+    parser.add_argument("--worlds", type=int, default=0, metavar="N", help="also train on N randomised worlds, with "
+                        "the simulator's surfaces as targets (default: %(default)s)")  # fmt: skip
+    parser.add_argument("--world-seed", type=int, default=FIRST_WORLD, metavar="SEED", help="of the first world "
+                        "(default: %(default)s)")  # fmt: skip
     parser.add_argument("--robot", default="husky", help=f"robot file or one of {', '.join(shipped_robots())}")
     parser.add_argument("--samples", type=Path, metavar="DIR", help="folder for the samples extracted from the bags "
                         "(default: OUT/samples)")  # fmt: skip
     parser.add_argument("--samples-only", action="store_true", help="extract the samples and stop")
-    parser.add_argument("--sensor", choices=("camera", "lidar"), default="camera", help="input of the encoder: images, "
-                        "or a lidar sweep to densify (default: %(default)s)")  # fmt: skip
+    parser.add_argument("--sensor", choices=SENSORS, default="camera", help="input of the encoder: images; a lidar "
+                        "sweep to densify; or both, either of which may be absent (default: %(default)s)")  # fmt: skip
     parser.add_argument("--images", nargs="+", default=[], metavar="TOPIC", help="image topics (default: all with a "
                         "CameraInfo)")  # fmt: skip
     add_read_options(parser)
@@ -112,9 +123,13 @@ def build_parser() -> argparse.ArgumentParser:
                         "cell (default: %(default)s)")  # fmt: skip
     parser.add_argument("--edges", action=argparse.BooleanOptionalAction, help="restore steps that uncertainty blurs "
                         "into slopes, cameras only (default: unless the geometric loss is the only one)")  # fmt: skip
+    parser.add_argument("--adapt", action="store_true", help="adapt the shipped encoder (or --start-from) to this "
+                        "robot in minutes: the last quarter of each bag is held out to judge it")  # fmt: skip
     parser.add_argument("--start-from", type=Path, metavar="FILE.safetensors", help="checkpoint to fine-tune")
     parser.add_argument("--backbone-weights", choices=("imagenet", "random"), default="imagenet", help="initial "
                         "weights of the backbone (default: %(default)s)")  # fmt: skip
+    parser.add_argument("--train-backbone", action="store_true", help="also train the backbone, whose ImageNet weights "
+                        "are kept by default")  # fmt: skip
     parser.add_argument("--validate-every", type=int, default=TrainingSettings.validate_every, metavar="STEPS",
                         help="(default: %(default)s)")  # fmt: skip
     parser.add_argument("--save-every", type=int, default=TrainingSettings.save_every, metavar="STEPS",
@@ -140,6 +155,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
     parser = build_parser()
     options = parser.parse_args(arguments)
+    if not options.bags and not options.worlds:
+        parser.error("got no bags and no --worlds; expected one of them at least")
     if options.samples_only and options.samples is None:
         parser.error("--samples-only: expected a folder with --samples")
     if options.out is None and not options.samples_only:
@@ -163,6 +180,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _train(options: argparse.Namespace, process: Process) -> None:
+    if options.adapt:
+        _adapt(options)
+        return
     # Results of a seed depend on the number of threads.
     if options.threads:
         torch.set_num_threads(options.threads)
@@ -177,12 +197,16 @@ def _train(options: argparse.Namespace, process: Process) -> None:
     if process.first:
         training, validation = (_samples(part, robot, config, options, title) for part, title in
                                 ((bags, "training"), (held_out, "held out")))  # fmt: skip
+        training += _world_samples(range(options.world_seed, options.world_seed + options.worlds), config, options)
+        if options.worlds and not validation:
+            validation = _world_samples(range(_HELD_OUT_WORLDS, _HELD_OUT_WORLDS + 12), config, options)
     if options.samples_only:
         return
     if process.count > 1:
         torch.distributed.barrier()
         if not process.first:
             training, validation = (_samples(part, robot, config, options, "") for part in (bags, held_out))
+            training += _world_samples(range(options.world_seed, options.world_seed + options.worlds), config, options)
     robot = _with_vegetation(robot, training, config, settings, options, process)
     torch.manual_seed(settings.seed)
     encoder = _encoder(options, config)
@@ -196,8 +220,44 @@ def _train(options: argparse.Namespace, process: Process) -> None:
         )
     with _Log(options.out, settings.steps, trainer, quiet=options.quiet or not process.first) as log:
         trainer.run(log)
+    if process.first and validation:
+        best = load_encoder(options.out / "encoder.safetensors")
+        sensors = CAMERAS if config.takes_images else SWEEP
+        save_encoder(calibrated(best, validation, sensors), options.out / "encoder.safetensors")
     if process.first:
         _write_summary(options.out, trainer, describe(config, settings, training))
+
+
+def _adapt(options: argparse.Namespace) -> None:
+    """Adapt an encoder to the bags' robot, and say what that changed."""
+    torch.set_num_threads(options.threads or torch.get_num_threads())
+    encoder = load_encoder(options.start_from or "")
+    robot = load_robot(options.robot)
+    recordings = _samples(options.bags, robot, encoder.config, options, "samples")
+    parts = [split_recording(recording) for recording in recordings]
+    count = options.worlds or REPLAY_WORLDS
+    replay = _world_samples(range(options.world_seed, options.world_seed + count), encoder.config, options)
+    judging = _world_samples(range(_HELD_OUT_WORLDS, _HELD_OUT_WORLDS + 3), encoder.config, options)
+    defaults = AdaptationSettings()
+    given = options.steps != TrainingSettings.steps, options.rate != TrainingSettings.rate
+    settings = AdaptationSettings(
+        steps=options.steps if given[0] else defaults.steps, batch=options.batch,
+        rate=options.rate if given[1] else defaults.rate, seed=options.seed, precision=options.precision,
+    )  # fmt: skip
+    with progress_bar(settings.steps, label="adapting", unit="step", quiet=options.quiet) as bar:
+        adapted = adapt(
+            encoder,
+            robot,
+            [part[0] for part in parts],
+            replay,
+            options.out,
+            settings,
+            lambda step, losses: bar.update() and None,
+        )
+    result = compare(encoder, adapted, [part[1] for part in parts], judging)
+    write_text(options.out / "adaptation.json", json.dumps(asdict(result), indent=1) + "\n")
+    print(result.summary)
+    print(f"use it with checkpoint:={options.out / 'encoder.safetensors'}")
 
 
 def _with_vegetation(
@@ -234,7 +294,8 @@ def _encoder(options: argparse.Namespace, config: EncoderConfig) -> Encoder:
     if options.start_from is not None:
         encoder = load_encoder(options.start_from)
         found, expected = asdict(encoder.config), asdict(config)
-        names = [n for n in expected if n not in ("decreases", "edges") and expected[n] != found[n]]
+        free = ("decreases", "edges", "geometric_spread_factor", "decrease_spread_factor")
+        names = [n for n in expected if n not in free and expected[n] != found[n]]
         if names:
             differences = "; ".join(f"{name}: got {found[name]}, expected {expected[name]}" for name in names)
             raise CheckpointError(f"{options.start_from}: configuration differs from the options: {differences}")
@@ -269,9 +330,21 @@ def _settings(options: argparse.Namespace) -> TrainingSettings:
     return TrainingSettings(
         steps=options.steps, batch=options.batch, rate=options.rate,
         weights=LossWeights(**weights, prominence=options.prominence), seed=options.seed,
-        augment=not options.no_augmentation,
+        augment=not options.no_augmentation, freeze_backbone=not options.train_backbone,
         validate_every=options.validate_every, save_every=options.save_every, precision=options.precision,
     )  # fmt: skip
+
+
+def _world_samples(seeds: Sequence[int], config: EncoderConfig, options: argparse.Namespace) -> list[RecordingSamples]:
+    """Samples of randomised worlds; those in which the robot cannot stand are left out."""
+    folder = options.samples or options.out / "samples"
+    found = []
+    for seed in progress(seeds, label="worlds", unit="world", quiet=options.quiet or not seeds):
+        try:
+            found.append(read_samples(world_samples(seed, config, folder)))
+        except SamplesError as error:
+            print(f"left out: {error}", file=sys.stderr)
+    return found
 
 
 def _samples(

@@ -18,7 +18,15 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from monoforce_ros.core import atomic_path
-from monoforce_ros.encoder import EncodedMaps, Encoder, EncoderConfig, EncoderInput, TerrainEncoder, save_encoder
+from monoforce_ros.encoder import (
+    EncodedMaps,
+    Encoder,
+    EncoderConfig,
+    EncoderInput,
+    TerrainEncoder,
+    multiplies_bfloat16,
+    save_encoder,
+)
 from monoforce_ros.physics import PhysicsOptions
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.training.losses import (
@@ -26,10 +34,13 @@ from monoforce_ros.training.losses import (
     LOWEST,
     LossWeights,
     decrease_loss,
+    depth_loss,
+    friction_loss,
     geometric_loss,
     measured_decrease_loss,
     prominent_decrease_loss,
     slope_loss,
+    spread_loss,
     terrain_loss,
     trajectory_loss,
 )
@@ -52,10 +63,12 @@ class TrainingSettings:
     seed: int = 1
     augment: bool = True
     """Whether to augment samples (mirror, rotate, crop, change colours)."""
+    freeze_backbone: bool = True
+    """Whether the backbone keeps its ImageNet weights, which hold for photographs."""
     validate_every: int = 250
     save_every: int = 50
     precision: str = "auto"
-    """``auto`` (bfloat16 on CUDA), ``float32`` or ``bfloat16``."""
+    """``float32``, ``bfloat16``, or ``auto``: bfloat16 where the processor multiplies it."""
 
     def __post_init__(self):
         for name, low, high in (
@@ -120,6 +133,11 @@ class _Losses(nn.Module):
 
     def forward(self, batch: EncoderInput, targets: Targets) -> dict[str, Tensor]:
         maps = self.encoder(batch)
+        # The physics needs more digits than the encoder's convolutions.
+        with torch.autocast(batch.ground.device.type, enabled=False):
+            return self._losses(maps, batch, targets)
+
+    def _losses(self, maps: EncodedMaps, batch: EncoderInput, targets: Targets) -> dict[str, Tensor]:
         weights, losses = self.weights, {}
         if weights.geometric:
             losses["geometric"] = weights.geometric * geometric_loss(maps, targets, batch.ground, weights.prominence)
@@ -138,6 +156,10 @@ class _Losses(nn.Module):
             losses["prominent decrease"] = weights.prominent_decrease * prominent_decrease_loss(
                 maps, targets, batch.ground
             )
+        losses["spread"] = weights.spread * spread_loss(maps, targets, batch.ground)
+        if isinstance(self.encoder, TerrainEncoder):
+            losses["depth"] = weights.depth * depth_loss(maps, targets, self.encoder.depths)
+        losses["friction"] = weights.friction * friction_loss(maps, targets, self.encoder.config)
         losses["total"] = torch.stack(list(losses.values())).sum()
         # A zero gradient for heads without a loss: distributed training expects one for each parameter.
         unused = maps.decrease.sum() + maps.stiffness.sum() + maps.damping.sum() + maps.friction.sum()
@@ -174,8 +196,14 @@ class Trainer:
         self.index = [(r, i) for r, recording in enumerate(self.recordings) for i in range(len(recording))]
         if not self.index:
             raise TrainingError("no samples to train on")
+        if isinstance(encoder, TerrainEncoder) and settings.freeze_backbone:
+            encoder.freeze_backbone()
         losses = _Losses(self.encoder, robot, settings.weights)
-        self.losses = nn.parallel.DistributedDataParallel(losses) if process.count > 1 else losses
+        self.losses: nn.Module = losses
+        if process.count > 1:
+            # A batch may be without any image.
+            unused = encoder.config.sensor == "camera_lidar"
+            self.losses = nn.parallel.DistributedDataParallel(losses, find_unused_parameters=unused)
         backbone = list(encoder.backbone.parameters()) if isinstance(encoder, TerrainEncoder) else []
         pretrained = set(backbone)
         groups = [
@@ -238,7 +266,8 @@ class Trainer:
 
     def _cast(self) -> torch.autocast:
         kind = self.process.device.type
-        enabled = self.settings.precision == "bfloat16" or (self.settings.precision == "auto" and kind == "cuda")
+        fast = kind == "cuda" or multiplies_bfloat16()
+        enabled = self.settings.precision == "bfloat16" or (self.settings.precision == "auto" and fast)
         return torch.autocast(kind, dtype=torch.bfloat16, enabled=enabled)
 
     def _batch(self, step: int) -> tuple[EncoderInput, Targets]:
@@ -251,7 +280,10 @@ class Trainer:
         order = np.random.default_rng([settings.seed, 7, epoch]).permutation(len(self.index))
         first += process.rank * settings.batch
         chosen = np.take(order, range(first, first + settings.batch), mode="wrap")
-        drawn = [Augmentation.draw(random) if settings.augment else Augmentation() for _ in range(total)]
+        drop = self.encoder.config.sensor == "camera_lidar"
+        drawn = [
+            Augmentation.draw(random, drop_sensors=drop) if settings.augment else Augmentation() for _ in range(total)
+        ]
         augmentations = drawn[process.rank * settings.batch :]
         samples = [
             sample(self.recordings[self.index[i][0]], self.index[i][1], self.encoder.config, augmentation)
@@ -353,13 +385,14 @@ def _renamed(settings: dict) -> dict:
 
 @torch.no_grad()
 def validate(encoder: Encoder, recordings: Sequence[RecordingSamples], device: torch.device) -> Validation:
-    """Evaluate an encoder on whole recordings, without augmentation."""
+    """Evaluate an encoder on whole recordings, without augmentation; an encoder of images and sweeps by its images."""
     encoder.eval()
+    augmentation = Augmentation(sweep_share=0.0) if encoder.config.sensor == "camera_lidar" else Augmentation()
     geometric, supporting, losses = [], [], []
     for recording in recordings:
         for start in range(0, len(recording), 8):
             indices = range(start, min(start + 8, len(recording)))
-            samples = [sample(recording, i, encoder.config, chunks=1) for i in indices]
+            samples = [sample(recording, i, encoder.config, augmentation, chunks=1) for i in indices]
             batch = EncoderInput.stack([s[0] for s in samples]).to(device)
             targets = Targets.stack([s[1] for s in samples]).to(device)
             maps: EncodedMaps = encoder(batch)

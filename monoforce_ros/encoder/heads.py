@@ -1,0 +1,123 @@
+"""Heads: features of a map → heights, their spread and material, each within its bounds."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from monoforce_ros.encoder.config import EncoderConfig
+from monoforce_ros.encoder.edges import restore_edges
+from monoforce_ros.encoder.view import EncoderInput
+from monoforce_ros.terrain import TerrainMap
+
+_HEADS = 7
+_SOFTPLUS_BETA = 5.0
+"""Sharpness β of the softplus that keeps H_d ≥ 0 [1/m]. Its gradient vanishes far below 0: a sharper bend starts there,
+or firm ground pushes the whole map there before grass is distinguished from it."""
+_FIRM = -0.4
+"""Initial output of the head of H_d, before the softplus: 2.5 cm, with an eighth of the full gradient [m]."""
+_INITIAL_SPREAD = 0.1
+_SMALLEST_SPREAD, _LARGEST_SPREAD = 0.01, 3.0
+"""Scales of the Laplace distribution of a height [m]: untrained, and limits."""
+_OBSERVED = 0.05
+"""Least summed depth probability of an observed cell."""
+
+
+@dataclass(frozen=True)
+class EncodedMaps:
+    """Predictions for a batch; each ``[B, rows, columns]``, heights in the terrain frame [m]."""
+
+    geometric_height: Tensor
+    decrease: Tensor
+    """H_d ≥ 0: depth of the supporting ground below the visible surface."""
+    stiffness: Tensor
+    """[N/m³]."""
+    damping: Tensor
+    """[N s/m³]."""
+    friction: Tensor
+    geometric_spread: Tensor
+    decrease_spread: Tensor
+    """Scale of the Laplace distribution of H_g and of H_d [m]: the mean of their absolute errors."""
+    covered: Tensor
+    """Whether a cell is in the field of view (bool)."""
+    evidence: Tensor
+    """Summed depth probability of the features in a cell."""
+    depth: Tensor | None = None
+    """Logarithm of the depth probabilities of each image ``[N, bins, feature rows, feature columns]``."""
+
+    @property
+    def height(self) -> Tensor:
+        """H_t = H_g - H_d (paper III-A)."""
+        return self.geometric_height - self.decrease
+
+
+def map_heads(features: int) -> nn.Conv2d:
+    """Untrained heads for H_g, H_d, stiffness, damping, friction and the spreads of H_g and H_d.
+
+    All weights start at zero, which encodes the ground that carries the robot with the configuration's material;
+    without a loss they stay there.
+    """
+    heads = nn.Conv2d(features, _HEADS, kernel_size=1)
+    assert heads.bias is not None
+    with torch.no_grad():
+        heads.weight.zero_()
+        heads.bias.zero_()
+        heads.bias[1] = _FIRM
+    return heads
+
+
+def maps_from_heads(
+    outputs: Tensor,
+    batch: EncoderInput,
+    config: EncoderConfig,
+    covered: Tensor,
+    evidence: Tensor,
+    depth: Tensor | None = None,
+) -> EncodedMaps:
+    """Heights, spreads and material from the outputs of the heads ``[B, 7, rows, columns]``, each within its bounds.
+
+    H_g is a correction to the ground that carries the robot (:attr:`EncoderInput.anchor`).
+    """
+    geometric, decrease, stiffness, damping, friction, geometric_spread, decrease_spread = outputs.unbind(1)
+    return EncodedMaps(
+        geometric_height=geometric + batch.anchor + batch.ground[:, None, None],
+        decrease=functional.softplus(decrease, beta=_SOFTPLUS_BETA) if config.decreases else torch.zeros_like(decrease),
+        stiffness=config.stiffness * torch.exp(stiffness.clamp(-4.0, 4.0)),
+        damping=config.damping * torch.exp(damping.clamp(-4.0, 4.0)),
+        friction=config.friction * torch.exp(friction.clamp(-3.0, 1.0)),
+        geometric_spread=config.geometric_spread_factor * _spread(geometric_spread),
+        decrease_spread=config.decrease_spread_factor * _spread(decrease_spread),
+        covered=covered,
+        evidence=evidence,
+        depth=depth,
+    )
+
+
+def _spread(output: Tensor) -> Tensor:
+    limits = math.log(_SMALLEST_SPREAD), math.log(_LARGEST_SPREAD)
+    return (output + math.log(_INITIAL_SPREAD)).clamp(*limits).exp()
+
+
+def with_edges(maps: EncodedMaps, config: EncoderConfig) -> EncodedMaps:
+    """Maps with steps restored in H_t; H_g changes by the same amount, so that H_d is unchanged."""
+    change = restore_edges(maps.height, config.resolution) - maps.height
+    return replace(maps, geometric_height=maps.geometric_height + change)
+
+
+def terrain_maps(maps: EncodedMaps, config: EncoderConfig) -> list[TerrainMap]:
+    """The predictions of a batch as terrain maps on the CPU."""
+    values = {
+        name: getattr(maps, name).detach().cpu()
+        for name in (
+            "height", "geometric_height", "stiffness", "damping", "friction", "geometric_spread", "decrease_spread",
+        )
+    }  # fmt: skip
+    observed = ((maps.evidence > _OBSERVED) & maps.covered).detach().cpu()
+    return [
+        TerrainMap(**{name: value[i] for name, value in values.items()}, observed=observed[i], grid=config.grid)
+        for i in range(len(observed))
+    ]

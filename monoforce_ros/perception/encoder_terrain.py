@@ -1,0 +1,115 @@
+"""EncoderTerrain: terrain that a trained encoder predicts from images, a lidar sweep, or both."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import torch
+
+from monoforce_ros.core import MotionState, transform_points
+from monoforce_ros.encoder import CameraView, Encoder
+from monoforce_ros.perception.ground_alignment import align_to_ground, support_points
+from monoforce_ros.perception.observation import Observation
+from monoforce_ros.perception.trace import DrivenGround
+from monoforce_ros.robots import RobotModel
+from monoforce_ros.terrain import Grid, TerrainMap
+
+
+@contextmanager
+def encoder_threads(count: int | None) -> Iterator[None]:
+    """Run PyTorch on ``count`` CPU threads within the context, and on as many as before afterwards.
+
+    The encoder gains from several threads, while the physics' many small operations are fastest on one. PyTorch's
+    number of threads is a setting of the whole process: only one thread, the one that makes predictions, may use this
+    context. ``None`` leaves the number unchanged.
+    """
+    if not count:
+        yield
+        return
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+class EncoderTerrain:
+    """Terrain predicted by a trained encoder from images, a lidar sweep, or both (paper III-A).
+
+    The ground that the robot drives over is an input, too; odometry must therefore come in order.
+
+    Args:
+        encoder: the encoder.
+        robot: the robot on the ground.
+        sensors: sensors used, of ``camera`` and ``lidar``; of two sensors either may be absent from an observation.
+        threads: CPU threads of the encoder; see :func:`encoder_threads`.
+
+    Raises:
+        ValueError: the encoder does not take one of the sensors.
+    """
+
+    def __init__(
+        self,
+        encoder: Encoder,
+        robot: RobotModel,
+        sensors: tuple[str, ...] = ("camera",),
+        *,
+        threads: int | None = None,
+    ):
+        config = encoder.config
+        unused = [name for name in sensors if name not in config.sensor.split("_")]
+        if unused or not sensors:
+            raise ValueError(f"terrain from {' and '.join(sensors) or 'no sensor'}: the encoder takes {config.sensor}")
+        self.encoder, self.robot, self.sensors = encoder, robot, sensors
+        self._threads = threads
+        self._driven = DrivenGround()
+        self.start_error = 0.0
+        """Median difference between the last map and the ground under the wheels, before they were aligned [m]."""
+
+    @property
+    def grid(self) -> Grid:
+        """The encoder's grid."""
+        return self.encoder.config.grid
+
+    def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
+        """Predicted map; raises ``ValueError`` if all sensors, a calibration or a camera pose are missing."""
+        views = _views(observation, motion) if "camera" in self.sensors else []
+        sweep = _sweep(observation, motion, self.robot) if "lidar" in self.sensors else None
+        if not views and sweep is None:
+            wanted = {"camera": "an image", "lidar": "a point cloud"}
+            names = " or ".join(wanted[name] for name in self.sensors)
+            raise ValueError(f"the terrain encoder needs {names}, and the observation has none")
+        support = support_points(self.robot, motion, self.encoder.config.stiffness)
+        trace = self._driven.update(motion, support)
+        with encoder_threads(self._threads):
+            found = self.encoder.terrain(views, support, sweep=sweep, trace=trace)
+        self.start_error = _error_under(found, support)
+        return align_to_ground(found, support)
+
+
+def _error_under(terrain: TerrainMap, support: np.ndarray) -> float:
+    rows, columns, inside = terrain.grid.cells(support[:, :2])
+    if not inside.any():
+        return 0.0
+    return float(np.median(np.abs(terrain.height.numpy()[rows[inside], columns[inside]] - support[inside, 2])))
+
+
+def _views(observation: Observation, motion: MotionState) -> list[CameraView]:
+    views = []
+    for name, image in observation.images.items():
+        if name not in observation.cameras or name not in observation.base_from_cameras:
+            raise ValueError(f"camera {name}: its calibration or its pose on the robot is missing")
+        pose = motion.terrain_from_base @ observation.base_from_cameras[name]
+        views.append(CameraView(image, observation.cameras[name], pose))
+    return views
+
+
+def _sweep(observation: Observation, motion: MotionState, robot: RobotModel) -> np.ndarray | None:
+    """Points of the ground and of obstacles ``[n, 3]`` in the terrain frame [m]."""
+    if observation.cloud is None:
+        return None
+    cloud = observation.cloud[~robot.covers(observation.cloud)].astype(np.float64)
+    return transform_points(motion.terrain_from_base, cloud[np.isfinite(cloud).all(axis=1)])

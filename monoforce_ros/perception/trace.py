@@ -1,0 +1,84 @@
+"""Trace: the ground that a robot drove over, from its poses."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from monoforce_ros.core import NANOSECOND, MotionState, transform_points
+from monoforce_ros.robots import RobotModel
+
+TRACE_LENGTH = 6.0
+"""Length of the path whose ground counts as known [m]; further back it is outside the map or odometry has drifted."""
+
+
+def traced_ground(robot: RobotModel, odometry_from_bases: np.ndarray, step: float) -> np.ndarray:
+    """Ground under the wheels along the last metres of a path.
+
+    Args:
+        robot: its wheels or tracks.
+        odometry_from_bases: poses ``[n, 4, 4]`` up to now, oldest first.
+        step: distance between the poses that are used [m].
+
+    Returns:
+        ``[k, 3]`` in the odometry frame [m]; empty if the robot has not moved by ``step`` yet.
+    """
+    if len(odometry_from_bases) < 2:
+        return np.zeros((0, 3))
+    positions = odometry_from_bases[:, :3, 3]
+    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
+    back = travelled[-1] - travelled
+    wanted = np.arange(step, min(TRACE_LENGTH, back[0]) + 1e-9, step)
+    index = np.unique(np.searchsorted(-back, -wanted))
+    lowest = robot.points[robot.point_tangents[:, 0] < -0.97].numpy().astype(np.float64)
+    return np.concatenate([transform_points(odometry_from_bases[i], lowest) for i in index] or [np.zeros((0, 3))])
+
+
+class DrivenGround:
+    """Collects, while driving, the ground under the wheels along the last metres.
+
+    It starts over where odometry jumps or time goes back.
+
+    Args:
+        length: length of the path that is kept [m].
+        step: distance after which the ground under the wheels is added [m].
+    """
+
+    def __init__(self, length: float = TRACE_LENGTH, step: float = 0.1):
+        self._length, self._step = length, step
+        self._places: list[tuple[np.ndarray, np.ndarray]] = []
+        """Position of the robot and the points under its wheels, in the odometry frame."""
+        self._previous: MotionState | None = None
+
+    def update(self, motion: MotionState, support: np.ndarray) -> np.ndarray:
+        """Add the ground under a robot, and return the ground that it drove over before.
+
+        Args:
+            motion: the robot's motion.
+            support: points under its wheels ``[m, 3]`` in its terrain frame [m].
+
+        Returns:
+            ``[k, 3]`` in the terrain frame [m], without the ground under the robot now.
+        """
+        if self._previous is None or not continues(motion, self._previous):
+            self._places = []
+        self._previous = motion
+        if not self._places or np.linalg.norm(motion.position - self._places[-1][0]) >= self._step:
+            self._places.append((motion.position, transform_points(motion.odometry_from_terrain, support)))
+            kept = round(self._length / self._step)
+            self._places = self._places[-kept:]
+        earlier = [points for _, points in self._places[:-1]]
+        if not earlier:
+            return np.zeros((0, 3))
+        return transform_points(np.linalg.inv(motion.odometry_from_terrain), np.concatenate(earlier))
+
+
+_JUMP = 1.0
+"""Largest distance between the measured position and the one extrapolated from the last velocity [m]; beyond it, the
+robot was moved or its odometry jumped."""
+
+
+def continues(motion: MotionState, previous: MotionState) -> bool:
+    """Whether the robot can have moved from the previous pose to this one in the time between."""
+    elapsed = (motion.stamp - previous.stamp) * NANOSECOND
+    expected = previous.position + previous.rotation @ previous.linear_velocity * elapsed
+    return elapsed >= 0.0 and float(np.linalg.norm(motion.position - expected)) < _JUMP * max(1.0, elapsed)

@@ -1,0 +1,242 @@
+"""Trust in predicted terrain: what an encoder said of a place, compared with the ground that the wheels found there."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+from scipy import stats
+
+from monoforce_ros.core import MotionState, transform_points
+from monoforce_ros.perception.encoder_terrain import EncoderTerrain
+from monoforce_ros.perception.ground_alignment import support_points
+from monoforce_ros.perception.observation import Observation, TerrainSource
+from monoforce_ros.perception.trace import continues
+from monoforce_ros.terrain import Grid, TerrainMap
+
+BLOCK = 0.5
+"""Distance travelled in one block of comparisons [m], about a robot's length: errors within it are not independent."""
+LENGTH = 6.0
+"""Distance travelled over which predictions are judged [m]."""
+ERROR_RATE = 0.01
+"""Rate at which an encoder as good as level ground is taken for a worse one, for each test; there are two per metre."""
+TOLERANCE = 0.01
+"""Difference between two mean errors that does not matter [m]: wheels sink in by as much (8 mm on firm soil)."""
+_FEWEST_BLOCKS = 3
+_NEAREST, _FARTHEST = 0.8, 5.0
+"""Distances from the robot between which predictions are compared [m]: nearer cells are fitted to the wheels."""
+DISTANCES = (0.8, 2.0, 3.5, 5.0)
+"""Limits of the distance classes of the report [m]."""
+START_TOLERANCE = 0.15
+"""Largest median difference between predicted and actual ground under the wheels [m]."""
+
+
+@dataclass(frozen=True)
+class TrustReport:
+    """How well predictions agreed with the ground that the robot then drove over."""
+
+    trusted: bool
+    travelled: float
+    """Distance over which predictions were compared [m]."""
+    error: float
+    """Mean error of the predicted ground [m]; NaN before any comparison."""
+    level_error: float
+    """Mean error of level ground at the height of the wheels, at the same places [m]."""
+    start_error: float
+    """Median difference between the predicted and the actual ground under the wheels now [m]."""
+    worst_camera: str = ""
+    """Camera that looked at the places with the largest mean error; empty before any comparison."""
+    by_distance: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """Mean error of prediction and of level ground [m], by the distance from which a place was predicted."""
+
+    @property
+    def explanation(self) -> str:
+        """The report in words."""
+        if not self.start_error <= START_TOLERANCE:
+            return (
+                f"the encoder's ground under the wheels is off by {100 * self.start_error:.0f} cm, expected at most"
+                f" {100 * START_TOLERANCE:.0f} cm: check the cameras' poses, or adapt the encoder (train --adapt BAG)"
+            )
+        if not np.isfinite(self.error):
+            return "nothing compared yet: the robot has not reached ground that it predicted"
+        compared = (
+            f"ground predicted {_NEAREST:g} to {_FARTHEST:g} m ahead was off by {100 * self.error:.0f} cm over the last"
+            f" {self.travelled:.1f} m, level ground by {100 * self.level_error:.0f} cm"
+        )
+        if self.trusted:
+            return compared
+        camera = f", worst from {self.worst_camera}" if self.worst_camera else ""
+        return f"{compared}{camera}: adapt the encoder to this robot (train --adapt BAG)"
+
+
+@dataclass(frozen=True)
+class _Said:
+    """A prediction made earlier."""
+
+    motion: MotionState
+    height: np.ndarray
+    """``[rows, columns]`` in its terrain frame [m]."""
+    observed: np.ndarray
+    level: float
+    """Height of level ground in that frame [m]."""
+    cameras: Mapping[str, float]
+    """Direction of each camera's optical axis in that frame [rad]."""
+
+
+class TerrainTrust:
+    """Compares predictions with the ground found later.
+
+    Level ground at the height of the wheels is the rival: an encoder that loses against it over the last metres harms.
+    Errors are averaged over blocks of half a metre of travel; a paired t-test over the blocks decides.
+    """
+
+    def __init__(self, grid: Grid):
+        self._grid = grid
+        self._start_over()
+
+    def _start_over(self) -> None:
+        self._said: deque[_Said] = deque(maxlen=round((LENGTH + _FARTHEST) / BLOCK))
+        self._blocks: deque[tuple[float, float]] = deque(maxlen=round(LENGTH / BLOCK))
+        """Mean error of the prediction and of level ground in each block."""
+        self._pending: list[tuple[float, float, float, str]] = []
+        """Error, error of level ground, distance and camera of each comparison of the current block."""
+        self._compared: deque[tuple[float, float, float, str]] = deque(maxlen=2000)
+        self._travelled = 0.0
+        self._previous: MotionState | None = None
+        self._trusted = True
+
+    def update(
+        self,
+        motion: MotionState,
+        support: np.ndarray,
+        predicted: TerrainMap,
+        cameras: Mapping[str, float],
+        start_error: float,
+    ) -> TrustReport:
+        """Compare earlier predictions with the ground under the wheels, and remember the newest one.
+
+        Args:
+            motion: the robot's motion now.
+            support: points of the ground under its wheels ``[m, 3]`` in its terrain frame [m].
+            predicted: predicted map.
+            cameras: direction of each camera's optical axis in the terrain frame [rad].
+            start_error: median difference between predicted and actual ground under the wheels [m].
+        """
+        if self._previous is None or not continues(motion, self._previous):
+            self._start_over()
+            moved = BLOCK
+        else:
+            moved = float(np.linalg.norm(motion.position[:2] - self._previous.position[:2]))
+        self._previous = motion
+        self._travelled += moved
+        if moved > 0.01:
+            self._compare(transform_points(motion.odometry_from_terrain, support))
+        if self._travelled >= BLOCK:
+            self._travelled = 0.0
+            if self._pending:
+                self._blocks.append(
+                    (float(np.mean([e[0] for e in self._pending])), float(np.mean([e[1] for e in self._pending])))
+                )
+                self._compared.extend(self._pending)
+                self._pending = []
+                self._judge()
+            self._said.append(
+                _Said(
+                    motion, predicted.height.numpy().copy(), predicted.observed.numpy().copy(),
+                    float(support[:, 2].mean()), dict(cameras),
+                )
+            )  # fmt: skip
+        return self._report(start_error)
+
+    def _compare(self, points: np.ndarray) -> None:
+        """Compare ground ``[m, 3]`` in the odometry frame with what was said of it."""
+        for said in self._said:
+            local = transform_points(np.linalg.inv(said.motion.odometry_from_terrain), points)
+            distance = np.hypot(local[:, 0], local[:, 1])
+            rows, columns, inside = self._grid.cells(local[:, :2])
+            usable = inside & (distance > _NEAREST) & (distance < _FARTHEST) & said.observed[rows, columns]
+            if not usable.any():
+                continue
+            height = said.height[rows, columns][usable]
+            error = float(np.abs(height - local[usable, 2]).mean())
+            level = float(np.abs(said.level - local[usable, 2]).mean())
+            middle = local[usable, :2].mean(axis=0)
+            towards = float(np.arctan2(middle[1], middle[0]))
+            away = {name: abs((axis - towards + np.pi) % (2 * np.pi) - np.pi) for name, axis in said.cameras.items()}
+            camera = min(away, key=lambda name: away[name]) if away else ""
+            self._pending.append((error, level, float(distance[usable].mean()), camera))
+
+    def _judge(self) -> None:
+        if len(self._blocks) < _FEWEST_BLOCKS:
+            return
+        difference = np.array([own - level for own, level in self._blocks])
+        if self._trusted:
+            # Without any variation the test has no answer.
+            spread = max(float(difference.std(ddof=1)), 1e-6)
+            statistic = (difference.mean() - TOLERANCE) / (spread / np.sqrt(len(difference)))
+            self._trusted = bool(stats.t.sf(statistic, len(difference) - 1) >= ERROR_RATE)
+        else:
+            self._trusted = bool(difference.mean() <= TOLERANCE)
+
+    def _report(self, start_error: float) -> TrustReport:
+        own, level = (float(np.mean([b[i] for b in self._blocks])) if self._blocks else float("nan") for i in (0, 1))
+        entries = list(self._compared)
+        by_distance = {}
+        for low, high in pairwise(DISTANCES):
+            within = [entry for entry in entries if low <= entry[2] < high]
+            if within:
+                means = float(np.mean([e[0] for e in within])), float(np.mean([e[1] for e in within]))
+                by_distance[f"{low:g} to {high:g} m"] = means
+        cameras = {entry[3] for entry in entries}
+        worst = max(cameras, key=lambda name: float(np.mean([e[0] for e in entries if e[3] == name])), default="")
+        return TrustReport(
+            trusted=self._trusted and start_error <= START_TOLERANCE,
+            travelled=BLOCK * len(self._blocks),
+            error=own,
+            level_error=level,
+            start_error=start_error,
+            worst_camera=worst,
+            by_distance=by_distance,
+        )
+
+
+class TrustedTerrain:
+    """An encoder's terrain as long as it is better than level ground, and a fallback otherwise.
+
+    The encoder keeps predicting meanwhile, and is used again once it is no worse than level ground.
+
+    Args:
+        source: source of the encoder's maps, with or without temporal memory.
+        encoder: the encoder's own source within it.
+        fallback: source of the maps where the encoder is not trusted.
+    """
+
+    def __init__(self, source: TerrainSource, encoder: EncoderTerrain, fallback: TerrainSource):
+        self._source, self._encoder, self._fallback = source, encoder, fallback
+        self._trust = TerrainTrust(source.grid)
+        self.report: TrustReport | None = None
+        """Result of the last comparison; None before the first map."""
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Sensors of the source."""
+        return self._source.sensors
+
+    @property
+    def grid(self) -> Grid:
+        """Grid of the source."""
+        return self._source.grid
+
+    def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
+        """The encoder's map or the fallback's; raises the source's errors."""
+        predicted = self._source.terrain(observation, motion)
+        support = support_points(self._encoder.robot, motion, self._encoder.encoder.config.stiffness)
+        cameras = {}
+        for name, pose in observation.base_from_cameras.items():
+            axis = (motion.terrain_from_base @ pose)[:3, 2]
+            cameras[name] = float(np.arctan2(axis[1], axis[0]))
+        self.report = self._trust.update(motion, support, predicted, cameras, self._encoder.start_error)
+        return predicted if self.report.trusted else self._fallback.terrain(observation, motion)

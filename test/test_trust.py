@@ -1,0 +1,151 @@
+"""Trust: predictions are compared with the ground found later, and a harmful encoder is not used."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from monoforce_ros.core import MotionState
+from monoforce_ros.encoder import EncoderConfig, new_encoder
+from monoforce_ros.perception import (
+    DrivenGround,
+    EncoderTerrain,
+    FlatTerrain,
+    Observation,
+    TerrainTrust,
+    TrustedTerrain,
+    support_points,
+)
+from monoforce_ros.robots import load_robot
+from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap
+
+GRID = Grid.square(12.8, 0.2)
+WHEELS = np.array([[0.3, 0.3], [0.3, -0.3], [-0.3, 0.3], [-0.3, -0.3]])
+
+
+def hill(x):
+    """A ridge across the path [m]."""
+    return 0.3 * np.sin(0.8 * x)
+
+
+def at(x, z=0.0, stamp=None):
+    stamp = int(1e9 * x) if stamp is None else stamp
+    return MotionState(stamp, np.array([x, 0.0, z]), np.eye(3), np.array([1.0, 0, 0]), np.zeros(3))
+
+
+def drive(trust, said, *, length=8.0, step=0.1, start_error=0.0):
+    """Reports along a drive over the hill; ``said(ahead, x)`` is the predicted height ``ahead`` metres away."""
+    reports = []
+    for x in np.arange(0.0, length, step):
+        height = said(np.broadcast_to(GRID.x, (GRID.rows, GRID.columns)), x)
+        terrain = TerrainMap.from_height(torch.from_numpy(height.astype(np.float32)), GRID)
+        support = np.column_stack([WHEELS, hill(x + WHEELS[:, 0]) - hill(x)])
+        motion = at(x, hill(x))
+        reports.append(trust.update(motion, support, terrain, {"front": 0.0, "rear": np.pi}, start_error))
+    return reports
+
+
+def test_a_true_map_is_trusted_and_its_error_is_small():
+    report = drive(TerrainTrust(GRID), lambda ahead, x: hill(ahead + x) - hill(x))[-1]
+    assert report.trusted and report.error < 0.03 < report.level_error
+    assert set(report.by_distance) == {"0.8 to 2 m", "2 to 3.5 m", "3.5 to 5 m"}
+    assert "level ground by" in report.explanation
+
+
+def test_holes_that_are_not_there_are_noticed_within_metres_and_named():
+    reports = drive(TerrainTrust(GRID), lambda ahead, x: np.where(np.abs(ahead) > 0.7, -0.7, 0.0))
+    first = next(i for i, report in enumerate(reports) if not report.trusted)
+    assert 0.1 * first < 4.0
+    assert not reports[-1].trusted and reports[-1].error > reports[-1].level_error
+    assert reports[-1].worst_camera == "front" and "worst from front: adapt the encoder" in reports[-1].explanation
+
+
+def test_an_encoder_as_good_as_level_ground_is_not_refused_by_chance():
+    random = np.random.default_rng(5)
+    refused = 0
+    for _ in range(20):
+        bias = random.normal(0.0, 0.02, 200)
+        reports = drive(TerrainTrust(GRID), lambda ahead, x, bias=bias: 0.0 * ahead + bias[round(10 * x)], step=0.25)
+        refused += any(not report.trusted for report in reports)
+    # Twelve tests along each drive, each with an error rate of 1 %, on differences around zero.
+    assert refused <= 2
+
+
+def test_trust_returns_when_predictions_become_right_again():
+    trust = TerrainTrust(GRID)
+    wrong = drive(trust, lambda ahead, x: np.full(ahead.shape, -0.7))
+    assert not wrong[-1].trusted
+    # Later on the same drive, without a jump of the odometry.
+    reports = []
+    for x in np.arange(8.0, 24.0, 0.1):
+        height = hill(np.broadcast_to(GRID.x, (GRID.rows, GRID.columns)) + x) - hill(x)
+        terrain = TerrainMap.from_height(torch.from_numpy(height.astype(np.float32)), GRID)
+        support = np.column_stack([WHEELS, hill(x + WHEELS[:, 0]) - hill(x)])
+        reports.append(trust.update(at(x, hill(x)), support, terrain, {}, 0.0))
+    assert reports[-1].trusted
+
+
+def test_ground_under_the_wheels_that_is_off_is_refused_at_once():
+    report = drive(TerrainTrust(GRID), lambda ahead, x: 0.0 * ahead, length=0.3, start_error=0.4)[0]
+    assert not report.trusted and "under the wheels is off by 40 cm, expected at most 15 cm" in report.explanation
+    assert not drive(TerrainTrust(GRID), lambda ahead, x: 0.0 * ahead, length=0.3, start_error=float("nan"))[0].trusted
+
+
+def test_an_odometry_jump_starts_over():
+    trust = TerrainTrust(GRID)
+    assert not drive(trust, lambda ahead, x: np.full(ahead.shape, -0.7))[-1].trusted
+    flat = TerrainMap.flat(GRID)
+    report = trust.update(at(500.0, stamp=int(9e9)), np.column_stack([WHEELS, np.zeros(4)]), flat, {}, 0.0)
+    assert report.trusted and np.isnan(report.error) and "nothing compared yet" in report.explanation
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return load_robot("husky")
+
+
+def test_the_fallback_replaces_the_maps_of_a_harmful_encoder(robot):
+    config = EncoderConfig(sensor="camera_lidar", image_width=64, image_height=48, resolution=0.2, edges=False)
+    encoder = new_encoder(config).eval()
+    source = EncoderTerrain(encoder, robot, ("lidar", "camera"))
+    material = TerrainDefaults()
+    trusted = TrustedTerrain(source, source, FlatTerrain(robot, config.grid, material))
+    cloud = np.random.default_rng(1).uniform([1.0, -4.0, -0.14], [5.0, 4.0, -0.12], (4000, 3))
+    maps = []
+    for x in np.arange(0.0, 8.0, 0.1):
+        # The encoder goes wrong far away: its ground under the wheels stays right.
+        with torch.no_grad():
+            encoder.heads.bias[0] = 0.1 if x > 1.0 else 0.0
+        maps.append(trusted.terrain(Observation(int(1e9 * x), cloud=cloud), at(x)))
+    assert trusted.report is not None and not trusted.report.trusted
+    flat = FlatTerrain(robot, config.grid, material).terrain(Observation(0), at(0.0))
+    assert torch.equal(maps[-1].height, flat.height) and not torch.equal(maps[0].height, flat.height)
+    # Right again: the encoder is used again.
+    with torch.no_grad():
+        encoder.heads.bias[:2] = torch.tensor([0.0, -3.0])
+    for x in np.arange(8.0, 24.0, 0.1):
+        trusted.terrain(Observation(int(1e9 * x), cloud=cloud), at(x))
+    assert trusted.report.trusted
+
+
+def test_driven_ground_moves_with_the_robot_and_ends_after_six_metres(robot):
+    driven = DrivenGround()
+    for i, angle in enumerate(np.linspace(0.0, 1.0, 101)):
+        turn = Rotation.from_euler("z", angle).as_matrix()
+        position = np.array([10.0 * np.sin(angle), 10.0 * (1 - np.cos(angle)), 0.2 * angle])
+        motion = MotionState(int(1e8 * i), position, turn, np.array([1.0, 0, 0]), np.array([0, 0, 0.1]))
+        points = driven.update(motion, support_points(robot, motion, 2e6))
+    distance = np.hypot(points[:, 0], points[:, 1])
+    assert 5.0 < distance.max() < 6.8 and points[distance < 1.0].shape[0] > 0
+    # The path rose by 2 cm per metre.
+    away = points[distance > 5.0]
+    assert np.median(away[:, 2]) == pytest.approx(-0.13 - 0.02 * np.median(np.hypot(away[:, 0], away[:, 1])), abs=0.03)
+    assert not len(driven.update(at(500.0, stamp=int(2e10)), np.zeros((4, 3))))
+
+
+def test_an_encoder_without_a_sensor_says_so(robot):
+    encoder = new_encoder(EncoderConfig(image_width=64, image_height=48, resolution=0.4))
+    with pytest.raises(ValueError, match="terrain from lidar: the encoder takes camera"):
+        EncoderTerrain(encoder, robot, ("lidar",))
+    with pytest.raises(ValueError, match="needs an image, and the observation has none"):
+        EncoderTerrain(encoder, robot).terrain(Observation(0), at(0.0))
