@@ -56,9 +56,13 @@ def test_a_world_has_samples_whose_sweeps_agree_with_its_surfaces(world, encoder
     assert len(world) == 3 and len(world.chunks.stamps) == 0
     for entry in judged_maps(encoder, [world], SWEEP):
         low, _, hit = entry.batch.sweep.unbind(1)
-        away = (low + entry.batch.ground[:, None, None] - entry.targets.geometric)[hit > 0]
-        # Vegetation lets some rays through, and cells are 20 cm wide.
-        assert float(away.abs().median()) < 0.06
+        low = (low + entry.batch.ground[:, None, None])[hit > 0]
+        visible, supporting = entry.targets.geometric[hit > 0], entry.targets.supporting[hit > 0]
+        # Rays pass between leaves, down to the ground that carries them; the labels have no crowns of trees.
+        between = (low > supporting - 0.1) & (low < visible + 0.1)
+        assert float(between.float().mean()) > 0.9
+        bare = visible - supporting < 0.05
+        assert float((low - visible)[bare].abs().median()) < 0.03 and int(bare.sum()) > 100
         # The robot stands on its ground.
         under = entry.targets.supporting[:, 15:17, 15:17].mean(dim=(1, 2)) - entry.batch.ground
         assert float(under.abs().max()) < 0.15
@@ -74,7 +78,7 @@ def test_bands_are_calibrated_on_held_out_samples(world, recording, encoder):
     before = judge(encoder, [recording])
     better = calibrated(encoder, [recording])
     after = judge(better, [recording])
-    assert abs(before.inside - 0.9) > 0.03 and after.inside == pytest.approx(0.9, abs=0.005)
+    assert abs(before.inside - 0.9) > 0.01 and after.inside == pytest.approx(0.9, abs=0.005)
     assert calibrated(better, [recording]).config.geometric_spread_factor == pytest.approx(
         better.config.geometric_spread_factor, rel=1e-3
     )

@@ -80,6 +80,24 @@ def test_turns_in_place_continue_straight():
     assert (only == only[:, :1]).all()
 
 
+def test_a_car_gets_arcs_that_its_steering_reaches_and_backs_out():
+    car = load_robot("rally_car")
+    curvature = car.maximum_curvature
+    assert 0.3 < curvature < 3.0 and load_robot("husky").maximum_curvature == np.inf
+    fan = fan_of_arcs(CandidateSettings(count=22, speeds=(0.0, 0.4, 0.8), yaw_rate=0.8, curvature=curvature))
+    moving = fan[:-1].reshape(-1, 2)
+    assert (np.abs(moving[:, 1]) <= np.abs(moving[:, 0]) * curvature + 1e-9).all() and (moving[:, 0] != 0).all()
+    assert np.abs(moving[:, 1]).max() == pytest.approx(min(0.8, 0.8 * curvature))
+    # In place of turns on the spot: back along an arc, then ahead.
+    assert fan[1, 0, 0] == -0.4 and fan[1, -1].tolist() in ([0.8, 0.0], fan[1, 0].tolist())
+    assert {tuple(entry) for entry in fan[2:5, -1]} == {(0.8, 0.0)}
+    # The robot's own kinematics follow every command without a limit.
+    speeds, _ = car.command(torch.from_numpy(moving))
+    assert torch.isfinite(speeds).all()
+    with pytest.raises(ValueError, match="curvature: got nan"):
+        CandidateSettings(curvature=float("nan"))
+
+
 def test_a_robot_right_before_a_wall_has_a_feasible_candidate(husky):
     """Every forward arc hits the wall; only turning first and then driving makes progress."""
     settings = CandidateSettings(count=20, speeds=(0.0, 0.8), yaw_rate=1.5)

@@ -109,7 +109,7 @@ def test_the_fallback_replaces_the_maps_of_a_harmful_encoder(robot):
     encoder = new_encoder(config).eval()
     source = EncoderTerrain(encoder, robot, ("lidar", "camera"))
     material = TerrainDefaults()
-    trusted = TrustedTerrain(source, source, FlatTerrain(robot, config.grid, material))
+    trusted = TrustedTerrain(source, source, [FlatTerrain(robot, config.grid, material)])
     cloud = np.random.default_rng(1).uniform([1.0, -4.0, -0.14], [5.0, 4.0, -0.12], (4000, 3))
     maps = []
     for x in np.arange(0.0, 8.0, 0.1):

@@ -14,6 +14,7 @@ from monoforce_ros.encoder.backbone import COARSE_CHANNELS, FINE_CHANNELS, Backb
 from monoforce_ros.encoder.birds_eye import BirdsEyeNetwork
 from monoforce_ros.encoder.config import EncoderConfig
 from monoforce_ros.encoder.heads import EncodedMaps, map_heads, maps_from_heads, terrain_maps, with_edges
+from monoforce_ros.encoder.image_context import ImageContext, resized
 from monoforce_ros.encoder.lift import depth_values, lifted_points, map_cells, splat
 from monoforce_ros.encoder.view import SUPPORT_CHANNELS, SWEEP_CHANNELS, CameraView, EncoderInput, encoder_input
 from monoforce_ros.terrain import TerrainMap
@@ -22,6 +23,7 @@ _GEOMETRY_CHANNELS = 5
 _MOMENTS = 3
 """Channels of the mean height of a cell's features, its variance, and the evidence."""
 _NECK_CHANNELS = 64
+_CONTEXT_CHANNELS = 96
 _LEVEL_GROUND_SPREAD = 0.25
 """Standard deviation of the initial depth prior around level ground, in the logarithm of depth."""
 
@@ -40,8 +42,9 @@ class TerrainEncoder(nn.Module):
         super().__init__()
         self.config = config
         self.backbone = Backbone()
+        self.context = ImageContext(COARSE_CHANNELS + _GEOMETRY_CHANNELS, _CONTEXT_CHANNELS)
         self.neck = nn.Sequential(
-            nn.Conv2d(FINE_CHANNELS + COARSE_CHANNELS + _GEOMETRY_CHANNELS, _NECK_CHANNELS, 1, bias=False),
+            nn.Conv2d(FINE_CHANNELS + _CONTEXT_CHANNELS + _GEOMETRY_CHANNELS, _NECK_CHANNELS, 1, bias=False),
             nn.BatchNorm2d(_NECK_CHANNELS),
             nn.ReLU(inplace=True),
             nn.Conv2d(_NECK_CHANNELS, _NECK_CHANNELS, 3, padding=1, bias=False),
@@ -123,7 +126,6 @@ class TerrainEncoder(nn.Module):
         """Logarithm of the depth probabilities ``[N, bins, rows, columns]``, features ``[N, C, rows, columns]``."""
         config = self.config
         fine, coarse = self.backbone((batch.images.float() / 127.5 - 1.0).to(self.lift.weight.dtype))
-        coarse = functional.interpolate(coarse, size=fine.shape[-2:], mode="bilinear", align_corners=False)
         down = batch.rays[..., 2]
         height = batch.origins[:, 2, None, None]
         # Depth at which the ray meets level ground; beyond every bin for rays that do not.
@@ -132,7 +134,9 @@ class TerrainEncoder(nn.Module):
         geometry = torch.stack(
             [*batch.rays.unbind(-1), height.expand_as(down), ((level - low) / (high - low)).clamp(-0.5, 1.5)], dim=1
         )
-        lifted = self.lift(self.neck(torch.cat([fine, coarse, geometry.to(fine.dtype)], dim=1)))
+        geometry = geometry.to(fine.dtype)
+        coarse = self.context(torch.cat([coarse, resized(geometry, coarse.shape[-2:])], dim=1))
+        lifted = self.lift(self.neck(torch.cat([fine, resized(coarse, fine.shape[-2:]), geometry], dim=1)))
         distance = (self.depths.log()[:, None, None] - level.clamp_max(high)[:, None]) / _LEVEL_GROUND_SPREAD
         logits = lifted[:, : config.depth_bins].float() - self.level_weight * 0.5 * distance**2
         return logits.log_softmax(dim=1), lifted[:, config.depth_bins :].float()

@@ -55,7 +55,10 @@ class CandidateOutput:
         self._force_every = force_every(options.time_step)
         self._fan = np.zeros((0, 4, 2))
         if settings.candidates:
-            fan = CandidateSettings(settings.candidates, tuple(settings.candidate_speeds), settings.candidate_yaw_rate)
+            fan = CandidateSettings(
+                settings.candidates, tuple(settings.candidate_speeds), settings.candidate_yaw_rate,
+                curvature=robot.maximum_curvature,
+            )  # fmt: skip
             self._fan = fan_of_arcs(fan)
         self._requested: tuple[float, np.ndarray] | None = None
         self._round_seconds = 0.0

@@ -59,6 +59,7 @@ def choose_terrain_source(
     if kind == "lidar":
         return LidarTerrain(robot, grid, material)
     encoder = load_encoder(checkpoint, "camera")
+    # An encoder of both predicts H_d from both.
     sensors = ("lidar", "camera") if kind == "lidar_camera" and encoder.config.takes_sweeps else ("camera",)
     # Packed weights and half precision save time on the CPU only.
     encoder = packed(fused(encoder, precision)) if device == "cpu" else fused(encoder).to(device)
@@ -66,13 +67,9 @@ def choose_terrain_source(
     learned: TerrainSource = own
     if retention_time:
         learned = TemporalMemory(learned, robot, stiffness=encoder.config.stiffness, retention_time=retention_time)
-    if fallback:
-        other: TerrainSource = FlatTerrain(robot, learned.grid, material)
-        if "lidar" in sensors:
-            other = LidarTerrain(robot, learned.grid, material)
-        learned = TrustedTerrain(learned, own, other)
-    if kind == "camera" or "lidar" in sensors:
-        return learned
+    level, lidar = FlatTerrain(robot, learned.grid, material), LidarTerrain(robot, learned.grid, material)
     if kind == "lidar_camera":
-        return LidarCameraTerrain(LidarTerrain(robot, learned.grid, material), learned)
-    raise ValueError(f"terrain source {kind!r} is listed in SOURCES, and choose_terrain_source has no branch for it")
+        learned = LidarCameraTerrain(lidar, learned)
+    if fallback:
+        learned = TrustedTerrain(learned, own, (lidar, level) if kind == "lidar_camera" else (level,))
+    return learned

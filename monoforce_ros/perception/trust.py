@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -211,11 +211,11 @@ class TrustedTerrain:
     Args:
         source: source of the encoder's maps, with or without temporal memory.
         encoder: the encoder's own source within it.
-        fallback: source of the maps where the encoder is not trusted.
+        fallbacks: sources of the maps where the encoder is not trusted; the first one whose sensors have measured.
     """
 
-    def __init__(self, source: TerrainSource, encoder: EncoderTerrain, fallback: TerrainSource):
-        self._source, self._encoder, self._fallback = source, encoder, fallback
+    def __init__(self, source: TerrainSource, encoder: EncoderTerrain, fallbacks: Sequence[TerrainSource]):
+        self._source, self._encoder, self._fallbacks = source, encoder, tuple(fallbacks)
         self._trust = TerrainTrust(source.grid)
         self.report: TrustReport | None = None
         """Result of the last comparison; None before the first map."""
@@ -239,4 +239,8 @@ class TrustedTerrain:
             axis = (motion.terrain_from_base @ pose)[:3, 2]
             cameras[name] = float(np.arctan2(axis[1], axis[0]))
         self.report = self._trust.update(motion, support, predicted, cameras, self._encoder.start_error)
-        return predicted if self.report.trusted else self._fallback.terrain(observation, motion)
+        if self.report.trusted:
+            return predicted
+        measured = {"lidar": observation.cloud is not None, "camera": bool(observation.images)}
+        fallback = next(f for f in self._fallbacks if all(measured[sensor] for sensor in f.sensors))
+        return fallback.terrain(observation, motion)

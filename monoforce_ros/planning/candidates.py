@@ -15,9 +15,12 @@ class CandidateSettings:
 
     count: int = 32
     speeds: tuple[float, ...] = (0.4, 0.8)
-    """Forward speeds [m/s], among which the candidates are divided. At 0 the robot turns in place."""
+    """Forward speeds [m/s], among which the candidates are divided. At 0 the robot turns in place; one that cannot
+    backs out along arcs instead."""
     yaw_rate: float = 0.8
     """Largest yaw rate [rad/s]."""
+    curvature: float = float("inf")
+    """Largest curvature that the steering reaches [1/m]; infinite for a robot that turns in place."""
     stop: bool = True
     """Add standing still as the last candidate."""
 
@@ -28,6 +31,8 @@ class CandidateSettings:
             raise ValueError(f"candidate speeds: got {list(self.speeds)}, expected finite speeds up to 20 m/s")
         if not 0.0 <= self.yaw_rate <= 10.0:
             raise ValueError(f"candidate yaw rate: got {self.yaw_rate}, expected 0 to 10 rad/s")
+        if not self.curvature >= 0.0:
+            raise ValueError(f"candidate curvature: got {self.curvature}, expected 0 or more, in 1/m")
 
 
 def fan_of_arcs(settings: CandidateSettings) -> np.ndarray:
@@ -36,19 +41,23 @@ def fan_of_arcs(settings: CandidateSettings) -> np.ndarray:
     Each arc holds one yaw rate; the rates are evenly spaced from right to left, and include 0 for a speed with an odd
     number of arcs. A robot in front of a wall must first turn and then drive: turns in place last half or three
     quarters of the horizon, alternately, and continue straight at the largest speed; the fastest turns to either side
-    last the whole horizon.
+    last the whole horizon. A robot that cannot turn in place reverses instead, at its lowest speed.
     """
     arcs = settings.count - int(settings.stop and settings.count > 1)
     # Assign a remainder to the last speeds: a single arc must not be a turn in place.
     shares = np.array_split(np.arange(arcs), len(settings.speeds))[::-1]
     fastest = max(settings.speeds)
+    moving = [abs(speed) for speed in settings.speeds if speed]
+    turns_in_place = np.isinf(settings.curvature)
     fan = []
     for speed, share in zip(settings.speeds, shares, strict=True):
+        first = speed if speed or turns_in_place or not moving else -min(moving)
+        limit = settings.yaw_rate if turns_in_place else min(settings.yaw_rate, abs(first) * settings.curvature)
         last = len(share) - 1
-        for index, rate in enumerate(np.linspace(-settings.yaw_rate, settings.yaw_rate, last + 1) if last else [0.0]):
+        for index, rate in enumerate(np.linspace(-limit, limit, last + 1) if last else [0.0]):
             rank = min(index, last - index)
             turning = _QUARTERS if speed or fastest <= 0.0 or not rank else 2 + rank % 2
-            fan.append([[speed, rate]] * turning + [[fastest, 0.0]] * (_QUARTERS - turning))
+            fan.append([[first, rate]] * turning + [[fastest, 0.0]] * (_QUARTERS - turning))
     fan += [[[0.0, 0.0]] * _QUARTERS] * (settings.count - arcs)
     return np.array(fan)
 

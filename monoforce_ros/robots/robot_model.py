@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from monoforce_ros.robots.joint import Coordinate, Joint
-from monoforce_ros.robots.kinematics import SteeredDrive
+from monoforce_ros.robots.kinematics import ACKERMANN, SteeredDrive
 from monoforce_ros.robots.mass import add_point_mass
 
 
@@ -107,6 +107,13 @@ class RobotModel:
     def number_of_drives(self) -> int:
         """Number of drives."""
         return len(self.drive_names)
+
+    @property
+    def maximum_curvature(self) -> float:
+        """Largest curvature of a turn [1/m]; infinite for a robot that turns in place."""
+        if self.steered is None or self.steered.kind != ACKERMANN:
+            return float("inf")
+        return self.steered.maximum_curvature
 
     @property
     def bounds(self) -> tuple[Tensor, Tensor]:

@@ -30,6 +30,14 @@ _OFF_TRACK = 1.5
 """Largest distance from the track at which the robot is placed [m]: obstacles stand beside the track."""
 _STEEPEST = math.radians(25.0)
 """Largest tilt at which the robot is placed."""
+_FACING = 0.4
+"""Share of the places from which the robot faces an obstacle: few places along a track do."""
+_FACED_FROM, _FACED_TO = 0.8, 6.0
+"""Range of the distances to that obstacle, of which the logarithm is uniform [m]."""
+_FACED_ASIDE = 0.3
+"""Standard deviation of the heading towards it [rad]."""
+_STANDS_OUT, _STANDS_OUT_REACH = 0.3, 0.3
+"""Height of an obstacle above the lowest ground nearby [m]; distance that is nearby [m]."""
 _UNEVEN = 0.12
 """Largest height difference between the ground under a wheel and the plane under all wheels [m]; the robot would not
 rest like that."""
@@ -77,7 +85,7 @@ def take_snapshots(
 ) -> WorldSnapshots:
     """Place the robot of a randomised world at random places and record its sensors.
 
-    Places lie along the track and up to 1.5 m beside it, with any heading. Fewer than ``count`` snapshots result where
+    Most places lie along the track and up to 1.5 m beside it, with any heading; the others face an obstacle. Fewer than ``count`` snapshots result where
     a world has few places at which a robot can stand.
 
     Args:
@@ -101,7 +109,13 @@ def take_snapshots(
     data = mujoco.MjData(model)
     labels = world_labels(world.scenery, np.zeros(3))
     support = HeightField(labels["support_height"], float(labels["resolution"]), labels["origin"])
-    places = [place for _ in range(count) if (place := _standing_place(world, robot, support, random)) is not None]
+    obstacles = _obstacle_cells(labels, world.scenery.route.points)
+    places = []
+    for _ in range(count):
+        faced = obstacles if len(obstacles) and random.uniform() < _FACING else None
+        place = _standing_place(world, robot, support, random, faced)
+        if place is not None:
+            places.append(place)
     views: list[list[np.ndarray]] = [[] for _ in places]
     # One camera after the other: each holds a renderer of the whole world.
     for entry in rig:
@@ -131,16 +145,37 @@ def take_snapshots(
     )
 
 
+def _obstacle_cells(labels: dict[str, np.ndarray], route: np.ndarray) -> np.ndarray:
+    """Positions ``[n, 2]`` [m] of cells that stand out of the ground, obstacles and tall grass, near the route."""
+    heights, resolution = labels["visible_height"], float(labels["resolution"])
+    window = np.ones((2 * round(_STANDS_OUT_REACH / resolution) + 1,) * 2, np.uint8)
+    rows, columns = np.nonzero(heights - cv2.erode(heights, window) > _STANDS_OUT)
+    cells = np.column_stack([columns, rows]) * resolution + labels["origin"]
+    reach = _FACED_TO + _OFF_TRACK
+    near = (cells > route.min(axis=0) - reach).all(axis=1) & (cells < route.max(axis=0) + reach).all(axis=1)
+    return cells[near]
+
+
 def _standing_place(
-    world: VariedWorld, robot: Vehicle, support: HeightField, random: np.random.Generator
+    world: VariedWorld, robot: Vehicle, support: HeightField, random: np.random.Generator, faced: np.ndarray | None
 ) -> np.ndarray | None:
-    """Pose ``[4, 4]`` of a robot at rest, world ← base; None if no place was found."""
+    """Pose ``[4, 4]`` of a robot at rest, world ← base; None if no place was found.
+
+    It faces one of the positions ``faced`` ``[n, 2]`` if there are any.
+    """
     route = world.scenery.route
     for _ in range(_ATTEMPTS):
-        along = random.uniform(0.0, 1.0)
-        middle = route.points[int(along * (len(route.points) - 1))]
-        xy = middle + random.uniform(-_OFF_TRACK, _OFF_TRACK, 2)
-        pose = _resting_pose(robot, support, xy, random.uniform(-math.pi, math.pi))
+        heading = random.uniform(-math.pi, math.pi)
+        if faced is None:
+            along = random.uniform(0.0, 1.0)
+            middle = route.points[int(along * (len(route.points) - 1))]
+            xy = middle + random.uniform(-_OFF_TRACK, _OFF_TRACK, 2)
+        else:
+            distance = math.exp(random.uniform(math.log(_FACED_FROM), math.log(_FACED_TO)))
+            towards = np.array([math.cos(heading), math.sin(heading)])
+            xy = faced[random.integers(len(faced))] - distance * towards
+            heading += random.normal(0.0, _FACED_ASIDE)
+        pose = _resting_pose(robot, support, xy, heading)
         if pose is not None:
             return pose
     return None

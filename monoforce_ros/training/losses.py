@@ -54,7 +54,7 @@ class LossWeights:
 
     spread: float = 0.05
     """Of the likelihood of the heights' errors, which trains their spreads only."""
-    depth: float = 0.05
+    depth: float = 0.2
     """Of the depth along each pixel's ray that the lidar measured."""
     friction: float = 0.1
     """Of the logarithm of the friction, where it is known."""

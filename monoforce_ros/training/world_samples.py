@@ -32,7 +32,7 @@ from monoforce_ros.training.recording_samples import (
 
 FIRST_WORLD = 420_000
 """First seed of the worlds for training; docs/protocol.md lists the seeds of each purpose."""
-PLACES = 10
+PLACES = 16
 """Places of each world: the drawing of a world takes as long as seven images."""
 _HISTORY = 1
 
