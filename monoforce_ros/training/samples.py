@@ -137,8 +137,8 @@ class Augmentation:
 
 
 def _drawn_sensors(random: np.random.Generator) -> dict[str, Any]:
-    """Sensors of one sample: images in four of five, sweeps in three of five, never neither."""
-    kind = random.choice(["images", "both", "sweep"], p=[0.45, 0.35, 0.2])
+    """Sensors of one sample: images in six of seven, sweeps in four of nine, never neither."""
+    kind = random.choice(["images", "both", "sweep"], p=[0.55, 0.3, 0.15])
     share = {"images": 1.0, "both": 1.0, "sweep": -1.0}[str(kind)]
     return {
         "cameras": tuple(random.uniform(size=6)),
