@@ -85,8 +85,8 @@ def take_snapshots(
 ) -> WorldSnapshots:
     """Place the robot of a randomised world at random places and record its sensors.
 
-    Most places lie along the track and up to 1.5 m beside it, with any heading; the others face an obstacle. Fewer than ``count`` snapshots result where
-    a world has few places at which a robot can stand.
+    Most places lie along the track and up to 1.5 m beside it, with any heading; the others face an obstacle. Fewer than
+    ``count`` snapshots result where a world has few places at which a robot can stand.
 
     Args:
         settings: ranges that the world is drawn from.

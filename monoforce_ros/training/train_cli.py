@@ -245,15 +245,11 @@ def _adapt(options: argparse.Namespace) -> None:
         rate=options.rate if given[1] else defaults.rate, seed=options.seed, precision=options.precision,
     )  # fmt: skip
     with progress_bar(settings.steps, label="adapting", unit="step", quiet=options.quiet) as bar:
-        adapted = adapt(
-            encoder,
-            robot,
-            [part[0] for part in parts],
-            replay,
-            options.out,
-            settings,
-            lambda step, losses: bar.update() and None,
-        )
+
+        def advance(step: int, losses: dict[str, float]) -> None:
+            bar.update()
+
+        adapted = adapt(encoder, robot, [part[0] for part in parts], replay, options.out, settings, advance)
     result = compare(encoder, adapted, [part[1] for part in parts], judging)
     write_text(options.out / "adaptation.json", json.dumps(asdict(result), indent=1) + "\n")
     print(result.summary)
