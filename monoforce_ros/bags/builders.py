@@ -95,6 +95,15 @@ def twist_stamped(stamp: int, frame_id: str, linear_x: float, angular_z: float) 
     return _make("geometry_msgs/msg/TwistStamped", header=header(stamp, frame_id), twist=twist(linear_x, angular_z))
 
 
+def ackermann_drive(stamp: int, frame_id: str, speed: float, steering_angle: float) -> Message:
+    """``ackermann_msgs/AckermannDriveStamped``: forward speed [m/s] and steering angle [rad]."""
+    drive = _make(
+        "ackermann_msgs/msg/AckermannDrive", speed=speed, steering_angle=steering_angle, steering_angle_velocity=0.0,
+        acceleration=0.0, jerk=0.0,
+    )  # fmt: skip
+    return _make("ackermann_msgs/msg/AckermannDriveStamped", header=header(stamp, frame_id), drive=drive)
+
+
 def joint_state(stamp: int, names: Sequence[str], positions: Vector, velocities: Vector) -> Message:
     """``sensor_msgs/JointState`` [rad, rad/s]."""
     return _make(
