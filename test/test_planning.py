@@ -1,6 +1,7 @@
 """Candidates, their costs, occupancy, cost-to-go and selection."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -156,6 +157,18 @@ def test_unobserved_ground_has_a_cost(husky):
     found, _ = assessed(husky, terrain_of(np.zeros_like(X), observed=ahead), [[0.9, 0.0], [-0.9, 0.0], [0.0, 0.0]])
     assert float(found.terms["unobserved"][0]) > 0.5 and float(found.terms["unobserved"][1]) == 0.0
     assert float(found.terms["unobserved"][2]) == 0.0
+
+
+def test_ground_of_uncertain_height_is_unknown_by_degrees(husky):
+    def term(spread):
+        terrain = terrain_of(np.zeros_like(X), observed=torch.zeros(X.shape, dtype=torch.bool))
+        spreads = {name: torch.full_like(terrain.height, spread) for name in ("geometric_spread", "decrease_spread")}
+        found, _ = assessed(husky, replace(terrain, **spreads), [[0.9, 0.0]])
+        return float(found.terms["unobserved"][0])
+
+    terms = [term(spread) for spread in (0.005, 0.05, 0.1, 1.0)]
+    assert terms[0] < 1e-3 and terms[-1] > 0.8
+    assert all(first < second for first, second in pairwise(terms))
 
 
 def test_weights_and_limits_scale_the_terms(husky):

@@ -76,6 +76,19 @@ def test_the_interval_of_an_effect_adds_spread_and_an_exact_value_does_not(predi
     assert spread(unsure, prediction, twists, settings).along[-1] == pytest.approx(0.06, rel=0.4)
 
 
+def test_the_spread_of_a_maps_heights_adds_spread(predictor):
+    def with_heights(value):
+        prediction, twists = predicted(predictor, command=(0.6, 0.0))
+        spreads = {"geometric_spread": torch.full(X.shape, value), "decrease_spread": torch.zeros(X.shape)}
+        uncertain = replace(prediction, terrain=replace(prediction.terrain, **spreads))
+        return spread(predictor, uncertain, twists, EnsembleSettings(members=32, **NOTHING))
+
+    assert with_heights(0.0).up.max() < 1e-4
+    # A Laplace distribution with a mean absolute error of 3 cm; the robot averages over the ground under its wheels.
+    assert with_heights(0.03).up[-1] == pytest.approx(0.03 * np.sqrt(2.0), rel=0.5)
+    assert with_heights(0.06).up[-1] > 1.5 * with_heights(0.03).up[-1]
+
+
 def test_the_band_contains_members_of_another_seed(predictor):
     """About 90 % of the members drawn with another seed lie within the band."""
     prediction, twists = predicted(predictor, BUMPS)

@@ -15,6 +15,8 @@ from monoforce_ros.terrain import TerrainMap
 _GRAVITY = 9.81
 _FORCE_INTERVAL = 0.06
 """Time between the steps at which forces are evaluated [s]; short compared with the averaging below."""
+_LEAST_CLEARANCE = 0.05
+"""For tracked robots, whose belts reach as low as their hulls [m]: half the resolution of the encoder's map."""
 _SMOOTHED = 0.2
 """Averaging time of forces [s]: a bouncing tyre does not count as an unloaded wheel."""
 
@@ -143,7 +145,7 @@ def assess(
         "wheel_load": _load_loss(contact.sides, step),
         "slip": _slip(rollout, robot, twists),
         "effort": _effort(contact.traction, robot, twists[:, :: rollout.force_every]) / weight,
-        "unobserved": _unobserved(rollout, terrain),
+        "unobserved": _unobserved(rollout, terrain, robot),
         "collision": _push(contact.push, step) / weight,
     }
     terms = {name: torch.nan_to_num(raw[name] / getattr(limits, name), nan=torch.inf) for name in TERMS}
@@ -183,18 +185,34 @@ def _effort(traction: Tensor, robot: RobotModel, twists: Tensor) -> Tensor:
     return (traction * speed).sum(dim=2).abs().mean(dim=1)
 
 
-def _unobserved(rollout: Rollout, terrain: TerrainMap) -> Tensor:
-    """Share of the path over cells without a measurement nearby, or off the map ``[N]``."""
+def _unobserved(rollout: Rollout, terrain: TerrainMap, robot: RobotModel) -> Tensor:
+    """Share of the path over unknown ground ``[N]``, from 0 to 1.
+
+    Off the map ground is unknown. Where the map tells the spread of its heights, a cell is unknown to the degree that
+    its height may be off by more than the clearance below the hull: the probability of that for a Laplace distribution.
+    Elsewhere cells without a measurement nearby are.
+    """
     grid = terrain.grid
     place = rollout.position.detach()[..., :2]
     column = ((place[..., 0] - grid.origin[0]) / grid.resolution).round().clamp(0, grid.columns - 1).nan_to_num(0.0)
     row = ((place[..., 1] - grid.origin[1]) / grid.resolution).round().clamp(0, grid.rows - 1).nan_to_num(0.0)
-    nearby = torch.from_numpy(terrain.measured_nearby()).to(place.device)
-    known = nearby[row.long(), column.long()] & rollout.inside
+    if terrain.height_spread is None:
+        unknown = 1.0 - torch.from_numpy(terrain.measured_nearby()).to(place)
+    else:
+        unknown = torch.exp(-_hull_clearance(robot) / terrain.height_spread.to(place).clamp_min(1e-4))
+    degree = torch.where(rollout.inside, unknown[row.long(), column.long()], 1.0)
     distance = (place - place[:, :1]).norm(dim=-1)
     # No sensor sees the ground below the robot, but it is known to support it.
     moved = distance > 1.0
-    return ((~known) & moved).sum(dim=1) / moved.sum(dim=1).clamp_min(1)
+    return (degree * moved).sum(dim=1) / moved.sum(dim=1).clamp_min(1)
+
+
+def _hull_clearance(robot: RobotModel) -> float:
+    """Height of the hull's lowest point above the lowest driven one [m], at least :data:`_LEAST_CLEARANCE`."""
+    driven = robot.point_drives >= 0
+    if bool(driven.all()):
+        return _LEAST_CLEARANCE
+    return max(float(robot.points[~driven][:, 2].min() - robot.points[driven][:, 2].min()), _LEAST_CLEARANCE)
 
 
 def _push(push: Tensor, step: float) -> Tensor:

@@ -6,16 +6,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from scipy.ndimage import gaussian_filter
 
 from monoforce_ros.core import wrap_angle
 from monoforce_ros.physics import State
 from monoforce_ros.prediction.predictor import Prediction, Predictor, start_states
 from monoforce_ros.robots import RobotModel
+from monoforce_ros.terrain import TerrainMap
 
 COVERAGE = 0.9
 """Share of outcomes that the band should contain."""
 _RAYLEIGH = float(np.sqrt(-2.0 * np.log(1.0 - COVERAGE)))
 """Radius, in standard deviations of each axis, that contains this share of a normal distribution in two dimensions."""
+
+_HALF_WIDTH = float(2.0 * np.sqrt(np.log(2.0)))
+"""Lag at which the correlation of white noise after a Gaussian filter has fallen to a half, in the filter's widths."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +42,9 @@ class EnsembleSettings:
     drift: float = 0.08
     """Of the position along and across the heading, per metre driven [-]; covers the remaining errors of maps and
     physics, and was measured on synthetic recordings with a lidar (benchmarks/uncertainty.py)."""
+    correlation_length: float = 1.6
+    """Distance within which the correlation of errors of predicted heights falls to a half [m], measured by
+    benchmarks/terrain_errors.py; only for maps that tell the spread of their heights."""
     position: float = 0.05
     """Of the position at any time [m]: odometry is noisy, and a wheel may or may not slip off the edge of a stone."""
     scale: float = 1.4
@@ -54,6 +62,7 @@ class EnsembleSettings:
             ("gain", 1.0),
             ("drift", 1.0),
             ("position", 1.0),
+            ("correlation_length", 10.0),
         ):
             if not 0.0 <= getattr(self, name) <= high:
                 raise ValueError(f"ensemble {name}: got {getattr(self, name)}, expected 0 to {high:g}")
@@ -82,8 +91,9 @@ class Spread:
 def spread(predictor: Predictor, prediction: Prediction, twists: np.ndarray, settings: EnsembleSettings) -> Spread:
     """Uncertainty of a prediction, from a batch of variants rolled out on its map.
 
-    The members vary friction, initial velocities and heading, the gain of each side's drives, and each parameter of the
-    robot's effects within its confidence interval. They are the same in each call, so that bands do not flicker.
+    The members vary friction, initial velocities and heading, the gain of each side's drives, each parameter of the
+    robot's effects within its confidence interval, and heights whose spread the map tells. They are the same in each
+    call, so that bands do not flicker.
 
     Args:
         predictor: robot and physics of the rollouts.
@@ -100,7 +110,7 @@ def spread(predictor: Predictor, prediction: Prediction, twists: np.ndarray, set
     robot = _varied_robot(predictor.robot, drawn, settings)
     motions = [prediction.motion] * count
     start = _varied_start(start_states([prediction.motion]), drawn, settings)
-    terrain = prediction.terrain
+    terrain = _varied_terrain(prediction.terrain, count, settings)
     commands = torch.as_tensor(twists, dtype=torch.float32).expand(count, -1, -1)
     with torch.no_grad():
         rolled = predictor.differentiable_roll_out(
@@ -155,6 +165,25 @@ def _varied_start(state: State, drawn: torch.Tensor, settings: EnsembleSettings)
         angular_velocity=(turn @ state.angular_velocity[0])
         + settings.yaw_rate * drawn[:, 4:5] * torch.tensor([0.0, 0.0, 1.0]),
     )
+
+
+def _varied_terrain(terrain: TerrainMap, count: int, settings: EnsembleSettings) -> TerrainMap:
+    """One map for each member, whose heights differ by smooth random fields; the map itself if it tells no spread."""
+    scale = terrain.height_spread
+    if scale is None:
+        return terrain
+    random = np.random.default_rng(settings.seed + 2)
+    sigma = settings.correlation_length / terrain.grid.resolution / _HALF_WIDTH
+    fields = []
+    for _ in range((count + 1) // 2):
+        noise = gaussian_filter(random.standard_normal(terrain.height.shape), sigma, mode="wrap")
+        fields += [noise / noise.std()]
+    drawn = torch.from_numpy(np.stack([*fields, *(-field for field in fields)])[:count]).to(terrain.height)
+    # The standard deviation of a Laplace distribution is √2 times its scale.
+    change = np.sqrt(2.0) * scale * drawn
+    maps = [replace(terrain, height=terrain.height + entry, geometric_height=terrain.geometric_height + entry)
+            for entry in change]  # fmt: skip
+    return TerrainMap.stack(maps)
 
 
 def _varied_robot(robot: RobotModel, drawn: torch.Tensor, settings: EnsembleSettings) -> RobotModel:

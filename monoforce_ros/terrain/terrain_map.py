@@ -142,6 +142,13 @@ class TerrainMap:
         return tuple(name for name in SPREADS if getattr(self, name) is not None)
 
     @property
+    def height_spread(self) -> Tensor | None:
+        """Expected absolute error of ``height`` [m], those of its two parts taken as independent; None if unknown."""
+        if self.geometric_spread is None or self.decrease_spread is None:
+            return self.geometric_spread
+        return torch.hypot(self.geometric_spread, self.decrease_spread)
+
+    @property
     def batch_size(self) -> int | None:
         """Number of maps in the batch; None for a single map."""
         return self.height.shape[0] if self.height.ndim == 3 else None
