@@ -14,20 +14,13 @@ mkdir -p "$worlds" out/encoders models
 run() { scripts/run.sh "$@"; }
 
 if [ "$target" = checkpoint ]; then
-  # Images and sweeps of randomised worlds with the simulator's surfaces as targets. The second training weighs the
-  # visible surface and obstacles more: walls cover few cells.
-  shipped() { # name, steps, options
-    local out=out/encoders/$1 steps=$2
-    shift 2
-    [ -f "$out/training.json" ] && return
-    run train --worlds 119 --samples "$worlds/randomised" --out "$out" --steps "$steps" --sensor camera_lidar --no-edges \
-      --losses geometric terrain --no-vegetation --precision bfloat16 --threads 1 "$@"
-  }
-  shipped general 1800 --validate-every 300
-  shipped shipped 700 --start-from out/encoders/general/encoder.safetensors --rate 0.0012 --geometric 3 --prominence 8 \
-    --validate-every 350 --seed 2
+  # Images and sweeps of randomised worlds with the simulator's surfaces as targets. Walls cover few cells and weigh more.
+  out=out/encoders/shipped
+  [ -f "$out/training.json" ] || run train --worlds 200 --samples "$worlds/randomised" --out "$out" --steps 2200 \
+    --sensor camera_lidar --no-edges --losses geometric terrain --no-vegetation --geometric 2 --prominence 5 \
+    --precision bfloat16 --threads 1 --validate-every 550
   for ending in safetensors json; do
-    cp "out/encoders/shipped/encoder.$ending" "models/.terrain_encoder.$ending"
+    cp "$out/encoder.$ending" "models/.terrain_encoder.$ending"
     mv "models/.terrain_encoder.$ending" "models/terrain_encoder.$ending"
   done
   ls -l models

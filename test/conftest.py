@@ -79,7 +79,12 @@ class Process:
         try:
             return self._process.wait(timeout=20)
         except subprocess.TimeoutExpired:
-            self._process.kill()
+            # Where each thread hangs: see PYTHONFAULTHANDLER below.
+            self._process.send_signal(signal.SIGABRT)
+            try:
+                self._process.wait(timeout=5)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
             pytest.fail(f"the process did not end on signal {how}; it printed:\n{self.output}")
 
 
