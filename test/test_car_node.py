@@ -1,9 +1,11 @@
-"""The installed predictor with a car: steering commands as cars take them."""
+"""The installed predictor with steered robots: steering angles, and commands to move sideways."""
 
 from itertools import pairwise
 
 import numpy as np
 import pytest
+import yaml
+from test_steering import rover
 
 from monoforce_ros.bags import builders
 from monoforce_ros.messages import message_class
@@ -56,3 +58,29 @@ def test_steering_commands_bend_the_path_as_a_bicycle(peer, predictor):
     drive(peer, 1.0, lambda stamp: builders.ackermann_drive(stamp, "base_link", SPEED, float("nan")))
     level, text = peer.status("commands")
     assert level == ERROR and "got speed 1.0, steering angle nan; expected finite numbers" in text
+
+
+def test_a_rover_that_crabs_is_predicted_to_move_sideways(peer, start, tmp_path):
+    (tmp_path / "rover.yaml").write_text(yaml.safe_dump(rover()))
+    process = start(
+        "predictor", "--ros-args", "-p", f"robot:={tmp_path}/rover.yaml", "-p", "terrain_source:=flat", "-p",
+        "horizon:=2.0", "-r", "__node:=crabbing", "-p", "candidates:=8",
+    )  # fmt: skip
+    process.wait_for("predicting 2 s ahead for rover")
+
+    def sideways(stamp):
+        message = builders.twist_stamped(stamp, "base_link", 0.3, 0.0)
+        message.twist.linear.y = 0.3
+        return message
+
+    peer.begin()
+    for _ in range(10):
+        peer.drive(1.0, cloud=lambda stamp: None, command=sideways)
+        if len(peer.received["/predicted/path"]) > 5:
+            break
+    poses = peer.received["/predicted/path"][-1].poses
+    moved = [getattr(poses[-1].pose.position, axis) - getattr(poses[0].pose.position, axis) for axis in "xy"]
+    # The wheels first turn by 45°.
+    assert moved[1] > 0.35, (moved, peer.status("commands"), process.output[-1500:])
+    assert moved[0] == pytest.approx(moved[1], abs=0.15)
+    assert process.stop() == 0

@@ -211,12 +211,12 @@ class WheelTrack:
 
 @dataclass(frozen=True)
 class CommandTrack:
-    """Commanded forward speed and yaw rate over time; each command holds until the next."""
+    """Commanded motion over time; each command holds until the next."""
 
     stamps: np.ndarray
     """``[n]`` int64 [ns], increasing."""
     twists: np.ndarray
-    """``[n, 2]`` forward speed [m/s], yaw rate [rad/s]."""
+    """``[n, 2]`` forward speed [m/s], yaw rate [rad/s]; ``[n, 3]`` with the lateral speed [m/s] of robots that crab."""
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -229,11 +229,11 @@ class CommandTrack:
             timeout: age [s] after which a command expires and zero velocity is assumed.
 
         Returns:
-            ``[..., 2]``; zero before the first command.
+            ``[..., 2]`` or ``[..., 3]``; zero before the first command.
         """
         stamps = np.asarray(stamps, np.int64)
         if not len(self):
-            return np.zeros((*stamps.shape, 2))
+            return np.zeros((*stamps.shape, self.twists.shape[-1]))
         index = np.searchsorted(self.stamps, stamps, side="right") - 1
         latest = self.twists[np.maximum(index, 0)]
         age = (stamps - self.stamps[np.maximum(index, 0)]) * NANOSECOND

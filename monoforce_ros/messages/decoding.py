@@ -286,12 +286,18 @@ def decode_ackermann(message: Any, wheelbase: float) -> np.ndarray:
     return np.array([speed, speed * np.tan(angle) / wheelbase])
 
 
-def decode_command(message: Any) -> np.ndarray:
-    """``geometry_msgs/Twist`` or ``TwistStamped`` → forward speed [m/s] and yaw rate [rad/s], ``[2]``."""
+def decode_command(message: Any, *, lateral: bool = False) -> np.ndarray:
+    """``geometry_msgs/Twist`` or ``TwistStamped`` → forward speed [m/s] and yaw rate [rad/s], ``[2]``.
+
+    With ``lateral``, for robots that move sideways, the speed to the left [m/s] follows, ``[3]``.
+    """
     twist = getattr(message, "twist", message)
-    command = np.array([twist.linear.x, twist.angular.z], float)
+    command = np.array([twist.linear.x, twist.angular.z, *([twist.linear.y] if lateral else [])], float)
     if not np.isfinite(command).all():
-        raise MessageError(f"command: got forward speed {command[0]}, yaw rate {command[1]}; expected finite numbers")
+        sideways = f", lateral speed {command[2]}" if lateral else ""
+        raise MessageError(
+            f"command: got forward speed {command[0]}, yaw rate {command[1]}{sideways}; expected finite numbers"
+        )
     return command
 
 

@@ -115,7 +115,8 @@ class CandidateOutput:
         delay = min(round(settings.candidate_delay / self._predictor.options.time_step), self._predictor.steps - 1)
         start, steps = self._predictor.history + delay, self._predictor.steps - delay
         stamps = self._predictor.command_stamps(prediction.stamp)[:start]
-        before = commands.sample(stamps, timeout=settings.command_timeout)
+        # Candidates have no lateral speed.
+        before = commands.sample(stamps, timeout=settings.command_timeout)[:, :2]
         twists = over_horizon(sequences, before, steps)
         rollout, assessment = self._assess(prediction, twists)
         if settings.refine_seconds and assessment.best is not None:

@@ -40,16 +40,26 @@ class Inputs:
         sensors: topics whose newest message is kept.
         slop: largest difference between the stamps of one set of sensor messages [s].
         patience: how long a set waits for a silent sensor [s].
+        command_width: numbers of a command: 2, or 3 with a lateral speed.
         on_time_jump: called after a backward time jump, when all data have been discarded, with the topic and the size
             of the jump [s].
     """
 
-    def __init__(self, sensors: list[str], *, slop: float, patience: float, on_time_jump: Callable[[str, float], None]):
+    def __init__(
+        self,
+        sensors: list[str],
+        *,
+        slop: float,
+        patience: float,
+        on_time_jump: Callable[[str, float], None],
+        command_width: int = 2,
+    ):
         self.changed = threading.Condition()
         self._sensors = sensors
         self._slop = slop
         self._patience = patience
         self._on_time_jump = on_time_jump
+        self._command_width = command_width
         self._last_stamps: dict[str, int] = {}
         self.frame_id = ""
         self.child_frame_id = ""
@@ -200,5 +210,5 @@ class Inputs:
             commands = list(self._commands)
         return CommandTrack(
             stamps=np.array([stamp for stamp, _ in commands], np.int64),
-            twists=np.array([twist for _, twist in commands]).reshape(-1, 2),
+            twists=np.array([twist for _, twist in commands]).reshape(-1, self._command_width),
         )

@@ -107,6 +107,7 @@ class PredictorNode(ManagedNode):
             slop=settings.camera_slop,
             patience=settings.data_timeout,
             on_time_jump=self._on_time_jump,
+            command_width=3 if self._crabs else 2,
         )
         self.joints: JointInput | None = None
         if self.robot.joints:
@@ -244,6 +245,11 @@ class PredictorNode(ManagedNode):
                 self.decoder.add_camera(part, info.topic)
                 self._subscriptions_by_part[f"{part} info"] = info
 
+    @property
+    def _crabs(self) -> bool:
+        """Whether the robot can move sideways."""
+        return self.robot.steered is not None and self.robot.steered.crabs
+
     def _command_types(self) -> dict[str, type]:
         types: dict[str, type] = {"geometry_msgs/msg/TwistStamped": TwistStamped, "geometry_msgs/msg/Twist": Twist}
         if self.robot.steered is not None:
@@ -276,8 +282,9 @@ class PredictorNode(ManagedNode):
         try:
             if hasattr(message, "drive") and self.robot.steered is not None:
                 twist = decoding.decode_ackermann(message, self.robot.steered.wheelbase)
+                twist = np.append(twist, 0.0) if self._crabs else twist
             else:
-                twist = decoding.decode_command(message)
+                twist = decoding.decode_command(message, lateral=self._crabs)
         except decoding.MessageError as error:
             self.health.report("commands", ERROR, str(error), reason="unusable")
             return
