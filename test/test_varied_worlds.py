@@ -202,11 +202,22 @@ def test_obstacles_are_not_always_off_the_track():
     assert min(distances) < 0.8
 
 
+def test_the_style_site_is_nearly_level_and_has_walls():
+    rises = []
+    for seed in range(4):
+        world = draw_world(WorldSettings.of_style("site"), seed)
+        assert sum(thing.kind == "wall" for thing in world.scenery.obstacles) >= 1
+        points = world.scenery.route.points
+        heights = world.scenery.ground.height_at(points)
+        rises.append(float(np.abs(heights - heights.mean()).max()))
+    assert np.median(rises) < 0.6
+
+
 def test_the_style_textures_has_no_natural_surface():
     settings = WorldSettings.of_style("textures")
     world = draw_world(settings, 3)
     assert {area.look for area in world.scenery.appearance.areas.areas} == {"odd"}
-    with pytest.raises(ValueError, match="style: got 'dreams', expected one of varied, textures"):
+    with pytest.raises(ValueError, match="style: got 'dreams', expected one of varied, textures, site"):
         WorldSettings.of_style("dreams")
 
 

@@ -34,20 +34,21 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--duration", type=float, default=10.0, metavar="SECONDS", help="(%(default)s)")
     parser.add_argument(
         "--style",
-        choices=("nature", "varied", "textures"),
+        choices=("nature", "varied", "textures", "site"),
         default="nature",
         help="nature: one kind of landscape; varied: everything is drawn from wide ranges, for training; textures: as "
-        "varied, with random patterns on every surface (%(default)s)",
+        "varied, with random patterns on every surface; site: as varied, nearly level, with more walls and things "
+        "(%(default)s)",
     )
     parser.add_argument(
         "--set",
         action="append",
         default=[],
         metavar="GROUP.SETTING=VALUE|LOW..HIGH|NAMES",
-        help="narrow a setting of varied or textures, such as vegetation.height=0.2..0.5; repeatable; `--set list` "
-        "lists all settings with their ranges",
+        help="narrow a setting of a style other than nature, such as vegetation.height=0.2..0.5; repeatable; "
+        "`--set list` lists all settings with their ranges",
     )
-    parser.add_argument("--robot", metavar="NAME|FILE.yaml", help="(husky; drawn by varied and textures)")
+    parser.add_argument("--robot", metavar="NAME|FILE.yaml", help="(husky; drawn by all styles but nature)")
     parser.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap", help="(%(default)s)")
     parser.add_argument("--camera", metavar="WIDTHxHEIGHT|none", help="(320x240; drawn by varied and textures)")
     parser.add_argument(

@@ -30,6 +30,7 @@ from monoforce_ros.encoder import (
 )
 from monoforce_ros.reporting import progress, progress_bar
 from monoforce_ros.robots import RobotFileError, RobotModel, fingerprint, load_robot, shipped_robots, write_robot
+from monoforce_ros.synthetic import STYLES
 from monoforce_ros.training.adaptation import REPLAY_WORLDS, AdaptationSettings, adapt, compare, split_recording
 from monoforce_ros.training.judgement import CAMERAS, SWEEP, calibrated
 from monoforce_ros.training.losses import LossWeights
@@ -37,7 +38,7 @@ from monoforce_ros.training.recording_samples import RecordingSamples, SamplesEr
 from monoforce_ros.training.sample_extraction import SampleSettings, extract_samples
 from monoforce_ros.training.trainer import Process, Trainer, TrainingError, TrainingSettings, describe
 from monoforce_ros.training.vegetation_fit import EFFECT, fit_vegetation
-from monoforce_ros.training.world_samples import FIRST_WORLD, world_samples
+from monoforce_ros.training.world_samples import FIRST_WORLD, WORLD_STYLES, world_samples, world_settings
 
 _HELD_OUT_WORLDS = 430_000
 
@@ -87,6 +88,9 @@ def build_parser() -> argparse.ArgumentParser:
                         "the simulator's surfaces as targets (default: %(default)s)")  # fmt: skip
     parser.add_argument("--world-seed", type=int, default=FIRST_WORLD, metavar="SEED", help="of the first world "
                         "(default: %(default)s)")  # fmt: skip
+    parser.add_argument("--world-styles", nargs="+", choices=sorted(STYLES), default=list(WORLD_STYLES),
+                        metavar="STYLE", help=f"styles that alternate, of {', '.join(sorted(STYLES))} (default: "
+                        f"{' '.join(WORLD_STYLES)})")  # fmt: skip
     parser.add_argument("--robot", default="husky", help=f"robot file or one of {', '.join(shipped_robots())}")
     parser.add_argument("--samples", type=Path, metavar="DIR", help="folder for the samples extracted from the bags "
                         "(default: OUT/samples)")  # fmt: skip
@@ -337,7 +341,8 @@ def _world_samples(seeds: Sequence[int], config: EncoderConfig, options: argpars
     found = []
     for seed in progress(seeds, label="worlds", unit="world", quiet=options.quiet or not seeds):
         try:
-            found.append(read_samples(world_samples(seed, config, folder)))
+            settings = world_settings(seed, options.world_styles)
+            found.append(read_samples(world_samples(seed, config, folder, settings=settings)))
         except SamplesError as error:
             print(f"left out: {error}", file=sys.stderr)
     return found

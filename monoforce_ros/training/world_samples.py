@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -34,6 +35,8 @@ FIRST_WORLD = 420_000
 """First seed of the worlds for training; docs/protocol.md lists the seeds of each purpose."""
 PLACES = 16
 """Places of each world: the drawing of a world takes as long as seven images."""
+WORLD_STYLES = ("varied", "site")
+"""Rough country alone teaches little of walls: on level ground their feet tell how far away they are."""
 _HISTORY = 1
 
 
@@ -42,17 +45,24 @@ def world_samples(
 ) -> Path:
     """Write the samples of a randomised world, unless there is a file of the same seed and settings; return its path.
 
+    Settings are those of :func:`world_settings` by default.
+
     Raises:
         SamplesError: the robot cannot stand anywhere in this world.
         DrawingError: no graphics library can render images.
     """
-    settings = settings or WorldSettings()
+    settings = settings or world_settings(seed)
     content = [SAMPLES_VERSION, places, asdict(settings), config.image_width, config.image_height]
     digest = hashlib.sha256(json.dumps(content, default=str).encode()).hexdigest()[:8]
     file = folder / f"world-{seed}-{digest}.safetensors"
     if not file.is_file():
         save_samples(_samples(take_snapshots(settings, seed, places), f"world {seed}", config), file)
     return file
+
+
+def world_settings(seed: int, styles: Sequence[str] = WORLD_STYLES) -> WorldSettings:
+    """Settings of a world for training; styles alternate with the seed."""
+    return WorldSettings.of_style(styles[seed % len(styles)])
 
 
 def _samples(world: WorldSnapshots, name: str, config: EncoderConfig) -> RecordingSamples:

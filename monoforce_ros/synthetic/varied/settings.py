@@ -367,5 +367,33 @@ STYLES: dict[str, WorldSettings] = {
         palette=PaletteSettings(natural=Uniform(0.0, 0.0), textures=Uniform(1.0, 1.0)),
         ground=GroundSettings(kind=Choice(("odd",)), patch_kind=Choice(("odd",))),
     ),
+    # Yards, lawns and car parks: nearly level, with more walls and things, and less vegetation.
+    "site": WorldSettings(
+        style="site",
+        terrain=TerrainShapeSettings(
+            hill_height=LogUniform(0.005, 0.08),
+            bumps=LogUniform(0.002, 0.02),
+            roughness=LogUniform(0.0005, 0.005),
+            slope=Uniform(0.0, 3.0 * DEGREE),
+            banks=Whole(0, 1),
+            ditches=Whole(0, 1),
+            steps=Whole(0, 2),
+            ramps=Whole(0, 1),
+            stairs=Whole(0, 1),
+            rim=Uniform(0.0, 0.3),
+        ),
+        vegetation=VegetationSettings(any=Chance(0.5), coverage=LogUniform(0.01, 0.2), hidden_rocks=Whole(0, 2)),
+        obstacles=ObstacleSettings(
+            boulders=Whole(0, 8),
+            stones=Whole(0, 10),
+            walls=Whole(2, 12),
+            kerbs=Whole(0, 6),
+            fences=Whole(0, 4),
+            posts=Whole(2, 18),
+            trees=Whole(0, 14),
+            boxes=Whole(0, 12),
+            vehicles=Whole(0, 3),
+        ),
+    ),
 }
 """Settings by style. The style ``nature`` is the world of ``build_scenery``, whose seeds published tables rest on."""
