@@ -396,6 +396,22 @@ def test_training_improves_on_the_ground_that_carries_the_robot(recording, husky
     assert validate(encoder, [recording], torch.device("cpu")).loss < 0.8 * before.loss
 
 
+@pytest.mark.parametrize(("part", "early", "late"), [("none", False, False), ("late", False, True), ("all", True, True)])
+def test_the_chosen_part_of_the_backbone_is_trained(recording, husky, tmp_path, one_thread, part, early, late):
+    torch.manual_seed(0)
+    encoder = new_encoder(TINY)
+    before = {name: value.clone() for name, value in encoder.backbone.state_dict().items()}
+    settings = TrainingSettings(steps=2, batch=2, backbone=part, weights=LossWeights(trajectory=0.0), warm_up=1)
+    Trainer(encoder, husky, [recording], [], tmp_path, settings, Process("cpu")).run()
+    after = encoder.backbone.state_dict()
+    changed = {name for name, value in after.items() if not torch.equal(value, before[name])}
+    assert any(name.startswith("stem") for name in changed) == early
+    assert ("blocks.10.project.conv.weight" in changed) == late
+    assert any("running_mean" in name for name in changed) == (part == "all")
+    with pytest.raises(ValueError, match="training backbone: got 'some', expected one of none, late, all"):
+        TrainingSettings(backbone="some")
+
+
 def test_a_training_writes_a_log_and_a_checkpoint_that_loads(trained):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 

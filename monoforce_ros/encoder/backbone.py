@@ -45,6 +45,11 @@ class Backbone(nn.Module):
                 inputs = outputs
         self.blocks = nn.ModuleList(blocks)
 
+    @property
+    def early(self) -> list[nn.Module]:
+        """The stages up to stride 8: edges, colours and textures."""
+        return [self.stem, *self.blocks[:_FINE_BLOCKS]]
+
     @override
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
         features = self.stem(images)

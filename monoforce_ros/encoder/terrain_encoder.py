@@ -60,13 +60,16 @@ class TerrainEncoder(nn.Module):
         self.register_buffer("depths", depths, persistent=False)
         self.backbone_frozen = False
 
-    def freeze_backbone(self) -> None:
-        """Keep the backbone and the statistics of its norms as they are.
+    def freeze_backbone(self, *, early_only: bool = False) -> None:
+        """Keep the backbone, or its early stages, and the statistics of its norms as they are.
 
         ImageNet's features hold for photographs; trained on rendered images alone, they would not.
         """
         self.backbone_frozen = True
-        self.backbone.requires_grad_(False).eval()
+        frozen = self.backbone.early if early_only else [self.backbone]
+        for part in frozen:
+            part.requires_grad_(False)
+        self.backbone.eval()
 
     @override
     def train(self, mode: bool = True) -> TerrainEncoder:

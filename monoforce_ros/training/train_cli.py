@@ -36,7 +36,14 @@ from monoforce_ros.training.judgement import CAMERAS, SWEEP, calibrated
 from monoforce_ros.training.losses import LossWeights
 from monoforce_ros.training.recording_samples import RecordingSamples, SamplesError, read_samples
 from monoforce_ros.training.sample_extraction import SampleSettings, extract_samples
-from monoforce_ros.training.trainer import Process, Trainer, TrainingError, TrainingSettings, describe
+from monoforce_ros.training.trainer import (
+    BACKBONE_PARTS,
+    Process,
+    Trainer,
+    TrainingError,
+    TrainingSettings,
+    describe,
+)
 from monoforce_ros.training.vegetation_fit import EFFECT, fit_vegetation
 from monoforce_ros.training.world_samples import FIRST_WORLD, WORLD_STYLES, world_samples, world_settings
 
@@ -132,8 +139,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--start-from", type=Path, metavar="FILE.safetensors", help="checkpoint to fine-tune")
     parser.add_argument("--backbone-weights", choices=("imagenet", "random"), default="imagenet", help="initial "
                         "weights of the backbone (default: %(default)s)")  # fmt: skip
-    parser.add_argument("--train-backbone", action="store_true", help="also train the backbone, whose ImageNet weights "
-                        "are kept by default")  # fmt: skip
+    parser.add_argument("--train-backbone", choices=BACKBONE_PARTS, default="none", help="part of the backbone that is "
+                        "trained, too; late: its stages at stride 16 (default: %(default)s)")  # fmt: skip
     parser.add_argument("--validate-every", type=int, default=TrainingSettings.validate_every, metavar="STEPS",
                         help="(default: %(default)s)")  # fmt: skip
     parser.add_argument("--save-every", type=int, default=TrainingSettings.save_every, metavar="STEPS",
@@ -330,7 +337,7 @@ def _settings(options: argparse.Namespace) -> TrainingSettings:
     return TrainingSettings(
         steps=options.steps, batch=options.batch, rate=options.rate,
         weights=LossWeights(**weights, prominence=options.prominence), seed=options.seed,
-        augment=not options.no_augmentation, freeze_backbone=not options.train_backbone,
+        augment=not options.no_augmentation, backbone=options.train_backbone,
         validate_every=options.validate_every, save_every=options.save_every, precision=options.precision,
     )  # fmt: skip
 

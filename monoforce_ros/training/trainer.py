@@ -47,6 +47,9 @@ from monoforce_ros.training.losses import (
 from monoforce_ros.training.recording_samples import RecordingSamples
 from monoforce_ros.training.samples import Augmentation, Targets, sample
 
+BACKBONE_PARTS = ("none", "late", "all")
+"""Parts of the backbone that can be trained; ``late``: the stages at stride 16. Norms are trained with ``all`` only."""
+
 
 @dataclass(frozen=True)
 class TrainingSettings:
@@ -63,8 +66,8 @@ class TrainingSettings:
     seed: int = 1
     augment: bool = True
     """Whether to augment samples (mirror, rotate, crop, change colours)."""
-    freeze_backbone: bool = True
-    """Whether the backbone keeps its ImageNet weights, which hold for photographs."""
+    backbone: str = "none"
+    """Part of the backbone that is trained, of :data:`BACKBONE_PARTS`: its ImageNet weights hold for photographs."""
     validate_every: int = 250
     save_every: int = 50
     precision: str = "auto"
@@ -77,6 +80,8 @@ class TrainingSettings:
         ):  # fmt: skip
             if not low <= getattr(self, name) <= high:
                 raise ValueError(f"training {name}: got {getattr(self, name)}, expected {low:g} to {high:g}")
+        if self.backbone not in BACKBONE_PARTS:
+            raise ValueError(f"training backbone: got {self.backbone!r}, expected one of {', '.join(BACKBONE_PARTS)}")
         if self.precision not in ("auto", "float32", "bfloat16"):
             raise ValueError(f"training precision: got {self.precision!r}, expected auto, float32 or bfloat16")
 
@@ -196,8 +201,8 @@ class Trainer:
         self.index = [(r, i) for r, recording in enumerate(self.recordings) for i in range(len(recording))]
         if not self.index:
             raise TrainingError("no samples to train on")
-        if isinstance(encoder, TerrainEncoder) and settings.freeze_backbone:
-            encoder.freeze_backbone()
+        if isinstance(encoder, TerrainEncoder) and settings.backbone != "all":
+            encoder.freeze_backbone(early_only=settings.backbone == "late")
         losses = _Losses(self.encoder, robot, settings.weights)
         self.losses: nn.Module = losses
         if process.count > 1:
