@@ -396,7 +396,9 @@ def test_training_improves_on_the_ground_that_carries_the_robot(recording, husky
     assert validate(encoder, [recording], torch.device("cpu")).loss < 0.8 * before.loss
 
 
-@pytest.mark.parametrize(("part", "early", "late"), [("none", False, False), ("late", False, True), ("all", True, True)])
+@pytest.mark.parametrize(
+    ("part", "early", "late"), [("none", False, False), ("late", False, True), ("all", True, True)]
+)
 def test_the_chosen_part_of_the_backbone_is_trained(recording, husky, tmp_path, one_thread, part, early, late):
     torch.manual_seed(0)
     encoder = new_encoder(TINY)

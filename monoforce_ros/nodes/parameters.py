@@ -101,6 +101,8 @@ def _declare(
         raise ValueError(f"parameter {name}: {error}; expected {expected} {entry.unit}".rstrip()) from error
     if entry.size and value is not None and len(value) != entry.size:
         raise ValueError(f"parameter {name}: got {len(value)} values, expected {entry.expected}")
+    if entry.name.endswith("_topic") and entry.default and value == "":
+        raise ValueError(f"parameter {name}: got an empty name, expected a topic such as {entry.default!r}")
     if entry.choices and value is not None and value not in entry.choices:
         raise ValueError(f"parameter {name}: got {value!r}, expected one of {list(entry.choices)}")
     return value

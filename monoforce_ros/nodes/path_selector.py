@@ -27,6 +27,8 @@ from monoforce_ros.planning import CostToGo, SelectionWeights, cost_to_go, plan_
 
 PART = "choice"
 DISTANCE = "distance to the goal [m]"
+_BASE_FRAME = "base_link"
+"""Of REP 105; used unless the parameter names another one."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,7 @@ class PathSelectorNode(Node):
             settings.weight_change,
         )
         self.frames = RobotFrames(
-            settings.base_frame,
+            settings.base_frame or _BASE_FRAME,
             odometry_child_pose=pose_matrix(settings.odometry_child_pose) if settings.odometry_child_pose else None,
         )
         self.health = Health(self, ["odometry", "candidates", PART])
@@ -92,7 +94,7 @@ class PathSelectorNode(Node):
         self._inputs = {
             "odometry": self._subscribe(settings.odometry_topic, "nav_msgs/msg/Odometry", Odometry, self._on_odometry),
             "candidates": self._subscribe(
-                settings.candidate_topic, "sensor_msgs/msg/PointCloud2", PointCloud2, self._on_candidates
+                settings.candidate_cost_topic, "sensor_msgs/msg/PointCloud2", PointCloud2, self._on_candidates
             ),
             "occupancy": self._subscribe(
                 settings.occupancy_topic, "nav_msgs/msg/OccupancyGrid", OccupancyGrid, self._on_occupancy
@@ -198,7 +200,7 @@ class PathSelectorNode(Node):
             return
         self._last_command = command or (0.0, 0.0)
         self._moving = command is not None or self._course is not None
-        self._commands.publish(*self._last_command, self._base_name or self.settings.base_frame)
+        self._commands.publish(*self._last_command, self._base_name or self.settings.base_frame or _BASE_FRAME)
 
     def _command(self) -> tuple[float, float] | None:
         """Speed [m/s] and yaw rate [rad/s] to publish; None to stop."""
