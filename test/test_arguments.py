@@ -98,3 +98,20 @@ def test_a_value_of_a_parameter_file_arrives_and_those_of_the_other_node_are_nam
     process.wait_for("waiting for a goal on /here")
     assert "not used by this node: terrain_source (of predictor)" in process.output
     assert process.stop() == 0
+
+
+@pytest.mark.parametrize(("node", "other"), [("predictor", "path_selector"), ("path_selector", "predictor")])
+def test_the_other_node_s_shipped_file_does_no_harm(start, node, other):
+    process = start(node, "--ros-args", "--params-file", ROOT / "config" / f"{other}.params.yaml")
+    process.wait_for("predicting 5 s ahead for husky" if node == "predictor" else "waiting for a goal", 120.0)
+    assert "not used by this node" in process.output and "Traceback" not in process.output
+    assert process.stop() == 0
+
+
+def test_an_empty_topic_is_refused(executables, ros_environment):
+    done = subprocess.run(
+        [executables / "path_selector", "--ros-args", "-p", "odometry_topic:=''"],
+        env=ros_environment, capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert "parameter odometry_topic: got an empty name, expected a topic such as 'odom'" in done.stderr

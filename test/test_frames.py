@@ -82,6 +82,18 @@ def test_odometry_of_another_frame_needs_its_offset(tree):
     assert given.odometry_child("imu", TransformTree())[0, 3] == 0.3
 
 
+def test_a_base_frame_that_is_elsewhere_than_the_robot_file_s_is_refused(tree):
+    frames = RobotFrames("base_footprint", file_frame="base_link")
+    with pytest.raises(
+        FrameError, match=r"got 'base_footprint', expected 'base_link'.* 0.130 m away.*Leave base_frame"
+    ):
+        frames.odometry_child("base_footprint", tree)
+    # Without transforms, and for another name of the same place, nothing contradicts the user.
+    np.testing.assert_allclose(frames.odometry_child("base_footprint", TransformTree()), np.eye(4))
+    same = TransformTree({("base_footprint", "base_link"): at(0.0)})
+    np.testing.assert_allclose(frames.odometry_child("base_footprint", same), np.eye(4))
+
+
 def test_the_motion_of_the_base_follows_from_that_of_a_frame_on_it():
     """A frame ahead of the base that is turned against it, on a circle: the base's motion is known in closed form."""
     pose = pose_matrix([0.5, 0.2, -0.1, 0.1, -0.2, 0.7])

@@ -17,6 +17,7 @@ from monoforce_ros.discrepancy.estimates import EffectEstimate, ParameterEstimat
 from monoforce_ros.discrepancy.ros_export import nav2_text
 from monoforce_ros.messages import encoding, message_class
 from monoforce_ros.nodes.schema import read_schema, schema_path
+from monoforce_ros.planning import AlignedGrid, Occupancy, speed_mask
 from monoforce_ros.robots import load_robot
 
 GRID_MAP, FILTER_INFO = "grid_map_msgs/msg/GridMap", "nav2_msgs/msg/CostmapFilterInfo"
@@ -209,3 +210,18 @@ def test_the_page_names_parameters_that_exist():
             for name, value in block[node]["ros__parameters"].items():
                 known[name].checked(value)
     assert any("path_selector" in block for block in BLOCKS)
+
+
+def test_the_speed_mask_limits_unknown_ground_but_not_the_robot_s_blind_spot():
+    cells = 60
+    grid = AlignedGrid(0.1, (-3.0, -3.0), 0.0, *(np.zeros((cells, cells), int),) * 2, np.ones((cells, cells), bool))
+    x, y = np.meshgrid(*(np.linspace(-2.95, 2.95, cells),) * 2)
+    data = np.where(x > 0.5, 50, 0).astype(np.int8)
+    data[np.hypot(x, y) < 0.8] = -1
+    data[y > 1.0] = -1
+    mask = speed_mask(Occupancy(grid, data))
+    # Below the robot the limit is that of the ground beside it, and unknown ground far from known one is slow.
+    assert mask[30, 28] == 0 and mask[30, 36] == 60
+    assert mask[-1, 10] == 20 and (mask[data == 50] == 60).all() and (mask[data == 0] == 0).all()
+    nothing = speed_mask(Occupancy(grid, np.full_like(data, -1)))
+    assert (nothing == 20).all()

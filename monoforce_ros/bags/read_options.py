@@ -53,7 +53,7 @@ class ReadOptions:
             BagError: it is unknown where the odometry's child frame is on the robot.
         """
         pose = None if self.odometry_child_pose is None else pose_matrix(self.odometry_child_pose)
-        return recording.in_base_frame(self.base_frame or robot.base_frame, pose)
+        return recording.in_base_frame(self.base_frame or robot.base_frame, pose, file_frame=robot.base_frame)
 
 
 DETECTED = ReadOptions()

@@ -164,18 +164,21 @@ class Recording:
         except FrameError as error:
             raise BagError(f"{self.path}: {error}") from error
 
-    def in_base_frame(self, base_frame: str, odometry_child_pose: np.ndarray | None = None) -> Recording:
+    def in_base_frame(
+        self, base_frame: str, odometry_child_pose: np.ndarray | None = None, *, file_frame: str = ""
+    ) -> Recording:
         """The recording with the motion of the robot's base instead of that of the odometry's child frame.
 
         Args:
             base_frame: frame that lengths in the robot file refer to.
             odometry_child_pose: pose ``[4, 4]`` of the odometry's child frame in it; by default from the bag's
                 transforms.
+            file_frame: the robot file's own name of the base frame, if ``base_frame`` replaces it.
 
         Raises:
             BagError: the frames differ, and the bag has no path between them.
         """
-        frames = RobotFrames(base_frame, odometry_child_pose=odometry_child_pose)
+        frames = RobotFrames(base_frame, odometry_child_pose=odometry_child_pose, file_frame=file_frame)
         child, tree = self.motion.child_frame_id, TransformTree(self.static_transforms)
         try:
             pose = frames.odometry_child(child, tree)

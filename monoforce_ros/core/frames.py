@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+
+_SAME_PLACE = 1e-3
+"""Largest difference of two poses of the same place [m, -]: transforms are rounded."""
 
 
 class FrameError(ValueError):
@@ -84,6 +87,8 @@ class RobotFrames:
     """Poses ``[4, 4]`` of sensors by frame, from the robot's file."""
     odometry_child_pose: np.ndarray | None = None
     """Pose ``[4, 4]`` of the odometry's child frame, if it is given instead of looked up."""
+    file_frame: str = ""
+    """The robot file's own name of the base frame, if ``base_frame`` replaces it."""
 
     def base_name(self, frame: str, known: Iterable[str]) -> str:
         """The base frame's name beside a frame: with that frame's prefix, unless only the bare name is known."""
@@ -115,9 +120,11 @@ class RobotFrames:
         """Pose ``[4, 4]`` of the odometry's child frame in the base frame. An empty name means the base frame.
 
         Raises:
-            FrameError: it is another frame, and neither given nor connected with the base frame.
+            FrameError: it is another frame, and neither given nor connected with the base frame; or the base frame is
+                elsewhere than the one of the robot file.
         """
         frame = frame.lstrip("/")
+        self._refuse_another_place(frame, transforms)
         if self.odometry_child_pose is not None:
             return self.odometry_child_pose
         base = self.base_name(frame, transforms.frames)
@@ -128,10 +135,24 @@ class RobotFrames:
             raise FrameError(
                 f"odometry describes the frame {frame!r}, lengths in the robot file refer to {base!r}, and the offset "
                 f"between them is unknown: {transforms.missing_path(base, frame)}. Publish it on /tf_static, give it "
-                "as `odometry_child_pose` (--odometry-child-pose X Y Z ROLL PITCH YAW), or, if the frame of the robot "
-                "file has another name here, give that name as `base_frame` (--base-frame)"
+                "as `odometry_child_pose` (--odometry-child-pose X Y Z ROLL PITCH YAW). Only if both are the same "
+                "place on the robot: give its name here as `base_frame` (--base-frame)"
             )
         return pose
+
+    def _refuse_another_place(self, frame: str, transforms: TransformTree) -> None:
+        if not self.file_frame or self.file_frame == self.base_frame:
+            return
+        own = replace(self, base_frame=self.file_frame).base_name(frame, transforms.frames)
+        base = self.base_name(frame, transforms.frames)
+        offset = transforms.find(base, own)
+        if offset is not None and not np.allclose(offset, np.eye(4), atol=_SAME_PLACE):
+            raise FrameError(
+                f"base_frame (--base-frame): got {base!r}, expected {own!r}, to which lengths in the robot file refer: "
+                f"transforms put it {np.linalg.norm(offset[:3, 3]):.3f} m away. Leave base_frame out: the offset of "
+                "the odometry's frame is then looked up. If the lengths do refer to the other frame, name it in the robot "
+                "file as `base_frame`"
+            )
 
 
 def _prefixed(name: str, like: str) -> str:

@@ -84,12 +84,12 @@ def _contents(
         yield missing(f"odometry: {error}. Record nav_msgs/Odometry from wheels, lidar or visual SLAM")
         return
     yield from (warning(text) for text in recording.choices)
-    robot = reading.robot_in_bag(robot)
+    in_file, robot = robot, reading.robot_in_bag(robot)
     motion = recording.motion
     span = (int(motion.stamps[-1]) - int(motion.stamps[0])) * NANOSECOND
     yield ok(f"odometry {recording.topics['odometry']}: {motion.frame_id} → {motion.child_frame_id}, {span:.1f} s")
     try:
-        recording = reading.at_base(recording, robot)
+        recording = reading.at_base(recording, in_file)
     except BagError as error:
         yield missing(f"frames: {error}")
     else:

@@ -97,6 +97,7 @@ class PredictorNode(ManagedNode):
             settings.base_frame or self.robot.base_frame,
             {name: pose.double().numpy() for name, pose in self.robot.sensors.items()},
             pose_matrix(settings.odometry_child_pose) if settings.odometry_child_pose else None,
+            file_frame=self.robot.base_frame,
         )
         self.transforms = TransformListener(self)
         if self.transforms.unavailable:

@@ -5,13 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter
+from scipy.ndimage import distance_transform_edt, maximum_filter, minimum_filter, uniform_filter
 
 from monoforce_ros.planning.goal_planner import LETHAL, UNKNOWN
 from monoforce_ros.terrain import Grid, TerrainMap
 
 _SLOPE_BASE = 0.5
 """Length over which slopes are measured [m]."""
+_BLIND_SPOT = 1.5
+"""Reach of the blind spot around a robot [m]: a lidar 0.8 m high, whose lowest ring looks 28° down, sees no nearer
+ground."""
 
 
 GRADED = LETHAL - 2
@@ -125,9 +128,14 @@ which Nav2 reads as no limit."""
 def speed_mask(found: Occupancy) -> np.ndarray:
     """Speed limits in per cent of the largest speed for Nav2's speed filter ``[rows, columns]`` int8; 0 is no limit.
 
-    The limit falls linearly with the cost, to :data:`SLOWEST` on lethal cells. Unknown cells, such as those in the
-    sensors' blind spot beneath the robot, have no limit: the filter accepts no unknown ones.
+    The limit falls linearly with the cost, to :data:`SLOWEST` on lethal cells. The filter accepts no unknown cells: in
+    the blind spot beneath the robot the limit is that of the nearest known cell, and unknown ground beyond it is
+    :data:`SLOWEST`.
     """
-    cost = np.clip(found.data, 0, LETHAL).astype(float)
-    limit = np.rint(100.0 - (100.0 - SLOWEST) * cost / LETHAL)
-    return np.where(found.data <= 0, 0, limit).astype(np.int8)
+    known = found.data >= 0
+    cost = np.where(known, found.data, LETHAL)
+    if known.any():
+        distance, (rows, columns) = distance_transform_edt(~known, return_indices=True)
+        cost = np.where(distance * found.resolution <= _BLIND_SPOT, found.data[rows, columns], cost)
+    limit = np.rint(100.0 - (100.0 - SLOWEST) * np.minimum(cost, LETHAL) / LETHAL)
+    return np.where(cost <= 0, 0, limit).astype(np.int8)
