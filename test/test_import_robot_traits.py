@@ -304,6 +304,15 @@ def test_a_link_named_tracker_is_no_track(tmp_path):
     assert "tracks" not in found.content
 
 
+def test_placeholders_of_the_inertia_are_reported(tmp_path):
+    four = [wheel(f"{name}_wheel", place) for name, place in
+            (("fl", "0.2 0.2 0"), ("fr", "0.2 -0.2 0"), ("rl", "-0.2 0.2 0"), ("rr", "-0.2 -0.2 0"))]  # fmt: skip
+    for inertia, reported in ((0.3, False), (100.0, True)):
+        body = link("base_link", box("0.4 0.3 0.1"), mass=9.0, inertia=inertia)
+        found = convert(robot(tmp_path, body, *four))
+        assert any("radius of gyration of 3.0" in warning for warning in found.warnings) == reported
+
+
 MACRO = """<robot name="bot" xmlns:xacro="http://www.ros.org/wiki/xacro">
 <xacro:include filename="$(find bot_description)/urdf/body.xacro"/></robot>"""
 

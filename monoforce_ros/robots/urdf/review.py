@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Mapping
 from typing import Any
+
+import numpy as np
 
 SAME_AXLE = 0.05
 """Wheels within this distance along x share an axle [m]."""
@@ -21,7 +24,33 @@ def side_of(y: float) -> str:
 
 def review(content: Mapping[str, Any]) -> list[str]:
     """Warnings about the content of a robot file."""
-    return [*_heights(content), *_wheels(content), *_balance(content)]
+    return [*_inertia(content), *_heights(content), *_wheels(content), *_balance(content)]
+
+
+def _inertia(content: Mapping[str, Any]) -> Iterator[str]:
+    """No mass within the robot's bounds is farther from its centre than half of their diagonal."""
+    bounds = []
+    for entry in content["hull"]:
+        bounds.append((np.array(entry["centre"]), np.array(entry["size"]) / 2))
+    for entry in content["wheels"]:
+        bounds.append((np.array(entry["centre"]), np.array([entry["radius"], entry["width"] / 2, entry["radius"]])))
+    for entry in content["tracks"]:
+        half = [entry["length"] / 2 + entry["radius"], entry["width"] / 2, entry["radius"]]
+        bounds.append((np.array(entry["centre"]), np.array(half)))
+    for entry in content["flippers"]:
+        reach = entry["length"] + max(entry["root_radius"], entry["tip_radius"])
+        bounds.append((np.array(entry["joint"]), np.array([reach, entry["width"] / 2, reach])))
+    if not bounds:
+        return
+    low = np.min([centre - half for centre, half in bounds], axis=0)
+    high = np.max([centre + half for centre, half in bounds], axis=0)
+    gyration = math.sqrt(max(content["inertia"][:3]) / content["mass"])
+    largest = float(np.linalg.norm(high - low)) / 2
+    if gyration > largest:
+        yield (
+            f"inertia: a radius of gyration of {gyration:.2f} m, expected at most half of the robot's diagonal, "
+            f"{largest:.2f} m; are inertia elements of links placeholders?"
+        )
 
 
 def _heights(content: Mapping[str, Any]) -> Iterator[str]:
