@@ -96,7 +96,7 @@ def test_velocity_limits_axes_to_the_right_and_spinning_lidars():
 
 
 def test_rockers_carry_their_wheels():
-    found = converted("skid_rocker")
+    found = converted("skid_rocker", hints={"left_rocker_joint": "rocker"})
     left = entry(found, "rockers", "left_rocker_joint")
     assert left["wheels"] == ["front_left", "rear_left"] and left["pivot"] == [0.0, 0.43, 0.16]
     assert left["limit"] == pytest.approx(0.18)
@@ -142,8 +142,12 @@ def test_tracks_and_flippers():
         assert (flipper["root_radius"], flipper["tip_radius"], flipper["mass"]) == (0.089, 0.04, 1.6)
         assert flipper["end"] == ("front" if flipper["joint"][0] > 0 else "rear")
     # Positive angles raise the tip: of the front flippers' axis (0, 1, 0) that is the negative direction.
-    assert entry(found, "flippers", "front_left_flipper")["limits"] == pytest.approx([0.5 - 1.2, 0.5 + 2.0], abs=1e-5)
-    assert entry(found, "flippers", "rear_left_flipper")["limits"] == pytest.approx([0.5 - 2.0, 0.5 + 1.2], abs=1e-5)
+    assert entry(found, "flippers", "front_left_flipper_joint")["limits"] == pytest.approx(
+        [0.5 - 1.2, 0.5 + 2.0], abs=1e-5
+    )
+    assert entry(found, "flippers", "rear_left_flipper_joint")["limits"] == pytest.approx(
+        [0.5 - 2.0, 0.5 + 1.2], abs=1e-5
+    )
     assert found.content["command"]["track_width"] == pytest.approx(2 * 0.2485, abs=1e-4)
 
 
@@ -192,7 +196,7 @@ BAD = {
     "lying cylinder": (lambda t: t.replace('rpy="1.5707963 0 0"', 'rpy="0 0 0"'), "lies along .* turn the shape"),
     "missing mesh": (
         lambda t: t.replace('<box size="0.42 0.31 0.184"/>', '<mesh filename="package://nobody/body.stl"/>'),
-        "link chassis_link: the mesh package://nobody/body.stl is missing.*--package NAME=FOLDER.*--ignore-meshes",
+        "link chassis_link: the mesh package://nobody/body.stl is missing.*--package nobody=FOLDER.*--ignore-meshes",
     ),
     "no size": (lambda t: t.replace('length="0.04"', 'length="-0.04"'), "cylinder radius and length: got .*-0.04"),
     "infinite origin": (lambda t: t.replace('xyz="0 0 0.05"', 'xyz="0 0 inf"'), "joint imu_joint: origin"),

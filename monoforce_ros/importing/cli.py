@@ -37,6 +37,9 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--name", help="name of the robot (that of the URDF)")
     parser.add_argument("--base-frame", metavar="LINK", help="frame with x forward and z up (base_link, or the root)")
     parser.add_argument(
+        "--forward", default="x", metavar="AXIS", help="direction of travel in that frame: x, y, =-x, =-y (x)"
+    )
+    parser.add_argument(
         "--drive", metavar="KIND", help="skid, differential, ackermann, four_wheel_steering, independent"
     )
     parser.add_argument("--maximum-speed", type=float, metavar="M/S", help="(from the wheel joints' velocity limits)")
@@ -86,6 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             ConversionOptions(
                 name=options.name,
                 base_frame=options.base_frame,
+                forward=options.forward,
                 drive=options.drive,
                 maximum_speed=options.maximum_speed,
                 maximum_yaw_rate=options.maximum_yaw_rate,
@@ -104,6 +108,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             try:
                 write_text(checked, robot_file_text(conversion, options.urdf))
                 load_robot(checked)
+            except RobotFileError as error:
+                checked.unlink(missing_ok=True)
+                raise RobotFileError(
+                    f"{options.urdf}: not a valid robot: {error}".replace(f"{checked}: ", "")
+                ) from error
             except BaseException:
                 checked.unlink(missing_ok=True)
                 raise

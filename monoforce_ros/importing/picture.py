@@ -162,13 +162,14 @@ class _Drawing:
     def dots(self, axes: Axes, a: int, b: int) -> None:
         """Body points of the hull, then of the drives, so that these lie on top."""
         hull, seen = self.drives < 0, set[str]()
+        free = {wheel["name"] for wheel in self.content.get("wheels", []) if wheel.get("drive") is None}
         axes.plot(*self.points[hull][:, [a, b]].T, ".", color=_HULL_EDGE, markersize=2.2, label="hull")
         for index, name in enumerate(self.robot.drive_names):
             chosen = self.points[self.drives == index]
             if not len(chosen):
                 continue
-            colour = self.colour(name, float(np.sign(np.round(chosen[:, 1].mean(), 3))))
-            label = {_LEFT: "driven, left", _RIGHT: "driven, right"}.get(colour, "driven")
+            colour = self.colour(None if name in free else name, float(np.sign(np.round(chosen[:, 1].mean(), 3))))
+            label = {_LEFT: "driven, left", _RIGHT: "driven, right", _FREE: "rolls freely"}.get(colour, "driven")
             shown = "_" + label if label in seen else label
             seen.add(label)
             axes.plot(*chosen[:, [a, b]].T, ".", color=colour, markersize=2.6, label=shown)

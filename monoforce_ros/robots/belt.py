@@ -6,6 +6,9 @@ import math
 
 import numpy as np
 
+_FEWEST = 6
+"""Samples on half a wheel: it rolls on a polygon, and one of 12 corners is 3 % lower than the wheel."""
+
 
 def belt_outline(
     length: float, rear_radius: float, front_radius: float, spacing: float
@@ -25,7 +28,8 @@ def belt_outline(
     # Angle of the straight parts, which are tangents of both circles, to the line between the centres.
     tilt = 0.0 if length == 0.0 else math.asin(np.clip((rear_radius - front_radius) / length, -1.0, 1.0))
     front, rear = np.array([length / 2, 0.0]), np.array([-length / 2, 0.0])
-    pieces = [_arc(front, front_radius, -math.pi / 2 + tilt, math.pi / 2 - tilt, spacing)]
+    fewest = 2 if length > 0.0 else _FEWEST
+    pieces = [_arc(front, front_radius, -math.pi / 2 + tilt, math.pi / 2 - tilt, spacing, fewest)]
     if length > 0.0:
         upper = np.array([math.sin(tilt), math.cos(tilt)])
         lower = np.array([math.sin(tilt), -math.cos(tilt)])
@@ -33,17 +37,17 @@ def belt_outline(
         pieces.append(_arc(rear, rear_radius, math.pi / 2 - tilt, 3 * math.pi / 2 + tilt, spacing))
         pieces.append(_line(rear + rear_radius * lower, front + front_radius * lower, spacing))
     else:
-        pieces.append(_arc(rear, front_radius, math.pi / 2, 3 * math.pi / 2, spacing))
+        pieces.append(_arc(rear, front_radius, math.pi / 2, 3 * math.pi / 2, spacing, fewest))
     positions, directions, lengths = (np.concatenate(parts) for parts in zip(*pieces, strict=True))
     # The outline runs forwards along the bottom; the belt of a robot that drives forward moves the other way.
     return positions, -directions, lengths
 
 
 def _arc(
-    centre: np.ndarray, radius: float, start: float, end: float, spacing: float
+    centre: np.ndarray, radius: float, start: float, end: float, spacing: float, fewest: int = 2
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     # With an even count, samples are symmetric about the lowest point and never at the junction of two pieces.
-    count = max(2, 2 * math.ceil(radius * (end - start) / spacing / 2))
+    count = max(fewest, 2 * math.ceil(radius * (end - start) / spacing / 2))
     angles = start + (np.arange(count) + 0.5) * (end - start) / count
     radial = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     tangent = np.stack([-np.sin(angles), np.cos(angles)], axis=1)

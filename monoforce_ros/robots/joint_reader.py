@@ -18,6 +18,8 @@ GRAVITY = 9.81
 _UNSPRUNG_SHARE = 0.03
 """Mass that moves with a wheel as a share of the robot's, where the file does not say: wheel, hub and half of its arm
 are 2 to 4 % on passenger cars (Gillespie, Fundamentals of Vehicle Dynamics, ch. 5)."""
+_SMALLEST_INERTIA = 1e-6
+"""About the axis of a caster or rocker [kg m²]."""
 _CASTER_SHARE = 0.01
 _MOTOR_SHARE = 0.01
 """Mass at the rim of a wheel that accelerates as slowly as motor, gear and wheels, as a share of the robot's."""
@@ -153,8 +155,8 @@ class JointReader:
             raise self.checks.fail(f"{where}.wheel", wheel.name, "a wheel with drive: null")
         pivot = np.array(self._pivot(entry, where, wheel))
         trail = float(np.hypot(*(wheel.centre - pivot)[:2]))
-        share = _CASTER_SHARE * self.mass * (trail**2 + 0.5 * wheel.radius**2)
-        inertia = self.checks.number(entry.get("inertia", share), f"{where}.inertia", 1e-6, 1e4, "kg m²")
+        share = max(_SMALLEST_INERTIA, _CASTER_SHARE * self.mass * (trail**2 + 0.5 * wheel.radius**2))
+        inertia = self.checks.number(entry.get("inertia", share), f"{where}.inertia", _SMALLEST_INERTIA, 1e4, "kg m²")
         damping = self.checks.number(entry.get("damping", 0.0), f"{where}.damping", 0.0, 1e4, "N m s/rad")
         parent = self._mount(wheel, where, (SUSPENSION, ROCKER))
         self.joints.append(
@@ -214,10 +216,12 @@ class JointReader:
             raise self.checks.fail(f"{where}.axis", axis.tolist(), "a direction")
         axis = axis / np.linalg.norm(axis)
         arms = [np.linalg.norm(np.cross(axis, wheel.centre - pivot)) for wheel in wheels]
-        share = _UNSPRUNG_SHARE * self.mass * float(np.square(arms).sum())
+        share = max(_SMALLEST_INERTIA, _UNSPRUNG_SHARE * self.mass * float(np.square(arms).sum()))
         limit = self.checks.number(entry.get("limit", math.inf), f"{where}.limit", 0.01, math.inf, "rad")
         dynamics = Coordinate(
-            inertia=self.checks.number(entry.get("inertia", share), f"{where}.inertia", 1e-6, 1e5, "kg m²"),
+            inertia=self.checks.number(
+                entry.get("inertia", share), f"{where}.inertia", _SMALLEST_INERTIA, 1e5, "kg m²"
+            ),
             damping=self.checks.number(entry.get("damping", 0.0), f"{where}.damping", 0.0, 1e6, "N m s/rad"),
             low=-limit,
             high=limit,

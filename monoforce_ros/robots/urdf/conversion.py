@@ -5,23 +5,23 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from monoforce_ros.robots.urdf.description import Description, Joint
 from monoforce_ros.robots.urdf.errors import UrdfError
-from monoforce_ros.robots.urdf.geometry import Frames, belt_shape, flipper_shape
-from monoforce_ros.robots.urdf.parts import Parts, WheelPart, find_parts
+from monoforce_ros.robots.urdf.geometry import DIRECTIONS, Frames, belt_shape, flipper_shape
+from monoforce_ros.robots.urdf.hull import find_hull
+from monoforce_ros.robots.urdf.parts import BeltPart, Parts, WheelPart, find_parts
+from monoforce_ros.robots.urdf.review import SAME_AXLE, review, side_of
 from monoforce_ros.robots.urdf.sensors import find_sensors
+from monoforce_ros.robots.urdf.supports import find_supports
 
 DRIVES = ("skid", "differential", "ackermann", "four_wheel_steering", "independent")
-_SAME_AXLE = 0.05
-"""Wheels within this distance along x share an axle [m]."""
-_LARGEST_HULL = 60
 _FASTEST = 100.0
-"""Velocity limits above this [rad/s] are placeholders: URDF requires a number even where there is no limit."""
+"""Velocity limits from this on [rad/s] are placeholders: URDF requires a number even where there is no limit."""
 _LARGEST_STEERING = 1.4
 """Steering limits above this [rad] are placeholders; beyond it a wheel is nearly across."""
 
@@ -32,6 +32,8 @@ class ConversionOptions:
 
     name: str | None = None
     base_frame: str | None = None
+    forward: str = "x"
+    """Direction of travel in the axes of the base frame's link: ``x``, ``y``, ``-x`` or ``-y``."""
     drive: str | None = None
     maximum_speed: float | None = None
     maximum_yaw_rate: float | None = None
@@ -66,8 +68,10 @@ class _Converter:
         self.description, self.options = description, options
         self.guesses: list[str] = []
         self.warnings: list[str] = []
-        self.frames = Frames(description, self._base())
-        self.parts = find_parts(self.frames, options.hints)
+        if options.forward not in DIRECTIONS:
+            raise UrdfError(f"forward {options.forward!r}: expected one of {', '.join(DIRECTIONS)}")
+        self.frames = Frames(description, self._base(), options.forward)
+        self.parts = self._with_supports(find_parts(self.frames, options.hints))
 
     def fail(self, message: str) -> UrdfError:
         return UrdfError(f"{self.description.path}: {message}")
@@ -87,6 +91,30 @@ class _Converter:
         self.guess(f"base frame {found}: {'by its name' if found == 'base_link' else 'the root link'}")
         return found
 
+    def _with_supports(self, parts: Parts) -> Parts:
+        """The parts, and casters that are fixed to the body."""
+        taken = set(parts.left_out) | {link for wheel in parts.wheels for link in self._turning_with(wheel)}
+        taken |= {link for belt in (*parts.tracks, *parts.flippers) for link, _ in belt.shapes}
+        return replace(
+            parts, wheels=(*parts.wheels, *find_supports(self.frames, parts.wheels, self.options.hints, taken))
+        )
+
+    def _turning_with(self, wheel: WheelPart) -> list[str]:
+        return list(self.description.subtree(wheel.joint.child, ("fixed",)))
+
+    def _base_frame(self) -> str:
+        """Name of the robot file's base frame."""
+        base, forward = self.frames.base, self.options.forward
+        if forward == "x":
+            return base
+        angle = DIRECTIONS[forward]
+        self.warnings.append(
+            f"the base frame {base}_forward is {base} turned by {angle:.4f} rad, and the description has no such link; "
+            f"publish it: ros2 run tf2_ros static_transform_publisher --yaw {angle:.6f} --frame-id {base} "
+            f"--child-frame-id {base}_forward"
+        )
+        return f"{base}_forward"
+
     def conversion(self) -> Conversion:
         mass, centre, inertia = self._mass()
         wheels = self.parts.wheels
@@ -94,7 +122,7 @@ class _Converter:
         content: dict[str, Any] = {
             "name": self._name(),
             "description": f"imported from {self.description.path.name}",
-            "base_frame": self.frames.base,
+            "base_frame": self._base_frame(),
             "mass": _number(mass),
             "centre_of_mass": _numbers(centre),
             "inertia": _numbers([*np.diag(inertia), inertia[0, 1], inertia[0, 2], inertia[1, 2]]),
@@ -106,16 +134,22 @@ class _Converter:
         driven = self._driven(kind)
         content["wheels"] = [self._wheel_entry(wheel, kind, driven) for wheel in wheels]
         content["tracks"] = [entry for track in self.parts.tracks if (entry := self._track_entry(track))]
-        content["flippers"] = [self._flipper_entry(joint) for joint in self.parts.flippers]
+        content["flippers"] = [self._flipper_entry(part) for part in self.parts.flippers]
         content["steering"] = [self._steering_entry(wheel) for wheel in wheels if wheel.steering is not None]
         content["casters"] = [self._caster_entry(wheel) for wheel in wheels if wheel.swivel is not None]
         content["rockers"] = [self._rocker_entry(joint) for joint in self.parts.rockers]
-        content["hull"] = self._hull()
+        hull = find_hull(self.frames, self.parts)
+        content["hull"] = [
+            {"name": name, "centre": _numbers((low + high) / 2), "size": _numbers(high - low)}
+            for name, low, high in hull.boxes
+        ]
+        self.guesses += hull.guesses
+        self.warnings += hull.warnings
         sensors, notes = find_sensors(self.frames)
         content["sensors"] = sensors
         self.guesses += notes
         content["command"] = self._command(content)
-        self._check(content)
+        self.warnings += review(content)
         kept = {key: value for key, value in content.items() if value not in ([], {})}
         return Conversion(kept, tuple(self.guesses), tuple(self.warnings))
 
@@ -128,7 +162,7 @@ class _Converter:
         heavy = [link for link in links if link.mass > 0]
         if not heavy:
             raise self.fail(f"none of the {len(links)} links has a mass; add inertial elements")
-        without = [name for name in self._moving_links() if self.description.links[name].mass == 0]
+        without = [name for name in self._moving_links() if not self._carried_mass(name)]
         if without:
             self.warnings.append(f"without mass: {', '.join(without[:6])}; the robot's mass may be too small")
         poses = {link.name: self.frames.link(link.name) for link in heavy}
@@ -149,7 +183,12 @@ class _Converter:
         return float(masses.sum()), centre, inertia
 
     def _moving_links(self) -> list[str]:
-        return [wheel.joint.child for wheel in self.parts.wheels] + list(self.parts.tracks)
+        turning = [wheel.joint.child for wheel in self.parts.wheels if wheel.joint.kind != "fixed"]
+        return list(dict.fromkeys(turning + [belt.link for belt in (*self.parts.tracks, *self.parts.flippers)]))
+
+    def _carried_mass(self, link: str) -> float:
+        """Mass of a link and all that hang on it [kg]."""
+        return sum(self.description.links[name].mass for name in self.description.subtree(link))
 
     def _drive_kind(self) -> str:
         wheels = self.parts.wheels
@@ -158,15 +197,19 @@ class _Converter:
         if self.options.drive is not None:
             return self.options.drive
         if not steered:
-            casters = any(wheel.swivel is not None for wheel in wheels)
+            casters = len(straight) < len(wheels)
+            along = [wheel.shape.centre[0] for wheel in straight]
+            one_axle = len(straight) >= 2 and max(along) - min(along) < SAME_AXLE and not self.parts.tracks
             kind, reason = ("differential", "it has casters") if casters else ("skid", "no wheel is steered")
+            if one_axle and not casters:
+                kind, reason = "differential", "its wheels stand on one axle"
         elif not straight:
             four = len(steered) == 4
             kind, reason = ("four_wheel_steering" if four else "independent"), f"all {len(steered)} wheels are steered"
         else:
             places = [wheel.shape.centre[0] for wheel in steered]
             between = all(min(places) < wheel.shape.centre[0] < max(places) for wheel in straight)
-            if max(places) - min(places) > _SAME_AXLE and between:
+            if max(places) - min(places) > SAME_AXLE and between:
                 kind, reason = "independent", "wheels in front and behind are steered, those between are not"
             else:
                 kind, reason = "ackermann", f"{len(steered)} of {len(wheels)} wheels are steered"
@@ -176,26 +219,28 @@ class _Converter:
     def _driven(self, kind: str) -> set[str]:
         """Joints of the wheels that a motor turns."""
         wheels = [wheel for wheel in self.parts.wheels if wheel.swivel is None]
-        hinted = {
-            wheel.joint.name
-            for wheel in wheels
-            if "free_wheel" in (self.options.hints.get(wheel.joint.name), self.options.hints.get(wheel.joint.child))
-        }
+        hinted = {wheel.joint.name for wheel in wheels if self._hinted(wheel, "free_wheel")}
         named = {wheel.joint.name for wheel in wheels} & self.description.actuated
         if named:
             free = [wheel.name for wheel in wheels if wheel.joint.name not in named]
             if free:
                 self.guess(f"free wheels {', '.join(free)}: no transmission or ros2_control interface names them")
             return named - hinted
+        told = {wheel.joint.name for wheel in wheels if self._hinted(wheel, "wheel")}
+        if told and any(wheel.joint.name in told for wheel in wheels if wheel.steering is not None):
+            return told
         found = {wheel.joint.name for wheel in wheels if kind != "ackermann" or wheel.steering is None}
         if kind == "ackermann":
             self.guess("driven wheels: those that are not steered, because the file names no motors")
         return (found or {wheel.joint.name for wheel in wheels}) - hinted
 
+    def _hinted(self, wheel: WheelPart, kind: str) -> bool:
+        return kind in (self.options.hints.get(wheel.joint.name), self.options.hints.get(wheel.joint.child))
+
     def _drive(self, wheel: WheelPart, kind: str) -> str:
         """Name of a wheel's drive: its side, its axle, or its own."""
         if kind in ("skid", "differential"):
-            return _side(wheel.shape.centre)
+            return side_of(wheel.shape.centre[1])
         if kind == "ackermann":
             middle = np.mean([other.shape.centre[0] for other in self.parts.wheels])
             return "front" if wheel.shape.centre[0] > middle else "rear"
@@ -213,11 +258,12 @@ class _Converter:
             "width": _number(shape.width),
         }  # fmt: skip
 
-    def _track_entry(self, track: str) -> dict[str, Any] | None:
-        shape = belt_shape(self.frames, self.description.subtree(track))
+    def _track_entry(self, part: BeltPart) -> dict[str, Any] | None:
+        shape, track = belt_shape(self.frames, part.shapes), part.name
         if shape is None:
             raise self.fail(
-                f"track {track}: no collision shapes that are longer than high; give it a box, or --hint {track}=fixed"
+                f"track {track}: no collision shapes that are longer than high; give it a box, or pass "
+                f"--hint {part.link}=fixed"
             )
         radius = (shape.rear_radius + shape.front_radius) / 2
         centre = (shape.rear + shape.front) / 2
@@ -226,44 +272,54 @@ class _Converter:
             f"track {track}: from {shape.source}, length {length:.3f} m between rollers of radius {radius:.3f} m"
         )
         return {
-            "name": track, "drive": _side(centre), "centre": _numbers(centre), "length": _number(length),
+            "name": track, "drive": side_of(centre[1]), "centre": _numbers(centre), "length": _number(length),
             "radius": _number(radius), "width": _number(shape.width),
         }  # fmt: skip
 
-    def _flipper_entry(self, joint: Joint) -> dict[str, Any]:
-        links = list(self.description.subtree(joint.child))
+    def _flipper_entry(self, part: BeltPart) -> dict[str, Any]:
+        joint = part.joint
+        assert joint is not None
         axle = self.frames.origin(joint)
-        shape = flipper_shape(self.frames, links, axle)
+        shape = flipper_shape(self.frames, part.shapes, axle)
         if shape is None:
             raise self.fail(f"flipper {joint.child}: no collision shapes that are longer than high; give it a box")
         reach = shape.front - shape.rear
         end = "front" if self._points_forward(joint, reach) else "rear"
         angle = math.atan2(reach[2], reach[0] if end == "front" else -reach[0])
-        mass = sum(self.description.links[name].mass for name in links)
+        mass = part.share * self._carried_mass(joint.child)
         length = float(np.hypot(reach[0], reach[2]))
         centre = shape.rear
         entry: dict[str, Any] = {
-            "name": joint.child, "drive": _side(centre), "end": end, "joint": _numbers(centre),
+            "name": part.name, "drive": side_of(centre[1]), "end": end, "joint": _numbers(centre),
             "length": _number(length),
             "root_radius": _number(shape.rear_radius), "tip_radius": _number(shape.front_radius),
             "width": _number(shape.width),
             "mass": _number(mass), "angle": _number(angle),
         }  # fmt: skip
         entry |= self._flipper_limits(joint, end, angle)
+        up = self._raises(joint, end)
+        if up < 0 or abs(angle) > 0.02:
+            self.warnings.append(
+                f"flipper {part.name}: its angle in the robot file is {_number(angle):+g} {'+' if up > 0 else '-'} the "
+                "joint's angle in this description [rad]; convert the measured and commanded angles in JointState"
+            )
         self.guess(
-            f"flipper {joint.child}: from {shape.source}, {end}, length {length:.3f} m, at {math.degrees(angle):.0f}° "
+            f"flipper {part.name}: from {shape.source}, {end}, length {length:.3f} m, at {math.degrees(angle):.0f}° "
             "at the zero position"
         )
         return entry
+
+    def _raises(self, joint: Joint, end: str) -> float:
+        """1 if a positive rotation raises the tip, -1 if it lowers it: about y it lowers what points forward."""
+        return float(-np.sign(self.frames.axis(joint)[1]) * (1.0 if end == "front" else -1.0))
 
     def _flipper_limits(self, joint: Joint, end: str, angle: float) -> dict[str, Any]:
         """Limits of the angle, positive upwards, and of its speed, where the file has them."""
         entry: dict[str, Any] = {}
         if joint.limits is not None and joint.limits[1] - joint.limits[0] < 2 * math.pi:
-            # A positive rotation about y lowers what points forward.
-            up = -np.sign(self.frames.axis(joint)[1]) * (1.0 if end == "front" else -1.0)
+            up = self._raises(joint, end)
             entry["limits"] = sorted(_number(angle + up * limit) for limit in joint.limits)
-        if joint.maximum_velocity is not None and joint.maximum_velocity <= _FASTEST:
+        if joint.maximum_velocity is not None and joint.maximum_velocity < _FASTEST:
             entry["maximum_rate"] = _number(joint.maximum_velocity)
         return entry
 
@@ -271,7 +327,7 @@ class _Converter:
         """Whether a flipper is a front one: by where it points, or where its axle is if it stands upright."""
         if abs(reach[0]) > 0.2 * np.linalg.norm(reach):
             return bool(reach[0] > 0)
-        places = [self.frames.origin(other)[0] for other in self.parts.flippers]
+        places = [self.frames.origin(other.joint)[0] for other in self.parts.flippers if other.joint]
         return bool(self.frames.origin(joint)[0] >= (min(places) + max(places)) / 2)
 
     def _steering_entry(self, wheel: WheelPart) -> dict[str, Any]:
@@ -280,11 +336,17 @@ class _Converter:
         entry: dict[str, Any] = {"name": joint.name, "wheel": wheel.name}
         limit = min(abs(joint.limits[0]), abs(joint.limits[1])) if joint.limits else math.inf
         if not 0.01 < limit <= _LARGEST_STEERING:
-            self.guess(f"steering {joint.name}: no usable limit in the file, {_LARGEST_STEERING} rad")
+            given = "no limit" if joint.limits is None else f"the limits {joint.limits[0]:g} to {joint.limits[1]:g} rad"
+            self.guess(f"steering {joint.name}: {given} in the file, {_LARGEST_STEERING} rad are taken")
             limit = _LARGEST_STEERING
         entry["maximum_angle"] = _number(limit)
-        if joint.maximum_velocity is not None and joint.maximum_velocity <= _FASTEST:
+        if joint.maximum_velocity is not None and joint.maximum_velocity < _FASTEST:
             entry["maximum_rate"] = _number(joint.maximum_velocity)
+        if self.frames.axis(joint)[2] < 0:
+            self.warnings.append(
+                f"steering {joint.name}: positive angles in this description steer to the right, those of the robot "
+                "file to the left; change the sign of its angles in JointState"
+            )
         entry["pivot"] = _numbers(self.frames.origin(joint))
         self.guess(
             f"steering {joint.name}: turns {wheel.name} about a vertical axis, {math.degrees(limit):.0f}° to each side"
@@ -294,11 +356,10 @@ class _Converter:
     def _caster_entry(self, wheel: WheelPart) -> dict[str, Any]:
         joint = wheel.swivel
         assert joint is not None
-        pivot = self.frames.origin(joint)
+        pivot = self.frames.origin(joint) if wheel.pivot is None else wheel.pivot
         trail = float(np.linalg.norm((wheel.shape.centre - pivot)[:2]))
-        self.guess(
-            f"caster {joint.name}: swivels {wheel.name} about a vertical axis without a motor, trail {trail:.3f} m"
-        )
+        how = "without a motor" if wheel.pivot is None else "as a ball rolls in any direction"
+        self.guess(f"caster {joint.name}: swivels {wheel.name} about a vertical axis {how}, trail {trail:.3f} m")
         if trail < 0.005:
             self.warnings.append(f"caster {joint.name}: without trail it does not follow; correct its origin")
         return {"name": joint.name, "wheel": wheel.name, "pivot": _numbers(pivot)}
@@ -314,56 +375,19 @@ class _Converter:
         self.guess(f"rocker {joint.name}: carries {', '.join(wheels)}")
         return entry
 
-    def _hull(self) -> list[dict[str, Any]]:
-        taken = set(self.parts.left_out)
-        for wheel in self.parts.wheels:
-            taken |= set(self.description.subtree(wheel.joint.child, ("fixed",)))
-        for link in self.parts.tracks:
-            taken |= set(self.description.subtree(link))
-        for joint in self.parts.flippers:
-            taken |= set(self.description.subtree(joint.child))
-        boxes = []
-        for name, shape in self.frames.shapes(link for link in self.description.links if link not in taken):
-            points = shape.placed(self.frames.link(name))
-            low, high = points.min(axis=0), points.max(axis=0)
-            boxes.append((name, shape, low, np.maximum(high, low + 0.005)))
-        kept = []
-        for index, (name, shape, low, high) in enumerate(boxes):
-            inside = any(
-                (low >= other_low - 1e-6).all() and (high <= other_high + 1e-6).all() and (other != index)
-                and not ((high - low == other_high - other_low).all() and other > index)
-                for other, (_, _, other_low, other_high) in enumerate(boxes)
-            )  # fmt: skip
-            if not inside:
-                kept.append((name, shape, low, high))
-        if len(kept) > _LARGEST_HULL:
-            self.warnings.append(f"hull: {len(kept)} boxes, of which the {_LARGEST_HULL} largest are kept")
-            kept = sorted(kept, key=lambda entry: -float(np.prod(entry[3] - entry[2])))[:_LARGEST_HULL]
-        if not kept:
-            self.warnings.append("hull: no link of the body has a collision shape; the body cannot touch anything")
-        entries, seen = [], set[str]()
-        for name, shape, low, high in kept:
-            volume = 1.0 if shape.kind == "box" else 0.0
-            turn = np.abs((self.frames.link(name) @ shape.pose)[:3, :3])
-            if not volume or turn.max(axis=0).min() < 0.99:
-                self.guess(f"hull {name}: the box around a {shape.kind}" + (" that is turned" if volume else ""))
-            label = name if name not in seen else f"{name}_{len(seen)}"
-            seen.add(label)
-            entries.append({"name": label, "centre": _numbers((low + high) / 2), "size": _numbers(high - low)})
-        return entries
-
     def _command(self, content: Mapping[str, Any]) -> dict[str, Any]:
         wheels = [wheel for wheel in self.parts.wheels if wheel.swivel is None]
         sides = [wheel.shape.centre[1] for wheel in wheels] + [entry["centre"][1] for entry in content["tracks"]]
         sides = sides or [entry["joint"][1] for entry in content["flippers"]]
-        width = 2 * float(np.mean(np.abs(sides)))
+        # A wheel on the centre line is on neither side.
+        width = 2 * float(np.mean([side for side in np.abs(sides) if side >= 0.1 * np.max(np.abs(sides))]))
         command: dict[str, Any] = {"track_width": _number(max(width, 0.05))}
         self.guess(f"track width {width:.3f} m: twice the mean distance of wheels and tracks from the centre line")
         speed = self.options.maximum_speed
         limits = [
             wheel.joint.maximum_velocity * wheel.shape.radius
             for wheel in wheels
-            if wheel.joint.maximum_velocity is not None and wheel.joint.maximum_velocity <= _FASTEST
+            if wheel.joint.maximum_velocity is not None and wheel.joint.maximum_velocity < _FASTEST
         ]
         if speed is None and limits:
             speed = float(min(limits))
@@ -375,34 +399,6 @@ class _Converter:
         if self.options.maximum_yaw_rate is not None:
             command["maximum_yaw_rate"] = _number(self.options.maximum_yaw_rate)
         return command
-
-    def _check(self, content: Mapping[str, Any]) -> None:
-        """Warn about what usually is a mistake in a description."""
-        lows = {w["name"]: w["centre"][2] - w["radius"] for w in content["wheels"]}
-        ground = min([*lows.values(), *(t["centre"][2] - t["radius"] for t in content["tracks"])], default=None)
-        if ground is None:
-            return
-        for name, low in lows.items():
-            if low > ground + 0.02:
-                self.warnings.append(
-                    f"wheel {name} hangs {low - ground:.3f} m above the lowest one at the zero position"
-                )
-        for box in content["hull"]:
-            if box["centre"][2] - box["size"][2] / 2 < ground:
-                self.warnings.append(f"hull {box['name']} reaches below the wheels; is it a shape of the body?")
-        for wheel in content["wheels"]:
-            if wheel["width"] > 2 * wheel["radius"]:
-                self.warnings.append(f"wheel {wheel['name']} is wider than high: {wheel['width']} m")
-        along = [w["centre"][0] for w in content["wheels"]]
-        for entry in content["tracks"]:
-            along += [entry["centre"][0] - entry["length"] / 2, entry["centre"][0] + entry["length"] / 2]
-        centre = content["centre_of_mass"][0]
-        if along and not min(along) <= centre <= max(along) and not content["flippers"]:
-            self.warnings.append(f"the centre of mass, x = {centre} m, lies outside the wheelbase: the robot tips over")
-
-
-def _side(centre: np.ndarray) -> str:
-    return "left" if centre[1] > 1e-3 else "right" if centre[1] < -1e-3 else "middle"
 
 
 def _number(value: float) -> float:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import shutil
-import subprocess
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,11 +14,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.robots.urdf.errors import UrdfError
+from monoforce_ros.robots.urdf.expansion import expand
 from monoforce_ros.robots.urdf.shapes import MeshFiles, Shape, read_shape
 
 MAXIMUM_URDF_BYTES = 10_000_000
 MAXIMUM_LINKS = 5_000
-_XACRO_TIMEOUT = 60.0
 MOVING = ("continuous", "revolute", "prismatic")
 
 
@@ -38,7 +36,9 @@ class Link:
     shapes: tuple[Shape, ...]
     """Collision shapes."""
     visuals: tuple[Shape, ...]
-    """Visual shapes, read only where there are no collision shapes and they are no meshes that are missing."""
+    """Simple visual shapes, read only where there are no collision shapes."""
+    without_meshes: bool = False
+    """Whether collision meshes were left out."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def read_description(
 
     Args:
         path: the file.
-        packages: folders of packages that ``package://`` refers to, before those that are found.
+        packages: folders of packages that ``package://`` and ``$(find …)`` refer to, before those that are found.
         ignore_meshes: leave out all meshes.
         xacro_arguments: ``name:=value`` arguments for xacro.
 
@@ -110,7 +110,7 @@ def read_description(
         UrdfError: the file is missing, too large, unsafe or no URDF; its links form no tree; or a value is invalid.
     """
     path = Path(path).expanduser()
-    text = _text(path, xacro_arguments)
+    text = _text(path, xacro_arguments, dict(packages or {}))
     parsed, tree = _parsed(text, path)
     if len(parsed.links) > MAXIMUM_LINKS:
         raise UrdfError(f"{path}: {len(parsed.links)} links, expected at most {MAXIMUM_LINKS}")
@@ -133,7 +133,7 @@ def read_description(
     return Description(path, parsed.name or path.stem, root, links, joints, _actuated(tree), poses)
 
 
-def _text(path: Path, xacro_arguments: Sequence[str]) -> str:
+def _text(path: Path, xacro_arguments: Sequence[str], packages: Mapping[str, Path]) -> str:
     if not path.is_file():
         raise UrdfError(f"{path}: the file does not exist")
     if path.stat().st_size > MAXIMUM_URDF_BYTES:
@@ -144,7 +144,9 @@ def _text(path: Path, xacro_arguments: Sequence[str]) -> str:
         raise UrdfError(f"{path}: not UTF-8 text: {error}") from error
     _refuse_entities(text, path)
     if path.suffix == ".xacro" or "http://www.ros.org/wiki/xacro" in text or "http://wiki.ros.org/xacro" in text:
-        text = _expanded(path, xacro_arguments)
+        text = expand(path, xacro_arguments, packages)
+        if len(text) > MAXIMUM_URDF_BYTES:
+            raise UrdfError(f"{path}: xacro made {len(text)} bytes, expected at most {MAXIMUM_URDF_BYTES}")
         _refuse_entities(text, path)
     return text
 
@@ -154,29 +156,6 @@ def _refuse_entities(text: str, path: Path) -> None:
     found = re.search(r"<!\s*(DOCTYPE|ENTITY)", text, re.IGNORECASE)
     if found:
         raise UrdfError(f"{path}: contains {found.group(0)}: document types and entities are refused; remove them")
-
-
-def _expanded(path: Path, arguments: Sequence[str]) -> str:
-    program = shutil.which("xacro")
-    if program is None:
-        raise UrdfError(
-            f"{path}: is a xacro file, and xacro is not installed: install ros-jazzy-xacro (apt) or xacro (pip), or "
-            "expand it elsewhere (xacro FILE > robot.urdf)"
-        )
-    bad = [argument for argument in arguments if ":=" not in argument]
-    if bad:
-        raise UrdfError(f"xacro argument {bad[0]!r}: expected name:=value")
-    try:
-        done = subprocess.run(
-            [program, str(path), *arguments], capture_output=True, text=True, timeout=_XACRO_TIMEOUT, check=False
-        )
-    except subprocess.TimeoutExpired as error:
-        raise UrdfError(f"{path}: xacro did not end within {_XACRO_TIMEOUT:g} s") from error
-    if done.returncode:
-        raise UrdfError(f"{path}: xacro failed: {done.stderr.strip()[-500:]}")
-    if len(done.stdout) > MAXIMUM_URDF_BYTES:
-        raise UrdfError(f"{path}: xacro made {len(done.stdout)} bytes, expected at most {MAXIMUM_URDF_BYTES}")
-    return done.stdout
 
 
 def _parsed(text: str, path: Path) -> tuple[Any, ElementTree.Element]:
@@ -273,10 +252,10 @@ def _link(link: Any, path: Path, files: MeshFiles) -> Link:
         centre, inertia = pose[:3, 3], pose[:3, :3] @ inertia @ pose[:3, :3].T
     shapes = tuple(_shapes(link.collisions, where, files))
     visuals: tuple[Shape, ...] = ()
-    if not link.collisions:
+    if not shapes:
         # Visual meshes are often missing or huge, and no robot depends on them.
         visuals = tuple(_shapes([v for v in link.visuals if not hasattr(v.geometry, "filename")], where, files))
-    return Link(link.name, mass, centre, inertia, shapes, visuals)
+    return Link(link.name, mass, centre, inertia, shapes, visuals, len(shapes) < len(link.collisions))
 
 
 def _shapes(elements: Sequence[Any], where: str, files: MeshFiles) -> Iterator[Shape]:

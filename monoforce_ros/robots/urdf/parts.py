@@ -10,12 +10,15 @@ import numpy as np
 
 from monoforce_ros.robots.urdf.description import Joint
 from monoforce_ros.robots.urdf.errors import UrdfError
-from monoforce_ros.robots.urdf.geometry import ALIGNED, Frames, WheelShape, wheel_shape
+from monoforce_ros.robots.urdf.geometry import ALIGNED, DIRECTIONS, Frames, WheelShape, wheel_shape
+from monoforce_ros.robots.urdf.shapes import Shape
 
 HINTS = ("wheel", "free_wheel", "steering", "caster", "rocker", "track", "flipper", "fixed", "ignore")
-_TRACK = re.compile(r"track|crawler|tread(?!s?_width)|(?<![a-z])belt", re.IGNORECASE)
+_TRACK = re.compile(r"track(?!er|ing)|crawler|tread(?!s?_width)|(?<![a-z])belt", re.IGNORECASE)
 _FLIPPER = re.compile(r"flipper", re.IGNORECASE)
 _CASTER = re.compile(r"caster|castor|swivel", re.IGNORECASE)
+_ONE_AXIS = 0.05
+"""Rockers turn about one axis if their pivots differ by less than this along x and z [m]."""
 _TRAIL = 0.15
 """Smallest trail of a caster in wheel radii, where neither actuation nor names tell it from steering."""
 
@@ -32,7 +35,26 @@ class WheelPart:
     swivel: Joint | None = None
     rocker: Joint | None = None
     slider: Joint | None = None
+    shapes: tuple[Shape, ...] = ()
+    """Shapes of a body that a support was made of."""
+    pivot: np.ndarray | None = None
+    """A point of the swivel's axis in the base frame [m]; None: the origin of its joint."""
     reason: str = ""
+
+
+@dataclass(frozen=True)
+class BeltPart:
+    """A track or a flipper: the shapes that its belt runs around."""
+
+    name: str
+    """The link's name for a track, the joint's for a flipper."""
+    link: str
+    shapes: tuple[tuple[str, Shape], ...]
+    """With the links that carry them."""
+    joint: Joint | None = None
+    """The joint that a flipper turns about."""
+    share: float = 1.0
+    """Of the mass of the links that turn with the joint: half, if one joint turns a flipper on either side."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +62,8 @@ class Parts:
     """Joints and links by what they are."""
 
     wheels: tuple[WheelPart, ...]
-    tracks: tuple[str, ...]
-    """Links."""
-    flippers: tuple[Joint, ...]
+    tracks: tuple[BeltPart, ...]
+    flippers: tuple[BeltPart, ...]
     rockers: tuple[Joint, ...]
     left_out: frozenset[str]
     """Links that belong to none of the bodies (hint ``ignore``)."""
@@ -61,6 +82,8 @@ class _Finder:
     def __init__(self, frames: Frames, hints: Mapping[str, str]):
         self.frames, self.description = frames, frames.description
         self.notes: list[str] = []
+        self.shapeless: list[str] = []
+        """Links that would be wheels, tracks or flippers if they had a shape."""
         self.hints = dict(hints)
         known = {*self.description.links, *self.description.joints}
         for name, kind in hints.items():
@@ -77,8 +100,9 @@ class _Finder:
         ignored = frozenset(link for name in self._hinted("ignore") for link in self.description.subtree(name))
         flippers = self._flippers(ignored)
         taken = {link for joint in flippers for link in self.description.subtree(joint.child)} | ignored
-        tracks = self._tracks(taken)
-        taken |= {link for track in tracks for link in self.description.subtree(track)}
+        tracks = self._track_parts(self._tracks(taken))
+        taken |= {link for track in tracks for link, _ in track.shapes if track.name == track.link}
+        taken |= {link for track in tracks for link in self._hanging(track)}
         spinning = self._spinning(taken)
         names = [_short(joint.name) for joint, _ in spinning]
         wheels = tuple(
@@ -93,14 +117,17 @@ class _Finder:
             for joint in self.description.joints.values()
             if sum(wheel.rocker is not None and wheel.rocker.name == joint.name for wheel in wheels) >= 2
         )
+        level = self._level(wheels, rockers) if not tracks and not flippers else ()
+        rockers = tuple(joint for joint in rockers if joint not in level)
         carrying = {joint.name for joint in rockers}
         wheels = tuple(
             wheel if wheel.rocker is None or wheel.rocker.name in carrying else replace(wheel, rocker=None)
             for wheel in wheels
         )
         self._check_mimics(wheels, flippers)
-        self._told_still(wheels, flippers, rockers, taken)
-        return Parts(wheels, tuple(tracks), tuple(flippers), rockers, ignored, tuple(self.notes))
+        self._told_still(wheels, flippers, (*rockers, *level), taken)
+        parts = [part for joint in flippers for part in self._flipper_parts(joint)]
+        return Parts(wheels, tuple(tracks), tuple(parts), rockers, ignored, tuple(self.notes))
 
     def _hinted(self, kind: str) -> list[str]:
         """Links with a hint, by their own name or their joint's."""
@@ -124,21 +151,73 @@ class _Finder:
                     f"{joint.kind}, axis {np.round(self.frames.axis(joint), 2).tolist()} of the base frame"
                 )
             carried = list(self.description.subtree(joint.child))
-            if lateral and (hint or named) and len(self.frames.points(carried)):
+            if lateral and (hint or named) and not len(self.frames.points(carried)):
+                self.shapeless.append(joint.child)
+            elif lateral and (hint or named):
                 if any(joint.child in self.description.subtree(other.child) for other in found):
                     continue
                 found.append(joint)
                 self.notes.append(f"flipper {joint.child}: {'by hint' if hint else 'by its name'}, joint {joint.name}")
         return found
 
+    def _flipper_parts(self, joint: Joint) -> list[BeltPart]:
+        """The flipper of a joint, or one on either side if the joint turns both."""
+        links = list(self.description.subtree(joint.child))
+        sides = self.frames.sides(links)
+        if not sides:
+            return [BeltPart(joint.name, joint.child, tuple(self.frames.shapes(links)), joint)]
+        self.notes.append(
+            f"flipper {joint.child}: its shapes lie on both sides: one flipper on either side, each with half its "
+            f"mass; give both the angle of {joint.name} in JointState"
+        )
+        return [
+            BeltPart(f"{joint.name}_{side}", joint.child, tuple(shapes), joint, 0.5) for side, shapes in sides.items()
+        ]
+
+    def _track_parts(self, links: Sequence[str]) -> list[BeltPart]:
+        """The track of each link, or one on either side if a link has shapes on both."""
+        found = []
+        for link in links:
+            sides = self.frames.sides([link])
+            if sides:
+                found += [BeltPart(f"{link}_{side}", link, tuple(shapes)) for side, shapes in sides.items()]
+                self.notes.append(f"track {link}: its shapes lie on both sides: one track on either side")
+            else:
+                found.append(BeltPart(link, link, tuple(self.frames.shapes(self.description.subtree(link)))))
+        return found
+
+    def _hanging(self, track: BeltPart) -> list[str]:
+        """Links that belong to a track: all that hang on it, or none if it is a part of the body."""
+        return list(self.description.subtree(track.link)) if track.name == track.link else []
+
+    def _level(self, wheels: Sequence[WheelPart], rockers: Sequence[Joint]) -> tuple[Joint, ...]:
+        """Rockers that carry the whole body about one lateral axis, on which it would tip onto its stops."""
+        carried = [wheel.rocker for wheel in wheels if wheel.rocker in rockers]
+        if len(rockers) < 2 or len(carried) < len(wheels) or any(self.hint(j, j.child) == "rocker" for j in rockers):
+            return ()
+        pivots = np.array([self.frames.origin(joint) for joint in rockers])
+        lateral = all(abs(self.frames.axis(joint)[1]) > ALIGNED for joint in rockers)
+        if not lateral or np.ptp(pivots[:, [0, 2]], axis=0).max() > _ONE_AXIS:
+            return ()
+        self.notes.append(
+            f"rockers {', '.join(joint.name for joint in rockers)}: held at 0, because the whole body hangs on one "
+            "axis and the file does not say what keeps it level (a differential); to let them swing: "
+            f"--hint {rockers[0].name}=rocker"
+        )
+        return tuple(rockers)
+
     def _tracks(self, taken: set[str]) -> list[str]:
         found: list[str] = []
         for name in self.description.links:
             hint = self.hint(self.description.parent_joint(name), name)
-            if name in taken or name == self.frames.base or (hint is not None and hint != "track"):
+            if name in taken or (hint is not None and hint != "track"):
+                continue
+            if name == self.frames.base and not (hint and self.frames.sides([name])):
                 continue
             inside = any(name in self.description.subtree(track) for track in found)
             rollers = len(self.frames.points([name])) > 0
+            if _TRACK.search(name) and self.description.links[name].without_meshes and not rollers:
+                self.shapeless.append(name)
             if not inside and (hint or (_TRACK.search(name) and rollers)):
                 found.append(name)
                 self.notes.append(f"track {name}: {'by hint' if hint else 'by its name'}")
@@ -158,6 +237,8 @@ class _Finder:
                 shape = wheel_shape(self.frames, joint)
                 if shape is not None:
                     candidates.append((joint, shape))
+                elif self.description.links[joint.child].without_meshes:
+                    self.shapeless.append(joint.child)
         inner = {joint.child for joint, _ in candidates}
         # What carries another wheel is a rocker, not a wheel.
         return [
@@ -231,13 +312,43 @@ class _Finder:
                     f"joint {joint.name}: a suspension held rigid, URDF has no springs; write a `suspension` entry"
                 )
             else:
-                self.notes.append(f"joint {joint.name} ({joint.kind}): held at 0")
+                carries = sum(wheel.joint.child in self.description.subtree(joint.child) for wheel in wheels)
+                why = " (of joints that carry wheels, only the one next to two or more swings)" if carries else ""
+                self.notes.append(f"joint {joint.name} ({joint.kind}): held at 0{why}")
+        for link in self.shapeless:
+            self.notes.append(f"{link}: neither wheel, track nor flipper, because it has no shape without its mesh")
 
     def _axis(self, joint: Joint) -> str:
         axis = ", ".join(f"{value:g}" for value in np.round(self.frames.axis(joint), 2) + 0.0)
         return f"joint {joint.name}: its axis is ({axis}) of the base frame"
 
+    def _has_wheel(self, joint: Joint) -> bool:
+        try:
+            return wheel_shape(self.frames, joint) is not None
+        except UrdfError:
+            return False
+
     def _nothing(self) -> UrdfError:
+        if self.shapeless:
+            return UrdfError(
+                f"{self.description.path}: no wheel, track or flipper has a shape: the meshes of "
+                f"{', '.join(self.shapeless[:6])} are left out; name the folder of the meshes (--package NAME=FOLDER)"
+            )
+        ahead = [
+            joint.name
+            for joint in self.description.joints.values()
+            if joint.kind == "continuous" and abs(self.frames.axis(joint)[0]) > ALIGNED and self._has_wheel(joint)
+        ]
+        if len(ahead) >= 2:
+            directions = [name for name, angle in DIRECTIONS.items() if abs(np.cos(angle)) < 0.5]
+            if self.frames.forward not in ("x", "-x"):
+                directions = [name for name in DIRECTIONS if name not in directions]
+            return UrdfError(
+                f"{self.description.path}: the joints {', '.join(ahead[:4])} turn about a longitudinal axis of the "
+                "base frame, as if the robot drove sideways; name the direction of travel in the axes of "
+                f"{self.frames.base} (--forward={directions[0]} or --forward={directions[1]}) or a frame with x "
+                "forward (--base-frame)"
+            )
         turning = [joint for joint in self.description.joints.values() if joint.kind == "continuous"]
         listed = "; ".join(self._axis(joint) for joint in turning[:4]) or "there is no continuous joint"
         return UrdfError(
@@ -249,4 +360,4 @@ class _Finder:
 
 def _short(name: str) -> str:
     """A joint's name without the words at its end that most wheel joints have."""
-    return re.sub(r"(_wheel|_drive)?(_joint|_axle)?$", "", name) or name
+    return re.sub(r"(_wheel|_drive)?(_joint|_jnt|_axle)?$", "", name) or name

@@ -81,10 +81,13 @@ class MeshFiles:
             return None
         path = self.path(uri)
         if path is None:
-            raise UrdfError(
-                f"{where}: the mesh {uri} is missing; name its package's folder (--package NAME=FOLDER), source the "
-                "workspace that has it, or leave out meshes (--ignore-meshes)"
+            package = uri.partition("://")[2].partition("/")[0]
+            place = (
+                f"name its package's folder (--package {package}=FOLDER), source the workspace that has it"
+                if uri.startswith(("package://", "model://"))
+                else "put the file there"
             )
+            raise UrdfError(f"{where}: the mesh {uri} is missing; {place}, or leave out meshes (--ignore-meshes)")
         if path.stat().st_size > MAXIMUM_MESH_BYTES:
             raise UrdfError(f"{where}: {path}: {path.stat().st_size} bytes, expected at most {MAXIMUM_MESH_BYTES}")
         return _hull_points(path, where)
@@ -99,15 +102,18 @@ class MeshFiles:
         if scheme not in ("package", "model"):
             return None
         package, _, inside = rest.partition("/")
-        return next((found for folder in self._folders(package) if (found := _existing(folder / inside))), None)
+        folders = package_folders(package, self.description, self.packages)
+        return next((found for folder in folders if (found := _existing(folder / inside))), None)
 
-    def _folders(self, package: str) -> list[Path]:
-        listed = [self.packages[package]] if package in self.packages else []
-        for parent in self.description.resolve().parents:
-            listed += [parent] if parent.name == package else []
-            listed.append(parent / package)
-        prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
-        return listed + [Path(prefix) / "share" / package for prefix in prefixes if prefix]
+
+def package_folders(package: str, description: Path, packages: Mapping[str, Path]) -> list[Path]:
+    """Where a package may lie: as told, around the description, and in the sourced workspaces."""
+    listed = [Path(packages[package])] if package in packages else []
+    for parent in description.resolve().parents:
+        listed += [parent] if parent.name == package else []
+        listed.append(parent / package)
+    prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
+    return listed + [Path(prefix) / "share" / package for prefix in prefixes if prefix]
 
 
 def _existing(path: Path) -> Path | None:
