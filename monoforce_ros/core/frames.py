@@ -150,8 +150,8 @@ class RobotFrames:
             raise FrameError(
                 f"base_frame (--base-frame): got {base!r}, expected {own!r}, to which lengths in the robot file refer: "
                 f"transforms put it {np.linalg.norm(offset[:3, 3]):.3f} m away. Leave base_frame out: the offset of "
-                "the odometry's frame is then looked up. If the lengths do refer to the other frame, name it in the robot "
-                "file as `base_frame`"
+                "the odometry's frame is then looked up. If the lengths do refer to the other frame, name it in the "
+                "robot file as `base_frame`"
             )
 
 

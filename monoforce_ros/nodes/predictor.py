@@ -46,6 +46,9 @@ from monoforce_ros.prediction import FORCE_INTERVAL, Prediction, Predictor
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainDefaults
 
+_TRANSFORMS_PATIENCE = 2.0
+"""Time after the start in which a missing transform is no error [s]: /tf_static takes as long to be discovered."""
+
 
 @dataclass(frozen=True)
 class ComparisonJob:
@@ -273,7 +276,9 @@ class PredictorNode(ManagedNode):
         try:
             pose = self.frames.odometry_child(child_frame_id, self.transforms.tree)
         except FrameError as error:
-            self.health.report("odometry", ERROR, self.transforms.explained(error), reason="frame")
+            # Transforms may be on their way.
+            if self.transforms.unavailable or time.monotonic() - self._started > _TRANSFORMS_PATIENCE:
+                self.health.report("odometry", ERROR, self.transforms.explained(error), reason="frame")
             return
         self.inputs.add_motion("odometry", state.of_base(pose), frame_id, child_frame_id)
         self.health.report("odometry", OK, "receiving odometry")
@@ -407,6 +412,8 @@ class PredictorNode(ManagedNode):
             self.monitor.update(prediction, track, commands)
         except Exception as error:  # no input may end the node
             text = _explained(error)
+            if not len(self.inputs.motion()) and self.health.level("odometry") == ERROR:
+                text = "the odometry cannot be used, see its entry in /diagnostics"
             self.health.report("prediction", ERROR, f"nothing published: {text}", reason=type(error).__name__)
             return
         self._report_trust()
