@@ -21,9 +21,11 @@ import torch
 
 from monoforce_ros.core import CameraModel, homogeneous, write_text
 from monoforce_ros.encoder import CameraView, EncoderConfig, TerrainEncoder, encoder_input, fused, packed
+from monoforce_ros.encoder.heads import terrain_maps, with_edges
 from monoforce_ros.encoder.inference import multiplies_bfloat16
 from monoforce_ros.encoder.lift import lifted_points, map_cells, splat
-from monoforce_ros.encoder.terrain_encoder import terrain_maps, with_edges
+from monoforce_ros.encoder.terrain_encoder import MOMENTS
+from monoforce_ros.encoder.view import SUPPORT_CHANNELS
 
 FORWARD = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
 SUPPORT = np.array([[0.3, 0.3, -0.1], [0.3, -0.3, -0.1], [-0.3, 0.3, -0.1], [-0.3, -0.3, -0.1]])
@@ -66,7 +68,8 @@ def stages(encoder: TerrainEncoder, cameras: list[CameraView], repeats: int) -> 
         cells = map_cells(points, config)
         dtype = encoder.lift.weight.dtype
         images = (batch.images.float() / 127.5 - 1.0).to(dtype)
-        maps = torch.zeros(1, config.image_features + 5, config.grid.rows, config.grid.columns)
+        inputs = config.image_features + MOMENTS + SUPPORT_CHANNELS
+        maps = torch.zeros(1, inputs, config.grid.rows, config.grid.columns)
         maps = maps.contiguous(memory_format=torch.channels_last)
         encoded = encoder(batch)
         return {

@@ -7,11 +7,11 @@ import pytest
 import torch
 import yaml
 from conftest import ROOT
-from monoforce_ros.perception.camera import encoder_threads
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.core import MotionState
 from monoforce_ros.perception import SOURCES, FlatTerrain, Observation, choose_terrain_source
+from monoforce_ros.perception.encoder_terrain import encoder_threads
 from monoforce_ros.perception.fusion import apply_compliance
 from monoforce_ros.perception.ground_alignment import align_to_ground, clear_footprint
 from monoforce_ros.physics import State, rollout

@@ -59,7 +59,11 @@ def checkpoints(tmp_path_factory):
     torch.manual_seed(0)
     for sensor in ("camera", "lidar"):
         config = EncoderConfig(sensor=sensor, image_width=128, image_height=96, resolution=0.2)
-        save_encoder(new_encoder(config), folder / f"{sensor}.safetensors")
+        encoder = new_encoder(config)
+        # Untrained heads predict level ground.
+        with torch.no_grad():
+            encoder.heads.weight.normal_(0.0, 0.02)
+        save_encoder(encoder, folder / f"{sensor}.safetensors")
     return folder
 
 

@@ -20,7 +20,7 @@ from monoforce_ros.encoder.view import SUPPORT_CHANNELS, SWEEP_CHANNELS, CameraV
 from monoforce_ros.terrain import TerrainMap
 
 _GEOMETRY_CHANNELS = 5
-_MOMENTS = 3
+MOMENTS = 3
 """Channels of the mean height of a cell's features, its variance, and the evidence."""
 _NECK_CHANNELS = 64
 _CONTEXT_CHANNELS = 96
@@ -53,7 +53,7 @@ class TerrainEncoder(nn.Module):
         )
         self.lift = nn.Conv2d(_NECK_CHANNELS, config.depth_bins + config.image_features, kernel_size=1)
         self.level_weight = nn.Parameter(torch.tensor(1.0))
-        inputs = config.image_features + _MOMENTS + SUPPORT_CHANNELS + (SWEEP_CHANNELS if config.takes_sweeps else 0)
+        inputs = config.image_features + MOMENTS + SUPPORT_CHANNELS + (SWEEP_CHANNELS if config.takes_sweeps else 0)
         self.bird = BirdsEyeNetwork(inputs, config.map_features)
         self.heads = map_heads(config.map_features)
         depths = torch.from_numpy(depth_values(config)).float()
@@ -88,7 +88,7 @@ class TerrainEncoder(nn.Module):
             image_features, covered, evidence, depth = self._splat(batch)
         else:
             device = batch.support.device
-            image_features = torch.zeros(batch.maps, config.image_features + _MOMENTS, *shape[1:], device=device)
+            image_features = torch.zeros(batch.maps, config.image_features + MOMENTS, *shape[1:], device=device)
             covered, evidence, depth = torch.zeros(shape, dtype=torch.bool, device=device), None, None
         parts = [image_features, batch.support]
         if config.takes_sweeps:

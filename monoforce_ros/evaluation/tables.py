@@ -116,7 +116,7 @@ def terrain_source(system: System, robot: RobotModel) -> TerrainSource:
     if system.with_lidar:
         return choose_terrain_source("lidar_camera", robot, checkpoint=system.checkpoint)
     encoder = fused(load_encoder(system.checkpoint))
-    return EncoderTerrain(encoder, robot, ("lidar",) if system.input == "lidar" else ("camera",))
+    return EncoderTerrain(encoder, robot, ("lidar",) if system.input == "point cloud" else ("camera",))
 
 
 def _sequence(name: str, evaluation: RecordingEvaluation, method: str, chosen: np.ndarray) -> SequenceErrors:

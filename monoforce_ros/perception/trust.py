@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
+import torch
 from scipy import stats
 
 from monoforce_ros.core import MotionState, transform_points
@@ -39,6 +41,9 @@ class TrustReport:
     """How well predictions agreed with the ground that the robot then drove over."""
 
     trusted: bool
+    """Whether predictions are not worse than the fallback's."""
+    share: float
+    """Share of the predicted difference to the fallback's heights that the ground has confirmed, 0 to 1."""
     travelled: float
     """Distance over which predictions were compared [m]."""
     error: float
@@ -61,13 +66,13 @@ class TrustReport:
                 f" {100 * START_TOLERANCE:.0f} cm: check the cameras' poses, or adapt the encoder (train --adapt BAG)"
             )
         if not np.isfinite(self.error):
-            return "nothing compared yet: the robot has not reached ground that it predicted"
+            return "nothing compared yet: until the robot reaches ground that was predicted, the fallback is used"
         compared = (
             f"ground predicted {_NEAREST:g} to {_FARTHEST:g} m ahead was off by {100 * self.error:.0f} cm over the last"
             f" {self.travelled:.1f} m, level ground by {100 * self.level_error:.0f} cm"
         )
         if self.trusted:
-            return compared
+            return f"{compared}; {100 * self.share:.0f} % of what it adds to the fallback's heights are used"
         camera = f", worst from {self.worst_camera}" if self.worst_camera else ""
         return f"{compared}{camera}: adapt the encoder to this robot (train --adapt BAG)"
 
@@ -82,6 +87,8 @@ class _Said:
     observed: np.ndarray
     level: float
     """Height of level ground in that frame [m]."""
+    fallback: np.ndarray
+    """Heights of the fallback's map ``[rows, columns]`` [m]."""
     cameras: Mapping[str, float]
     """Direction of each camera's optical axis in that frame [rad]."""
 
@@ -91,6 +98,12 @@ class TerrainTrust:
 
     Level ground at the height of the wheels is the rival: an encoder that loses against it over the last metres harms.
     Errors are averaged over blocks of half a metre of travel; a paired t-test over the blocks decides.
+
+    How much of a prediction is used has to be earned, too: the share w of its difference d to the fallback's heights is
+    the regression of the ground's difference g on d, g = w d + noise, with the prior w ~ N(0, 1). The posterior mean is
+    Σ d g / (Σ d² + σ²) over blocks; for σ², the variance of the noise, stands that of g, which it is if d says nothing.
+    One standard deviation less is used: two hills may be alike by chance. The share is 0 at the start, 3/4
+    after three blocks of perfect predictions, and near 0 for pictures of another place.
     """
 
     def __init__(self, grid: Grid):
@@ -101,6 +114,9 @@ class TerrainTrust:
         self._said: deque[_Said] = deque(maxlen=round((LENGTH + _FARTHEST) / BLOCK))
         self._blocks: deque[tuple[float, float]] = deque(maxlen=round(LENGTH / BLOCK))
         """Mean error of the prediction and of level ground in each block."""
+        self._moments: deque[tuple[float, float, float]] = deque(maxlen=round(LENGTH / BLOCK))
+        """Means of d g, d² and g² in each block."""
+        self._pending_moments: list[tuple[float, float, float]] = []
         self._pending: list[tuple[float, float, float, str]] = []
         """Error, error of level ground, distance and camera of each comparison of the current block."""
         self._compared: deque[tuple[float, float, float, str]] = deque(maxlen=2000)
@@ -115,6 +131,7 @@ class TerrainTrust:
         predicted: TerrainMap,
         cameras: Mapping[str, float],
         start_error: float,
+        fallback: TerrainMap | None = None,
     ) -> TrustReport:
         """Compare earlier predictions with the ground under the wheels, and remember the newest one.
 
@@ -124,6 +141,7 @@ class TerrainTrust:
             predicted: predicted map.
             cameras: direction of each camera's optical axis in the terrain frame [rad].
             start_error: median difference between predicted and actual ground under the wheels [m].
+            fallback: map that is used in place of the predicted one; level ground by default.
         """
         if self._previous is None or not continues(motion, self._previous):
             self._start_over()
@@ -140,15 +158,20 @@ class TerrainTrust:
                 self._blocks.append(
                     (float(np.mean([e[0] for e in self._pending])), float(np.mean([e[1] for e in self._pending])))
                 )
-                self._compared.extend(self._pending)
-                self._pending = []
-                self._judge()
-            self._said.append(
-                _Said(
-                    motion, predicted.height.numpy().copy(), predicted.observed.numpy().copy(),
-                    float(support[:, 2].mean()), dict(cameras),
+                self._moments.append(
+                    (
+                        float(np.mean([m[0] for m in self._pending_moments])),
+                        float(np.mean([m[1] for m in self._pending_moments])),
+                        float(np.mean([m[2] for m in self._pending_moments])),
+                    )
                 )
-            )  # fmt: skip
+                self._compared.extend(self._pending)
+                self._pending, self._pending_moments = [], []
+                self._judge()
+            level = float(support[:, 2].mean())
+            height = predicted.height.numpy().copy()
+            other = np.full_like(height, level) if fallback is None else fallback.height.numpy().copy()
+            self._said.append(_Said(motion, height, predicted.observed.numpy().copy(), level, other, dict(cameras)))
         return self._report(start_error)
 
     def _compare(self, points: np.ndarray) -> None:
@@ -168,6 +191,15 @@ class TerrainTrust:
             away = {name: abs((axis - towards + np.pi) % (2 * np.pi) - np.pi) for name, axis in said.cameras.items()}
             camera = min(away, key=lambda name: away[name]) if away else ""
             self._pending.append((error, level, float(distance[usable].mean()), camera))
+            other = said.fallback[rows, columns][usable]
+            said_more, was_more = height - other, local[usable, 2] - other
+            self._pending_moments.append(
+                (
+                    float((said_more * was_more).mean()),
+                    float((said_more**2).mean()),
+                    float((was_more**2).mean()),
+                )
+            )
 
     def _judge(self) -> None:
         if len(self._blocks) < _FEWEST_BLOCKS:
@@ -181,6 +213,17 @@ class TerrainTrust:
         else:
             self._trusted = bool(difference.mean() <= TOLERANCE)
 
+    def _share(self) -> float:
+        """The posterior mean of the share w, less its standard deviation."""
+        if len(self._moments) < _FEWEST_BLOCKS:
+            return 0.0
+        product, square, ground = np.array(self._moments).T.sum(axis=1)
+        count = len(self._moments)
+        precision = max(square + ground / count, 1e-9)
+        share = product / precision
+        unexplained = max(ground - 2.0 * share * product + share**2 * square, 0.0) / count
+        return float(np.clip(share - np.sqrt(unexplained / precision), 0.0, 1.0))
+
     def _report(self, start_error: float) -> TrustReport:
         own, level = (float(np.mean([b[i] for b in self._blocks])) if self._blocks else float("nan") for i in (0, 1))
         entries = list(self._compared)
@@ -192,8 +235,10 @@ class TerrainTrust:
                 by_distance[f"{low:g} to {high:g} m"] = means
         cameras = {entry[3] for entry in entries}
         worst = max(cameras, key=lambda name: float(np.mean([e[0] for e in entries if e[3] == name])), default="")
+        trusted = self._trusted and start_error <= START_TOLERANCE
         return TrustReport(
-            trusted=self._trusted and start_error <= START_TOLERANCE,
+            trusted=trusted,
+            share=self._share() if trusted else 0.0,
             travelled=BLOCK * len(self._blocks),
             error=own,
             level_error=level,
@@ -204,7 +249,7 @@ class TerrainTrust:
 
 
 class TrustedTerrain:
-    """An encoder's terrain as long as it is better than level ground, and a fallback otherwise.
+    """An encoder's terrain to the degree that the ground has confirmed it, and a fallback otherwise.
 
     The encoder keeps predicting meanwhile, and is used again once it is no worse than level ground.
 
@@ -233,14 +278,28 @@ class TrustedTerrain:
     def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
         """The encoder's map or the fallback's; raises the source's errors."""
         predicted = self._source.terrain(observation, motion)
+        measured = {"lidar": observation.cloud is not None, "camera": bool(observation.images)}
+        fallback = next(f for f in self._fallbacks if all(measured[sensor] for sensor in f.sensors))
+        other = fallback.terrain(observation, motion)
         support = support_points(self._encoder.robot, motion, self._encoder.encoder.config.stiffness)
         cameras = {}
         for name, pose in observation.base_from_cameras.items():
             axis = (motion.terrain_from_base @ pose)[:3, 2]
             cameras[name] = float(np.arctan2(axis[1], axis[0]))
-        self.report = self._trust.update(motion, support, predicted, cameras, self._encoder.start_error)
-        if self.report.trusted:
-            return predicted
-        measured = {"lidar": observation.cloud is not None, "camera": bool(observation.images)}
-        fallback = next(f for f in self._fallbacks if all(measured[sensor] for sensor in f.sensors))
-        return fallback.terrain(observation, motion)
+        self.report = self._trust.update(motion, support, predicted, cameras, self._encoder.start_error, other)
+        return blended(other, predicted, self.report.share)
+
+
+def blended(fallback: TerrainMap, predicted: TerrainMap, share: float) -> TerrainMap:
+    """The fallback's map with a share of its difference to a predicted one.
+
+    Stiffness, damping and friction are interpolated in their logarithms. What the predicted map says of its heights'
+    spread, and which cells were observed, stays.
+    """
+    if share <= 0.0:
+        return fallback
+    changed: dict[str, Any] = {name: torch.lerp(getattr(fallback, name), getattr(predicted, name), share)
+               for name in ("height", "geometric_height")}  # fmt: skip
+    for name in ("stiffness", "damping", "friction"):
+        changed[name] = torch.lerp(getattr(fallback, name).log(), getattr(predicted, name).log(), share).exp()
+    return replace(predicted, **changed)

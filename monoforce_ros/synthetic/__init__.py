@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from monoforce_ros.synthetic.scenery import Scenery, build_scenery
     from monoforce_ros.synthetic.sensors import CameraSettings, LidarSettings
     from monoforce_ros.synthetic.simulation import Simulation
+    from monoforce_ros.synthetic.snapshots import Snapshot, WorldSnapshots, take_snapshots
     from monoforce_ros.synthetic.terrain_shape import GROUNDS, TerrainSettings
     from monoforce_ros.synthetic.varied.settings import STYLES, WorldSettings
     from monoforce_ros.synthetic.varied.wall_ahead import AHEAD_KINDS, WallAhead, draw_wall_ahead
@@ -38,6 +39,7 @@ else:
             "scenery": ("Scenery", "build_scenery"),
             "sensors": ("CameraSettings", "LidarSettings"),
             "simulation": ("Simulation",),
+            "snapshots": ("Snapshot", "WorldSnapshots", "take_snapshots"),
             "terrain_shape": ("GROUNDS", "TerrainSettings"),
             "varied.settings": ("STYLES", "WorldSettings"),
             "varied.wall_ahead": ("AHEAD_KINDS", "WallAhead", "draw_wall_ahead"),
@@ -63,11 +65,13 @@ __all__ = [
     "RecordingSettings",
     "Scenery",
     "Simulation",
+    "Snapshot",
     "TerrainSettings",
     "VariedWorld",
     "Vehicle",
     "WallAhead",
     "WorldSettings",
+    "WorldSnapshots",
     "build_model",
     "build_scenery",
     "draw_hidden",
@@ -76,4 +80,5 @@ __all__ = [
     "parse_hidden",
     "random_stream",
     "record",
+    "take_snapshots",
 ]

@@ -19,8 +19,7 @@ from monoforce_ros.core import MotionState
 from monoforce_ros.encoder import EncoderConfig, network_image
 from monoforce_ros.perception import support_points
 from monoforce_ros.robots import load_robot
-from monoforce_ros.synthetic import WorldSettings
-from monoforce_ros.synthetic.snapshots import WorldSnapshots, take_snapshots
+from monoforce_ros.synthetic import WorldSettings, WorldSnapshots, take_snapshots
 from monoforce_ros.terrain import Grid
 from monoforce_ros.training.recording_samples import (
     SAMPLES_VERSION,
