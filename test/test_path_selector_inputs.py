@@ -28,10 +28,13 @@ class Robot:
         self.odometry = node.create_publisher(Odometry, f"/{prefix}/odom", BEST_EFFORT)
         self.candidates = node.create_publisher(PointCloud2, f"/{prefix}/predicted/candidate_costs", 1)
         self.goals = node.create_publisher(PoseStamped, f"/{prefix}/goal_pose", 1)
+        self.transforms: dict = {}
         self.place, self.heading, self.speed = np.zeros(2), 0.0, 0.0
         self.child, self.frame = "base_link", "odom"
         self.commands: list = []
         self.base = None
+        self.obeys = False
+        self.travelled = 0.0
 
     def listen(self, kind: type) -> None:
         """Become a base that listens to one type of command."""
@@ -41,10 +44,11 @@ class Robot:
         self.commands.clear()
         self.base = node.create_subscription(kind, f"/{self.prefix}/cmd_vel", self.commands.append, BEST_EFFORT)
 
-    def send_goal(self, x: float, y: float, frame: str = "odom") -> None:
+    def send_goal(self, x: float, y: float, frame: str = "odom", stamp: int = 0) -> None:
         assert self.peer.until(lambda: self.goals.get_subscription_count() > 1, 10.0)
         goal = PoseStamped()
         goal.header.frame_id = frame
+        goal.header.stamp.sec, goal.header.stamp.nanosec = divmod(stamp, 10**9)
         goal.pose.position.x, goal.pose.position.y = x, y
         self.goals.publish(goal)
 
@@ -53,6 +57,11 @@ class Robot:
         end, step = time.monotonic() + seconds, 0
         while time.monotonic() < end:
             self.peer.now += 50_000_000
+            if self.obeys and self.commands:
+                twist = getattr(self.commands[-1], "twist", self.commands[-1])
+                self.speed = twist.linear.x
+                self.heading += 0.05 * twist.angular.z
+            self.travelled += 0.05 * self.speed
             self.place = self.place + 0.05 * self.speed * np.array([np.cos(self.heading), np.sin(self.heading)])
             stamp = self.peer.now
             if odometry:
@@ -77,6 +86,19 @@ class Robot:
             fields |= {f"x_{share}": self.place[0] + along * (fields["x"] - self.place[0])}
             fields |= {f"y_{share}": self.place[1] + along * (fields["y"] - self.place[1])}
         return encoding.point_cloud(stamp, self.frame, fields)
+
+    def send_transform(self, parent: str, child: str, pose: list[float], *, static: bool = False) -> None:
+        """Publish a transform; the pose is x, y, z [m], roll, pitch, yaw [rad]."""
+        kind = message_class("tf2_msgs/msg/TFMessage")
+        if kind is None:
+            pytest.skip("tf2_msgs is not installed (make interfaces builds it)")
+        topic = "/tf_static" if static else "/tf"
+        if topic not in self.transforms:
+            latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+            self.transforms[topic] = self.peer.node.create_publisher(kind, topic, latched if static else 100)
+            assert self.peer.until(lambda: self.transforms[topic].get_subscription_count() > 0, 10.0)
+        message = builders.transforms(self.peer.now, parent, {child: pose_matrix(pose)})
+        self.transforms[topic].publish(bytes(type_store().serialize_cdr(message, message.__msgtype__)))
 
     def status(self, part: str = "choice") -> tuple[int, str]:
         for array in reversed(self.peer.received["/diagnostics"]):
@@ -214,6 +236,74 @@ def test_goals_in_the_map_are_transformed_by_tf(robot):
     robot.place = np.array([5.0, 0.1])
     robot.send_goal(1.0, 7.0, frame="map_2")
     assert robot.live(10.0, until=robot.says("the goal is reached: 0.10 m away")), robot.status()
+
+
+@pytest.mark.parametrize(("frame", "goal"), [("base_link", (2.0, 0.0)), ("lidar_7", (-0.5, -2.0))])
+def test_a_goal_that_moves_with_the_robot_is_reached_and_the_robot_stops_there(robot, frame, goal):
+    robot.listen(Twist)
+    robot.place, robot.heading = np.array([3.0, 1.0]), np.pi / 2
+    # The lidar looks to the left.
+    robot.send_transform("base_link", "lidar_7", [1.5, 0.0, 0.4, 0.0, 0.0, np.pi / 2], static=True)
+    robot.obeys = True
+    robot.live(1.0)
+    robot.send_goal(*goal, frame=frame)
+    # (-0.5, -2) from the lidar is (1.5 + 2, -0.5) from the base, which looks along y.
+    expected = np.array([3.0, 3.0] if frame == "base_link" else [3.5, 4.5])
+    assert robot.live(20.0, until=robot.says("the goal is reached")), robot.status()
+    robot.live(2.0)
+    assert np.linalg.norm(robot.place - expected) < 0.6 and robot.travelled < 5.0, (robot.place, robot.travelled)
+    assert robot.speed == 0.0 and not robot.driven
+    assert f"'{frame}' moves with the robot: the goal is kept at ({expected[0]:.2f}, {expected[1]:.2f}) in 'odom'" in (
+        robot.process.output
+    )
+
+
+def test_a_goal_that_moves_with_the_robot_counts_from_its_stamp(robot):
+    robot.listen(Twist)
+    robot.speed = 1.0
+    robot.live(3.0)
+    # Where the robot was a second ago, 2 m ahead of it then: 1 m ahead of it now.
+    place, stamp = robot.place.copy(), robot.peer.now
+    robot.live(1.0)
+    robot.send_goal(2.0, 0.0, frame="base_link", stamp=stamp)
+    kept = f"is kept at ({place[0] + 2.0:.2f}, 0.00) in 'odom'"
+    assert robot.live(10.0, until=lambda: kept in robot.process.output), (kept, robot.process.output)
+
+
+def test_a_stamp_that_the_odometry_does_not_reach_is_refused(robot):
+    robot.listen(Twist)
+    robot.live(1.0)
+    robot.send_goal(2.0, 0.0, frame="base_link", stamp=robot.peer.now + 60 * 10**9)
+    assert robot.live(2.0, until=robot.says("waiting for a transform: the goal is in frame 'base_link'"))
+    assert robot.live(10.0, until=robot.says("the goal is refused, not transformed within 2 s")), robot.status()
+    assert "no odometry: the newest one is 5" in robot.status()[1] and not robot.driven
+
+
+def test_a_goal_in_the_map_follows_a_correction(robot):
+    robot.listen(Twist)
+    robot.send_transform("map_3", "odom", [0.0] * 6)
+    robot.send_transform("odom", "base_link", [0.0] * 6)
+    robot.obeys = True
+    robot.send_goal(3.0, 0.0, frame="map_3")
+    assert robot.live(10.0, until=lambda: robot.place[0] > 0.5), robot.status()
+    # Localisation finds that the odometry frame lies 2 m further back: the goal is at (5, 0) in it.
+    robot.send_transform("map_3", "odom", [-2.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    assert robot.live(20.0, until=robot.says("the goal is reached")), robot.status()
+    robot.live(1.0)
+    assert np.linalg.norm(robot.place - [5.0, 0.0]) < 0.6 and robot.speed == 0.0, robot.place
+
+
+def test_a_goal_without_a_transform_is_refused_and_the_robot_stands(robot):
+    robot.listen(Twist)
+    robot.send_goal(3.0, 0.0, frame="nowhere")
+    assert robot.live(10.0, until=robot.says("the goal is refused, not transformed within 2 s")), robot.status()
+    assert "in frame 'nowhere', odometry in 'odom': no transform has" in robot.status()[1]
+    # A transform that comes after that moves nothing: the goal has to be sent again.
+    robot.send_transform("nowhere", "odom", [0.0] * 6)
+    robot.live(1.5)
+    assert not robot.driven
+    robot.send_goal(3.0, 0.0, frame="nowhere")
+    assert robot.live(10.0, until=lambda: robot.driven), robot.status()
 
 
 @pytest.mark.parametrize("robot", ["odometry_child_pose:=[2.0, 0.0, 0.0, 0.0, 0.0, 0.0]"], indirect=True)
