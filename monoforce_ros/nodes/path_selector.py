@@ -85,7 +85,7 @@ class PathSelectorNode(Node):
         self._first_odometry = 0.0
         self._arrivals: dict[str, float] = {}
         self._candidates: Candidates | None = None
-        self._moving = False
+        self._moving = self._driving = False
         self._last_command = (0.0, 0.0)
         self._progress = ProgressCheck()
         self._map: tuple[np.ndarray, float, np.ndarray] | None = None
@@ -175,6 +175,10 @@ class PathSelectorNode(Node):
         self._base_name = self.frames.base_name(child, self.transforms.tree.frames)
         on_robot = {child or self._base_name: offset, self._base_name: np.eye(4)}
         self._course_frames.add_odometry(frame_id, self._motion, on_robot)
+        if self._driving:
+            motion = self._motion
+            seconds = motion.stamp * NANOSECOND
+            self._progress.add(seconds, self._last_command, motion.position[:2], motion.heading)
         self.health.report("odometry", OK, "receiving odometry")
 
     def _on_candidates(self, message: PointCloud2) -> None:
@@ -207,6 +211,7 @@ class PathSelectorNode(Node):
 
     def _publish_command(self) -> None:
         command = self._command()
+        self._driving = command is not None
         if command is None:
             self._progress.clear()
         # Without a goal nothing is published; a robot that was moving is commanded to stop first.
@@ -259,7 +264,6 @@ class PathSelectorNode(Node):
         if best is None:
             raise Stop("no candidate is feasible", "infeasible")
         command = float(candidates.fields["speed"][best]), float(candidates.fields["yaw_rate"][best])
-        self._progress.add(time.monotonic(), command, position, motion.heading)
         self._report_driving(distance, command)
         return command
 
@@ -336,12 +340,12 @@ class PathSelectorNode(Node):
         if moving:
             self.health.report(PART, OK, "driving to the goal", reason="driving", **values)
         elif moving is None:
-            message = "commands are sent, odometry shows no motion yet"
+            message = f"commands are sent to {self._commands.listeners}, odometry shows no motion yet"
             self.health.report(PART, OK, message, reason="starting", **values)
         else:
             sent = f"{command[0]:.2f} m/s and {command[1]:.2f} rad/s are sent to {self._commands.topic}"
-            kind = self._commands.type
-            message = f"the robot does not move: {sent} ({kind}), odometry has shown no motion for {WINDOW:g} s"
+            heard = f"{self._commands.type}, heard by {self._commands.listeners}"
+            message = f"the robot does not move: {sent} ({heard}), odometry has shown no motion for {WINDOW:g} s"
             self.health.report(PART, WARN, message, reason="no motion", **values)
 
 
