@@ -2,8 +2,13 @@
 
 ``ros2 launch monoforce_ros predictor.launch.py robot:=husky terrain_source:=lidar candidates:=32 path_selector:=true``
 
-Arguments override the parameter file. What is started is decided, and checked, by monoforce_ros.nodes.launch_plan.
+Every parameter of the nodes is an argument; ``--show-args`` lists them, and says which node has each. They are checked
+as the nodes check them, and override the parameter file. What is started is decided, and checked, by
+monoforce_ros.nodes.launch_plan.
 """
+
+import sys
+from pathlib import Path
 
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
@@ -15,6 +20,8 @@ from monoforce_ros.nodes.launch_plan import launch_arguments, plan_nodes
 
 def _nodes(context: LaunchContext) -> list[Node]:
     """The nodes for the given arguments."""
+    # Where another launch file was called, the arguments on the command line are first of all that file's.
+    included = not any(Path(word).name == Path(__file__).name for word in sys.argv)
     given = {argument.name: LaunchConfiguration(argument.name).perform(context) for argument in launch_arguments()}
     return [
         Node(
@@ -26,12 +33,12 @@ def _nodes(context: LaunchContext) -> list[Node]:
             remappings=list(plan.remappings),
             output="screen",
         )
-        for plan in plan_nodes(given, context.argv)
+        for plan in plan_nodes(given, context.argv, included=included)
     ]
 
 
 def generate_launch_description() -> LaunchDescription:
-    """The predictor with its most important parameters as arguments, and path_selector on request."""
+    """The predictor and, on request, path_selector, with their parameters as arguments."""
     declared = [
         DeclareLaunchArgument(argument.name, default_value="", description=argument.description)
         for argument in launch_arguments()

@@ -5,7 +5,13 @@ import subprocess
 import pytest
 from conftest import ROOT
 
-from monoforce_ros.nodes.arguments import check_parameter_files, own_arguments, parameter_files, refuse_stray_arguments
+from monoforce_ros.nodes.arguments import (
+    check_parameter_files,
+    own_arguments,
+    parameter_files,
+    refuse_other_nodes,
+    refuse_stray_arguments,
+)
 
 KNOWN = ("robot", "terrain_source", "rate")
 
@@ -43,6 +49,24 @@ def test_a_file_without_a_section_for_the_node_is_reported(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("words", "right"),
+    [
+        (["-p", "predictor:robot:=marv"], True),
+        (["-p", "left/predictor:robot:=marv"], False),
+        (["-r", "predictor:cmd_vel:=drive", "-r", "rostopic://a:=b", "-r", "__ns:=/", "-p", "robot:=a:b"], True),
+        (["--param", "predictr:robot:=marv"], False),
+        (["-r", "foresight:cmd_vel:=drive"], False),
+    ],
+)
+def test_what_is_for_a_node_of_another_name_is_refused(words, right):
+    if right:
+        refuse_other_nodes(words, "/predictor")
+        return
+    with pytest.raises(ValueError, match="the node is /predictor, not"):
+        refuse_other_nodes(words, "/predictor")
+
+
+@pytest.mark.parametrize(
     ("command", "message"),
     [
         (
@@ -61,6 +85,13 @@ def test_a_file_without_a_section_for_the_node_is_reported(tmp_path):
             "path_selector --ros-args -p weight_distence:=1.0",
             "unknown parameter 'weight_distence'; did you mean 'weight_distance'?",
         ),
+        (
+            "predictor --ros-args -p predictr:terrain_source:=camera",
+            "the node is /predictor, not 'predictr'; give -p terrain_source:=camera",
+        ),
+        ("path_selector --ros-args -r selector:cmd_vel:=drive", "the node is /path_selector, not 'selector'"),
+        ("path_selector --ros-args --params-file {misnamed}", "no node is called /path_selectr; did you mean 'path_s"),
+        ("path_selector --ros-args --params-file {beside}", "'timeout: 2.0' is not under 'ros__parameters'"),
         ("simulator --fat", "unrecognized arguments: --fat; did you mean '--flat'?"),
         ("bag_player --rte 3", "unrecognized arguments: --rte; did you mean '--rate'?"),
         ("bag_player --ros-args -p rate:=3.0", "unknown parameter 'rate': bag_player has no parameters"),
@@ -69,7 +100,12 @@ def test_a_file_without_a_section_for_the_node_is_reported(tmp_path):
     ],
 )
 def test_a_wrong_command_line_ends_the_start_in_one_line(executables, ros_environment, tmp_path, command, message):
-    filled = command.format(schema=ROOT / "config" / "predictor.schema.yaml", out=tmp_path / "bag")
+    files = {name: tmp_path / f"{name}.yaml" for name in ("misnamed", "beside")}
+    section = "ros__parameters:\n    timeout: 1.0\n"
+    files["misnamed"].write_text(f"path_selector:\n  {section}path_selectr:\n  {section}")
+    files["beside"].write_text(f"/**:\n  timeout: 2.0\n  {section}")
+    schema = ROOT / "config" / "predictor.schema.yaml"
+    filled = command.format(schema=schema, out=tmp_path / "bag", **files)
     name, *words = filled.split()
     done = subprocess.run(
         [str(executables / name), *words],

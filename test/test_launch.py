@@ -1,14 +1,16 @@
 """The launch file: its plan everywhere, and the file itself wherever ROS's launch is installed."""
 
 import importlib.util
+import json
 import subprocess
 import sys
+from unittest.mock import MagicMock
 
 import pytest
 from conftest import ROOT
 
-from monoforce_ros.nodes.launch_plan import launch_arguments, plan_nodes
-from monoforce_ros.nodes.schema import read_schema, schema_path
+from monoforce_ros.nodes.launch_plan import AMBIGUOUS, SHARED, launch_arguments, plan_nodes
+from monoforce_ros.nodes.schema import SCHEMAS, read_schema, schema_path
 
 LAUNCH_FILE = ROOT / "launch" / "predictor.launch.py"
 
@@ -90,6 +92,18 @@ def test_wrong_values_are_named_with_what_was_expected(given, message):
             "section /\\*\\*: rate: got 'fast', expected a number 0.1 … 100 Hz",
         ),
         ("robot: husky\n", "has no 'ros__parameters'"),
+        (
+            "/**:\n  robot: jackal\n  ros__parameters:\n    rate: 3.0\n",
+            "'robot: jackal' is not under 'ros__parameters'",
+        ),
+        (
+            "predictor:\n  ros__parameters:\n    rate: 3.0\npredictr:\n  ros__parameters:\n    horizon: 3.0\n",
+            "no node is called /predictr; did you mean 'predictor'",
+        ),
+        (
+            "predictor:\n  ros__parameters:\n    rate: 3.0\nforesight:\n  ros__parameters:\n    horizon: 3.0\n",
+            "no node is called /foresight; expected /left/predictor or /\\*\\*",
+        ),
         ("a: [", "is not YAML"),
     ],
 )
@@ -98,10 +112,77 @@ def test_a_wrong_parameter_file_is_named_with_what_was_expected(file, text, mess
         plan_nodes({"params_file": file(text), "namespace": "left"})
 
 
-def test_a_misspelt_argument_is_answered_and_those_of_other_launch_files_are_left_alone():
-    with pytest.raises(ValueError, match="unknown launch argument 'terain_source'; did you mean 'terrain_source'"):
-        plan_nodes({}, ["terain_source:=camera"])
-    assert plan_nodes({}, ["slam:=true", "robot:=husky", "map_yaml:=x"])
+def test_sections_for_other_packages_and_other_robots_are_left_alone(file):
+    mine = "predictor:\n  ros__parameters:\n    rate: 3.0\n"
+    others = "controller_server:\n  ros__parameters:\n    controller_frequency: 20.0\n    odom_topic: odom\n"
+    others += "/right/predictor:\n  ros__parameters:\n    robot: marv\n/**/costmap:\n  ros__parameters: {}\n"
+    (plan,) = plan_nodes({"params_file": file(mine + others), "namespace": "left"})
+    assert plan.parameters == {"rate": 3.0}
+
+
+def test_a_parameter_with_two_meanings_is_not_set_for_both_nodes_at_once(file):
+    path = file("/**:\n  ros__parameters:\n    rate: 3.0\n")
+    assert plan_nodes({"params_file": path})[0].parameters == {"rate": 3.0}
+    with pytest.raises(ValueError, match="rate means something else in either node; set it in a params_file, under"):
+        plan_nodes({"params_file": path, "path_selector": "true"})
+    with pytest.raises(ValueError, match="predictor: Largest rate of predictions.*under 'predictor:' or 'path_selec"):
+        plan_nodes({}, ["rate:=3.0"])
+
+
+def test_every_parameter_is_an_argument_and_reaches_the_nodes_that_have_it():
+    entries = {node: {entry.name: entry for entry in read_schema(schema_path(node))} for node in SCHEMAS}
+    both = set(entries["predictor"]) & set(entries["path_selector"])
+    assert both == {*AMBIGUOUS, *SHARED}, "a parameter of both nodes: does it mean the same in both?"
+    arguments = {argument.name for argument in launch_arguments()}
+    for node, known in entries.items():
+        for name, entry in known.items():
+            if name in AMBIGUOUS:
+                assert name not in arguments
+                continue
+            value = entry.default
+            if value is None or entry.type == "string_array":
+                value = [0.5] * entry.size if entry.type == "double_array" else ["/a", "/b"]
+            text = value if isinstance(value, str) else json.dumps(value)
+            if text:
+                plans = {
+                    plan.name: plan.parameters for plan in plan_nodes({}, [f"{name}:={text}", "path_selector:=true"])
+                }
+                assert plans[node] == {name: value}
+                assert all((name in plans[other]) == (name in entries[other]) for other in plans)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["horizon:=300"], "horizon: got 300, expected a number"),
+        (["image_topics:=a"], r"image_topics: got 'a', expected a list of texts, such as image_topics:='\[/a, /a\]'"),
+        (
+            ["goal_topic:=/g"],
+            "goal_topic is a parameter of path_selector, which is not started: add path_selector:=true",
+        ),
+        (["terain_source:=camera"], "unknown launch argument 'terain_source'; did you mean 'terrain_source'?"),
+        (["ns:=left"], "unknown launch argument 'ns'; did you mean 'namespace'?"),
+        (["slam:=true"], "unknown launch argument 'slam'.*--show-args lists all arguments"),
+        (["candidates=32"], "unexpected argument 'candidates=32': launch arguments are given as candidates:=32"),
+        (["--robot", "husky"], "unexpected argument '--robot': launch arguments are given as robot:=VALUE"),
+    ],
+)
+def test_an_argument_that_would_be_ignored_is_refused_with_the_right_advice(words, message):
+    with pytest.raises(ValueError, match=message):
+        plan_nodes({}, words)
+
+
+def test_an_empty_argument_empties_what_the_file_sets(file):
+    path = file("path_selector:\n  ros__parameters:\n    plan_topic: /plan\n")
+    words = [f"params_file:={path}", "path_selector:=true"]
+    assert plan_nodes({}, words)[1].parameters == {"plan_topic": "/plan"}
+    assert plan_nodes({}, [*words, "plan_topic:="])[1].parameters == {"plan_topic": ""}
+
+
+def test_arguments_of_a_launch_file_that_includes_this_one_are_left_alone():
+    assert plan_nodes({"robot": "marv"}, ["slam:=true", "robot:=husky", "map_yaml:=x", "rate:=5"], included=True)
+    with pytest.raises(ValueError, match="did you mean 'terrain_source'"):
+        plan_nodes({}, ["terain_source:=camera"], included=True)
 
 
 def test_every_launch_argument_is_a_parameter_or_explained():
@@ -110,6 +191,8 @@ def test_every_launch_argument_is_a_parameter_or_explained():
     known = {entry.name: entry for entry in read_schema(schema_path("predictor"))}
     for name in set(described) & set(known):
         assert described[name].startswith(known[name].description)
+    assert described["horizon"].endswith("Parameter of predictor.")
+    assert described["odometry_topic"].endswith("Parameter of predictor and path_selector.")
     assert all("Default: " in text for text in described.values())
 
 
@@ -121,6 +204,34 @@ def test_the_plan_needs_neither_launch_nor_the_physics():
     )
     done = subprocess.run([sys.executable, "-c", loaded], capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout.strip() == "[]"
+
+
+@pytest.fixture
+def launch_file(monkeypatch):
+    """The launch file, with stand-ins for ROS's launch, which keep what they are given."""
+    for name in ("launch", "launch.actions", "launch.substitutions", "launch_ros", "launch_ros.actions"):
+        monkeypatch.setitem(sys.modules, name, MagicMock())
+    sys.modules["launch_ros.actions"].Node = dict
+    spec = importlib.util.spec_from_file_location("predictor_launch", LAUNCH_FILE)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    given: dict[str, str] = {}
+    monkeypatch.setattr(module, "LaunchConfiguration", lambda name: MagicMock(perform=lambda _: given.get(name, "")))
+    return module, given
+
+
+def test_arguments_reach_the_nodes_and_unknown_ones_end_the_start_unless_another_file_owns_them(
+    launch_file, monkeypatch
+):
+    module, given = launch_file
+    given |= {"horizon": "3.0", "timeout": "1.0", "path_selector": "true"}
+    monkeypatch.setattr(sys, "argv", ["ros2", "launch", "monoforce_ros", "predictor.launch.py", "horizon:=3.0"])
+    predictor, selector = module._nodes(MagicMock(argv=["horizon:=3.0", "timeout:=1.0", "path_selector:=true"]))
+    assert predictor["parameters"] == [{"horizon": 3.0}] and selector["parameters"] == [{"timeout": 1.0}]
+    with pytest.raises(ValueError, match="unknown launch argument 'ns'; did you mean 'namespace'"):
+        module._nodes(MagicMock(argv=["ns:=left"]))
+    monkeypatch.setattr(sys, "argv", ["ros2", "launch", "my_robot", "bringup.launch.py", "ns:=left"])
+    assert len(module._nodes(MagicMock(argv=["ns:=left"]))) == 2
 
 
 def test_the_launch_file_starts_what_is_planned(file):

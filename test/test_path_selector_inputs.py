@@ -28,10 +28,13 @@ class Robot:
         self.odometry = node.create_publisher(Odometry, f"/{prefix}/odom", BEST_EFFORT)
         self.candidates = node.create_publisher(PointCloud2, f"/{prefix}/predicted/candidate_costs", 1)
         self.goals = node.create_publisher(PoseStamped, f"/{prefix}/goal_pose", 1)
+        self.transforms: dict = {}
         self.place, self.heading, self.speed = np.zeros(2), 0.0, 0.0
         self.child, self.frame = "base_link", "odom"
         self.commands: list = []
         self.base = None
+        self.obeys = False
+        self.travelled = 0.0
 
     def listen(self, kind: type) -> None:
         """Become a base that listens to one type of command."""
@@ -41,10 +44,11 @@ class Robot:
         self.commands.clear()
         self.base = node.create_subscription(kind, f"/{self.prefix}/cmd_vel", self.commands.append, BEST_EFFORT)
 
-    def send_goal(self, x: float, y: float, frame: str = "odom") -> None:
+    def send_goal(self, x: float, y: float, frame: str = "odom", stamp: int = 0) -> None:
         assert self.peer.until(lambda: self.goals.get_subscription_count() > 1, 10.0)
         goal = PoseStamped()
         goal.header.frame_id = frame
+        goal.header.stamp.sec, goal.header.stamp.nanosec = divmod(stamp, 10**9)
         goal.pose.position.x, goal.pose.position.y = x, y
         self.goals.publish(goal)
 
@@ -53,6 +57,11 @@ class Robot:
         end, step = time.monotonic() + seconds, 0
         while time.monotonic() < end:
             self.peer.now += 50_000_000
+            if self.obeys and self.commands:
+                twist = getattr(self.commands[-1], "twist", self.commands[-1])
+                self.speed = twist.linear.x
+                self.heading += 0.05 * twist.angular.z
+            self.travelled += 0.05 * self.speed
             self.place = self.place + 0.05 * self.speed * np.array([np.cos(self.heading), np.sin(self.heading)])
             stamp = self.peer.now
             if odometry:
@@ -78,6 +87,19 @@ class Robot:
             fields |= {f"y_{share}": self.place[1] + along * (fields["y"] - self.place[1])}
         return encoding.point_cloud(stamp, self.frame, fields)
 
+    def send_transform(self, parent: str, child: str, pose: list[float], *, static: bool = False) -> None:
+        """Publish a transform; the pose is x, y, z [m], roll, pitch, yaw [rad]."""
+        kind = message_class("tf2_msgs/msg/TFMessage")
+        if kind is None:
+            pytest.skip("tf2_msgs is not installed (make interfaces builds it)")
+        topic = f"/{self.prefix}/{'tf_static' if static else 'tf'}"
+        if topic not in self.transforms:
+            latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+            self.transforms[topic] = self.peer.node.create_publisher(kind, topic, latched if static else 100)
+            assert self.peer.until(lambda: self.transforms[topic].get_subscription_count() > 0, 10.0)
+        message = builders.transforms(self.peer.now, parent, {child: pose_matrix(pose)})
+        self.transforms[topic].publish(bytes(type_store().serialize_cdr(message, message.__msgtype__)))
+
     def status(self, part: str = "choice") -> tuple[int, str]:
         for array in reversed(self.peer.received["/diagnostics"]):
             for entry in array.status:
@@ -99,7 +121,8 @@ def robot(peer, start, request):
     """A robot in a namespace of its own, with a selector that may have one parameter."""
     prefix = f"robot{abs(hash(request.node.name)) % 10**6}"
     arguments = ["-p", request.param] if hasattr(request, "param") else []
-    process = start("path_selector", "--ros-args", "-r", f"__ns:=/{prefix}", *arguments)
+    transforms = "-r", "/tf:=tf", "-r", "/tf_static:=tf_static"
+    process = start("path_selector", "--ros-args", "-r", f"__ns:=/{prefix}", *transforms, *arguments)
     process.wait_for("waiting for a")
     robot = Robot(peer, prefix)
     robot.process = process
@@ -130,6 +153,7 @@ def test_a_robot_that_stands_is_not_said_to_drive(robot):
     robot.listen(TwistStamped)
     robot.send_goal(50.0, 0.0)
     assert robot.live(15.0, until=robot.says("the robot does not move: 0.50 m/s")), robot.status()
+    assert "heard by /peer" in robot.status()[1]
     assert robot.status()[0] == WARN and "driving" not in robot.process.output
 
 
@@ -170,6 +194,21 @@ def test_a_predictor_beside_the_base_hears_the_base_s_type(robot, start):
     assert predictor.stop() == 0
 
 
+def test_a_predictor_is_no_base(robot, start):
+    """Whatever its name: it listens to commands, but moves nothing."""
+    names = ("-r", f"__ns:=/{robot.prefix}", "-r", "__node:=foresight")
+    predictor = start("predictor", "--ros-args", *names, "-p", "terrain_source:=flat")
+    predictor.wait_for("with terrain from flat", 120.0)
+    robot.send_goal(50.0, 0.0)
+    space = f"/{robot.prefix}"
+    alone = f"nothing listens to {space}/cmd_vel but {space}/foresight, which cannot move the robot"
+    assert robot.live(10.0, until=robot.says(alone)), robot.status()
+    assert "driving" not in robot.process.output and not robot.driven
+    robot.listen(Twist)
+    assert robot.live(10.0, until=robot.says("commands are sent to /peer, odometry shows no motion")), robot.status()
+    assert robot.live(5.0, until=lambda: robot.driven) and predictor.stop() == 0
+
+
 def test_commands_that_nobody_hears_are_no_drive(robot):
     robot.send_goal(50.0, 0.0)
     assert robot.live(10.0, until=robot.says(f"stopped: nothing listens to /{robot.prefix}/cmd_vel")), robot.status()
@@ -197,15 +236,8 @@ def test_the_frame_of_a_goal_comes_before_its_distance(robot):
 
 
 def test_goals_in_the_map_are_transformed_by_tf(robot):
-    kind = message_class("tf2_msgs/msg/TFMessage")
-    if kind is None:
-        pytest.skip("tf2_msgs is not installed (make interfaces builds it)")
-    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    transforms = robot.peer.node.create_publisher(kind, "/tf_static", latched)
     # The map is turned by a quarter: what lies ahead of the robot there is to its right in the odometry frame.
-    pose = pose_matrix([1.0, 2.0, 0.0, 0.0, 0.0, np.pi / 2])
-    message = builders.transforms(robot.peer.now, "map_2", {"odom": pose})
-    transforms.publish(bytes(type_store().serialize_cdr(message, message.__msgtype__)))
+    robot.send_transform("map_2", "odom", [1.0, 2.0, 0.0, 0.0, 0.0, np.pi / 2], static=True)
     robot.listen(Twist)
     robot.send_goal(10.0, 2.0, frame="map_2")
     assert robot.live(10.0, until=lambda: robot.driven), robot.status()
@@ -214,6 +246,73 @@ def test_goals_in_the_map_are_transformed_by_tf(robot):
     robot.place = np.array([5.0, 0.1])
     robot.send_goal(1.0, 7.0, frame="map_2")
     assert robot.live(10.0, until=robot.says("the goal is reached: 0.10 m away")), robot.status()
+
+
+@pytest.mark.parametrize(("frame", "goal"), [("base_link", (2.0, 0.0)), ("lidar_7", (-0.5, -2.0))])
+def test_a_goal_that_moves_with_the_robot_is_reached_and_the_robot_stops_there(robot, frame, goal):
+    robot.listen(Twist)
+    robot.place, robot.heading = np.array([3.0, 1.0]), np.pi / 2
+    # The lidar looks to the left.
+    robot.send_transform("base_link", "lidar_7", [1.5, 0.0, 0.4, 0.0, 0.0, np.pi / 2], static=True)
+    robot.obeys = True
+    robot.live(1.0)
+    robot.send_goal(*goal, frame=frame)
+    # (-0.5, -2) from the lidar is (1.5 + 2, -0.5) from the base, which looks along y.
+    expected = np.array([3.0, 3.0] if frame == "base_link" else [3.5, 4.5])
+    assert robot.live(20.0, until=robot.says("the goal is reached")), robot.status()
+    robot.live(2.0)
+    assert np.linalg.norm(robot.place - expected) < 0.6 and robot.travelled < 5.0, (robot.place, robot.travelled)
+    assert robot.speed == 0.0 and not robot.driven
+    assert f"'{frame}' moves with the robot: the goal is kept at ({expected[0]:.2f}, {expected[1]:.2f}) in 'odom'" in (
+        robot.process.output
+    )
+
+
+def test_a_goal_that_moves_with_the_robot_counts_from_its_stamp(robot):
+    robot.listen(Twist)
+    robot.speed = 1.0
+    robot.live(3.0)
+    # Where the robot was a second ago, 2 m ahead of it then: 1 m ahead of it now.
+    place, stamp = robot.place.copy(), robot.peer.now
+    robot.live(1.0)
+    robot.send_goal(2.0, 0.0, frame="base_link", stamp=stamp)
+    kept = f"is kept at ({place[0] + 2.0:.2f}, 0.00) in 'odom'"
+    assert robot.live(10.0, until=lambda: kept in robot.process.output), (kept, robot.process.output)
+
+
+def test_a_stamp_that_the_odometry_does_not_reach_is_refused(robot):
+    robot.listen(Twist)
+    robot.live(1.0)
+    robot.send_goal(2.0, 0.0, frame="base_link", stamp=robot.peer.now + 60 * 10**9)
+    assert robot.live(2.0, until=robot.says("waiting for a transform: the goal is in frame 'base_link'"))
+    assert robot.live(10.0, until=robot.says("the goal is refused, not transformed within 2 s")), robot.status()
+    assert "no odometry: the newest one is 5" in robot.status()[1] and not robot.driven
+
+
+def test_a_goal_in_the_map_follows_a_correction(robot):
+    robot.listen(Twist)
+    robot.send_transform("map_3", "odom", [0.0] * 6, static=True)
+    robot.obeys = True
+    robot.send_goal(3.0, 0.0, frame="map_3")
+    assert robot.live(10.0, until=lambda: robot.place[0] > 0.5), robot.status()
+    # Localisation finds that the odometry frame lies 2 m further back: the goal is at (5, 0) in it.
+    robot.send_transform("map_3", "odom", [-2.0, 0.0, 0.0, 0.0, 0.0, 0.0], static=True)
+    assert robot.live(20.0, until=robot.says("the goal is reached")), robot.status()
+    robot.live(1.0)
+    assert np.linalg.norm(robot.place - [5.0, 0.0]) < 0.6 and robot.speed == 0.0, robot.place
+
+
+def test_a_goal_without_a_transform_is_refused_and_the_robot_stands(robot):
+    robot.listen(Twist)
+    robot.send_goal(3.0, 0.0, frame="nowhere")
+    assert robot.live(10.0, until=robot.says("the goal is refused, not transformed within 2 s")), robot.status()
+    assert "in frame 'nowhere', odometry in 'odom': no transform has" in robot.status()[1]
+    # A transform that comes after that moves nothing: the goal has to be sent again.
+    robot.send_transform("nowhere", "odom", [0.0] * 6, static=True)
+    robot.live(1.5)
+    assert not robot.driven
+    robot.send_goal(3.0, 0.0, frame="nowhere")
+    assert robot.live(10.0, until=lambda: robot.driven), robot.status()
 
 
 @pytest.mark.parametrize("robot", ["odometry_child_pose:=[2.0, 0.0, 0.0, 0.0, 0.0, 0.0]"], indirect=True)
@@ -265,6 +364,47 @@ def test_the_target_lies_ahead_on_the_plan():
     assert plan_target(plan[:1], np.array([9.0, 9.0]), 1.0)[1] == 0.0
     with pytest.raises(ValueError, match="at least one finite position"):
         plan_target(np.array([[np.nan, 0.0]]), np.zeros(2), 1.0)
+
+
+def progress(noise: float, rate: int, speed: float, share: float, generator: np.random.Generator, seconds: float = 5.0):
+    """What ProgressCheck says after each pose of a robot that carries out a share of its commanded speed [m/s].
+
+    The noise of positions is in m per axis, that of the heading is half as many rad.
+    """
+    check, found = ProgressCheck(), []
+    for step in range(round(seconds * rate)):
+        place = np.array([share * speed * step / rate, 0.0]) + generator.normal(0.0, noise, 2)
+        check.add(step / rate, (speed, 0.0), place, generator.normal(0.0, noise / 2))
+        found.append(check.moving)
+    return np.array(found)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01, 0.03, 0.05])
+def test_noise_of_the_odometry_is_not_taken_for_motion_and_motion_is_found_in_it(noise):
+    generator = np.random.default_rng(950124)
+    for rate in (10, 50):
+        for speed in (0.2, 0.4, 1.0):
+            case = f"{rate} Hz, {speed} m/s"
+            stuck = [progress(noise, rate, speed, 0.0, generator) for _ in range(15)]
+            claimed = np.mean([found[2 * rate :] == True for found in stuck])  # noqa: E712  (elementwise)
+            assert claimed <= 0.02, f"{case}: stuck, and said to drive {claimed:.1%} of the time"
+            named = np.mean([(found[2 * rate :] == False).any() for found in stuck])  # noqa: E712
+            assert named > 0.9, f"{case}: stuck, and said so in {named:.0%} of the runs"
+            slow = [progress(noise, rate, speed, 0.5, generator, 3.0) for _ in range(15)]
+            recognised = np.mean([(found == True).any() for found in slow])  # noqa: E712
+            assert recognised >= 0.95, f"{case}: half as fast as commanded, recognised in {recognised:.0%} of the runs"
+            assert not any((found == False).any() for found in slow), f"{case}: moving, and said to stand"  # noqa: E712
+
+
+def test_poses_are_taken_once_and_a_backward_jump_starts_anew():
+    check = ProgressCheck()
+    for step in range(60):
+        # Each pose comes three times, as when commands are sent faster than odometry arrives.
+        time = 0.1 * (step // 3)
+        check.add(time, (0.5, 0.0), np.array([0.25 * time, 0.0]), 0.0)
+    assert check.moving
+    check.add(0.0, (0.5, 0.0), np.zeros(2), 0.0)
+    assert check.moving is None
 
 
 @pytest.mark.parametrize(("speed", "moving"), [(0.5, True), (0.1, True), (0.0, False), (0.005, False)])

@@ -25,6 +25,7 @@ from monoforce_ros.core.tracks import (
     StaleDataError,
     WheelTrack,
 )
+from monoforce_ros.core.transform_history import PoseHistory, TransformHistory
 
 __all__ = [
     "FAST_SHARE",
@@ -37,8 +38,10 @@ __all__ = [
     "FrameError",
     "MotionState",
     "MotionTrack",
+    "PoseHistory",
     "RobotFrames",
     "StaleDataError",
+    "TransformHistory",
     "TransformTree",
     "WheelTrack",
     "atomic_path",

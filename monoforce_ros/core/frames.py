@@ -40,9 +40,20 @@ class TransformTree:
         """Names of all frames."""
         return set(self._neighbours)
 
-    def find(self, target: str, source: str) -> np.ndarray | None:
-        """Pose ``[4, 4]`` of ``source`` in ``target``; None if they are not connected."""
-        return self._reached(target.lstrip("/"), source.lstrip("/")).get(source.lstrip("/"))
+    def find(self, target: str, source: str, *, without: str = "") -> np.ndarray | None:
+        """Pose ``[4, 4]`` of ``source`` in ``target``; None if they are not connected, or only through ``without``."""
+        target, source, without = (name.lstrip("/") for name in (target, source, without))
+        return self._reached(target, source, without).get(source)
+
+    def descends(self, frame: str, ancestor: str) -> bool:
+        """Whether a frame is a child of another one, or a child of its children."""
+        known, frontier = {ancestor.lstrip("/")}, [ancestor.lstrip("/")]
+        while frontier:
+            neighbours = list(self._neighbours.get(frontier.pop(), {}).items())
+            children = {name for name, (_, downwards) in neighbours if downwards} - known
+            known |= children
+            frontier += children
+        return frame.lstrip("/") in known - {ancestor.lstrip("/")}
 
     def missing_path(self, target: str, source: str) -> str:
         """Why :meth:`find` returns None, in words."""
@@ -57,8 +68,8 @@ class TransformTree:
             "is missing"
         )
 
-    def _reached(self, start: str, end: str = "") -> dict[str, np.ndarray]:
-        """Pose in ``start`` of every frame connected with it; the search ends early at ``end``."""
+    def _reached(self, start: str, end: str = "", without: str = "") -> dict[str, np.ndarray]:
+        """Pose in ``start`` of every frame connected with it, not through ``without``; ends early at ``end``."""
         reached = {start: np.eye(4)}
         frontier = [start]
         while frontier and end not in reached:
@@ -66,7 +77,7 @@ class TransformTree:
             for frame in frontier:
                 # Copied at once: another thread may add a frame.
                 for neighbour, (matrix, downwards) in list(self._neighbours.get(frame, {}).items()):
-                    if neighbour not in reached:
+                    if neighbour not in reached and neighbour != without:
                         reached[neighbour] = reached[frame] @ (matrix if downwards else np.linalg.inv(matrix))
                         following.append(neighbour)
             frontier = following

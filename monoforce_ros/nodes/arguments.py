@@ -9,7 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NoReturn, override
 
-from monoforce_ros.nodes.parameter_files import read_sections, section_matches
+from monoforce_ros.nodes.parameter_files import read_sections, refuse_misnamed_sections, section_matches
 from monoforce_ros.nodes.schema import most_similar, nearest
 
 
@@ -66,17 +66,40 @@ def check_parameter_files(arguments: Sequence[str], node: str) -> list[str]:
         node: fully qualified name of the node.
 
     Raises:
-        ValueError: a file is missing or is no parameter file.
+        ValueError: a file is missing, is no parameter file, or has a misnamed section.
     """
     warnings = []
     for path in parameter_files(arguments):
         sections = read_sections(path)
+        others = {name: values for name, values in sections.items() if not section_matches(name, node)}
+        refuse_misnamed_sections(path, others, [node])
         if not any(section_matches(section, node) for section in sections):
             warnings.append(
                 f"{path} has no parameters for {node}: its sections are {', '.join(sorted(sections))}; expected {node} "
                 "or /**"
             )
     return warnings
+
+
+def refuse_other_nodes(arguments: Sequence[str], node: str) -> None:
+    """Raise ``ValueError`` for a parameter or remapping that is for a node of another name, which ROS ignores.
+
+    Args:
+        arguments: the command line, with ``-p NODE:NAME:=VALUE`` and ``-r NODE:FROM:=TO``.
+        node: fully qualified name of the only node of the process.
+    """
+    for option, word in pairwise(arguments):
+        if option not in ("-p", "--param", "-r", "--remap"):
+            continue
+        prefix, sign, rest = word.partition(":=")[0].partition(":")
+        # `rostopic://` and the like are no node names.
+        if not sign or rest.startswith("/"):
+            continue
+        bare = node.rpartition("/")[2]
+        wanted = (f"/{prefix.lstrip('/')}", node) if option in ("-p", "--param") else (prefix, bare)
+        if wanted[0] != wanted[1]:
+            how = word.removeprefix(f"{prefix}:")
+            raise ValueError(f"{option} {word}: the node is {node}, not {prefix!r}; give {option} {how}")
 
 
 def parameter_files(arguments: Sequence[str]) -> list[Path]:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from geometry_msgs.msg import Twist, TwistStamped
-from rclpy.node import Node
+from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.publisher import Publisher
-
-from monoforce_ros.nodes.subscriptions import other_listeners
 
 STAMPED, PLAIN = "geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist"
 _CLASSES = {STAMPED: TwistStamped, PLAIN: Twist}
 _CHOICES = {"twist_stamped": STAMPED, "twist": PLAIN}
+_RECORDER = "bag_recorder"
+_UNKNOWN = "_NODE_NAME_UNKNOWN_"
+"""What ROS calls a node that is no ROS node, or whose name it has not received yet."""
 
 
 class CommandOutput:
@@ -18,6 +19,8 @@ class CommandOutput:
 
     Fast DDS allows a process one type per topic. Where listeners expect both, ``Twist`` is published: nodes that adapt,
     as this package's do, start with ``TwistStamped``, so that a listener to ``Twist`` is one that needs it.
+
+    Predictors and bag recorders listen to commands, too, but move nothing: they do not count as listeners.
 
     Args:
         node: the node that publishes.
@@ -32,18 +35,28 @@ class CommandOutput:
         self.type = ""
         """Message type that is published; empty while it changes."""
         self._publisher: Publisher | None = None
-        self._listened: set[str] = set()
+        # Fully qualified node names with the types that they expect.
+        self._listened: set[tuple[str, str]] = set()
+        self._bystanders: list[str] = []
         self._timer = node.create_timer(0.5, self._update)
         self._update()
 
     @property
     def deaf(self) -> str:
         """Why no other node hears the commands; empty if one does."""
-        if self.type in self._listened:
+        kinds = {kind for _, kind in self._listened}
+        if self.type in kinds:
             return ""
-        if self._listened:
-            return f"{self.topic}: its listeners expect {', '.join(sorted(self._listened))}"
-        return f"nothing listens to {self.topic}"
+        if kinds:
+            expected = ", ".join(sorted(kinds))
+            return f"{self.topic}: its listeners expect {expected} ({self.listeners})"
+        only = f" but {', '.join(self._bystanders)}, which cannot move the robot" if self._bystanders else ""
+        return f"nothing listens to {self.topic}{only}"
+
+    @property
+    def listeners(self) -> str:
+        """Fully qualified names of the nodes that listen and are not of this package."""
+        return ", ".join(sorted({name for name, _ in self._listened})) or "no node"
 
     def publish(self, speed: float, yaw_rate: float, frame_id: str) -> None:
         """Publish forward speed [m/s] and yaw rate [rad/s]."""
@@ -60,9 +73,22 @@ class CommandOutput:
         self._publisher.publish(message)
 
     def _update(self) -> None:
-        self._listened = other_listeners(self._node, self.topic)
+        self._listened, bystanders = set(), set()
+        for info in self._node.get_subscriptions_info_by_topic(self.topic):
+            if info.node_name == _UNKNOWN:
+                self._listened.add(("a node without a name", info.topic_type))
+                continue
+            name = f"{info.node_namespace}/{info.node_name}".replace("//", "/")
+            if name == self._node.get_fully_qualified_name():
+                continue
+            if self._is_bystander(info.node_name, info.node_namespace):
+                bystanders.add(name)
+            else:
+                self._listened.add((name, info.topic_type))
+        self._bystanders = sorted(bystanders)
+        expected = {kind for _, kind in self._listened}
         # While nobody listens, the last type stays: a base that restarts asks for the same one.
-        wanted = next((kind for kind in (PLAIN, STAMPED) if kind in self._listened), self.type or STAMPED)
+        wanted = next((kind for kind in (PLAIN, STAMPED) if kind in expected), self.type or STAMPED)
         wanted = self._fixed or wanted
         if wanted == self.type:
             return
@@ -76,3 +102,19 @@ class CommandOutput:
             self._node.get_logger().debug(f"{self.topic}: {error}")
             return
         self.type = wanted
+
+    def _is_bystander(self, name: str, namespace: str) -> bool:
+        """Whether a node listens to commands only to predict or to record.
+
+        A predictor may have any name: what it publishes shows what it is.
+        """
+        if name == _RECORDER:
+            return True
+        try:
+            published = self._node.get_publisher_names_and_types_by_node(name, namespace)
+        except NodeNameNonExistentError:
+            # It has just ended.
+            return False
+        # Some of its topics may be remapped; candidates alone may also come from a node that drives the base.
+        outputs = {topic.rpartition("/predicted/")[2] for topic, _ in published if "/predicted/" in topic}
+        return len(outputs) > 1 or "path" in outputs

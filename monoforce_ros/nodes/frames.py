@@ -7,7 +7,7 @@ from typing import Any
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
-from monoforce_ros.core import FrameError, TransformTree
+from monoforce_ros.core import FrameError, TransformHistory, TransformTree
 from monoforce_ros.messages import MessageError, decoding, message_class, missing_package
 
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
@@ -16,15 +16,17 @@ TRANSFORMS = "tf2_msgs/msg/TFMessage"
 class TransformListener:
     """Keeps the newest transform of every frame on ``/tf`` and ``/tf_static``.
 
-    tf2's own listener keeps a history and needs tf2_ros; the newest transforms suffice for frames fixed on the robot
-    and for slowly corrected ones such as ``map`` to ``odom``. Without the package tf2_msgs there are none.
+    tf2's own listener needs tf2_ros; the newest transforms suffice for frames fixed on the robot and for slowly
+    corrected ones such as ``map`` to ``odom``. Without the package tf2_msgs there are none.
 
     Args:
         node: the node that subscribes; its executor calls the listener. Remappings such as ``/tf:=tf`` apply.
+        history: also keeps earlier transforms here, for transforms at a stamp.
     """
 
-    def __init__(self, node: Node):
+    def __init__(self, node: Node, history: TransformHistory | None = None):
         self.tree = TransformTree()
+        self._history = history
         self._node = node
         kind = message_class(TRANSFORMS)
         self.unavailable = "" if kind is not None else f"/tf cannot be read: {missing_package(TRANSFORMS)}"
@@ -34,14 +36,17 @@ class TransformListener:
         latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._subscriptions = (
             node.create_subscription(kind, "/tf", self._on_transforms, QoSProfile(depth=100)),
-            node.create_subscription(kind, "/tf_static", self._on_transforms, latched),
+            node.create_subscription(kind, "/tf_static", self._on_static_transforms, latched),
         )
 
     def explained(self, error: FrameError) -> str:
         """An error about frames, and that transforms cannot be received if that is the reason."""
         return f"{error}. {self.unavailable}" if self.unavailable else str(error)
 
-    def _on_transforms(self, message: Any) -> None:
+    def _on_static_transforms(self, message: Any) -> None:
+        self._on_transforms(message, static=True)
+
+    def _on_transforms(self, message: Any, *, static: bool = False) -> None:
         try:
             found = decoding.decode_transforms(message)
         except MessageError as error:
@@ -49,3 +54,8 @@ class TransformListener:
             return
         for (parent, child), matrix in found.items():
             self.tree.add(parent, child, matrix)
+        if self._history is None:
+            return
+        for entry in message.transforms:
+            frames = entry.header.frame_id.lstrip("/"), entry.child_frame_id.lstrip("/")
+            self._history.add(*frames, found[frames], None if static else decoding.stamp_of(entry))

@@ -5,12 +5,13 @@ Nothing here needs ``launch``: launch/predictor.launch.py turns a plan into acti
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from monoforce_ros.nodes.parameter_files import read_sections, section_matches
+from monoforce_ros.nodes.parameter_files import read_sections, refuse_misnamed_sections, section_matches
 from monoforce_ros.nodes.schema import (
     SCHEMAS,
     ParameterEntry,
@@ -21,11 +22,13 @@ from monoforce_ros.nodes.schema import (
     schema_path,
 )
 
-_PARAMETERS = (
-    "robot", "terrain_source", "checkpoint", "cloud_topic", "odometry_topic", "command_topic", "base_frame",
-    "candidates", "ensemble", "autostart",
-)  # fmt: skip
-"""The predictor's parameters that are launch arguments; path_selector gets those that it has, too."""
+AMBIGUOUS = ("rate",)
+"""Parameters with the same name in both nodes but another meaning: no launch arguments."""
+SHARED = ("odometry_topic", "base_frame", "odometry_child_pose", "command_topic", "data_timeout")
+"""Parameters that mean the same in both nodes: their launch arguments are passed to both."""
+_INSTEAD = "in a params_file, under 'predictor:' or 'path_selector:'"
+_INCLUDED_CUTOFF = 0.8
+"""Similarity from which an unknown argument is refused where another launch file may own it."""
 _CLOCK = ParameterEntry("use_sim_time", "bool", False, "Use the time on /clock.")
 _SWITCHES = (
     ParameterEntry("path_selector", "bool", False, "Also start path_selector, which drives to goal_pose."),
@@ -35,7 +38,11 @@ _SWITCHES = (
     ),
 )  # fmt: skip
 _FILE = ParameterEntry(
-    "params_file", "string", "", "Parameter file for the nodes, see config/predictor.params.yaml; launch arguments win."
+    "params_file",
+    "string",
+    "",
+    "Parameter file for the nodes, see config/predictor.params.yaml; launch arguments win. "
+    f"{' and '.join(AMBIGUOUS)} mean something else in either node and can only be set there.",
 )
 _NAMESPACE = ParameterEntry("namespace", "string", "", "Namespace of the nodes and their topics, for several robots.")
 
@@ -77,50 +84,118 @@ class _Node:
 
 
 def launch_arguments() -> tuple[LaunchArgument, ...]:
-    """All arguments, with the default of each in its description."""
-    entries = _Node.read("predictor").entries
-    listed = [entries[name] for name in (*_PARAMETERS, _CLOCK.name)]
-    return tuple(_described(entry) for entry in (*listed, _FILE, _NAMESPACE, *_SWITCHES))
+    """All arguments: every parameter of the nodes but the ambiguous ones, with its default and its nodes."""
+    nodes = [_Node.read(name) for name in SCHEMAS]
+    names = dict.fromkeys(name for node in nodes for name in node.entries if name not in (*AMBIGUOUS, _CLOCK.name))
+    listed = [_described(name, [node for node in nodes if name in node.entries]) for name in (*names, _CLOCK.name)]
+    return (
+        *listed,
+        *(_described(entry.name, [_Node("", {entry.name: entry})]) for entry in (_FILE, _NAMESPACE, *_SWITCHES)),
+    )
 
 
-def _described(entry: ParameterEntry) -> LaunchArgument:
-    default = str(entry.default).lower() if isinstance(entry.default, bool) else str(entry.default)
-    limits = f" [{entry.range_text}]" if entry.range_text else ""
-    return LaunchArgument(entry.name, f"{entry.description}{limits} Default: {default or 'empty'}.")
+def _described(name: str, nodes: Sequence[_Node]) -> LaunchArgument:
+    entry = nodes[0].entries[name]
+    defaults = {node.name: _default_text(node.entries[name]) for node in nodes}
+    if len(set(defaults.values())) > 1:
+        default = ", ".join(f"{text} ({node})" for node, text in defaults.items())
+    else:
+        default = defaults[nodes[0].name]
+    unit = f" {entry.unit}" if entry.unit else ""
+    limits = f" [{entry.range_text}{unit}]" if entry.range_text else ""
+    owners = f" Parameter of {' and '.join(defaults)}." if nodes[0].name else ""
+    return LaunchArgument(name, f"{entry.description}{limits} Default: {default}.{owners}")
 
 
-def plan_nodes(given: Mapping[str, str], words: Sequence[str] = ()) -> tuple[NodePlan, ...]:
+def _default_text(entry: ParameterEntry) -> str:
+    default = str(entry.default).lower() if isinstance(entry.default, bool) else entry.default
+    return "empty" if default in ("", None, []) else str(default)
+
+
+def plan_nodes(given: Mapping[str, str], words: Sequence[str] = (), *, included: bool = False) -> tuple[NodePlan, ...]:
     """The nodes to start.
 
     Args:
         given: values of the launch arguments by name; an empty one was not given.
-        words: ``NAME:=VALUE`` of the whole command line, in which misspelt names are found. Arguments of other launch
-            files may be among them.
+        words: the arguments on the command line, ``NAME:=VALUE``. All of them have to be arguments of this launch file.
+        included: another launch file includes this one, and ``words`` may be arguments of that file: only those that
+            closely resemble one of this file are refused.
 
     Raises:
         ValueError: a value, the parameter file or a name is wrong; the message names the argument.
     """
-    known = [argument.name for argument in launch_arguments()]
-    for name in (word.partition(":=")[0] for word in words if ":=" in word):
-        # Far from every name it is an argument of another launch file.
-        if name not in known and most_similar(name, known):
-            raise ValueError(f"unknown launch argument {name!r}{nearest(name, known)}")
-    namespace = given.get("namespace", "").strip("/")
+    schemas = [_Node.read(name) for name in SCHEMAS]
+    _refuse_unknown_words(words, schemas, included=included)
+    on_line = {} if included else dict(word.split(":=", 1) for word in words)
+    # An empty value on the command line was given, to set an empty text in place of the file's.
+    values = on_line | {name: text for name, text in given.items() if text}
+    namespace = values.get("namespace", "").strip("/")
     if namespace and not re.fullmatch(r"[A-Za-z_]\w*(/[A-Za-z_]\w*)*", namespace):
         raise ValueError(f"namespace: got {namespace!r}, expected letters, digits and underscores, parts joined by /")
-    switches = {entry.name: bool(entry.parsed(text)) for entry in _SWITCHES if (text := given.get(entry.name, ""))}
-    names = SCHEMAS if switches.get("path_selector") else SCHEMAS[:1]
-    nodes = [_Node.read(name) for name in names]
-    file = given.get(_FILE.name, "")
+    switches = {entry.name: bool(entry.parsed(text)) for entry in _SWITCHES if (text := values.get(entry.name, ""))}
+    nodes = schemas if switches.get("path_selector") else schemas[:1]
+    idle = {name: node.name for node in schemas if node not in nodes for name in node.entries}
+    for name in values:
+        if name in idle and name not in nodes[0].entries:
+            owner = idle[name]
+            raise ValueError(f"{name} is a parameter of {owner}, which is not started: add {owner}:=true")
+    file = values.get(_FILE.name, "")
     from_file = _from_file(Path(file), nodes, namespace) if file else [{} for _ in nodes]
     remappings = (("/tf", "tf"), ("/tf_static", "tf_static")) if switches.get("tf_in_namespace") else ()
     plans = []
     for node, parameters in zip(nodes, from_file, strict=True):
-        for name in (*_PARAMETERS, _CLOCK.name):
-            if (text := given.get(name, "")) and name in node.entries:
-                parameters[name] = node.entries[name].parsed(text)
+        parameters |= {name: _parsed(node.entries[name], text) for name, text in values.items() if name in node.entries}
         plans.append(NodePlan(node.name, node.name, namespace, parameters, remappings))
     return tuple(plans)
+
+
+def _parsed(entry: ParameterEntry, text: str) -> ParameterValue:
+    """The value of a launch argument; raises ``ValueError`` with an example if it is no list where it has to be one."""
+    try:
+        return entry.parsed(text)
+    except ValueError as error:
+        if not entry.type.endswith("_array"):
+            raise
+        element = "0.0" if entry.type == "double_array" else "/a"
+        raise ValueError(f"{error}, such as {entry.name}:='[{', '.join([element] * (entry.size or 2))}]'") from None
+
+
+def _refuse_unknown_words(words: Sequence[str], nodes: Sequence[_Node], *, included: bool) -> None:
+    """Raise ``ValueError`` for an argument on the command line that is not ``NAME:=VALUE`` with a known name."""
+    known = [argument.name for argument in launch_arguments()]
+    former = {entry.formerly: entry.name for node in nodes for entry in node.entries.values() if entry.formerly}
+    for word in words:
+        name, sign, _ = word.partition(":=")
+        if name in known and sign:
+            continue
+        if included:
+            if sign and difflib.get_close_matches(name, known, n=1, cutoff=_INCLUDED_CUTOFF):
+                raise ValueError(f"unknown launch argument {name!r}{nearest(name, known)}")
+            continue
+        if not sign:
+            name, _, value = word.lstrip("-").partition("=")
+            name = name.rstrip(":").replace("-", "_")
+            meant = f"{_meant(name, known) or 'NAME'}:={value or 'VALUE'}"
+            raise ValueError(f"unexpected argument {word!r}: launch arguments are given as {meant}")
+        if name in AMBIGUOUS:
+            meanings = "; ".join(f"{node.name}: {node.entries[name].description}" for node in nodes)
+            raise ValueError(f"{name} means something else in either node ({meanings}); set it {_INSTEAD}")
+        if name in former:
+            raise ValueError(f"unknown launch argument {name!r}: it is called {former[name]!r} now")
+        meant = _meant(name, known)
+        advice = f"; did you mean {meant!r}?" if meant else ""
+        raise ValueError(f"unknown launch argument {name!r}{advice} --show-args lists all arguments")
+
+
+def _meant(name: str, known: Sequence[str]) -> str:
+    """The known name that is most similar, or that the name abbreviates; empty if there is none."""
+    similar = most_similar(name, known)
+    if similar:
+        return similar[0]
+    letters = re.compile(".*".join(map(re.escape, name)), re.IGNORECASE)
+    # `ns` for `namespace`: the same first letter, and all others in order; of several, a single word before others.
+    abbreviated = [full for full in known if name and full.startswith(name[0]) and letters.match(full)]
+    return min(abbreviated, key=lambda full: (full != _NAMESPACE.name, len(full)), default="")
 
 
 def _from_file(path: Path, nodes: Sequence[_Node], namespace: str) -> list[dict[str, ParameterValue]]:
@@ -134,14 +209,21 @@ def _from_file(path: Path, nodes: Sequence[_Node], namespace: str) -> list[dict[
             wanted = (f"/{namespace}/{node.name}".replace("//", "/"), f"/{node.name}")
             if any(section_matches(section, name) for name in wanted):
                 used.add(section)
+                unclear = [name for name in AMBIGUOUS if name in values and len(nodes) > 1]
+                if unclear and "*" in section.rpartition("/")[2]:
+                    raise ValueError(
+                        f"params_file: {path}, section {section}: {unclear[0]} means something else in either node; "
+                        f"set it {_INSTEAD}"
+                    )
                 parameters |= _checked(path, section, node, values)
         found.append(parameters)
+    expected = [f"/{namespace}/{node.name}".replace("//", "/") for node in nodes]
     if not used:
-        expected = " or ".join(f"/{namespace}/{node.name}".replace("//", "/") for node in nodes)
         raise ValueError(
-            f"params_file: {path} has no parameters for {expected}: its sections are {', '.join(sorted(sections))}; "
-            "expected /** or the name of the node"
+            f"params_file: {path} has no parameters for {' or '.join(expected)}: its sections are "
+            f"{', '.join(sorted(sections))}; expected /** or the name of the node"
         )
+    refuse_misnamed_sections(path, {name: sections[name] for name in set(sections) - used}, expected)
     return found
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import yaml
 
 from monoforce_ros.core import write_text
-from monoforce_ros.nodes.schema import SCHEMAS, ParameterEntry, read_schema
+from monoforce_ros.nodes.schema import SCHEMAS, ParameterEntry, most_similar, nearest, read_schema, schema_path
 
 _WIDTH = 110
 
@@ -69,20 +69,53 @@ def read_sections(path: Path) -> dict[str, dict[str, Any]]:
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ValueError(f"parameter file {path} is not YAML: {error}") from error
     sections: dict[str, dict[str, Any]] = {}
-    _collect(content, "", sections)
+    stray: list[str] = []
+    _collect(content, "", sections, stray)
     if not sections:
         raise ValueError(f"parameter file {path} has no 'ros__parameters': {example}")
+    if stray:
+        raise ValueError(f"parameter file {path}: {stray[0]} is not under 'ros__parameters': {example}")
     return sections
 
 
-def _collect(content: Any, name: str, sections: dict[str, dict[str, Any]]) -> None:
+def _collect(content: Any, name: str, sections: dict[str, dict[str, Any]], stray: list[str]) -> None:
+    """Find the sections, and what is beside them instead of in one."""
     if not isinstance(content, Mapping):
+        if name and content is not None:
+            stray.append(f"'{name.rpartition('/')[2]}: {content}'")
         return
     for key, value in content.items():
         if key == "ros__parameters":
+            if value is not None and not isinstance(value, Mapping):
+                stray.append(f"'{value}'")
             sections[name or "/**"] = dict(value) if isinstance(value, Mapping) else {}
         else:
-            _collect(value, f"{name}/{str(key).strip('/')}", sections)
+            _collect(value, f"{name}/{str(key).strip('/')}", sections, stray)
+
+
+def refuse_misnamed_sections(path: Path, sections: Mapping[str, Mapping[str, Any]], nodes: Sequence[str]) -> None:
+    """Raise ``ValueError`` for a section that is meant for a node of this package and reaches none.
+
+    A file may also have sections for nodes of other packages, and for this package's nodes in other namespaces. A
+    section is taken for a misnamed one if its name resembles that of a node, or if this package's nodes have all
+    parameters in it.
+
+    Args:
+        path: the file, for the message.
+        sections: its sections that match none of the nodes.
+        nodes: fully qualified names of the nodes that are started.
+    """
+    own = {name.rpartition("/")[2] for name in nodes} | set(SCHEMAS)
+    known = {entry.name for node in SCHEMAS for entry in read_schema(schema_path(node))}
+    for section, values in sections.items():
+        name = section.rpartition("/")[2]
+        if name in own or "*" in name:
+            continue
+        if most_similar(name, own) or (values and set(values) <= known):
+            meant = nearest(name, own)
+            raise ValueError(
+                f"parameter file {path}: no node is called {section}{meant or f'; expected {nodes[0]} or /**'}"
+            )
 
 
 def section_matches(section: str, node: str) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import time
 from dataclasses import dataclass
@@ -13,9 +14,10 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 
-from monoforce_ros.core import NANOSECOND, FrameError, MotionState, RobotFrames, pose_matrix, transform_points
+from monoforce_ros.core import NANOSECOND, FrameError, MotionState, RobotFrames, TransformHistory, pose_matrix
 from monoforce_ros.messages import decoding
 from monoforce_ros.nodes.command_output import CommandOutput
+from monoforce_ros.nodes.course import TRANSFORM_TIMEOUT, Course, CourseFrames
 from monoforce_ros.nodes.frames import TransformListener
 from monoforce_ros.nodes.health import ERROR, OK, WARN, Health
 from monoforce_ros.nodes.parameters import declare_parameters
@@ -29,15 +31,8 @@ PART = "choice"
 DISTANCE = "distance to the goal [m]"
 _BASE_FRAME = "base_link"
 """Of REP 105; used unless the parameter names another one."""
-
-
-@dataclass(frozen=True)
-class Course:
-    """Where to drive: a plan, or a goal as a plan of one point."""
-
-    frame_id: str
-    points: np.ndarray
-    """``[n, 3]`` [m]; the last one is the goal."""
+_TWICE = 0.2
+"""Time within which the same goal from the other subscription arrives [s]."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +53,10 @@ class Stop(Exception):  # noqa: N818  (no error: the robot has to stand)
         self.reason = reason
 
 
+class Refusal(Exception):  # noqa: N818  (as Stop)
+    """The goal or plan cannot be driven to and is dropped; the message says why."""
+
+
 class PathSelectorNode(Node):
     """Publishes the best candidate's command; stops the robot if there is no reliable one."""
 
@@ -76,15 +75,19 @@ class PathSelectorNode(Node):
             odometry_child_pose=pose_matrix(settings.odometry_child_pose) if settings.odometry_child_pose else None,
         )
         self.health = Health(self, ["odometry", "candidates", PART])
-        self.transforms = TransformListener(self)
+        history = TransformHistory()
+        self.transforms = TransformListener(self, history)
+        self._course_frames = CourseFrames(self.transforms, history)
         self._course: Course | None = None
+        self._received: Course | None = None
         self._motion: MotionState | None = None
         self._odometry_frame = self._base_name = ""
         self._offset_problem = ""
         self._started = time.monotonic()
+        self._first_odometry = 0.0
         self._arrivals: dict[str, float] = {}
         self._candidates: Candidates | None = None
-        self._moving = False
+        self._moving = self._driving = False
         self._last_command = (0.0, 0.0)
         self._progress = ProgressCheck()
         self._map: tuple[np.ndarray, float, np.ndarray] | None = None
@@ -103,7 +106,7 @@ class PathSelectorNode(Node):
         wanted = ("plan", settings.plan_topic) if settings.plan_topic else ("goal", settings.goal_topic)
         kind, callback = (Path, self._on_plan) if settings.plan_topic else (PoseStamped, self._on_goal)
         # Goals are sent once: a subscription that is replaced on discovery might miss one. Of a reliable publisher each
-        # arrives twice, which changes nothing.
+        # arrives twice; the second is ignored.
         self._goal_inputs = [
             self.create_subscription(kind, wanted[1], callback, QoSProfile(depth=1, reliability=reliability))
             for reliability in (ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT)
@@ -121,29 +124,38 @@ class PathSelectorNode(Node):
 
     def _on_goal(self, message: PoseStamped) -> None:
         place = message.pose.position
-        self._set_course(message.header.frame_id, np.array([[place.x, place.y, place.z]]), "goal")
+        self._set_course("goal", message.header.frame_id, decoding.stamp_of(message), [[place.x, place.y, place.z]])
 
     def _on_plan(self, message: Path) -> None:
         places = [pose.pose.position for pose in message.poses]
         if not places:
-            self._course = None
+            self._course = self._received = None
             self.health.report(PART, OK, "the plan is empty: standing", reason="empty plan")
             return
-        frame = message.header.frame_id or message.poses[0].header.frame_id
-        self._set_course(frame, np.array([[place.x, place.y, place.z] for place in places]), "plan")
+        header = message.header if message.header.frame_id else message.poses[0].header
+        stamp = header.stamp.sec * 10**9 + header.stamp.nanosec
+        self._set_course("plan", header.frame_id, stamp, [[place.x, place.y, place.z] for place in places])
 
-    def _set_course(self, frame_id: str, points: np.ndarray, kind: str) -> None:
+    def _set_course(self, kind: str, frame_id: str, stamp: int, places: list[list[float]]) -> None:
+        points = np.array(places)
         if not np.isfinite(points).all():
             message = f"the {kind} {points[-1, :2].tolist()} is not finite and is ignored"
             self.health.report(PART, ERROR, message, reason="goal")
             return
-        previous, self._course = self._course, Course(frame_id, points)
+        course, previous = Course(kind, frame_id, stamp, points, time.monotonic()), self._received
+        if course.repeats(previous) and previous is not None and course.received - previous.received < _TWICE:
+            return
+        self._course = self._received = course
         # A plan is sent again and again; the same numbers in another frame are another goal.
         same = previous is not None and (previous.frame_id, *previous.points[-1]) == (frame_id, *points[-1])
         if not same:
             end = points[-1]
             self.get_logger().info(f"new {kind}: to ({end[0]:.2f}, {end[1]:.2f}) in frame {frame_id or 'odometry'!r}")
             self._progress.clear()
+        # At once, as the robot may be moving; what is missing now may be there at the next command.
+        with contextlib.suppress(Stop, Refusal):
+            self._usable_motion()
+            self._in_odometry(course)
 
     def _on_odometry(self, message: Odometry) -> None:
         try:
@@ -152,15 +164,23 @@ class PathSelectorNode(Node):
             self.health.report("odometry", ERROR, str(error), reason="unusable")
             return
         self._arrivals["odometry"] = time.monotonic()
+        self._first_odometry = self._first_odometry or self._arrivals["odometry"]
         self._odometry_frame = frame_id
         try:
-            self._motion = state.of_base(self.frames.odometry_child(child, self.transforms.tree))
+            offset = self.frames.odometry_child(child, self.transforms.tree)
         except FrameError as error:
             self._offset_problem = self.transforms.explained(error)
             self.health.report("odometry", ERROR, self._offset_problem, reason="frame")
             return
         self._offset_problem = ""
+        self._motion = state.of_base(offset)
         self._base_name = self.frames.base_name(child, self.transforms.tree.frames)
+        on_robot = {child or self._base_name: offset, self._base_name: np.eye(4)}
+        self._course_frames.add_odometry(frame_id, self._motion, on_robot)
+        if self._driving:
+            motion = self._motion
+            seconds = motion.stamp * NANOSECOND
+            self._progress.add(seconds, self._last_command, motion.position[:2], motion.heading)
         self.health.report("odometry", OK, "receiving odometry")
 
     def _on_candidates(self, message: PointCloud2) -> None:
@@ -193,6 +213,7 @@ class PathSelectorNode(Node):
 
     def _publish_command(self) -> None:
         command = self._command()
+        self._driving = command is not None
         if command is None:
             self._progress.clear()
         # Without a goal nothing is published; a robot that was moving is commanded to stop first.
@@ -211,12 +232,17 @@ class PathSelectorNode(Node):
         except Stop as stop:
             self.health.report(PART, WARN, f"stopped: {stop}", reason=stop.reason)
             return None
+        except Refusal as refusal:
+            self._course = None
+            self.health.report(PART, ERROR, str(refusal), reason="refused")
+            return None
 
     def _drive(self, course: Course) -> tuple[float, float] | None:
         """The best candidate's command; None if the goal is reached.
 
         Raises:
             Stop: there is no reliable command.
+            Refusal: the course has no place in the odometry frame.
         """
         motion = self._usable_motion()
         plan = self._in_odometry(course)[:, :2]
@@ -240,7 +266,6 @@ class PathSelectorNode(Node):
         if best is None:
             raise Stop("no candidate is feasible", "infeasible")
         command = float(candidates.fields["speed"][best]), float(candidates.fields["yaw_rate"][best])
-        self._progress.add(time.monotonic(), command, position, motion.heading)
         self._report_driving(distance, command)
         return command
 
@@ -258,15 +283,29 @@ class PathSelectorNode(Node):
         return self._motion
 
     def _in_odometry(self, course: Course) -> np.ndarray:
-        """Points of the course ``[n, 3]`` in the odometry frame; raises ``Stop`` if /tf does not connect the frames."""
-        goal_frame, odometry_frame = course.frame_id.lstrip("/"), self._odometry_frame.lstrip("/")
-        if goal_frame in ("", odometry_frame):
-            return course.points
-        pose = self.transforms.tree.find(odometry_frame, goal_frame)
-        if pose is None:
-            reason = self.transforms.unavailable or self.transforms.tree.missing_path(odometry_frame, goal_frame)
-            raise Stop(f"the goal is in frame {goal_frame!r}, odometry in {odometry_frame!r}: {reason}", "frame")
-        return transform_points(pose, course.points)
+        """Points of the course ``[n, 3]`` in the odometry frame.
+
+        Raises:
+            Stop: the transform is missing so far.
+            Refusal: it has been missing for too long.
+        """
+        now = time.monotonic()
+        try:
+            self._course, points = self._course_frames.resolved(course, now)
+        except FrameError as error:
+            # Without odometry the frame that the transform leads to is unknown.
+            if now - max(course.received, self._first_odometry) < TRANSFORM_TIMEOUT:
+                raise Stop(f"waiting for a transform: {error}", "frame") from error
+            wait = f"not transformed within {TRANSFORM_TIMEOUT:g} s"
+            raise Refusal(f"the {course.kind} is refused, {wait}: {error}; send it again") from error
+        if self._course is not course:
+            end, frame = points[-1], self._odometry_frame
+            place = f"({end[0]:.2f}, {end[1]:.2f}) in {frame!r}"
+            self.get_logger().info(
+                f"{course.frame_id!r} moves with the robot: the {course.kind} is kept at {place}",
+                throttle_duration_sec=1.0,
+            )
+        return points
 
     def _usable_candidates(self, motion: MotionState) -> Candidates:
         """The newest candidates; raises ``Stop`` if they are missing, old or in another frame than the odometry."""
@@ -303,12 +342,12 @@ class PathSelectorNode(Node):
         if moving:
             self.health.report(PART, OK, "driving to the goal", reason="driving", **values)
         elif moving is None:
-            message = "commands are sent, odometry shows no motion yet"
+            message = f"commands are sent to {self._commands.listeners}, odometry shows no motion yet"
             self.health.report(PART, OK, message, reason="starting", **values)
         else:
             sent = f"{command[0]:.2f} m/s and {command[1]:.2f} rad/s are sent to {self._commands.topic}"
-            kind = self._commands.type
-            message = f"the robot does not move: {sent} ({kind}), odometry has shown no motion for {WINDOW:g} s"
+            heard = f"{self._commands.type}, heard by {self._commands.listeners}"
+            message = f"the robot does not move: {sent} ({heard}), odometry has shown no motion for {WINDOW:g} s"
             self.health.report(PART, WARN, message, reason="no motion", **values)
 
 

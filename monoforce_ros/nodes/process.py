@@ -14,6 +14,7 @@ from monoforce_ros.nodes.arguments import (
     check_parameter_files,
     command_line,
     parameter_files,
+    refuse_other_nodes,
     refuse_stray_arguments,
 )
 from monoforce_ros.nodes.parameter_files import read_sections
@@ -45,6 +46,9 @@ def run_node[NodeType: Node](
     try:
         initialise(arguments)
         node = make_node()
+        full_name = node.get_fully_qualified_name()
+        refuse_other_nodes(words, full_name)
+        warnings = check_parameter_files(words, full_name)
     except KeyboardInterrupt:
         rclpy.try_shutdown()
         return 0
@@ -55,8 +59,7 @@ def run_node[NodeType: Node](
     executor = SingleThreadedExecutor()
     try:
         executor.add_node(node)
-        # Reading files takes a moment, in which a signal may come.
-        for warning in check_parameter_files(words, node.get_fully_qualified_name()):
+        for warning in warnings:
             node.get_logger().warning(warning)
         work(node, executor)
     except (KeyboardInterrupt, ExternalShutdownException):
