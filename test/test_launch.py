@@ -9,7 +9,7 @@ from unittest.mock import MagicMock
 import pytest
 from conftest import ROOT
 
-from monoforce_ros.nodes.launch_plan import AMBIGUOUS, SHARED, launch_arguments, plan_nodes
+from monoforce_ros.nodes.launch_plan import SHARED, launch_arguments, plan_nodes
 from monoforce_ros.nodes.schema import SCHEMAS, read_schema, schema_path
 
 LAUNCH_FILE = ROOT / "launch" / "predictor.launch.py"
@@ -48,12 +48,12 @@ def test_a_namespace_leaves_a_file_in_effect_however_it_names_the_node(file, key
 def test_one_file_serves_both_nodes(file):
     path = file(
         "/**:\n  ros__parameters:\n    command_topic: drive\n    horizon: 4.0\n    goal_tolerance: 0.3\n"
-        "path_selector:\n  ros__parameters:\n    rate: 20.0\n"
+        "path_selector:\n  ros__parameters:\n    command_rate: 20.0\n"
     )
     predictor, selector = plan_nodes({"params_file": path, "path_selector": "true", "odometry_topic": "filtered"})
     assert predictor.parameters == {"command_topic": "drive", "horizon": 4.0, "odometry_topic": "filtered"}
     assert selector.parameters == {
-        "command_topic": "drive", "goal_tolerance": 0.3, "rate": 20.0, "odometry_topic": "filtered",
+        "command_topic": "drive", "goal_tolerance": 0.3, "command_rate": 20.0, "odometry_topic": "filtered",
     }  # fmt: skip
 
 
@@ -120,25 +120,22 @@ def test_sections_for_other_packages_and_other_robots_are_left_alone(file):
     assert plan.parameters == {"rate": 3.0}
 
 
-def test_a_parameter_with_two_meanings_is_not_set_for_both_nodes_at_once(file):
-    path = file("/**:\n  ros__parameters:\n    rate: 3.0\n")
-    assert plan_nodes({"params_file": path})[0].parameters == {"rate": 3.0}
-    with pytest.raises(ValueError, match="rate means something else in either node; set it in a params_file, under"):
-        plan_nodes({"params_file": path, "path_selector": "true"})
-    with pytest.raises(ValueError, match="predictor: Largest rate of predictions.*under 'predictor:' or 'path_selec"):
-        plan_nodes({}, ["rate:=3.0"])
+@pytest.mark.parametrize("node", ["predictor", "path_selector"])
+def test_the_shipped_file_of_one_node_serves_both(node):
+    path = str(ROOT / "config" / f"{node}.params.yaml")
+    plans = plan_nodes({"params_file": path, "path_selector": "true"})
+    other = next(plan for plan in plans if plan.name != node)
+    assert set(other.parameters) <= set(SHARED) and other.parameters["odometry_topic"] == "odom"
 
 
 def test_every_parameter_is_an_argument_and_reaches_the_nodes_that_have_it():
     entries = {node: {entry.name: entry for entry in read_schema(schema_path(node))} for node in SCHEMAS}
     both = set(entries["predictor"]) & set(entries["path_selector"])
-    assert both == {*AMBIGUOUS, *SHARED}, "a parameter of both nodes: does it mean the same in both?"
+    assert both == set(SHARED), "a parameter of both nodes: does it mean the same in both?"
     arguments = {argument.name for argument in launch_arguments()}
     for node, known in entries.items():
         for name, entry in known.items():
-            if name in AMBIGUOUS:
-                assert name not in arguments
-                continue
+            assert name in arguments
             value = entry.default
             if value is None or entry.type == "string_array":
                 value = [0.5] * entry.size if entry.type == "double_array" else ["/a", "/b"]

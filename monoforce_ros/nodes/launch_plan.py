@@ -22,11 +22,8 @@ from monoforce_ros.nodes.schema import (
     schema_path,
 )
 
-AMBIGUOUS = ("rate",)
-"""Parameters with the same name in both nodes but another meaning: no launch arguments."""
 SHARED = ("odometry_topic", "base_frame", "odometry_child_pose", "command_topic", "data_timeout")
 """Parameters that mean the same in both nodes: their launch arguments are passed to both."""
-_INSTEAD = "in a params_file, under 'predictor:' or 'path_selector:'"
 _INCLUDED_CUTOFF = 0.8
 """Similarity from which an unknown argument is refused where another launch file may own it."""
 _CLOCK = ParameterEntry("use_sim_time", "bool", False, "Use the time on /clock.")
@@ -41,8 +38,7 @@ _FILE = ParameterEntry(
     "params_file",
     "string",
     "",
-    "Parameter file for the nodes, see config/predictor.params.yaml; launch arguments win. "
-    f"{' and '.join(AMBIGUOUS)} mean something else in either node and can only be set there.",
+    "Parameter file for the nodes, see config/predictor.params.yaml; launch arguments win.",
 )
 _NAMESPACE = ParameterEntry("namespace", "string", "", "Namespace of the nodes and their topics, for several robots.")
 
@@ -84,9 +80,9 @@ class _Node:
 
 
 def launch_arguments() -> tuple[LaunchArgument, ...]:
-    """All arguments: every parameter of the nodes but the ambiguous ones, with its default and its nodes."""
+    """All arguments: every parameter of the nodes, with its default and its nodes."""
     nodes = [_Node.read(name) for name in SCHEMAS]
-    names = dict.fromkeys(name for node in nodes for name in node.entries if name not in (*AMBIGUOUS, _CLOCK.name))
+    names = dict.fromkeys(name for node in nodes for name in node.entries if name != _CLOCK.name)
     listed = [_described(name, [node for node in nodes if name in node.entries]) for name in (*names, _CLOCK.name)]
     return (
         *listed,
@@ -177,9 +173,6 @@ def _refuse_unknown_words(words: Sequence[str], nodes: Sequence[_Node], *, inclu
             name = name.rstrip(":").replace("-", "_")
             meant = f"{_meant(name, known) or 'NAME'}:={value or 'VALUE'}"
             raise ValueError(f"unexpected argument {word!r}: launch arguments are given as {meant}")
-        if name in AMBIGUOUS:
-            meanings = "; ".join(f"{node.name}: {node.entries[name].description}" for node in nodes)
-            raise ValueError(f"{name} means something else in either node ({meanings}); set it {_INSTEAD}")
         if name in former:
             raise ValueError(f"unknown launch argument {name!r}: it is called {former[name]!r} now")
         meant = _meant(name, known)
@@ -209,12 +202,6 @@ def _from_file(path: Path, nodes: Sequence[_Node], namespace: str) -> list[dict[
             wanted = (f"/{namespace}/{node.name}".replace("//", "/"), f"/{node.name}")
             if any(section_matches(section, name) for name in wanted):
                 used.add(section)
-                unclear = [name for name in AMBIGUOUS if name in values and len(nodes) > 1]
-                if unclear and "*" in section.rpartition("/")[2]:
-                    raise ValueError(
-                        f"params_file: {path}, section {section}: {unclear[0]} means something else in either node; "
-                        f"set it {_INSTEAD}"
-                    )
                 parameters |= _checked(path, section, node, values)
         found.append(parameters)
     expected = [f"/{namespace}/{node.name}".replace("//", "/") for node in nodes]

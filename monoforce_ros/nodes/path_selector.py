@@ -111,7 +111,7 @@ class PathSelectorNode(Node):
             self.create_subscription(kind, wanted[1], callback, QoSProfile(depth=1, reliability=reliability))
             for reliability in (ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT)
         ]
-        self._command_timer = self.create_timer(1.0 / settings.rate, self._publish_command)
+        self._command_timer = self.create_timer(1.0 / settings.command_rate, self._publish_command)
         self._watch_timer = self.create_timer(0.5, self._watch_inputs)
         waiting = f"waiting for a {wanted[0]} on {self.resolve_topic_name(wanted[1])}"
         self.health.report(PART, OK, waiting, reason="waiting")
