@@ -53,12 +53,25 @@ def recording(robot, height: float) -> RecordingSamples:
     )  # fmt: skip
     known = np.ones((GRID.rows, GRID.columns), bool)
     seen = (ground + height).numpy()
-    segment = Segment(GRID, np.eye(4), seen, known, ground.numpy(), known)
-    nothing = np.zeros((COUNT, 0))
+    unknown = np.full(known.shape, np.nan, np.float32)
+    segment = Segment(GRID, np.eye(4), seen, known, ground.numpy(), known, unknown)
+    points, ends = np.zeros((0, 3), np.float32), np.zeros(COUNT, np.int64)
     return RecordingSamples(
-        "injected", (), torch.zeros(COUNT, 0, 4, 4, 3, dtype=torch.uint8), stamps, pose, nothing, nothing, nothing,
-        nothing, np.zeros(COUNT, int), (segment,), chunks,
-    )  # fmt: skip
+        name="injected",
+        cameras=(),
+        images=torch.zeros(COUNT, 0, 4, 4, 3, dtype=torch.uint8),
+        stamps=stamps,
+        odometry_from_base=pose,
+        odometry_from_cameras=np.zeros((COUNT, 0, 4, 4)),
+        support=np.zeros((COUNT, 0, 3)),
+        sweeps=points,
+        sweep_ends=ends,
+        traces=points,
+        trace_ends=ends,
+        segment_of=np.zeros(COUNT, int),
+        segments=(segment,),
+        chunks=chunks,
+    )
 
 
 @pytest.fixture(scope="module")
