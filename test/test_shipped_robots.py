@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from monoforce_ros.core import MotionState
 from monoforce_ros.effects import controls
+from monoforce_ros.perception import support_points
 from monoforce_ros.physics import State, rollout
 from monoforce_ros.robots import load_robot, shipped_robots
 from monoforce_ros.terrain import Grid, TerrainMap
@@ -47,3 +49,13 @@ def test_it_drives_straight_and_turns_to_the_side_that_is_commanded(name):
     left, right = drive(robot, speed, 0.6), drive(robot, speed, -0.6)
     assert heading(left) > 3.0
     assert heading(right) == pytest.approx(-heading(left), abs=2.0)
+
+
+@pytest.mark.parametrize("name", shipped_robots())
+def test_every_robot_touches_the_ground_beneath_it(name):
+    robot = load_robot(name)
+    still = MotionState(0, np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3))
+    points = support_points(robot, still, 2e6)
+    # Ahead of, behind, left and right of the base.
+    assert (points[:, :2].max(axis=0) > 0.05).all() and (points[:, :2].min(axis=0) < -0.05).all()
+    assert points[:, 2] == pytest.approx(-robot.ground_clearance, abs=0.05)

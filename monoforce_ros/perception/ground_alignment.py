@@ -20,6 +20,10 @@ _TOLERANCE = 0.03
 """How far ground may reach above the lowest point of a wheel or track within a cell [m]."""
 
 
+_AT_THE_BOTTOM = -0.97
+"""Largest forward component of the surface's direction of motion at the bottom of a wheel, which rolls backwards."""
+
+
 def support_points(robot: RobotModel, motion: MotionState, stiffness: float) -> np.ndarray:
     """Points ``[m, 3]`` [m] on the ground under the wheels of a robot at rest on it, in terrain axes.
 
@@ -28,7 +32,10 @@ def support_points(robot: RobotModel, motion: MotionState, stiffness: float) -> 
         motion: the robot's pose.
         stiffness: stiffness of the ground [N/m³]; the wheels sink in by the rest depth.
     """
-    lowest = robot.points[robot.point_tangents[:, 0] < -0.97].numpy()
+    backwards = robot.point_tangents[:, 0]
+    # Small wheels have twelve samples, of which the lowest is up to 15° from the bottom.
+    limit = _AT_THE_BOTTOM if bool((backwards < _AT_THE_BOTTOM).any()) else float(np.cos(np.radians(16.0)) * -1.0)
+    lowest = robot.points[backwards < limit].numpy()
     points = transform_points(motion.terrain_from_base, lowest.astype(np.float64))
     points[:, 2] += rest_depth(robot, stiffness)
     return points
