@@ -20,12 +20,14 @@ def predictor(start, peer, tmp_path_factory):
     encoder = TerrainEncoder(config)
     # This encoder predicts visible surfaces 0.3 m above the supporting ground at the height of the wheels.
     torch.nn.init.zeros_(encoder.heads.weight)
-    encoder.heads.bias.data = torch.tensor([DECREASE, DECREASE, 0.0, 0.0, 0.0])
+    encoder.heads.bias.data = torch.tensor([DECREASE, DECREASE, 0.0, 0.0, 0.0, 0.0, 0.0])
     path = tmp_path_factory.mktemp("checkpoint") / "encoder.safetensors"
     save_encoder(encoder, path)
     process = start(
         "predictor", "--ros-args", "-p", "terrain_source:=lidar_camera", "-p", f"checkpoint:={path}",
         "-p", f"image_topics:=[{IMAGE}]", "-p", "data_timeout:=1.0", "-p", "horizon:=2.0",
+        # What the encoder says counts at once.
+        "-p", "camera_fallback:=false",
     )  # fmt: skip
     process.wait_for("predicting 2 s ahead for husky with terrain from lidar_camera")
     return process

@@ -294,10 +294,10 @@ def blended(fallback: TerrainMap, predicted: TerrainMap, share: float) -> Terrai
     """The fallback's map with a share of its difference to a predicted one.
 
     Stiffness, damping and friction are interpolated in their logarithms. What the predicted map says of its heights'
-    spread, and which cells were observed, stays.
+    spread, and which cells were observed, stays; level ground alone would count as observed everywhere.
     """
     if share <= 0.0:
-        return fallback
+        return replace(fallback, observed=predicted.observed)
     changed: dict[str, Any] = {name: torch.lerp(getattr(fallback, name), getattr(predicted, name), share)
                for name in ("height", "geometric_height")}  # fmt: skip
     for name in ("stiffness", "damping", "friction"):
