@@ -58,8 +58,9 @@ def test_steering_commands_bend_the_path_as_a_bicycle(peer, predictor):
     drive(peer, 1.0, lambda stamp: builders.ackermann_drive(stamp, "base_link", SPEED, float("nan")))
     level, text = peer.status("commands")
     assert level == ERROR and "got speed 1.0, steering angle nan; expected finite numbers" in text
-    # The next test hears no other predictor.
+    # The next test hears no other predictor, and sends commands of another type.
     assert predictor.stop() == 0
+    peer.node.destroy_publisher(peer._publishers.pop("/cmd_vel"))
 
 
 def test_a_rover_that_crabs_is_predicted_to_move_sideways(peer, start, tmp_path):
