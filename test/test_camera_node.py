@@ -20,6 +20,12 @@ WIDTH, HEIGHT = 160, 120
 MATRIX = np.array([[100.0, 0, 80], [0, 100.0, 60], [0, 0, 1]])
 
 
+def cells(peer):
+    """Channels of the last terrain cloud, a row for each cell; their number depends on what the map tells."""
+    cloud = peer.received["/predicted/terrain"][-1]
+    return np.frombuffer(bytes(cloud.data), "<f4").reshape(-1, cloud.point_step // 4)
+
+
 @pytest.fixture(scope="module")
 def predictor(start, peer, tmp_path_factory):
     torch.manual_seed(0)
@@ -98,7 +104,7 @@ def test_images_become_terrain_with_their_stamp(peer, predictor):
     first = peer.now
     healthy(peer, predictor)
     assert set(peer.stamps("/predicted/terrain")) <= set(range(first, peer.now, 20_000_000))
-    values = np.frombuffer(bytes(peer.received["/predicted/terrain"][-1].data), "<f4").reshape(-1, 8)
+    values = cells(peer)
     assert len(values) == 64 * 64 and np.isfinite(values).all()
     assert 0.05 < values[:, 7].mean() < 0.6
 
@@ -135,12 +141,12 @@ def test_images_without_a_pixel(peer, predictor):
 
 def test_a_changed_calibration_is_used_from_then_on(peer, predictor):
     healthy(peer, predictor)
-    before = np.frombuffer(bytes(peer.received["/predicted/terrain"][-1].data), "<f4").reshape(-1, 8)
+    before = cells(peer)
     narrow = MATRIX * np.array([[3, 1, 1], [1, 3, 1], [1, 1, 1]])
     peer.begin()
     look(peer, 2.0, info=lambda stamp: information(stamp, matrix=narrow))
     assert peer.until(lambda: len(peer.received["/predicted/terrain"]) > 3)
-    after = np.frombuffer(bytes(peer.received["/predicted/terrain"][-1].data), "<f4").reshape(-1, 8)
+    after = cells(peer)
     # A longer lens sees less.
     assert after[:, 7].sum() < 0.6 * before[:, 7].sum()
     healthy(peer, predictor)
