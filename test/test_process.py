@@ -35,6 +35,35 @@ def test_a_callback_that_outlives_its_context_is_no_fault(shut_down, ros_environ
     assert ("a fault of the node" in done.stderr) != shut_down
 
 
+INTERRUPTED = """
+import os, signal, sys, time, rclpy
+from rclpy.node import Node
+from std_msgs.msg import String
+from monoforce_ros.nodes.process import run_node
+
+class Starting(Node):
+    def __init__(self):
+        super().__init__("starting")
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.5)
+        except KeyboardInterrupt:
+            pass
+        {next}
+
+sys.exit(run_node(Starting, []))
+"""
+
+
+@pytest.mark.parametrize("following", ["self.create_publisher(String, 'x', 1)", "pass", "raise KeyboardInterrupt"])
+def test_a_signal_while_a_node_starts_is_no_fault(following, ros_environment):
+    done = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED.format(next=following)],
+        env=ros_environment, capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
+
+
 def test_choosing_among_candidates_needs_no_physics_engine():
     """A second process of half a gigabyte matters on the small computer of a robot."""
     loaded = (

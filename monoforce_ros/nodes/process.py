@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -43,21 +44,21 @@ def run_node[NodeType: Node](
         error in the command line, is printed as one line).
     """
     words = command_line(arguments)
+    node: NodeType | None = None
+    executor: SingleThreadedExecutor | None = None
     try:
-        initialise(arguments)
-        node = make_node()
-        full_name = node.get_fully_qualified_name()
-        refuse_other_nodes(words, full_name)
-        warnings = check_parameter_files(words, full_name)
-    except KeyboardInterrupt:
-        rclpy.try_shutdown()
-        return 0
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        rclpy.try_shutdown()
-        return 1
-    executor = SingleThreadedExecutor()
-    try:
+        try:
+            initialise(arguments)
+            node = make_node()
+            full_name = node.get_fully_qualified_name()
+            refuse_other_nodes(words, full_name)
+            warnings = check_parameter_files(words, full_name)
+        except (ValueError, OSError) as error:
+            print(f"error: {error}", file=sys.stderr)
+            return 1
+        if not rclpy.ok():
+            return 0
+        executor = SingleThreadedExecutor()
         executor.add_node(node)
         for warning in warnings:
             node.get_logger().warning(warning)
@@ -65,13 +66,15 @@ def run_node[NodeType: Node](
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except Exception:
-        # A signal shuts the context down at once; a callback or the executor that uses it afterwards fails.
+        # A signal shuts the context down at once; what the node, a callback or the executor does with it then fails.
         if rclpy.ok():
             raise
     finally:
-        executor.shutdown()
-        node.destroy_node()
-        rclpy.try_shutdown()
+        # The signal that ended the context may reach Python a moment later.
+        for end in (executor and executor.shutdown, node and node.destroy_node, rclpy.try_shutdown):
+            with suppress(KeyboardInterrupt):
+                if end:
+                    end()
     return 0
 
 
