@@ -72,7 +72,7 @@ def diagnose_case(case: Case, work: Path, judged: Judged) -> dict | None:
             *_terrain(case, files, files.bag),
             *held_out,
         ]
-        status, message, seconds, cpu = _diagnose([*arguments, "--out", str(out), "--quiet"], judged)
+        status, message, seconds, cpu = _diagnose([*arguments, "--out", str(out), "--quiet", "--jobs", "1"], judged)
         report = out / "report.json"
         row |= {"seconds": seconds, "cpu_seconds": cpu, "report": str(out / "report.html")}
         if status in (0, 3) and report.exists():  # 3: the recording cannot be diagnosed

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from monoforce_ros.bags import DETECTED, ReadOptions, Recording, smooth
-from monoforce_ros.discrepancy.comparison import GapRow, compare, gap_table
+from monoforce_ros.discrepancy.comparison import GapRow, HeldOut, compare, gap_table
 from monoforce_ros.discrepancy.credibility import complaint
 from monoforce_ros.discrepancy.diagnosis import Diagnosis, DiagnosisSettings, diagnose
 from monoforce_ros.discrepancy.gap import noisy_motions
@@ -233,5 +233,5 @@ def _held_out_table(
     if not len(starts):
         raise ValueError(f"{bag}: no gap-free window of 2 s, expected at least one for the comparison")
     data = evidence.cut(starts, np.array([2.0]))
-    parts = [effects, effects] if effects else None
-    return gap_table(compare(robot, data, smoothed, parts, noisy_motions(smoothed), within_blocks=False))
+    everywhere = HeldOut.everywhere(effects) if effects else None
+    return gap_table(compare(robot, data, smoothed, everywhere, noisy_motions(smoothed)))

@@ -76,7 +76,13 @@ def build_parser() -> argparse.ArgumentParser:
         help="write the effects for other tools: FILE.xml (MuJoCo), FILE.diff_drive.yaml (ros2_control) or "
         "FILE.nav2.yaml (Nav2), or KIND:FILE with mujoco, diff_drive or nav2; with one bag only",
     )
-    parser.add_argument("--jobs", type=int, default=2, metavar="N", help="bags diagnosed in parallel (%(default)s)")
+    parser.add_argument(
+        "--jobs",
+        type=int,
+        default=2,
+        metavar="N",
+        help="processes: bags diagnosed in parallel, or of one bag the repetitions without parts of it (%(default)s)",
+    )
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     return parser
 
@@ -165,7 +171,10 @@ def _run(
         out,
         terrain=options.terrain,
         reading=read_options(options),
-        settings=DiagnosisSettings(max_effects=options.effects),
+        # Bags have processes of their own.
+        settings=DiagnosisSettings(
+            max_effects=options.effects, processes=options.jobs if len(options.bags) == 1 else 1
+        ),
         held_out=options.held_out,
         progress=progress,
     )

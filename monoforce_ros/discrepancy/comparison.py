@@ -1,7 +1,7 @@
 """Comparison: errors at every horizon without and with the identified effects.
 
-Each window is predicted with parameters fitted to the other fold. Two things are not held out: values that a gyro or
-wheel speeds measure come from the whole recording, and the effects were selected on the same folds.
+Each window is predicted with what was found and fitted without it (:mod:`repetition`), or, in a recording too short
+for that, with parameters fitted to the other fold.
 """
 
 from __future__ import annotations
@@ -15,10 +15,43 @@ from monoforce_ros.bags import SmoothedMotion
 from monoforce_ros.core import MotionTrack
 from monoforce_ros.discrepancy.gap import find_regimes, noise_residuals, relative_motion
 from monoforce_ros.discrepancy.hypothesis import Effects, EvidenceWindows, Predictions, window_starts
-from monoforce_ros.discrepancy.trial import BLOCK, blocks_of, folds_of
+from monoforce_ros.discrepancy.trial import BLOCK, blocks_of
 from monoforce_ros.robots import RobotModel
 
 HORIZONS = (1.0, 2.0, 5.0)
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Effects by part of a recording, each found or fitted without the part that it predicts."""
+
+    effects: tuple[Effects, ...]
+    first: int
+    """Start of the first block [ns]."""
+    block: float = BLOCK
+    """Length of the blocks, which take turns in belonging to each part [s]."""
+
+    @classmethod
+    def everywhere(cls, effects: Effects) -> HeldOut:
+        """One part: effects of another recording."""
+        return cls((effects,), 0)
+
+    def part_of(self, stamps: np.ndarray) -> np.ndarray:
+        """Number of the part in which each stamp [ns] lies."""
+        return ((stamps - self.first) // round(self.block * 1e9)).astype(int) % len(self.effects)
+
+    def judged(self, starts: np.ndarray, horizon: float) -> np.ndarray:
+        """Windows that end in their part, or just behind it: the next block belongs to another one."""
+        if len(self.effects) == 1:
+            return starts
+        starts = starts[starts >= self.first]
+        into = ((starts - self.first) % round(self.block * 1e9)) * 1e-9
+        return starts[into + horizon <= self.block + 0.5]
+
+    def residuals(self, predictions: Predictions) -> np.ndarray:
+        """Residuals ``[W, K, 3]`` of each window with the effects of its part."""
+        part = self.part_of(predictions.data.starts)
+        return predictions.residuals(list(self.effects))[part, np.arange(len(part))]
 
 
 @dataclass(frozen=True)
@@ -91,45 +124,32 @@ def compare(
     robot: RobotModel,
     data: EvidenceWindows,
     smoothed: SmoothedMotion,
-    parts: Sequence[Effects] | None,
+    held_out: HeldOut | None,
     noisy: Sequence[MotionTrack],
-    *,
-    within_blocks: bool = True,
 ) -> list[Comparison]:
     """Residuals at 1, 2 and 5 s without and with the identified effects.
 
     Args:
         robot: the nominal model.
-        data: the windows that were split into folds.
+        data: the recording.
         smoothed: the recording's motion and noise.
-        parts: effects fitted with each fold left out, or None.
+        held_out: the effects that predict each window, or None.
         noisy: the motion with other noise, from :func:`noisy_motions`.
-        within_blocks: leave out windows that reach into a block of the fitted fold.
     """
-    prepared = []
+    results = []
     for horizon in HORIZONS:
         starts = window_starts(data.motion, smoothed.stretches, horizon, 1.0)
-        if parts is not None and within_blocks:
-            # Only windows that end before the next block begins: that one belongs to the fitted fold.
-            starts = starts[starts >= data.starts[0]]
-            into = ((starts - data.starts[0]) % round(BLOCK * 1e9)) * 1e-9
-            starts = starts[into + horizon <= BLOCK + 0.5]
-        if len(starts) >= 6:
-            prepared.append(replace(data, starts=starts, horizon=horizon, samples=np.array([horizon])))
-    results = []
-    for windows in prepared:
+        if held_out is not None:
+            starts = held_out.judged(starts, horizon)
+        if len(starts) < 6:
+            continue
+        windows = replace(data, starts=starts, horizon=horizon, samples=np.array([horizon]))
         floor = noise_residuals(data.motion, noisy, windows)
         predictions = Predictions(robot, windows)
         before = predictions.residuals([()])[0][:, 0]
-        after = None if parts is None else _cross_validated(predictions, data.starts[0], parts)[:, 0]
+        after = None if held_out is None else held_out.residuals(predictions)[:, 0]
         results.append(Comparison(windows.horizon, windows.starts, before, after, floor[:, 0], windows))
     return results
-
-
-def _cross_validated(predictions: Predictions, first: int, parts: Sequence[Effects]) -> np.ndarray:
-    """Residuals ``[W, K, 3]`` of each window with the effects fitted without its fold."""
-    fold = folds_of(np.r_[first, predictions.data.starts])[1:]
-    return predictions.residuals(list(parts))[fold, np.arange(len(fold))]
 
 
 def gap_table(comparisons: Sequence[Comparison], seed: int = 0) -> dict[str, GapRow]:
@@ -199,20 +219,20 @@ def regime_table(comparison: Comparison) -> list[RegimeRow]:
 
 
 def measured_paths(
-    robot: RobotModel, data: EvidenceWindows, parts: Sequence[Effects] | None, count: int = 6
+    robot: RobotModel, data: EvidenceWindows, held_out: HeldOut | None, count: int = 6
 ) -> list[PathComparison]:
     """Predicted and measured paths of some windows with errors above the median, the largest error first."""
     horizon = 5.0
-    into = ((data.starts - data.starts[0]) % round(BLOCK * 1e9)) * 1e-9
-    last = data.motion.stamps[-1] - round((horizon + 0.1) * 1e9)
-    starts = data.starts[(into + horizon <= BLOCK + 0.5) & (data.starts < last)]
+    starts = data.starts[data.starts < data.motion.stamps[-1] - round((horizon + 0.1) * 1e9)]
+    if held_out is not None:
+        starts = held_out.judged(starts, horizon)
     if not len(starts):
         return []
     windows = replace(data, starts=starts, horizon=horizon, samples=np.arange(0.25, horizon + 0.01, 0.25))
     measured = relative_motion(windows.motion, windows)
     predictions = Predictions(robot, windows)
     before = predictions.residuals([()])[0]
-    after = None if parts is None else _cross_validated(predictions, data.starts[0], parts)
+    after = None if held_out is None else held_out.residuals(predictions)
     order = np.argsort(np.hypot(before[:, -1, 0], before[:, -1, 1]))
     picked = order[np.unique(np.linspace(0.5 * len(order), len(order) - 1, count).astype(int))]
     return [

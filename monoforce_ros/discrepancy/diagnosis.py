@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from monoforce_ros.discrepancy.clocks import compare_with_gyro
 from monoforce_ros.discrepancy.comparison import (
     Comparison,
     GapRow,
+    HeldOut,
     PathComparison,
     RegimeRow,
     compare,
@@ -20,6 +20,7 @@ from monoforce_ros.discrepancy.comparison import (
     regime_table,
 )
 from monoforce_ros.discrepancy.estimates import EffectEstimate
+from monoforce_ros.discrepancy.explanation import DiagnosisSettings, Windows, explain
 from monoforce_ros.discrepancy.fit import Fit
 from monoforce_ros.discrepancy.gap import (
     Localisation,
@@ -28,7 +29,6 @@ from monoforce_ros.discrepancy.gap import (
     localise,
     noise_floor,
     noisy_motions,
-    residual_scale,
 )
 from monoforce_ros.discrepancy.hypothesis import (
     Effects,
@@ -40,42 +40,20 @@ from monoforce_ros.discrepancy.hypothesis import (
 )
 from monoforce_ros.discrepancy.kinematic_baseline import StepComparison
 from monoforce_ros.discrepancy.nominal import NominalModel
-from monoforce_ros.discrepancy.onset import find_onset
-from monoforce_ros.discrepancy.preflight import FEWEST_WINDOWS, advice, complaints
+from monoforce_ros.discrepancy.preflight import advice, complaints
+from monoforce_ros.discrepancy.repetition import repeat
 from monoforce_ros.discrepancy.selection import Search
 from monoforce_ros.discrepancy.sensor_findings import (
     accepts_bias,
     bias_estimate,
     bias_row,
-    measured_effects,
-    refine_clock,
-    with_measured_interval,
 )
 from monoforce_ros.discrepancy.terrain_evidence import terrain_uncertainty
-from monoforce_ros.discrepancy.thresholds import Thresholds
-from monoforce_ros.discrepancy.trial import BLOCK, HEALTHY_LOSS, CandidateScore, Outcome, Trial, paired
-from monoforce_ros.discrepancy.verdict import Findings, Losses, Verdict, decide
+from monoforce_ros.discrepancy.trial import BLOCK, CandidateScore, Outcome
+from monoforce_ros.discrepancy.verdict import Decision, Losses, Verdict
 from monoforce_ros.discrepancy.wheel_motion import undriven_stretches, wheels_without_motion
-from monoforce_ros.discrepancy.wheels import changed_drives, compare_with_wheels
 from monoforce_ros.effects import CATALOGUE
 from monoforce_ros.robots import RobotModel
-
-
-@dataclass(frozen=True)
-class DiagnosisSettings:
-    """How a recording is diagnosed."""
-
-    horizon: float = 2.0
-    """Length of the windows [s]."""
-    stride: float = 1.0
-    """Time between their starts [s]."""
-    samples: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0)
-    """Times in a window at which residuals are computed [s]."""
-    max_effects: int = 4
-    max_windows: int = 120
-    """A longer recording is subsampled to about as many, spread over all of it."""
-    seed: int = 0
-    thresholds: Thresholds = field(default_factory=Thresholds)
 
 
 @dataclass(frozen=True)
@@ -135,7 +113,7 @@ def diagnose(
     robot: RobotModel,
     *,
     nominal: NominalModel | None = None,
-    settings: DiagnosisSettings = DiagnosisSettings(),
+    settings: DiagnosisSettings = DiagnosisSettings(),  # noqa: B008
     progress: Callable[[float, str], None] = lambda share, step: None,
 ) -> Diagnosis:
     """Find the physical effects that a robot's model lacks in a recording.
@@ -163,97 +141,41 @@ def diagnose(
     uncertainty = np.hypot(
         noise_floor(smoothed.motion, noisy, data), terrain_uncertainty(robot, data, evidence.split_maps)
     )
-    thresholds = settings.thresholds
-    gyro = compare_with_gyro(smoothed, evidence.gyro)
-    wheels = compare_with_wheels(evidence.commands, evidence.wheels, robot)
-    # The gyro measures the offset of the pose clock, or that there is none.
-    excluded: tuple[str, ...] = () if gyro is None else ("pose_clock_offset",)
-    hints: Effects = ()
-    if nominal is None and not any(CATALOGUE[name].stage == "command" for name, _ in robot.effects):
-        known = measured_effects(gyro, wheels, robot)
-    else:
-        # A commissioned file knows how the drives respond. What the wheels show may be different now, or only look so:
-        # the motion decides, against how much it varies on the healthy robot.
-        known = measured_effects(gyro, None, robot)
-        if wheels is not None:
-            hints, unchanged = changed_drives(wheels, robot)
-            excluded += unchanged
-    steps = _Steps(progress, 0.05, 0.85)
-
-    def searched(part: np.ndarray) -> Search:
-        """A search on some of the windows."""
-        search = Search(
-            robot,
-            replace(data, starts=starts[part]),
-            residual_scale(uncertainty[part], nominal),
-            nominal=nominal,
-            known=known,
-            hints=hints,
-            excluded=excluded,
-            thresholds=thresholds,
-            seed=settings.seed,
-            progress=steps,
-        )
-        if gyro is not None and wheels is not None:
-            refine_clock(search, gyro)
-        return search
-
-    search = searched(np.ones(len(starts), bool))
-    outcome = search.run(settings.max_effects)
-    if outcome.fit.p <= thresholds.fit_rate:
-        trial = outcome.best
-        second = starts >= np.median(starts)
-        if not trial.effects and second.sum() >= FEWEST_WINDOWS:
-            # An effect that begins late may be too weak over the whole recording.
-            trial = search.judge(searched(second).run(1).best.effects)
-        onset = find_onset(search, trial)
-        late = starts >= (starts[0] if onset is None else onset.stamp)
-        if onset is not None and late.sum() >= FEWEST_WINDOWS:
-            left_out = (
-                *left_out,
-                f"it begins {onset.since_start:.0f} s after the start: what follows describes the time after that",
-            )
-            search = searched(late)
-            outcome = search.run(settings.max_effects)
-            data, uncertainty = search.data, uncertainty[late]
+    explanation = explain(evidence, robot, Windows(data, uncertainty), nominal, settings, _Steps(progress, 0.05, 0.6))
+    if explanation.onset is not None:
+        left_out = (*left_out, explanation.onset.remark)
+    search, outcome, sensors = explanation.search, explanation.outcome, explanation.sensors
+    data, uncertainty, decision = explanation.windows.data, explanation.windows.uncertainty, explanation.decision
     floor = np.sqrt((uncertainty**2).mean(axis=0))
     before = search.predictions.residuals([()])[0]
-    findings = Findings(
-        outcome.nominal, outcome.best, outcome.fit,
-        healthy_loss=HEALTHY_LOSS if nominal is None else nominal.loss,
-        commissioned=nominal is not None and nominal.segments > 0,
-        known=search.known,
-    )  # fmt: skip
-    if findings.fit.p <= thresholds.fit_rate:
-        learned = search.learn(outcome.best.effects)
-        if len(outcome.best.effects) > len(search.known):
-            alone = search.learn()
-            _, low = paired(alone.held_out_loss, learned.held_out_loss, data.starts, thresholds.comparison_rate)
-            # A formula that predicts as well without the effects takes their place.
-            learned = learned if low > 0 else alone
-        gain = paired(outcome.best.held_out_loss, learned.held_out_loss, data.starts, thresholds.comparison_rate)
-        findings = replace(findings, formula=learned, formula_gain=gain)
-    decision = decide(findings, thresholds)
-    decision = replace(decision, losses=replace(decision.losses, variance_ratio=outcome.variance_ratio))
-    progress(0.88, "comparing before and after")
+    progress(0.6, "comparing before and after")
 
-    def compared_with(trial: Trial | None) -> list[Comparison]:
-        return compare(robot, data, smoothed, None if trial is None else trial.parts, noisy)
+    def held_out(decision: Decision) -> HeldOut | None:
+        return None if decision.trial is None else HeldOut(decision.trial.parts, int(data.starts[0]))
 
-    compared = compared_with(decision.trial)
-    gap = gap_table(compared, settings.seed)
-    if decision.trial is not None and not improves(gap):
+    # Whether an effect is added follows from the folds on which it was selected. How much it helps does not.
+    judged = held_out(decision)
+    compared = compare(robot, data, smoothed, judged, noisy)
+    if judged is not None and not improves(gap_table(compared, settings.seed)):
         decision = decision.without_improvement()
-        if decision.trial is None:
-            # The same windows, without the rejected effects.
-            compared = [replace(comparison, after=None) for comparison in compared]
-        else:
-            compared = compared_with(decision.trial)
-        gap = gap_table(compared, settings.seed)
+        judged = held_out(decision)
+        # Without the rejected effects; the same windows, where nothing is left.
+        compared = (
+            [replace(entry, after=None) for entry in compared]
+            if judged is None
+            else compare(robot, data, smoothed, judged, noisy)
+        )
+    repetition = None
+    if decision.trial is not None:
+        repetition = repeat(evidence, robot, explanation.windows, nominal, settings, _Steps(progress, 0.62, 0.95))
+        if repetition is not None:
+            judged = repetition.held_out
+            compared = compare(robot, data, smoothed, judged, noisy)
+    gap = gap_table(compared, settings.seed)
     known_parts: tuple[EffectEstimate, ...] = ()
     if decision.parts is not None:
         partial = _estimated(search, search.refit(decision.parts.effects), outcome)
-        known_parts = tuple(with_measured_interval(estimate, search, gyro, wheels) for estimate in partial)
+        known_parts = tuple(sensors.with_interval(estimate, search) for estimate in partial)
     # Values for the robot's file are fitted to the whole recording.
     effects: tuple[EffectEstimate, ...] = ()
     fitted: Effects = ()
@@ -261,19 +183,21 @@ def diagnose(
         whole = search.refit(decision.trial.effects)
         estimates = _estimated(search, whole, outcome)
         fitted = whole.effects
-        effects = tuple(with_measured_interval(estimates[i], search, gyro, wheels) for i in search.ranked(whole))
+        effects = tuple(sensors.with_interval(estimates[i], search) for i in search.ranked(whole))
+        if repetition is not None:
+            effects = repetition.judged(effects)
+    gyro = sensors.gyro
     if gyro is not None and gyro.biased and accepts_bias(decision, robot):
         effects, gap = (*effects, bias_estimate(gyro)), {**gap, "yaw_rate_gyro": bias_row(gyro)}
         remarks = (*decision.remarks, "the gyro measures a rotation that the poses do not show")
         decision = replace(decision, verdict=Verdict.EFFECT_FOUND, remarks=remarks)
     if left_out:
         decision = replace(decision, remarks=(*decision.remarks, *left_out))
-    if wheels is not None and evidence.wheels is not None:
-        decision = replace(decision, remarks=(*decision.remarks, wheels.summary()))
+    if sensors.wheels is not None:
+        decision = replace(decision, remarks=(*decision.remarks, sensors.wheels.summary()))
     at_horizon = next((comparison for comparison in compared if comparison.horizon == settings.horizon), None)
     expected = np.hypot(floor, 0 if nominal is None else nominal.residual)
-    parts = None if decision.trial is None else decision.trial.parts
-    paths = tuple(measured_paths(robot, data, parts))
+    paths = tuple(measured_paths(robot, data, judged))
     progress(1.0, "done")
     return Diagnosis(
         verdict=decision.verdict,

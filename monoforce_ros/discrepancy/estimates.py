@@ -32,3 +32,6 @@ class EffectEstimate:
     parameters: Mapping[str, ParameterEstimate]
     indistinguishable: tuple[str, ...] = ()
     """Other effects that explain the recording about as well in its place."""
+    found_again: tuple[int, int] | None = None
+    """In how many of how many repetitions, each without another part of the recording, it or one of these others is
+    found; None for a recording too short for that, and for a formula."""

@@ -140,6 +140,8 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
         if effect.indistinguishable:
             others = " or ".join(cause(other) for other in effect.indistinguishable)
             doubts.append(f"{cause(effect.name)} could as well be {others}: this recording cannot tell them apart")
+    unstable = [effect for effect in named if effect.found_again and 2 * effect.found_again[0] < effect.found_again[1]]
+    doubts += [f"{cause(e.name)} shows in a part of the recording only: drive longer to be sure" for e in unstable]
     # What was found under a doubt about the recording or the ground may be nothing but its cause.
     remedies = ["remove the cause of the doubt first, then run diagnose again"] if complaints else []
     actions = [*(remedies or [remedy(effect.name) for effect in effects]), *diagnosis.advice]
@@ -169,7 +171,7 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
     if diagnosis.verdict == Verdict.NO_IMPROVEMENT or not effects:
         sentence = "The robot does not move as predicted, and the cause is not established."
         return result(Tone.UNKNOWN, sentence)
-    if enough and not grew and not refused and not complaints:
+    if enough and not grew and not refused and not complaints and not unstable:
         sentence = "The cause was found." if len(effects) == 1 else f"{len(effects)} causes were found."
         return result(Tone.GOOD, sentence)
     if grew and not any(row.share >= MOST for row in counted):
@@ -239,4 +241,7 @@ def _intervals(effects: Sequence[EffectEstimate]) -> list[str]:
             unit = "" if value.unit == "-" else f" {value.unit}"
             listed.append(f"{key.replace('_', ' ')} {value.low:.3g} to {value.high:.3g}{unit}")
         texts.append(f"{cause(effect.name)}: {', '.join(listed)} with 95 % confidence")
+        if effect.found_again is not None:
+            times, of = effect.found_again
+            texts[-1] += f"; found again in {times} of {of} searches, each without another part of the recording"
     return texts

@@ -26,6 +26,11 @@ class Onset:
     gain: float
     """Reduction of the mean loss against the same effects over the whole recording."""
 
+    @property
+    def remark(self) -> str:
+        """One sentence for reports."""
+        return f"it begins {self.since_start:.0f} s after the start: what follows describes the time after that"
+
 
 def find_onset(search: Search, trial: Trial) -> Onset | None:
     """The time from which effects act, if that explains a recording better than effects that always act.

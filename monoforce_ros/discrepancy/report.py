@@ -28,6 +28,7 @@ def effect_entry(effect: EffectEstimate) -> dict:
         "parameters": {key: asdict(parameter) for key, parameter in effect.parameters.items()},
         "indistinguishable": others,
         "rivals": others,
+        "found_again": None if effect.found_again is None else list(effect.found_again),
     }
 
 

@@ -3,17 +3,63 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from monoforce_ros.discrepancy.clocks import GyroFinding
+from monoforce_ros.discrepancy.clocks import GyroFinding, compare_with_gyro
 from monoforce_ros.discrepancy.comparison import GapRow
 from monoforce_ros.discrepancy.estimates import EffectEstimate, ParameterEstimate
-from monoforce_ros.discrepancy.hypothesis import Effects
+from monoforce_ros.discrepancy.hypothesis import Effects, Evidence
 from monoforce_ros.discrepancy.selection import Search
 from monoforce_ros.discrepancy.verdict import Decision, Verdict
-from monoforce_ros.discrepancy.wheels import WheelFinding
+from monoforce_ros.discrepancy.wheels import WheelFinding, changed_drives, compare_with_wheels
+from monoforce_ros.effects import CATALOGUE
 from monoforce_ros.robots import RobotModel
+
+
+@dataclass(frozen=True)
+class SensorFindings:
+    """What sensors beside the localisation say of a recording."""
+
+    gyro: GyroFinding | None
+    wheels: WheelFinding | None
+    known: Effects = ()
+    """Effects that a sensor measured: they act in every hypothesis."""
+    hints: Effects = ()
+    """Values that a sensor suggests."""
+    excluded: tuple[str, ...] = ()
+    """Effects that a sensor rules out."""
+
+    @classmethod
+    def of(cls, evidence: Evidence, robot: RobotModel, *, commissioned: bool) -> SensorFindings:
+        """Compare the sensors of a recording with its poses and commands.
+
+        The gyro measures the offset of the pose clock, or that there is none. A commissioned file knows how the drives
+        respond. What the wheels show may be different now, or only look so: the motion decides, against how much it
+        varies on the healthy robot.
+        """
+        gyro = compare_with_gyro(evidence.smoothed, evidence.gyro)
+        wheels = compare_with_wheels(evidence.commands, evidence.wheels, robot)
+        excluded: tuple[str, ...] = () if gyro is None else ("pose_clock_offset",)
+        if not commissioned and not any(CATALOGUE[name].stage == "command" for name, _ in robot.effects):
+            return cls(gyro, wheels, measured_effects(gyro, wheels, robot), excluded=excluded)
+        hints, unchanged = ((), ()) if wheels is None else changed_drives(wheels, robot)
+        return cls(gyro, wheels, measured_effects(gyro, None, robot), hints, excluded + unchanged)
+
+    def with_interval(self, estimate: EffectEstimate, search: Search) -> EffectEstimate:
+        """The estimate with the confidence interval of the gyro or of the wheels where these measured it."""
+        if estimate.name not in dict(search.known):
+            return estimate
+        if self.gyro is not None and estimate.name == "pose_clock_offset":
+            half_width = self.gyro.offset_half_width
+        elif self.wheels is not None and estimate.name in dict(self.wheels.effects):
+            names = [name for name, _ in self.wheels.effects]
+            half_width = self.wheels.half_widths[names.index(estimate.name)]
+        else:
+            return estimate
+        parameters = {key: value.with_half_width(half_width) for key, value in estimate.parameters.items()}
+        return EffectEstimate(estimate.name, parameters)
 
 
 def measured_effects(gyro: GyroFinding | None, wheels: WheelFinding | None, robot: RobotModel) -> Effects:
@@ -33,23 +79,6 @@ def refine_clock(search: Search, gyro: GyroFinding) -> None:
         (("pose_clock_offset", {"offset": float(offset)}), *search.known[1:]) for offset in offsets
     ]
     search.known = min(tried, key=lambda effects: float(search.loss_of(effects).mean()))
-
-
-def with_measured_interval(
-    estimate: EffectEstimate, search: Search, gyro: GyroFinding | None, wheels: WheelFinding | None
-) -> EffectEstimate:
-    """The estimate with the confidence interval of the gyro or of the wheels where these measured it."""
-    if estimate.name not in dict(search.known):
-        return estimate
-    if gyro is not None and estimate.name == "pose_clock_offset":
-        half_width = gyro.offset_half_width
-    elif wheels is not None and estimate.name in dict(wheels.effects):
-        names = [name for name, _ in wheels.effects]
-        half_width = wheels.half_widths[names.index(estimate.name)]
-    else:
-        return estimate
-    parameters = {key: value.with_half_width(half_width) for key, value in estimate.parameters.items()}
-    return EffectEstimate(estimate.name, parameters)
 
 
 def accepts_bias(decision: Decision, robot: RobotModel) -> bool:

@@ -1,0 +1,141 @@
+"""Explanation: the effects that explain a recording, from its sensors by a search and a formula to a verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from monoforce_ros.discrepancy.gap import residual_scale
+from monoforce_ros.discrepancy.hypothesis import Evidence, EvidenceWindows
+from monoforce_ros.discrepancy.nominal import NominalModel
+from monoforce_ros.discrepancy.onset import Onset, find_onset
+from monoforce_ros.discrepancy.preflight import FEWEST_WINDOWS
+from monoforce_ros.discrepancy.selection import Search
+from monoforce_ros.discrepancy.sensor_findings import SensorFindings, refine_clock
+from monoforce_ros.discrepancy.thresholds import Thresholds
+from monoforce_ros.discrepancy.trial import HEALTHY_LOSS, Outcome, paired
+from monoforce_ros.discrepancy.verdict import Decision, Findings, decide
+from monoforce_ros.robots import RobotModel
+
+
+@dataclass(frozen=True)
+class DiagnosisSettings:
+    """How a recording is diagnosed."""
+
+    horizon: float = 2.0
+    """Length of the windows [s]."""
+    stride: float = 1.0
+    """Time between their starts [s]."""
+    samples: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0)
+    """Times in a window at which residuals are computed [s]."""
+    max_effects: int = 4
+    max_windows: int = 120
+    """A longer recording is subsampled to about as many, spread over all of it."""
+    seed: int = 0
+    processes: int = 1
+    """In which the diagnosis is repeated without parts of the recording."""
+    thresholds: Thresholds = field(default_factory=Thresholds)
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Windows of a recording with what noise and map leave uncertain in each."""
+
+    data: EvidenceWindows
+    uncertainty: np.ndarray
+    """Residuals by noise and map, ``[W, K, 3]`` [m, m, rad]."""
+
+    def __getitem__(self, chosen: np.ndarray) -> Windows:
+        return Windows(replace(self.data, starts=self.data.starts[chosen]), self.uncertainty[chosen])
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """The effects that explain a recording, and the search that found them."""
+
+    windows: Windows
+    """Those that were searched: after an onset the later ones."""
+    sensors: SensorFindings
+    search: Search
+    outcome: Outcome
+    decision: Decision
+    onset: Onset | None = None
+
+
+def explain(
+    evidence: Evidence,
+    robot: RobotModel,
+    windows: Windows,
+    nominal: NominalModel | None,
+    settings: DiagnosisSettings,
+    progress: Callable[[str], None] = lambda step: None,
+) -> Explanation:
+    """Find the effects that explain the windows of a recording.
+
+    Args:
+        evidence: the recording, corrected for what the robot's file says of its sensors.
+        robot: the nominal model with the effects of its file.
+        windows: the windows to explain.
+        nominal: what commissioning learned; None for a robot that was never commissioned.
+        settings: settings of the diagnosis.
+        progress: called with each step.
+    """
+    thresholds = settings.thresholds
+    sensors = SensorFindings.of(evidence, robot, commissioned=nominal is not None)
+
+    def searched(part: Windows) -> Search:
+        search = Search(
+            robot,
+            part.data,
+            residual_scale(part.uncertainty, nominal),
+            nominal=nominal,
+            known=sensors.known,
+            hints=sensors.hints,
+            excluded=sensors.excluded,
+            thresholds=thresholds,
+            seed=settings.seed,
+            progress=progress,
+        )
+        if sensors.gyro is not None and sensors.wheels is not None:
+            refine_clock(search, sensors.gyro)
+        return search
+
+    search = searched(windows)
+    outcome = search.run(settings.max_effects)
+    onset = None
+    if outcome.fit.p <= thresholds.fit_rate:
+        starts = windows.data.starts
+        trial = outcome.best
+        second = starts >= np.median(starts)
+        if not trial.effects and second.sum() >= FEWEST_WINDOWS:
+            # An effect that begins late may be too weak over the whole recording.
+            trial = search.judge(searched(windows[second]).run(1).best.effects)
+        onset = find_onset(search, trial)
+        late = starts >= (starts[0] if onset is None else onset.stamp)
+        if onset is not None and late.sum() >= FEWEST_WINDOWS:
+            windows = windows[late]
+            search = searched(windows)
+            outcome = search.run(settings.max_effects)
+        else:
+            onset = None
+    findings = Findings(
+        outcome.nominal, outcome.best, outcome.fit,
+        healthy_loss=HEALTHY_LOSS if nominal is None else nominal.loss,
+        commissioned=nominal is not None and nominal.segments > 0,
+        known=search.known,
+    )  # fmt: skip
+    if findings.fit.p <= thresholds.fit_rate:
+        starts = windows.data.starts
+        learned = search.learn(outcome.best.effects)
+        if len(outcome.best.effects) > len(search.known):
+            alone = search.learn()
+            _, low = paired(alone.held_out_loss, learned.held_out_loss, starts, thresholds.comparison_rate)
+            # A formula that predicts as well without the effects takes their place.
+            learned = learned if low > 0 else alone
+        gain = paired(outcome.best.held_out_loss, learned.held_out_loss, starts, thresholds.comparison_rate)
+        findings = replace(findings, formula=learned, formula_gain=gain)
+    decision = decide(findings, thresholds)
+    decision = replace(decision, losses=replace(decision.losses, variance_ratio=outcome.variance_ratio))
+    return Explanation(windows, sensors, search, outcome, decision, onset)

@@ -1,0 +1,159 @@
+"""Repetition: the diagnosis repeated without parts of a recording, so that errors are judged on data it never saw.
+
+The recording is cut into blocks of 16 s, which take turns in being left out. Without each part sensors are compared,
+effects selected and their values fitted anew; what is found there predicts the part. An effect that is found again each
+time does not hang on a single manoeuvre.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from monoforce_ros.core import WheelTrack
+from monoforce_ros.discrepancy.comparison import HeldOut
+from monoforce_ros.discrepancy.estimates import EffectEstimate
+from monoforce_ros.discrepancy.explanation import DiagnosisSettings, Windows, explain
+from monoforce_ros.discrepancy.hypothesis import Effects, Evidence
+from monoforce_ros.discrepancy.learned import LEARNED
+from monoforce_ros.discrepancy.nominal import NominalModel
+from monoforce_ros.discrepancy.trial import BLOCK
+from monoforce_ros.robots import RobotModel
+
+LENGTH = 2 * BLOCK
+"""Length of the blocks that are left out together [s]: two of those that the search itself holds out."""
+_COUNTS = (4, 3, 5, 7)
+"""Numbers of parts, the preferred one first: a long recording is subsampled to every so many blocks, and must not lose
+all of them at once."""
+FEWEST_WINDOWS = 8
+"""On which a search is repeated: as many as a block of the search holds."""
+
+
+@dataclass(frozen=True)
+class Repeated:
+    """What a diagnosis without one part of a recording found."""
+
+    effects: Effects = ()
+    """With the values fitted without the part; empty where nothing is added to the model."""
+    named: tuple[str, ...] = ()
+    """Effects that are found, known parts of an unknown one included."""
+    indistinguishable: tuple[str, ...] = ()
+    """Others that could stand in their place."""
+
+
+@dataclass(frozen=True)
+class Repetition:
+    """The diagnosis repeated without each part of a recording."""
+
+    first: int
+    """Start of the first block [ns]."""
+    repeated: tuple[Repeated | None, ...]
+    """By part; None for a part without windows."""
+
+    @property
+    def held_out(self) -> HeldOut:
+        """The effects that predict each part."""
+        return HeldOut(tuple(() if r is None else r.effects for r in self.repeated), self.first, LENGTH)
+
+    def judged(self, effects: Sequence[EffectEstimate]) -> tuple[EffectEstimate, ...]:
+        """The effects of the whole recording, each with how often it was found again.
+
+        Where a single other effect is found in its place half of the time, the recording does not tell the two apart.
+        """
+        done = [entry for entry in self.repeated if entry is not None]
+        names = {effect.name for effect in effects}
+        result = []
+        for effect in effects:
+            if effect.name == LEARNED:
+                result.append(effect)
+                continue
+            same = {effect.name, *effect.indistinguishable}
+            missed = [r for r in done if not same & set(r.named) and effect.name not in r.indistinguishable]
+            instead = [extra[0] for r in missed if len(extra := [n for n in r.named if n not in names]) == 1]
+            others = [name for name in dict.fromkeys(instead) if 2 * instead.count(name) >= len(done)]
+            result.append(
+                replace(
+                    effect,
+                    indistinguishable=(*effect.indistinguishable, *others),
+                    found_again=(len(done) - len(missed), len(done)),
+                )
+            )
+        return tuple(result)
+
+
+def repeat(
+    evidence: Evidence,
+    robot: RobotModel,
+    windows: Windows,
+    nominal: NominalModel | None,
+    settings: DiagnosisSettings,
+    progress: Callable[[str], None] = lambda step: None,
+) -> Repetition | None:
+    """What is found without each part of the windows; None for a recording too short for it.
+
+    Arguments are those of :func:`~monoforce_ros.discrepancy.explanation.explain`.
+    """
+    starts = windows.data.starts
+    first = int(starts[0])
+    numbers = np.unique((starts - first) // round(LENGTH * 1e9))
+    count = next((count for count in _COUNTS if len(np.unique(numbers % count)) > 1), 0)
+    if not count:
+        return None
+    places = HeldOut(((),) * count, first, LENGTH)
+    part, end = places.part_of(starts), places.part_of(starts + round(windows.data.horizon * 1e9))
+    chosen = [(part != number) & (end != number) for number in range(count)]
+    present = [number for number in range(count) if (part == number).any()]
+    if min(chosen[number].sum() for number in present) < FEWEST_WINDOWS:
+        return None
+    tasks = [
+        (without_part(evidence, places, number), robot, windows[chosen[number]], nominal, settings)
+        for number in present
+    ]
+    repeated: list[Repeated | None] = [None] * count
+    if settings.processes > 1:
+        with ProcessPoolExecutor(
+            min(settings.processes, len(tasks)), multiprocessing.get_context("spawn"), torch.set_num_threads, (1,)
+        ) as pool:
+            running = [pool.submit(_found, *task) for task in tasks]
+            for number, done in zip(present, running, strict=True):
+                progress("repeating it without parts of the recording")
+                repeated[number] = done.result()
+    else:
+        for number, task in zip(present, tasks, strict=True):
+            progress("repeating it without parts of the recording")
+            repeated[number] = _found(*task)
+    return Repetition(first, tuple(repeated))
+
+
+def _found(
+    evidence: Evidence, robot: RobotModel, windows: Windows, nominal: NominalModel | None, settings: DiagnosisSettings
+) -> Repeated:
+    found = explain(evidence, robot, windows, nominal, settings)
+    trial = found.decision.trial
+    listed = trial or found.decision.parts
+    return Repeated(
+        () if trial is None else found.search.refit(trial.effects).effects,
+        () if listed is None else tuple(name for name in listed.names if name != LEARNED),
+        tuple(name for names in found.outcome.indistinguishable.values() for name in names),
+    )
+
+
+def without_part(evidence: Evidence, places: HeldOut, number: int) -> Evidence:
+    """The sensors of a recording without one part."""
+    smoothed = evidence.smoothed
+    stretches: list[slice] = []
+    for stretch in smoothed.stretches:
+        poses = np.arange(stretch.start, stretch.stop)
+        kept = poses[places.part_of(smoothed.motion.stamps[poses]) != number]
+        runs = np.split(kept, np.flatnonzero(np.diff(kept) > 1) + 1)
+        stretches += [slice(int(run[0]), int(run[-1]) + 1) for run in runs if len(run) > 1]
+    wheels = evidence.wheels
+    if wheels is not None:
+        chosen = places.part_of(wheels.stamps) != number
+        wheels = WheelTrack(wheels.stamps[chosen], wheels.speeds[chosen])
+    return replace(evidence, smoothed=replace(smoothed, stretches=tuple(stretches)), wheels=wheels)

@@ -1,0 +1,105 @@
+"""Repetition: what is found without a part of a recording predicts that part, and nothing of the part enters it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_diagnose import simulated_recording
+
+from monoforce_ros.bags import SmoothedMotion
+from monoforce_ros.core import WheelTrack
+from monoforce_ros.discrepancy import DiagnosisSettings, Evidence
+from monoforce_ros.discrepancy.comparison import HeldOut
+from monoforce_ros.discrepancy.estimates import EffectEstimate
+from monoforce_ros.discrepancy.explanation import Windows
+from monoforce_ros.discrepancy.hypothesis import window_starts
+from monoforce_ros.discrepancy.repetition import LENGTH, Repeated, Repetition, repeat, without_part
+from monoforce_ros.discrepancy.sensor_findings import SensorFindings
+from monoforce_ros.robots import load_robot
+
+SAMPLES = np.array([0.5, 1.0, 1.5, 2.0])
+SETTINGS = DiagnosisSettings(max_effects=1)
+
+
+@pytest.fixture(scope="module")
+def husky():
+    return load_robot("husky")
+
+
+def windows_of(motion, commands, horizon=2.0):
+    starts = window_starts(motion, [slice(0, len(motion))], horizon, 1.0)
+    smoothed = SmoothedMotion(motion, 0.003, 0.002, (slice(0, len(motion)),))
+    evidence = Evidence(smoothed, commands)
+    # Every other second is enough, and takes half of the time.
+    starts = starts[::2]
+    return evidence, Windows(evidence.cut(starts, SAMPLES), np.full((len(starts), 4, 3), 0.005))
+
+
+def test_parts_take_turns_and_windows_end_within_theirs():
+    held_out = HeldOut(((), (), ()), 10**9, 16.0)
+    stamps = 10**9 + np.array([0, 15, 16, 33, 47, 48]) * 10**9
+    assert held_out.part_of(stamps).tolist() == [0, 0, 1, 2, 2, 0]
+    starts = 10**9 + np.arange(0, 32) * 10**9
+    kept = (held_out.judged(starts, 5.0) - 10**9) // 10**9
+    assert kept.tolist() == [*range(12), *range(16, 28)]
+    assert len(HeldOut.everywhere(()).judged(starts, 5.0)) == len(starts)
+
+
+def test_a_delay_is_found_again_without_each_part_and_a_part_that_lies_changes_only_its_own_prediction(husky):
+    motion, commands = simulated_recording(husky, (("command_delay", {"delay": 0.3}),), seconds=60.0)
+    evidence, windows = windows_of(motion, commands)
+    whole = repeat(evidence, husky, windows, None, SETTINGS)
+    assert whole is not None and len(whole.repeated) == 4
+    for repeated in whole.repeated:
+        assert repeated is not None
+        (effect,) = repeated.effects
+        assert effect[0] in ("command_delay", "pose_clock_offset", "command_clock_offset")
+    # In the first part the commands are nonsense: what is found without that part must not change at all.
+    first = int(windows.data.starts[0])
+    lie = HeldOut(((),) * 4, first, LENGTH).part_of(commands.stamps) == 0
+    lie &= (commands.stamps > first + 4 * 10**9) & (commands.stamps < first + 12 * 10**9)
+    twists = commands.twists.copy()
+    twists[lie] *= -1.0
+    evidence, windows = windows_of(motion, replace(commands, twists=twists))
+    lying = repeat(evidence, husky, windows, None, SETTINGS)
+    assert lying is not None and lie.any()
+    assert lying.repeated[0] == whole.repeated[0]
+    assert lying.repeated[1] != whole.repeated[1]
+
+
+def test_sensors_are_taken_without_the_part(husky):
+    """Wheels that turn by other rules in one part must not tell anything where that part is left out."""
+    motion, commands = simulated_recording(husky, (), seconds=60.0)
+
+    def wheels(delay):
+        twists = commands.sample(motion.stamps - round(delay * 1e9))
+        sides = [twists[:, 0] + side * 0.3 * twists[:, 1] for side in (-1, 1)]
+        return np.stack(sides, axis=1) / husky.wheel_radius
+
+    evidence, windows = windows_of(motion, commands)
+    places = HeldOut(((),) * 4, int(windows.data.starts[0]), LENGTH)
+    measured = []
+    for delay in (0.3, 0.8):
+        changed = np.where((places.part_of(motion.stamps) == 2)[:, None], wheels(delay), wheels(0.3))
+        recorded = replace(evidence, wheels=WheelTrack(motion.stamps, changed))
+        parts = [
+            SensorFindings.of(without_part(recorded, places, part), husky, commissioned=False) for part in range(4)
+        ]
+        measured.append([findings.known for findings in parts])
+    assert measured[0][2] == measured[1][2] != ()
+    assert all(measured[0][part] != measured[1][part] for part in (0, 1, 3))
+
+
+def test_too_short_a_recording_is_not_repeated(husky):
+    motion, commands = simulated_recording(husky, (), seconds=20.0)
+    evidence, windows = windows_of(motion, commands)
+    assert repeat(evidence, husky, windows, None, SETTINGS) is None
+
+
+def test_an_effect_that_others_replace_half_of_the_time_belongs_to_a_class_with_them():
+    repeated = (Repeated(named=("drive_gain",)), Repeated(named=("drive_gain",)), Repeated(named=("payload",)), None)
+    (judged,) = Repetition(0, repeated).judged([EffectEstimate("drive_gain", {})])
+    assert judged.found_again == (2, 3) and judged.indistinguishable == ()
+    repeated = (Repeated(named=("drive_gain",)), Repeated(named=("payload",)), None, None)
+    (judged,) = Repetition(0, repeated).judged([EffectEstimate("drive_gain", {})])
+    assert judged.found_again == (1, 2) and judged.indistinguishable == ("payload",)
