@@ -412,7 +412,6 @@ def test_a_commissioned_model_predicts_the_healthy_robot(husky, tmp_path):
         NominalModel.read(file, samples)
 
 
-@pytest.mark.xfail(reason="turning_scrub is named beside the late clock on this recording", strict=False)
 def test_a_gyro_distinguishes_a_late_pose_clock_from_a_late_robot(husky):
     def gyro_of(motion, bias=0.0, sign=1.0, axis=2):
         rates = np.zeros((len(motion), 3))

@@ -91,6 +91,8 @@ class Diagnosis:
     """Tables like ``gap`` of further recordings, by their names."""
     fitted: Effects = ()
     """Effects with the values fitted to the whole recording."""
+    commissioned: bool = True
+    """Whether the robot's file knows the healthy robot."""
     remarks: tuple[str, ...] = ()
     """The reasons for the verdict."""
     losses: Losses | None = None
@@ -212,6 +214,7 @@ def diagnose(
         fitted=fitted,
         remarks=decision.remarks,
         losses=decision.losses,
+        commissioned=nominal is not None and nominal.segments > 0,
         details=Details(data, before, floor, tuple(compared), paths),
     )
 

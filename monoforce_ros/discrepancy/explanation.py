@@ -15,7 +15,7 @@ from monoforce_ros.discrepancy.preflight import FEWEST_WINDOWS
 from monoforce_ros.discrepancy.selection import Search
 from monoforce_ros.discrepancy.sensor_findings import SensorFindings, refine_clock
 from monoforce_ros.discrepancy.thresholds import Thresholds
-from monoforce_ros.discrepancy.trial import HEALTHY_LOSS, Outcome, paired
+from monoforce_ros.discrepancy.trial import Outcome, paired
 from monoforce_ros.discrepancy.verdict import Decision, Findings, decide
 from monoforce_ros.robots import RobotModel
 
@@ -98,7 +98,7 @@ def explain(
             seed=settings.seed,
             progress=progress,
         )
-        if sensors.gyro is not None and sensors.wheels is not None:
+        if sensors.gyro is not None:
             refine_clock(search, sensors.gyro)
         return search
 
@@ -122,7 +122,7 @@ def explain(
             onset = None
     findings = Findings(
         outcome.nominal, outcome.best, outcome.fit,
-        healthy_loss=HEALTHY_LOSS if nominal is None else nominal.loss,
+        healthy_loss=search.healthy_loss,
         commissioned=nominal is not None and nominal.segments > 0,
         known=search.known,
     )  # fmt: skip

@@ -132,6 +132,10 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
         )
     effects, refused = credible_effects(diagnosis)
     doubts = [*complaints, *refused]
+    if not diagnosis.commissioned:
+        doubts.append(
+            "the robot's file was never commissioned: this may be how the healthy robot is (diagnose --commission)"
+        )
     named = [effect for effect in effects if effect.name != LEARNED]
     rows = explained(diagnosis)
     left = _left(rows) or "Unexplained: all of the error."

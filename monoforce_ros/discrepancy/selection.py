@@ -34,7 +34,16 @@ from monoforce_ros.discrepancy.learned import learned_terms
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.score_test import Direction, ScoreResult, block_numbers, score_tests
 from monoforce_ros.discrepancy.thresholds import Thresholds
-from monoforce_ros.discrepancy.trial import FOLDS, CandidateScore, FitTest, Outcome, Trial, folds_of, paired
+from monoforce_ros.discrepancy.trial import (
+    FOLDS,
+    HEALTHY_LOSS,
+    CandidateScore,
+    FitTest,
+    Outcome,
+    Trial,
+    folds_of,
+    paired,
+)
 from monoforce_ros.effects import CATALOGUE, Effect, identifiable_effects, separating_sensor
 from monoforce_ros.robots import RobotModel
 
@@ -178,6 +187,11 @@ class Search:
             if self._gain(best, trial)[1] > 0:
                 best = trial
         return best
+
+    @property
+    def healthy_loss(self) -> float:
+        """Mean loss of the healthy robot."""
+        return HEALTHY_LOSS if self.nominal is None else self.nominal.loss
 
     def loss_of(self, effects: Effects) -> np.ndarray:
         """Robust loss of each window, ``[W]``."""
@@ -357,7 +371,9 @@ class Search:
         """
         gain, low = self._gain(before, after)
         commissioned = self.nominal is not None and self.nominal.segments > 0
-        return gain > self.thresholds.smallest_share * before.loss and (commissioned or low > 0)
+        # Where residuals are far below what counts as healthy, any share of them is nothing.
+        least = self.thresholds.smallest_share * max(before.loss, self.healthy_loss)
+        return gain > least and (commissioned or low > 0)
 
     def _gain(self, before: Trial, after: Trial) -> tuple[float, float]:
         rate = self.thresholds.comparison_rate

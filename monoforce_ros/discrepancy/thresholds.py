@@ -29,9 +29,9 @@ class Thresholds:
         model_error: error of an effect's formula as a share of what the effect changes, root mean square in any one
             direction: no formula holds exactly on another engine or robot. Set by judgement: rolling resistance and
             friction of the own simulator keep their names with it. No command repeats it.
-        smallest_share: smallest share of a loss that an effect must remove (of the loss without it), or a rest must
-            make up (of the nominal model's), to be reported: the loss is quadratic, so a twentieth of it is an error of
-            less than a quarter (√0.05) of the error that was there.
+        smallest_share: smallest share of a loss that an effect must remove (of the loss without it, but at least the
+            healthy robot's), or a rest must make up (of the nominal model's), to be reported: the loss is quadratic,
+            so a twentieth of it is an error of less than a quarter (√0.05) of the error that was there.
     """
 
     effect_rate: float = 0.025
