@@ -71,6 +71,8 @@ def explain(
     nominal: NominalModel | None,
     settings: DiagnosisSettings,
     progress: Callable[[str], None] = lambda step: None,
+    *,
+    exchange: bool = True,
 ) -> Explanation:
     """Find the effects that explain the windows of a recording.
 
@@ -81,6 +83,7 @@ def explain(
         nominal: what commissioning learned; None for a robot that was never commissioned.
         settings: settings of the diagnosis.
         progress: called with each step.
+        exchange: see :meth:`Search.run`.
     """
     thresholds = settings.thresholds
     sensors = SensorFindings.of(evidence, robot, commissioned=nominal is not None)
@@ -103,7 +106,7 @@ def explain(
         return search
 
     search = searched(windows)
-    outcome = search.run(settings.max_effects)
+    outcome = search.run(settings.max_effects, exchange=exchange)
     onset = None
     if outcome.fit.p <= thresholds.fit_rate:
         starts = windows.data.starts
@@ -117,7 +120,7 @@ def explain(
         if onset is not None and late.sum() >= FEWEST_WINDOWS:
             windows = windows[late]
             search = searched(windows)
-            outcome = search.run(settings.max_effects)
+            outcome = search.run(settings.max_effects, exchange=exchange)
         else:
             onset = None
     findings = Findings(

@@ -27,7 +27,7 @@ from monoforce_ros.robots import RobotModel
 
 LENGTH = 2 * BLOCK
 """Length of the blocks that are left out together [s]: two of those that the search itself holds out."""
-_COUNTS = (4, 3, 5, 7)
+_COUNTS = (3, 4, 5, 7)
 """Numbers of parts, the preferred one first: a long recording is subsampled to every so many blocks, and must not lose
 all of them at once."""
 FEWEST_WINDOWS = 8
@@ -42,8 +42,6 @@ class Repeated:
     """With the values fitted without the part; empty where nothing is added to the model."""
     named: tuple[str, ...] = ()
     """Effects that are found, known parts of an unknown one included."""
-    indistinguishable: tuple[str, ...] = ()
-    """Others that could stand in their place."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +71,7 @@ class Repetition:
                 result.append(effect)
                 continue
             same = {effect.name, *effect.indistinguishable}
-            missed = [r for r in done if not same & set(r.named) and effect.name not in r.indistinguishable]
+            missed = [r for r in done if not same & set(r.named)]
             instead = [extra[0] for r in missed if len(extra := [n for n in r.named if n not in names]) == 1]
             others = [name for name in dict.fromkeys(instead) if 2 * instead.count(name) >= len(done)]
             result.append(
@@ -133,13 +131,13 @@ def repeat(
 def _found(
     evidence: Evidence, robot: RobotModel, windows: Windows, nominal: NominalModel | None, settings: DiagnosisSettings
 ) -> Repeated:
-    found = explain(evidence, robot, windows, nominal, settings)
+    # What could stand in an effect's place is known from the whole recording.
+    found = explain(evidence, robot, windows, nominal, settings, exchange=False)
     trial = found.decision.trial
     listed = trial or found.decision.parts
     return Repeated(
         () if trial is None else found.search.refit(trial.effects).effects,
         () if listed is None else tuple(name for name in listed.names if name != LEARNED),
-        tuple(name for names in found.outcome.indistinguishable.values() for name in names),
     )
 
 

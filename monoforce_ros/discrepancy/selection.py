@@ -49,6 +49,8 @@ from monoforce_ros.robots import RobotModel
 
 _JUDGED = 6
 """Significant effects that are cross-validated in one round, those with the smallest screening loss first."""
+_FITTED = 8
+"""Effects with one parameter that are fitted in one round, those that promise the smallest loss first."""
 _ALTERNATIVES = 2
 """Combinations that do not begin with the best single effect and are tried where that one leads to no good fit."""
 
@@ -106,6 +108,8 @@ class Search:
         starts = data.starts
         self._coarse = Predictions(robot, replace(data, starts=starts[::2]))
         self._coarse_scale = self.scale[::2]
+        self._sparse = Predictions(robot, replace(data, starts=starts[::4]))
+        self._sparse_scale = self.scale[::4]
         self._blocks = block_numbers(starts, thresholds.block)
         folds = folds_of(starts)
         # A window that reaches into the next block shares motion with windows of the held-out fold.
@@ -132,8 +136,14 @@ class Search:
         of that between segments."""
         self._screenings: dict[tuple[tuple[object, ...], ...], tuple[float, list[_Screened]]] = {}
 
-    def run(self, most_effects: int) -> Outcome:
-        """Add effects while a further one is significant, then test each in the presence of the others."""
+    def run(self, most_effects: int, *, exchange: bool = True) -> Outcome:
+        """Add effects while a further one is significant, then test each in the presence of the others.
+
+        Args:
+            most_effects: largest number.
+            exchange: replace each of several effects by every other one at the end, and find those that are
+                indistinguishable from it.
+        """
         nominal = Trial((), ((),) * FOLDS, self.loss_of(()))
         start = nominal
         if self.known:
@@ -157,7 +167,7 @@ class Search:
             gain, low = self._gain(best, extended)
             if low > 0 and gain > self.thresholds.smallest_share * nominal.loss:
                 best, fit = extended, self.fit_test(extended, nominal)
-        exchanged, indistinguishable = self._exchanged(best)
+        exchanged, indistinguishable = self._exchanged(best) if exchange else (best, {})
         if exchanged is not best:
             best, fit = exchanged, self.fit_test(exchanged, nominal)
         return Outcome(nominal, best, fit, tuple(tried), self.variance_ratio, indistinguishable)
@@ -326,14 +336,20 @@ class Search:
         if key in self._screenings:
             return self._screenings[key]
         before = float(robust(self._coarse.residuals([base])[0] / self._coarse_scale).mean())
+        residual = self._sparse.residuals([base])[0] / self._sparse_scale
         names = {name for name, _ in base}
-        fits: list[Fit] = []
+        tried: list[tuple[float, Effect, Effects]] = []
         for effect in identifiable_effects():
             if effect.name in names or effect.name in self._excluded:
                 continue
             self._progress(f"{number}{effect.name}")
-            starts = [base + start for start in self._starts(effect)]
-            fits.append(fit_effects(self._coarse, starts, self._coarse_scale, iterations=3, free=len(base)))
+            tried.append(self._tried(effect, base, residual))
+        # An effect that reduces the loss little from all of its initial values is tested, but not fitted.
+        tried.sort(key=lambda entry: entry[0])
+        fits = []
+        for rank, (_, effect, start) in enumerate(tried):
+            iterations = 2 if rank < _FITTED or len(effect.identified) > 1 else 0
+            fits.append(fit_effects(self._coarse, [start], self._coarse_scale, iterations=iterations, free=len(base)))
         residual = self.directions.scaled(base)
         tests = self._tested(base, residual, [self.directions.influence(base, fit.effects[-1]) for fit in fits])
         screened = [_Screened(fit.effects, float(fit.loss.mean()), test) for fit, test in zip(fits, tests, strict=True)]
@@ -343,6 +359,21 @@ class Search:
             self.variance_ratio = float(np.mean(ratios)) - share if ratios else None
         self._screenings[key] = (before, sorted(screened, key=lambda entry: entry.loss))
         return self._screenings[key]
+
+    def _tried(self, effect: Effect, base: Effects, residual: np.ndarray) -> tuple[float, Effect, Effects]:
+        """Loss that an effect promises on some windows, and the best of its initial values.
+
+        The promised loss is the smallest at an initial value, or along the straight line from ``base`` to one.
+        """
+        starts = [base + start for start in self._starts(effect)]
+        scaled = np.nan_to_num(self._sparse.residuals(starts) / self._sparse_scale)
+        losses = robust(scaled).mean(axis=1)
+        weights = robust_weights(residual)
+        changes = scaled - residual
+        slopes = (weights * residual * changes).sum(axis=(1, 2, 3))
+        curvatures = np.maximum((weights * changes**2).sum(axis=(1, 2, 3)), 1e-12)
+        promised = robust(residual).mean() - 0.5 * slopes**2 / curvatures / residual.size
+        return float(min(promised.min(), losses.min())), effect, starts[int(np.argmin(losses))]
 
     def _round(self, best: Trial, number: int, rate: float) -> tuple[list[Trial], list[CandidateScore]]:
         """Trials with one more effect that is significant, smallest held-out loss first, and the scores of all."""
