@@ -92,6 +92,16 @@ def test_what_is_for_a_node_of_another_name_is_refused(words, right):
         ("path_selector --ros-args -r selector:cmd_vel:=drive", "the node is /path_selector, not 'selector'"),
         ("path_selector --ros-args --params-file {misnamed}", "no node is called /path_selectr; did you mean 'path_s"),
         ("path_selector --ros-args --params-file {beside}", "'timeout: 2.0' is not under 'ros__parameters'"),
+        (
+            "path_selector --ros-args -p odometry_child_pose:=[.nan,0.0,0.0,0.0,0.0,0.0]",
+            "parameter odometry_child_pose: got [nan, 0.0, 0.0, 0.0, 0.0, 0.0], expected finite numbers",
+        ),
+        (
+            "predictor --ros-args -p candidate_speeds:=[]",
+            "parameter candidate_speeds: got no value, expected a list of",
+        ),
+        ("predictor --ros-args -p odometry_topic:=odom!", "got 'odom!', expected a topic such as '/odom': topic name"),
+        ("path_selector --ros-args --params-file {repeated}", "has '/**' twice, again in line 4: merge both into one"),
         ("simulator --fat", "unrecognized arguments: --fat; did you mean '--flat'?"),
         ("bag_player --rte 3", "unrecognized arguments: --rte; did you mean '--rate'?"),
         ("bag_player --ros-args -p rate:=3.0", "unknown parameter 'rate': bag_player has no parameters"),
@@ -100,10 +110,11 @@ def test_what_is_for_a_node_of_another_name_is_refused(words, right):
     ],
 )
 def test_a_wrong_command_line_ends_the_start_in_one_line(executables, ros_environment, tmp_path, command, message):
-    files = {name: tmp_path / f"{name}.yaml" for name in ("misnamed", "beside")}
+    files = {name: tmp_path / f"{name}.yaml" for name in ("misnamed", "beside", "repeated")}
     section = "ros__parameters:\n    timeout: 1.0\n"
     files["misnamed"].write_text(f"path_selector:\n  {section}path_selectr:\n  {section}")
     files["beside"].write_text(f"/**:\n  timeout: 2.0\n  {section}")
+    files["repeated"].write_text(2 * f"/**:\n  {section}")
     schema = ROOT / "config" / "predictor.schema.yaml"
     filled = command.format(schema=schema, out=tmp_path / "bag", **files)
     name, *words = filled.split()

@@ -196,7 +196,7 @@ def test_wrong_arguments_are_reported(start, bag, arguments, message):
 
 
 def test_the_recorder_writes_the_received_messages(start, peer, tmp_path):
-    recorder = start("bag_recorder", tmp_path / "out", "--topics", "/cmd_vel", "/odom")
+    recorder = start("bag_recorder", tmp_path / "out", "--topics", "cmd_vel", "/odom", "odmo")
     sent = 0
 
     def publish():
@@ -213,6 +213,7 @@ def test_the_recorder_writes_the_received_messages(start, peer, tmp_path):
         publish()
     assert not (tmp_path / "out").exists()
     assert recorder.stop() == 0
+    assert "nobody published /odmo, /odom" in recorder.output
     with BagReader(tmp_path / "out") as bag:
         speeds = [m.decode().twist.linear.x for m in bag.messages(["/cmd_vel"])]
     assert len(speeds) >= 35 and np.allclose(np.diff(speeds), 0.1)

@@ -30,7 +30,7 @@ class Robot:
         self.goals = node.create_publisher(PoseStamped, f"/{prefix}/goal_pose", 1)
         self.transforms: dict = {}
         self.place, self.heading, self.speed = np.zeros(2), 0.0, 0.0
-        self.child, self.frame = "base_link", "odom"
+        self.child, self.frame, self.odometry_frame = "base_link", "odom", "odom"
         self.commands: list = []
         self.base = None
         self.obeys = False
@@ -66,7 +66,9 @@ class Robot:
             stamp = self.peer.now
             if odometry:
                 turn = [0, 0, np.sin(self.heading / 2), np.cos(self.heading / 2)]
-                message = builders.odometry(stamp, self.frame, self.child, [*self.place, 0], turn, [0] * 3, [0] * 3)
+                message = builders.odometry(
+                    stamp, self.odometry_frame, self.child, [*self.place, 0], turn, [0] * 3, [0] * 3
+                )
                 self.odometry.publish(bytes(type_store().serialize_cdr(message, message.__msgtype__)))
             if candidates and step % 4 == 0:
                 self.candidates.publish(self._fan(stamp))
@@ -147,6 +149,13 @@ def test_best_effort_odometry_is_received_and_a_moving_robot_drives(robot):
     robot.speed = 0.5
     assert robot.live(10.0, until=robot.says("driving to the goal")), robot.status()
     assert robot.status()[0] == OK
+
+
+def test_odometry_without_a_frame_is_in_odom_as_the_predictor_takes_it(robot):
+    robot.odometry_frame = ""
+    robot.listen(TwistStamped)
+    robot.send_goal(50.0, 0.0)
+    assert robot.live(10.0, until=lambda: robot.driven), robot.status()
 
 
 def test_a_robot_that_stands_is_not_said_to_drive(robot):

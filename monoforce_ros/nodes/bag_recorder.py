@@ -37,12 +37,17 @@ class BagRecorder(Node):
         super().__init__("bag_recorder")
         refuse_unknown_parameters(self)
         self._bag = bag
-        self._topics = topics
+        self._topics = None if topics is None else {self.resolve_topic_name(topic) for topic in topics}
         self._subscribed: set[str] = set()
         self.recorded = 0
         self._timer = self.create_timer(0.2, self._subscribe_new)
         self._flusher = self.create_timer(1.0, bag.flush)
         self._subscribe_new()
+
+    @property
+    def missing(self) -> list[str]:
+        """Topics that were asked for and never published."""
+        return sorted((self._topics or set()) - self._subscribed)
 
     def _subscribe_new(self) -> None:
         for topic, types in self.get_topic_names_and_types():
@@ -98,6 +103,8 @@ def main(arguments: list[str] | None = None) -> int:
                 pass
             finally:
                 print(f"recorded {recorder.recorded} messages into {options.out}", file=sys.stderr)
+                if recorder.missing:
+                    print(f"nobody published {', '.join(recorder.missing)}", file=sys.stderr)
                 recorder.destroy_node()
     except (OSError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)

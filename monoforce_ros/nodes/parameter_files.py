@@ -63,11 +63,12 @@ def read_sections(path: Path) -> dict[str, dict[str, Any]]:
         "expected '/**:', under it 'ros__parameters:', and under that NAME: VALUE, as in config/predictor.params.yaml"
     )
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content = yaml.load(path.read_text(encoding="utf-8"), _UniqueLoader)
     except OSError as error:
         raise ValueError(f"parameter file {path}: {error.strerror}; give the path of an existing file") from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"parameter file {path} is not YAML: {error}") from error
+        problem = error.problem if isinstance(error, RepeatedKeyError) else f"is not YAML: {error}"
+        raise ValueError(f"parameter file {path} {problem}") from error
     sections: dict[str, dict[str, Any]] = {}
     stray: list[str] = []
     _collect(content, "", sections, stray)
@@ -76,6 +77,26 @@ def read_sections(path: Path) -> dict[str, dict[str, Any]]:
     if stray:
         raise ValueError(f"parameter file {path}: {stray[0]} is not under 'ros__parameters': {example}")
     return sections
+
+
+class RepeatedKeyError(yaml.YAMLError):
+    """A key that occurs twice in one mapping."""
+
+    def __init__(self, key: object, line: int):
+        self.problem = f"has {key!r} twice, again in line {line}: merge both into one"
+        super().__init__(self.problem)
+
+
+class _UniqueLoader(yaml.SafeLoader):
+    """YAML's safe loader, which refuses a repeated key; YAML keeps the last one only."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """The mapping of a node; raises ``RepeatedKeyError`` for a key that occurs twice."""
+        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
+        for number, (key, (place, _)) in enumerate(zip(keys, node.value, strict=True)):
+            if key in keys[:number]:
+                raise RepeatedKeyError(key, place.start_mark.line + 1)
+        return super().construct_mapping(node, deep)
 
 
 def _collect(content: Any, name: str, sections: dict[str, dict[str, Any]], stray: list[str]) -> None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Callable, Iterable
 from types import SimpleNamespace
+from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -99,13 +102,35 @@ def _declare(
     except (InvalidParameterTypeException, InvalidParameterValueException) as error:
         expected = f"{entry.type} {entry.range_text}".strip()
         raise ValueError(f"parameter {name}: {error}; expected {expected} {entry.unit}".rstrip()) from error
-    if entry.size and value is not None and len(value) != entry.size:
-        raise ValueError(f"parameter {name}: got {len(value)} values, expected {entry.expected}")
-    if entry.name.endswith("_topic") and entry.default and value == "":
-        raise ValueError(f"parameter {name}: got an empty name, expected a topic such as {entry.default!r}")
-    if entry.choices and value is not None and value not in entry.choices:
-        raise ValueError(f"parameter {name}: got {value!r}, expected one of {list(entry.choices)}")
+    if (value is not None or name == entry.name) and (reason := complaint(entry, value)):
+        raise ValueError(f"parameter {name}: {reason}")
     return value
+
+
+def complaint(entry: ParameterEntry, value: Any) -> str:
+    """What is wrong with a parameter's value beyond its type and range, which ROS checks; empty if nothing is."""
+    if value is None:
+        # ROS has no type for an empty list, and leaves the parameter unset.
+        return "" if entry.default is None else f"got no value, expected {entry.expected}"
+    if entry.size and len(value) != entry.size:
+        return f"got {len(value)} values, expected {entry.expected}"
+    if entry.type == "double_array" and not all(math.isfinite(number) for number in value):
+        return f"got {list(value)}, expected finite numbers"
+    if entry.choices and value not in entry.choices:
+        return f"got {value!r}, expected one of {list(entry.choices)}"
+    if not entry.name.endswith(("_topic", "_topics")):
+        return ""
+    if value == "" and entry.default:
+        return f"got an empty name, expected a topic such as {entry.default!r}"
+    for topic in [value] if isinstance(value, str) else value:
+        try:
+            if topic:
+                expand_topic_name(topic, "node", "/")
+        except ValueError as error:
+            # rcl's messages end with the place in its source code.
+            reason = str(error).partition(", at /")[0].partition(": ")[2]
+            return f"got {topic!r}, expected a topic such as '/odom': {reason}"
+    return ""
 
 
 def follow_changes(
@@ -134,9 +159,8 @@ def follow_changes(
                 continue
             if not entry.dynamic and (reason := fixed(entry.name)):
                 return SetParametersResult(successful=False, reason=reason)
-            if entry.choices and parameter.value not in entry.choices:
-                reason = f"{entry.name}: got {parameter.value!r}, expected one of {list(entry.choices)}"
-                return SetParametersResult(successful=False, reason=reason)
+            if reason := complaint(entry, parameter.value):
+                return SetParametersResult(successful=False, reason=f"{entry.name}: {reason}")
             setattr(changed, parameter.name, parameter.value)
         try:
             change(changed)

@@ -165,6 +165,8 @@ class PathSelectorNode(Node):
             return
         self._arrivals["odometry"] = time.monotonic()
         self._first_odometry = self._first_odometry or self._arrivals["odometry"]
+        # The name of REP 105, as the predictor takes it.
+        frame_id = frame_id or "odom"
         self._odometry_frame = frame_id
         try:
             offset = self.frames.odometry_child(child, self.transforms.tree)
