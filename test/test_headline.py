@@ -1,6 +1,7 @@
 """The first screen of a diagnosis follows the verdict and what is explained on held-out data."""
 
 import re
+from dataclasses import replace
 
 import pytest
 
@@ -62,8 +63,22 @@ def test_a_small_share_or_a_grown_error_is_never_good(position, heading, sentenc
     grown = position[1] > position[0] or heading[1] > heading[0]
     assert any("grows with these effects" in text for text in top.doubts) == grown
     assert top.helps == (not grown)
+    assert any("do not use what was found yet" in text for text in top.actions) == grown
     # Neither is the page green, whatever the search says of the share of its own loss.
     assert "#0b6e4f'" not in diagnosis_page(diagnosed(position, heading), {}, None)
+
+
+def test_an_effect_that_one_part_of_the_recording_shows_is_not_good():
+    for times, sure in (((3, 3), True), ((2, 3), True), ((1, 3), False)):
+        top = headline(diagnosed((0.5, 0.06), (8.0, 1.0), effects=(replace(DELAY, found_again=times),)))
+        assert (top.tone is Tone.GOOD) == sure
+        assert any("in a part of the recording only" in text for text in top.doubts) == (not sure)
+        assert any(f"found again in {times[0]} of 3 searches" in text for text in top.confidence)
+
+
+def test_a_robot_that_was_never_commissioned_is_a_doubt():
+    known, unknown = (headline(diagnosed((0.5, 0.06), (8.0, 1.0), commissioned=it)) for it in (True, False))
+    assert not known.doubts and "never commissioned" in unknown.doubts[0]
 
 
 def test_held_out_recordings_go_before_blocks_of_the_diagnosed_one():

@@ -146,11 +146,15 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
             doubts.append(f"{cause(effect.name)} could as well be {others}: this recording cannot tell them apart")
     unstable = [effect for effect in named if effect.found_again and 2 * effect.found_again[0] < effect.found_again[1]]
     doubts += [f"{cause(e.name)} shows in a part of the recording only: drive longer to be sure" for e in unstable]
-    # What was found under a doubt about the recording or the ground may be nothing but its cause.
-    remedies = ["remove the cause of the doubt first, then run diagnose again"] if complaints else []
-    actions = [*(remedies or [remedy(effect.name) for effect in effects]), *diagnosis.advice]
     counted = [row for row in rows if row.counts]
     grew = [row for row in rows if row.grew]
+    remedies = [remedy(effect.name) for effect in effects]
+    if complaints:
+        # What was found under a doubt about the recording or the ground may be nothing but its cause.
+        remedies = ["remove the cause of the doubt first, then run diagnose again"]
+    elif grew:
+        remedies = ["do not use what was found yet: drive longer, with more kinds of motion, and run diagnose again"]
+    actions = [*remedies, *diagnosis.advice]
     doubts += [_growth(row) for row in grew]
     enough = bool(counted) and all(row.share >= MOST for row in counted)
     findings = tuple(finding(effect) for effect in effects)
