@@ -11,10 +11,11 @@ from monoforce_ros.core import WheelTrack
 from monoforce_ros.discrepancy import DiagnosisSettings, Evidence
 from monoforce_ros.discrepancy.comparison import HeldOut
 from monoforce_ros.discrepancy.estimates import EffectEstimate
-from monoforce_ros.discrepancy.explanation import Windows
+from monoforce_ros.discrepancy.explanation import Windows, explain
 from monoforce_ros.discrepancy.hypothesis import window_starts
 from monoforce_ros.discrepancy.repetition import LENGTH, Repeated, Repetition, repeat, without_part
 from monoforce_ros.discrepancy.sensor_findings import SensorFindings
+from monoforce_ros.discrepancy.verdict import Verdict
 from monoforce_ros.robots import load_robot
 
 SAMPLES = np.array([0.5, 1.0, 1.5, 2.0])
@@ -104,3 +105,25 @@ def test_an_effect_that_others_replace_half_of_the_time_belongs_to_a_class_with_
     repeated = (Repeated(named=("drive_gain",)), Repeated(named=("payload",)), None, None)
     (judged,) = Repetition(0, repeated).judged([EffectEstimate("drive_gain", {})])
     assert judged.found_again == (1, 2) and judged.indistinguishable == ("payload",)
+
+
+def test_an_effect_beside_another_that_no_repetition_finds_is_not_added(husky):
+    motion, commands = simulated_recording(husky, (("command_delay", {"delay": 0.3}),), seconds=40.0)
+    evidence, windows = windows_of(motion, commands)
+    found = explain(evidence, husky, windows, None, SETTINGS)
+    assert found.decision.verdict == Verdict.EFFECT_FOUND
+    (name,) = found.decision.trial.names
+    both = found.search.judge((*found.decision.trial.effects, ("payload", {"mass": 3.0, "x": 0.1, "y": 0.0})))
+    decision = replace(found.decision, trial=both)
+
+    def names(*repeated):
+        confirmed = Repetition(0, repeated).confirmed(found, decision, SETTINGS.thresholds)
+        return confirmed.trial.names, " ".join(confirmed.remarks)
+
+    delay, payload = Repeated(named=(name,)), Repeated(named=(name, "payload"))
+    assert names(delay, payload, None)[0] == (name, "payload")
+    kept, remarks = names(delay, delay, None)
+    assert kept == (name,) and "no repetition without a part of the recording finds it: payload" in remarks
+    # The only effect is kept: its doubt stands on the first screen.
+    alone = replace(decision, trial=found.decision.trial)
+    assert Repetition(0, (Repeated(), Repeated())).confirmed(found, alone, SETTINGS.thresholds) is alone

@@ -171,7 +171,8 @@ def diagnose(
     if decision.trial is not None:
         repetition = repeat(evidence, robot, explanation.windows, nominal, settings, _Steps(progress, 0.62, 0.95))
         if repetition is not None:
-            judged = repetition.held_out
+            decision = repetition.confirmed(explanation, decision, settings.thresholds)
+            judged = None if decision.trial is None else repetition.held_out
             compared = compare(robot, data, smoothed, judged, noisy)
     gap = gap_table(compared, settings.seed)
     known_parts: tuple[EffectEstimate, ...] = ()

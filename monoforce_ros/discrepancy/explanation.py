@@ -60,6 +60,8 @@ class Explanation:
     sensors: SensorFindings
     search: Search
     outcome: Outcome
+    findings: Findings
+    """From which the decision follows."""
     decision: Decision
     onset: Onset | None = None
 
@@ -141,4 +143,4 @@ def explain(
         findings = replace(findings, formula=learned, formula_gain=gain)
     decision = decide(findings, thresholds)
     decision = replace(decision, losses=replace(decision.losses, variance_ratio=outcome.variance_ratio))
-    return Explanation(windows, sensors, search, outcome, decision, onset)
+    return Explanation(windows, sensors, search, outcome, findings, decision, onset)

@@ -18,11 +18,13 @@ import torch
 from monoforce_ros.core import WheelTrack
 from monoforce_ros.discrepancy.comparison import HeldOut
 from monoforce_ros.discrepancy.estimates import EffectEstimate
-from monoforce_ros.discrepancy.explanation import DiagnosisSettings, Windows, explain
+from monoforce_ros.discrepancy.explanation import DiagnosisSettings, Explanation, Windows, explain
 from monoforce_ros.discrepancy.hypothesis import Effects, Evidence
 from monoforce_ros.discrepancy.learned import LEARNED
 from monoforce_ros.discrepancy.nominal import NominalModel
+from monoforce_ros.discrepancy.thresholds import Thresholds
 from monoforce_ros.discrepancy.trial import BLOCK
+from monoforce_ros.discrepancy.verdict import Decision, Verdict, decide
 from monoforce_ros.robots import RobotModel
 
 LENGTH = 2 * BLOCK
@@ -57,6 +59,30 @@ class Repetition:
     def held_out(self) -> HeldOut:
         """The effects that predict each part."""
         return HeldOut(tuple(() if r is None else r.effects for r in self.repeated), self.first, LENGTH)
+
+    def confirmed(self, explanation: Explanation, decision: Decision, thresholds: Thresholds) -> Decision:
+        """The decision without the effects beside others that no repetition finds (stability selection, Meinshausen and
+        Bühlmann 2010).
+
+        The rest is judged anew: without them it may leave what does not look like the healthy robot.
+        """
+        trial, search = decision.trial, explanation.search
+        if trial is None or decision.verdict != Verdict.EFFECT_FOUND:
+            return decision
+        found = {name for entry in self.repeated if entry is not None for name in entry.named}
+        alike = explanation.outcome.indistinguishable
+        known = dict(search.known)
+        missing = [n for n in trial.names if n not in known and not {n, *alike.get(n, ())} & found]
+        kept = tuple(entry for entry in trial.effects if entry[0] not in missing)
+        if not missing or not kept:
+            return decision
+        best = search.judge(kept)
+        findings = explanation.findings
+        findings = replace(findings, best=best, fit=search.fit_test(best, findings.nominal), formula=None)
+        again = decide(findings, thresholds)
+        remark = f"not added, for no repetition without a part of the recording finds it: {' and '.join(missing)}"
+        losses = replace(again.losses, variance_ratio=decision.losses.variance_ratio)
+        return replace(again, remarks=(*again.remarks, remark), losses=losses)
 
     def judged(self, effects: Sequence[EffectEstimate]) -> tuple[EffectEstimate, ...]:
         """The effects of the whole recording, each with how often it was found again.
