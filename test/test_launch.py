@@ -105,6 +105,8 @@ def test_wrong_values_are_named_with_what_was_expected(given, message):
             "no node is called /foresight; expected /left/predictor or /\\*\\*",
         ),
         ("a: [", "is not YAML"),
+        ("a: &a [*a]", "is not YAML: maximum recursion depth"),
+        ("/**:\n  ros__parameters:\n    rate: 3.0\n    rate: 4.0\n", "has 'rate' twice, again in line 4"),
     ],
 )
 def test_a_wrong_parameter_file_is_named_with_what_was_expected(file, text, message):

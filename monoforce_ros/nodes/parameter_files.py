@@ -63,10 +63,12 @@ def read_sections(path: Path) -> dict[str, dict[str, Any]]:
         "expected '/**:', under it 'ros__parameters:', and under that NAME: VALUE, as in config/predictor.params.yaml"
     )
     try:
-        content = yaml.load(path.read_text(encoding="utf-8"), _UniqueLoader)
+        text = path.read_text(encoding="utf-8")
+        _refuse_repeated_keys(yaml.compose(text, yaml.SafeLoader))
+        content = yaml.safe_load(text)
     except OSError as error:
         raise ValueError(f"parameter file {path}: {error.strerror}; give the path of an existing file") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         problem = error.problem if isinstance(error, RepeatedKeyError) else f"is not YAML: {error}"
         raise ValueError(f"parameter file {path} {problem}") from error
     sections: dict[str, dict[str, Any]] = {}
@@ -87,16 +89,19 @@ class RepeatedKeyError(yaml.YAMLError):
         super().__init__(self.problem)
 
 
-class _UniqueLoader(yaml.SafeLoader):
-    """YAML's safe loader, which refuses a repeated key; YAML keeps the last one only."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """The mapping of a node; raises ``RepeatedKeyError`` for a key that occurs twice."""
-        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
-        for number, (key, (place, _)) in enumerate(zip(keys, node.value, strict=True)):
-            if key in keys[:number]:
-                raise RepeatedKeyError(key, place.start_mark.line + 1)
-        return super().construct_mapping(node, deep)
+def _refuse_repeated_keys(node: yaml.Node | None) -> None:
+    """Raise :class:`RepeatedKeyError` for a key that occurs twice in a mapping, of which YAML keeps the last one."""
+    if isinstance(node, yaml.SequenceNode):
+        for entry in node.value:
+            _refuse_repeated_keys(entry)
+    if not isinstance(node, yaml.MappingNode):
+        return
+    keys = [key.value for key, _ in node.value]
+    for number, (key, value) in enumerate(node.value):
+        # Equal scalars are equal texts; a key that is a list is none of ROS's.
+        if keys[number] in keys[:number]:
+            raise RepeatedKeyError(key.value, key.start_mark.line + 1)
+        _refuse_repeated_keys(value)
 
 
 def _collect(content: Any, name: str, sections: dict[str, dict[str, Any]], stray: list[str]) -> None:
