@@ -1,7 +1,7 @@
 """Repetition: the diagnosis repeated without parts of a recording, so that errors are judged on data it never saw.
 
 The recording is cut into blocks of 16 s, which take turns in being left out. Without each part sensors are compared,
-effects selected and their values fitted anew; what is found there predicts the part. An effect that is found again each
+effects selected and their values fitted again; what is found there predicts the part. An effect that is found again each
 time does not hang on a single manoeuvre.
 """
 
@@ -32,6 +32,7 @@ LENGTH = 2 * BLOCK
 _COUNTS = (3, 4, 5, 7)
 """Numbers of parts, the preferred one first: a long recording is subsampled to every so many blocks, and must not lose
 all of them at once."""
+FEWEST_PARTS = 3
 FEWEST_WINDOWS = 8
 """On which a search is repeated: as many as a block of the search holds."""
 
@@ -125,7 +126,8 @@ def repeat(
     starts = windows.data.starts
     first = int(starts[0])
     numbers = np.unique((starts - first) // round(LENGTH * 1e9))
-    count = next((count for count in _COUNTS if len(np.unique(numbers % count)) > 1), 0)
+    # With two parts only half of the recording would be left, on which a search finds less.
+    count = next((count for count in _COUNTS if len(np.unique(numbers % count)) >= FEWEST_PARTS), 0)
     if not count:
         return None
     places = HeldOut(((),) * count, first, LENGTH)
