@@ -1,8 +1,8 @@
 """Repetition: the diagnosis repeated without parts of a recording, so that errors are judged on data it never saw.
 
 The recording is cut into blocks of 16 s, which take turns in being left out. Without each part sensors are compared,
-effects selected and their values fitted again; what is found there predicts the part. An effect that is found again each
-time does not hang on a single manoeuvre.
+effects selected and their values fitted again; what is found there predicts the part. An effect that is found again
+each time does not hang on a single manoeuvre.
 """
 
 from __future__ import annotations
