@@ -33,6 +33,7 @@ _COUNTS = (3, 4, 5, 7)
 """Numbers of parts, the preferred one first: a long recording is subsampled to every so many blocks, and must not lose
 all of them at once."""
 FEWEST_PARTS = 3
+"""Of two parts only half of the recording would be left, on which a search finds less."""
 FEWEST_WINDOWS = 8
 """On which a search is repeated: as many as a block of the search holds."""
 
@@ -126,7 +127,6 @@ def repeat(
     starts = windows.data.starts
     first = int(starts[0])
     numbers = np.unique((starts - first) // round(LENGTH * 1e9))
-    # With two parts only half of the recording would be left, on which a search finds less.
     count = next((count for count in _COUNTS if len(np.unique(numbers % count)) >= FEWEST_PARTS), 0)
     if not count:
         return None

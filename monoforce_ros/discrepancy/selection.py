@@ -50,7 +50,8 @@ from monoforce_ros.robots import RobotModel
 _JUDGED = 6
 """Significant effects that are cross-validated in one round, those with the smallest screening loss first."""
 _FITTED = 8
-"""Effects with one parameter that are fitted in one round, those that promise the smallest loss first."""
+"""Effects with one parameter that are fitted in one round, those that promise the smallest loss first. More than are
+judged afterwards; fewer than all of them only to save time."""
 _ALTERNATIVES = 2
 """Combinations that do not begin with the best single effect and are tried where that one leads to no good fit."""
 
