@@ -54,11 +54,11 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
-            "predictor = monoforce_ros.nodes.predictor:main",
-            "path_selector = monoforce_ros.nodes.path_selector:main",
-            "simulator = monoforce_ros.nodes.simulator:main",
-            "bag_player = monoforce_ros.nodes.bag_player:main",
-            "bag_recorder = monoforce_ros.nodes.bag_recorder:main",
+            "predictor = monoforce_ros.nodes.executables:predictor",
+            "path_selector = monoforce_ros.nodes.executables:path_selector",
+            "simulator = monoforce_ros.nodes.executables:simulator",
+            "bag_player = monoforce_ros.nodes.executables:bag_player",
+            "bag_recorder = monoforce_ros.nodes.executables:bag_recorder",
             "synthesize = monoforce_ros.synthetic.cli:main",
             "evaluate = monoforce_ros.evaluation.cli:main",
             "convert = monoforce_ros.datasets.cli:main",

@@ -10,20 +10,20 @@ monoforce_ros.nodes.launch_plan.
 import sys
 from pathlib import Path
 
-from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from launch import LaunchContext, LaunchDescription
-from monoforce_ros.nodes.launch_plan import launch_arguments, plan_nodes
+from launch import Action, LaunchContext, LaunchDescription
+from monoforce_ros.nodes.launch_plan import idle_sections, launch_arguments, plan_nodes
 
 
-def _nodes(context: LaunchContext) -> list[Node]:
-    """The nodes for the given arguments."""
+def _actions(context: LaunchContext) -> list[Action]:
+    """The nodes for the given arguments, and what the user should know of them."""
     # Where another launch file was called, the arguments on the command line are first of all that file's.
     included = not any(Path(word).name == Path(__file__).name for word in sys.argv)
     given = {argument.name: LaunchConfiguration(argument.name).perform(context) for argument in launch_arguments()}
-    return [
+    nodes = [
         Node(
             package="monoforce_ros",
             executable=plan.executable,
@@ -35,6 +35,7 @@ def _nodes(context: LaunchContext) -> list[Node]:
         )
         for plan in plan_nodes(given, context.argv, included=included)
     ]
+    return [*(LogInfo(msg=text) for text in idle_sections(given, context.argv, included=included)), *nodes]
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -43,4 +44,4 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument(argument.name, default_value="", description=argument.description)
         for argument in launch_arguments()
     ]
-    return LaunchDescription([*declared, OpaqueFunction(function=_nodes)])
+    return LaunchDescription([*declared, OpaqueFunction(function=_actions)])

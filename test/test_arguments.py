@@ -78,6 +78,10 @@ def test_what_is_for_a_node_of_another_name_is_refused(words, right):
             "predictor --ros-args -p terrain_sourse:=camera",
             "unknown parameter 'terrain_sourse'; did you mean 'terrain_source'?",
         ),
+        (
+            "predictor --ros-args -p use_sim_tme:=true",
+            "unknown parameter 'use_sim_tme'; did you mean 'use_sim_time'?",
+        ),
         ("predictor --ros-args -p robot=husky", "the ROS arguments cannot be read"),
         ("predictor --ros-args --params-file {schema}", "has no 'ros__parameters': expected '/**:'"),
         ("predictor --ros-args --params-file /nowhere.yaml", "parameter file /nowhere.yaml: No such file"),

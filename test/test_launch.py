@@ -9,7 +9,7 @@ from unittest.mock import MagicMock
 import pytest
 from conftest import ROOT
 
-from monoforce_ros.nodes.launch_plan import SHARED, launch_arguments, plan_nodes
+from monoforce_ros.nodes.launch_plan import SHARED, idle_sections, launch_arguments, plan_nodes
 from monoforce_ros.nodes.schema import SCHEMAS, read_schema, schema_path
 
 LAUNCH_FILE = ROOT / "launch" / "predictor.launch.py"
@@ -55,6 +55,15 @@ def test_one_file_serves_both_nodes(file):
     assert selector.parameters == {
         "command_topic": "drive", "goal_tolerance": 0.3, "command_rate": 20.0, "odometry_topic": "filtered",
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("key", ["path_selector", "/left/path_selector"])
+def test_parameters_for_a_node_that_is_not_started_are_mentioned(file, key):
+    section = f"{key}:\n  ros__parameters:\n    timeout: 2.0\n"
+    given = {"params_file": file(f"predictor:\n  ros__parameters:\n    rate: 4.0\n{section}"), "namespace": "left"}
+    (sentence,) = idle_sections(given)
+    assert sentence.endswith("has parameters for path_selector, which is not started: add path_selector:=true")
+    assert idle_sections(given | {"path_selector": "true"}) == idle_sections({}) == []
 
 
 def test_tf_moves_into_the_namespace_on_request():
@@ -225,12 +234,22 @@ def test_arguments_reach_the_nodes_and_unknown_ones_end_the_start_unless_another
     module, given = launch_file
     given |= {"horizon": "3.0", "timeout": "1.0", "path_selector": "true"}
     monkeypatch.setattr(sys, "argv", ["ros2", "launch", "monoforce_ros", "predictor.launch.py", "horizon:=3.0"])
-    predictor, selector = module._nodes(MagicMock(argv=["horizon:=3.0", "timeout:=1.0", "path_selector:=true"]))
+    predictor, selector = module._actions(MagicMock(argv=["horizon:=3.0", "timeout:=1.0", "path_selector:=true"]))
     assert predictor["parameters"] == [{"horizon": 3.0}] and selector["parameters"] == [{"timeout": 1.0}]
     with pytest.raises(ValueError, match="unknown launch argument 'ns'; did you mean 'namespace'"):
-        module._nodes(MagicMock(argv=["ns:=left"]))
+        module._actions(MagicMock(argv=["ns:=left"]))
     monkeypatch.setattr(sys, "argv", ["ros2", "launch", "my_robot", "bringup.launch.py", "ns:=left"])
-    assert len(module._nodes(MagicMock(argv=["ns:=left"]))) == 2
+    assert len(module._actions(MagicMock(argv=["ns:=left"]))) == 2
+
+
+def test_the_launch_file_mentions_parameters_of_a_node_that_it_does_not_start(launch_file, file):
+    module, given = launch_file
+    sections = (f"{name}:\n  ros__parameters:\n    {value}\n" for name, value in
+                (("predictor", "rate: 4.0"), ("path_selector", "timeout: 2.0")))  # fmt: skip
+    given |= {"params_file": file("".join(sections))}
+    module._actions(MagicMock(argv=[]))
+    (called,) = module.LogInfo.call_args_list
+    assert "add path_selector:=true" in called.kwargs["msg"]
 
 
 def test_the_launch_file_starts_what_is_planned(file):
@@ -244,8 +263,8 @@ def test_the_launch_file_starts_what_is_planned(file):
     assert declared == [argument.name for argument in launch_arguments()]
     context = launch.LaunchContext(argv=["robot:=marv"])
     context.launch_configurations.update({name: "" for name in declared} | {"robot": "marv", "path_selector": "true"})
-    nodes = module._nodes(context)
+    nodes = module._actions(context)
     assert [node.node_executable for node in nodes] == ["predictor", "path_selector"]
     context.launch_configurations["candidates"] = "abc"
     with pytest.raises(ValueError, match="candidates: got 'abc'"):
-        module._nodes(context)
+        module._actions(context)

@@ -1,5 +1,6 @@
 """End of a node's process: orderly after a signal, with a traceback after a fault of its own."""
 
+import signal
 import subprocess
 import sys
 
@@ -62,6 +63,32 @@ def test_a_signal_while_a_node_starts_is_no_fault(following, ros_environment):
         env=ros_environment, capture_output=True, text=True, timeout=60, check=False,
     )  # fmt: skip
     assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
+
+
+LOADING = """
+import os, signal, sys
+from importlib.abc import MetaPathFinder
+
+class Interrupts(MetaPathFinder):
+    def find_spec(self, name, path, target=None):
+        if name == "rclpy":
+            os.kill(os.getpid(), {number})
+
+sys.meta_path.insert(0, Interrupts())
+from importlib.metadata import entry_points
+(point,) = [p for p in entry_points(group="console_scripts") if p.name == {name!r} and "monoforce" in p.value]
+sys.exit(point.load()([]))
+"""
+
+
+@pytest.mark.parametrize("name", ["predictor", "path_selector", "simulator", "bag_player", "bag_recorder"])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_an_executable_is_loaded_is_no_fault(name, number, ros_environment):
+    done = subprocess.run(
+        [sys.executable, "-c", LOADING.format(name=name, number=int(number))],
+        env=ros_environment, capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0 and not done.stderr, done.stderr
 
 
 def test_choosing_among_candidates_needs_no_physics_engine():

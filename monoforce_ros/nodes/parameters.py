@@ -67,7 +67,8 @@ def refuse_unknown_parameters(node: Node, entries: Iterable[ParameterEntry] = ()
                 f"unknown parameter {name!r}: {node.get_name()} has no parameters; --help lists its options"
             )
         if name not in others:
-            raise ValueError(f"unknown parameter {name!r}{nearest(name, known)} --help lists all parameters")
+            meant = nearest(name, known | {"use_sim_time"})
+            raise ValueError(f"unknown parameter {name!r}{meant} --help lists all parameters")
         unused.append(name)
     if unused:
         owners = " and ".join(sorted({others[name] for name in unused}))
