@@ -12,7 +12,8 @@ from pathlib import Path
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 
-INSTALLED = Path(__file__).resolve().parent.parent / "install" / "monoforce_ros" / "lib" / "monoforce_ros"
+_INSTALL = Path(os.environ.get("MONOFORCE_INSTALL", Path(__file__).resolve().parent.parent / "install"))
+INSTALLED = _INSTALL / "monoforce_ros" / "lib" / "monoforce_ros"
 
 
 class Peer:
