@@ -23,6 +23,7 @@ def _actions(context: LaunchContext) -> list[Action]:
     # Where another launch file was called, the arguments on the command line are first of all that file's.
     included = not any(Path(word).name == Path(__file__).name for word in sys.argv)
     given = {argument.name: LaunchConfiguration(argument.name).perform(context) for argument in launch_arguments()}
+    plans = plan_nodes(given, context.argv, included=included)
     nodes = [
         Node(
             package="monoforce_ros",
@@ -33,9 +34,9 @@ def _actions(context: LaunchContext) -> list[Action]:
             remappings=list(plan.remappings),
             output="screen",
         )
-        for plan in plan_nodes(given, context.argv, included=included)
+        for plan in plans
     ]
-    return [*(LogInfo(msg=text) for text in idle_sections(given, context.argv, included=included)), *nodes]
+    return [*(LogInfo(msg=text) for text in idle_sections(plans, given["params_file"])), *nodes]
 
 
 def generate_launch_description() -> LaunchDescription:

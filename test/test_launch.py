@@ -61,9 +61,10 @@ def test_one_file_serves_both_nodes(file):
 def test_parameters_for_a_node_that_is_not_started_are_mentioned(file, key):
     section = f"{key}:\n  ros__parameters:\n    timeout: 2.0\n"
     given = {"params_file": file(f"predictor:\n  ros__parameters:\n    rate: 4.0\n{section}"), "namespace": "left"}
-    (sentence,) = idle_sections(given)
+    (sentence,) = idle_sections(plan_nodes(given), given["params_file"])
     assert sentence.endswith("has parameters for path_selector, which is not started: add path_selector:=true")
-    assert idle_sections(given | {"path_selector": "true"}) == idle_sections({}) == []
+    both = plan_nodes(given | {"path_selector": "true"})
+    assert idle_sections(both, given["params_file"]) == idle_sections(both[:1], "") == []
 
 
 def test_tf_moves_into_the_namespace_on_request():

@@ -122,7 +122,9 @@ def plan_nodes(given: Mapping[str, str], words: Sequence[str] = (), *, included:
     """
     schemas = [_Node.read(name) for name in SCHEMAS]
     _refuse_unknown_words(words, schemas, included=included)
-    values = _values(given, words, included)
+    on_line = {} if included else dict(word.split(":=", 1) for word in words)
+    # An empty value on the command line was given, to set an empty text in place of the file's.
+    values = on_line | {name: text for name, text in given.items() if text}
     namespace = values.get("namespace", "").strip("/")
     if namespace and not re.fullmatch(r"[A-Za-z_]\w*(/[A-Za-z_]\w*)*", namespace):
         raise ValueError(f"namespace: got {namespace!r}, expected letters, digits and underscores, parts joined by /")
@@ -143,29 +145,19 @@ def plan_nodes(given: Mapping[str, str], words: Sequence[str] = (), *, included:
     return tuple(plans)
 
 
-def idle_sections(given: Mapping[str, str], words: Sequence[str] = (), *, included: bool = False) -> list[str]:
-    """A sentence for each node that the parameter file has a section for, by name, and that is not started.
+def idle_sections(plans: Sequence[NodePlan], file: str) -> list[str]:
+    """A sentence for each node that a parameter file has a section for, by name, and that is not started.
 
     Args:
-        given: values of the launch arguments, as for :func:`plan_nodes`, which has accepted them.
-        words: the arguments on the command line.
-        included: another launch file includes this one.
+        plans: the nodes that are started.
+        file: the parameter file; empty if there is none.
     """
-    values = _values(given, words, included)
-    started = {plan.name for plan in plan_nodes(given, words, included=included)}
-    file = values.get(_FILE.name, "")
+    idle = set(SCHEMAS) - {plan.name for plan in plans}
     return [
         f"{file} has parameters for {name}, which is not started: add {name}:=true"
         for section in (read_sections(Path(file)) if file else ())
-        if (name := section.rpartition("/")[2]) in set(SCHEMAS) - started
+        if (name := section.rpartition("/")[2]) in idle
     ]
-
-
-def _values(given: Mapping[str, str], words: Sequence[str], included: bool) -> dict[str, str]:
-    """All values that were given, by the name of their argument."""
-    on_line = {} if included else dict(word.split(":=", 1) for word in words)
-    # An empty value on the command line was given, to set an empty text in place of the file's.
-    return on_line | {name: text for name, text in given.items() if text}
 
 
 def _parsed(entry: ParameterEntry, text: str) -> ParameterValue:
