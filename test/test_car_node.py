@@ -45,7 +45,7 @@ def test_steering_commands_bend_the_path_as_a_bicycle(peer, predictor):
         if len(peer.received["/predicted/path"]) > 5:
             break
     assert peer.received["/predicted/path"], (peer.status("commands"), predictor.output[-3000:])
-    assert peer.status("commands") == (OK, "receiving commands")
+    assert peer.until(lambda: peer.status("commands") == (OK, "receiving commands"), 5.0), peer.status("commands")
     poses = peer.received["/predicted/path"][-1].poses
     yaw = [2.0 * np.arctan2(p.pose.orientation.z, p.pose.orientation.w) for p in poses]
     way = sum(

@@ -78,7 +78,7 @@ def test_an_offset_is_asked_for_and_applied_once_tf_has_it(peer, start, tf_type)
     # The path is that of base_link, in the odometry frame with its prefix.
     assert feed.paths[-1].header.frame_id == "robot1/odom"
     np.testing.assert_allclose(start_position(feed.paths[-1]), [1.2, 2.0, 0.1323], atol=1e-6)
-    assert feed.status("odometry") == (0, "receiving odometry")
+    assert feed.until(lambda: feed.status("odometry") == (0, "receiving odometry"), 5.0), feed.status("odometry")
     assert process.stop() == 0
 
 

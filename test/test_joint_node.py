@@ -69,7 +69,7 @@ def test_measured_angles_pose_the_flippers_in_any_order(peer, predictor):
     _, pitch = predicted(peer, predictor, joints=measured([-0.14, 1.0, -0.7, -0.14, -0.7], names))
     assert abs(level[1]) < 0.02
     assert pitch > 0.1
-    assert peer.status("joints") == (OK, "receiving joints")
+    assert peer.until(lambda: peer.status("joints") == (OK, "receiving joints"), 5.0), peer.status("joints")
 
 
 def test_commanded_angles_move_the_flippers_over_the_horizon(peer, predictor):

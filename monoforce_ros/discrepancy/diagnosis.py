@@ -41,7 +41,7 @@ from monoforce_ros.discrepancy.hypothesis import (
 from monoforce_ros.discrepancy.kinematic_baseline import StepComparison
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.preflight import advice, complaints
-from monoforce_ros.discrepancy.repetition import repeat
+from monoforce_ros.discrepancy.repetition import prepare_processes, repeat
 from monoforce_ros.discrepancy.selection import Search
 from monoforce_ros.discrepancy.sensor_findings import (
     accepts_bias,
@@ -128,6 +128,8 @@ def diagnose(
         progress: called with the share of the work done and the next step.
     """
     progress(0.0, "preflight")
+    if settings.processes > 1:
+        prepare_processes()
     evidence = corrected_evidence(evidence, robot)
     smoothed = evidence.smoothed
     starts = window_starts(smoothed.motion, smoothed.stretches, settings.horizon, settings.stride)

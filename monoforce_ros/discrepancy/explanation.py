@@ -110,7 +110,7 @@ def explain(
     search = searched(windows)
     outcome = search.run(settings.max_effects, exchange=exchange)
     onset = None
-    if outcome.fit.p <= thresholds.fit_rate:
+    if not outcome.fit.passed(thresholds):
         starts = windows.data.starts
         trial = outcome.best
         second = starts >= np.median(starts)
@@ -131,7 +131,7 @@ def explain(
         commissioned=nominal is not None and nominal.segments > 0,
         known=search.known,
     )  # fmt: skip
-    if findings.fit.p <= thresholds.fit_rate:
+    if not findings.fit.passed(thresholds):
         starts = windows.data.starts
         learned = search.learn(outcome.best.effects)
         if len(outcome.best.effects) > len(search.known):

@@ -11,6 +11,7 @@ import multiprocessing
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from multiprocessing import forkserver
 
 import numpy as np
 import torch
@@ -36,6 +37,7 @@ FEWEST_PARTS = 3
 """Of two parts only half of the recording would be left, on which a search finds less."""
 FEWEST_WINDOWS = 8
 """On which a search is repeated: as many as a block of the search holds."""
+_CONTEXT = multiprocessing.get_context("forkserver")
 
 
 @dataclass(frozen=True)
@@ -112,6 +114,12 @@ class Repetition:
         return tuple(result)
 
 
+def prepare_processes() -> None:
+    """Let a server load the package from which the processes of :func:`repeat` are forked, while other work goes on."""
+    _CONTEXT.set_forkserver_preload([__name__])
+    forkserver.ensure_running()
+
+
 def repeat(
     evidence: Evidence,
     robot: RobotModel,
@@ -142,9 +150,9 @@ def repeat(
     ]
     repeated: list[Repeated | None] = [None] * count
     if settings.processes > 1:
-        with ProcessPoolExecutor(
-            min(settings.processes, len(tasks)), multiprocessing.get_context("spawn"), torch.set_num_threads, (1,)
-        ) as pool:
+        # More of them than cores: none is idle while the last of an odd number of parts is repeated.
+        workers = min(2 * settings.processes - 1, len(tasks))
+        with ProcessPoolExecutor(workers, _CONTEXT, torch.set_num_threads, (1,)) as pool:
             running = [pool.submit(_found, *task) for task in tasks]
             for number, done in zip(present, running, strict=True):
                 progress("repeating it without parts of the recording")

@@ -41,6 +41,7 @@ from monoforce_ros.discrepancy.trial import (
     FitTest,
     Outcome,
     Trial,
+    excess_share,
     folds_of,
     paired,
 )
@@ -161,7 +162,7 @@ class Search:
         fit = self.fit_test(best, nominal)
         for other in [trial for trial in judged if trial.names[-1] not in best.names][:_ALTERNATIVES]:
             # The effect that explains most alone need not be part of the best combination.
-            if fit.p > self.thresholds.fit_rate or most_effects < 2:
+            if fit.passed(self.thresholds) or most_effects < 2:
                 break
             extended, listed = self._extended(other, most_effects)
             tried += listed
@@ -311,7 +312,10 @@ class Search:
                 p, name = size, "residuals that are too large"
             # Two tests: the smaller p-value of two has twice the rate.
             p = min(1.0, 2.0 * p)
-        return FitTest(p, name, tuple(tests))
+        explained = 1.0
+        if self.nominal is not None and self.nominal.segments > 0 and trial.effects:
+            explained = excess_share(nominal.loss, trial.loss, self.healthy_loss)
+        return FitTest(p, name, tuple(tests), explained)
 
     def _tested(self, base: Effects, residual: np.ndarray, directions: Sequence[Direction]) -> list[ScoreResult]:
         fixed = self.fixed_count(base)

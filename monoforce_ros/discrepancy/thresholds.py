@@ -32,6 +32,8 @@ class Thresholds:
         smallest_share: smallest share of a loss that an effect must remove (of the loss without it, but at least the
             healthy robot's), or a rest must make up (of the nominal model's), to be reported: the loss is quadratic,
             so a twentieth of it is an error of less than a quarter (√0.05) of the error that was there.
+        most_share: smallest share of the excess loss, that above a healthy robot's, which effects must explain to be
+            the explanation: most of it, by definition. What explains less is reported as a known part.
     """
 
     effect_rate: float = 0.025
@@ -46,3 +48,4 @@ class Thresholds:
     drive_share: float = 1.25
     model_error: float = 0.15
     smallest_share: float = 0.05
+    most_share: float = 0.5

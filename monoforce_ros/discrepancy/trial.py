@@ -9,6 +9,7 @@ import numpy as np
 
 from monoforce_ros.discrepancy.hypothesis import Effects
 from monoforce_ros.discrepancy.score_test import ScoreResult, block_numbers
+from monoforce_ros.discrepancy.thresholds import Thresholds
 
 HEALTHY_LOSS = 0.5
 """Robust loss of residuals as large as their scale: half the square of a standard deviation."""
@@ -63,6 +64,13 @@ class FitTest:
     strongest: str
     """What the residuals contain most significantly."""
     tests: tuple[ScoreResult, ...] = ()
+    explained: float = 1.0
+    """Share of the excess loss, that above a healthy robot's, which the effects explain; 1 without effects, and where
+    a healthy robot's loss is unknown."""
+
+    def passed(self, thresholds: Thresholds) -> bool:
+        """Whether the effects are the explanation: they explain most, and the rest looks like a healthy robot's."""
+        return self.p > thresholds.fit_rate and self.explained >= thresholds.most_share
 
 
 @dataclass(frozen=True)
@@ -79,6 +87,11 @@ class Outcome:
     """See :class:`Search`; on healthy recordings its mean is ``drive_share`` of the thresholds."""
     indistinguishable: Mapping[str, Sequence[str]] = field(default_factory=dict)
     """By selected effect: others that explain the recording about as well in its place."""
+
+
+def excess_share(before: float, after: float, healthy: float) -> float:
+    """Share of the loss above a healthy robot's that is gone afterwards, at most 1."""
+    return min((before - after) / max(before - healthy, 1e-6), 1.0)
 
 
 def folds_of(starts: np.ndarray) -> np.ndarray:

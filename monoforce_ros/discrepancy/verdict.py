@@ -8,7 +8,7 @@ from enum import StrEnum
 from monoforce_ros.discrepancy.hypothesis import Effects
 from monoforce_ros.discrepancy.learned import LEARNED, formula
 from monoforce_ros.discrepancy.thresholds import Thresholds
-from monoforce_ros.discrepancy.trial import FitTest, Trial
+from monoforce_ros.discrepancy.trial import FitTest, Trial, excess_share
 
 
 class Verdict(StrEnum):
@@ -93,7 +93,7 @@ def fits(findings: Findings, thresholds: Thresholds) -> bool:
     Of a robot that was never commissioned nobody knows how large its errors should be. Its effects keep their names if
     they explain most of the loss, and a formula in addition to them does not explain most of the rest.
     """
-    if findings.fit.p > thresholds.fit_rate:
+    if findings.fit.passed(thresholds):
         return True
     if findings.commissioned or not findings.best.effects:
         return False
@@ -104,8 +104,7 @@ def fits(findings: Findings, thresholds: Thresholds) -> bool:
 def decide(findings: Findings, thresholds: Thresholds = Thresholds()) -> Decision:  # noqa: B008
     """The verdict on a recording."""
     nominal, best = findings.nominal, findings.best
-    excess = max(nominal.loss - findings.healthy_loss, 1e-6)
-    share = min((nominal.loss - best.loss) / excess, 1.0) if best.effects else None
+    share = excess_share(nominal.loss, best.loss, findings.healthy_loss) if best.effects else None
     losses = Losses(nominal.loss, best.loss, findings.healthy_loss, share, p_rest=findings.fit.p)
     if fits(findings, thresholds):
         if not best.effects:
@@ -117,7 +116,9 @@ def decide(findings: Findings, thresholds: Thresholds = Thresholds()) -> Decisio
                 "the robot was never commissioned: whether the rest is normal cannot be told (diagnose --commission)",
             )
         return Decision(Verdict.EFFECT_FOUND, best, remarks, losses)
-    reason = f"what is left does not look like the healthy robot: {findings.fit.strongest}"
+    reason = "what is left exceeds a healthy robot's error by more than what is explained"
+    if findings.fit.p <= thresholds.fit_rate:
+        reason = f"what is left does not look like the healthy robot: {findings.fit.strongest}"
     remarks = (reason,)
     parts = best if best.effects else None
     if parts is not None:

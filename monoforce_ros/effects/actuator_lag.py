@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar
 
 import numpy as np
@@ -49,25 +50,37 @@ class ActuatorLag(Effect):
         slow = constant > 1e-6
         safe = torch.where(slow, constant, torch.ones_like(constant))
         retained = torch.where(slow, torch.exp(-time_step / safe), torch.zeros_like(constant))
-        if constant.ndim:
-            return _by_doubling(speeds, retained[:, None, None])
-        count = speeds.shape[1]
-        steps = torch.arange(count, device=speeds.device)
-        distance = (steps[:, None] - steps).to(speeds.dtype)
-        # The response to all previous commands as one matrix. The first command also holds before the start.
-        decay = retained ** distance.clamp_min(0.0)
-        weights = torch.where(distance >= 0, (1.0 - retained) * decay, torch.zeros_like(decay))
-        return torch.where(slow, weights @ speeds + (decay[:, :1] * retained) * speeds[:, :1], speeds)
+        return _lagged(speeds, retained.reshape(-1))
 
 
-def _by_doubling(speeds: Tensor, retained: Tensor) -> Tensor:
-    """The lag with one time constant per trajectory, for which one matrix each would be large.
+def _lagged(speeds: Tensor, retained: Tensor) -> Tensor:
+    """The lag ``[B, T, D]`` of commands, the first of which also held before the start.
 
-    The linear recurrence is solved by doubling the number of terms in each pass (Hillis and Steele 1986).
+    The linear recurrence is solved within blocks of √T steps by a matrix, and in the same way over their ends: its cost
+    grows with T^1.5, and a trajectory may have a time constant of its own.
+
+    Args:
+        speeds: ``[B, T, D]``.
+        retained: share of the previous speed that is left after a step, ``[1]`` or ``[B]``.
     """
-    result = torch.cat([speeds[:, :1], (1.0 - retained) * speeds[:, 1:]], dim=1)
-    reach, factor = 1, retained
-    while reach < speeds.shape[1]:
-        result = torch.cat([result[:, :reach], result[:, reach:] + factor * result[:, :-reach]], dim=1)
-        reach, factor = 2 * reach, factor * factor
-    return result
+    batch, steps, drives = speeds.shape
+    length = math.isqrt(max(steps - 1, 0)) + 1
+    count = -(-steps // length)
+    padded = torch.nn.functional.pad(speeds.transpose(1, 2), (0, count * length - steps))
+    within = _response(padded.reshape(batch, drives * count, length), retained, 1.0 - retained)
+    across = retained**length
+    ends = within.reshape(batch, drives, count, length)[..., -1]
+    # What a block starts with: the end of the one before it, or the first command.
+    entering = torch.cat([speeds[:, :1].transpose(1, 2), ends[..., :-1]], dim=2)
+    carried = _response(entering, across, torch.ones_like(across))
+    powers = retained[:, None] ** torch.arange(1, length + 1, device=speeds.device)
+    result = within.reshape(batch, drives, count, length) + carried[..., None] * powers[:, None, None]
+    return result.reshape(batch, drives, -1)[..., :steps].transpose(1, 2)
+
+
+def _response(inputs: Tensor, retained: Tensor, gain: Tensor) -> Tensor:
+    """Sums of all previous ``inputs`` ``[B, R, N]``, each weaker by ``retained`` after every step."""
+    steps = torch.arange(inputs.shape[-1], device=inputs.device)
+    distance = steps[:, None] - steps
+    weights = (gain[:, None, None] * retained[:, None, None] ** distance.clamp_min(0)).tril()
+    return inputs @ (weights[0].T if len(retained) == 1 else weights.mT)

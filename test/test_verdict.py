@@ -1,0 +1,68 @@
+"""The verdict as a function of typed findings, without a recording."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from monoforce_ros.discrepancy.thresholds import Thresholds
+from monoforce_ros.discrepancy.trial import FitTest, Trial, excess_share
+from monoforce_ros.discrepancy.verdict import Findings, Verdict, decide
+
+EFFECTS = (("drive_asymmetry", {"difference": 0.1}),)
+
+
+def trial(loss: float, effects=()) -> Trial:
+    return Trial(effects, (effects, effects), np.full(10, loss))
+
+
+def found(after: float, *, before: float = 2.5, healthy: float = 0.5, p: float = 0.4, commissioned: bool = True):
+    """Findings of one effect that reduces the mean loss to ``after``."""
+    fit = FitTest(p, "torque_z:vx", (), excess_share(before, after, healthy) if commissioned else 1.0)
+    return Findings(trial(before), trial(after, EFFECTS), fit, healthy_loss=healthy, commissioned=commissioned)
+
+
+@pytest.mark.parametrize("after", [0.4, 0.7, 1.45])
+def test_an_effect_that_explains_most_of_the_excess_is_named(after):
+    decision = decide(found(after))
+    assert decision.verdict is Verdict.EFFECT_FOUND
+    assert decision.trial is not None and decision.trial.names == ("drive_asymmetry",)
+
+
+@pytest.mark.parametrize("after", [1.6, 2.2])
+def test_an_effect_that_explains_less_than_half_is_a_known_part_even_where_the_rest_is_within_chance(after):
+    decision = decide(found(after))
+    assert decision.verdict is Verdict.UNKNOWN_EFFECT
+    assert decision.trial is None
+    assert decision.parts is not None and decision.parts.names == ("drive_asymmetry",)
+    first, second, *_ = decision.remarks
+    assert first == f"drive_asymmetry explains only {100 * (2.5 - after) / 2.0:.0f} % of the excess loss"
+    assert second == "what is left exceeds a healthy robot's error by more than what is explained"
+
+
+def test_a_rest_that_does_not_look_healthy_is_unknown_however_small():
+    decision = decide(found(0.7, p=0.001))
+    assert decision.verdict is Verdict.UNKNOWN_EFFECT
+    assert decision.remarks[1] == "what is left does not look like the healthy robot: torque_z:vx"
+
+
+def test_the_share_is_not_asked_of_a_robot_whose_healthy_error_nobody_knows():
+    assert decide(found(2.2, commissioned=False)).verdict is Verdict.EFFECT_FOUND
+
+
+def test_without_effects_nothing_is_missing():
+    nominal = trial(0.9)
+    findings = Findings(nominal, nominal, FitTest(0.5, ""), healthy_loss=0.5, commissioned=True)
+    assert decide(findings).verdict is Verdict.NO_DISCREPANCY
+    alarm = decide(replace(findings, fit=FitTest(0.01, "force_x:1")))
+    assert alarm.verdict is Verdict.UNKNOWN_EFFECT and alarm.parts is None
+
+
+def test_the_share_of_the_excess():
+    assert excess_share(2.5, 1.5, 0.5) == 0.5
+    assert excess_share(2.5, 0.1, 0.5) == 1.0
+    # Nothing in excess: whatever an effect removes is all of it.
+    assert excess_share(0.4, 0.3, 0.5) == 1.0
+    assert Thresholds().most_share == 0.5
