@@ -114,7 +114,12 @@ def test_wrong_values_are_named_with_what_was_expected(given, message):
             "predictor:\n  ros__parameters:\n    rate: 3.0\nforesight:\n  ros__parameters:\n    horizon: 3.0\n",
             "no node is called /foresight; expected /left/predictor or /\\*\\*",
         ),
-        ("a: [", "is not YAML"),
+        ("a: [", "is not YAML: line 1: expected the node content"),
+        (
+            "/**:\n  ros__parameters: [1, 2\n",
+            "is not YAML: line 3: expected ',' or ']', but got '<stream end>', while parsing a flow sequence that "
+            "begins in line 2$",
+        ),
         ("a: &a [*a]", "is not YAML: maximum recursion depth"),
         ("/**:\n  ros__parameters:\n    rate: 3.0\n    rate: 4.0\n", "has 'rate' twice, again in line 4"),
     ],

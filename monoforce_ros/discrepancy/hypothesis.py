@@ -166,11 +166,12 @@ class Predictions:
     Args:
         robot: robot with the effects of its file.
         data: the windows.
+        time_step: of the rollouts [s].
     """
 
-    def __init__(self, robot: RobotModel, data: EvidenceWindows):
+    def __init__(self, robot: RobotModel, data: EvidenceWindows, time_step: float = PhysicsOptions.time_step):
         self.data = data
-        self.options = PhysicsOptions()
+        self.options = PhysicsOptions(time_step=time_step)
         if data.terrain is None:
             self._terrain = TerrainMap.flat(Grid.square(2.0, 1.0))
         else:

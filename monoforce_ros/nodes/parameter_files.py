@@ -69,7 +69,7 @@ def read_sections(path: Path) -> dict[str, dict[str, Any]]:
     except OSError as error:
         raise ValueError(f"parameter file {path}: {error.strerror}; give the path of an existing file") from error
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-        problem = error.problem if isinstance(error, RepeatedKeyError) else f"is not YAML: {error}"
+        problem = error.problem if isinstance(error, RepeatedKeyError) else f"is not YAML: {_problem(error)}"
         raise ValueError(f"parameter file {path} {problem}") from error
     sections: dict[str, dict[str, Any]] = {}
     stray: list[str] = []
@@ -79,6 +79,14 @@ def read_sections(path: Path) -> dict[str, dict[str, Any]]:
     if stray:
         raise ValueError(f"parameter file {path}: {stray[0]} is not under 'ros__parameters': {example}")
     return sections
+
+
+def _problem(error: Exception) -> str:
+    """What is wrong with a file in one line: YAML's own message draws the place."""
+    if not isinstance(error, yaml.MarkedYAMLError) or error.problem_mark is None:
+        return str(error)
+    begun = f", {error.context} that begins in line {error.context_mark.line + 1}" if error.context_mark else ""
+    return f"line {error.problem_mark.line + 1}: {error.problem}{begun}"
 
 
 class RepeatedKeyError(yaml.YAMLError):

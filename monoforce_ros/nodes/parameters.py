@@ -68,7 +68,7 @@ def refuse_unknown_parameters(node: Node, entries: Iterable[ParameterEntry] = ()
             )
         if name not in others:
             meant = nearest(name, known | {"use_sim_time"})
-            raise ValueError(f"unknown parameter {name!r}{meant} --help lists all parameters")
+            raise ValueError(f"unknown parameter {name!r}{meant or ';'} --help lists all parameters")
         unused.append(name)
     if unused:
         owners = " and ".join(sorted({others[name] for name in unused}))
@@ -102,7 +102,8 @@ def _declare(
         value = node.declare_parameter(name, declared, descriptor).value
     except (InvalidParameterTypeException, InvalidParameterValueException) as error:
         expected = f"{entry.type} {entry.range_text}".strip()
-        raise ValueError(f"parameter {name}: {error}; expected {expected} {entry.unit}".rstrip()) from error
+        got = node._parameter_overrides[name].value if name in node._parameter_overrides else default
+        raise ValueError(f"parameter {name}: got {got!r}, expected {expected} {entry.unit}".rstrip()) from error
     if (value is not None or name == entry.name) and (reason := complaint(entry, value)):
         raise ValueError(f"parameter {name}: {reason}")
     return value
