@@ -58,6 +58,8 @@ def test_sensor_poses_come_from_transforms_before_the_robot_file(tree):
     assert frames.sensor_pose("camera", tree)[0, 3] == 7.0
     with pytest.raises(FrameError, match=r"'sonar' on the robot is unknown.*path from 'base_link' to 'sonar'"):
         frames.sensor_pose("sonar", tree)
+    with pytest.raises(FrameError, match="frame_id is empty"):
+        frames.sensor_pose("", tree)
 
 
 def test_prefixed_frames_are_those_of_their_robot(tree):

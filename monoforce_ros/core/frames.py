@@ -111,9 +111,14 @@ class RobotFrames:
         """Pose ``[4, 4]`` of a sensor's frame in the base frame.
 
         Raises:
-            FrameError: neither the transforms nor the robot's file have it.
+            FrameError: the name is empty, or neither the transforms nor the robot's file have it.
         """
         frame = frame.lstrip("/")
+        if not frame:
+            raise FrameError(
+                "the message does not say which sensor it is from (header.frame_id is empty): set the driver's frame "
+                f"parameter (frames in the robot file: {sorted(self.sensors)})"
+            )
         base = self.base_name(frame, transforms.frames)
         pose = transforms.find(base, frame)
         if pose is not None:
