@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from dataclasses import dataclass, field
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -14,6 +15,9 @@ OK, WARN, ERROR, STALE = (
     DiagnosticStatus.ERROR,
     DiagnosticStatus.STALE,
 )
+_REPEATED = 2.0
+"""A state that returns within this time [s] is logged only if it lasts: a part that keeps changing between two states
+would fill the log."""
 
 
 @dataclass
@@ -22,10 +26,28 @@ class _Part:
     message: str = "nothing received yet"
     reason: str = ""
     values: dict[str, str] = field(default_factory=dict)
+    logged: dict[tuple[bytes, str], float] = field(default_factory=dict)
+    """When states were logged last [s], by level and reason."""
+    shown: tuple[bytes, str] | None = None
+    """State of the last line in the log."""
+
+    @property
+    def key(self) -> tuple[bytes, str]:
+        return self.level, self.reason
+
+    def due(self, now: float) -> bool:
+        """Whether the present state has to be logged, which counts as done."""
+        self.logged = {key: when for key, when in self.logged.items() if now - when < _REPEATED}
+        if self.key == self.shown or self.key in self.logged:
+            return False
+        self.shown, self.logged[self.key] = self.key, now
+        return True
 
 
 class Health:
     """The state of a node's parts. Changes are logged once and published at once; everything is published every second.
+
+    A state that comes back within two seconds is logged when it has lasted, not each time.
 
     Thread-safe.
     """
@@ -35,7 +57,7 @@ class Health:
         self._lock = threading.Lock()
         self._parts = {name: _Part() for name in parts}
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self._timer = node.create_timer(1.0, self.publish)
+        self._timer = node.create_timer(1.0, self._tick)
 
     def report(self, part: str, level: bytes, message: str, *, reason: str = "", **values: object) -> None:
         """Set a part's state.
@@ -51,12 +73,30 @@ class Health:
         reason = reason or message
         with self._lock:
             state = self._parts.setdefault(part, _Part())
-            changed = (state.level, state.reason) != (level, reason)
+            changed = state.key != (level, reason)
             started = state.level == STALE and level == OK
             state.level, state.message, state.reason = level, message, reason
             state.values.update({name.replace("_", " "): str(value) for name, value in values.items()})
-        if not changed:
-            return
+            due = changed and state.due(time.monotonic())
+        if due and not started:
+            self._log(part, level, message)
+        if changed:
+            self.publish()
+
+    def _tick(self) -> None:
+        now = time.monotonic()
+        with self._lock:
+            # Parts that nobody reported yet have no line either.
+            due = [
+                (name, state.level, state.message)
+                for name, state in self._parts.items()
+                if state.shown is not None and state.due(now)
+            ]
+        for line in due:
+            self._log(*line)
+        self.publish()
+
+    def _log(self, part: str, level: bytes, message: str) -> None:
         logger = self._node.get_logger()
         text = f"{part}: {message}"
         # Each severity needs a call of its own: rclpy allows only one severity per line of code.
@@ -64,9 +104,8 @@ class Health:
             logger.error(text)
         elif level in (WARN, STALE):
             logger.warning(text)
-        elif not started:
+        else:
             logger.info(text)
-        self.publish()
 
     def report_values(self, part: str, values: dict[str, str]) -> None:
         """Attach values to a part without changing its state."""
