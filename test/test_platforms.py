@@ -275,3 +275,21 @@ def test_cases_recorded_together_have_files_only_where_the_effect_matters(tmp_pa
         assert files.check.exists() == (case.kind == "single")
     assert CaseFiles.of(empty, tmp_path).commissioning.exists()
     record_together([[matters, empty]], tmp_path, lambda jobs: pytest.fail("everything is recorded"))
+
+
+def test_a_platform_that_tips_over_is_commissioned_on_another_drive(tmp_path):
+    empty = Case("choosing", 1000, 2, "mujoco", "level", "empty")
+    driven = []
+
+    def simulate_in_turn(jobs):
+        traces = [simulate(dataclasses.replace(job, duration=3.0)) for job in jobs]
+        healthy = [number for number, job in enumerate(jobs) if job.duration > 60.0]
+        for number in healthy:
+            driven.append(jobs[number].duration)
+            if len(driven) < 3:
+                traces[number] = dataclasses.replace(traces[number], mishap="tipped over")
+        return traces
+
+    record_together([[empty]], tmp_path, simulate_in_turn)
+    assert CaseFiles.of(empty, tmp_path).commissioning.exists()
+    assert len(set(driven)) == len(driven) == 3, "each attempt has commands of its own"

@@ -27,7 +27,8 @@ EFFECT_TIME = 5.0
 COMPARED = 30.0
 """Length of the drive over which displacements are compared, unless an effect begins later [s]."""
 MOST_DRAWS = 8
-"""Of the strength of an effect; a platform on which none matters does not get this case."""
+"""Of the strength of an effect, and of a drive to commission a platform. A platform on which no strength matters does
+not get this case."""
 CHECK_DURATION = 30.0
 """Of a second drive with the same effect, on which only the improvement is checked [s]."""
 
@@ -118,22 +119,21 @@ def record_together(
         simulate_together: the engine.
     """
     todo = [case for cases in platforms for case in cases if not CaseFiles.of(case, work).truth.exists()]
+    for cases in platforms:
+        write_robot_file(draw_platform(cases[0].platform_seed), CaseFiles.of(cases[0], work).robot)
     for attempt in range(MOST_DRAWS):
         jobs: list[DriveJob] = []
         healthy: list[tuple[int, Case]] = []
-        for cases in platforms if attempt == 0 else ():
-            files = CaseFiles.of(cases[0], work)
-            platform = draw_platform(cases[0].platform_seed)
-            write_robot_file(platform, files.robot)
-            if not files.commissioning.exists():
+        for cases in platforms:
+            if not CaseFiles.of(cases[0], work).commissioning.exists():
                 healthy.append((len(jobs), cases[0]))
-                jobs.append(commissioning_job(platform, cases[0]))
+                jobs.append(commissioning_job(draw_platform(cases[0].platform_seed), cases[0], attempt))
         attempts = [_add_attempt(jobs, case, attempt) for case in todo]
         if not jobs:
             return
         traces = simulate_together(jobs)
         for index, case in healthy:
-            _write_commissioning(case, CaseFiles.of(case, work), jobs[index], traces[index])
+            _write_commissioning(case, CaseFiles.of(case, work), jobs[index], traces[index], attempt)
         todo = [entry.case for entry in attempts if not _keep(entry, jobs, traces, work, attempt)]
 
 
@@ -184,22 +184,32 @@ def _ground(case: Case, seed: int, platform: Platform) -> Ground:
     return draw_hills(seed, platform.friction) if case.ground == "hills" else Ground()
 
 
-def commissioning_job(platform: Platform, case: Case) -> DriveJob:
-    """The healthy drive of 60 to 120 s from which a platform is commissioned; the seed is the platform's own."""
-    seed = platform.seed * 100
+def commissioning_job(platform: Platform, case: Case, attempt: int = 0) -> DriveJob:
+    """The healthy drive of 60 to 120 s from which a platform is commissioned; the seed is the platform's own.
+
+    Another attempt has another ground and other commands: a platform that tips over is not commissioned on that drive.
+    """
+    # Cases have the seeds that follow the platform's own; the last ones of its hundred are free.
+    seed = platform.seed * 100 + (100 - attempt if attempt else 0)
     duration = float(np.random.default_rng([seed, 10]).uniform(60.0, 120.0))
     return DriveJob(platform, _ground(case, seed, platform), _driver(platform, seed), (), round(duration, 1))
 
 
 def _record_commissioning(platform: Platform, case: Case, files: CaseFiles, simulate) -> None:
-    job = commissioning_job(platform, case)
-    _write_commissioning(case, files, job, simulate(job))
+    for attempt in range(MOST_DRAWS):
+        job = commissioning_job(platform, case, attempt)
+        if _write_commissioning(case, files, job, simulate(job), attempt):
+            return
 
 
-def _write_commissioning(case: Case, files: CaseFiles, job: DriveJob, trace: Trace) -> None:
+def _write_commissioning(case: Case, files: CaseFiles, job: DriveJob, trace: Trace, attempt: int) -> bool:
+    """Write the drive unless it ended too early; ``RuntimeError`` where that was the last attempt."""
     if trace.mishap is not None and len(trace.positions) * TICK < 45.0:
-        raise RuntimeError(f"{case.platform_name}: commissioning ended early: {trace.mishap}")
+        if attempt + 1 == MOST_DRAWS:
+            raise RuntimeError(f"{case.platform_name}: {MOST_DRAWS} commissioning drives ended early: {trace.mishap}")
+        return False
     _write(trace, job, Measurement(), job.platform.seed * 100, files, files.commissioning)
+    return True
 
 
 def _write(trace: Trace, job: DriveJob, measurement: Measurement, seed: int, files: CaseFiles, bag: Path) -> None:
