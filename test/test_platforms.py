@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from benchmark_case import SETS, Case, all_cases
 from benchmark_score import closed_share, covered, found_all, scores
 from case_recording import CaseFiles, displacement, hidden_job, record_platform, record_together
 from command_faults import DeadBand, Delay, DriveFactors, Lag, TwistLimits
+from diagnosis_run import Judged, commission_platform
 from drawn_platform import draw_platform, write_robot_file
 from drive_commands import FollowingDriver, LeadingDriver, ManoeuvreDriver, ReplayedCommands
 from drive_session import DriveJob
@@ -20,10 +22,13 @@ from hidden_effect import KINDS, OUTSIDE, SINGLES, HiddenEffect, draw_effect
 from injection import TICK, BaseState, Injection, Measurement
 from mujoco_engine import simulate
 from sensor_recording import measured_poses
+from true_effects import measured, summary
 
 from monoforce_ros.bags import Recording
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import load_terrain
+
+ROOT = Path(__file__).resolve().parent.parent
 
 
 def straight(platform, *injections, seconds=4.0, speed=0.5, rate=0.0, ground=Ground()):
@@ -293,3 +298,14 @@ def test_a_platform_that_tips_over_is_commissioned_on_another_drive(tmp_path):
     record_together([[empty]], tmp_path, simulate_in_turn)
     assert CaseFiles.of(empty, tmp_path).commissioning.exists()
     assert len(set(driven)) == len(driven) == 3, "each attempt has commands of its own"
+
+
+def test_the_true_effect_explains_most_of_what_it_does_in_the_other_engine(tmp_path):
+    (case,) = (case for case in all_cases("choosing") if case.name == "mujoco-level-1008-03-single-drive_loss")
+    record_platform([case], tmp_path)
+    commission_platform(case, tmp_path, Judged(ROOT, tmp_path / "results" / "label", "", 300.0))
+    nominal = tmp_path / "results" / "label" / "nominal" / case.platform_name / "platform.yaml"
+    row = measured(case, CaseFiles.of(case, tmp_path), nominal)
+    assert row["fitted"] == ["drive_loss"] and row["visible"]
+    assert row["explained"] > 0.7 and row["error"] < 0.5
+    assert summary("single", [row]).startswith("single: 1 of 1 drives visible; share explained: 10 % quantile")

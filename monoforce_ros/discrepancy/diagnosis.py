@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from monoforce_ros.discrepancy.comparable_windows import comparable_starts, windows_of
 from monoforce_ros.discrepancy.comparison import (
     Comparison,
     GapRow,
@@ -20,14 +21,13 @@ from monoforce_ros.discrepancy.comparison import (
     regime_table,
 )
 from monoforce_ros.discrepancy.estimates import EffectEstimate
-from monoforce_ros.discrepancy.explanation import DiagnosisSettings, Windows, explain
+from monoforce_ros.discrepancy.explanation import DiagnosisSettings, explain
 from monoforce_ros.discrepancy.fit import Fit
 from monoforce_ros.discrepancy.gap import (
     Localisation,
     NoiseFloor,
     find_regimes,
     localise,
-    noise_floor,
     noisy_motions,
 )
 from monoforce_ros.discrepancy.hypothesis import (
@@ -35,8 +35,6 @@ from monoforce_ros.discrepancy.hypothesis import (
     Evidence,
     EvidenceWindows,
     corrected_evidence,
-    subsampled,
-    window_starts,
 )
 from monoforce_ros.discrepancy.kinematic_baseline import StepComparison
 from monoforce_ros.discrepancy.nominal import NominalModel
@@ -48,10 +46,8 @@ from monoforce_ros.discrepancy.sensor_findings import (
     bias_estimate,
     bias_row,
 )
-from monoforce_ros.discrepancy.terrain_evidence import terrain_uncertainty
-from monoforce_ros.discrepancy.trial import BLOCK, CandidateScore, Outcome
+from monoforce_ros.discrepancy.trial import CandidateScore, Outcome
 from monoforce_ros.discrepancy.verdict import Decision, Losses, Verdict
-from monoforce_ros.discrepancy.wheel_motion import undriven_stretches, wheels_without_motion
 from monoforce_ros.effects import CATALOGUE
 from monoforce_ros.robots import RobotModel
 
@@ -132,20 +128,15 @@ def diagnose(
         prepare_processes()
     evidence = corrected_evidence(evidence, robot)
     smoothed = evidence.smoothed
-    starts = window_starts(smoothed.motion, smoothed.stretches, settings.horizon, settings.stride)
-    starts = subsampled(starts, BLOCK, settings.max_windows)
-    starts, left_out = _comparable(starts, evidence, robot, settings.horizon)
+    starts, left_out = comparable_starts(evidence, robot, settings)
     found = complaints(smoothed, evidence.commands, starts)
     if found:
         return Diagnosis(Verdict.NOT_IDENTIFIABLE, advice=(*left_out, *found))
     samples = np.array(settings.samples)
-    data = evidence.cut(starts, samples)
     progress(0.02, "noise floor")
     noisy = noisy_motions(smoothed, settings.seed)
-    uncertainty = np.hypot(
-        noise_floor(smoothed.motion, noisy, data), terrain_uncertainty(robot, data, evidence.split_maps)
-    )
-    explanation = explain(evidence, robot, Windows(data, uncertainty), nominal, settings, _Steps(progress, 0.05, 0.6))
+    windows = windows_of(evidence, robot, starts, samples, noisy)
+    explanation = explain(evidence, robot, windows, nominal, settings, _Steps(progress, 0.05, 0.6))
     if explanation.onset is not None:
         left_out = (*left_out, explanation.onset.remark)
     search, outcome, sensors = explanation.search, explanation.outcome, explanation.sensors
@@ -220,32 +211,6 @@ def diagnose(
         commissioned=nominal is not None and nominal.segments > 0,
         details=Details(data, before, floor, tuple(compared), paths),
     )
-
-
-def _comparable(
-    starts: np.ndarray, evidence: Evidence, robot: RobotModel, horizon: float
-) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Windows in which the ground moves the robot as its commands ask, and what was left out for which reason."""
-    remarks = []
-    if not len(starts) or not len(evidence.commands):
-        return starts, ()
-
-    def overlapping(stretches: np.ndarray) -> np.ndarray:
-        low, high = stretches.reshape(-1, 2).T
-        return ((starts[:, None] < high) & (starts[:, None] + round(horizon * 1e9) > low)).any(axis=1)
-
-    undriven = undriven_stretches(evidence.commands, evidence.wheels, evidence.smoothed.motion, robot)
-    left_out = overlapping(undriven)
-    if left_out.any():
-        seconds = float(np.diff(undriven, axis=1).sum()) * 1e-9
-        remarks.append(f"{seconds:.0f} s are left out in which the robot moved without commands (a joystick?)")
-    spinning = wheels_without_motion(evidence.smoothed.motion, evidence.wheels, evidence.commands, robot)
-    if spinning is not None:
-        remarks.append(spinning.summary())
-        if spinning.side == "both":
-            left_out |= overlapping(np.array(spinning.stretches, np.int64))
-            remarks[-1] += "; this time is left out"
-    return starts[~left_out], tuple(remarks)
 
 
 def _estimated(search: Search, fit: Fit, outcome: Outcome) -> tuple[EffectEstimate, ...]:

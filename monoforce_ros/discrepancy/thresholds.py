@@ -28,12 +28,14 @@ class Thresholds:
         calibration_degrees: degrees of freedom of these two, the number of empty drives on which they were measured.
         model_error: error of an effect's formula as a share of what the effect changes, root mean square in any one
             direction: no formula holds exactly on another engine or robot. Set by judgement: rolling resistance and
-            friction of the own simulator keep their names with it. No command repeats it.
+            friction of the own simulator keep their names with it. ``benchmarks/platforms/true_effects.py`` prints
+            what it is where the true effect is fitted (``error of the formula``), on another engine.
         smallest_share: smallest share of a loss that an effect must remove (of the loss without it, but at least the
             healthy robot's), or a rest must make up (of the nominal model's), to be reported: the loss is quadratic,
             so a twentieth of it is an error of less than a quarter (√0.05) of the error that was there.
         most_share: smallest share of the excess loss, that above a healthy robot's, which effects must explain to be
-            the explanation: most of it, by definition. What explains less is reported as a known part.
+            the explanation: most of it, by definition. What explains less is reported as a known part. How much true
+            effects explain on another engine is printed by the same command (``share explained``).
     """
 
     effect_rate: float = 0.025

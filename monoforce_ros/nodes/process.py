@@ -112,4 +112,6 @@ def initialise(arguments: list[str] | None, signals: SignalHandlerOptions | None
     except RuntimeError as error:
         # rcl's messages end with the place in its source code.
         reason = str(error).partition(", at /")[0]
-        raise ValueError(f"the ROS arguments cannot be read: {reason}; expected -p NAME:=VALUE or -r FROM:=TO after --ros-args") from error
+        raise ValueError(
+            f"the ROS arguments cannot be read: {reason}; expected -p NAME:=VALUE or -r FROM:=TO after --ros-args"
+        ) from error

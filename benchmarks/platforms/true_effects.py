@@ -1,0 +1,157 @@
+"""How well the formulas of the catalogue hold where their own effects are hidden in another engine.
+
+    scripts/run.sh python benchmarks/platforms/true_effects.py --work out/platforms --label LABEL --kind single pair
+
+Fits the effects that are truly hidden in recorded drives, without a search, and prints for each drive which share of
+what exceeds a healthy robot's loss they explain, and how large their formula's error is beside what they change. The
+numbers calibrate ``most_share`` and ``model_error`` of ``discrepancy/thresholds.py``. Outside the catalogue nothing
+true can be fitted: there the effects that a search selects are measured, which should explain less.
+Needs recordings and commissioned platforms: run.py makes both.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+from benchmark_case import SETS, Case, all_cases
+from case_recording import CaseFiles
+from tqdm import tqdm
+
+from monoforce_ros.core import write_text
+from monoforce_ros.discrepancy.bag_diagnosis import read_with_ground
+from monoforce_ros.discrepancy.comparable_windows import comparable_starts, windows_of
+from monoforce_ros.discrepancy.explanation import DiagnosisSettings
+from monoforce_ros.discrepancy.fit import first_values, fit_effects
+from monoforce_ros.discrepancy.gap import noisy_motions, residual_scale
+from monoforce_ros.discrepancy.hypothesis import Effects, corrected_evidence
+from monoforce_ros.discrepancy.nominal import NominalModel
+from monoforce_ros.discrepancy.selection import Search
+from monoforce_ros.discrepancy.trial import excess_share
+from monoforce_ros.effects import CATALOGUE
+from monoforce_ros.robots import load_robot
+
+KINDS = ("single", "pair", "outside")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--work", type=Path, default=Path("out/platforms"), help="folder of run.py (out/platforms)")
+    parser.add_argument("--label", required=True, help="results of run.py whose commissioned platforms are used")
+    parser.add_argument("--set", choices=sorted(SETS), default="choosing", help="set of seeds (choosing)")
+    parser.add_argument("--kind", choices=KINDS, nargs="+", default=["single"], help="kinds of drives (single)")
+    parser.add_argument("--json", type=Path, help="write the rows to this file")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    rows = []
+    for case in tqdm([case for case in all_cases(options.set) if case.kind in options.kind], unit="drive"):
+        files = CaseFiles.of(case, options.work)
+        nominal = options.work / "results" / options.label / "nominal" / case.platform_name / "platform.yaml"
+        if not (files.truth.exists() and nominal.exists()):
+            continue
+        row = measured(case, files, nominal)
+        if row is not None:
+            rows.append(row)
+            tqdm.write(row_line(row))
+    if not rows:
+        print(f"no drive of these kinds is recorded and commissioned in {options.work}: run run.py", file=sys.stderr)
+        return 1
+    for kind in options.kind:
+        print(summary(kind, [row for row in rows if row["kind"] == kind]))
+    if options.json:
+        write_text(options.json, json.dumps(rows, indent=1) + "\n")
+    return 0
+
+
+def measured(case: Case, files: CaseFiles, nominal_file: Path) -> dict | None:
+    """The row of a drive; None where nothing can be fitted to it."""
+    truth = json.loads(files.truth.read_text())
+    if not truth["usable"]:
+        return None
+    settings = DiagnosisSettings()
+    robot = load_robot(nominal_file)
+    nominal = NominalModel.read(nominal_file, settings.samples)
+    if nominal is None:
+        return None
+    map_file = files.terrain(files.bag)
+    read, _, _ = read_with_ground(files.bag, robot, str(map_file) if map_file.exists() else "auto")
+    evidence = corrected_evidence(read, robot)
+    starts, _ = comparable_starts(evidence, robot, settings)
+    noisy = noisy_motions(evidence.smoothed, settings.seed)
+    if not len(starts):
+        return None
+    # A late effect explains what is measured after its onset.
+    onset = max((entry["onset_s"] for entry in truth["hidden"]), default=0.0)
+    starts = starts[starts >= starts[0] + round(onset * 1e9)]
+    windows = windows_of(evidence, robot, starts, np.array(settings.samples), noisy)
+    search = Search(robot, windows.data, residual_scale(windows.uncertainty, nominal), nominal=nominal)
+    effects = selected(search) if case.kind == "outside" else fitted_truth(search, truth["hidden"])
+    if not effects:
+        return None
+    trial = search.judge(effects)
+    before = float(search.loss_of(()).mean())
+    change = 0.5 * search.directions.mean_square(search.refit(trial.effects).effects, 0)
+    return {
+        "case": case.name,
+        "kind": case.kind,
+        "hidden": [entry["name"] for entry in truth["hidden"]],
+        "fitted": list(trial.names),
+        "healthy": nominal.loss,
+        "before": before,
+        "after": trial.loss,
+        # A loss within the spread of healthy drives has no excess to explain.
+        "visible": before > nominal.loss * np.exp(search.thresholds.drive_spread),
+        "explained": excess_share(before, trial.loss, nominal.loss),
+        "error": float(np.sqrt(max(trial.loss - nominal.loss, 0.0) / max(change, 1e-9))),
+    }
+
+
+def fitted_truth(search: Search, hidden: list[dict]) -> Effects:
+    """The hidden effects, each as the one of its class that fits best; empty where the catalogue has none."""
+    base: Effects = ()
+    for entry in hidden:
+        names = [name for name in entry["names"] if name in CATALOGUE and CATALOGUE[name].identified]
+        fits = [
+            fit_effects(
+                search.predictions,
+                [base + start for start in first_values(CATALOGUE[name])],
+                search.scale,
+                iterations=6,
+            )
+            for name in names
+        ]
+        if not fits:
+            return ()
+        base = min(fits, key=lambda fit: float(fit.loss.mean())).effects
+    return base
+
+
+def selected(search: Search) -> Effects:
+    """What a search selects where nothing of the catalogue is hidden."""
+    return search.run(4, exchange=False).best.effects
+
+
+def row_line(row: dict) -> str:
+    """One line about a drive."""
+    share = f"{100 * row['explained']:4.0f} %" if row["visible"] else "   – "
+    return f"{row['case']:60s} {'+'.join(row['fitted']):40s} explain {share}, error {100 * row['error']:4.0f} %"
+
+
+def summary(kind: str, rows: list[dict]) -> str:
+    """The spread over drives whose error is visible at all."""
+    visible = [row for row in rows if row["visible"]]
+    if not visible:
+        return f"{kind}: none of {len(rows)} drives exceeds the healthy robot's loss visibly"
+    text = f"{kind}: {len(visible)} of {len(rows)} drives visible"
+    for key, words in (("explained", "share explained"), ("error", "error of the formula")):
+        low, middle, high = np.quantile([row[key] for row in visible], (0.1, 0.5, 0.9))
+        text += f"; {words}: 10 % quantile {low:.2f}, median {middle:.2f}, 90 % quantile {high:.2f}"
+    return text
+
+
+if __name__ == "__main__":
+    sys.exit(main())
