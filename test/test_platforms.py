@@ -308,4 +308,5 @@ def test_the_true_effect_explains_most_of_what_it_does_in_the_other_engine(tmp_p
     row = measured(case, CaseFiles.of(case, tmp_path), nominal)
     assert row["fitted"] == ["drive_loss"] and row["visible"]
     assert row["explained"] > 0.7 and row["error"] < 0.5
+    assert json.loads(json.dumps(row)) == row
     assert summary("single", [row]).startswith("single: 1 of 1 drives visible; share explained: 10 % quantile")

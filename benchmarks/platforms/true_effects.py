@@ -104,7 +104,7 @@ def measured(case: Case, files: CaseFiles, nominal_file: Path) -> dict | None:
         "before": before,
         "after": trial.loss,
         # A loss within the spread of healthy drives has no excess to explain.
-        "visible": before > nominal.loss * np.exp(search.thresholds.drive_spread),
+        "visible": before > nominal.loss * float(np.exp(search.thresholds.drive_spread)),
         "explained": excess_share(before, trial.loss, nominal.loss),
         "error": float(np.sqrt(max(trial.loss - nominal.loss, 0.0) / max(change, 1e-9))),
     }
