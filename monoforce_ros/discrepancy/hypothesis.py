@@ -166,12 +166,11 @@ class Predictions:
     Args:
         robot: robot with the effects of its file.
         data: the windows.
-        time_step: of the rollouts [s].
     """
 
-    def __init__(self, robot: RobotModel, data: EvidenceWindows, time_step: float = PhysicsOptions.time_step):
+    def __init__(self, robot: RobotModel, data: EvidenceWindows):
         self.data = data
-        self.options = PhysicsOptions(time_step=time_step)
+        self.options = PhysicsOptions()
         if data.terrain is None:
             self._terrain = TerrainMap.flat(Grid.square(2.0, 1.0))
         else:

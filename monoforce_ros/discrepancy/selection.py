@@ -53,9 +53,6 @@ _JUDGED = 6
 _FITTED = 8
 """Effects with one parameter that are fitted in one round, those that promise the smallest loss first. More than are
 judged afterwards; fewer than all of them only to save time."""
-_COARSE_STEP = 0.02
-"""Time step of the rollouts of quick fits [s]: twice that of all others takes half the time and alters what effects
-change by some 5 % (median), which only decides what is examined further."""
 _ALTERNATIVES = 2
 """Combinations that do not begin with the best single effect and are tried where that one leads to no good fit."""
 
@@ -111,9 +108,9 @@ class Search:
         self.directions = Directions(self.predictions, self.scale, nominal, thresholds)
         self._seed, self._progress = seed, progress
         starts = data.starts
-        self._coarse = Predictions(robot, replace(data, starts=starts[::2]), _COARSE_STEP)
+        self._coarse = Predictions(robot, replace(data, starts=starts[::2]))
         self._coarse_scale = self.scale[::2]
-        self._sparse = Predictions(robot, replace(data, starts=starts[::4]), _COARSE_STEP)
+        self._sparse = Predictions(robot, replace(data, starts=starts[::4]))
         self._sparse_scale = self.scale[::4]
         self._blocks = block_numbers(starts, thresholds.block)
         folds = folds_of(starts)
