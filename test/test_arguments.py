@@ -3,6 +3,7 @@
 import subprocess
 
 import pytest
+import torch
 from conftest import ROOT
 
 from monoforce_ros.nodes.arguments import (
@@ -113,6 +114,11 @@ def test_what_is_for_a_node_of_another_name_is_refused(words, right):
         ("bag_player --rte 3", "unrecognized arguments: --rte; did you mean '--rate'?"),
         ("bag_player --ros-args -p rate:=3.0", "unknown parameter 'rate': bag_player has no parameters"),
         ("bag_recorder {out} --ros-args -p topics:=odom", "unknown parameter 'topics': bag_recorder has no parameters"),
+        ("bag_player --start inf", "argument --start: got 'inf', expected a number of seconds, 0 or more"),
+        ("bag_player --wait nan", "argument --wait: got 'nan', expected a number of seconds, 0 or more"),
+        ("bag_recorder {out} --topics a!b", "argument --topics: got 'a!b', expected a topic such as '/odom'"),
+        ("simulator --seed -1", "argument --seed: got '-1', expected an integer, 0 or more"),
+        ("simulator --duration nan", "argument --duration: got 'nan', expected a number of seconds"),
         ("bag_recorder {out} --topic odom", "unrecognized arguments: --topic odom; did you mean '--topics'?"),
     ],
 )
@@ -169,3 +175,14 @@ def test_an_empty_topic_is_refused(executables, ros_environment):
     )  # fmt: skip
     assert done.returncode == 1
     assert "parameter odometry_topic: got an empty name, expected a topic such as 'odom'" in done.stderr
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
+def test_a_gpu_that_is_not_there_is_said_in_one_line(executables, ros_environment):
+    done = subprocess.run(
+        [executables / "predictor", "--ros-args", "-p", "device:=cuda", "-p", "terrain_source:=camera"],
+        env=ros_environment, capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert "parameter device: got 'cuda', but PyTorch finds no CUDA device" in done.stderr
+    assert "Traceback" not in done.stderr

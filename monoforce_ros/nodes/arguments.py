@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import NoReturn, override
+
+from rclpy.expand_topic_name import expand_topic_name
 
 from monoforce_ros.nodes.parameter_files import read_sections, refuse_misnamed_sections, section_matches
 from monoforce_ros.nodes.schema import most_similar, nearest
@@ -25,6 +28,35 @@ class NodeArgumentParser(argparse.ArgumentParser):
         if message.startswith("unrecognized arguments: "):
             message += nearest(unknown[0].split("=")[0], self._option_string_actions)
         super().error(message)
+
+
+def seconds(text: str) -> float:
+    """Type of an option: a finite time of 0 s or more, up to a year."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 <= value <= 365 * 86400.0:
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected a number of seconds, 0 or more")
+    return value
+
+
+def seed(text: str) -> int:
+    """Type of an option: the seed of a random generator."""
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected an integer, 0 or more")
+    return int(text)
+
+
+def topic_name(text: str) -> str:
+    """Type of an option: a topic's name as ROS allows it."""
+    try:
+        expand_topic_name(text, "node", "/")
+    except ValueError as error:
+        # rcl's messages end with the place in its source code.
+        reason = str(error).partition(", at /")[0].partition(": ")[2]
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected a topic such as '/odom': {reason}") from error
+    return text
 
 
 def own_arguments(arguments: Sequence[str]) -> list[str]:

@@ -17,7 +17,7 @@ from rosgraph_msgs.msg import Clock
 from monoforce_ros.bags import BagError, BagMessage, BagReader, type_store
 from monoforce_ros.core import share_directory
 from monoforce_ros.messages import message_class, missing_package
-from monoforce_ros.nodes.arguments import NodeArgumentParser, own_arguments
+from monoforce_ros.nodes.arguments import NodeArgumentParser, own_arguments, seconds
 from monoforce_ros.nodes.frames import TRANSFORMS
 from monoforce_ros.nodes.odometry_transform import odometry_transform
 from monoforce_ros.nodes.parameters import refuse_unknown_parameters
@@ -34,13 +34,13 @@ def _arguments(arguments: list[str]) -> argparse.Namespace:
     )
     parser.add_argument("bag", nargs="?", help="rosbag2 folder or ROS 1 .bag file (default: the demo bag)")
     parser.add_argument("--rate", type=float, default=1.0, help="speed relative to the recording (default 1)")
-    parser.add_argument("--start", type=float, default=0.0, help="seconds to skip at the beginning")
-    parser.add_argument("--duration", type=float, default=None, help="seconds of the bag to play")
+    parser.add_argument("--start", type=seconds, default=0.0, help="seconds to skip at the beginning")
+    parser.add_argument("--duration", type=seconds, default=None, help="seconds of the bag to play")
     parser.add_argument("--loop", action="store_true", help="start over at the end")
     parser.add_argument("--clock", action="store_true", help="publish /clock with the bag's time")
     parser.add_argument("--topics", nargs="+", default=None, metavar="TOPIC", help="play only these topics")
     parser.add_argument(
-        "--wait", type=float, default=3.0, help="seconds to wait for the first subscriber before playing (default 3)"
+        "--wait", type=seconds, default=3.0, help="seconds to wait for the first subscriber before playing (default 3)"
     )
     parser.add_argument(
         "--no-tf",
@@ -51,8 +51,8 @@ def _arguments(arguments: list[str]) -> argparse.Namespace:
     options = parser.parse_args(arguments)
     if not 0.001 <= options.rate <= 1000:
         parser.error(f"--rate: got {options.rate}, expected 0.001 to 1000")
-    if options.start < 0 or (options.duration is not None and options.duration <= 0):
-        parser.error("--start and --duration: expected positive seconds")
+    if options.duration == 0:
+        parser.error("--duration: got 0, expected a positive number of seconds")
     return options
 
 

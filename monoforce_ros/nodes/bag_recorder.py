@@ -14,7 +14,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from monoforce_ros.bags import BagWriter
 from monoforce_ros.messages import message_class, missing_package
-from monoforce_ros.nodes.arguments import NodeArgumentParser, own_arguments
+from monoforce_ros.nodes.arguments import NodeArgumentParser, own_arguments, topic_name
 from monoforce_ros.nodes.parameters import refuse_unknown_parameters
 from monoforce_ros.nodes.process import initialise
 
@@ -24,7 +24,7 @@ def _arguments(arguments: list[str]) -> argparse.Namespace:
         prog="bag_recorder", description="Record topics into a rosbag2 bag until interrupted (SIGINT or SIGTERM)."
     )
     parser.add_argument("out", help="folder of the bag; must not exist")
-    parser.add_argument("--topics", nargs="+", default=None, metavar="TOPIC", help="topics (default: all)")
+    parser.add_argument("--topics", nargs="+", type=topic_name, metavar="TOPIC", help="topics (default: all)")
     parser.add_argument("--storage", choices=["mcap", "sqlite3"], default="mcap", help="storage format (default mcap)")
     parser.add_argument("--overwrite", action="store_true", help="replace an existing bag")
     return parser.parse_args(arguments)

@@ -183,6 +183,11 @@ class PredictorNode(ManagedNode):
 
     def _terrain_source(self) -> TerrainSource:
         settings = self.settings
+        if settings.device == "cuda" and not torch.cuda.is_available():
+            raise ValueError(
+                "parameter device: got 'cuda', but PyTorch finds no CUDA device: install its CUDA build and NVIDIA's "
+                "driver, or use device:=auto"
+            )
         cuda = settings.device == "cuda" or (settings.device == "auto" and torch.cuda.is_available())
         return choose_terrain_source(
             settings.terrain_source,

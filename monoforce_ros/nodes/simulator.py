@@ -16,7 +16,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from monoforce_ros.bags import builders, type_store
 from monoforce_ros.messages import decoding, message_class, missing_package
-from monoforce_ros.nodes.arguments import NodeArgumentParser, own_arguments
+from monoforce_ros.nodes.arguments import NodeArgumentParser, own_arguments, seconds, seed
 from monoforce_ros.nodes.frames import TRANSFORMS
 from monoforce_ros.nodes.odometry_transform import odometry_transform
 from monoforce_ros.nodes.parameters import refuse_unknown_parameters
@@ -37,7 +37,7 @@ def _arguments(arguments: list[str]) -> argparse.Namespace:
         prog="simulator",
         description="Drive a simulated robot through ROS: cmd_vel in; odom, points and images out.",
     )
-    parser.add_argument("--seed", type=int, default=12, help="seed of the world (%(default)s)")
+    parser.add_argument("--seed", type=seed, default=12, help="seed of the world (%(default)s)")
     parser.add_argument("--robot", default="husky", metavar="NAME|FILE.yaml", help="robot name or file (%(default)s)")
     parser.add_argument("--ground", choices=GROUNDS, default="mixed", help="type of ground (%(default)s)")
     parser.add_argument("--flat", action="store_true", help="level ground without obstacles")
@@ -46,7 +46,7 @@ def _arguments(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--lidar-rate", type=float, default=5.0, metavar="HZ", help="0 disables it (%(default)s)")
     parser.add_argument("--camera-rate", type=float, default=0.0, metavar="HZ", help="0 disables it (%(default)s)")
     parser.add_argument(
-        "--duration", type=float, default=float("inf"), metavar="S", help="simulated time (default: until stopped)"
+        "--duration", type=seconds, default=float("inf"), metavar="S", help="simulated time (default: until stopped)"
     )
     options = parser.parse_args(arguments)
     for name in ("lidar_rate", "camera_rate"):
