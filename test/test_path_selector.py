@@ -98,6 +98,20 @@ def test_it_stops_when_all_inputs_are_silent(peer, nodes, sent):
     moves(peer, sent)
 
 
+def test_it_stops_when_odometry_repeats_one_stamp(peer, nodes, sent):
+    """Candidates do not grow old then either: by stamps alone the robot would drive on for ever."""
+    send(peer, 9.0, 2.0)
+    moves(peer, sent)
+    frozen = peer.now
+    place = ([1.0, 2.0, 0.3], [0, 0, 0, 1], [0] * 3, [0] * 3)
+    peer.drive(
+        2.0, cloud=lambda stamp: None, odometry=lambda stamp: builders.odometry(frozen, "odom", "base_link", *place)
+    )
+    assert sent[-1].twist.linear.x == 0.0 and sent[-1].twist.angular.z == 0.0
+    assert "repeated the same stamp" in status(peer)[1], status(peer)
+    moves(peer, sent)
+
+
 def test_it_stops_at_the_goal_and_for_a_goal_in_another_frame(peer, nodes, sent):
     send(peer, 9.0, 2.0, frame="map")
     peer.drive(1.0)

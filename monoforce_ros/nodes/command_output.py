@@ -9,7 +9,8 @@ from rclpy.publisher import Publisher
 STAMPED, PLAIN = "geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist"
 _CLASSES = {STAMPED: TwistStamped, PLAIN: Twist}
 _CHOICES = {"twist_stamped": STAMPED, "twist": PLAIN}
-_RECORDER = "bag_recorder"
+_RECORDERS = ("bag_recorder", "rosbag2_recorder")
+"""Names of the recorders of this package and of ``ros2 bag record``."""
 _UNKNOWN = "_NODE_NAME_UNKNOWN_"
 """What ROS calls a node that is no ROS node, or whose name it has not received yet."""
 
@@ -108,7 +109,7 @@ class CommandOutput:
 
         A predictor may have any name: what it publishes shows what it is.
         """
-        if name == _RECORDER:
+        if name in _RECORDERS:
             return True
         try:
             published = self._node.get_publisher_names_and_types_by_node(name, namespace)

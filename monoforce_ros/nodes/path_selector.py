@@ -85,6 +85,8 @@ class PathSelectorNode(Node):
         self._offset_problem = ""
         self._started = time.monotonic()
         self._first_odometry = 0.0
+        self._odometry_stamp: int | None = None
+        self._advanced = 0.0
         self._arrivals: dict[str, float] = {}
         self._candidates: Candidates | None = None
         self._moving = self._driving = False
@@ -164,6 +166,8 @@ class PathSelectorNode(Node):
             self.health.report("odometry", ERROR, str(error), reason="unusable")
             return
         self._arrivals["odometry"] = time.monotonic()
+        if state.stamp != self._odometry_stamp:
+            self._odometry_stamp, self._advanced = state.stamp, self._arrivals["odometry"]
         self._first_odometry = self._first_odometry or self._arrivals["odometry"]
         # The name of REP 105, as the predictor takes it.
         frame_id = frame_id or "odom"
@@ -282,6 +286,10 @@ class PathSelectorNode(Node):
         silence = time.monotonic() - self._arrivals["odometry"]
         if silence > self.settings.timeout:
             raise Stop(f"no odometry for {silence:.1f} s: the position is unknown ({source.silence_cause})", "silent")
+        # With such odometry candidates cannot grow old either.
+        frozen = time.monotonic() - self._advanced
+        if frozen > self.settings.timeout:
+            raise Stop(f"odometry has repeated the same stamp for {frozen:.1f} s: the position is unknown", "frozen")
         return self._motion
 
     def _in_odometry(self, course: Course) -> np.ndarray:
