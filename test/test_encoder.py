@@ -113,7 +113,7 @@ def test_level_ground_is_lifted_to_its_height_without_training():
     support = np.array([[0.3, 0.3, -0.3], [0.3, -0.3, -0.3], [-0.3, 0.3, -0.3], [-0.3, -0.3, -0.3]])
     batch = encoder_input([view()], support, SMALL)
     assert float(batch.ground[0]) == pytest.approx(-0.3) and float(batch.origins[0, 2]) == pytest.approx(0.8)
-    depth, _ = encoder._lift(batch)
+    depth, _ = encoder.lifted(*encoder.image_features(batch.images), batch.rays, batch.origins)
     expected = (depth.exp() * encoder.depths[None, :, None, None]).sum(1)[0]
     # Rays steep enough to meet the ground within the depths that are looked at.
     level = -batch.origins[0, 2] / batch.rays[0, ..., 2]

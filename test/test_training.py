@@ -27,6 +27,7 @@ from monoforce_ros.training.losses import (
     geometric_loss,
     measured_decrease_loss,
     prominent_decrease_loss,
+    ray_depth_loss,
     slope_loss,
     spread_loss,
     terrain_loss,
@@ -279,6 +280,12 @@ def test_the_depth_loss_is_smallest_at_the_measured_depth(recording):
         probability.scatter_(1, (right + shift).clamp(max=47)[:, None], 1.0)
         losses.append(float(depth_loss(maps_of(targets, depth=probability.log()), targets, depths)))
     assert losses[0] < 0.1 * losses[1]
+    # Rays of no weight do not count.
+    right_one = torch.zeros_like(known)
+    right_one[tuple(torch.nonzero(known)[0])] = True
+    probability.scatter_(1, right[:, None], torch.where(right_one, 1.0, 1e-4)[:, None])
+    weighted = ray_depth_loss(probability.log(), targets.depth, depths, right_one.float())
+    assert float(weighted) == pytest.approx(0.0, abs=1e-5)
 
 
 def test_the_trajectory_loss_reaches_heights_and_material(recording, husky):
@@ -412,6 +419,18 @@ def test_the_chosen_part_of_the_backbone_is_trained(recording, husky, tmp_path, 
     assert any("running_mean" in name for name in changed) == (part == "all")
     with pytest.raises(ValueError, match="training backbone: got 'some', expected one of none, late, all"):
         TrainingSettings(backbone="some")
+
+
+def test_with_the_map_alone_trained_images_say_what_they_said(recording, husky, tmp_path, one_thread):
+    torch.manual_seed(0)
+    encoder = new_encoder(TINY)
+    before = {name: value.clone() for name, value in encoder.state_dict().items()}
+    settings = TrainingSettings(steps=2, batch=2, backbone="map", weights=LossWeights(trajectory=0.0), warm_up=1)
+    Trainer(encoder, husky, [recording], [], tmp_path, settings, Process("cpu")).run()
+    changed = {
+        name.split(".")[0] for name, value in encoder.state_dict().items() if not torch.equal(value, before[name])
+    }
+    assert changed == {"bird", "heads"}
 
 
 def test_a_training_writes_a_log_and_a_checkpoint_that_loads(trained):

@@ -35,6 +35,9 @@ class EncoderConfig:
     depth_maximum: float = 10.0
     depth_bins: int = 48
     """Range [m] and number of depth bins, evenly spaced in the logarithm of depth."""
+    relative_bins: int = 0
+    """Number of bins of depth relative to level ground, as wide as those of depth, that add to them; 0 for none, as in
+    the shipped encoder."""
     image_features: int = 32
     """Channels lifted into the map."""
     map_features: int = 24
@@ -70,6 +73,7 @@ class EncoderConfig:
             ("map_size", 1.0, 200.0),
             ("resolution", 0.01, 2.0),
             ("depth_bins", 2, 256),
+            ("relative_bins", 0, 256),
             ("depth_minimum", 0.05, 20.0),
             ("depth_maximum", 0.5, 500.0),
             ("image_features", 1, 512),

@@ -26,6 +26,8 @@ _NECK_CHANNELS = 64
 _CONTEXT_CHANNELS = 96
 _LEVEL_GROUND_SPREAD = 0.25
 """Standard deviation of the initial depth prior around level ground, in the logarithm of depth."""
+_NEARER = 0.75
+"""Share of the bins of relative depth that are nearer than level ground: most things stand on it."""
 
 
 class TerrainEncoder(nn.Module):
@@ -53,12 +55,18 @@ class TerrainEncoder(nn.Module):
         )
         self.lift = nn.Conv2d(_NECK_CHANNELS, config.depth_bins + config.image_features, kernel_size=1)
         self.level_weight = nn.Parameter(torch.tensor(1.0))
+        if config.relative_bins:
+            self.relative = nn.Conv2d(_NECK_CHANNELS, config.relative_bins, kernel_size=1)
+            # At first only the prior around level ground is known.
+            nn.init.zeros_(self.relative.weight)
+            assert self.relative.bias is not None
+            nn.init.zeros_(self.relative.bias)
         inputs = config.image_features + MOMENTS + SUPPORT_CHANNELS + (SWEEP_CHANNELS if config.takes_sweeps else 0)
         self.bird = BirdsEyeNetwork(inputs, config.map_features)
         self.heads = map_heads(config.map_features)
         depths = torch.from_numpy(depth_values(config)).float()
         self.register_buffer("depths", depths, persistent=False)
-        self.backbone_frozen = False
+        self.backbone_frozen = self.images_frozen = False
 
     def freeze_backbone(self, *, early_only: bool = False) -> None:
         """Keep the backbone, or its early stages, and the statistics of its norms as they are.
@@ -71,12 +79,27 @@ class TerrainEncoder(nn.Module):
             part.requires_grad_(False)
         self.backbone.eval()
 
+    def freeze_images(self) -> None:
+        """Keep all that is lifted into the map as it is: only the bird's-eye-view network and the heads are trained."""
+        self.images_frozen = True
+        for part in self._image_parts:
+            part.requires_grad_(False).eval()
+        self.level_weight.requires_grad_(False)
+
+    @property
+    def _image_parts(self) -> list[nn.Module]:
+        relative = [self.relative] if self.config.relative_bins else []
+        return [self.backbone, self.context, self.neck, self.lift, *relative]
+
     @override
     def train(self, mode: bool = True) -> TerrainEncoder:
-        """Training or evaluation mode; a frozen backbone stays in evaluation mode."""
+        """Training or evaluation mode; frozen parts stay in evaluation mode."""
         super().train(mode)
         if self.backbone_frozen:
             self.backbone.eval()
+        if self.images_frozen:
+            for part in self._image_parts:
+                part.eval()
         return self
 
     @override
@@ -107,7 +130,7 @@ class TerrainEncoder(nn.Module):
         and the logarithm of the depth probabilities."""
         config, grid = self.config, self.config.grid
         size = grid.rows * grid.columns
-        depth, features = self._lift(batch)
+        depth, features = self.lifted(*self.image_features(batch.images), batch.rays, batch.origins)
         probability = depth.exp()
         points = lifted_points(batch.rays, batch.origins, self.depths)
         cells = map_cells(points, config)
@@ -125,24 +148,64 @@ class TerrainEncoder(nn.Module):
         covered = functional.max_pool2d(hits.view(batch.maps, 1, grid.rows, grid.columns), 5, 1, 2)[:, 0] > 0
         return joined.view(shape).permute(0, 3, 1, 2), covered, evidence.view(shape[:-1]), depth
 
-    def _lift(self, batch: EncoderInput) -> tuple[Tensor, Tensor]:
-        """Logarithm of the depth probabilities ``[N, bins, rows, columns]``, features ``[N, C, rows, columns]``."""
+    @property
+    def backbone_channels(self) -> tuple[int, int]:
+        """Channels of the backbone's features at stride 8 and at stride 16."""
+        return FINE_CHANNELS, COARSE_CHANNELS
+
+    def image_features(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """Backbone features ``[N, 40, rows, columns]`` and ``[N, 112, rows / 2, columns / 2]`` of RGB images uint8
+        ``[N, 3, image_height, image_width]``."""
+        return self.backbone((images.float() / 127.5 - 1.0).to(self.lift.weight.dtype))
+
+    def lifted(self, fine: Tensor, coarse: Tensor, rays: Tensor, origins: Tensor) -> tuple[Tensor, Tensor]:
+        """What is lifted into the map.
+
+        Args:
+            fine, coarse: from :meth:`image_features`.
+            rays, origins: of :class:`~monoforce_ros.encoder.view.EncoderInput`.
+
+        Returns:
+            the logarithm of the depth probabilities ``[N, bins, rows, columns]``, and features ``[N, C, rows,
+            columns]``.
+        """
         config = self.config
-        fine, coarse = self.backbone((batch.images.float() / 127.5 - 1.0).to(self.lift.weight.dtype))
-        down = batch.rays[..., 2]
-        height = batch.origins[:, 2, None, None]
+        down = rays[..., 2]
+        height = origins[:, 2, None, None]
         # Depth at which the ray meets level ground; beyond every bin for rays that do not.
         level = torch.where(down < -1e-3, -height / down.clamp_max(-1e-3), 1e3).clamp(0.1, 1e3).log()
         low, high = float(np.log(config.depth_minimum)), float(np.log(config.depth_maximum))
         geometry = torch.stack(
-            [*batch.rays.unbind(-1), height.expand_as(down), ((level - low) / (high - low)).clamp(-0.5, 1.5)], dim=1
+            [*rays.unbind(-1), height.expand_as(down), ((level - low) / (high - low)).clamp(-0.5, 1.5)], dim=1
         )
         geometry = geometry.to(fine.dtype)
         coarse = self.context(torch.cat([coarse, resized(geometry, coarse.shape[-2:])], dim=1))
-        lifted = self.lift(self.neck(torch.cat([fine, resized(coarse, fine.shape[-2:]), geometry], dim=1)))
+        neck = self.neck(torch.cat([fine, resized(coarse, fine.shape[-2:]), geometry], dim=1))
+        lifted = self.lift(neck)
         distance = (self.depths.log()[:, None, None] - level.clamp_max(high)[:, None]) / _LEVEL_GROUND_SPREAD
         logits = lifted[:, : config.depth_bins].float() - self.level_weight * 0.5 * distance**2
+        if config.relative_bins:
+            logits = logits + self._from_level_ground(self.relative(neck).float(), level.clamp_max(high))
         return logits.log_softmax(dim=1), lifted[:, config.depth_bins :].float()
+
+    def _from_level_ground(self, relative: Tensor, level: Tensor) -> Tensor:
+        """Logits of the depth bins from logits of depths relative to level ground.
+
+        A network can say "as far away as level ground" of every pixel in the same way, and so can it say "a third
+        nearer"; in bins of absolute depth each row of an image needs words of its own.
+
+        Args:
+            relative: logits ``[N, relative bins, rows, columns]``; bins are as wide as those of depth.
+            level: logarithm of the depth of level ground ``[N, rows, columns]``.
+        """
+        last = relative.shape[1] - 1
+        step = float(self.depths[1].log() - self.depths[0].log())
+        start = (self.depths[0].log() - level) / step + _NEARER * last
+        whole = start.floor()
+        share = (start - whole)[:, None]
+        place = whole.long()[:, None] + torch.arange(len(self.depths), device=level.device)[:, None, None]
+        lower, upper = (relative.gather(1, (place + i).clamp(0, last)) for i in (0, 1))
+        return lower + share * (upper - lower)
 
     @torch.no_grad()
     def terrain(

@@ -147,22 +147,28 @@ def spread_loss(maps: EncodedMaps, targets: Targets, ground: Tensor) -> Tensor:
 
 
 def depth_loss(maps: EncodedMaps, targets: Targets, depths: Tensor) -> Tensor:
+    """:func:`ray_depth_loss` of a batch; 0 without images."""
+    if maps.depth is None or not len(targets.depth):
+        return maps.geometric_height.sum() * 0.0
+    return ray_depth_loss(maps.depth, targets.depth, depths)
+
+
+def ray_depth_loss(log_probability: Tensor, measured: Tensor, depths: Tensor, weight: Tensor | float = 1.0) -> Tensor:
     """Cross-entropy of the depth bins along the rays of features that the lidar measured.
 
     Args:
-        maps: predictions with depth probabilities.
-        targets: measured depths.
+        log_probability: logarithm of the depth probabilities ``[N, bins, rows, columns]``.
+        measured: depths ``[N, rows, columns]`` [m]; 0 where none was measured.
         depths: depth of each bin ``[bins]`` [m].
+        weight: of each ray, shaped like ``measured``.
     """
-    if maps.depth is None or not len(targets.depth):
-        return maps.geometric_height.sum() * 0.0
-    known = (targets.depth >= depths[0]) & (targets.depth <= depths[-1])
+    known = weight * ((measured >= depths[0]) & (measured <= depths[-1]))
     # Bins are evenly spaced in the logarithm.
     step = (depths[-1] / depths[0]).log() / (len(depths) - 1)
-    place = (targets.depth.clamp_min(float(depths[0])) / depths[0]).log() / step
+    place = (measured.clamp_min(float(depths[0])) / depths[0]).log() / step
     bins = place.round().long().clamp(0, len(depths) - 1)
-    loss = -maps.depth.gather(1, bins[:, None])[:, 0]
-    return (loss * known).sum() / known.sum().clamp_min(1)
+    loss = -log_probability.gather(1, bins[:, None])[:, 0]
+    return (loss * known).sum() / known.sum().clamp_min(1.0)
 
 
 def friction_loss(maps: EncodedMaps, targets: Targets, config: EncoderConfig) -> Tensor:

@@ -32,6 +32,8 @@ from monoforce_ros.reporting import progress, progress_bar
 from monoforce_ros.robots import RobotFileError, RobotModel, fingerprint, load_robot, shipped_robots, write_robot
 from monoforce_ros.synthetic import STYLES
 from monoforce_ros.training.adaptation import REPLAY_WORLDS, AdaptationSettings, adapt, compare, split_recording
+from monoforce_ros.training.depth_training import DepthSettings, DepthTrainer, depth_errors
+from monoforce_ros.training.image_features import image_features
 from monoforce_ros.training.judgement import CAMERAS, SWEEP, calibrated
 from monoforce_ros.training.losses import LossWeights
 from monoforce_ros.training.recording_samples import RecordingSamples, SamplesError, read_samples
@@ -40,14 +42,17 @@ from monoforce_ros.training.trainer import (
     BACKBONE_PARTS,
     Process,
     Trainer,
-    TrainingError,
     TrainingSettings,
     describe,
+    state_file,
 )
+from monoforce_ros.training.training_state import TrainingError
 from monoforce_ros.training.vegetation_fit import EFFECT, fit_vegetation
-from monoforce_ros.training.world_samples import FIRST_WORLD, WORLD_STYLES, world_samples, world_settings
+from monoforce_ros.training.world_samples import FIRST_WORLD, PLACES, WORLD_STYLES, world_samples, world_settings
 
 _HELD_OUT_WORLDS = 430_000
+_JUDGED_IMAGES = 256
+"""Images on which the training of depth is judged before and after."""
 
 
 class _RenamedOption(argparse.Action):
@@ -95,6 +100,10 @@ def build_parser() -> argparse.ArgumentParser:
                         "the simulator's surfaces as targets (default: %(default)s)")  # fmt: skip
     parser.add_argument("--world-seed", type=int, default=FIRST_WORLD, metavar="SEED", help="of the first world "
                         "(default: %(default)s)")  # fmt: skip
+    parser.add_argument("--places", type=int, default=PLACES, metavar="N", help="places in each world (default: "
+                        "%(default)s)")  # fmt: skip
+    parser.add_argument("--held-out-worlds", type=int, default=12, metavar="N", help="worlds to validate on where no "
+                        "recording is held out (default: %(default)s)")  # fmt: skip
     parser.add_argument("--world-styles", nargs="+", choices=sorted(STYLES), default=list(WORLD_STYLES),
                         metavar="STYLE", help=f"styles that alternate, of {', '.join(sorted(STYLES))} (default: "
                         f"{' '.join(WORLD_STYLES)})")  # fmt: skip
@@ -132,6 +141,8 @@ def build_parser() -> argparse.ArgumentParser:
                         "%(default)s)")  # fmt: skip
     parser.add_argument("--resolution", type=float, default=EncoderConfig.resolution, metavar="M", help="size of a "
                         "cell (default: %(default)s)")  # fmt: skip
+    parser.add_argument("--relative-bins", type=int, default=EncoderConfig.relative_bins, metavar="N", help="bins of "
+                        "depth relative to level ground, 0 for none (default: %(default)s)")  # fmt: skip
     parser.add_argument("--edges", action=argparse.BooleanOptionalAction, help="restore steps that uncertainty blurs "
                         "into slopes, cameras only (default: unless the geometric loss is the only one)")  # fmt: skip
     parser.add_argument("--adapt", action="store_true", help="adapt the shipped encoder (or --start-from) to this "
@@ -140,7 +151,12 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--backbone-weights", choices=("imagenet", "random"), default="imagenet", help="initial "
                         "weights of the backbone (default: %(default)s)")  # fmt: skip
     parser.add_argument("--train-backbone", choices=BACKBONE_PARTS, default="none", help="part of the backbone that is "
-                        "trained, too; late: its stages at stride 16 (default: %(default)s)")  # fmt: skip
+                        "trained, too; late: its stages at stride 16; map: nothing of the images, not even what "
+                        "follows the backbone (default: %(default)s)")  # fmt: skip
+    parser.add_argument("--depth-steps", type=int, default=0, metavar="N", help="first train the depth along pixels "
+                        "for N steps, on features that the backbone computes once (default: %(default)s)")  # fmt: skip
+    parser.add_argument("--depth-variants", type=int, default=2, metavar="N", help="augmented variants of each image "
+                        "for that, 0.24 MB each (default: %(default)s)")  # fmt: skip
     parser.add_argument("--validate-every", type=int, default=TrainingSettings.validate_every, metavar="STEPS",
                         help="(default: %(default)s)")  # fmt: skip
     parser.add_argument("--save-every", type=int, default=TrainingSettings.save_every, metavar="STEPS",
@@ -208,19 +224,29 @@ def _train(options: argparse.Namespace, process: Process) -> None:
     if process.first:
         training, validation = (_samples(part, robot, config, options, title) for part, title in
                                 ((bags, "training"), (held_out, "held out")))  # fmt: skip
-        training += _world_samples(range(options.world_seed, options.world_seed + options.worlds), config, options)
+        training += _world_samples(
+            range(options.world_seed, options.world_seed + options.worlds), config, options, options.places
+        )
         if options.worlds and not validation:
-            validation = _world_samples(range(_HELD_OUT_WORLDS, _HELD_OUT_WORLDS + 12), config, options)
+            validation = _world_samples(
+                range(_HELD_OUT_WORLDS, _HELD_OUT_WORLDS + options.held_out_worlds), config, options
+            )
     if options.samples_only:
         return
     if process.count > 1:
         torch.distributed.barrier()
         if not process.first:
             training, validation = (_samples(part, robot, config, options, "") for part in (bags, held_out))
-            training += _world_samples(range(options.world_seed, options.world_seed + options.worlds), config, options)
+            training += _world_samples(
+                range(options.world_seed, options.world_seed + options.worlds), config, options, options.places
+            )
     robot = _with_vegetation(robot, training, config, settings, options, process)
     torch.manual_seed(settings.seed)
     encoder = _encoder(options, config)
+    if options.depth_steps and process.first and not state_file(options.out).is_file():
+        _train_depth(encoder, training, options)
+    if process.count > 1:
+        torch.distributed.barrier()
     trainer = Trainer(encoder, robot, training, validation, options.out, settings, process)
     resumed = trainer.resume()
     if process.first:
@@ -237,6 +263,40 @@ def _train(options: argparse.Namespace, process: Process) -> None:
         save_encoder(calibrated(best, validation, sensors), options.out / "encoder.safetensors")
     if process.first:
         _write_summary(options.out, trainer, describe(config, settings, training))
+
+
+def _train_depth(encoder: Encoder, training: Sequence[RecordingSamples], options: argparse.Namespace) -> None:
+    """Train the depth along pixels of an encoder, in place; resumes an interrupted training."""
+    if not isinstance(encoder, TerrainEncoder):
+        raise ValueError("--depth-steps: got an encoder without images, expected --sensor camera or camera_lidar")
+    # An encoder that was trained before reads the lifted features; they are to stay what they are.
+    settings = DepthSettings(
+        steps=options.depth_steps, keep=DepthSettings.keep if options.start_from else 0.0, seed=options.seed
+    )
+    folder = (options.samples or options.out / "samples") / "features"
+    with progress_bar(len(training), label="features", unit="recording", quiet=options.quiet) as bar:
+
+        def computed(done: int) -> None:
+            bar.update()
+
+        features = image_features(
+            encoder, training, folder, variants=options.depth_variants, seed=options.seed, report=computed
+        )
+    trainer = DepthTrainer(encoder, features, options.out / "state", settings)
+    trainer.resume()
+    judged = features.select(torch.linspace(0, len(features) - 1, min(_JUDGED_IMAGES, len(features))).long())
+    before = depth_errors(encoder, judged) if trainer.step == 0 else None
+    with progress_bar(settings.steps, initial=trainer.step, label="depth", unit="step", quiet=options.quiet) as bar:
+
+        def advance(step: int, losses: dict[str, float]) -> None:
+            bar.set_postfix({"loss": f"{losses['depth']:.2f}"})
+            bar.update()
+
+        trainer.run(advance)
+    after = depth_errors(encoder, judged)
+    start = "" if before is None else f"{before.median:.1%} → "
+    print(f"depth along pixels: median error {start}{after.median:.1%} on images of the training (level ground "
+          f"{after.level:.1%})")  # fmt: skip
 
 
 def _adapt(options: argparse.Namespace) -> None:
@@ -301,13 +361,16 @@ def _encoder(options: argparse.Namespace, config: EncoderConfig) -> Encoder:
     if options.start_from is not None:
         encoder = load_encoder(options.start_from)
         found, expected = asdict(encoder.config), asdict(config)
-        free = ("decreases", "edges", "geometric_spread_factor", "decrease_spread_factor")
+        free = {"decreases", "edges", "geometric_spread_factor", "decrease_spread_factor"}
+        if isinstance(encoder, TerrainEncoder) and not encoder.config.relative_bins:
+            free.add("relative_bins")
         names = [n for n in expected if n not in free and expected[n] != found[n]]
         if names:
             differences = "; ".join(f"{name}: got {found[name]}, expected {expected[name]}" for name in names)
             raise CheckpointError(f"{options.start_from}: configuration differs from the options: {differences}")
         fresh = new_encoder(config)
-        fresh.load_state_dict(encoder.state_dict())
+        # Bins of relative depth that the checkpoint lacks add nothing until they are trained.
+        fresh.load_state_dict(fresh.state_dict() | encoder.state_dict())
         return fresh
     encoder = new_encoder(config)
     if isinstance(encoder, TerrainEncoder) and options.backbone_weights == "imagenet":
@@ -325,6 +388,7 @@ def _config(options: argparse.Namespace) -> EncoderConfig:
         image_height=int(height),
         map_size=options.map_size,
         resolution=options.resolution,
+        relative_bins=options.relative_bins,
         decreases=options.losses != ["geometric"],
         edges=options.losses != ["geometric"] if options.edges is None else options.edges,
     )
@@ -342,14 +406,16 @@ def _settings(options: argparse.Namespace) -> TrainingSettings:
     )  # fmt: skip
 
 
-def _world_samples(seeds: Sequence[int], config: EncoderConfig, options: argparse.Namespace) -> list[RecordingSamples]:
+def _world_samples(
+    seeds: Sequence[int], config: EncoderConfig, options: argparse.Namespace, places: int = PLACES
+) -> list[RecordingSamples]:
     """Samples of randomised worlds; those in which the robot cannot stand are left out."""
     folder = options.samples or options.out / "samples"
     found = []
     for seed in progress(seeds, label="worlds", unit="world", quiet=options.quiet or not seeds):
         try:
             settings = world_settings(seed, options.world_styles)
-            found.append(read_samples(world_samples(seed, config, folder, settings=settings)))
+            found.append(read_samples(world_samples(seed, config, folder, places=places, settings=settings)))
         except SamplesError as error:
             print(f"left out: {error}", file=sys.stderr)
     return found

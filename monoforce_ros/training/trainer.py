@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -13,11 +12,8 @@ from pathlib import Path
 import numpy as np
 import torch
 import torch.distributed
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from monoforce_ros.core import atomic_path
 from monoforce_ros.encoder import (
     EncodedMaps,
     Encoder,
@@ -46,9 +42,11 @@ from monoforce_ros.training.losses import (
 )
 from monoforce_ros.training.recording_samples import RecordingSamples
 from monoforce_ros.training.samples import Augmentation, Targets, sample
+from monoforce_ros.training.training_state import RENAMED_WEIGHTS, TrainingError, read_state, save_state
 
-BACKBONE_PARTS = ("none", "late", "all")
-"""Parts of the backbone that can be trained; ``late``: the stages at stride 16. Norms are trained with ``all`` only."""
+BACKBONE_PARTS = ("none", "late", "all", "map")
+"""Parts of the backbone that can be trained; ``late``: the stages at stride 16. Norms are trained with ``all`` only.
+``map``: nothing before the map is trained, neither the backbone nor what follows it up to the lift."""
 
 
 @dataclass(frozen=True)
@@ -84,10 +82,6 @@ class TrainingSettings:
             raise ValueError(f"training backbone: got {self.backbone!r}, expected one of {', '.join(BACKBONE_PARTS)}")
         if self.precision not in ("auto", "float32", "bfloat16"):
             raise ValueError(f"training precision: got {self.precision!r}, expected auto, float32 or bfloat16")
-
-
-class TrainingError(RuntimeError):
-    """Training cannot start or continue; the message gives the reason."""
 
 
 @dataclass(frozen=True)
@@ -201,7 +195,9 @@ class Trainer:
         self.index = [(r, i) for r, recording in enumerate(self.recordings) for i in range(len(recording))]
         if not self.index:
             raise TrainingError("no samples to train on")
-        if isinstance(encoder, TerrainEncoder) and settings.backbone != "all":
+        if isinstance(encoder, TerrainEncoder) and settings.backbone == "map":
+            encoder.freeze_images()
+        elif isinstance(encoder, TerrainEncoder) and settings.backbone != "all":
             encoder.freeze_backbone(early_only=settings.backbone == "late")
         losses = _Losses(self.encoder, robot, settings.weights)
         self.losses: nn.Module = losses
@@ -312,21 +308,11 @@ class Trainer:
 
     def save(self) -> None:
         """Save weights, the optimiser's moments and the step, from which :meth:`resume` continues."""
-        folder = self.out / "state"
-        tensors = {f"encoder.{name}": value for name, value in self.encoder.state_dict().items()}
-        names: dict[Tensor, str] = {parameter: name for name, parameter in self.encoder.named_parameters()}
-        for parameter, moments in self.optimiser.state.items():
-            for key, value in moments.items():
-                tensors[f"optimiser.{names[parameter]}.{key}"] = torch.as_tensor(value)
         description = {
             "step": self.step, "best": self.best, "history": self.described_history, "settings": asdict(self.settings),
             "config": asdict(self.encoder.config), "written": time.time(),
         }  # fmt: skip
-        with atomic_path(folder / "state.safetensors") as unfinished:
-            save_file(
-                {name: value.detach().cpu().contiguous() for name, value in tensors.items()}, str(unfinished),
-                metadata={"training": json.dumps(description)},
-            )  # fmt: skip
+        save_state(state_file(self.out), self.encoder, self.optimiser, description)
 
     @property
     def described_history(self) -> list[dict[str, float]]:
@@ -339,35 +325,9 @@ class Trainer:
         Raises:
             TrainingError: the state is damaged, or its network or settings differ.
         """
-        file = self.out / "state" / "state.safetensors"
-        if not file.is_file():
+        description = read_state(state_file(self.out), self.encoder, self.optimiser, asdict(self.settings))
+        if description is None:
             return False
-        from safetensors import safe_open
-
-        try:
-            with safe_open(str(file), framework="pt") as content:
-                description = json.loads((content.metadata() or {})["training"])
-            tensors = load_file(str(file))
-        except (SafetensorError, KeyError, ValueError, OSError) as error:
-            raise TrainingError(f"{file}: damaged ({error}); delete {file.parent} to start over") from error
-        expected, saved = json.loads(json.dumps(asdict(self.settings))), _renamed(description["settings"])
-        different = [name for name, value in expected.items() if saved.get(name) != value]
-        if description["config"] != asdict(self.encoder.config):
-            different.append("network configuration")
-        if different:
-            raise TrainingError(
-                f"{file}: saved with different {', '.join(different)}; use the same options, or another --out"
-            )
-        self.encoder.load_state_dict(
-            {name.removeprefix("encoder."): v for name, v in tensors.items() if name.startswith("encoder.")}
-        )
-        for name, parameter in self.encoder.named_parameters():
-            prefix = f"optimiser.{name}."
-            moments = {key.removeprefix(prefix): v for key, v in tensors.items() if key.startswith(prefix)}
-            if moments:
-                self.optimiser.state[parameter] = {
-                    key: v if key == "step" else v.to(self.process.device) for key, v in moments.items()
-                }
         self.step, self.best = description["step"], description["best"]
         self.history = [
             (e["step"], Validation(e["geometric"], e["supporting"], e["loss"])) for e in description["history"]
@@ -375,17 +335,9 @@ class Trainer:
         return True
 
 
-_RENAMED_WEIGHTS = {"standing": "prominence", "standing_decrease": "prominent_decrease"}
-"""Loss weights by the names of earlier releases."""
-
-
-def _renamed(settings: dict) -> dict:
-    """Saved settings of an earlier release under their names of today."""
-    settings = {"augment" if name == "vary" else name: value for name, value in settings.items()}
-    weights = settings.get("weights")
-    if isinstance(weights, dict):
-        settings["weights"] = {_RENAMED_WEIGHTS.get(name, name): value for name, value in weights.items()}
-    return settings
+def state_file(out: Path) -> Path:
+    """File in a training's folder that an interrupted training continues from."""
+    return out / "state" / "state.safetensors"
 
 
 @torch.no_grad()
@@ -420,7 +372,7 @@ def describe(config: EncoderConfig, settings: TrainingSettings, recordings: Sequ
     current = asdict(settings)
     # Also under the names of earlier releases.
     current["vary"] = current["augment"]
-    current["weights"] |= {old: current["weights"][new] for old, new in _RENAMED_WEIGHTS.items()}
+    current["weights"] |= {old: current["weights"][new] for old, new in RENAMED_WEIGHTS.items()}
     return {
         "config": asdict(config),
         "settings": current,
