@@ -245,7 +245,7 @@ def _train(options: argparse.Namespace, process: Process) -> None:
     encoder = _encoder(options, config)
     if options.depth_steps and process.first and not state_file(options.out).is_file():
         _train_depth(encoder, training, options)
-    if process.count > 1:
+    if options.depth_steps and process.count > 1:
         torch.distributed.barrier()
     trainer = Trainer(encoder, robot, training, validation, options.out, settings, process)
     resumed = trainer.resume()
