@@ -4,13 +4,14 @@ import time
 
 import numpy as np
 import pytest
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from nav_msgs.msg import OccupancyGrid
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image
 
 from monoforce_ros.bags import BagReader, BagWriter, builders
 from monoforce_ros.core import pose_matrix
-from monoforce_ros.messages import message_class
+from monoforce_ros.messages import encoding, message_class
 from monoforce_ros.messages.decoding import stamp_of
 from monoforce_ros.nodes.frames import TransformListener
 
@@ -143,6 +144,32 @@ def test_no_tf_is_derived_on_request(start, peer, tf_type, tmp_path):
     transforms = TransformListener(peer.node)
     assert finish(peer, player) == 0
     assert transforms.tree.find("odom", "base_link") is None
+
+
+def test_latched_topics_reach_late_subscribers_also_after_recording_anew(start, peer, tmp_path):
+    """A map, as Nav2's static layer subscribes to it, published once before the part that is played."""
+    with BagWriter(tmp_path / "maps") as writer:
+        for second in range(3):
+            data = encoding.occupancy_grid(
+                START + second, "map", 0.1, (0.0, 0.0, 0.0), np.full((2, 2), second, np.int8)
+            )
+            writer.write_serialized("/map", "nav_msgs/msg/OccupancyGrid", data, START + second, latched=True)
+        for tick in range(60):
+            at = START + 10**9 + tick * 50_000_000
+            writer.write("/cmd_vel", builders.twist(0.1, 0), at)
+    player = start("bag_player", tmp_path / "maps", "--start", "1", "--wait", "0", "--loop", "--quiet")
+    player.wait_for("playing")
+    recorder = start("bag_recorder", tmp_path / "again", "--topics", "map")
+    recorder.wait_for("recording /map")
+    grids = []
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    subscription = peer.node.create_subscription(OccupancyGrid, "/map", grids.append, latched)
+    assert peer.until(lambda: grids, 15.0)
+    assert set(grids[-1].data) == {2}
+    peer.node.destroy_subscription(subscription)
+    assert player.stop() == 0 and recorder.stop() == 0
+    with BagReader(tmp_path / "again") as bag:
+        assert bag.latched == {"/map"} and bag.counts["/map"] >= 1
 
 
 def damaged(bag, tmp_path, damage):

@@ -149,6 +149,38 @@ def test_stamps_of_zero(peer, predictor):
     refused(peer, predictor, "lidar", "stamps are zero", cloud=bad)
 
 
+def test_odometry_with_stamps_of_zero(peer, predictor):
+    bad = lambda stamp: builders.odometry(0, "odom", "base_link", [1, 2, 0.3], [0, 0, 0, 1], [0] * 3, [0] * 3)  # noqa: E731
+    refused(peer, predictor, "odometry", "the stamps are zero: the state estimator does not set them", odometry=bad)
+
+
+@pytest.mark.parametrize(("offset", "text"), [(-2.0, "before the odometry and ignored"), (50.0, "after the odometry")])
+def test_commands_of_another_clock_are_reported(peer, predictor, offset, text):
+    """A laptop that drives the robot, its clock off: the robot would be predicted to stand, without a word."""
+    healthy(peer, predictor)
+    peer.begin()
+    shift = round(1e9 * offset)
+    peer.drive(1.4, command=lambda stamp: builders.twist_stamped(stamp + shift, "base_link", 0.5, 0.0))
+    assert peer.until(lambda: text in (peer.status("commands") or (0, ""))[1], 5.0), peer.status("commands")
+    level, message = peer.status("commands")
+    stated = float(message.removeprefix("commands are stamped ").split()[0])
+    assert level == WARN and stated == pytest.approx(abs(offset), abs=0.7)
+    healthy(peer, predictor)
+    assert peer.until(lambda: peer.status("commands") == (OK, "receiving commands"), 3.0)
+
+
+def test_clouds_in_the_odometry_frame_are_used(peer, predictor):
+    healthy(peer, predictor)
+    peer.settle()
+    peer.begin()
+    moved = ground_cloud() + np.float32([1.0, 2.0, 0.3 + 0.65])
+    peer.drive(1.6, cloud=lambda stamp: builders.point_cloud(stamp, "odom", moved))
+    assert peer.until(lambda: len(peer.received["/predicted/terrain"]) > 1, 5.0), peer.status("lidar")
+    terrain = peer.received["/predicted/terrain"][-1]
+    values = np.frombuffer(terrain.data, "<f4").reshape(-1, len(terrain.fields))
+    np.testing.assert_allclose(values[values[:, 7] > 0.5, 2], 0.3 - 0.1323, atol=0.01)
+
+
 def test_odometry_that_stops(peer, predictor):
     refused(peer, predictor, "odometry", "no messages for", seconds=2.5, odometry=lambda stamp: None)
 

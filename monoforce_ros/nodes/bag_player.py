@@ -17,11 +17,18 @@ from rosgraph_msgs.msg import Clock
 from monoforce_ros.bags import BagError, BagMessage, BagReader, type_store
 from monoforce_ros.core import share_directory
 from monoforce_ros.messages import message_class, missing_package
-from monoforce_ros.nodes.arguments import NodeArgumentParser, own_arguments, seconds
+from monoforce_ros.nodes.arguments import (
+    NodeArgumentParser,
+    idle_remappings,
+    own_arguments,
+    refuse_given_parameters,
+    seconds,
+)
 from monoforce_ros.nodes.frames import TRANSFORMS
 from monoforce_ros.nodes.odometry_transform import odometry_transform
 from monoforce_ros.nodes.parameters import refuse_unknown_parameters
 from monoforce_ros.nodes.process import initialise
+from monoforce_ros.nodes.schema import nearest
 from monoforce_ros.reporting import progress_bar
 
 # Fast DDS 2 (Jazzy) reads the first, Fast DDS 3 the second.
@@ -65,23 +72,31 @@ class BagPlayer(Node):
         self.bag = bag
         self.options = options
         self.playable: dict[str, Publisher] = {}
+        # Names in a bag are absolute; a name without its first slash is meant for one of them.
+        wanted = {f"/{topic.lstrip('/')}" for topic in options.topics} if options.topics else None
+        missing = sorted((wanted or set()) - set(bag.topics))
+        if missing:
+            meant = nearest(missing[0], bag.topics)
+            raise BagError(f"{bag.path} has no topics {missing}{meant or ';'} its topics are {sorted(bag.topics)}")
+        if 1e9 * options.start > bag.end - bag.start:
+            raise BagError(f"--start: got {options.start:g} s, but {bag.path} lasts {bag.duration:.1f} s")
         for topic, message_type in bag.topics.items():
-            if options.topics and topic not in options.topics:
+            if wanted is not None and topic not in wanted:
+                continue
+            if topic == "/clock" and options.clock:
+                self.get_logger().info("the bag's own /clock is not played: --clock publishes the time of reception")
                 continue
             message_type_class = message_class(message_type)
             if message_type_class is None:
                 self.get_logger().warning(f"{topic} is not played: {missing_package(message_type)}")
                 continue
-            latched = _is_static(topic)
+            latched = topic in bag.latched
             quality = QoSProfile(
-                depth=100 if latched else 10,
+                depth=100 if _is_static(topic) else 1 if latched else 10,
                 reliability=ReliabilityPolicy.RELIABLE,
                 durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
             )
             self.playable[topic] = self.create_publisher(message_type_class, topic, quality)
-        missing = sorted(set(options.topics or ()) - set(bag.topics))
-        if missing:
-            raise BagError(f"{bag.path} has no topics {missing}; its topics are {sorted(bag.topics)}")
         self.clock = self.create_publisher(Clock, "/clock", 10) if options.clock else None
         self._odometry, self._transforms = self._prepare_transforms()
 
@@ -121,10 +136,16 @@ class BagPlayer(Node):
                 break
         return published
 
-    def _publish_earlier_transforms(self, start: int) -> None:
-        """Publish the static transforms before the start: they hold from then on."""
-        static = [topic for topic in self.playable if _is_static(topic)]
-        for message in self.bag.messages(static, stop=start) if static and start > self.bag.start else ():
+    def _publish_earlier(self, start: int) -> None:
+        """Publish what holds since before the start: all static transforms, and the last message of latched topics."""
+        latched = self.bag.latched & set(self.playable)
+        last: dict[str, BagMessage] = {}
+        for message in self.bag.messages(latched, stop=start) if latched and start > self.bag.start else ():
+            if _is_static(message.topic):
+                self.playable[message.topic].publish(message.cdr())
+            else:
+                last[message.topic] = message
+        for message in last.values():
             self.playable[message.topic].publish(message.cdr())
 
     def _publish_pose(self, message: BagMessage) -> None:
@@ -140,7 +161,7 @@ class BagPlayer(Node):
 
     def _play_once(self) -> int:
         start = self.bag.start + int(self.options.start * 1e9)
-        self._publish_earlier_transforms(start)
+        self._publish_earlier(start)
         length = self.options.duration if self.options.duration is not None else (self.bag.end - start) * 1e-9
         stop = start + int(length * 1e9)
         published = 0
@@ -190,13 +211,14 @@ def main(arguments: list[str] | None = None) -> int:
     for variable in _PROFILES:
         os.environ.setdefault(variable, str(share_directory() / "config" / "fastdds_large_messages.xml"))
     try:
+        refuse_given_parameters(command_line, "bag_player")
         initialise(command_line, SignalHandlerOptions.ALL)
         with BagReader(options.bag or share_directory() / "bags" / "demo") as bag:
             player = BagPlayer(bag, options)
             player.get_logger().info(
                 f"playing {bag.path}: {bag.duration:.1f} s, {len(player.playable)} topics, {bag.message_count} messages"
             )
-            for warning in bag.warnings:
+            for warning in (*bag.warnings, *idle_remappings(command_line, player)):
                 player.get_logger().warning(warning)
             published = player.play()
             player.get_logger().info(f"published {published} messages")

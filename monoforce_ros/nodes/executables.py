@@ -10,6 +10,8 @@ import importlib
 import signal
 from types import FrameType
 
+from monoforce_ros.nodes.schema import SCHEMAS
+
 
 def _end(number: int, frame: FrameType | None) -> None:
     raise SystemExit(0)
@@ -18,6 +20,11 @@ def _end(number: int, frame: FrameType | None) -> None:
 def _run(name: str, arguments: list[str] | None) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _end)
+    # A wrong command line is answered before the node loads torch.
+    if name in SCHEMAS:
+        early: int | None = importlib.import_module("monoforce_ros.nodes.process").answered(name, arguments)
+        if early is not None:
+            return early
     # rclpy replaces these handlers when the node initialises it.
     status: int = importlib.import_module(f"monoforce_ros.nodes.{name}").main(arguments)
     return status

@@ -14,10 +14,15 @@ from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from monoforce_ros.nodes.schema import SCHEMAS, ParameterEntry, ParameterValue, nearest, read_schema, schema_path
+from monoforce_ros.nodes.schema import (
+    OF_EVERY_NODE,
+    ParameterEntry,
+    ParameterValue,
+    nearest,
+    no_parameters,
+    parameter_owners,
+)
 
-_OF_EVERY_NODE = ("use_sim_time", "start_type_description_service", "qos_overrides.")
-"""Parameters that rclpy itself declares or understands; the last one is a prefix."""
 _SOMETIMES = "read-only while the node is configured"
 
 
@@ -56,16 +61,14 @@ def refuse_unknown_parameters(node: Node, entries: Iterable[ParameterEntry] = ()
     Parameters of the package's other nodes are only logged: several nodes may share a file with the key ``/**``.
     """
     known = {name for entry in entries for name in (entry.name, entry.formerly) if name}
-    others = {entry.name: other for other in SCHEMAS for entry in read_schema(schema_path(other))}
+    others = parameter_owners()
     unused = []
     # rclpy keeps the values given on the command line and in files only here.
     for name in node._parameter_overrides:
-        if name in known or name.startswith(_OF_EVERY_NODE):
+        if name in known or name.startswith(OF_EVERY_NODE):
             continue
-        if not known:
-            raise ValueError(
-                f"unknown parameter {name!r}: {node.get_name()} has no parameters; --help lists its options"
-            )
+        if name not in others and not known:
+            raise ValueError(f"unknown parameter {name!r}: {no_parameters(node.get_name())}")
         if name not in others:
             meant = nearest(name, known | {"use_sim_time"})
             raise ValueError(f"unknown parameter {name!r}{meant or ';'} --help lists all parameters")

@@ -18,6 +18,9 @@ ParameterValue = bool | int | float | str | list[float] | list[str]
 SCHEMAS = ("predictor", "path_selector")
 """Nodes with a schema: ``config/NAME.schema.yaml``."""
 
+OF_EVERY_NODE = ("use_sim_time", "start_type_description_service", "qos_overrides.")
+"""Parameters that rclpy itself declares or understands; the last one is a prefix."""
+
 _ELEMENTS = {"double_array": "double", "string_array": "string"}
 _WORDS = {"bool": "true or false", "integer": "an integer", "double": "a number", "string": "text"}
 
@@ -123,6 +126,16 @@ def read_schema(path: Path) -> list[ParameterEntry]:
         ParameterEntry(name, **{"default": None, **entry, "choices": tuple(entry.get("choices", ()))})
         for name, entry in content.items()
     ]
+
+
+def parameter_owners() -> dict[str, str]:
+    """Node of each parameter; a parameter of several nodes counts for the last of them."""
+    return {entry.name: node for node in SCHEMAS for entry in read_schema(schema_path(node))}
+
+
+def no_parameters(node: str) -> str:
+    """The answer to a parameter for a node that has none, only options."""
+    return f"{node} has no parameters; --help lists its options"
 
 
 def most_similar(name: str, known: Iterable[str]) -> list[str]:
