@@ -7,6 +7,7 @@ import pytest
 import torch
 from conftest import ROOT
 
+from monoforce_ros.core import OptionParser
 from monoforce_ros.nodes.arguments import (
     check_parameter_files,
     own_arguments,
@@ -14,6 +15,9 @@ from monoforce_ros.nodes.arguments import (
     refuse_other_nodes,
     refuse_stray_arguments,
 )
+
+# Starts and refusals: how long they take does not matter.
+pytestmark = pytest.mark.unhurried
 
 KNOWN = ("robot", "terrain_source", "rate")
 
@@ -115,6 +119,10 @@ def test_what_is_for_a_node_of_another_name_is_refused(words, right):
         ("bag_player --topics /odm", "has no topics ['/odm']; did you mean '/odom'? its topics are"),
         ("predictor --ros-args -p robot:=5", "parameter robot: got 5, expected string"),
         ("predictor --ros-args -p horizon:=-1.0", "parameter horizon: got -1.0, expected double 0.1 … 30 s"),
+        (
+            "path_selector --ros-args -p timeout:=1",
+            "parameter timeout: got 1, expected double 0.05 … 10 s: write 1.0",
+        ),
         ("path_selector --ros-args -p max_sped:=1.0", "unknown parameter 'max_sped'; --help lists all parameters"),
         ("predictor --ros-args -p odometry_topic:=odom!", "got 'odom!', expected a topic such as '/odom': topic name"),
         ("path_selector --ros-args --params-file {repeated}", "has '/**' twice, again in line 4: merge both into one"),
@@ -183,6 +191,32 @@ def test_a_remapping_that_renames_nothing_is_reported(start):
     process.wait_for("-r odm:=/husky/odometry renames nothing: /left/path_selector has no topic /left/odm")
     assert process.output.count("renames nothing") == 1
     assert process.stop() == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "answer"),
+    [
+        (["--robto=husky"], "unrecognized arguments: --robto=husky; did you mean '--robot'?"),
+        (["--rob=husky"], "unrecognized arguments: --rob=husky; did you mean '--robot'?"),
+        (["rough", "--secnds", "3"], "unrecognized arguments: --secnds 3; did you mean '--seconds'?"),
+    ],
+)
+def test_tools_name_the_nearest_option_and_take_no_abbreviation(capsys, words, answer):
+    parser = OptionParser(prog="tool")
+    parser.add_argument("--robot")
+    parser.add_subparsers().add_parser("rough").add_argument("--seconds")
+    with pytest.raises(SystemExit):
+        parser.parse_args(words)
+    assert answer in capsys.readouterr().err
+
+
+def test_every_tool_uses_this_parser():
+    plain = [
+        path.name
+        for path in (ROOT / "monoforce_ros").rglob("*.py")
+        if "argparse.ArgumentParser(" in path.read_text() and path.name != "command_line.py"
+    ]
+    assert plain == []
 
 
 def test_a_wrong_command_line_is_answered_before_torch_is_loaded():

@@ -8,27 +8,13 @@ import sys
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import NoReturn, override
 
 from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
 
+from monoforce_ros.core import most_similar, nearest
 from monoforce_ros.nodes.parameter_files import read_sections, refuse_misnamed_sections, section_matches
-from monoforce_ros.nodes.schema import OF_EVERY_NODE, most_similar, nearest, no_parameters, parameter_owners
-
-
-class NodeArgumentParser(argparse.ArgumentParser):
-    """An argument parser that refuses abbreviations and names the most similar option for an unknown one."""
-
-    def __init__(self, *, prog: str, description: str):
-        super().__init__(prog=prog, description=description, allow_abbrev=False)
-
-    @override
-    def error(self, message: str) -> NoReturn:
-        unknown = message.removeprefix("unrecognized arguments: ").split()
-        if message.startswith("unrecognized arguments: "):
-            message += nearest(unknown[0].split("=")[0], self._option_string_actions)
-        super().error(message)
+from monoforce_ros.nodes.schema import OF_EVERY_NODE, no_parameters, parameter_owners
 
 
 def seconds(text: str) -> float:

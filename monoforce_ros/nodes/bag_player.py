@@ -15,10 +15,9 @@ from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 
 from monoforce_ros.bags import BagError, BagMessage, BagReader, type_store
-from monoforce_ros.core import share_directory
+from monoforce_ros.core import OptionParser, nearest, share_directory
 from monoforce_ros.messages import message_class, missing_package
 from monoforce_ros.nodes.arguments import (
-    NodeArgumentParser,
     idle_remappings,
     own_arguments,
     refuse_given_parameters,
@@ -28,7 +27,6 @@ from monoforce_ros.nodes.frames import TRANSFORMS
 from monoforce_ros.nodes.odometry_transform import odometry_transform
 from monoforce_ros.nodes.parameters import refuse_unknown_parameters
 from monoforce_ros.nodes.process import initialise
-from monoforce_ros.nodes.schema import nearest
 from monoforce_ros.reporting import progress_bar
 
 # Fast DDS 2 (Jazzy) reads the first, Fast DDS 3 the second.
@@ -36,7 +34,7 @@ _PROFILES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 
 
 def _arguments(arguments: list[str]) -> argparse.Namespace:
-    parser = NodeArgumentParser(
+    parser = OptionParser(
         prog="bag_player", description="Publish the messages of a bag (ROS 2 or ROS 1) with their recorded timing."
     )
     parser.add_argument("bag", nargs="?", help="rosbag2 folder or ROS 1 .bag file (default: the demo bag)")

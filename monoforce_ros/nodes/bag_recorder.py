@@ -13,15 +13,16 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from monoforce_ros.bags import BagWriter
+from monoforce_ros.core import OptionParser
 from monoforce_ros.messages import message_class, missing_package
-from monoforce_ros.nodes.arguments import NodeArgumentParser, own_arguments, refuse_given_parameters, topic_name
+from monoforce_ros.nodes.arguments import own_arguments, refuse_given_parameters, topic_name
 from monoforce_ros.nodes.clocks import STEADY
 from monoforce_ros.nodes.parameters import refuse_unknown_parameters
 from monoforce_ros.nodes.process import initialise
 
 
 def _arguments(arguments: list[str]) -> argparse.Namespace:
-    parser = NodeArgumentParser(
+    parser = OptionParser(
         prog="bag_recorder", description="Record topics into a rosbag2 bag until interrupted (SIGINT or SIGTERM)."
     )
     parser.add_argument("out", help="folder of the bag; must not exist")

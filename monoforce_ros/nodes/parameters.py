@@ -14,11 +14,11 @@ from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from monoforce_ros.core import nearest
 from monoforce_ros.nodes.schema import (
     OF_EVERY_NODE,
     ParameterEntry,
     ParameterValue,
-    nearest,
     no_parameters,
     parameter_owners,
 )
@@ -106,7 +106,10 @@ def _declare(
     except (InvalidParameterTypeException, InvalidParameterValueException) as error:
         expected = f"{entry.type} {entry.range_text}".strip()
         got = node._parameter_overrides[name].value if name in node._parameter_overrides else default
-        raise ValueError(f"parameter {name}: got {got!r}, expected {expected} {entry.unit}".rstrip()) from error
+        text = f"parameter {name}: got {got!r}, expected {expected} {entry.unit}".rstrip()
+        # ROS takes no integer for a floating-point number.
+        whole = entry.type == "double" and isinstance(got, int) and not isinstance(got, bool)
+        raise ValueError(f"{text}: write {got}.0" if whole else text) from error
     if (value is not None or name == entry.name) and (reason := complaint(entry, value)):
         raise ValueError(f"parameter {name}: {reason}")
     return value

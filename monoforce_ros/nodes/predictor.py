@@ -120,6 +120,7 @@ class PredictorNode(ManagedNode):
             continues = settings.flipper_motion == "continue"
             self.joints = JointInput(self.robot, continues=continues, timeout=settings.odometry_timeout)
         self._arrivals: dict[str, float] = {}
+        self._motion_arrival = 0.0
         self._started = time.monotonic()
         self._predictions = 0
         self._last_prediction = self._started
@@ -291,6 +292,7 @@ class PredictorNode(ManagedNode):
                 self.health.report("odometry", ERROR, self.transforms.explained(error), reason="frame")
             return
         self.inputs.add_motion("odometry", state.of_base(pose), frame_id, child_frame_id)
+        self._motion_arrival = time.monotonic()
         self.health.report("odometry", OK, "receiving odometry")
 
     def _on_command(self, message: Twist | TwistStamped) -> None:
@@ -313,14 +315,14 @@ class PredictorNode(ManagedNode):
 
     def _command_clock(self, stamp: int) -> str:
         """Why a command that has just arrived cannot take effect: its stamp is of another clock; empty if it can."""
-        odometry, arrival = self.inputs.motion_stamp, self._arrivals.get("odometry")
-        if not stamp or not odometry or arrival is None:
+        odometry = self.inputs.motion_stamp
+        if not stamp or not odometry:
             return ""
-        silence, limit = time.monotonic() - arrival, self.settings.command_timeout
+        silence, limit = time.monotonic() - self._motion_arrival, self.settings.command_timeout
         late = (odometry - stamp) * NANOSECOND
         if late > limit:
             what = f"are stamped {late:.1f} s before the odometry and ignored (command_timeout: {limit:g} s)"
-        elif silence < self.settings.data_timeout and -late - silence > TIME_JUMP * NANOSECOND:
+        elif silence < 0.5 * self.settings.data_timeout and -late - silence > TIME_JUMP * NANOSECOND:
             what = f"are stamped {-late - silence:.1f} s after the odometry and take effect only then"
         else:
             return ""
