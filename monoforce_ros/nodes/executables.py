@@ -10,7 +10,8 @@ import importlib
 import signal
 from types import FrameType
 
-from monoforce_ros.nodes.schema import SCHEMAS
+_ANSWERED_EARLY = ("predictor", "path_selector")
+"""Nodes with nothing but ROS arguments on their command line, which is checked before torch is loaded."""
 
 
 def _end(number: int, frame: FrameType | None) -> None:
@@ -20,8 +21,7 @@ def _end(number: int, frame: FrameType | None) -> None:
 def _run(name: str, arguments: list[str] | None) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _end)
-    # A wrong command line is answered before the node loads torch.
-    if name in SCHEMAS:
+    if name in _ANSWERED_EARLY:
         early: int | None = importlib.import_module("monoforce_ros.nodes.process").answered(name, arguments)
         if early is not None:
             return early
