@@ -17,7 +17,7 @@ from monoforce_ros.nodes.arguments import (
 )
 
 # Starts and refusals: how long they take does not matter.
-pytestmark = pytest.mark.unhurried
+pytestmark = pytest.mark.unhurried_nodes
 
 KNOWN = ("robot", "terrain_source", "rate")
 

@@ -87,7 +87,7 @@ def test_rate_start_duration_topics_and_clock(start, peer, bag):
     assert times[0] == START + 10**9 and times[-1] == START + 2 * 10**9
 
 
-@pytest.mark.unhurried
+@pytest.mark.unhurried_nodes
 def test_a_loop_goes_on_until_interrupted(start, peer, bag):
     images = Listener(peer, Image, "/camera/image_raw")
     player = start("bag_player", bag, "--loop", "--rate", "10", "--duration", "0.5", "--wait", "10", "--quiet")
@@ -119,7 +119,7 @@ def write_motion(path, *, tf: bool, namespace: str = ""):
     return path
 
 
-@pytest.mark.unhurried
+@pytest.mark.unhurried_nodes
 @pytest.mark.parametrize("tf", [True, False])
 def test_transforms_are_played_or_derived_from_odometry(start, peer, tf_type, tmp_path, tf):
     player = start("bag_player", write_motion(tmp_path / "bag", tf=tf), "--start", "2", "--wait", "10", "--quiet")
@@ -131,7 +131,7 @@ def test_transforms_are_played_or_derived_from_odometry(start, peer, tf_type, tm
     assert transforms.tree.find("odom", "base_link")[0, 3] == pytest.approx(7.0 if tf else 5.9)
 
 
-@pytest.mark.unhurried
+@pytest.mark.unhurried_nodes
 def test_transforms_of_a_robot_with_its_own_tf_stay_together(start, peer, tf_type, tmp_path):
     bag = write_motion(tmp_path / "bag", tf=False, namespace="/left")
     received = Listener(peer, tf_type, "/left/tf")
@@ -142,7 +142,7 @@ def test_transforms_of_a_robot_with_its_own_tf_stay_together(start, peer, tf_typ
     received.close()
 
 
-@pytest.mark.unhurried
+@pytest.mark.unhurried_nodes
 def test_no_tf_is_derived_on_request(start, peer, tf_type, tmp_path):
     player = start("bag_player", write_motion(tmp_path / "bag", tf=False), "--no-tf", "--rate", "5", "--quiet")
     transforms = TransformListener(peer.node)
@@ -150,7 +150,7 @@ def test_no_tf_is_derived_on_request(start, peer, tf_type, tmp_path):
     assert transforms.tree.find("odom", "base_link") is None
 
 
-@pytest.mark.unhurried
+@pytest.mark.unhurried_nodes
 def test_latched_topics_reach_late_subscribers_also_after_recording_anew(start, peer, tmp_path):
     """A map, as Nav2's static layer subscribes to it, published once before the part that is played."""
     with BagWriter(tmp_path / "maps") as writer:
@@ -191,7 +191,7 @@ def cut(path, size):
     file.write_bytes(file.read_bytes()[:size])
 
 
-@pytest.mark.unhurried
+@pytest.mark.unhurried_nodes
 def test_an_unreadable_bag_is_refused_in_one_line(start, bag, tmp_path):
     player = start("bag_player", damaged(bag, tmp_path, lambda path: cut(path, 30)), "--quiet", "--wait", "0")
     assert player.wait(30) == 1
@@ -199,7 +199,7 @@ def test_an_unreadable_bag_is_refused_in_one_line(start, bag, tmp_path):
     assert len(lines) == 1 and "cannot be read" in lines[0] and "Traceback" not in player.output
 
 
-@pytest.mark.unhurried
+@pytest.mark.unhurried_nodes
 @pytest.mark.parametrize(
     "damage",
     [
@@ -219,7 +219,7 @@ def test_the_readable_part_of_a_damaged_bag_is_played_with_a_warning(start, peer
     assert "no usable index" in player.output and "Traceback" not in player.output
 
 
-@pytest.mark.unhurried
+@pytest.mark.unhurried_nodes
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [(["--topics", "/nothing"], "has no topics ['/nothing']"), (["--rate", "0"], "--rate: got 0.0")],
@@ -230,7 +230,7 @@ def test_wrong_arguments_are_reported(start, bag, arguments, message):
     assert message in player.output and "Traceback" not in player.output
 
 
-@pytest.mark.unhurried
+@pytest.mark.unhurried_nodes
 def test_the_recorder_writes_the_received_messages(start, peer, tmp_path):
     recorder = start("bag_recorder", tmp_path / "out", "--topics", "cmd_vel", "/odom", "odmo")
     sent = 0

@@ -14,7 +14,7 @@ from monoforce_ros.core import share_directory
 from monoforce_ros.encoder.checkpoint import shipped_checkpoint
 
 # What remains of a process that was killed does not depend on when.
-pytestmark = pytest.mark.unhurried
+pytestmark = pytest.mark.unhurried_nodes
 
 START = 1_700_000_000_000_000_000
 

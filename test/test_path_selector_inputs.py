@@ -17,7 +17,7 @@ from monoforce_ros.nodes.progress_check import ProgressCheck
 from monoforce_ros.planning import WAYPOINTS, plan_target
 
 # Every test waits for a state, for as long as it takes, and the robot's world goes at the pace of the test.
-pytestmark = pytest.mark.unhurried
+pytestmark = pytest.mark.unhurried_nodes
 
 BEST_EFFORT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 OK, WARN = 0, 1

@@ -59,7 +59,7 @@ def test_outputs_carry_the_stamp_and_frame_of_their_input(peer, predictor):
     assert abs(first_time.z - (0.3 - 0.14)) < 0.05
 
 
-@pytest.mark.unhurried
+@pytest.mark.unhurried_nodes
 def test_the_first_prediction_is_logged_and_inputs_are_visible_before_they_are_published(peer, start):
     process = start("predictor", "--ros-args", "-r", "__ns:=/apart", "-p", "terrain_source:=lidar_camera")
     process.wait_for("predicting 5 s ahead for husky")
@@ -262,14 +262,14 @@ def test_ends_cleanly_on_an_interrupt(predictor):
     assert "Traceback" not in predictor.output
 
 
-@pytest.mark.unhurried
+@pytest.mark.unhurried_nodes
 def test_a_termination_ends_it_cleanly_too(start):
     process = start("predictor", "--ros-args", "-p", "terrain_source:=flat")
     process.wait_for("with terrain from flat")
     assert process.stop(signal.SIGTERM) == 0
 
 
-@pytest.mark.unhurried
+@pytest.mark.unhurried_nodes
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
