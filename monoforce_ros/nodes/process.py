@@ -7,7 +7,6 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 from types import FrameType
-from typing import NoReturn
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -49,8 +48,8 @@ def run_node[NodeType: Node](
         make_node: creates the node; called after rclpy is initialised.
         arguments: arguments of the command line.
         work: spins the node; the default only processes callbacks.
-        at_the_end: called at the end, also on SIGINT and SIGTERM, while the node can still publish. rclpy's handling of
-            signals would end that at once. Python's waits for the next callback: the node needs a fast timer.
+        at_the_end: called at the end, also on SIGINT and SIGTERM, while the node can still publish, which rclpy's own
+            handling of signals would end at once. Only for the default ``work``.
 
     Returns:
         exit status: 0 after a regular end, 1 if the node could not start (its ``ValueError`` or ``OSError``, or an
@@ -62,8 +61,7 @@ def run_node[NodeType: Node](
     try:
         try:
             if at_the_end is not None:
-                for number in (signal.SIGINT, signal.SIGTERM):
-                    signal.signal(number, _interrupt)
+                _handle_signals(_interrupt)
             initialise(arguments, None if at_the_end is None else SignalHandlerOptions.NO)
             node = make_node()
             full_name = node.get_fully_qualified_name()
@@ -79,7 +77,10 @@ def run_node[NodeType: Node](
         for warning in warnings:
             node.get_logger().warning(warning)
         _watch_remappings(words, node)
-        work(node, executor)
+        if at_the_end is None:
+            work(node, executor)
+        else:
+            _spin_until_signalled(executor)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except Exception:
@@ -99,8 +100,28 @@ def run_node[NodeType: Node](
     return 0
 
 
-def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
+def _handle_signals(handler: Callable[[int, FrameType | None], None]) -> None:
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, handler)
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
     raise KeyboardInterrupt
+
+
+def _spin_until_signalled(executor: SingleThreadedExecutor) -> None:
+    """Process callbacks until a signal comes, and return between two of them. A second signal interrupts at once."""
+    signalled = False
+
+    def end(number: int, frame: FrameType | None) -> None:
+        nonlocal signalled
+        if signalled:
+            raise KeyboardInterrupt
+        signalled = True
+
+    _handle_signals(end)
+    while rclpy.ok() and not signalled:
+        executor.spin_once(timeout_sec=0.1)
 
 
 def _watch_remappings(words: list[str], node: Node) -> None:
