@@ -123,6 +123,10 @@ def test_what_is_for_a_node_of_another_name_is_refused(words, right):
             "path_selector --ros-args -p timeout:=1",
             "parameter timeout: got 1, expected double 0.05 … 10 s: write 1.0",
         ),
+        (
+            "path_selector --ros-args -p use_sim_times:=true",
+            "unknown parameter 'use_sim_times'; did you mean 'use_sim_time'?",
+        ),
         ("path_selector --ros-args -p max_sped:=1.0", "unknown parameter 'max_sped'; --help lists all parameters"),
         ("predictor --ros-args -p odometry_topic:=odom!", "got 'odom!', expected a topic such as '/odom': topic name"),
         ("path_selector --ros-args --params-file {repeated}", "has '/**' twice, again in line 4: merge both into one"),

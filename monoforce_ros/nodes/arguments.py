@@ -14,7 +14,7 @@ from rclpy.node import Node
 
 from monoforce_ros.core import most_similar, nearest
 from monoforce_ros.nodes.parameter_files import read_sections, refuse_misnamed_sections, section_matches
-from monoforce_ros.nodes.schema import OF_EVERY_NODE, no_parameters, parameter_owners
+from monoforce_ros.nodes.schema import no_parameters, of_every_node, parameter_owners
 
 
 def seconds(text: str) -> float:
@@ -138,7 +138,7 @@ def refuse_given_parameters(arguments: Sequence[str], node: str, known: Iterable
         name = before.rpartition(":")[2]
         if option not in ("-p", "--param") or not sign:
             continue
-        if name in known or name.startswith(OF_EVERY_NODE):
+        if name in known or of_every_node(name):
             continue
         if not known:
             raise ValueError(f"unknown parameter {name!r}: {no_parameters(node)}")

@@ -16,10 +16,10 @@ from rclpy.parameter import Parameter
 
 from monoforce_ros.core import nearest
 from monoforce_ros.nodes.schema import (
-    OF_EVERY_NODE,
     ParameterEntry,
     ParameterValue,
     no_parameters,
+    of_every_node,
     parameter_owners,
 )
 
@@ -65,7 +65,7 @@ def refuse_unknown_parameters(node: Node, entries: Iterable[ParameterEntry] = ()
     unused = []
     # rclpy keeps the values given on the command line and in files only here.
     for name in node._parameter_overrides:
-        if name in known or name.startswith(OF_EVERY_NODE):
+        if name in known or of_every_node(name):
             continue
         if name not in others and not known:
             raise ValueError(f"unknown parameter {name!r}: {no_parameters(node.get_name())}")

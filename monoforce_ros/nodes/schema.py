@@ -16,9 +16,6 @@ ParameterValue = bool | int | float | str | list[float] | list[str]
 SCHEMAS = ("predictor", "path_selector")
 """Nodes with a schema: ``config/NAME.schema.yaml``."""
 
-OF_EVERY_NODE = ("use_sim_time", "start_type_description_service", "qos_overrides.")
-"""Parameters that rclpy itself declares or understands; the last one is a prefix."""
-
 _ELEMENTS = {"double_array": "double", "string_array": "string"}
 _WORDS = {"bool": "true or false", "integer": "an integer", "double": "a number", "string": "text"}
 
@@ -124,6 +121,11 @@ def read_schema(path: Path) -> list[ParameterEntry]:
         ParameterEntry(name, **{"default": None, **entry, "choices": tuple(entry.get("choices", ()))})
         for name, entry in content.items()
     ]
+
+
+def of_every_node(name: str) -> bool:
+    """Whether rclpy itself declares or understands a parameter."""
+    return name in ("use_sim_time", "start_type_description_service") or name.startswith("qos_overrides.")
 
 
 def parameter_owners() -> dict[str, str]:
