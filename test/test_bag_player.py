@@ -132,6 +132,23 @@ def test_transforms_are_played_or_derived_from_odometry(start, peer, tf_type, tm
 
 
 @pytest.mark.unhurried_nodes
+def test_a_tf_without_the_robot_s_pose_gets_it_from_the_odometry(start, peer, tf_type, tmp_path):
+    """A driver that publishes the angles of its wheels, and a state estimator that publishes odometry alone."""
+    with BagWriter(tmp_path / "bag") as writer:
+        for i in range(40):
+            at = START + i * 50_000_000
+            odometry = builders.odometry(at, "odom", "base_link", [0.1 * i, 0, 0], [0, 0, 0, 1], [0] * 3, [0] * 3)
+            writer.write("/odom", odometry, at)
+            wheel = {"wheel": pose_matrix([0.3, 0, 0, 0, 0.1 * i, 0])}
+            writer.write("/tf", builders.transforms(at, "base_link", wheel), at)
+    player = start("bag_player", tmp_path / "bag", "--wait", "10", "--quiet")
+    transforms = TransformListener(peer.node)
+    assert finish(peer, player) == 0
+    assert "the bag's /tf has no odom → base_link: it is derived from /odom" in player.output
+    assert transforms.tree.find("odom", "wheel")[0, 3] == pytest.approx(3.9 + 0.3)
+
+
+@pytest.mark.unhurried_nodes
 def test_transforms_of_a_robot_with_its_own_tf_stay_together(start, peer, tf_type, tmp_path):
     bag = write_motion(tmp_path / "bag", tf=False, namespace="/left")
     received = Listener(peer, tf_type, "/left/tf")

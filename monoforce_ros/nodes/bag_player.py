@@ -15,8 +15,8 @@ from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 
 from monoforce_ros.bags import BagError, BagMessage, BagReader, type_store
-from monoforce_ros.core import OptionParser, nearest, share_directory
-from monoforce_ros.messages import message_class, missing_package
+from monoforce_ros.core import OptionParser, TransformTree, nearest, share_directory
+from monoforce_ros.messages import decoding, message_class, missing_package
 from monoforce_ros.nodes.arguments import (
     idle_remappings,
     own_arguments,
@@ -31,6 +31,10 @@ from monoforce_ros.reporting import progress_bar
 
 # Fast DDS 2 (Jazzy) reads the first, Fast DDS 3 the second.
 _PROFILES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
+
+
+_SEARCHED = 5_000_000_000
+"""Part of a bag in which transforms are looked for [ns]: state estimators publish theirs many times a second."""
 
 
 def _arguments(arguments: list[str]) -> argparse.Namespace:
@@ -50,7 +54,7 @@ def _arguments(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument(
         "--no-tf",
         action="store_true",
-        help="do not derive /tf from the odometry of a bag without /tf",
+        help="do not derive the robot's pose on /tf from the odometry of a bag that lacks it",
     )
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     options = parser.parse_args(arguments)
@@ -103,14 +107,41 @@ class BagPlayer(Node):
         played = [topic for topic in self.bag.of_type("nav_msgs/msg/Odometry") if topic in self.playable]
         recorded = [topic for topic in self.bag.of_type(TRANSFORMS) if not _is_static(topic)]
         kind = message_class(TRANSFORMS)
-        if self.options.no_tf or recorded or not played or kind is None:
+        if self.options.no_tf or not played or kind is None:
             return "", None
         topic = max(played, key=lambda name: self.bag.counts[name])
+        if recorded:
+            missing = self._missing_transform(topic)
+            target = next((name for name in recorded if name in self.playable), "")
+            if not missing or not target:
+                return "", None
+            self.get_logger().info(
+                f"the bag's {target} has no {missing}: it is derived from {topic} (--no-tf disables this)"
+            )
+            return topic, self.playable[target]
         # A robot in a namespace may have a /tf of its own; then its static transforms are there, too.
         static = sorted(topic for topic in self.playable if _is_static(topic))
         target = static[0].removesuffix("_static") if static else "/tf"
         self.get_logger().info(f"the bag has no {target}: it is derived from {topic} (--no-tf disables this)")
         return topic, self.create_publisher(kind, target, 100)
+
+    def _missing_transform(self, odometry: str) -> str:
+        """The transform of an odometry topic, in words, if the transforms at the start of the bag do not contain it."""
+        tree, frames = TransformTree(), ("", "")
+        topics = [odometry, *self.bag.of_type(TRANSFORMS)]
+        for message in self.bag.messages(topics, stop=self.bag.start + _SEARCHED):
+            try:
+                decoded = message.decode()
+                if message.topic != odometry:
+                    for (parent, child), matrix in decoding.decode_transforms(decoded).items():
+                        tree.add(parent, child, matrix)
+                elif not frames[0]:
+                    frames = decoded.header.frame_id or "odom", decoded.child_frame_id or "base_link"
+            except ValueError:
+                continue
+            if frames[0] and tree.find(*frames) is not None:
+                return ""
+        return f"{frames[0]} → {frames[1]}" if frames[0] else ""
 
     def wait_for_subscribers(self) -> None:
         """Wait for a first subscriber, and then a little longer for further ones."""
