@@ -49,6 +49,8 @@ from monoforce_ros.terrain import Grid, TerrainDefaults
 
 _TRANSFORMS_PATIENCE = 2.0
 """Time after the start in which a missing transform is no error [s]: /tf_static takes as long to be discovered."""
+_MOST_ODD = 5
+"""Commands of another time in a row that are reported: when a bag starts anew, the first ones precede its odometry."""
 _ZERO_STAMPS = "the stamps are zero: the {} does not set them"
 
 
@@ -121,6 +123,7 @@ class PredictorNode(ManagedNode):
             self.joints = JointInput(self.robot, continues=continues, timeout=settings.odometry_timeout)
         self._arrivals: dict[str, float] = {}
         self._motion_arrival = 0.0
+        self._odd_commands = 0
         self._started = time.monotonic()
         self._predictions = 0
         self._last_prediction = self._started
@@ -308,7 +311,9 @@ class PredictorNode(ManagedNode):
             return
         stamp = decoding.stamp_of(message)
         self.inputs.add_command(stamp, twist)
-        if problem := self._command_clock(stamp):
+        problem = self._command_clock(stamp)
+        self._odd_commands = self._odd_commands + 1 if problem else 0
+        if self._odd_commands >= _MOST_ODD:
             self.health.report("commands", WARN, problem, reason="clock")
         else:
             self.health.report("commands", OK, "receiving commands")
