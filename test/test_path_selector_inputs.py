@@ -1,5 +1,6 @@
 """What path_selector says and does for each of its inputs: missing, of another type, quality of service or frame."""
 
+import signal
 import time
 
 import numpy as np
@@ -14,6 +15,9 @@ from monoforce_ros.core import pose_matrix
 from monoforce_ros.messages import encoding, message_class
 from monoforce_ros.nodes.progress_check import ProgressCheck
 from monoforce_ros.planning import WAYPOINTS, plan_target
+
+# Every test waits for a state, for as long as it takes, and the robot's world goes at the pace of the test.
+pytestmark = pytest.mark.unhurried_nodes
 
 BEST_EFFORT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 OK, WARN = 0, 1
@@ -149,6 +153,38 @@ def test_best_effort_odometry_is_received_and_a_moving_robot_drives(robot):
     robot.speed = 0.5
     assert robot.live(10.0, until=robot.says("driving to the goal")), robot.status()
     assert robot.status()[0] == OK
+
+
+@pytest.mark.parametrize("robot", ["use_sim_time:=true"], indirect=True)
+def test_simulated_time_that_stands_still_stops_nothing(robot):
+    """A /clock that nobody publishes any more: commands, and above all the command to stop, still reach the base."""
+    robot.listen(TwistStamped)
+    robot.send_goal(50.0, 0.0)
+    assert robot.live(10.0, until=lambda: robot.driven), robot.status()
+    assert robot.live(5.0, until=robot.says("there are no messages on /clock", "clock"))
+    assert robot.live(10.0, odometry=False, until=lambda: not robot.driven), robot.status()
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+def test_a_robot_that_drives_is_stopped_when_the_selector_ends(robot, how):
+    robot.listen(Twist)
+    robot.send_goal(50.0, 0.0)
+    assert robot.live(10.0, until=lambda: robot.driven), robot.status()
+    assert robot.process.stop(how) == 0
+    assert robot.peer.until(lambda: not robot.driven, 2.0)
+
+
+def test_odometry_with_stamps_of_zero_is_refused(robot):
+    robot.listen(TwistStamped)
+    robot.send_goal(5.0, 0.0)
+    robot.peer.now, now = -50_000_000, robot.peer.now
+    for _ in range(60):
+        robot.peer.now = -50_000_000
+        robot.live(0.05)
+        if robot.says("stopped: the stamps are zero")():
+            break
+    robot.peer.now = now
+    assert robot.says("stopped: the stamps are zero")() and not robot.driven, robot.status()
 
 
 def test_odometry_without_a_frame_is_in_odom_as_the_predictor_takes_it(robot):

@@ -5,10 +5,13 @@ from __future__ import annotations
 import argparse
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from monoforce_ros.bags.recording import Recording
 from monoforce_ros.core import pose_matrix
-from monoforce_ros.robots import RobotModel
+
+if TYPE_CHECKING:  # robots load torch, for which bag_player and bag_recorder need not wait
+    from monoforce_ros.robots import RobotModel
 
 
 @dataclass(frozen=True)

@@ -159,6 +159,11 @@ class Recording:
         Raises:
             BagError: neither has the frame.
         """
+        if frame_id.lstrip("/") == (self.motion.frame_id or "odom").lstrip("/"):
+            raise BagError(
+                f"{self.path}: data in the odometry frame {frame_id!r} do not say where their sensor is on the robot: "
+                "record the driver's own topic, in the sensor's frame"
+            )
         try:
             return RobotFrames(base_frame, known).sensor_pose(frame_id, TransformTree(self.static_transforms))
         except FrameError as error:

@@ -2,6 +2,7 @@
 
 from monoforce_ros.core.alignment import DelayCorrelation, Delayed, largest_spread, nearest_stamp
 from monoforce_ros.core.camera import CameraModel
+from monoforce_ros.core.command_line import OptionParser, most_similar, nearest
 from monoforce_ros.core.files import atomic_path, unfinished_path, write_bytes, write_text
 from monoforce_ros.core.frames import FrameError, RobotFrames, TransformTree
 from monoforce_ros.core.geometry import (
@@ -38,6 +39,7 @@ __all__ = [
     "FrameError",
     "MotionState",
     "MotionTrack",
+    "OptionParser",
     "PoseHistory",
     "RobotFrames",
     "StaleDataError",
@@ -49,7 +51,9 @@ __all__ = [
     "huber",
     "largest_spread",
     "lazy_exports",
+    "most_similar",
     "motion_regimes",
+    "nearest",
     "nearest_stamp",
     "pose_matrix",
     "quaternions",

@@ -125,12 +125,14 @@ def _standing(smoothed: SmoothedMotion, commands: CommandTrack, wheels: WheelTra
     """That the robot does not move; empty if it does."""
     span = round(_SPAN / _STEP)
     least = max(_MOVED, 5.0 * smoothed.position_noise), max(_TURNED, 5.0 * smoothed.rotation_noise)
-    moving = 0.0
+    moving = judged = 0.0
     for _, places, headings in _sampled(smoothed):
         shift = np.linalg.norm(places[span:] - places[:-span], axis=1)
         turn = np.abs(headings[span:] - headings[:-span])
         moving += _STEP * float(np.sum((shift > least[0]) | (turn > least[1])))
-    if moving >= _LEAST_MOVING:
+        judged += _STEP * len(shift)
+    # In less than two windows a robot that moves all the time falls short of one: half the time is enough there.
+    if moving >= min(_LEAST_MOVING, 0.5 * judged):
         return ""
     largest = np.abs(commands.twists).max(axis=0)
     if (largest < _COMMANDED).all():

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from monoforce_ros.bags import BagError, add_read_options, read_options
-from monoforce_ros.core import share_directory
+from monoforce_ros.core import OptionParser, share_directory
 from monoforce_ros.effects import EffectError
 from monoforce_ros.encoder import CheckpointError
 from monoforce_ros.evaluation import figures
@@ -54,7 +54,7 @@ class _FormerOption(argparse.Action):
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = OptionParser(
         prog="evaluate",
         description="Predict along a recording and compare with the measured motion. Writes report.html, report.json "
         "and figures.",

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from geometry_msgs.msg import Twist, TwistStamped
+from rclpy.duration import Duration
 from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.publisher import Publisher
+
+from monoforce_ros.nodes.clocks import STEADY
 
 STAMPED, PLAIN = "geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist"
 _CLASSES = {STAMPED: TwistStamped, PLAIN: Twist}
@@ -39,7 +42,7 @@ class CommandOutput:
         # Fully qualified node names with the types that they expect.
         self._listened: set[tuple[str, str]] = set()
         self._bystanders: list[str] = []
-        self._timer = node.create_timer(0.5, self._update)
+        self._timer = node.create_timer(0.5, self._update, clock=STEADY)
         self._update()
 
     @property
@@ -72,6 +75,11 @@ class CommandOutput:
         message.header.stamp = self._node.get_clock().now().to_msg()
         message.header.frame_id = frame_id
         self._publisher.publish(message)
+
+    def flush(self, seconds: float) -> None:
+        """Wait until reliable listeners have received everything, at most ``seconds``."""
+        if self._publisher is not None:
+            self._publisher.wait_for_all_acked(Duration(seconds=seconds))
 
     def _update(self) -> None:
         self._listened, bystanders = set(), set()

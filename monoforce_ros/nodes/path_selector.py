@@ -16,6 +16,7 @@ from sensor_msgs.msg import PointCloud2
 
 from monoforce_ros.core import NANOSECOND, FrameError, MotionState, RobotFrames, TransformHistory, pose_matrix
 from monoforce_ros.messages import decoding
+from monoforce_ros.nodes.clocks import STEADY
 from monoforce_ros.nodes.command_output import CommandOutput
 from monoforce_ros.nodes.course import TRANSFORM_TIMEOUT, Course, CourseFrames
 from monoforce_ros.nodes.frames import TransformListener
@@ -82,7 +83,7 @@ class PathSelectorNode(Node):
         self._received: Course | None = None
         self._motion: MotionState | None = None
         self._odometry_frame = self._base_name = ""
-        self._offset_problem = ""
+        self._odometry_problem = ""
         self._started = time.monotonic()
         self._first_odometry = 0.0
         self._odometry_stamp: int | None = None
@@ -113,8 +114,8 @@ class PathSelectorNode(Node):
             self.create_subscription(kind, wanted[1], callback, QoSProfile(depth=1, reliability=reliability))
             for reliability in (ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT)
         ]
-        self._command_timer = self.create_timer(1.0 / settings.command_rate, self._publish_command)
-        self._watch_timer = self.create_timer(0.5, self._watch_inputs)
+        self._command_timer = self.create_timer(1.0 / settings.command_rate, self._publish_command, clock=STEADY)
+        self._watch_timer = self.create_timer(0.5, self._watch_inputs, clock=STEADY)
         waiting = f"waiting for a {wanted[0]} on {self.resolve_topic_name(wanted[1])}"
         self.health.report(PART, OK, waiting, reason="waiting")
         self.get_logger().info(waiting)
@@ -160,12 +161,15 @@ class PathSelectorNode(Node):
             self._in_odometry(course)
 
     def _on_odometry(self, message: Odometry) -> None:
+        self._arrivals["odometry"] = time.monotonic()
         try:
             state, frame_id, child = decoding.decode_odometry(message)
+            if not state.stamp:
+                raise decoding.MessageError("the stamps are zero: the state estimator does not set them")
         except decoding.MessageError as error:
+            self._odometry_problem = str(error)
             self.health.report("odometry", ERROR, str(error), reason="unusable")
             return
-        self._arrivals["odometry"] = time.monotonic()
         if state.stamp != self._odometry_stamp:
             self._odometry_stamp, self._advanced = state.stamp, self._arrivals["odometry"]
         self._first_odometry = self._first_odometry or self._arrivals["odometry"]
@@ -175,10 +179,10 @@ class PathSelectorNode(Node):
         try:
             offset = self.frames.odometry_child(child, self.transforms.tree)
         except FrameError as error:
-            self._offset_problem = self.transforms.explained(error)
-            self.health.report("odometry", ERROR, self._offset_problem, reason="frame")
+            self._odometry_problem = self.transforms.explained(error)
+            self.health.report("odometry", ERROR, self._odometry_problem, reason="frame")
             return
-        self._offset_problem = ""
+        self._odometry_problem = ""
         self._motion = state.of_base(offset)
         self._base_name = self.frames.base_name(child, self.transforms.tree.frames)
         on_robot = {child or self._base_name: offset, self._base_name: np.eye(4)}
@@ -229,6 +233,12 @@ class PathSelectorNode(Node):
         self._moving = command is not None or self._course is not None
         self._commands.publish(*self._last_command, self._base_name or self.settings.base_frame or _BASE_FRAME)
 
+    def stand(self) -> None:
+        """Command a robot that was moving to stop: the node ends."""
+        self._course = None
+        self._publish_command()
+        self._commands.flush(0.5)
+
     def _command(self) -> tuple[float, float] | None:
         """Speed [m/s] and yaw rate [rad/s] to publish; None to stop."""
         if self._course is None:
@@ -278,8 +288,8 @@ class PathSelectorNode(Node):
     def _usable_motion(self) -> MotionState:
         """The newest motion of the base; raises ``Stop`` if it is missing, old or of an unknown frame."""
         source = self._inputs["odometry"]
-        if self._offset_problem:
-            raise Stop(self._offset_problem, "child frame")
+        if self._odometry_problem:
+            raise Stop(self._odometry_problem, "odometry")
         if self._motion is None:
             raise Stop(f"no odometry: the position is unknown ({source.silence_cause})", "no odometry")
         # Stamps cannot detect this: without odometry there are no new candidates either, so their age stays constant.
@@ -363,7 +373,7 @@ class PathSelectorNode(Node):
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the node; ``--help`` lists its parameters, which config/path_selector.schema.yaml defines."""
-    return run_schema_node("path_selector", PathSelectorNode, arguments)
+    return run_schema_node("path_selector", PathSelectorNode, arguments, at_the_end=PathSelectorNode.stand)
 
 
 if __name__ == "__main__":

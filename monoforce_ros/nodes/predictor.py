@@ -20,17 +20,18 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState, Poin
 from visualization_msgs.msg import MarkerArray
 
 from monoforce_ros.bags import camera_info_topic
-from monoforce_ros.core import CommandTrack, FrameError, RobotFrames, pose_matrix
+from monoforce_ros.core import NANOSECOND, CommandTrack, FrameError, RobotFrames, pose_matrix
 from monoforce_ros.effects import corrected_commands, corrected_motion
 from monoforce_ros.messages import decoding
 from monoforce_ros.nodes import prediction_messages as encoders
 from monoforce_ros.nodes.background_worker import BackgroundWorker
 from monoforce_ros.nodes.candidate_output import CandidateOutput
+from monoforce_ros.nodes.clocks import STEADY
 from monoforce_ros.nodes.costmap_output import CostmapOutput
 from monoforce_ros.nodes.ensemble_output import EnsembleOutput
 from monoforce_ros.nodes.frames import TransformListener
 from monoforce_ros.nodes.health import ERROR, OK, STALE, WARN, Health
-from monoforce_ros.nodes.inputs import Inputs, Received
+from monoforce_ros.nodes.inputs import TIME_JUMP, Inputs, Received
 from monoforce_ros.nodes.joint_input import JointInput
 from monoforce_ros.nodes.managed import ManagedNode
 from monoforce_ros.nodes.monitor_output import MonitorOutput
@@ -48,6 +49,9 @@ from monoforce_ros.terrain import Grid, TerrainDefaults
 
 _TRANSFORMS_PATIENCE = 2.0
 """Time after the start in which a missing transform is no error [s]: /tf_static takes as long to be discovered."""
+_MOST_ODD = 5
+"""Commands of another time in a row that are reported: when a bag starts anew, the first ones precede its odometry."""
+_ZERO_STAMPS = "the stamps are zero: the {} does not set them"
 
 
 @dataclass(frozen=True)
@@ -118,6 +122,8 @@ class PredictorNode(ManagedNode):
             continues = settings.flipper_motion == "continue"
             self.joints = JointInput(self.robot, continues=continues, timeout=settings.odometry_timeout)
         self._arrivals: dict[str, float] = {}
+        self._motion_arrival = 0.0
+        self._odd_commands = 0
         self._started = time.monotonic()
         self._predictions = 0
         self._last_prediction = self._started
@@ -140,7 +146,7 @@ class PredictorNode(ManagedNode):
     def begin(self) -> None:
         """Start predicting."""
         self._started = self._last_prediction = time.monotonic()
-        self._watch = self.create_timer(0.5, self._watch_inputs)
+        self._watch = self.create_timer(0.5, self._watch_inputs, clock=STEADY)
         self._running = True
         self._comparison = BackgroundWorker("comparison", self._compare, self.settings.comparison_niceness)
         self._worker = threading.Thread(target=self._work, name="prediction", daemon=True)
@@ -278,6 +284,9 @@ class PredictorNode(ManagedNode):
         except decoding.MessageError as error:
             self.health.report("odometry", ERROR, str(error), reason="unusable")
             return
+        if not state.stamp:
+            self.health.report("odometry", ERROR, _ZERO_STAMPS.format("state estimator"), reason="zero stamp")
+            return
         try:
             pose = self.frames.odometry_child(child_frame_id, self.transforms.tree)
         except FrameError as error:
@@ -286,6 +295,7 @@ class PredictorNode(ManagedNode):
                 self.health.report("odometry", ERROR, self.transforms.explained(error), reason="frame")
             return
         self.inputs.add_motion("odometry", state.of_base(pose), frame_id, child_frame_id)
+        self._motion_arrival = time.monotonic()
         self.health.report("odometry", OK, "receiving odometry")
 
     def _on_command(self, message: Twist | TwistStamped) -> None:
@@ -299,8 +309,29 @@ class PredictorNode(ManagedNode):
         except decoding.MessageError as error:
             self.health.report("commands", ERROR, str(error), reason="unusable")
             return
-        self.inputs.add_command("commands", decoding.stamp_of(message), twist)
-        self.health.report("commands", OK, "receiving commands")
+        stamp = decoding.stamp_of(message)
+        self.inputs.add_command(stamp, twist)
+        problem = self._command_clock(stamp)
+        self._odd_commands = self._odd_commands + 1 if problem else 0
+        if self._odd_commands >= _MOST_ODD:
+            self.health.report("commands", WARN, problem, reason="clock")
+        else:
+            self.health.report("commands", OK, "receiving commands")
+
+    def _command_clock(self, stamp: int) -> str:
+        """Why a command that has just arrived cannot take effect: its stamp is of another clock; empty if it can."""
+        odometry = self.inputs.motion_stamp
+        if not stamp or not odometry:
+            return ""
+        silence, limit = time.monotonic() - self._motion_arrival, self.settings.command_timeout
+        late = (odometry - stamp) * NANOSECOND
+        if late > limit:
+            what = f"are stamped {late:.1f} s before the odometry and ignored (command_timeout: {limit:g} s)"
+        elif silence < 0.5 * self.settings.data_timeout and -late - silence > TIME_JUMP * NANOSECOND:
+            what = f"are stamped {-late - silence:.1f} s after the odometry and take effect only then"
+        else:
+            return ""
+        return f"commands {what}: synchronise the clocks of the computers that stamp them, or stamp commands with zero"
 
     def _on_joints(self, part: str, message: JointState) -> None:
         assert self.joints is not None
@@ -318,9 +349,7 @@ class PredictorNode(ManagedNode):
         self._arrivals[part] = time.monotonic()
         stamp = decoding.stamp_of(message)
         if stamp == 0:
-            self.health.report(
-                part, ERROR, "the stamps are zero: the sensor driver does not set them", reason="zero stamp"
-            )
+            self.health.report(part, ERROR, _ZERO_STAMPS.format("sensor driver"), reason="zero stamp")
             return
         self.inputs.add_sensor(part, stamp, message)
 

@@ -15,8 +15,9 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from monoforce_ros.bags import builders, type_store
+from monoforce_ros.core import OptionParser
 from monoforce_ros.messages import decoding, message_class, missing_package
-from monoforce_ros.nodes.arguments import NodeArgumentParser, own_arguments, seconds, seed
+from monoforce_ros.nodes.arguments import own_arguments, refuse_given_parameters, seconds, seed
 from monoforce_ros.nodes.frames import TRANSFORMS
 from monoforce_ros.nodes.odometry_transform import odometry_transform
 from monoforce_ros.nodes.parameters import refuse_unknown_parameters
@@ -33,7 +34,7 @@ _MAXIMUM_LAG = 0.5
 
 
 def _arguments(arguments: list[str]) -> argparse.Namespace:
-    parser = NodeArgumentParser(
+    parser = OptionParser(
         prog="simulator",
         description="Drive a simulated robot through ROS: cmd_vel in; odom, points and images out.",
     )
@@ -151,6 +152,7 @@ def main(arguments: list[str] | None = None) -> int:
     command_line = sys.argv if arguments is None else ["simulator", *arguments]
     options = _arguments(own_arguments(command_line[1:]))
     try:
+        refuse_given_parameters(command_line, "simulator")
         world = LiveWorld(_settings(options))
     except (ValueError, OSError, RuntimeError) as error:
         print(f"error: {error}", file=sys.stderr)

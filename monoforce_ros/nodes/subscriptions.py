@@ -11,6 +11,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
+from monoforce_ros.nodes.clocks import STEADY
+
 
 @dataclass(frozen=True)
 class _Offer:
@@ -62,7 +64,7 @@ class AdaptiveSubscription:
         self._subscribed: _Offer | None = None
         self.wrong_type = ""
         """Types on the topic if none of them is usable."""
-        self._timer = node.create_timer(0.5, self._update)
+        self._timer = node.create_timer(0.5, self._update, clock=STEADY)
         self._update()
 
     @property

@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from monoforce_ros.core import OptionParser
 from monoforce_ros.reporting import progress_bar
 from monoforce_ros.synthetic.random_streams import DEFAULT_SEED
 from monoforce_ros.synthetic.terrain_shape import GROUNDS
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
 def build_parser() -> argparse.ArgumentParser:
     """The command line's options."""
-    parser = argparse.ArgumentParser(
+    parser = OptionParser(
         prog="synthesize",
         description="Record bags in simulated worlds: hills, ramp, kerbs, rocks, walls, trees, mud and tall grass.",
     )
