@@ -124,6 +124,8 @@ class _System:
             body.yield_speed,
             self.options,
             grip=self.moving.grip,
+            soil=body.soil
+            and replace(body.soil, faces=(turns @ problem.point_faces[..., None])[..., 0].transpose(1, 2)),
         )
         return arms, touch, belt
 

@@ -10,10 +10,10 @@ from monoforce_ros.physics.warp_kernels.structs import types
 
 
 @cache
-def forces_joints_kernel(double: bool, differentiable: bool) -> Any:
+def forces_joints_kernel(double: bool, differentiable: bool, soft: bool) -> Any:
     """The kernel in float64 (``double``) or float32, with its adjoint or, compiled sooner, without."""
     t = types(double)
-    functions = contact_functions(double)
+    functions = contact_functions(double, soft)
     state_at, touch_ground, over_the_step = functions.state_at, functions.touch_ground, functions.over_the_step
     scalar, vec3 = t.scalar, t.vec3
     Ground, Body, Robots, States, Options = t.Ground, t.Body, t.Robots, t.States, t.Options
