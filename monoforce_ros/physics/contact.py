@@ -22,6 +22,23 @@ with its full traction (25 J, and 4 J per cm) stops within about 1 cm at a conta
 stiffness is 1e8 N/m³, 50 times that of firm soil; on soil's own it would need 12 cm, more than a post is thick."""
 
 
+FLAT_TREAD = 0.9
+"""Cosine of the angle to the ground within which a belt's surface moves along it at the belt's full speed (26°): tyres
+and tracks lie flat in their contact. On the circle, a wheel that sinks by 8 mm would roll 1 % slower than its rim, and
+one that is sampled every 30° 3.4 % slower, because its two lowest samples are 15° from the bottom."""
+
+
+def tread(belt: Tensor, along: Tensor) -> Tensor:
+    """Speed of the surface of a flattened belt along the ground ``[B, N]`` [m/s].
+
+    Args:
+        belt: its velocity on the circle, ``[B, 3, N]`` [m/s].
+        along: the ground's direction along the wheel, ``[B, 3, N]``.
+    """
+    fastest = torch.sqrt((belt * belt).sum(1) + 1e-12)
+    return ((belt * along).sum(1) / FLAT_TREAD).clamp(-fastest, fastest)
+
+
 def steepness(normal: Tensor) -> Tensor:
     """From 0 where soil stands to 1 where ground is rigid, ``[B, N]``, by the ground's normal ``[B, 3, N]``."""
     return ((STEEPEST_SOIL - normal[:, 2]) / (STEEPEST_SOIL - RIGID_SLOPE)).clamp(0.0, 1.0)
@@ -134,7 +151,8 @@ def contact(
     across = across * torch.rsqrt((across * across).sum(1, keepdim=True) + 1e-12)
     directions = torch.stack([normal, cross(across, normal), across], dim=2)
     point_velocity = (directions * velocities[:, :, None]).sum(1)
-    slip = point_velocity[:, 1:] + (directions[:, :, 1:] * belt_velocities[:, :, None]).sum(1)
+    belt_speeds = torch.stack([tread(belt_velocities, directions[:, :, 1]), (across * belt_velocities).sum(1)], dim=1)
+    slip = point_velocity[:, 1:] + belt_speeds
 
     softness, drag = ground_factors[..., None].unbind(1)
     stiffness, ground_damping = ground.stiffness / softness * rigid, ground.damping / softness * rigid

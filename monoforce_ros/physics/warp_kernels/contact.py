@@ -10,6 +10,7 @@ from monoforce_ros.physics.contact import RIGID_FACTOR, RIGID_SLOPE, STEEPEST_SO
 from monoforce_ros.physics.soil_contact import FACING
 from monoforce_ros.physics.warp_kernels.soil import soil_pressure
 from monoforce_ros.physics.warp_kernels.structs import types
+from monoforce_ros.physics.warp_kernels.tread import tread_function
 
 CONSTANT_LOOKUP, BILINEAR_LOOKUP = 0, 1
 VERTICAL_FORCE, NORMAL_FORCE = 0, 1
@@ -35,7 +36,7 @@ def contact_functions(double: bool, soft: bool) -> ContactFunctions:
     """Device functions in float64 (``double``) or float32, on firm ground or on ``soft`` soil."""
     t = types(double)
     scalar, vec2, vec3, vec4, mat33 = t.scalar, t.vec2, t.vec3, t.vec4, t.mat33
-    pressure = soil_pressure(double)
+    pressure, tread = soil_pressure(double), tread_function(double)
     Ground, Body, Robots, States, State, Options, Touch = (
         t.Ground, t.Body, t.Robots, t.States, t.State, t.Options, t.Touch
     )  # fmt: skip
@@ -204,7 +205,7 @@ def contact_functions(double: bool, soft: bool) -> ContactFunctions:
             along = wp.cross(across, normal)
             velocity_along = wp.dot(velocity, along)
             velocity_across = wp.dot(velocity, across)
-            slip_along = grip * (velocity_along + wp.dot(belt, along))
+            slip_along = grip * (velocity_along + tread(belt, along))
             slip_across = velocity_across + wp.dot(belt, across)
             friction_along = grip * material[2] * factors[0]
             friction_across = material[2] * factors[1]
