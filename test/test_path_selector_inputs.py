@@ -5,10 +5,11 @@ import time
 
 import numpy as np
 import pytest
+import rclpy
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry, Path
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import PointCloud2
+from sensor_msgs.msg import JointState, PointCloud2
 
 from monoforce_ros.bags import builders, type_store
 from monoforce_ros.core import pose_matrix
@@ -135,6 +136,40 @@ def robot(peer, start, request):
     yield robot
     assert process.stop() == 0
     assert "Traceback" not in process.output
+
+
+@pytest.mark.parametrize("robot", ["flipper_command_topic:=flipper_commands", "command_rate:=10.0"], indirect=True)
+def test_flipper_angles_are_passed_on_only_where_a_topic_is_named_and_while_driving(robot, request):
+    node, prefix = robot.peer.node, robot.prefix
+    heard: list = []
+    node.create_subscription(JointState, f"/{prefix}/flipper_commands", heard.append, 1)
+    # From a node of its own: one that publishes two predictions is a predictor, which is no base.
+    climber = rclpy.create_node("climber", context=node.context)
+    angles = climber.create_publisher(JointState, f"/{prefix}/predicted/flipper_angles", 1)
+    message = JointState(name=["front_left", "front_right"], position=[0.4, 0.4])
+    robot.listen(TwistStamped)
+
+    def drives() -> bool:
+        angles.publish(message)
+        return robot.driven and bool(heard)
+
+    robot.live(2.0, until=lambda: drives() and False)
+    assert not heard, "no goal yet"
+    robot.send_goal(50.0, 0.0)
+    if "flipper" in request.node.callspec.id:
+        assert robot.live(10.0, until=drives), robot.status()
+        assert list(heard[-1].position) == [0.4, 0.4] and list(heard[-1].name) == message.name
+        # Angles that are not finite, or old, are not.
+        message.position = [float("nan"), 0.4]
+        robot.live(1.0, until=lambda: drives() and False)
+        heard.clear()
+        robot.live(1.0)
+        assert robot.driven and not heard
+    else:
+        assert robot.live(10.0, until=lambda: drives() or robot.driven)
+        robot.live(1.0, until=lambda: drives() and False)
+        assert not heard
+    climber.destroy_node()
 
 
 def test_without_odometry_it_says_so_and_claims_nothing(robot):

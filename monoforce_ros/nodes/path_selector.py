@@ -19,6 +19,7 @@ from monoforce_ros.messages import decoding
 from monoforce_ros.nodes.clocks import STEADY
 from monoforce_ros.nodes.command_output import CommandOutput
 from monoforce_ros.nodes.course import TRANSFORM_TIMEOUT, Course, CourseFrames
+from monoforce_ros.nodes.flipper_output import FlipperOutput
 from monoforce_ros.nodes.frames import TransformListener
 from monoforce_ros.nodes.health import ERROR, OK, WARN, Health
 from monoforce_ros.nodes.parameters import declare_parameters
@@ -97,6 +98,7 @@ class PathSelectorNode(Node):
         self._map_frame = ""
         self._cost_to_go: CostToGo | None = None
         self._commands = CommandOutput(self, settings.command_topic, settings.command_type)
+        self._flippers = FlipperOutput(self, settings.flipper_command_topic, settings.timeout)
         self._inputs = {
             "odometry": self._subscribe(settings.odometry_topic, "nav_msgs/msg/Odometry", Odometry, self._on_odometry),
             "candidates": self._subscribe(
@@ -232,6 +234,8 @@ class PathSelectorNode(Node):
         self._last_command = command or (0.0, 0.0)
         self._moving = command is not None or self._course is not None
         self._commands.publish(*self._last_command, self._base_name or self.settings.base_frame or _BASE_FRAME)
+        if command is not None:
+            self._flippers.forward()
 
     def stand(self) -> None:
         """Command a robot that was moving to stop: the node ends."""

@@ -42,7 +42,7 @@ from monoforce_ros.nodes.schema import read_schema, schema_path
 from monoforce_ros.nodes.sensor_decoder import LIDAR, SensorDecoder
 from monoforce_ros.nodes.subscriptions import AdaptiveSubscription
 from monoforce_ros.perception import TerrainSource, TrustReport, choose_terrain_source
-from monoforce_ros.physics import PhysicsOptions
+from monoforce_ros.physics import PhysicsOptions, read_soil
 from monoforce_ros.prediction import FORCE_INTERVAL, Prediction, Predictor
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainDefaults
@@ -93,7 +93,7 @@ class PredictorNode(ManagedNode):
             self.robot,
             self._terrain_source(),
             horizon=settings.horizon,
-            options=PhysicsOptions(time_step=settings.time_step),
+            options=PhysicsOptions(time_step=settings.time_step, soil=read_soil(settings.soil)),
         )
         self._force_every = max(1, round(FORCE_INTERVAL / settings.time_step))
         self.get_logger().info("preparing the physics; on first use the kernels are compiled, which takes about 10 s")
