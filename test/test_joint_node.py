@@ -93,7 +93,7 @@ def test_the_best_candidate_s_flipper_angles_are_published(peer, start):
         "-p", "horizon:=1.0", "-p", "candidates:=4", "-p", "candidate_delay:=0.2", "-p", "refine_seconds:=0.5",
         "-r", "predicted/flipper_angles:=climber_angles",
     )  # fmt: skip
-    process.wait_for("predicting 1 s ahead for marv")
+    process.wait_for("predicting 1 s ahead for marv", 240.0)
     heard: list = []
     peer.node.create_subscription(JointState, "/climber_angles", heard.append, 1)
     for _ in range(40):
