@@ -12,6 +12,7 @@ from monoforce_ros.core.geometry import (
     transform_points,
     wrap_angle,
 )
+from monoforce_ros.core.joint_track import JointTrack
 from monoforce_ros.core.lazy import lazy_exports
 from monoforce_ros.core.regimes import FAST_SHARE, motion_regimes
 from monoforce_ros.core.shared_files import share_directory
@@ -36,6 +37,7 @@ __all__ = [
     "DelayCorrelation",
     "Delayed",
     "FrameError",
+    "JointTrack",
     "MotionState",
     "MotionTrack",
     "PoseHistory",
