@@ -32,7 +32,7 @@ from monoforce_ros.planning import (
     refine,
 )
 from monoforce_ros.prediction import Prediction, Predictor
-from monoforce_ros.robots import load_robot
+from monoforce_ros.robots import RobotModel, load_robot
 
 PART = "candidates"
 TYPED_MESSAGE = "monoforce_msgs/msg/Candidates"
@@ -58,6 +58,7 @@ class CandidateOutput:
             fan = CandidateSettings(
                 settings.candidates, tuple(settings.candidate_speeds), settings.candidate_yaw_rate,
                 curvature=robot.maximum_curvature,
+                lateral=min(robot.maximum_lateral_speed, max(settings.candidate_speeds)) if _crabs(robot) else 0.0,
             )  # fmt: skip
             self._fan = fan_of_arcs(fan)
         self._requested: tuple[float, np.ndarray] | None = None
@@ -115,12 +116,16 @@ class CandidateOutput:
         delay = min(round(settings.candidate_delay / self._predictor.options.time_step), self._predictor.steps - 1)
         start, steps = self._predictor.history + delay, self._predictor.steps - delay
         stamps = self._predictor.command_stamps(prediction.stamp)[:start]
-        # Candidates have no lateral speed.
-        before = commands.sample(stamps, timeout=settings.command_timeout)[:, :2]
+        before = commands.sample(stamps, timeout=settings.command_timeout)
+        # A planner's sequences have no lateral speed.
+        width = max(0, before.shape[-1] - sequences.shape[-1])
+        sequences = np.pad(sequences, ((0, 0), (0, 0), (0, width)))
         twists = over_horizon(sequences, before, steps)
         rollout, assessment = self._assess(prediction, twists)
-        if settings.refine_seconds and assessment.best is not None:
-            refined = over_horizon(self._refined(prediction, before, sequences[assessment.best]), before, steps)
+        # Speed and yaw rate are refined, of candidates that do not move sideways.
+        if settings.refine_seconds and assessment.best is not None and not sequences[assessment.best][:, 2:].any():
+            best = self._refined(prediction, before[:, :2], sequences[assessment.best][:, :2])
+            refined = over_horizon(np.pad(best, ((0, 0), (0, 0), (0, before.shape[-1] - 2))), before, steps)
             refined_rollout, refined_assessment = self._assess(prediction, refined)
             twists = np.concatenate([twists, refined])
             rollout, assessment = rollout.joined(refined_rollout), assessment.joined(refined_assessment)
@@ -132,7 +137,7 @@ class CandidateOutput:
             data["best_path"] = messages.best_path(motion, rollout, assessment.best, frame_id, settings.path_time_step)
         if "candidate_rollouts" in self._publishers:
             data["candidate_rollouts"] = messages.candidate_rollouts(
-                motion, rollout, self._predictor.robot, twists[:, self._predictor.history :], assessment, frame_id,
+                motion, rollout, self._predictor.robot, twists[:, self._predictor.history :, :2], assessment, frame_id,
                 settings.path_time_step,
             )  # fmt: skip
         self._statistics["feasible candidates"] = f"{int(assessment.feasible.sum())} of {len(twists)}"
@@ -185,3 +190,7 @@ class CandidateOutput:
                 f"not refined: a round takes {1e3 * self._round_seconds:.0f} ms, refine_seconds is {budget:g}"
             )
         return found.sequence[None]
+
+
+def _crabs(robot: RobotModel) -> bool:
+    return robot.steered is not None and robot.steered.crabs
