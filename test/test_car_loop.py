@@ -11,7 +11,7 @@ from test_steering import rover
 from monoforce_ros.robots import load_robot
 
 
-def reached(peer, start, robot, target, *, seconds=90.0):
+def reached(peer, start, robot, target, *, seconds=150.0):
     """Drive to a goal in the odometry frame; returns the commands that were sent and the joint states."""
     simulator = start("simulator", "--flat", "--lidar-rate", "0", "--robot", robot)
     simulator.wait_for("simulating", 180.0)
@@ -20,7 +20,7 @@ def reached(peer, start, robot, target, *, seconds=90.0):
         peer.node.create_subscription(kind, topic, kept.append, QoSProfile(depth=20))
         for kind, topic, kept in ((Odometry, "/odom", odometry), (JointState, "/joint_states", joints))
     ]
-    parameters = ["candidates:=24", "horizon:=3.0", "terrain_source:=flat", f"robot:={robot}", "rate:=5.0",
+    parameters = ["candidates:=16", "horizon:=3.0", "terrain_source:=flat", f"robot:={robot}", "rate:=3.0",
                   "candidate_speeds:=[0.0,0.5,0.9]", "candidate_yaw_rate:=0.9"]  # fmt: skip
     predictor = start("predictor", "--ros-args", *(word for p in parameters for word in ("-p", p)))
     predictor.wait_for("predicting 3 s ahead", 180.0)

@@ -33,7 +33,7 @@ def evidence_of(folder, robot_path, seed, *hidden, **settings):
     robot = load_robot(robot_path)
     faults = tuple(parse_hidden(text) for text in hidden)
     summary = record(folder, RecordingSettings(
-        seed=seed, duration=36.0, robot=str(robot_path), commands="steps", terrain=TerrainSettings(flat=True), camera=None,
+        seed=seed, duration=40.0, robot=str(robot_path), commands="steps", terrain=TerrainSettings(flat=True), camera=None,
         lidar=None, hidden=faults, **settings,
     ))  # fmt: skip
     assert summary.mishap is None
@@ -77,7 +77,7 @@ def car(tmp_path_factory):
 @pytest.mark.parametrize(
     ("name", "parameter", "value"),
     [
-        ("steering_offset", "offset", 0.05),
+        ("steering_offset", "offset", 0.08),
         ("steering_gain", "gain", 0.7),
         ("steering_lag", "time_constant", 0.5),
         ("steering_deadband", "width", 0.08),

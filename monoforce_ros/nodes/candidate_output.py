@@ -169,7 +169,8 @@ class CandidateOutput:
             prediction.terrain, motions, twists, with_forces=False, with_contact=True, force_every=self._force_every,
             joints=prediction.joints,
         )  # fmt: skip
-        commanded = torch.from_numpy(twists[:, self._predictor.history :]).float()
+        # Costs are of the forward speed: moving sideways alone costs no slip.
+        commanded = torch.from_numpy(twists[:, self._predictor.history :, :2]).float()
         robot = self._predictor.robot
         weights, limits = self._weights, self._limits
         return rollout, assess(rollout, prediction.terrain, robot, commanded, weights=weights, limits=limits)
