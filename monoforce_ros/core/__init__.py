@@ -13,6 +13,7 @@ from monoforce_ros.core.geometry import (
     transform_points,
     wrap_angle,
 )
+from monoforce_ros.core.joint_track import JointTrack
 from monoforce_ros.core.lazy import lazy_exports
 from monoforce_ros.core.regimes import FAST_SHARE, motion_regimes
 from monoforce_ros.core.shared_files import share_directory
@@ -37,6 +38,7 @@ __all__ = [
     "DelayCorrelation",
     "Delayed",
     "FrameError",
+    "JointTrack",
     "MotionState",
     "MotionTrack",
     "OptionParser",

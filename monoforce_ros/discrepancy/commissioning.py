@@ -238,7 +238,7 @@ def _directions(entry: _Prepared, effects: Effects, scale: np.ndarray) -> Iterat
         yield name, rows[own]
     directions = Directions(predictions, scale, None, Thresholds())
     present = {name for name, _ in effects}
-    for effect in identifiable_effects():
+    for effect in identifiable_effects(predictions.robot):
         if effect.name in present:
             continue
         starts = first_values(effect)

@@ -66,7 +66,8 @@ def motion_faults(
     if still:
         return (still,)
     # Speeds of wrong poses are wrong, too: whether they follow the commands says nothing then.
-    faults = tuple(_pose_faults(smoothed))
+    crabs = commands.twists.shape[-1] > 2 and float(np.abs(commands.twists[:, 2]).max()) >= _COMMANDED
+    faults = tuple(_pose_faults(smoothed, crabs=crabs))
     other = "" if faults else _unrelated(smoothed, commands)
     return (other,) if other else faults
 
@@ -151,8 +152,8 @@ def _standing(smoothed: SmoothedMotion, commands: CommandTrack, wheels: WheelTra
     )
 
 
-def _pose_faults(smoothed: SmoothedMotion) -> Iterator[str]:
-    """Faults of the poses alone."""
+def _pose_faults(smoothed: SmoothedMotion, *, crabs: bool = False) -> Iterator[str]:
+    """Faults of the poses alone; a robot that was commanded to move sideways has no course of its heading."""
     motion = smoothed.motion
     rotations = Rotation.from_quat(motion.quaternions).as_matrix()
     if np.median(rotations[:, 2, 2]) < 0.7:
@@ -160,6 +161,8 @@ def _pose_faults(smoothed: SmoothedMotion) -> Iterator[str]:
             "by its poses the robot lies on its side or upside down: record poses of the base frame in a frame whose "
             "z axis points up"
         )
+        return
+    if crabs:
         return
     courses, headings, offsets = [], [], []
     least = max(0.2, 10.0 * smoothed.position_noise)

@@ -364,7 +364,7 @@ class Search:
         residual = self._sparse.residuals([base])[0] / self._sparse_scale
         names = {name for name, _ in base}
         tried: list[tuple[float, Effect, Effects]] = []
-        for effect in identifiable_effects():
+        for effect in identifiable_effects(self.robot):
             if effect.name in names or effect.name in self._excluded:
                 continue
             self._progress(f"{number}{effect.name}")

@@ -33,7 +33,7 @@ from monoforce_ros.planning import (
     refine,
 )
 from monoforce_ros.prediction import Prediction, Predictor
-from monoforce_ros.robots import load_robot
+from monoforce_ros.robots import RobotModel, load_robot
 
 PART = "candidates"
 TYPED_MESSAGE = "monoforce_msgs/msg/Candidates"
@@ -59,6 +59,7 @@ class CandidateOutput:
             fan = CandidateSettings(
                 settings.candidates, tuple(settings.candidate_speeds), settings.candidate_yaw_rate,
                 curvature=robot.maximum_curvature,
+                lateral=min(robot.maximum_lateral_speed, max(settings.candidate_speeds)) if _crabs(robot) else 0.0,
             )  # fmt: skip
             self._fan = fan_of_arcs(fan)
         self._requested: tuple[float, np.ndarray] | None = None
@@ -118,14 +119,18 @@ class CandidateOutput:
         delay = min(round(settings.candidate_delay / self._predictor.options.time_step), self._predictor.steps - 1)
         start, steps = self._predictor.history + delay, self._predictor.steps - delay
         stamps = self._predictor.command_stamps(prediction.stamp)[:start]
-        # Candidates have no lateral speed.
-        before = commands.sample(stamps, timeout=settings.command_timeout)[:, :2]
+        before = commands.sample(stamps, timeout=settings.command_timeout)
+        # A planner's sequences have no lateral speed.
+        width = max(0, before.shape[-1] - sequences.shape[-1])
+        sequences = np.pad(sequences, ((0, 0), (0, 0), (0, width)))
         twists = over_horizon(sequences, before, steps)
         rollout, assessment = self._assess(prediction, twists)
         angles = self._commanded_flippers(prediction)
-        if settings.refine_seconds and assessment.best is not None:
-            found = self._refined(prediction, before, sequences[assessment.best])
-            refined = over_horizon(found.sequence[None], before, steps)
+        # Speed and yaw rate are refined, of candidates that do not move sideways.
+        if settings.refine_seconds and assessment.best is not None and not sequences[assessment.best][:, 2:].any():
+            found = self._refined(prediction, before[:, :2], sequences[assessment.best][:, :2])
+            best = np.pad(found.sequence[None], ((0, 0), (0, 0), (0, before.shape[-1] - 2)))
+            refined = over_horizon(best, before, steps)
             refined_rollout, refined_assessment = self._assess(prediction, refined, found.flippers)
             twists = np.concatenate([twists, refined])
             rollout, assessment = rollout.joined(refined_rollout), assessment.joined(refined_assessment)
@@ -141,7 +146,7 @@ class CandidateOutput:
             data["best_path"] = messages.best_path(motion, rollout, assessment.best, frame_id, settings.path_time_step)
         if "candidate_rollouts" in self._publishers:
             data["candidate_rollouts"] = messages.candidate_rollouts(
-                motion, rollout, self._predictor.robot, twists[:, self._predictor.history :], assessment, frame_id,
+                motion, rollout, self._predictor.robot, twists[:, self._predictor.history :, :2], assessment, frame_id,
                 settings.path_time_step,
             )  # fmt: skip
         self._statistics["feasible candidates"] = f"{int(assessment.feasible.sum())} of {len(twists)}"
@@ -192,7 +197,8 @@ class CandidateOutput:
             prediction.terrain, motions, twists, with_forces=False, with_contact=True, force_every=self._force_every,
             joints=prediction.joints, flippers=None if flippers is None else flippers[None],
         )  # fmt: skip
-        commanded = torch.from_numpy(twists[:, self._predictor.history :]).float()
+        # Costs are of the forward speed: moving sideways alone costs no slip.
+        commanded = torch.from_numpy(twists[:, self._predictor.history :, :2]).float()
         robot = self._predictor.robot
         weights, limits = self._weights, self._limits
         return rollout, assess(rollout, prediction.terrain, robot, commanded, weights=weights, limits=limits)
@@ -213,3 +219,7 @@ class CandidateOutput:
                 f"not refined: a round takes {1e3 * self._round_seconds:.0f} ms, refine_seconds is {budget:g}"
             )
         return found
+
+
+def _crabs(robot: RobotModel) -> bool:
+    return robot.steered is not None and robot.steered.crabs

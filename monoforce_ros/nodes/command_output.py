@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from geometry_msgs.msg import Twist, TwistStamped
 from rclpy.duration import Duration
 from rclpy.node import Node, NodeNameNonExistentError
@@ -62,12 +64,14 @@ class CommandOutput:
         """Fully qualified names of the nodes that listen and are not of this package."""
         return ", ".join(sorted({name for name, _ in self._listened})) or "no node"
 
-    def publish(self, speed: float, yaw_rate: float, frame_id: str) -> None:
-        """Publish forward speed [m/s] and yaw rate [rad/s]."""
+    def publish(self, command: Sequence[float], frame_id: str) -> None:
+        """Publish forward speed [m/s], yaw rate [rad/s] and, if there are three, the speed to the left [m/s]."""
         if self._publisher is None:
             return
         twist = Twist()
-        twist.linear.x, twist.angular.z = speed, yaw_rate
+        twist.linear.x, twist.angular.z = command[:2]
+        if len(command) > 2:
+            twist.linear.y = command[2]
         if self.type == PLAIN:
             self._publisher.publish(twist)
             return

@@ -27,7 +27,14 @@ from monoforce_ros.nodes.process import run_schema_node
 from monoforce_ros.nodes.progress_check import WINDOW, ProgressCheck
 from monoforce_ros.nodes.schema import read_schema, schema_path
 from monoforce_ros.nodes.subscriptions import AdaptiveSubscription
-from monoforce_ros.planning import CostToGo, SelectionWeights, cost_to_go, plan_target, select_candidate
+from monoforce_ros.planning import (
+    COMMAND_FIELDS,
+    CostToGo,
+    SelectionWeights,
+    cost_to_go,
+    plan_target,
+    select_candidate,
+)
 
 PART = "choice"
 DISTANCE = "distance to the goal [m]"
@@ -92,7 +99,7 @@ class PathSelectorNode(Node):
         self._arrivals: dict[str, float] = {}
         self._candidates: Candidates | None = None
         self._moving = self._driving = False
-        self._last_command = (0.0, 0.0)
+        self._last_command: tuple[float, ...] = (0.0, 0.0)
         self._progress = ProgressCheck()
         self._map: tuple[np.ndarray, float, np.ndarray] | None = None
         self._map_frame = ""
@@ -192,7 +199,8 @@ class PathSelectorNode(Node):
         if self._driving:
             motion = self._motion
             seconds = motion.stamp * NANOSECOND
-            self._progress.add(seconds, self._last_command, motion.position[:2], motion.heading)
+            speed, yaw_rate = self._last_command[:2]
+            self._progress.add(seconds, (speed, yaw_rate), motion.position[:2], motion.heading)
         self.health.report("odometry", OK, "receiving odometry")
 
     def _on_candidates(self, message: PointCloud2) -> None:
@@ -233,7 +241,7 @@ class PathSelectorNode(Node):
             return
         self._last_command = command or (0.0, 0.0)
         self._moving = command is not None or self._course is not None
-        self._commands.publish(*self._last_command, self._base_name or self.settings.base_frame or _BASE_FRAME)
+        self._commands.publish(self._last_command, self._base_name or self.settings.base_frame or _BASE_FRAME)
         if command is not None:
             self._flippers.forward()
 
@@ -243,8 +251,8 @@ class PathSelectorNode(Node):
         self._publish_command()
         self._commands.flush(0.5)
 
-    def _command(self) -> tuple[float, float] | None:
-        """Speed [m/s] and yaw rate [rad/s] to publish; None to stop."""
+    def _command(self) -> tuple[float, ...] | None:
+        """Speed [m/s], yaw rate [rad/s] and, of robots that move sideways, lateral speed [m/s]; None to stop."""
         if self._course is None:
             return None
         try:
@@ -257,7 +265,7 @@ class PathSelectorNode(Node):
             self.health.report(PART, ERROR, str(refusal), reason="refused")
             return None
 
-    def _drive(self, course: Course) -> tuple[float, float] | None:
+    def _drive(self, course: Course) -> tuple[float, ...] | None:
         """The best candidate's command; None if the goal is reached.
 
         Raises:
@@ -285,7 +293,7 @@ class PathSelectorNode(Node):
             raise Stop(str(error), "fields") from error
         if best is None:
             raise Stop("no candidate is feasible", "infeasible")
-        command = float(candidates.fields["speed"][best]), float(candidates.fields["yaw_rate"][best])
+        command = tuple(float(candidates.fields[name][best]) for name in COMMAND_FIELDS if name in candidates.fields)
         self._report_driving(distance, command)
         return command
 
@@ -360,7 +368,7 @@ class PathSelectorNode(Node):
             self._cost_to_go = found
         return found
 
-    def _report_driving(self, distance: float, command: tuple[float, float]) -> None:
+    def _report_driving(self, distance: float, command: tuple[float, ...]) -> None:
         """Say that the robot drives only if its odometry shows it."""
         moving, values = self._progress.moving, {DISTANCE: f"{distance:.2f}"}
         if moving:

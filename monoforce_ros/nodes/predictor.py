@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import sys
 import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from types import SimpleNamespace
 
@@ -40,7 +39,7 @@ from monoforce_ros.nodes.process import run_schema_node
 from monoforce_ros.nodes.rate_limiter import RateLimiter
 from monoforce_ros.nodes.schema import read_schema, schema_path
 from monoforce_ros.nodes.sensor_decoder import LIDAR, SensorDecoder
-from monoforce_ros.nodes.subscriptions import AdaptiveSubscription
+from monoforce_ros.nodes.subscriptions import AdaptiveSubscription, command_types
 from monoforce_ros.perception import TerrainSource, TrustReport, choose_terrain_source
 from monoforce_ros.physics import PhysicsOptions, read_soil
 from monoforce_ros.prediction import FORCE_INTERVAL, Prediction, Predictor
@@ -229,7 +228,7 @@ class PredictorNode(ManagedNode):
             "commands": AdaptiveSubscription(
                 self,
                 settings.command_topic,
-                self._command_types(),
+                command_types(steering_angles=self.robot.steered is not None),
                 self._on_command,
                 depth=small,
                 follow_listeners=True,
@@ -264,16 +263,6 @@ class PredictorNode(ManagedNode):
     def _crabs(self) -> bool:
         """Whether the robot can move sideways."""
         return self.robot.steered is not None and self.robot.steered.crabs
-
-    def _command_types(self) -> dict[str, type]:
-        types: dict[str, type] = {"geometry_msgs/msg/TwistStamped": TwistStamped, "geometry_msgs/msg/Twist": Twist}
-        if self.robot.steered is not None:
-            try:
-                ackermann = importlib.import_module("ackermann_msgs.msg")
-            except ImportError:
-                return types
-            types["ackermann_msgs/msg/AckermannDriveStamped"] = ackermann.AckermannDriveStamped
-        return types
 
     # Callbacks decode small messages, keep large ones undecoded, and never raise.
 
@@ -430,6 +419,8 @@ class PredictorNode(ManagedNode):
             commands = corrected_commands(self.inputs.commands(), self.robot.effects)
             twists = commands.sample(stamps, timeout=self.settings.command_timeout)
             joints = None if self.joints is None else self.joints.at(stamp)
+            if joints is not None and self.robot.flippers:
+                observation = replace(observation, flipper_angles=joints.start[-len(self.robot.flippers) :])
             prediction = self.predictor.predict(
                 observation, motion, twists, force_every=self._force_every, joints=joints
             )

@@ -169,6 +169,14 @@ class RobotModel:
         """Height of the base frame above the lowest driven point [m]."""
         return -float(self.points[self.point_drives >= 0][:, 2].min())
 
+    @property
+    def underside(self) -> Tensor:
+        """Points at the bottom of wheels, tracks and flippers, which level ground carries ``[n, 3]`` [m]."""
+        backwards = self.point_tangents[:, 0]
+        # Small wheels have twelve samples, of which the lowest is up to 15° from the bottom.
+        limit = -0.97 if bool((backwards < -0.97).any()) else float(backwards.min()) + 0.02
+        return self.points[backwards < limit]
+
     def posed(self, angles: Tensor) -> RobotModel:
         """The robot with its flippers at ``angles`` [rad] ``[F]``, including the change of its mass properties.
 

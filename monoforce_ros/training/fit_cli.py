@@ -194,8 +194,9 @@ def _fit_one(
                 recording, motion, robot, grid, pose, start=first_sweep, stop=stop, material=material
             )
         fit = fit_terrain(
-            motion, recording.commands, robot, start=start, length=options.length, visible=visible, settings=settings
-        )
+            motion, recording.commands, robot, start=start, length=options.length, visible=visible, settings=settings,
+            joints=recording.joints,
+        )  # fmt: skip
     except (TerrainError, ValueError) as error:
         return replace(trajectory, error=str(error))
     figures = FitFigures.of(fit)
