@@ -32,19 +32,23 @@ demo: build
 lint: environment
 	@scripts/run.sh ruff check --quiet . && scripts/run.sh ruff format --check --quiet . && scripts/run.sh mypy && echo "[lint] clean"
 
-# Tests that compute share the cores; those of nodes run one after another: their timing wants the machine.
-TEST_PROCESSES ?= 2
+# Tests that compute share the cores, up to four: each process has ROS domains of its own, of which ROS has a hundred. Those
+# of nodes run one after another on two cores, for their timing wants the machine, and by twos on four.
+CORES := $(shell nproc 2>/dev/null || echo 2)
+TEST_PROCESSES ?= $(shell echo $$(($(CORES) < 4 ? $(CORES) : 4)))
+# Without a number xdist starts no process of its own.
+NODE_PROCESSES ?= $(shell echo $$(($(CORES) < 4 ? 0 : 2)))
 test: build interfaces graphics lint
 	@failed=0; \
 	scripts/run.sh python -m pytest -m "not robot" -n $(TEST_PROCESSES) --dist loadfile $(PYTEST_ARGUMENTS) || failed=1; \
-	scripts/run.sh python -m pytest -m robot $(PYTEST_ARGUMENTS) || failed=1; \
+	scripts/run.sh python -m pytest -m robot -n $(NODE_PROCESSES) --dist loadfile $(PYTEST_ARGUMENTS) || failed=1; \
 	exit $$failed
 
 # In the lowest supported versions of all dependencies: see requirements-lowest.in.
 LOWEST := MONOFORCE_ENVIRONMENT=lowest
 test-lowest: graphics
 	@$(LOWEST) scripts/set_up.sh environment && $(LOWEST) scripts/set_up.sh build
-	@$(LOWEST) scripts/run.sh python -m pytest -m "not robot" -n $(TEST_PROCESSES) --dist loadfile $(PYTEST_ARGUMENTS)
+	@$(LOWEST) scripts/run.sh python -m pytest -m "not node" -n $(TEST_PROCESSES) --dist loadfile $(PYTEST_ARGUMENTS)
 
 # Pin anew after a change of requirements.in or requirements-lowest.in.
 COMPILE := .venv/bin/uv pip compile --quiet --python .venv/bin/python --no-header

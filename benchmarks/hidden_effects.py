@@ -96,7 +96,8 @@ def with_baselines(result: dict, bag: Path, robot: Path, row: Path) -> dict:
     data = evidence.cut(starts, np.array([0.5, 1.0, 1.5, 2.0]))
     floor = noise_floor(smoothed.motion, noisy_motions(smoothed), data)
     nominal = NominalModel.read(robot, tuple(float(sample) for sample in data.samples))
-    errors = baseline_errors(evidence, data, model, residual_scale(floor, nominal))
+    scale = np.sqrt((residual_scale(floor, data, nominal) ** 2).reshape(-1, *floor.shape).mean(axis=0))
+    errors = baseline_errors(evidence, data, model, scale)
     result["baselines"] = {name: float(np.median(np.hypot(e[:, 0], e[:, 1]))) for name, e in errors.items()}
     row.write_text(json.dumps(result, indent=1))
     return result

@@ -3,7 +3,8 @@
     scripts/run.sh python benchmarks/mujoco_drives.py [--only CASE...] [--json FILE]
 
 MuJoCo's model is built here from the robot file: bodies for wheels, hubs and flippers, its own contacts, friction and
-servos. Nothing is fitted. Without a spring in the file, a wheel has a stiff one as its tyre (see synthetic/vehicle.py).
+servos. Nothing is fitted; the rollout has its default ground and body points. Without a spring in the file, a wheel has
+a stiff one as its tyre (see synthetic/vehicle.py).
 """
 
 from __future__ import annotations
@@ -30,10 +31,6 @@ from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap
 
 SECONDS, STEP, MUJOCO_STEP = 5.0, 0.01, 0.001
 FRICTION = 0.8
-STIFFNESS = 2e7
-"""Of the rollout's ground [N/m³]: MuJoCo's is hard, and a wheel that sinks is slower than its rim."""
-SPACING = 0.025
-"""Of the rollout's body points [m]: a wheel of 0.1 m on hard ground must be round."""
 _WHEELS_SHARE = 0.12
 _TYRE_STIFFNESS, _TYRE_DAMPING, _SERVO_GAIN, _GEAR_INERTIA = 1200.0, 56.0, 24.0, 0.008
 """Of each kilogram of the robot, divided among its wheels, as in synthetic/vehicle.py."""
@@ -263,7 +260,11 @@ class Engine:
         if wheel["drive"] is not None:
             axle.armature = share * _GEAR_INERTIA * (wheel["radius"] / 0.165) ** 2
             servo = spec.add_actuator(name=f"{name}_drive", target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-            servo.set_to_velocity(kv=share * _SERVO_GAIN * (wheel["radius"] / 0.165) ** 2)
+            # One motor turns a belt, and all of it acts on whichever of the belt's wheels carries the load. With a
+            # share of it on each wheel, the robot slows down where it stands on few of them.
+            belt = wheel["carrier"] is not None
+            driven = sum(other["drive"] == wheel["drive"] for other in self.wheels) if belt else 1
+            servo.set_to_velocity(kv=driven * share * _SERVO_GAIN * (wheel["radius"] / 0.165) ** 2)
 
     def drive(self, given: Controls, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Positions ``[T + 1, 3]`` and rotations ``[T + 1, 3, 3]`` under the controls, after a second at rest.
@@ -314,7 +315,7 @@ def compare(case: Case, twist: tuple[float, float, float]) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "robot.yaml"
         path.write_text(yaml.safe_dump(dict(case.content)))
-        robot = load_robot(path, spacing=SPACING)
+        robot = load_robot(path)
     steps = round(case.seconds / STEP)
     ramp = torch.linspace(0.0, case.seconds, steps).clamp(max=1.0)[:, None]
     twists = (ramp * torch.tensor(twist))[None]
@@ -330,7 +331,7 @@ def compare(case: Case, twist: tuple[float, float, float]) -> dict[str, Any]:
     terrain = TerrainMap.from_height(
         torch.from_numpy(case.heights(x, y).astype(np.float32)),
         grid,
-        material=TerrainDefaults(friction=FRICTION, stiffness=STIFFNESS, damping=1e5),
+        material=TerrainDefaults(friction=FRICTION),
     )
     state = State(
         *(torch.from_numpy(v.astype(np.float32))[None] for v in (positions[0], rotations[0], np.zeros(3), np.zeros(3)))

@@ -20,7 +20,10 @@ torch.set_num_threads(1)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Tests that start nodes run by themselves, the others beside each other (see the Makefile)."""
     for item in items:
-        if {"start", "peer"} & set(getattr(item, "fixturenames", ())) and not item.get_closest_marker("unhurried"):
+        if not {"start", "peer"} & set(getattr(item, "fixturenames", ())) or item.get_closest_marker("unhurried"):
+            continue
+        item.add_marker(pytest.mark.node)
+        if not item.get_closest_marker("unhurried_nodes"):
             item.add_marker(pytest.mark.robot)
 
 
@@ -63,7 +66,7 @@ class Process:
     def running(self) -> bool:
         return self._process.poll() is None
 
-    def wait_for(self, text: str, seconds: float = 60.0) -> None:
+    def wait_for(self, text: str, seconds: float = 120.0) -> None:
         deadline = time.monotonic() + seconds
         while text not in self.output:
             if not self.running or time.monotonic() > deadline:

@@ -1,11 +1,13 @@
 """Command lines of the nodes: nothing on them is ignored, and what is wrong is answered with the nearest right name."""
 
 import subprocess
+import sys
 
 import pytest
 import torch
 from conftest import ROOT
 
+from monoforce_ros.core import OptionParser
 from monoforce_ros.nodes.arguments import (
     check_parameter_files,
     own_arguments,
@@ -13,6 +15,9 @@ from monoforce_ros.nodes.arguments import (
     refuse_other_nodes,
     refuse_stray_arguments,
 )
+
+# Starts and refusals: how long they take does not matter.
+pytestmark = pytest.mark.unhurried_nodes
 
 KNOWN = ("robot", "terrain_source", "rate")
 
@@ -105,8 +110,23 @@ def test_what_is_for_a_node_of_another_name_is_refused(words, right):
             "predictor --ros-args -p candidate_speeds:=[]",
             "parameter candidate_speeds: got no value, expected a list of",
         ),
+        (
+            "path_selector --ros-args -p candidate_topic:=plans",
+            "unknown parameter 'candidate_topic' (it is one of predictor); did you mean 'candidate_cost_topic'?",
+        ),
+        ("simulator --ros-args -p robot:=marv", "unknown parameter 'robot': simulator has no parameters"),
+        ("bag_player --start 1000", "--start: got 1000 s, but "),
+        ("bag_player --topics /odm", "has no topics ['/odm']; did you mean '/odom'? its topics are"),
         ("predictor --ros-args -p robot:=5", "parameter robot: got 5, expected string"),
         ("predictor --ros-args -p horizon:=-1.0", "parameter horizon: got -1.0, expected double 0.1 … 30 s"),
+        (
+            "path_selector --ros-args -p timeout:=1",
+            "parameter timeout: got 1, expected double 0.05 … 10 s: write 1.0",
+        ),
+        (
+            "path_selector --ros-args -p use_sim_times:=true",
+            "unknown parameter 'use_sim_times'; did you mean 'use_sim_time'?",
+        ),
         ("path_selector --ros-args -p max_sped:=1.0", "unknown parameter 'max_sped'; --help lists all parameters"),
         ("predictor --ros-args -p odometry_topic:=odom!", "got 'odom!', expected a topic such as '/odom': topic name"),
         ("path_selector --ros-args --params-file {repeated}", "has '/**' twice, again in line 4: merge both into one"),
@@ -158,6 +178,64 @@ def test_a_value_of_a_parameter_file_arrives_and_those_of_the_other_node_are_nam
     process.wait_for("waiting for a goal on /here")
     assert "not used by this node: terrain_source (of predictor)" in process.output
     assert process.stop() == 0
+
+
+def test_a_file_that_all_nodes_share_does_no_harm_to_those_without_parameters(executables, ros_environment):
+    file = ROOT / "config" / "predictor.params.yaml"
+    done = subprocess.run(
+        [executables / "bag_player", "--wait", "0", "--duration", "0.1", "--ros-args", "--params-file", file],
+        env=ros_environment, capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0 and "not used by this node: autostart, base_frame" in done.stderr
+
+
+def test_a_remapping_that_renames_nothing_is_reported(start):
+    rules = ("odm:=/husky/odometry", "odom:=/husky/odom", "__ns:=/left", "path_selector:cmd_vel:=drive")
+    process = start("path_selector", "--ros-args", *(word for rule in rules for word in ("-r", rule)))
+    process.wait_for("-r odm:=/husky/odometry renames nothing: /left/path_selector has no topic /left/odm")
+    assert process.output.count("renames nothing") == 1
+    assert process.stop() == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "answer"),
+    [
+        (["--robto=husky"], "unrecognized arguments: --robto=husky; did you mean '--robot'?"),
+        (["--rob=husky"], "unrecognized arguments: --rob=husky; did you mean '--robot'?"),
+        (["rough", "--secnds", "3"], "unrecognized arguments: --secnds 3; did you mean '--seconds'?"),
+    ],
+)
+def test_tools_name_the_nearest_option_and_take_no_abbreviation(capsys, words, answer):
+    parser = OptionParser(prog="tool")
+    parser.add_argument("--robot")
+    parser.add_subparsers().add_parser("rough").add_argument("--seconds")
+    with pytest.raises(SystemExit):
+        parser.parse_args(words)
+    assert answer in capsys.readouterr().err
+
+
+def test_every_tool_uses_this_parser():
+    plain = [
+        path.name
+        for path in (ROOT / "monoforce_ros").rglob("*.py")
+        if "argparse.ArgumentParser(" in path.read_text() and path.name != "command_line.py"
+    ]
+    assert plain == []
+
+
+def test_a_wrong_command_line_is_answered_before_torch_is_loaded():
+    code = (
+        "import sys\nfrom monoforce_ros.nodes.executables import predictor\n"
+        "assert predictor(['--ros-args', '-p', 'terrain_sourse:=camera']) == 1 and predictor(['--help']) == 0\n"
+        "assert 'torch' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60, capture_output=True)
+
+
+@pytest.mark.parametrize("module", ["bag_player", "bag_recorder", "path_selector"])
+def test_nodes_without_physics_start_without_torch(module):
+    code = f"import sys, monoforce_ros.nodes.{module}; assert 'torch' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
 
 @pytest.mark.parametrize(("node", "other"), [("predictor", "path_selector"), ("path_selector", "predictor")])

@@ -4,13 +4,14 @@ import time
 
 import numpy as np
 import pytest
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from nav_msgs.msg import OccupancyGrid
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image
 
 from monoforce_ros.bags import BagReader, BagWriter, builders
 from monoforce_ros.core import pose_matrix
-from monoforce_ros.messages import message_class
+from monoforce_ros.messages import encoding, message_class
 from monoforce_ros.messages.decoding import stamp_of
 from monoforce_ros.nodes.frames import TransformListener
 
@@ -86,6 +87,7 @@ def test_rate_start_duration_topics_and_clock(start, peer, bag):
     assert times[0] == START + 10**9 and times[-1] == START + 2 * 10**9
 
 
+@pytest.mark.unhurried_nodes
 def test_a_loop_goes_on_until_interrupted(start, peer, bag):
     images = Listener(peer, Image, "/camera/image_raw")
     player = start("bag_player", bag, "--loop", "--rate", "10", "--duration", "0.5", "--wait", "10", "--quiet")
@@ -117,6 +119,7 @@ def write_motion(path, *, tf: bool, namespace: str = ""):
     return path
 
 
+@pytest.mark.unhurried_nodes
 @pytest.mark.parametrize("tf", [True, False])
 def test_transforms_are_played_or_derived_from_odometry(start, peer, tf_type, tmp_path, tf):
     player = start("bag_player", write_motion(tmp_path / "bag", tf=tf), "--start", "2", "--wait", "10", "--quiet")
@@ -128,6 +131,24 @@ def test_transforms_are_played_or_derived_from_odometry(start, peer, tf_type, tm
     assert transforms.tree.find("odom", "base_link")[0, 3] == pytest.approx(7.0 if tf else 5.9)
 
 
+@pytest.mark.unhurried_nodes
+def test_a_tf_without_the_robot_s_pose_gets_it_from_the_odometry(start, peer, tf_type, tmp_path):
+    """A driver that publishes the angles of its wheels, and a state estimator that publishes odometry alone."""
+    with BagWriter(tmp_path / "bag") as writer:
+        for i in range(40):
+            at = START + i * 50_000_000
+            odometry = builders.odometry(at, "odom", "base_link", [0.1 * i, 0, 0], [0, 0, 0, 1], [0] * 3, [0] * 3)
+            writer.write("/odom", odometry, at)
+            wheel = {"wheel": pose_matrix([0.3, 0, 0, 0, 0.1 * i, 0])}
+            writer.write("/tf", builders.transforms(at, "base_link", wheel), at)
+    player = start("bag_player", tmp_path / "bag", "--wait", "10", "--quiet")
+    transforms = TransformListener(peer.node)
+    assert finish(peer, player) == 0
+    assert "the bag's /tf has no odom → base_link: it is derived from /odom" in player.output
+    assert transforms.tree.find("odom", "wheel")[0, 3] == pytest.approx(3.9 + 0.3)
+
+
+@pytest.mark.unhurried_nodes
 def test_transforms_of_a_robot_with_its_own_tf_stay_together(start, peer, tf_type, tmp_path):
     bag = write_motion(tmp_path / "bag", tf=False, namespace="/left")
     received = Listener(peer, tf_type, "/left/tf")
@@ -138,11 +159,39 @@ def test_transforms_of_a_robot_with_its_own_tf_stay_together(start, peer, tf_typ
     received.close()
 
 
+@pytest.mark.unhurried_nodes
 def test_no_tf_is_derived_on_request(start, peer, tf_type, tmp_path):
     player = start("bag_player", write_motion(tmp_path / "bag", tf=False), "--no-tf", "--rate", "5", "--quiet")
     transforms = TransformListener(peer.node)
     assert finish(peer, player) == 0
     assert transforms.tree.find("odom", "base_link") is None
+
+
+@pytest.mark.unhurried_nodes
+def test_latched_topics_reach_late_subscribers_also_after_recording_anew(start, peer, tmp_path):
+    """A map, as Nav2's static layer subscribes to it, published once before the part that is played."""
+    with BagWriter(tmp_path / "maps") as writer:
+        for second in range(3):
+            data = encoding.occupancy_grid(
+                START + second, "map", 0.1, (0.0, 0.0, 0.0), np.full((2, 2), second, np.int8)
+            )
+            writer.write_serialized("/map", "nav_msgs/msg/OccupancyGrid", data, START + second, latched=True)
+        for tick in range(60):
+            at = START + 10**9 + tick * 50_000_000
+            writer.write("/cmd_vel", builders.twist(0.1, 0), at)
+    player = start("bag_player", tmp_path / "maps", "--start", "1", "--wait", "0", "--loop", "--quiet")
+    player.wait_for("playing")
+    recorder = start("bag_recorder", tmp_path / "again", "--topics", "map")
+    recorder.wait_for("recording /map")
+    grids = []
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    subscription = peer.node.create_subscription(OccupancyGrid, "/map", grids.append, latched)
+    assert peer.until(lambda: grids, 15.0)
+    assert set(grids[-1].data) == {2}
+    peer.node.destroy_subscription(subscription)
+    assert player.stop() == 0 and recorder.stop() == 0
+    with BagReader(tmp_path / "again") as bag:
+        assert bag.latched == {"/map"} and bag.counts["/map"] >= 1
 
 
 def damaged(bag, tmp_path, damage):
@@ -159,6 +208,7 @@ def cut(path, size):
     file.write_bytes(file.read_bytes()[:size])
 
 
+@pytest.mark.unhurried_nodes
 def test_an_unreadable_bag_is_refused_in_one_line(start, bag, tmp_path):
     player = start("bag_player", damaged(bag, tmp_path, lambda path: cut(path, 30)), "--quiet", "--wait", "0")
     assert player.wait(30) == 1
@@ -166,6 +216,7 @@ def test_an_unreadable_bag_is_refused_in_one_line(start, bag, tmp_path):
     assert len(lines) == 1 and "cannot be read" in lines[0] and "Traceback" not in player.output
 
 
+@pytest.mark.unhurried_nodes
 @pytest.mark.parametrize(
     "damage",
     [
@@ -185,6 +236,7 @@ def test_the_readable_part_of_a_damaged_bag_is_played_with_a_warning(start, peer
     assert "no usable index" in player.output and "Traceback" not in player.output
 
 
+@pytest.mark.unhurried_nodes
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [(["--topics", "/nothing"], "has no topics ['/nothing']"), (["--rate", "0"], "--rate: got 0.0")],
@@ -195,6 +247,7 @@ def test_wrong_arguments_are_reported(start, bag, arguments, message):
     assert message in player.output and "Traceback" not in player.output
 
 
+@pytest.mark.unhurried_nodes
 def test_the_recorder_writes_the_received_messages(start, peer, tmp_path):
     recorder = start("bag_recorder", tmp_path / "out", "--topics", "cmd_vel", "/odom", "odmo")
     sent = 0

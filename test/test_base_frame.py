@@ -49,6 +49,11 @@ def test_an_unknown_offset_is_refused_with_both_frames_and_the_missing_path(disp
         lost.in_base_frame("base_link")
 
 
+def test_data_in_the_odometry_frame_need_the_driver_s_own_topic(recording):
+    with pytest.raises(BagError, match="odometry frame .odom. do not say where their sensor is.*record the driver"):
+        recording.sensor_pose("odom", "base_link", {})
+
+
 @pytest.mark.usefixtures("one_thread")
 def test_errors_do_not_depend_on_the_frame_of_the_odometry(recording, displaced):
     robot = load_robot("husky")

@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import mujoco
 import numpy as np
 import pytest
 
@@ -26,9 +25,6 @@ def test_the_rollout_follows_an_independent_engine(check, name, number):
     assert row["rotation_error_deg"] < 8.0
 
 
-@pytest.mark.xfail(
-    mujoco.__version__.startswith("3.10."), reason="0.252 m of the 0.25 m allowed with MuJoCo 3.10", strict=True
-)
 def test_flippers_climb_a_step_of_0_3_m_in_both_engines(check):
     case = check.cases()["flippers"]
     row = check.compare(case, case.twists[0])

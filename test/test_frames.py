@@ -52,6 +52,18 @@ def test_a_loop_does_not_hang(tree):
     assert tree.find("base_link", "moon") is None
 
 
+def test_data_in_the_odometry_frame_use_the_odometry_of_their_stamp(tree):
+    """Clouds of lidar odometry: where the robot was then, not where the newest transform puts it."""
+    frames = RobotFrames("base_link", {"lidar": at(9.0)})
+    tree.add("odom", "map", at(100.0))
+    then = {"odometry_frame": "/odom", "odometry_from_base": lambda: pose_matrix([2.0, 1.0, 0.0, 0.0, 0.0, np.pi / 2])}
+    np.testing.assert_allclose((frames.sensor_pose("odom", tree, **then) @ [2, 3, 0, 1])[:3], [2, 0, 0], atol=1e-12)
+    np.testing.assert_allclose((frames.sensor_pose("map", tree, **then) @ [-98, 3, 0, 1])[:3], [2, 0, 0], atol=1e-12)
+    assert frames.sensor_pose("lidar", tree, **then)[0, 3] == pytest.approx(0.2)
+    with pytest.raises(FrameError, match="'moon' on the robot is unknown"):
+        frames.sensor_pose("moon", tree, **then)
+
+
 def test_sensor_poses_come_from_transforms_before_the_robot_file(tree):
     frames = RobotFrames("base_link", {"lidar": at(9.0), "camera": at(7.0)})
     assert frames.sensor_pose("lidar", tree)[0, 3] == pytest.approx(0.2)

@@ -4,7 +4,9 @@ import time
 
 import pytest
 import rclpy
+from rosgraph_msgs.msg import Clock
 
+from monoforce_ros.nodes.clocks import STEADY
 from monoforce_ros.nodes.health import ERROR, OK, WARN, Health
 
 
@@ -19,12 +21,19 @@ def node(ros_environment, monkeypatch):
     context.try_shutdown()
 
 
-def spun(node, seconds):
+def spun(node, seconds, until=lambda: False):
     executor = rclpy.executors.SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
     end = time.monotonic() + seconds
-    while time.monotonic() < end:
+    while time.monotonic() < end and not until():
         executor.spin_once(timeout_sec=0.05)
+    return until()
+
+
+def seconds_of(seconds):
+    message = Clock()
+    message.clock.sec = seconds
+    return message
 
 
 def lines(capfd, part):
@@ -41,6 +50,36 @@ def test_a_part_that_flickers_does_not_fill_the_log_and_its_last_state_is_in_it(
     seen = lines(capfd, "choice")
     assert 3 <= len(seen) <= 4
     assert "0.60 s old" in seen[0] and "driving" in seen[1] and "0.99 s old" in seen[-1]
+
+
+def test_simulated_time_that_stands_still_is_reported(ros_environment, monkeypatch, capfd):
+    """`use_sim_time` without /clock: the watch goes on, for it follows steady time."""
+    monkeypatch.setenv("ROS_DOMAIN_ID", ros_environment["ROS_DOMAIN_ID"])
+    context = rclpy.Context()
+    context.init()
+    simulated = rclpy.parameter.Parameter("use_sim_time", value=True)
+    node = rclpy.create_node("watched", context=context, parameter_overrides=[simulated])
+    health = Health(node, ["clock"])
+    clock = node.create_publisher(Clock, "/clock", 10)
+    time_of_bag = 0
+    # A time of zero is none yet.
+    timer = node.create_timer(0.1, lambda: clock.publish(seconds_of(time_of_bag)), clock=STEADY)
+    assert spun(node, 10.0, lambda: health.level("clock") == WARN)
+    timer.cancel()
+
+    def tick():
+        nonlocal time_of_bag
+        time_of_bag += 1
+        clock.publish(seconds_of(time_of_bag))
+
+    timer = node.create_timer(0.1, tick, clock=STEADY)
+    assert spun(node, 10.0, lambda: health.level("clock") == OK)
+    timer.cancel()
+    assert spun(node, 10.0, lambda: health.level("clock") == WARN)
+    first, _, last = lines(capfd, "clock")
+    assert "use_sim_time is true, but there are no messages on /clock" in first and "/clock stands still" in last
+    node.destroy_node()
+    context.try_shutdown()
 
 
 def test_every_new_state_is_logged_at_once(node, capfd):

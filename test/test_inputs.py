@@ -125,7 +125,7 @@ def test_a_silent_camera_delays_the_others_only_for_a_while():
 def test_a_backward_time_jump_discards_everything_and_is_reported():
     kept, jumps = inputs(["a"])
     moved(kept, 100 * SECOND)
-    kept.add_command("commands", 100 * SECOND, np.ones(2))
+    kept.add_command(100 * SECOND, np.ones(2))
     moved(kept, 50 * SECOND)
     assert jumps == [("odometry", 50.0)]
     assert len(kept.motion()) == 1 and len(kept.commands()) == 0
@@ -133,10 +133,29 @@ def test_a_backward_time_jump_discards_everything_and_is_reported():
     assert len(kept.motion()) == 1 and len(jumps) == 1
 
 
+def test_the_clock_of_commands_says_nothing_of_the_sensors():
+    """Two computers that command by turns, their clocks 100 s apart, must not stop the predictions."""
+    kept, jumps = inputs(["a"])
+    moved(kept, 100 * SECOND)
+    kept.add_command(200 * SECOND, np.ones(2))
+    kept.add_command(100 * SECOND, np.zeros(2))
+    assert not jumps and len(kept.motion()) == 1
+    assert kept.commands().stamps.tolist() == [100 * SECOND]
+
+
+def test_commands_of_the_new_time_survive_a_jump():
+    kept, _ = inputs(["a"])
+    moved(kept, 100 * SECOND)
+    kept.add_command(100 * SECOND, np.ones(2))
+    kept.add_command(50 * SECOND, np.ones(2))
+    moved(kept, 50 * SECOND)
+    assert kept.commands().stamps.tolist() == [50 * SECOND]
+
+
 def test_commands_without_a_stamp_are_dated_by_odometry():
     kept, _ = inputs(["a"])
-    kept.add_command("commands", 0, np.ones(2))
+    kept.add_command(0, np.ones(2))
     assert len(kept.commands()) == 0
     moved(kept, 7 * SECOND)
-    kept.add_command("commands", 0, np.ones(2))
+    kept.add_command(0, np.ones(2))
     assert kept.commands().stamps.tolist() == [7 * SECOND]

@@ -87,6 +87,7 @@ def test_a_manager_configures_activates_pauses_and_takes_down(peer, start):
     assert process.stop() == 0
 
 
+@pytest.mark.unhurried_nodes
 def test_a_node_that_cannot_be_configured_keeps_running_and_logs_the_reason(peer, start):
     process = start(
         "predictor", "--ros-args", "-p", "autostart:=false", "-p", "robot:=no_such_robot", "-r", "__node:=wrong"
@@ -98,6 +99,7 @@ def test_a_node_that_cannot_be_configured_keeps_running_and_logs_the_reason(peer
     assert process.stop() == 0
 
 
+@pytest.mark.unhurried_nodes
 def test_the_robot_may_change_while_the_node_is_unconfigured(peer, start):
     process = start(
         "predictor", "--ros-args", "-p", "autostart:=false", "-p", "terrain_source:=flat", "-r", "__node:=changing"

@@ -127,6 +127,19 @@ def test_a_fault_stops_both_tools(tmp_path, capsys, fault, text):
     assert "cannot be diagnosed" in (tmp_path / "out" / "report.html").read_text()
 
 
+@pytest.mark.parametrize("seconds", [2.5, 3.6])
+def test_a_short_recording_of_a_moving_robot_is_not_said_to_stand(seconds):
+    """As a bag that was cut off: windows begin in less than two of its seconds."""
+    motion, commands = recorded(noise=0.01)
+    kept = motion.stamps < START + 1e9 * (4.0 + seconds)
+    kept &= motion.stamps >= START + 4e9
+    arrays = {name: value[kept] for name, value in vars(motion).items() if isinstance(value, np.ndarray)}
+    short = replace(motion, **arrays)
+    assert motion_faults(smooth(short), commands, None) == ()
+    (fault,) = motion_faults(smooth(standing(short, commands)[0]), commands, None)
+    assert fault.startswith("the robot does not move although commands reach")
+
+
 def test_wheels_that_turn_while_the_robot_does_not_are_said():
     motion, commands = standing(*recorded())
     speeds = commands.twists[:, :1] + np.outer(commands.twists[:, 1], [-0.3, 0.3])

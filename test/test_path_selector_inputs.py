@@ -1,19 +1,24 @@
 """What path_selector says and does for each of its inputs: missing, of another type, quality of service or frame."""
 
+import signal
 import time
 
 import numpy as np
 import pytest
+import rclpy
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry, Path
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import PointCloud2
+from sensor_msgs.msg import JointState, PointCloud2
 
 from monoforce_ros.bags import builders, type_store
 from monoforce_ros.core import pose_matrix
 from monoforce_ros.messages import encoding, message_class
 from monoforce_ros.nodes.progress_check import ProgressCheck
 from monoforce_ros.planning import WAYPOINTS, plan_target
+
+# Every test waits for a state, for as long as it takes, and the robot's world goes at the pace of the test.
+pytestmark = pytest.mark.unhurried_nodes
 
 BEST_EFFORT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 OK, WARN = 0, 1
@@ -133,6 +138,40 @@ def robot(peer, start, request):
     assert "Traceback" not in process.output
 
 
+@pytest.mark.parametrize("robot", ["flipper_command_topic:=flipper_commands", "command_rate:=10.0"], indirect=True)
+def test_flipper_angles_are_passed_on_only_where_a_topic_is_named_and_while_driving(robot, request):
+    node, prefix = robot.peer.node, robot.prefix
+    heard: list = []
+    node.create_subscription(JointState, f"/{prefix}/flipper_commands", heard.append, 1)
+    # From a node of its own: one that publishes two predictions is a predictor, which is no base.
+    climber = rclpy.create_node("climber", context=node.context)
+    angles = climber.create_publisher(JointState, f"/{prefix}/predicted/flipper_angles", 1)
+    message = JointState(name=["front_left", "front_right"], position=[0.4, 0.4])
+    robot.listen(TwistStamped)
+
+    def drives() -> bool:
+        angles.publish(message)
+        return robot.driven and bool(heard)
+
+    robot.live(2.0, until=lambda: drives() and False)
+    assert not heard, "no goal yet"
+    robot.send_goal(50.0, 0.0)
+    if "flipper" in request.node.callspec.id:
+        assert robot.live(10.0, until=drives), robot.status()
+        assert list(heard[-1].position) == [0.4, 0.4] and list(heard[-1].name) == message.name
+        # Angles that are not finite, or old, are not.
+        message.position = [float("nan"), 0.4]
+        robot.live(1.0, until=lambda: drives() and False)
+        heard.clear()
+        robot.live(1.0)
+        assert robot.driven and not heard
+    else:
+        assert robot.live(10.0, until=lambda: drives() or robot.driven)
+        robot.live(1.0, until=lambda: drives() and False)
+        assert not heard
+    climber.destroy_node()
+
+
 def test_without_odometry_it_says_so_and_claims_nothing(robot):
     robot.listen(TwistStamped)
     robot.send_goal(5.0, 0.0)
@@ -149,6 +188,38 @@ def test_best_effort_odometry_is_received_and_a_moving_robot_drives(robot):
     robot.speed = 0.5
     assert robot.live(10.0, until=robot.says("driving to the goal")), robot.status()
     assert robot.status()[0] == OK
+
+
+@pytest.mark.parametrize("robot", ["use_sim_time:=true"], indirect=True)
+def test_simulated_time_that_stands_still_stops_nothing(robot):
+    """A /clock that nobody publishes any more: commands, and above all the command to stop, still reach the base."""
+    robot.listen(TwistStamped)
+    robot.send_goal(50.0, 0.0)
+    assert robot.live(10.0, until=lambda: robot.driven), robot.status()
+    assert robot.live(5.0, until=robot.says("there are no messages on /clock", "clock"))
+    assert robot.live(10.0, odometry=False, until=lambda: not robot.driven), robot.status()
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+def test_a_robot_that_drives_is_stopped_when_the_selector_ends(robot, how):
+    robot.listen(Twist)
+    robot.send_goal(50.0, 0.0)
+    assert robot.live(10.0, until=lambda: robot.driven), robot.status()
+    assert robot.process.stop(how) == 0
+    assert robot.peer.until(lambda: not robot.driven, 2.0)
+
+
+def test_odometry_with_stamps_of_zero_is_refused(robot):
+    robot.listen(TwistStamped)
+    robot.send_goal(5.0, 0.0)
+    robot.peer.now, now = -50_000_000, robot.peer.now
+    for _ in range(60):
+        robot.peer.now = -50_000_000
+        robot.live(0.05)
+        if robot.says("stopped: the stamps are zero")():
+            break
+    robot.peer.now = now
+    assert robot.says("stopped: the stamps are zero")() and not robot.driven, robot.status()
 
 
 def test_odometry_without_a_frame_is_in_odom_as_the_predictor_takes_it(robot):

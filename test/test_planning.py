@@ -356,3 +356,15 @@ def test_selection_does_not_alternate_between_similar_paths():
     # A much better path is taken nevertheless.
     better = candidates | {"cost": np.array([2.0, 0.5])}
     assert select_candidate(better, np.zeros(2), goal, previous_command=(0.0, 0.8)) == 1
+
+
+def test_robots_that_crab_get_candidates_that_move_sideways():
+    settings = {"count": 20, "speeds": (0.0, 0.8), "yaw_rate": 0.8}
+    plain, fan = fan_of_arcs(CandidateSettings(**settings)), fan_of_arcs(CandidateSettings(**settings, lateral=0.5))
+    assert plain.shape == (20, 4, 2) and fan.shape == (20, 4, 3)
+    sideways = np.abs(fan[..., 2]).max(axis=1) > 0
+    assert fan[sideways, 0].tolist() == [[0.0, 0.0, 0.5], [0.0, 0.0, -0.5], [0.8, 0.0, 0.5], [0.8, 0.0, -0.5]]
+    assert not fan[-1].any()
+    assert fan_of_arcs(CandidateSettings(count=5, speeds=(0.8,), lateral=0.5)).shape == (5, 4, 3)
+    with pytest.raises(ValueError, match="candidate lateral speed"):
+        CandidateSettings(lateral=-1.0)

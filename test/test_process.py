@@ -56,6 +56,12 @@ sys.exit(run_node(Starting, []))
 """
 
 
+def test_signals_are_handled_before_anything_that_takes_time_is_imported():
+    code = "import sys, monoforce_ros.nodes.executables; sys.exit(str({'numpy', 'yaml', 'rclpy'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert done.stderr.strip() == "set()"
+
+
 @pytest.mark.parametrize("following", ["self.create_publisher(String, 'x', 1)", "pass", "raise KeyboardInterrupt"])
 def test_a_signal_while_a_node_starts_is_no_fault(following, ros_environment):
     done = subprocess.run(

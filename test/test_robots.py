@@ -48,7 +48,7 @@ def test_inertia_does_not_depend_on_sampling():
 def test_belts_are_closed_and_run_backwards_at_the_bottom(length, rear, front, spacing):
     if abs(rear - front) >= 0.95 * length:
         return
-    positions, tangents, lengths = belt_outline(length, rear, front, spacing)
+    positions, tangents, lengths, _ = belt_outline(length, rear, front, spacing)
     np.testing.assert_allclose(np.linalg.norm(tangents, axis=1), 1.0, atol=1e-9)
     # The belt is closed.
     np.testing.assert_allclose((tangents * lengths[:, None]).sum(axis=0), 0.0, atol=0.03 * lengths.sum())

@@ -18,7 +18,8 @@ from monoforce_ros.core import write_text
 from monoforce_ros.discrepancy import read_evidence
 from monoforce_ros.discrepancy.gap import noise_floor, noisy_motions, residual_scale
 from monoforce_ros.discrepancy.hypothesis import window_starts
-from monoforce_ros.robots import load_robot, read_nominal_residual
+from monoforce_ros.discrepancy.nominal import NominalModel
+from monoforce_ros.robots import load_robot
 
 SAMPLES = np.array([0.5, 1.0, 1.5, 2.0])
 """Times in a window of 2 s [s]."""
@@ -36,7 +37,8 @@ def main() -> None:
     smoothed = evidence.smoothed
     data = evidence.cut(window_starts(smoothed.motion, smoothed.stretches, 2.0, 1.0), SAMPLES)
     floor = noise_floor(smoothed.motion, noisy_motions(smoothed), data)
-    scale = residual_scale(floor, read_nominal_residual(robot, tuple(SAMPLES)))
+    nominal = NominalModel.read(robot, tuple(SAMPLES))
+    scale = np.sqrt((residual_scale(floor, data, nominal) ** 2).reshape(-1, *floor.shape).mean(axis=0))
     errors = baseline_errors(evidence, data, model, scale)
     medians = {name: float(np.median(np.hypot(error[:, 0], error[:, 1]))) for name, error in errors.items()}
     write_text(Path(out), json.dumps(medians) + "\n")

@@ -105,8 +105,8 @@ def scores(rows: Sequence[Row]) -> dict[str, dict]:
     logarithms = [np.log(size["loss_before"] / size["loss_of_a_healthy_robot"]) for size in sizes]
     ratios = [row["numbers"]["variance_ratio"] for row in empty if "variance_ratio" in row.get("numbers", {})]
     return {
-        "drive_share": {"value": float(np.mean(ratios)) if ratios else None, "of": len(ratios)},
-        # Both calibrate numbers of discrepancy/thresholds.py.
+        "variance_ratio": {"value": float(np.mean(ratios)) if ratios else None, "of": len(ratios)},
+        # Compare with those of discrepancy/thresholds.py.
         "drive_spread": {"value": float(np.sqrt(np.mean(np.square(logarithms)))) if sizes else None, "of": len(sizes)},
         "singles_named": share([row for row in singles if found_all(row)], singles),
         "singles_named_exactly": share([row for row in singles if named_exactly(row)], singles),

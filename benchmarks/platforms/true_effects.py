@@ -20,20 +20,15 @@ import numpy as np
 import torch
 from benchmark_case import SETS, Case, all_cases
 from case_recording import CaseFiles
+from case_search import search_of
 from tqdm import tqdm
 
 from monoforce_ros.core import write_text
-from monoforce_ros.discrepancy.bag_diagnosis import read_with_ground
-from monoforce_ros.discrepancy.comparable_windows import comparable_starts, windows_of
-from monoforce_ros.discrepancy.explanation import DiagnosisSettings
 from monoforce_ros.discrepancy.fit import first_values, fit_effects
-from monoforce_ros.discrepancy.gap import noisy_motions, residual_scale
-from monoforce_ros.discrepancy.hypothesis import Effects, corrected_evidence
-from monoforce_ros.discrepancy.nominal import NominalModel
+from monoforce_ros.discrepancy.hypothesis import Effects
 from monoforce_ros.discrepancy.selection import Search
 from monoforce_ros.discrepancy.trial import excess_share
 from monoforce_ros.effects import CATALOGUE
-from monoforce_ros.robots import load_robot
 
 KINDS = ("single", "pair", "outside")
 
@@ -72,23 +67,12 @@ def measured(case: Case, files: CaseFiles, nominal_file: Path) -> dict | None:
     truth = json.loads(files.truth.read_text())
     if not truth["usable"]:
         return None
-    settings = DiagnosisSettings()
-    robot = load_robot(nominal_file)
-    nominal = NominalModel.read(nominal_file, settings.samples)
-    if nominal is None:
-        return None
-    map_file = files.terrain(files.bag)
-    read, _, _ = read_with_ground(files.bag, robot, str(map_file) if map_file.exists() else "auto")
-    evidence = corrected_evidence(read, robot)
-    starts, _ = comparable_starts(evidence, robot, settings)
-    noisy = noisy_motions(evidence.smoothed, settings.seed)
-    if not len(starts):
-        return None
     # A late effect explains what is measured after its onset.
     onset = max((entry["onset_s"] for entry in truth["hidden"]), default=0.0)
-    starts = starts[starts >= starts[0] + round(onset * 1e9)]
-    windows = windows_of(evidence, robot, starts, np.array(settings.samples), noisy)
-    search = Search(robot, windows.data, residual_scale(windows.uncertainty, nominal), nominal=nominal)
+    search = search_of(files, nominal_file, onset)
+    if search is None or search.nominal is None:
+        return None
+    nominal = search.nominal
     effects = selected(search) if case.kind == "outside" else fitted_truth(search, truth["hidden"])
     if not effects:
         return None

@@ -1,6 +1,7 @@
 """Read and write rosbag files of ROS 2 (sqlite3, mcap) and read those of ROS 1, without a ROS installation."""
 
 from monoforce_ros.bags import builders
+from monoforce_ros.bags.joint_record import JointRecord
 from monoforce_ros.bags.read_options import DETECTED, ReadOptions, add_read_options, read_options
 from monoforce_ros.bags.reader import BagError, BagMessage, BagReader
 from monoforce_ros.bags.recording import (
@@ -32,6 +33,7 @@ __all__ = [
     "BagReader",
     "BagWriter",
     "Frame",
+    "JointRecord",
     "ReadOptions",
     "Recording",
     "SmoothedMotion",

@@ -85,14 +85,15 @@ def imu(stamp: int, frame_id: str, angular_velocity: Vector, linear_acceleration
     )
 
 
-def twist(linear_x: float, angular_z: float) -> Message:
-    """``geometry_msgs/Twist``: forward speed [m/s] and yaw rate [rad/s]."""
-    return _twist([linear_x, 0, 0], [0, 0, angular_z])
+def twist(linear_x: float, angular_z: float, linear_y: float = 0.0) -> Message:
+    """``geometry_msgs/Twist``: forward speed [m/s], yaw rate [rad/s] and speed to the left [m/s]."""
+    return _twist([linear_x, linear_y, 0], [0, 0, angular_z])
 
 
-def twist_stamped(stamp: int, frame_id: str, linear_x: float, angular_z: float) -> Message:
-    """``geometry_msgs/TwistStamped``: forward speed [m/s] and yaw rate [rad/s]."""
-    return _make("geometry_msgs/msg/TwistStamped", header=header(stamp, frame_id), twist=twist(linear_x, angular_z))
+def twist_stamped(stamp: int, frame_id: str, linear_x: float, angular_z: float, linear_y: float = 0.0) -> Message:
+    """``geometry_msgs/TwistStamped``: forward speed [m/s], yaw rate [rad/s] and speed to the left [m/s]."""
+    content = twist(linear_x, angular_z, linear_y)
+    return _make("geometry_msgs/msg/TwistStamped", header=header(stamp, frame_id), twist=content)
 
 
 def ackermann_drive(stamp: int, frame_id: str, speed: float, steering_angle: float) -> Message:

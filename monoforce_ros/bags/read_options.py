@@ -5,10 +5,13 @@ from __future__ import annotations
 import argparse
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from monoforce_ros.bags.recording import Recording
 from monoforce_ros.core import pose_matrix
-from monoforce_ros.robots import RobotModel
+
+if TYPE_CHECKING:  # robots load torch, for which bag_player and bag_recorder need not wait
+    from monoforce_ros.robots import RobotModel
 
 
 @dataclass(frozen=True)
@@ -21,6 +24,10 @@ class ReadOptions:
     """Topic."""
     cloud: str | None = None
     """Topic."""
+    joints: str | None = None
+    """Topic of measured joint states."""
+    flipper_commands: str | None = None
+    """Topic of joint states."""
     base_frame: str = ""
     """Name of the robot's base frame in the bag, if it is not the one of the robot file."""
     odometry_child_pose: tuple[float, ...] | None = None
@@ -36,15 +43,18 @@ class ReadOptions:
         Raises:
             BagError: the bag or a topic cannot be used, or it is unknown where its odometry is on the robot.
         """
-        return self.at_base(self.open_as_measured(path), robot)
+        return self.at_base(self.open_as_measured(path, robot), robot)
 
-    def open_as_measured(self, path: str | Path) -> Recording:
-        """The recording with the motion of the odometry's child frame.
+    def open_as_measured(self, path: str | Path, robot: RobotModel) -> Recording:
+        """The recording with the motion of the odometry's child frame, and the commands and joints of a robot.
 
         Raises:
             BagError: the bag or a topic cannot be used.
         """
-        return Recording.open(path, odometry=self.odometry, commands=self.commands, cloud=self.cloud)
+        return Recording.open(
+            path, odometry=self.odometry, commands=self.commands, cloud=self.cloud, joints=self.joints,
+            flipper_commands=self.flipper_commands, robot=robot,
+        )  # fmt: skip
 
     def at_base(self, recording: Recording, robot: RobotModel) -> Recording:
         """A recording that was opened as measured, with the motion of the robot's base.
@@ -62,7 +72,11 @@ DETECTED = ReadOptions()
 
 def add_read_options(parser: argparse.ArgumentParser) -> None:
     """The options of a command line that :func:`read_options` reads."""
-    for role, what in (("odometry", "odometry"), ("commands", "command"), ("cloud", "point cloud")):
+    roles = (
+        ("odometry", "odometry"), ("commands", "command"), ("cloud", "point cloud"), ("joints", "joint state"),
+        ("flipper-commands", "flipper command (joint states)"),
+    )  # fmt: skip
+    for role, what in roles:
         parser.add_argument(f"--{role}", metavar="TOPIC", help=f"{what} topic (default: detected by type)")
     parser.add_argument(
         "--base-frame",
@@ -86,6 +100,8 @@ def read_options(options: argparse.Namespace) -> ReadOptions:
         odometry=options.odometry,
         commands=options.commands,
         cloud=options.cloud,
+        joints=options.joints,
+        flipper_commands=options.flipper_commands,
         base_frame=options.base_frame,
         odometry_child_pose=None if pose is None else tuple(pose),
     )

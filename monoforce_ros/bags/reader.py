@@ -9,7 +9,7 @@ from types import TracebackType
 from typing import Any
 
 from rosbags.highlevel import AnyReader
-from rosbags.interfaces import Connection
+from rosbags.interfaces import Connection, QosDurability
 
 from monoforce_ros.bags.salvage import SalvagedBag, storage_files
 from monoforce_ros.bags.types import type_store
@@ -117,6 +117,11 @@ class BagReader:
         return {connection.topic: connection.msgtype for connection in self._any.connections}
 
     @property
+    def latched(self) -> set[str]:
+        """Topics whose publishers offered late subscribers their last message: transient local, latched in ROS 1."""
+        return {connection.topic for connection in self._any.connections if _is_latched(connection)}
+
+    @property
     def counts(self) -> dict[str, int]:
         """Number of messages on every topic."""
         return {name: info.msgcount for name, info in self._any.topics.items()}
@@ -168,3 +173,14 @@ class BagReader:
             raise BagError(
                 f"{self.path} breaks off while being read ({type(error).__name__}: {error}): it is truncated or damaged"
             ) from error
+
+
+def _is_latched(connection: Connection) -> bool:
+    if connection.topic.rpartition("/")[2] == "tf_static":
+        return True
+    # A salvaged bag does not say.
+    offers = getattr(connection, "ext", None)
+    offered = getattr(offers, "offered_qos_profiles", None)
+    if offered is None:
+        return bool(getattr(offers, "latching", None))
+    return bool(offered) and all(profile.durability == QosDurability.TRANSIENT_LOCAL for profile in offered)

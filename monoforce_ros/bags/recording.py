@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,12 +10,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags.builders import Message
+from monoforce_ros.bags.joint_record import JointRecord
 from monoforce_ros.bags.reader import BagError, BagMessage, BagReader
 from monoforce_ros.core import (
     AngularVelocityTrack,
     CameraModel,
     CommandTrack,
     FrameError,
+    JointTrack,
     MotionState,
     MotionTrack,
     RobotFrames,
@@ -24,9 +26,11 @@ from monoforce_ros.core import (
     nearest_stamp,
 )
 from monoforce_ros.messages import decoding
+from monoforce_ros.robots import RobotModel
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 COMMANDS = ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist")
+ACKERMANN = "ackermann_msgs/msg/AckermannDriveStamped"
 CLOUD = "sensor_msgs/msg/PointCloud2"
 IMAGES = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
@@ -62,7 +66,7 @@ class Recording:
     static_transforms: dict[tuple[str, str], np.ndarray]
     """Poses ``[4, 4]`` by parent and child frame: those on /tf_static, and those on /tf that hold still."""
     topics: dict[str, str]
-    """Topic used for each of ``odometry``, ``commands``, ``cloud``, ``imu`` and ``joints``."""
+    """Topic used for each of ``odometry``, ``commands``, ``cloud``, ``imu``, ``joints`` and ``flipper_commands``."""
     warnings: tuple[str, ...] = ()
     """Defects of the bag and of single messages, which were skipped."""
     angular_velocity: AngularVelocityTrack | None = None
@@ -73,36 +77,53 @@ class Recording:
     """Topics that were chosen among several of their type; also among the warnings."""
     odometry_child_frame: str = ""
     """The frame that the odometry messages describe; ``motion`` may be that of the base."""
+    joints: JointRecord | None = None
+    """Measured and commanded joints of the robot for which the bag was opened, if there are any."""
 
     @classmethod
     def open(
-        cls, path: str | Path, *, odometry: str | None = None, commands: str | None = None, cloud: str | None = None
+        cls,
+        path: str | Path,
+        *,
+        odometry: str | None = None,
+        commands: str | None = None,
+        cloud: str | None = None,
+        joints: str | None = None,
+        flipper_commands: str | None = None,
+        robot: RobotModel | None = None,
     ) -> Recording:
         """Read a bag's motion and index its clouds and images.
 
         Args:
             path: the bag (see :class:`BagReader`).
-            odometry, commands, cloud: topics to use; by default the one of the required type with the most messages.
+            odometry, commands, cloud, joints, flipper_commands: topics to use; by default the one of the required type
+                with the most messages. Of joint states those with ``command`` in their name are commands.
+            robot: of a robot that steers, steering angles as commands are read; of one that crabs, lateral speeds; and
+                the angles of its joints.
 
         Raises:
             BagError: the bag cannot be read, a named topic is absent or of another type, or there is no odometry.
         """
+        command_types = COMMANDS if robot is None or robot.steered is None else (*COMMANDS, ACKERMANN)
         with BagReader(path) as bag:
             chosen = {
                 "odometry": _choose(bag, odometry, (ODOMETRY,)),
-                "commands": _choose(bag, commands, COMMANDS),
+                "commands": _choose(bag, commands, command_types),
                 "cloud": _choose(bag, cloud, (CLOUD,)),
                 "imu": _choose(bag, None, (IMU,)),
-                "joints": _choose(bag, None, (JOINTS,)),
+                "joints": _choose(bag, joints, (JOINTS,), lambda topic: not _is_commanded(topic)),
             }
+            if robot is not None and robot.flippers:
+                chosen["flipper_commands"] = _choose(bag, flipper_commands, (JOINTS,), _is_commanded)
             if chosen["odometry"] is None:
                 raise BagError(f"{bag.path} has no {ODOMETRY} topic; it contains {sorted(set(bag.topics.values()))}")
             image_topics = bag.of_type(*IMAGES)
             topics = {topic for topic in chosen.values() if topic}
             topics.update(image_topics, bag.of_type(CAMERA_INFO), bag.of_type(TRANSFORMS))
-            collected = _Collector(bag, chosen)
+            collected = _Collector(bag, chosen, robot)
             collected.warnings.extend(bag.warnings)
-            collected.choices = _choices(bag, chosen, {"odometry": odometry, "commands": commands, "cloud": cloud})
+            named = {"odometry": odometry, "commands": commands, "cloud": cloud}
+            collected.choices = _choices(bag, chosen, named, command_types)
             collected.warnings.extend(collected.choices)
             try:
                 for message in bag.messages(topics):
@@ -159,6 +180,11 @@ class Recording:
         Raises:
             BagError: neither has the frame.
         """
+        if frame_id.lstrip("/") == (self.motion.frame_id or "odom").lstrip("/"):
+            raise BagError(
+                f"{self.path}: data in the odometry frame {frame_id!r} do not say where their sensor is on the robot: "
+                "record the driver's own topic, in the sensor's frame"
+            )
         try:
             return RobotFrames(base_frame, known).sensor_pose(frame_id, TransformTree(self.static_transforms))
         except FrameError as error:
@@ -231,21 +257,33 @@ def camera_info_topic(image_topic: str) -> str:
     return f"{base.rsplit('/', 1)[0]}/camera_info" if "/" in base else "camera_info"
 
 
-def _choose(bag: BagReader, named: str | None, message_types: tuple[str, ...]) -> str | None:
+def _is_commanded(topic: str) -> bool:
+    """Whether joint states on a topic are commands, by its name."""
+    return "command" in topic.lower() or "cmd" in topic.lower()
+
+
+def _choose(
+    bag: BagReader,
+    named: str | None,
+    message_types: tuple[str, ...],
+    accepts: Callable[[str], bool] = lambda topic: True,
+) -> str | None:
     if named:
         if bag.topics.get(named) not in message_types:
             raise BagError(
                 f"{bag.path}: topic {named} is {bag.topics.get(named, 'absent')}, expected {' or '.join(message_types)}"
             )
         return named
-    candidates = bag.of_type(*message_types)
+    candidates = [topic for topic in bag.of_type(*message_types) if accepts(topic)]
     return max(candidates, key=lambda topic: bag.counts[topic], default=None)
 
 
-def _choices(bag: BagReader, chosen: Mapping[str, str | None], named: Mapping[str, str | None]) -> list[str]:
+def _choices(
+    bag: BagReader, chosen: Mapping[str, str | None], named: Mapping[str, str | None], command_types: tuple[str, ...]
+) -> list[str]:
     """What was chosen among several topics of a type, and how to choose another one."""
     texts = []
-    for role, types in (("odometry", (ODOMETRY,)), ("commands", COMMANDS), ("cloud", (CLOUD,))):
+    for role, types in (("odometry", (ODOMETRY,)), ("commands", command_types), ("cloud", (CLOUD,))):
         others = [topic for topic in bag.of_type(*types) if topic != chosen[role] and bag.counts[topic]]
         if others and not named[role]:
             texts.append(
@@ -258,15 +296,20 @@ def _choices(bag: BagReader, chosen: Mapping[str, str | None], named: Mapping[st
 class _Collector:
     """Collects the messages of one pass over a bag."""
 
-    def __init__(self, bag: BagReader, chosen: dict[str, str | None]):
+    def __init__(self, bag: BagReader, chosen: dict[str, str | None], robot: RobotModel | None = None):
         self.bag = bag
         self.chosen = chosen
+        self.robot = robot
+        self._crabs = robot is not None and robot.steered is not None and robot.steered.crabs
         self.states: list[tuple[int, MotionState]] = []
         self.frames = ("odom", "base_link")
         self.twists: list[tuple[int, np.ndarray]] = []
         self.angular_velocities: list[tuple[int, np.ndarray]] = []
         self.imu_frame = ""
         self.wheels: list[tuple[int, np.ndarray]] = []
+        self.joints: list[tuple[int, np.ndarray]] = []
+        self.flipper_commands: list[tuple[int, np.ndarray]] = []
+        self._unknown_joints: dict[str, list[str]] = {}
         self.indexed: dict[str, list[Frame]] = {}
         self.cameras: dict[str, CameraModel] = {}
         self.transforms: dict[tuple[str, str], np.ndarray] = {}
@@ -289,7 +332,7 @@ class _Collector:
                 self.frames = (frame_id, child_frame_id)
                 self.states.append((stamp, state))
             elif message.topic == self.chosen["commands"]:
-                self.twists.append((stamp, decoding.decode_command(decoded)))
+                self.twists.append((stamp, self._command(decoded)))
             elif message.topic == self.chosen["imu"]:
                 rate, self.imu_frame = decoding.decode_angular_velocity(decoded)
                 self.angular_velocities.append((stamp, rate))
@@ -297,6 +340,9 @@ class _Collector:
                 speeds = decoding.decode_wheel_speeds(decoded)
                 if speeds is not None:
                     self.wheels.append((stamp, speeds))
+                self._take_joints(message.topic, stamp, decoded, self.joints)
+            elif message.topic == self.chosen.get("flipper_commands"):
+                self._take_joints(message.topic, stamp, decoded, self.flipper_commands)
             elif message.message_type == CAMERA_INFO:
                 if message.topic not in self.cameras:
                     self.cameras[message.topic] = decoding.decode_camera_info(decoded)
@@ -309,6 +355,23 @@ class _Collector:
         except ValueError as error:
             if len(self.warnings) < 20:
                 self.warnings.append(f"{message.topic}: {error}")
+
+    def _command(self, message: Message) -> np.ndarray:
+        if hasattr(message, "drive"):
+            assert self.robot is not None
+            assert self.robot.steered is not None
+            twist = decoding.decode_ackermann(message, self.robot.steered.wheelbase)
+            return np.append(twist, 0.0) if self._crabs else twist
+        return decoding.decode_command(message, lateral=self._crabs)
+
+    def _take_joints(self, topic: str, stamp: int, message: Message, kept: list[tuple[int, np.ndarray]]) -> None:
+        if self.robot is None or not self.robot.joints:
+            return
+        if not set(message.name) & set(self.robot.joint_names):
+            if any(joint.kind in ("steering", "flipper") for joint in self.robot.joints):
+                self._unknown_joints[topic] = sorted(str(name) for name in message.name)
+            return
+        kept.append((stamp, decoding.decode_joints(message, self.robot.joint_names)[0]))
 
     def _take_transforms(self, found: dict[tuple[str, str], np.ndarray], static: bool) -> None:
         """Keep static transforms and, of moving ones, those that hold still: frames fixed on the robot."""
@@ -325,6 +388,12 @@ class _Collector:
         if not self.states:
             raise BagError(f"{self.bag.path}: no usable message on {self.chosen['odometry']}: {self.warnings[:1]}")
         stamps, states = _in_order(self.states)
+        for topic, names in self._unknown_joints.items():
+            if not (self.joints if topic == self.chosen["joints"] else self.flipper_commands):
+                assert self.robot is not None
+                self.warnings.append(
+                    f"{topic}: got the joints {names}, expected some of {list(self.robot.joint_names)}; none is used"
+                )
         self.twists.sort(key=lambda entry: entry[0])
         cloud_topic = self.chosen["cloud"] or ""
         return Recording(
@@ -340,7 +409,7 @@ class _Collector:
             ),
             commands=CommandTrack(
                 stamps=np.array([stamp for stamp, _ in self.twists], np.int64),
-                twists=np.array([twist for _, twist in self.twists]).reshape(-1, 2),
+                twists=np.array([twist for _, twist in self.twists]).reshape(-1, 3 if self._crabs else 2),
             ),
             clouds=tuple(sorted(self.indexed.get(cloud_topic, ()), key=lambda frame: frame.stamp)),
             images={
@@ -359,6 +428,7 @@ class _Collector:
             odometry_child_frame=self.frames[1],
             angular_velocity=self._angular_velocity_track(),
             wheels=self._wheel_track(),
+            joints=self._joint_record(),
         )
 
     def _wheel_track(self) -> WheelTrack | None:
@@ -366,6 +436,18 @@ class _Collector:
             return None
         stamps, speeds = _in_order(self.wheels)
         return WheelTrack(stamps, np.array(speeds))
+
+    def _joint_record(self) -> JointRecord | None:
+        if self.robot is None:
+            return None
+        tracks = []
+        for samples in (self.joints, self.flipper_commands):
+            stamps, angles = _in_order(samples)
+            found = JointTrack(stamps, self.robot.joint_names, np.array(angles)) if len(stamps) else None
+            tracks.append(found if found is not None and np.isfinite(found.angles).any() else None)
+        if tracks == [None, None]:
+            return None
+        return JointRecord(tracks[0], tracks[1], len(self.robot.flippers))
 
     def _angular_velocity_track(self) -> AngularVelocityTrack | None:
         if not self.angular_velocities:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from monoforce_ros.bags.joint_record import JointRecord
 from monoforce_ros.core import CommandTrack, MotionState, MotionTrack, StaleDataError
 
 
@@ -17,7 +18,7 @@ class Windows:
     """Measured state at the start of each window, ``[W]``."""
     twists: np.ndarray
     """Commanded forward speed [m/s] and yaw rate [rad/s] at each physics step, beginning ``history`` steps before the
-    start, ``[W, history + T, 2]``."""
+    start, ``[W, history + T, 2]``; ``[W, history + T, 3]`` with lateral speeds [m/s]."""
     history: int
     """Physics steps before the start."""
     times: np.ndarray
@@ -30,6 +31,10 @@ class Windows:
     """Measured velocity in base axes [m/s], ``[W, K, 3]``."""
     angular_velocities: np.ndarray
     """Measured angular velocity in base axes [rad/s], ``[W, K, 3]``."""
+    joint_start: np.ndarray | None = None
+    """Measured angles of the joints at the start [rad], ``[W, J]``, NaN where unknown."""
+    flippers: np.ndarray | None = None
+    """Commanded angles of the flippers at each physics step [rad], ``[W, T, F]``, NaN where unknown."""
 
     def __len__(self) -> int:
         return len(self.starts)
@@ -46,6 +51,7 @@ def cut_windows(
     sample_time: float = 0.1,
     maximum_gap: float = 0.3,
     timeout: float = np.inf,
+    joints: JointRecord | None = None,
 ) -> Windows:
     """Cut a recording into windows.
 
@@ -61,6 +67,7 @@ def cut_windows(
         sample_time: time between samples of the motion [s].
         maximum_gap: largest time between a sample and the odometry around it [s].
         timeout: age beyond which a command is ignored [s].
+        joints: recorded joints of the robot.
 
     Raises:
         ValueError: no window is left; the message gives the duration of the odometry.
@@ -84,7 +91,8 @@ def cut_windows(
             f"{maximum_gap:g} s"
         )
     offsets = np.rint(np.arange(-before, steps) * time_step * 1e9).astype(np.int64)
-    stamps = np.array([state.stamp for state in starts])[:, None] + offsets
+    first_stamps = np.array([state.stamp for state in starts])
+    stamps = first_stamps[:, None] + offsets
     return Windows(
         starts=tuple(starts),
         twists=commands.sample(stamps, timeout=timeout),
@@ -94,4 +102,6 @@ def cut_windows(
         rotations=np.array([[state.rotation for state in states] for states in sampled]),
         velocities=np.array([[state.linear_velocity for state in states] for states in sampled]),
         angular_velocities=np.array([[state.angular_velocity for state in states] for states in sampled]),
+        joint_start=None if joints is None else joints.start(first_stamps),
+        flippers=None if joints is None else joints.flipper_angles(stamps[:, before:]),
     )

@@ -100,11 +100,17 @@ class BagWriter:
             topic, message.__msgtype__, self._types.serialize_cdr(message, message.__msgtype__), stamp
         )
 
-    def write_serialized(self, topic: str, message_type: str, data: bytes | memoryview, stamp: int) -> None:
-        """Append a CDR-encoded message received at ``stamp`` [ns]."""
+    def write_serialized(
+        self, topic: str, message_type: str, data: bytes | memoryview, stamp: int, *, latched: bool = False
+    ) -> None:
+        """Append a CDR-encoded message received at ``stamp`` [ns].
+
+        The first message of a topic decides by ``latched`` whether players offer late subscribers the last message
+        (transient local), as they always do for ``tf_static``.
+        """
         connection = self._connections.get(topic)
         if connection is None:
-            latched = topic.rsplit("/", 1)[-1] == "tf_static"
+            latched = latched or topic.rsplit("/", 1)[-1] == "tf_static"
             connection = self._writer.add_connection(
                 topic, message_type, typestore=self._types, offered_qos_profiles=[_LATCHED] if latched else []
             )

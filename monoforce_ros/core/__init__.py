@@ -2,6 +2,7 @@
 
 from monoforce_ros.core.alignment import DelayCorrelation, Delayed, largest_spread, nearest_stamp
 from monoforce_ros.core.camera import CameraModel
+from monoforce_ros.core.command_line import OptionParser, most_similar, nearest
 from monoforce_ros.core.files import atomic_path, unfinished_path, write_bytes, write_text
 from monoforce_ros.core.frames import FrameError, RobotFrames, TransformTree
 from monoforce_ros.core.geometry import (
@@ -12,6 +13,7 @@ from monoforce_ros.core.geometry import (
     transform_points,
     wrap_angle,
 )
+from monoforce_ros.core.joint_track import JointTrack
 from monoforce_ros.core.lazy import lazy_exports
 from monoforce_ros.core.regimes import FAST_SHARE, motion_regimes
 from monoforce_ros.core.shared_files import share_directory
@@ -36,8 +38,10 @@ __all__ = [
     "DelayCorrelation",
     "Delayed",
     "FrameError",
+    "JointTrack",
     "MotionState",
     "MotionTrack",
+    "OptionParser",
     "PoseHistory",
     "RobotFrames",
     "StaleDataError",
@@ -49,7 +53,9 @@ __all__ = [
     "huber",
     "largest_spread",
     "lazy_exports",
+    "most_similar",
     "motion_regimes",
+    "nearest",
     "nearest_stamp",
     "pose_matrix",
     "quaternions",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -107,8 +107,25 @@ class RobotFrames:
         frames = {*known, frame.lstrip("/")}
         return prefixed if prefixed in frames or bare not in frames else bare
 
-    def sensor_pose(self, frame: str, transforms: TransformTree) -> np.ndarray:
-        """Pose ``[4, 4]`` of a sensor's frame in the base frame.
+    def sensor_pose(
+        self,
+        frame: str,
+        transforms: TransformTree,
+        *,
+        odometry_frame: str = "",
+        odometry_from_base: Callable[[], np.ndarray] | None = None,
+    ) -> np.ndarray:
+        """Pose ``[4, 4]`` of the frame of sensor data in the base frame.
+
+        Lidar odometry publishes its clouds in the odometry frame. Where the robot was at the stamp of the data is then
+        known from the odometry itself; the newest transform would be that of another time.
+
+        Args:
+            frame: the frame.
+            transforms: transforms between frames.
+            odometry_frame: frame of the odometry, in which data may be, too; empty if they may not.
+            odometry_from_base: returns the pose ``[4, 4]`` of the base in it at the stamp of the data; called if it is
+                needed.
 
         Raises:
             FrameError: the name is empty, or neither the transforms nor the robot's file have it.
@@ -119,10 +136,14 @@ class RobotFrames:
                 "the message does not say which sensor it is from (header.frame_id is empty): set the driver's frame "
                 f"parameter (frames in the robot file: {sorted(self.sensors)})"
             )
-        base = self.base_name(frame, transforms.frames)
-        pose = transforms.find(base, frame)
+        base, odometry_frame = self.base_name(frame, transforms.frames), odometry_frame.lstrip("/")
+        pose = transforms.find(base, frame, without=odometry_frame) if frame != odometry_frame else None
         if pose is not None:
             return pose
+        if odometry_frame and odometry_from_base is not None:
+            pose = np.eye(4) if frame == odometry_frame else transforms.find(odometry_frame, frame, without=base)
+            if pose is not None:
+                return np.linalg.inv(odometry_from_base()) @ pose
         for name in (frame, frame.rpartition("/")[2]):
             if name in self.sensors:
                 return np.asarray(self.sensors[name], np.float64)

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 from monoforce_ros.bags import Recording
+from monoforce_ros.core import OptionParser
 from monoforce_ros.datasets.dataset import DatasetError
 from monoforce_ros.datasets.drive import DriveRecording, drive_to_bag
 from monoforce_ros.datasets.rellis import LIDAR_FRAME, RellisSequence, sequence_to_bag
@@ -16,7 +17,7 @@ from monoforce_ros.robots import RobotFileError, load_robot
 
 def build_parser() -> argparse.ArgumentParser:
     """The command line's options."""
-    parser = argparse.ArgumentParser(
+    parser = OptionParser(
         prog="convert",
         description="Convert a folder or file of a public dataset to a rosbag2 bag. Data in the bag that are not "
         "measurements are listed in the output and on the bag's topic /about.",

@@ -83,7 +83,9 @@ def read_with_ground(
     recording = reading.open(bag, robot)
     robot = reading.robot_in_bag(robot)
     smoothed = smooth(recording.motion)
-    evidence = Evidence(smoothed, recording.commands, gyro=recording.angular_velocity, wheels=recording.wheels)
+    evidence = Evidence(
+        smoothed, recording.commands, gyro=recording.angular_velocity, wheels=recording.wheels, joints=recording.joints
+    )
     ground = choose_ground(terrain, recording, smoothed, robot)
     if ground.source == "flat":
         return evidence, recording, ground

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from monoforce_ros.bags import BagError, add_read_options, read_options
+from monoforce_ros.core import OptionParser
 from monoforce_ros.discrepancy.bag_diagnosis import BagDiagnosis, diagnose_bag, read_with_ground
 from monoforce_ros.discrepancy.commissioning import commission
 from monoforce_ros.discrepancy.diagnosis import DiagnosisSettings
@@ -32,7 +33,7 @@ _ERRORS = (BagError, EffectError, RobotFileError, TerrainFileError, TerrainError
 
 def build_parser() -> argparse.ArgumentParser:
     """The command line's options."""
-    parser = argparse.ArgumentParser(
+    parser = OptionParser(
         prog="diagnose",
         description="Compare a robot's model with recordings, find the physical effects that it lacks, and write them "
         "into a copy of its file. Each bag gets a folder with report.html and report.json.",

@@ -24,6 +24,7 @@ from monoforce_ros.discrepancy.gap import noise_floor, noisy_motions, residual_s
 from monoforce_ros.discrepancy.hypothesis import Effects, Evidence, EvidenceWindows, Predictions, window_starts
 from monoforce_ros.discrepancy.nominal import SEGMENT, NominalModel
 from monoforce_ros.discrepancy.preflight import complaints
+from monoforce_ros.discrepancy.residual_model import fit_terms, motion_terms
 from monoforce_ros.discrepancy.score_test import variation
 from monoforce_ros.discrepancy.selection import Search
 from monoforce_ros.discrepancy.terrain_evidence import terrain_uncertainty
@@ -38,6 +39,8 @@ COMMISSIONED: Effects = tuple(
 )
 """Effects that every robot needs, with the values at which their fit starts."""
 _FEWEST_SEGMENTS = 3
+_PARTS = 3
+"""Parts of a single recording that take turns in being predicted by the others."""
 _MOST_EFFECTS = 4
 """Effects of the catalogue that commissioning adds to those that every robot needs."""
 
@@ -50,6 +53,10 @@ class _Prepared:
     predictions: Predictions
     floor: np.ndarray
     """Residuals by noise and map, ``[W, K, 3]``."""
+
+    def __getitem__(self, chosen: np.ndarray) -> _Prepared:
+        data = replace(self.data, starts=self.data.starts[chosen])
+        return _Prepared(data, Predictions(self.predictions.robot, data), self.floor[chosen])
 
 
 def commission(
@@ -97,8 +104,10 @@ def commission(
         fits = [_fitted(entry, chosen) for entry in prepared]
     values = np.median([flat(fit.effects) for fit in fits], axis=0)
     merged = replace(fits[0], effects=with_values(fits[0].effects, values))
-    progress(0.8, "variation between segments")
-    nominal = _nominal(prepared, merged.effects)
+    progress(0.75, "held-out residuals")
+    residuals = _held_out_residuals(prepared, fits, merged.effects)
+    progress(0.85, "variation between segments")
+    nominal = _nominal(prepared, merged.effects, residuals)
     progress(1.0, "done")
     return estimate_effects(merged, {}), nominal
 
@@ -117,10 +126,12 @@ def _prepare(evidence: Evidence, robot: RobotModel, samples: np.ndarray, stride:
     return _Prepared(data, Predictions(robot, data), floor)
 
 
-def _fitted(entry: _Prepared, effects: Effects) -> Fit:
+def _fitted(entry: _Prepared, effects: Effects, iterations: int = 12) -> Fit:
     # Blocks are roughly independent, windows within a block are not: the prior weighs as much as one block.
     prior = 1.0 / len(np.unique(blocks_of(entry.data.starts)))
-    return fit_effects(entry.predictions, [effects], residual_scale(entry.floor, None), iterations=12, prior=prior)
+    return fit_effects(
+        entry.predictions, [effects], residual_scale(entry.floor, entry.data, None), iterations=iterations, prior=prior
+    )
 
 
 def _further(robot: RobotModel, entry: _Prepared, effects: Effects, wheels: WheelFinding | None) -> Effects:
@@ -130,40 +141,78 @@ def _further(robot: RobotModel, entry: _Prepared, effects: Effects, wheels: Whee
     residuals = np.nan_to_num(Predictions(fitted, entry.data).residuals([()])[0])
     spread = np.quantile(np.abs(residuals), 0.683, axis=0)
     # Scaled by what is left, so that a recording is judged by its own size of errors.
-    scale = np.sqrt(residual_scale(floor, None) ** 2 + np.maximum(spread**2 - (floor**2).mean(axis=0), 0.0))
+    scale = np.sqrt(residual_scale(floor, entry.data, None) ** 2 + np.maximum(spread**2 - (floor**2).mean(axis=0), 0.0))
     hints, unchanged = ((), ()) if wheels is None else changed_drives(wheels, fitted)
     search = Search(fitted, entry.data, scale, hints=hints, excluded=[*unchanged, *(name for name, _ in effects)])
     best = search.run(_MOST_EFFECTS).best
     return search.refit(best.effects).effects if best.effects else ()
 
 
-def _nominal(prepared: Sequence[_Prepared], effects: Effects) -> NominalModel:
+def _held_out_residuals(prepared: Sequence[_Prepared], fits: Sequence[Fit], effects: Effects) -> list[np.ndarray]:
+    """Residuals ``[W, K, 3]`` of each recording, predicted with values that were fitted without it.
+
+    With the values that were fitted to it a recording looks better than the robot's next one will. Of several
+    recordings each is predicted by the others; a single one is cut into segments that take turns in being left out.
+    """
+    if len(prepared) > 1:
+        values = np.array([flat(fit.effects) for fit in fits])
+        others = [np.median(np.delete(values, number, axis=0), axis=0) for number in range(len(fits))]
+        return [
+            np.nan_to_num(entry.predictions.residuals([with_values(effects, other)])[0])
+            for entry, other in zip(prepared, others, strict=True)
+        ]
+    entry = prepared[0]
+    data, starts = entry.data, entry.data.starts
+    held_out = _segments(entry) % _PARTS
+    # A window that reaches into the next segment shares motion with it.
+    ends = held_out[np.searchsorted(starts, np.minimum(starts + round(data.horizon * 1e9), starts[-1]))]
+    residuals = np.zeros((len(starts), len(data.samples), 3))
+    for part in range(_PARTS):
+        fitted, judged = (held_out != part) & (ends != part), held_out == part
+        fit = _fitted(entry[fitted], effects, iterations=6)
+        residuals[judged] = entry[judged].predictions.residuals([fit.effects])[0]
+    return [np.nan_to_num(residuals)]
+
+
+def _segments(entry: _Prepared) -> np.ndarray:
+    """Number of the segment in which each window starts, ``[W]``."""
+    starts = entry.data.starts
+    length = max(float(starts[-1] - starts[0]) * 1e-9 + entry.data.horizon, 1.0)
+    count = max(_FEWEST_SEGMENTS, round(length / SEGMENT))
+    numbers = ((starts - starts[0]) * count) // max(int(starts[-1] - starts[0]), 1)
+    return np.minimum(numbers, count - 1).astype(int)
+
+
+def _nominal(prepared: Sequence[_Prepared], effects: Effects, residuals: Sequence[np.ndarray]) -> NominalModel:
+    """What remains of the healthy robot.
+
+    Args:
+        prepared: its recordings.
+        effects: with the values of the robot file.
+        residuals: of each recording, held out, ``[W, K, 3]``.
+    """
     squares = []
-    residuals = []
-    for entry in prepared:
-        # With the values that go into the file, not with those of each recording.
-        residual = np.nan_to_num(entry.predictions.residuals([effects])[0])
-        residuals.append(residual)
+    for entry, residual in zip(prepared, residuals, strict=True):
         # Robust: single windows with a disturbance must not raise the nominal residual.
         spread = np.quantile(np.abs(residual), 0.683, axis=0)
         squares.append(np.maximum(spread**2 - np.mean(entry.floor**2, axis=0), 0.0))
-    nominal = NominalModel(np.sqrt(np.mean(squares, axis=0)))
+    terms = fit_terms(
+        residuals,
+        [residual_scale(entry.floor, entry.data, None) for entry in prepared],
+        [motion_terms(entry.data) for entry in prepared],
+    )
+    nominal = NominalModel(np.sqrt(np.mean(squares, axis=0)), terms=terms)
     changes: dict[str, list[float]] = {}
     losses, segments = [], []
     for entry, residual in zip(prepared, residuals, strict=True):
-        scale = residual_scale(entry.floor, nominal)
-        starts = entry.data.starts
-        length = max(float(starts[-1] - starts[0]) * 1e-9 + entry.data.horizon, 1.0)
-        count = max(_FEWEST_SEGMENTS, round(length / SEGMENT))
-        numbers = np.minimum(((starts - starts[0]) * count) // max(int(starts[-1] - starts[0]), 1), count - 1).astype(
-            int
-        )
+        scale = residual_scale(entry.floor, entry.data, nominal)
+        numbers = _segments(entry)
         scaled = residual / scale
         window_losses = robust(scaled)
         losses += [float(window_losses[numbers == number].mean()) for number in np.unique(numbers)]
         segments.append(len(np.unique(numbers)))
         weights = robust_weights(scaled)
-        metric = scale / nominal.scale
+        metric = scale / nominal.scale_in(entry.data)
         # Nothing counts as fitted here: a later recording is tested with the values of the file, too.
         for name, columns in _directions(entry, effects, scale):
             within = variation(scaled, weights, numbers, columns, metric)
@@ -189,7 +238,7 @@ def _directions(entry: _Prepared, effects: Effects, scale: np.ndarray) -> Iterat
         yield name, rows[own]
     directions = Directions(predictions, scale, None, Thresholds())
     present = {name for name, _ in effects}
-    for effect in identifiable_effects():
+    for effect in identifiable_effects(predictions.robot):
         if effect.name in present:
             continue
         starts = first_values(effect)

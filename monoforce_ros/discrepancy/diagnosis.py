@@ -192,7 +192,7 @@ def diagnose(
     if sensors.wheels is not None:
         decision = replace(decision, remarks=(*decision.remarks, sensors.wheels.summary()))
     at_horizon = next((comparison for comparison in compared if comparison.horizon == settings.horizon), None)
-    expected = np.hypot(floor, 0 if nominal is None else nominal.residual)
+    expected = floor if nominal is None else np.sqrt(floor**2 + (nominal.residual_in(data) ** 2).mean(axis=0))
     paths = tuple(measured_paths(robot, data, judged))
     progress(1.0, "done")
     return Diagnosis(

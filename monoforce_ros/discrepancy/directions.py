@@ -36,7 +36,7 @@ class Directions:
         self, predictions: Predictions, scale: np.ndarray, nominal: NominalModel | None, thresholds: Thresholds
     ):
         self.predictions, self.scale, self.nominal = predictions, scale, nominal
-        self.metric = 1.0 if nominal is None else scale / nominal.scale
+        self.metric = 1.0 if nominal is None else scale / nominal.scale_in(predictions.data)
         self._thresholds = thresholds
         self._own = dict(predictions.robot.effects)
         self._rolled: dict[tuple[tuple[object, ...], ...], np.ndarray] = {}

@@ -94,7 +94,7 @@ def explain(
         search = Search(
             robot,
             part.data,
-            residual_scale(part.uncertainty, nominal),
+            residual_scale(part.uncertainty, part.data, nominal),
             nominal=nominal,
             known=sensors.known,
             hints=sensors.hints,

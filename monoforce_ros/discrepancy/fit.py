@@ -143,12 +143,18 @@ def fit_effects(
             step = np.zeros(len(values))
             step[fixed:] = typical[fixed:] * np.linalg.solve(curvature + damping * diagonal, gradient)
             candidates.append(with_values(current, values - step))
-        tried = predictions.residuals(candidates) / scale
-        losses = total(candidates, tried)
-        best = int(np.argmin(losses))
-        if losses[best] >= loss * (1.0 - 1e-3):
+        # Most steps need no damping: the others are rolled out only where that one fails.
+        improved = False
+        for part in (candidates[:1], candidates[1:]):
+            tried = predictions.residuals(part) / scale
+            losses = total(part, tried)
+            best = int(np.argmin(losses))
+            improved = losses[best] < loss * (1.0 - 1e-3)
+            if improved:
+                current, residual, loss = part[best], tried[best], float(losses[best])
+                break
+        if not improved:
             break
-        current, residual, loss = candidates[best], tried[best], float(losses[best])
         values = flat(current)
     covariance = np.zeros((len(values), len(values)))
     if rows is not None and rows.any():

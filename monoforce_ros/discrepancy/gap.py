@@ -108,11 +108,14 @@ def relative_motion(motion: MotionTrack, data: EvidenceWindows) -> np.ndarray:
     return np.concatenate([moved[..., :2], turned[..., None]], axis=-1)
 
 
-def residual_scale(floor: np.ndarray, nominal: NominalModel | None) -> np.ndarray:
-    """Expected size of a residual by noise, map and the healthy robot's own error, like ``floor`` ``[..., K, 3]``."""
+def residual_scale(floor: np.ndarray, data: EvidenceWindows, nominal: NominalModel | None) -> np.ndarray:
+    """Expected size of a residual by noise, map and the healthy robot's own error, like ``floor`` ``[..., K, 3]``.
+
+    With a nominal model it depends on the windows' commands, ``[W, K, 3]``.
+    """
     squares = floor**2 + SMALLEST**2
     if nominal is not None:
-        squares = squares + nominal.residual**2
+        squares = squares + nominal.residual_in(data) ** 2
     return np.sqrt(squares)
 
 

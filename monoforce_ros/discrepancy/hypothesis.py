@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation, Slerp
 
-from monoforce_ros.bags import SmoothedMotion
+from monoforce_ros.bags import JointRecord, SmoothedMotion
 from monoforce_ros.core import AngularVelocityTrack, CommandTrack, MotionTrack, WheelTrack, wrap_angle
 from monoforce_ros.effects import CATALOGUE, controls, corrected_commands, corrected_motion
 from monoforce_ros.physics import PhysicsOptions, State, TerrainLookup, rest_depth, rollout
@@ -52,6 +52,8 @@ class Evidence:
     """Angular velocity measured by an IMU."""
     wheels: WheelTrack | None = None
     """Measured wheel speeds."""
+    joints: JointRecord | None = None
+    """Measured joints and commands to flippers."""
 
     def cut(self, starts: np.ndarray, samples: np.ndarray) -> EvidenceWindows:
         """Windows from ``starts`` [ns] to the last of ``samples`` [s]."""
@@ -63,6 +65,7 @@ class Evidence:
             samples,
             self.terrain,
             self.odometry_from_terrain,
+            self.joints,
         )
 
 
@@ -82,6 +85,8 @@ class EvidenceWindows:
     terrain: TerrainMap | None = None
     """One map in its own frame, or None for level ground."""
     odometry_from_terrain: np.ndarray | None = None
+    joints: JointRecord | None = None
+    """Measured joints and commands to flippers."""
 
 
 def window_starts(motion: MotionTrack, stretches: Sequence[slice], horizon: float, stride: float) -> np.ndarray:
@@ -158,6 +163,10 @@ class _Prepared:
     rotation: torch.Tensor
     velocity: torch.Tensor
     angular_velocity: torch.Tensor
+    joint_start: torch.Tensor | None
+    """Measured angles of the joints, ``[W, J]`` [rad], NaN where unknown."""
+    flippers: torch.Tensor | None
+    """Commanded angles of the flippers, ``[W, T, F]`` [rad], NaN where unknown."""
 
 
 class Predictions:
@@ -178,7 +187,11 @@ class Predictions:
         self._depth = rest_depth(robot, float(self._terrain.stiffness.median()))
         # Contact points that never touch the ground are left out, which makes rollouts twice as fast.
         reach = _LEVEL_REACH if data.terrain is None else _HILLY_REACH
-        self.robot = robot.with_points(robot.points[:, 2] < reach - robot.ground_clearance)
+        touching = robot.points[:, 2] < reach - robot.ground_clearance
+        self._moves_flippers = bool(robot.flippers) and data.joints is not None
+        if self._moves_flippers and robot.point_flippers is not None:
+            touching = touching | (robot.point_flippers >= 0)
+        self.robot = robot.with_points(touching)
         self._prepared: dict[_MeasurementKey, _Prepared] = {}
         self._index = np.rint(data.samples / self.options.time_step).astype(int)
 
@@ -227,7 +240,10 @@ class Predictions:
         if data.terrain is None:
             # On level ground every window starts at the origin, with the wheels on the ground.
             frame_rotation = rotations[:, 0]
-            lowest = np.einsum("wij,nj->wni", frame_rotation, self._underside())[..., 2].mean(axis=1)
+            if self._moves_flippers:
+                lowest = self._lowest(np.einsum("wij,wnj->wni", frame_rotation, self._posed())[..., 2]).mean(axis=1)
+            else:
+                lowest = np.einsum("wij,nj->wni", frame_rotation, self._underside())[..., 2].mean(axis=1)
             place = np.stack([0 * lowest, 0 * lowest, -lowest - self._depth], axis=1)
         else:
             if data.odometry_from_terrain is None:
@@ -242,17 +258,22 @@ class Predictions:
         def tensor(values: np.ndarray) -> torch.Tensor:
             return torch.as_tensor(np.ascontiguousarray(values), dtype=torch.float32)
 
+        measured = None if data.joints is None else data.joints.start(data.starts)
+        history = round(HISTORY / self.options.time_step)
+        program = None if data.joints is None else data.joints.flipper_angles(command_stamps[:, history:])
         return _Prepared(
             moved=moved,
             turned=turned,
             frames=frames,
             places=place,
             twists=tensor(commands.sample(command_stamps)),
-            history=round(HISTORY / self.options.time_step),
+            history=history,
             position=tensor(place),
             rotation=tensor(frame_rotation),
             velocity=tensor(np.einsum("wij,wj->wi", frame_rotation, linear[:, 0])),
             angular_velocity=tensor(np.einsum("wij,wj->wi", frame_rotation, angular[:, 0])),
+            joint_start=None if measured is None else tensor(measured),
+            flippers=None if program is None else tensor(program),
         )
 
     def _settling(self, place: np.ndarray, rotation: np.ndarray) -> np.ndarray:
@@ -260,17 +281,39 @@ class Predictions:
 
         Map and localisation agree on heights only within centimetres; a start that deep in the ground would jump.
         """
-        underside = self._underside()
-        points = place[:, None] + np.einsum("wij,nj->wni", rotation, underside)
+        if self._moves_flippers:
+            points = place[:, None] + np.einsum("wij,wnj->wni", rotation, self._posed())
+        else:
+            points = place[:, None] + np.einsum("wij,nj->wni", rotation, self._underside())
         at = torch.as_tensor(points[..., :2], dtype=torch.float32).transpose(1, 2)
         ground = TerrainLookup(self._terrain, "bilinear", len(points))(at).height.double().numpy()
         gap = points[..., 2] - ground
+        if self._moves_flippers:
+            return -self._lowest(gap).mean(axis=1) - self._depth
         # The lower half of the points carries the robot: on rough ground some wheels hang in the air.
         return -np.sort(gap, axis=1)[:, : max(1, gap.shape[1] // 2)].mean(axis=1) - self._depth
 
+    def _posed(self) -> np.ndarray:
+        """Points of the robot with its flippers at the measured angles of each window's start, ``[W, n, 3]`` [m]."""
+        robot, joints = self.robot, self.data.joints
+        assert joints is not None
+        assert robot.flipper_angles is not None
+        at_rest = robot.flipper_angles.double().cpu().numpy()
+        measured = joints.start(self.data.starts)
+        angles = np.tile(at_rest, (len(self.data.starts), 1))
+        if measured is not None:
+            found = measured[:, -len(at_rest) :]
+            angles = np.where(np.isfinite(found), found, angles)
+        driven = robot.point_drives >= 0
+        return np.stack([robot.posed(torch.from_numpy(row)).points[driven].double().numpy() for row in angles])
+
+    @staticmethod
+    def _lowest(heights: np.ndarray) -> np.ndarray:
+        """The lowest of heights ``[W, n]``: some of them carry the robot, whatever its flippers do."""
+        return np.sort(heights, axis=1)[:, : max(4, heights.shape[1] // 20)]
+
     def _underside(self) -> np.ndarray:
-        robot = self.robot
-        return robot.points[robot.point_tangents[:, 0] < -0.97].double().numpy()
+        return self.robot.underside.double().numpy()
 
     def _roll_out(self, windows: _Prepared, hypotheses: list[Effects]) -> list[np.ndarray]:
         count, width = len(hypotheses), len(self.data.starts)
@@ -281,6 +324,8 @@ class Predictions:
                 windows.twists.repeat(count, 1, 1),
                 self.options.time_step,
                 history=windows.history,
+                joint_start=None if windows.joint_start is None else windows.joint_start.repeat(count, 1),
+                flippers=None if windows.flippers is None else windows.flippers.repeat(count, 1, 1),
             )
             state = State(
                 windows.position.repeat(count, 1),

@@ -217,4 +217,5 @@ def _arrays(data: EvidenceWindows) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     stamps = data.starts[:, None] + np.rint(steps * _STEP * 1e9).astype(np.int64)
     _, _, linear, angular = sample_motion(data.motion, data.starts)
     start = np.stack([linear[:, 0], angular[:, 2]], axis=1)
-    return data.commands.sample(stamps), start, relative_motion(data.motion, data)
+    # A differential drive has no lateral speed.
+    return data.commands.sample(stamps)[..., :2], start, relative_motion(data.motion, data)

@@ -66,7 +66,8 @@ def motion_faults(
     if still:
         return (still,)
     # Speeds of wrong poses are wrong, too: whether they follow the commands says nothing then.
-    faults = tuple(_pose_faults(smoothed))
+    crabs = commands.twists.shape[-1] > 2 and float(np.abs(commands.twists[:, 2]).max()) >= _COMMANDED
+    faults = tuple(_pose_faults(smoothed, crabs=crabs))
     other = "" if faults else _unrelated(smoothed, commands)
     return (other,) if other else faults
 
@@ -125,12 +126,14 @@ def _standing(smoothed: SmoothedMotion, commands: CommandTrack, wheels: WheelTra
     """That the robot does not move; empty if it does."""
     span = round(_SPAN / _STEP)
     least = max(_MOVED, 5.0 * smoothed.position_noise), max(_TURNED, 5.0 * smoothed.rotation_noise)
-    moving = 0.0
+    moving = judged = 0.0
     for _, places, headings in _sampled(smoothed):
         shift = np.linalg.norm(places[span:] - places[:-span], axis=1)
         turn = np.abs(headings[span:] - headings[:-span])
         moving += _STEP * float(np.sum((shift > least[0]) | (turn > least[1])))
-    if moving >= _LEAST_MOVING:
+        judged += _STEP * len(shift)
+    # In less than two windows a robot that moves all the time falls short of one: half the time is enough there.
+    if moving >= min(_LEAST_MOVING, 0.5 * judged):
         return ""
     largest = np.abs(commands.twists).max(axis=0)
     if (largest < _COMMANDED).all():
@@ -149,8 +152,8 @@ def _standing(smoothed: SmoothedMotion, commands: CommandTrack, wheels: WheelTra
     )
 
 
-def _pose_faults(smoothed: SmoothedMotion) -> Iterator[str]:
-    """Faults of the poses alone."""
+def _pose_faults(smoothed: SmoothedMotion, *, crabs: bool = False) -> Iterator[str]:
+    """Faults of the poses alone; a robot that was commanded to move sideways has no course of its heading."""
     motion = smoothed.motion
     rotations = Rotation.from_quat(motion.quaternions).as_matrix()
     if np.median(rotations[:, 2, 2]) < 0.7:
@@ -158,6 +161,8 @@ def _pose_faults(smoothed: SmoothedMotion) -> Iterator[str]:
             "by its poses the robot lies on its side or upside down: record poses of the base frame in a frame whose "
             "z axis points up"
         )
+        return
+    if crabs:
         return
     courses, headings, offsets = [], [], []
     least = max(0.2, 10.0 * smoothed.position_noise)

@@ -10,7 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from monoforce_ros.discrepancy.hypothesis import COMPONENTS, EvidenceWindows
 from monoforce_ros.discrepancy.moderation import VariancePrior
+from monoforce_ros.discrepancy.residual_model import TERMS, motion_terms
 from monoforce_ros.effects import CATALOGUE
 from monoforce_ros.robots import RobotFileError, read_commissioning, read_nominal_residual, robot_file
 
@@ -28,18 +30,27 @@ class NominalModel:
     residual: np.ndarray
     """RMS residual beyond noise and terrain, ``[K, 3]`` at the times of the windows [m, m, rad]."""
     variation: Mapping[str, float] = field(default_factory=dict)
-    """By effect: RMS change of the residual by the effect's variation between segments, in units of ``scale``."""
+    """By effect: RMS change of the residual by the effect's variation between segments, in units of
+    :meth:`scale_in`."""
     segments: int = 0
     """Number of segments."""
     loss: float = 0.5
     """Mean robust loss of the healthy robot; 0.5 if its residuals are normal."""
     loss_spread: float = 0.0
     """Standard deviation of the logarithm of a segment's mean loss."""
+    terms: np.ndarray | None = None
+    """Coefficients of the residual's variance, ``[3, len(TERMS)]`` (:mod:`residual_model`); None: the same residual in
+    all windows."""
 
-    @property
-    def scale(self) -> np.ndarray:
-        """Unit of ``variation``, ``[K, 3]`` [m, m, rad]."""
-        return np.sqrt(self.residual**2 + SMALLEST**2)
+    def residual_in(self, data: EvidenceWindows) -> np.ndarray:
+        """RMS residual of the healthy robot in each window, ``[W, K, 3]`` [m, m, rad]."""
+        if self.terms is None:
+            return np.broadcast_to(self.residual, (len(data.starts), *self.residual.shape))
+        return np.sqrt(np.einsum("wkj,cj->wkc", motion_terms(data), self.terms))
+
+    def scale_in(self, data: EvidenceWindows) -> np.ndarray:
+        """Unit of ``variation`` in each window, ``[W, K, 3]`` [m, m, rad]."""
+        return np.sqrt(self.residual_in(data) ** 2 + SMALLEST**2)
 
     @cached_property
     def prior(self) -> VariancePrior:
@@ -48,7 +59,7 @@ class NominalModel:
         return VariancePrior.of(squares, max(self.segments - 1, 1))
 
     def variation_of(self, name: str, drive_share: float) -> tuple[float, float]:
-        """Variation of an effect on a healthy recording, in units of ``scale``, and its degrees of freedom.
+        """Variation of an effect on a healthy recording, in nominal units, and its degrees of freedom.
 
         It comes from the robot file, which is a mean over its segments, and from what differs between recordings. What
         varies within the recording shows there.
@@ -77,6 +88,13 @@ class NominalModel:
             "segments": self.segments,
             "loss": float(f"{self.loss:.4g}"),
             "loss_spread": float(f"{self.loss_spread:.4g}"),
+        } | ({} if self.terms is None else {"residual_terms": self._named_terms()})
+
+    def _named_terms(self) -> dict[str, dict[str, float]]:
+        assert self.terms is not None
+        return {
+            component: {term: float(f"{value:.4g}") for term, value in zip(TERMS, row, strict=True)}
+            for component, row in zip(COMPONENTS, self.terms, strict=True)
         }
 
     @classmethod
@@ -96,15 +114,24 @@ class NominalModel:
             variation = {str(name): float(value) for name, value in dict(entry.get("variation") or {}).items()}
             numbers = [float(entry.get(key, value)) for key, value in (("loss", 0.5), ("loss_spread", 0.0))]
             segments = int(entry.get("segments", 0))
-        except (TypeError, ValueError) as error:
-            raise RobotFileError(f"{robot_file(robot)}: commissioning: expected numbers, got {error}") from error
+            named = entry.get("residual_terms")
+            terms = None
+            if named is not None:
+                terms = np.array([[float(named[component][term]) for term in TERMS] for component in COMPONENTS])
+        except (KeyError, TypeError, ValueError) as error:
+            raise RobotFileError(f"{robot_file(robot)}: commissioning: expected numbers, got {error!r}") from error
         values = [*variation.values(), *numbers]
         if segments < 0 or not all(np.isfinite(value) and value >= 0 for value in values) or numbers[0] <= 0:
             raise RobotFileError(
                 f"{robot_file(robot)}: commissioning: variation, loss and loss_spread: expected finite numbers of 0 or "
                 "more; commission the robot again"
             )
-        return cls(residual, variation, segments, *numbers)
+        if terms is not None and not (np.isfinite(terms).all() and (terms >= 0).all()):
+            raise RobotFileError(
+                f"{robot_file(robot)}: commissioning.residual_terms: expected finite numbers of 0 or more; commission "
+                "the robot again"
+            )
+        return cls(residual, variation, segments, loss=numbers[0], loss_spread=numbers[1], terms=terms)
 
 
 def _coefficients(name: str) -> int:

@@ -53,6 +53,9 @@ _JUDGED = 6
 _FITTED = 8
 """Effects with one parameter that are fitted in one round, those that promise the smallest loss first. More than are
 judged afterwards; fewer than all of them only to save time."""
+_HOPELESS = 0.3
+"""p-value of an effect by itself at its best initial value above which it is not fitted: ten times the rate at which
+effects count as significant among all candidates. It only saves time."""
 _ALTERNATIVES = 2
 """Combinations that do not begin with the best single effect and are tried where that one leads to no good fit."""
 
@@ -137,6 +140,8 @@ class Search:
         """Mean variance of the candidates' influence beyond what this recording and the robot file explain, as a share
         of that between segments."""
         self._screenings: dict[tuple[tuple[object, ...], ...], tuple[float, list[_Screened]]] = {}
+        self._influences: dict[tuple[tuple[object, ...], ...], list[Direction]] = {}
+        """Directions of the candidates that were screened last."""
 
     def run(self, most_effects: int, *, exchange: bool = True) -> Outcome:
         """Add effects while a further one is significant, then test each in the presence of the others.
@@ -317,6 +322,21 @@ class Search:
             explained = excess_share(nominal.loss, trial.loss, self.healthy_loss)
         return FitTest(p, name, tuple(tests), explained)
 
+    def screened(self, thresholds: Thresholds) -> list[ScoreResult]:
+        """Tests of all candidates alone, as if healthy drives varied as ``thresholds`` say."""
+        key = _key(self.known)
+        if key not in self._influences:
+            self._screenings.pop(key, None)
+            self._screened(self.known, "1: ")
+        directions = self._influences[key]
+        if self.nominal is not None:
+            varied = [self.nominal.variation_of(entry.name, thresholds.drive_share) for entry in directions]
+            directions = [
+                replace(entry, variation=variation, degrees=degrees)
+                for entry, (variation, degrees) in zip(directions, varied, strict=True)
+            ]
+        return self._tested(self.known, self.directions.scaled(self.known), directions)
+
     def _tested(self, base: Effects, residual: np.ndarray, directions: Sequence[Direction]) -> list[ScoreResult]:
         fixed = self.fixed_count(base)
         free = sum(len(values) for _, values in base[fixed:])
@@ -344,24 +364,31 @@ class Search:
         residual = self._sparse.residuals([base])[0] / self._sparse_scale
         names = {name for name, _ in base}
         tried: list[tuple[float, Effect, Effects]] = []
-        for effect in identifiable_effects():
+        for effect in identifiable_effects(self.robot):
             if effect.name in names or effect.name in self._excluded:
                 continue
             self._progress(f"{number}{effect.name}")
             tried.append(self._tried(effect, base, residual))
-        # An effect that reduces the loss little from all of its initial values is tested, but not fitted.
         tried.sort(key=lambda entry: entry[0])
+        residual = self.directions.scaled(base)
+        directions = [self.directions.influence(base, start[-1]) for _, _, start in tried]
+        tests = self._tested(base, residual, directions)
+        # Only what may be significant, and promises to reduce the loss, is fitted; others keep their initial values.
         fits = []
         for rank, (_, effect, start) in enumerate(tried):
-            iterations = 2 if rank < _FITTED or len(effect.identified) > 1 else 0
-            fits.append(fit_effects(self._coarse, [start], self._coarse_scale, iterations=iterations, free=len(base)))
-        residual = self.directions.scaled(base)
-        tests = self._tested(base, residual, [self.directions.influence(base, fit.effects[-1]) for fit in fits])
+            promising = tests[rank].p <= _HOPELESS and (rank < _FITTED or len(effect.identified) > 1)
+            iterations = 2 if promising else 0
+            fit = fit_effects(self._coarse, [start], self._coarse_scale, iterations=iterations, free=len(base))
+            fits.append(fit)
+            if fit.effects != start:
+                directions[rank] = self.directions.influence(base, fit.effects[-1])
+        tests = self._tested(base, residual, directions)
         screened = [_Screened(fit.effects, float(fit.loss.mean()), test) for fit, test in zip(fits, tests, strict=True)]
         if base == self.known and self.nominal is not None and self.nominal.segments:
             ratios = [test.excess / self.nominal.between_segments(test.name)[0] for test in tests if test.p < 1.0]
             share = 1.0 / self.nominal.segments
             self.variance_ratio = float(np.mean(ratios)) - share if ratios else None
+        self._influences = {key: directions}
         self._screenings[key] = (before, sorted(screened, key=lambda entry: entry.loss))
         return self._screenings[key]
 

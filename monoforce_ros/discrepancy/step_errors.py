@@ -37,7 +37,7 @@ def compare_after_steps(evidence: Evidence, robot: RobotModel, effects: Effects)
     if not len(starts):
         return None
     samples = np.array([0.5, 1.0, 1.5, HORIZON])
-    scale = residual_scale(np.zeros((len(samples), 3)), None)
+    scale = residual_scale(np.zeros((len(samples), 3)), evidence.cut(starts, samples), None)
 
     def predictions(at: np.ndarray) -> Predictions:
         return Predictions(robot, evidence.cut(at, samples))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
 from scipy.spatial.transform import Rotation
 
@@ -73,6 +74,23 @@ def half_track(robot: RobotModel) -> float:
     return 0.5 * float((robot.drive_offsets.max() - robot.drive_offsets.min()).abs())
 
 
+def side_speeds(robot: RobotModel, twists: np.ndarray) -> np.ndarray:
+    """Commanded speeds of the left and right wheels ``[..., 2]`` [m/s].
+
+    Args:
+        robot: of one that steers, the driven wheels of each side count.
+        twists: forward speed [m/s], yaw rate [rad/s] and, of a robot that crabs, lateral speed [m/s], ``[..., 2]`` or
+            ``[..., 3]``.
+    """
+    if robot.steered is None:
+        return twists[..., :1] + half_track(robot) * np.array([-1.0, 1.0]) * twists[..., 1:2]
+    speeds = robot.command(torch.as_tensor(twists, dtype=torch.float64))[0].numpy()
+    across = robot.steered.drive_places[:, 1].numpy()
+    sides = [across > 0.0, across < 0.0]
+    every = np.ones(len(across), bool)
+    return np.stack([speeds[..., side if side.any() else every].mean(axis=-1) for side in sides], axis=-1)
+
+
 def wheels_without_motion(
     motion: MotionTrack, wheels: WheelTrack | None, commands: CommandTrack, robot: RobotModel
 ) -> WheelsWithoutMotion | None:
@@ -134,7 +152,7 @@ def wheels_without_motion(
         share=float(kept.sum() / max(1, driven[:, column].sum())),
         wheel_distance=float(np.abs(speeds[where, column]).sum() * _STEP),
         moved=float(ground[kept, column].max()),
-        followed=_followed(commands, stamps[where], speeds[where], half, column),
+        followed=_followed(commands, stamps[where], speeds[where], robot, column),
         origin=int(motion.stamps[0]),
     )
 
@@ -185,7 +203,7 @@ def undriven_stretches(
     measured = _interpolated(source, speeds, stamps)
     usual = float(np.median(np.diff(commands.stamps))) * 1e-9 if len(commands) > 1 else 0.0
     timeout = max(timeout, 5.0 * usual)
-    held, active = (_side_speeds(commands.sample(stamps, timeout=age), half) for age in (np.inf, timeout))
+    held, active = (side_speeds(robot, commands.sample(stamps, timeout=age)) for age in (np.inf, timeout))
     # Difference of neighbouring measurements: noise and quantisation, as long as the speed changes slowly.
     noise = 1.4826 / np.sqrt(2.0) * float(np.median(np.abs(np.diff(speeds, axis=0))))
     floor = max(_SLOWEST if by_wheels else 2.0 * _SLOWEST, 5.0 * noise)
@@ -227,14 +245,12 @@ def _sides(motion: MotionTrack, stamps: np.ndarray, half: float) -> np.ndarray:
     return _interpolated(motion.stamps, points.reshape(-1, 4), stamps).reshape(-1, 2, 2)
 
 
-def _side_speeds(twists: np.ndarray, half: float) -> np.ndarray:
-    return twists[:, :1] + half * np.array([-1.0, 1.0]) * twists[:, 1:]
-
-
-def _followed(commands: CommandTrack, stamps: np.ndarray, speeds: np.ndarray, half: float, column: int) -> float | None:
+def _followed(
+    commands: CommandTrack, stamps: np.ndarray, speeds: np.ndarray, robot: RobotModel, column: int
+) -> float | None:
     if not len(commands):
         return None
-    commanded = _side_speeds(commands.sample(stamps), half)
+    commanded = side_speeds(robot, commands.sample(stamps))
     commanded = np.column_stack([commanded, np.abs(commanded).mean(axis=1)])[:, column]
     driven = np.abs(commanded) > _SLOWEST
     return float(np.median(speeds[driven, column] / commanded[driven])) if driven.any() else None

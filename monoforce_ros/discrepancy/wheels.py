@@ -13,7 +13,7 @@ from scipy.stats import wilcoxon
 
 from monoforce_ros.core import CommandTrack, WheelTrack
 from monoforce_ros.discrepancy.hypothesis import Effects
-from monoforce_ros.discrepancy.wheel_motion import half_track, undriven_stretches
+from monoforce_ros.discrepancy.wheel_motion import side_speeds, undriven_stretches
 from monoforce_ros.effects import CATALOGUE, Fastest, WheelResponse, wheel_effects
 from monoforce_ros.robots import RobotModel
 
@@ -149,7 +149,8 @@ class _Blocks:
     """Commands and measured wheel speeds in blocks of one length."""
 
     twists: np.ndarray
-    """Commanded forward speed [m/s] and yaw rate [rad/s], with those before the block, ``[n, 2, T]``."""
+    """Commanded forward speed [m/s], yaw rate [rad/s] and, of a robot that crabs, lateral speed [m/s], with those
+    before the block, ``[n, 2, T]`` or ``[n, 3, T]``."""
     measured: np.ndarray
     """Measured speed of the left and right wheels, ``[n, 2, K]`` [rad/s], or [m/s] after division by the ratio."""
     place: np.ndarray
@@ -158,8 +159,8 @@ class _Blocks:
     """Samples that exist, ``[n, K]`` bool; others fill the array."""
     step: float
     """Time between commands [s]."""
-    half: float
-    """Lateral distance of the drives from the centre line [m]."""
+    robot: RobotModel
+    """Its kinematics make wheel speeds of twists."""
 
     @classmethod
     def of(cls, commands: CommandTrack, wheels: WheelTrack, robot: RobotModel, step: float) -> _Blocks | None:
@@ -186,9 +187,10 @@ class _Blocks:
                 known.append(np.arange(_MOST_SAMPLES) < len(part))
         if not twists:
             return None
-        bounds = np.array([[robot.maximum_speed], [robot.maximum_yaw_rate]])
+        bounds = np.array([[robot.maximum_speed], [robot.maximum_yaw_rate], [robot.maximum_lateral_speed]])
+        bounds = bounds[: twists[0].shape[0]]
         limited = np.clip(np.array(twists), -bounds, bounds)
-        return cls(limited, np.array(measured), np.array(place), np.array(known), step, half_track(robot))
+        return cls(limited, np.array(measured), np.array(place), np.array(known), step, robot)
 
     def __len__(self) -> int:
         return len(self.twists)
@@ -217,8 +219,8 @@ class _Blocks:
 
     def commanded(self, twists: np.ndarray | None = None) -> np.ndarray:
         """Wheel speeds ``[n, 2, T]`` [m/s] of commanded or given twists."""
-        forward, yaw_rate = np.moveaxis(self.twists if twists is None else twists, 1, 0)
-        return np.stack([forward - self.half * yaw_rate, forward + self.half * yaw_rate], axis=1)
+        given = self.twists if twists is None else twists
+        return np.moveaxis(side_speeds(self.robot, np.moveaxis(given, 1, -1)), -1, 1)
 
     def at_samples(self, speeds: np.ndarray) -> np.ndarray:
         """Speeds ``[n, 2, T]`` at the samples, ``[n, 2, K]``."""
@@ -362,7 +364,8 @@ def _modelled(values: np.ndarray, names: tuple[str, ...], blocks: _Blocks) -> np
     twists = blocks.twists
     for response, value in named:
         if response.of_twist:
-            twists = response.speeds(twists, value, blocks.step)
+            changed = response.speeds(twists[:, :2], value, blocks.step)
+            twists = np.concatenate([changed, twists[:, 2:]], axis=1) if twists.shape[1] > 2 else changed
     speeds = blocks.commanded(twists)
     for response, value in named:
         if not response.of_twist:

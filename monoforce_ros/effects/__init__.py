@@ -4,7 +4,6 @@ from monoforce_ros.effects.catalogue import (
     CATALOGUE,
     EffectError,
     applied_setup,
-    controls,
     corrected_commands,
     corrected_motion,
     drive_speeds,
@@ -19,6 +18,7 @@ from monoforce_ros.effects.catalogue import (
     wheel_effects,
 )
 from monoforce_ros.effects.effect import STAGES, Effect, Fastest, Parameter, WheelResponse, per_trajectory
+from monoforce_ros.effects.joint_controls import controls
 from monoforce_ros.effects.setup import FEATURE_SIZES, FEATURES, Loads, Setup
 from monoforce_ros.effects.timing import contains, values_from, values_growing
 

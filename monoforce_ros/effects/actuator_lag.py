@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from typing import ClassVar
 
 import numpy as np
-import torch
 from scipy.signal import lfilter
 from torch import Tensor
 
 from monoforce_ros.effects.effect import Effect, Parameter, Values, WheelResponse
+from monoforce_ros.effects.first_order import lagged
 from monoforce_ros.effects.ramp import at_stamps
 
 
@@ -45,42 +44,4 @@ class ActuatorLag(Effect):
 
     def drive_speeds(self, speeds: Tensor, values: Values, time_step: float, offsets: Tensor) -> Tensor:
         """Drive speeds with this effect applied; see :class:`Effect`."""
-        constant = values["time_constant"]
-        # exp(-Δt/τ); at τ = 0 the quotient stays finite and the gradient is zero.
-        slow = constant > 1e-6
-        safe = torch.where(slow, constant, torch.ones_like(constant))
-        retained = torch.where(slow, torch.exp(-time_step / safe), torch.zeros_like(constant))
-        return _lagged(speeds, retained.reshape(-1))
-
-
-def _lagged(speeds: Tensor, retained: Tensor) -> Tensor:
-    """The lag ``[B, T, D]`` of commands, the first of which also held before the start.
-
-    The linear recurrence is solved within blocks of √T steps by a matrix, and in the same way over their ends: its cost
-    grows with T^1.5, and a trajectory may have a time constant of its own.
-
-    Args:
-        speeds: ``[B, T, D]``.
-        retained: share of the previous speed that is left after a step, ``[1]`` or ``[B]``.
-    """
-    batch, steps, drives = speeds.shape
-    length = math.isqrt(max(steps - 1, 0)) + 1
-    count = -(-steps // length)
-    padded = torch.nn.functional.pad(speeds.transpose(1, 2), (0, count * length - steps))
-    within = _response(padded.reshape(batch, drives * count, length), retained, 1.0 - retained)
-    across = retained**length
-    ends = within.reshape(batch, drives, count, length)[..., -1]
-    # What a block starts with: the end of the one before it, or the first command.
-    entering = torch.cat([speeds[:, :1].transpose(1, 2), ends[..., :-1]], dim=2)
-    carried = _response(entering, across, torch.ones_like(across))
-    powers = retained[:, None] ** torch.arange(1, length + 1, device=speeds.device)
-    result = within.reshape(batch, drives, count, length) + carried[..., None] * powers[:, None, None]
-    return result.reshape(batch, drives, -1)[..., :steps].transpose(1, 2)
-
-
-def _response(inputs: Tensor, retained: Tensor, gain: Tensor) -> Tensor:
-    """Sums of all previous ``inputs`` ``[B, R, N]``, each weaker by ``retained`` after every step."""
-    steps = torch.arange(inputs.shape[-1], device=inputs.device)
-    distance = steps[:, None] - steps
-    weights = (gain[:, None, None] * retained[:, None, None] ** distance.clamp_min(0)).tril()
-    return inputs @ (weights[0].T if len(retained) == 1 else weights.mT)
+        return lagged(speeds, values["time_constant"], time_step)

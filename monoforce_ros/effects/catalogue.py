@@ -15,7 +15,7 @@ from torch import Tensor
 from monoforce_ros.core import CommandTrack, MotionTrack
 from monoforce_ros.effects.effect import STAGES, Effect
 from monoforce_ros.effects.setup import Setup
-from monoforce_ros.robots import Controls, RobotModel, servo_response
+from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import TerrainMap
 
 
@@ -23,7 +23,7 @@ class EffectError(ValueError):
     """Unknown effect, unknown parameter of an effect, or a value out of bounds."""
 
 
-_NO_EFFECTS = frozenset({"catalogue", "effect", "page", "ramp", "setup", "timing"})
+_NO_EFFECTS = frozenset({"catalogue", "effect", "first_order", "joint_controls", "page", "ramp", "setup", "timing"})
 """Modules of this package without an effect."""
 
 
@@ -56,10 +56,14 @@ def speed_effects() -> tuple[Effect, ...]:
     return tuple(sorted((e for e in CATALOGUE.values() if e.order is not None), key=lambda e: (e.order, e.name)))
 
 
-def identifiable_effects() -> tuple[Effect, ...]:
-    """Effects that a recording of motion and commands can identify; sensors and clocks first, then dynamics."""
+def identifiable_effects(robot: RobotModel | None = None) -> tuple[Effect, ...]:
+    """Effects that a recording of motion and commands can identify; sensors and clocks first, then dynamics.
+
+    Args:
+        robot: effects on joints that it does not have are left out; None leaves out none.
+    """
     first = ("measurement", "command", "contact", "body")
-    found = [effect for effect in CATALOGUE.values() if effect.identified]
+    found = [effect for effect in CATALOGUE.values() if effect.identified and effect.applies_to(robot)]
     return tuple(sorted(found, key=lambda e: (first.index(e.stage), e.order or 0, e.name)))
 
 
@@ -120,83 +124,17 @@ def drive_speeds(robot: RobotModel, twists: Tensor, time_step: float, *, history
     Returns:
         ``[B, T, D]`` [m/s].
     """
-    return _commanded(robot, twists, time_step)[0][:, history:]
+    return commanded(robot, twists, time_step)[0][:, history:]
 
 
-def controls(
-    robot: RobotModel,
-    twists: Tensor,
-    time_step: float,
-    *,
-    history: int = 0,
-    joint_start: Tensor | None = None,
-    flippers: Tensor | None = None,
-) -> Controls:
-    """Controls of a rollout from commanded twists: drive speeds, and angles of the joints that are commanded.
+def commanded(robot: RobotModel, twists: Tensor, time_step: float) -> tuple[Tensor, Tensor]:
+    """Drive speeds ``[B, T, D]`` [m/s] and steering angles ``[B, T, S]`` [rad] that the base demands for twists.
 
     Args:
-        robot: its effects act in the order of :func:`speed_effects`.
-        twists: forward speed [m/s], yaw rate [rad/s] and, optionally, lateral speed [m/s],
-            ``[B, history + T, 2]`` or ``[B, history + T, 3]``.
+        robot: its effects on commands act.
+        twists: as for :func:`drive_speeds`, ``[B, T, 2]`` or ``[B, T, 3]``.
         time_step: time between twists [s].
-        history: number of twists before the start; delay, lag and steering need them.
-        joint_start: measured angles of the joints at the start, ``[B, J]`` [rad]; None: steering follows from the
-            commands before the start, other joints are at the angles of the robot's points.
-        flippers: commanded angles of the flippers ``[B, T, F]`` [rad]; None holds them.
-
-    Raises:
-        ValueError: a shape does not fit the robot.
     """
-    speeds, steering = _commanded(robot, twists, time_step)
-    batch, steps = speeds.shape[0], speeds.shape[1] - history
-    count = len(robot.flippers)
-    if flippers is not None and tuple(flippers.shape) != (batch, steps, count):
-        raise ValueError(f"flippers: got shape {tuple(flippers.shape)}, expected [{batch}, {steps}, {count}]")
-    if joint_start is not None and tuple(joint_start.shape) != (batch, len(robot.joints)):
-        raise ValueError(f"joint start: got shape {tuple(joint_start.shape)}, expected [{batch}, {len(robot.joints)}]")
-    rest = speeds.new_zeros(0) if robot.joint_angles is None else robot.joint_angles.to(speeds)
-    start = rest.expand(batch, -1) if joint_start is None else joint_start.to(speeds)
-    if not steering.shape[-1] and flippers is None and joint_start is None:
-        return Controls(speeds[:, history:])
-    angles, rates = start[:, None].expand(-1, steps, -1), torch.zeros_like(start)[:, None].expand(-1, steps, -1)
-    if steering.shape[-1]:
-        assert robot.steered is not None
-        moved = list(robot.steered.joints)
-        if joint_start is None:
-            followed = _followed(robot, moved, steering, steering[:, 0], time_step)
-            followed = followed[0][:, history:], followed[1][:, history:]
-        else:
-            followed = _followed(robot, moved, steering[:, history:], start[:, moved], time_step)
-        angles, rates = _placed(angles, moved, followed[0]), _placed(rates, moved, followed[1])
-    if flippers is not None:
-        moved = list(range(len(robot.joints) - count, len(robot.joints)))
-        turned, turning = _followed(robot, moved, flippers.to(speeds), start[:, moved], time_step)
-        angles, rates = _placed(angles, moved, turned), _placed(rates, moved, turning)
-    return Controls(speeds[:, history:], angles, rates, start_angles=None if joint_start is None else start)
-
-
-def _followed(
-    robot: RobotModel, joints: list[int], targets: Tensor, start: Tensor, time_step: float
-) -> tuple[Tensor, Tensor]:
-    """Angles and rates of joints ``[B, T, n]`` that follow commands within their limits."""
-    chosen = [robot.joints[index] for index in joints]
-    low, high = (targets.new_tensor([getattr(joint, name) for joint in chosen]) for name in ("low", "high"))
-    lags, rates = (
-        targets.new_tensor([getattr(joint, name) for joint in chosen]) for name in ("time_constant", "maximum_rate")
-    )
-    return servo_response(torch.minimum(torch.maximum(targets, low), high), start, lags, rates, time_step)
-
-
-def _placed(values: Tensor, columns: list[int], entries: Tensor) -> Tensor:
-    """Values ``[B, T, J]`` with other columns."""
-    listed = list(values.unbind(-1))
-    for column, entry in zip(columns, entries.unbind(-1), strict=True):
-        listed[column] = entry
-    return torch.stack(listed, dim=-1)
-
-
-def _commanded(robot: RobotModel, twists: Tensor, time_step: float) -> tuple[Tensor, Tensor]:
-    """Drive speeds ``[B, T, D]`` and steering angles ``[B, T, S]`` that the base controller demands."""
     given = dict(robot.effects)
     active = [
         (effect, effect_values(effect.name, given[effect.name], twists))
@@ -213,6 +151,8 @@ def _commanded(robot: RobotModel, twists: Tensor, time_step: float) -> tuple[Ten
         speeds = effect.drive_speeds(speeds, values, time_step, robot.drive_offsets)
         if effect.acts_on_steering and steering.shape[-1]:
             steering = effect.drive_speeds(steering, values, time_step, torch.zeros_like(steering[0, 0]))
+        if effect.needs == "steering" and steering.shape[-1]:
+            steering = effect.steering_angles(steering, values, time_step)
     return speeds, steering
 
 

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from monoforce_ros.core import CommandTrack, MotionTrack
 from monoforce_ros.effects.setup import Setup
+from monoforce_ros.robots import Flipper, RobotModel
 
 STAGES = ("command", "contact", "body", "measurement")
 Values = Mapping[str, Tensor]
@@ -87,6 +88,9 @@ class Effect(ABC):
     Required for every effect that overrides :meth:`twists` or :meth:`drive_speeds`; all twists change first."""
     acts_on_steering: ClassVar[bool] = False
     """Whether :meth:`drive_speeds` also acts on steering angles, as a delay of all commands does."""
+    needs: ClassVar[str] = ""
+    """``steering`` or ``flippers`` for an effect on these joints: it does nothing on robots without them, and is no
+    candidate there."""
     identified: ClassVar[tuple[str, ...]] = ()
     """Parameters that a recording of motion and commands can identify, the most important first. If empty, ``diagnose``
     does not test this effect."""
@@ -126,6 +130,33 @@ class Effect(ABC):
         """
         return speeds
 
+    def steering_angles(self, angles: Tensor, values: Values, time_step: float) -> Tensor:
+        """Steering angles ``[B, T, S]`` [rad] from commanded ones, of an effect that needs ``steering``.
+
+        Args:
+            angles: commanded angles ``[B, T, S]`` [rad], including those before the start.
+            values: parameter values.
+            time_step: time between angles [s].
+        """
+        return angles
+
+    def flipper_angles(self, targets: Tensor, start: Tensor, values: Values, flippers: tuple[Flipper, ...]) -> Tensor:
+        """Angles ``[B, T, F]`` [rad] that flippers follow, from commanded ones, of an effect that needs ``flippers``.
+
+        Args:
+            targets: commanded angles ``[B, T, F]`` [rad].
+            start: their angles at the start ``[B, F]`` [rad].
+            values: parameter values.
+            flippers: of the robot.
+        """
+        return targets
+
+    def applies_to(self, robot: RobotModel | None) -> bool:
+        """Whether a robot has the joints that this effect needs; None stands for one that has all."""
+        if robot is None or not self.needs:
+            return True
+        return bool(robot.flippers) if self.needs == "flippers" else robot.steered is not None
+
     def setup(self, setup: Setup, values: Values) -> Setup:
         """The setup with this effect applied."""
         return setup
@@ -160,6 +191,8 @@ class Effect(ABC):
             return f"stage: got {self.stage!r}, expected one of {STAGES}"
         kind = type(self)
         changes_speeds = kind.drive_speeds is not Effect.drive_speeds or kind.twists is not Effect.twists
+        if self.needs not in ("", "steering", "flippers"):
+            return f"needs: got {self.needs!r}, expected steering, flippers or nothing"
         if self.order is not None and not isinstance(self.order, int):
             return f"order: got {self.order!r}, expected a whole number"
         if (changes_speeds or self.stage == "command") and self.order is None:

@@ -19,6 +19,7 @@ class FrictionAnisotropy(Effect):
     source = "friction ellipse of tyres and grousers (Pacejka 2012)"
     parameters = (Parameter("factor", "-", 1.0, 0.05, 3.0, 0.3, "lateral over longitudinal friction"),)
     identified = ("factor",)
+    commissioning_start: ClassVar = {"factor": 1.0}
     manoeuvre = "turns on the spot, wide arcs and hard starts straight ahead"
     separated_by: ClassVar = {
         "friction_scale": "hard starts straight ahead, which need longitudinal friction only",

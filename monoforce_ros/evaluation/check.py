@@ -79,7 +79,7 @@ def _contents(
 ) -> Iterator[Finding]:
     """Findings about the odometry, commands and sensors of a bag."""
     try:
-        recording = reading.open_as_measured(path)
+        recording = reading.open_as_measured(path, robot)
     except BagError as error:
         yield missing(f"odometry: {error}. Record nav_msgs/Odometry from wheels, lidar or visual SLAM")
         return
@@ -185,10 +185,11 @@ def _command_findings(
 ) -> Iterator[Finding]:
     """Findings about commands; whether motion follows them is of interest where nothing worse was found."""
     commands = recording.commands
-    largest_speed, largest_yaw_rate = np.abs(commands.twists).max(axis=0)
+    largest_speed, largest_yaw_rate, *lateral = np.abs(commands.twists).max(axis=0).tolist()
+    sideways = f", {lateral[0]:.2f} m/s sideways" if lateral else ""
     yield ok(
         f"commands {recording.topics['commands']}: {len(commands)}, up to {largest_speed:.2f} m/s and "
-        f"{largest_yaw_rate:.2f} rad/s"
+        f"{largest_yaw_rate:.2f} rad/s{sideways}"
     )
     if largest_speed > 1.5 * robot.maximum_speed:
         yield warning(

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from monoforce_ros.bags import BagError, add_read_options, read_options
-from monoforce_ros.core import share_directory
+from monoforce_ros.core import OptionParser, share_directory
 from monoforce_ros.effects import EffectError
 from monoforce_ros.encoder import CheckpointError
 from monoforce_ros.evaluation import figures
@@ -30,7 +30,7 @@ from monoforce_ros.evaluation.report import Picture, terminal_table, write_repor
 from monoforce_ros.evaluation.view import PredictionView
 from monoforce_ros.messages import MessageError
 from monoforce_ros.perception import SOURCES, choose_terrain_source
-from monoforce_ros.physics import PhysicsOptions
+from monoforce_ros.physics import SOILS, PhysicsOptions, SoilError, read_soil
 from monoforce_ros.prediction import Predictor
 from monoforce_ros.reporting import figure_png
 from monoforce_ros.robots import RobotFileError, load_robot, shipped_robots
@@ -54,7 +54,7 @@ class _FormerOption(argparse.Action):
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = OptionParser(
         prog="evaluate",
         description="Predict along a recording and compare with the measured motion. Writes report.html, report.json "
         "and figures.",
@@ -92,6 +92,12 @@ def _parser() -> argparse.ArgumentParser:
         help="friction coefficient of the ground (default: 0.8)",
     )
     parser.add_argument(
+        "--soil",
+        default="",
+        metavar="NAME|FILE",
+        help=f"soft soil: one of {', '.join(SOILS)}, or a soil file (docs/physics.md); default: firm ground",
+    )
+    parser.add_argument(
         "--check",
         action="store_true",
         help="only report the bag's contents, missing data, rates, gaps, clocks and frames; exit status 1 if unusable",
@@ -127,7 +133,16 @@ def main(arguments: list[str] | None = None) -> int:
             print(check_text(check))
             return int(not check.usable)
         run(options)
-    except (BagError, CheckpointError, EffectError, EvaluationError, MessageError, RobotFileError, OSError) as error:
+    except (
+        BagError,
+        CheckpointError,
+        EffectError,
+        EvaluationError,
+        MessageError,
+        RobotFileError,
+        SoilError,
+        OSError,
+    ) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     return 0
@@ -151,7 +166,9 @@ def run(options: argparse.Namespace) -> None:
         checkpoint=options.checkpoint,
         retention_time=options.retention_time,
     )
-    predictor = Predictor(robot, source, horizon=max(options.horizons), options=PhysicsOptions())
+    predictor = Predictor(
+        robot, source, horizon=max(options.horizons), options=PhysicsOptions(soil=read_soil(options.soil))
+    )
     topics = tuple(options.images or recording.images) if "camera" in source.sensors else ()
     evaluation = evaluate_recording(
         recording,
@@ -206,6 +223,7 @@ def run(options: argparse.Namespace) -> None:
         "odometry": f"{recording.motion.frame_id} → {recording.odometry_child_frame}, "
         f"evaluated at {recording.motion.child_frame_id}",
         "friction": options.friction,
+        "soil": options.soil or "firm ground",
         "stride [s]": options.stride,
         "physics": str(predictor.options),
         "duration [s]": round(time.monotonic() - began, 1),

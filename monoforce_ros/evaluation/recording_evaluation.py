@@ -14,7 +14,7 @@ from monoforce_ros.effects import corrected_commands, corrected_motion
 from monoforce_ros.evaluation.metrics import Poses, Summary, position_errors, rotation_errors, summarise
 from monoforce_ros.messages import MessageError
 from monoforce_ros.perception import FlatTerrain, Observation
-from monoforce_ros.prediction import Prediction, Predictor
+from monoforce_ros.prediction import JointMotion, Prediction, Predictor
 from monoforce_ros.reporting import progress
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import TerrainDefaults, TerrainMap
@@ -115,10 +115,17 @@ def evaluate_recording(
 
     def roll_out_batch(batch: list[MotionState], maps: list[TerrainMap]) -> None:
         twists = np.stack([recording.commands.sample(predictor.command_stamps(m.stamp)) for m in batch])
-        for method, batch_maps in ((PHYSICS, maps), (FLAT_PHYSICS, [flat.terrain(Observation(0), m) for m in batch])):
+        joints = recorded_joints(recording, predictor, [m.stamp for m in batch])
+        for method, batch_maps in (
+            (PHYSICS, maps),
+            (
+                FLAT_PHYSICS,
+                [flat.terrain(Observation(0, flipper_angles=_flippers_at(recording, m.stamp)), m) for m in batch],
+            ),
+        ):
             if method == FLAT_PHYSICS and not sensors:
                 continue
-            result = predictor.roll_out(TerrainMap.stack(batch_maps), batch, twists)
+            result = predictor.roll_out(TerrainMap.stack(batch_maps), batch, twists, joints=joints)
             index = np.rint(times / predictor.options.time_step).astype(int)
             for row, motion in enumerate(batch):
                 transform = motion.odometry_from_terrain
@@ -180,7 +187,23 @@ def predict_at(recording: Recording, predictor: Predictor, stamp: int, image_top
         observe(recording, predictor.robot, stamp, predictor.source.sensors, image_topics),
         recording.motion.at(stamp, maximum_gap=MAXIMUM_GAP),
         recording.commands.sample(predictor.command_stamps(stamp)),
+        joints=recorded_joints(recording, predictor, [stamp]),
     )
+
+
+def recorded_joints(recording: Recording, predictor: Predictor, stamps: Sequence[int]) -> JointMotion | None:
+    """Measured joints at the starts ``[B]`` [ns] of predictions, and how the flippers were then moved.
+
+    None where the bag has neither measured angles nor commands of the robot's joints.
+    """
+    if recording.joints is None:
+        return None
+    starts = np.array(stamps, np.int64)
+    measured = recording.joints.start(starts)
+    if measured is None:
+        measured = np.full((len(starts), len(predictor.robot.joints)), np.nan)
+    after = np.stack([predictor.command_stamps(int(stamp))[predictor.history :] for stamp in starts])
+    return JointMotion.recorded(measured, recording.joints.flipper_angles(after))
 
 
 def corrected_recording(recording: Recording, robot: RobotModel) -> Recording:
@@ -216,7 +239,15 @@ def observe(
         cameras[topic] = recording.cameras[topic]
         pose = recording.sensor_pose(cameras[topic].frame_id, robot.base_frame, robot.sensors)
         poses[topic] = _base_motion(recording, frame.stamp, stamp) @ pose
-    return Observation(stamp, cloud, images, cameras, poses)
+    return Observation(stamp, cloud, images, cameras, poses, _flippers_at(recording, stamp))
+
+
+def _flippers_at(recording: Recording, stamp: int) -> np.ndarray | None:
+    """Measured angles of the flippers ``[F]`` [rad] at a stamp [ns]; None where none were measured."""
+    if recording.joints is None or not recording.joints.flippers:
+        return None
+    measured = recording.joints.start(np.array([stamp]))
+    return None if measured is None else measured[0, -recording.joints.flippers :]
 
 
 def _base_motion(recording: Recording, start: int, end: int) -> np.ndarray:

@@ -87,7 +87,7 @@ def evaluate_sequence(
     Raises:
         BagError, CheckpointError, EvaluationError: the bag or a checkpoint cannot be used.
     """
-    recording = Recording.open(bag).in_base_frame(robot.base_frame)
+    recording = Recording.open(bag, robot=robot).in_base_frame(robot.base_frame)
     evaluations: dict[str, RecordingEvaluation] = {}
     for system in systems:
         if system.key in (FLAT.key, CONSTANT.key):

@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 
 from monoforce_ros.bags import BagError
-from monoforce_ros.core import write_text
+from monoforce_ros.core import OptionParser, write_text
 from monoforce_ros.encoder import CheckpointError
 from monoforce_ros.evaluation.recording_evaluation import EvaluationError
 from monoforce_ros.evaluation.tables import CONSTANT, FLAT, LIDAR, SequenceErrors, System, evaluate_sequence
@@ -32,7 +32,7 @@ LEARNED = {
 
 def build_parser() -> argparse.ArgumentParser:
     """The command line's options."""
-    parser = argparse.ArgumentParser(
+    parser = OptionParser(
         prog="evaluate --tables",
         description="Compare terrain sources over whole recordings: lidar interpolation, level ground, constant "
         "velocity, and trained encoders. Writes tables.json, tables.html and tables.md.",

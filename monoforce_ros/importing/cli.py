@@ -10,7 +10,7 @@ from typing import Any
 
 import yaml
 
-from monoforce_ros.core import atomic_path, write_text
+from monoforce_ros.core import OptionParser, atomic_path, write_text
 from monoforce_ros.robots import (
     Conversion,
     ConversionOptions,
@@ -24,7 +24,7 @@ from monoforce_ros.robots import (
 
 def build_parser() -> argparse.ArgumentParser:
     """The command line's options."""
-    parser = argparse.ArgumentParser(
+    parser = OptionParser(
         prog="import_robot",
         description="Make a robot file from a URDF: masses, wheels, tracks, flippers, steering, hull and sensors. It "
         "lists what it guesses, draws the robot, and checks that it stands still, drives straight and turns.",

@@ -8,26 +8,13 @@ import sys
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import NoReturn, override
 
 from rclpy.expand_topic_name import expand_topic_name
+from rclpy.node import Node
 
+from monoforce_ros.core import most_similar, nearest
 from monoforce_ros.nodes.parameter_files import read_sections, refuse_misnamed_sections, section_matches
-from monoforce_ros.nodes.schema import most_similar, nearest
-
-
-class NodeArgumentParser(argparse.ArgumentParser):
-    """An argument parser that refuses abbreviations and names the most similar option for an unknown one."""
-
-    def __init__(self, *, prog: str, description: str):
-        super().__init__(prog=prog, description=description, allow_abbrev=False)
-
-    @override
-    def error(self, message: str) -> NoReturn:
-        unknown = message.removeprefix("unrecognized arguments: ").split()
-        if message.startswith("unrecognized arguments: "):
-            message += nearest(unknown[0].split("=")[0], self._option_string_actions)
-        super().error(message)
+from monoforce_ros.nodes.schema import no_parameters, of_every_node, parameter_owners
 
 
 def seconds(text: str) -> float:
@@ -132,6 +119,61 @@ def refuse_other_nodes(arguments: Sequence[str], node: str) -> None:
         if wanted[0] != wanted[1]:
             how = word.removeprefix(f"{prefix}:")
             raise ValueError(f"{option} {word}: the node is {node}, not {prefix!r}; give {option} {how}")
+
+
+def refuse_given_parameters(arguments: Sequence[str], node: str, known: Iterable[str] = ()) -> None:
+    """Raise ``ValueError`` for ``-p NAME:=VALUE`` with a parameter that the node does not have.
+
+    Parameters of the package's other nodes are refused, too: in a file they may stand, which several nodes share, but
+    the command line is meant for this node.
+
+    Args:
+        arguments: the command line.
+        node: name of the executable.
+        known: names of the node's parameters.
+    """
+    known, owners = set(known), parameter_owners()
+    for option, word in pairwise(arguments):
+        before, sign, _ = word.partition(":=")
+        name = before.rpartition(":")[2]
+        if option not in ("-p", "--param") or not sign:
+            continue
+        if name in known or of_every_node(name):
+            continue
+        if not known:
+            raise ValueError(f"unknown parameter {name!r}: {no_parameters(node)}")
+        owner = f" (it is one of {owners[name]})" if name in owners else ""
+        meant = nearest(name, known | {"use_sim_time"}) or ";"
+        raise ValueError(f"unknown parameter {name!r}{owner}{meant} --help lists all parameters")
+
+
+def idle_remappings(arguments: Sequence[str], node: Node) -> list[str]:
+    """Warnings about remappings of the command line that rename nothing, such as a misspelt topic.
+
+    Args:
+        arguments: the command line.
+        node: the node, with all its topics.
+    """
+    topics = {publisher.topic_name for publisher in node.publishers}
+    topics |= {subscription.topic_name for subscription in node.subscriptions}
+    others = {service.srv_name for service in node.services} | {client.srv_name for client in node.clients}
+    found = []
+    for option, word in pairwise(arguments):
+        before, sign, after = word.partition(":=")
+        # Names of nodes and namespaces, schemes such as rostopic://, and what ROS itself refuses.
+        if option not in ("-r", "--remap") or not sign or before.startswith("__") or "://" in before:
+            continue
+        name, space = node.get_name(), node.get_namespace()
+        try:
+            old, new = (expand_topic_name(text, name, space) for text in (before.rpartition(":")[2], after))
+        except ValueError:
+            continue
+        # Services of every node, of parameters and lifecycles, are not listed above.
+        if new in topics | others or old.startswith(f"{node.get_fully_qualified_name()}/"):
+            continue
+        full_name = node.get_fully_qualified_name()
+        found.append(f"-r {word} renames nothing: {full_name} has no topic {old}{nearest(old, topics)}")
+    return found
 
 
 def parameter_files(arguments: Sequence[str]) -> list[Path]:

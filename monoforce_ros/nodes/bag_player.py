@@ -15,9 +15,14 @@ from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 
 from monoforce_ros.bags import BagError, BagMessage, BagReader, type_store
-from monoforce_ros.core import share_directory
-from monoforce_ros.messages import message_class, missing_package
-from monoforce_ros.nodes.arguments import NodeArgumentParser, own_arguments, seconds
+from monoforce_ros.core import OptionParser, TransformTree, nearest, share_directory
+from monoforce_ros.messages import decoding, message_class, missing_package
+from monoforce_ros.nodes.arguments import (
+    idle_remappings,
+    own_arguments,
+    refuse_given_parameters,
+    seconds,
+)
 from monoforce_ros.nodes.frames import TRANSFORMS
 from monoforce_ros.nodes.odometry_transform import odometry_transform
 from monoforce_ros.nodes.parameters import refuse_unknown_parameters
@@ -28,8 +33,12 @@ from monoforce_ros.reporting import progress_bar
 _PROFILES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 
 
+_SEARCHED = 5_000_000_000
+"""Part of a bag in which transforms are looked for [ns]: state estimators publish theirs many times a second."""
+
+
 def _arguments(arguments: list[str]) -> argparse.Namespace:
-    parser = NodeArgumentParser(
+    parser = OptionParser(
         prog="bag_player", description="Publish the messages of a bag (ROS 2 or ROS 1) with their recorded timing."
     )
     parser.add_argument("bag", nargs="?", help="rosbag2 folder or ROS 1 .bag file (default: the demo bag)")
@@ -45,7 +54,7 @@ def _arguments(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument(
         "--no-tf",
         action="store_true",
-        help="do not derive /tf from the odometry of a bag without /tf",
+        help="do not derive the robot's pose on /tf from the odometry of a bag that lacks it",
     )
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     options = parser.parse_args(arguments)
@@ -65,23 +74,31 @@ class BagPlayer(Node):
         self.bag = bag
         self.options = options
         self.playable: dict[str, Publisher] = {}
+        # Names in a bag are absolute; a name without its first slash is meant for one of them.
+        wanted = {f"/{topic.lstrip('/')}" for topic in options.topics} if options.topics else None
+        missing = sorted((wanted or set()) - set(bag.topics))
+        if missing:
+            meant = nearest(missing[0], bag.topics)
+            raise BagError(f"{bag.path} has no topics {missing}{meant or ';'} its topics are {sorted(bag.topics)}")
+        if 1e9 * options.start > bag.end - bag.start:
+            raise BagError(f"--start: got {options.start:g} s, but {bag.path} lasts {bag.duration:.1f} s")
         for topic, message_type in bag.topics.items():
-            if options.topics and topic not in options.topics:
+            if wanted is not None and topic not in wanted:
+                continue
+            if topic == "/clock" and options.clock:
+                self.get_logger().info("the bag's own /clock is not played: --clock publishes the time of reception")
                 continue
             message_type_class = message_class(message_type)
             if message_type_class is None:
                 self.get_logger().warning(f"{topic} is not played: {missing_package(message_type)}")
                 continue
-            latched = _is_static(topic)
+            latched = topic in bag.latched
             quality = QoSProfile(
-                depth=100 if latched else 10,
+                depth=100 if _is_static(topic) else 1 if latched else 10,
                 reliability=ReliabilityPolicy.RELIABLE,
                 durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
             )
             self.playable[topic] = self.create_publisher(message_type_class, topic, quality)
-        missing = sorted(set(options.topics or ()) - set(bag.topics))
-        if missing:
-            raise BagError(f"{bag.path} has no topics {missing}; its topics are {sorted(bag.topics)}")
         self.clock = self.create_publisher(Clock, "/clock", 10) if options.clock else None
         self._odometry, self._transforms = self._prepare_transforms()
 
@@ -90,14 +107,41 @@ class BagPlayer(Node):
         played = [topic for topic in self.bag.of_type("nav_msgs/msg/Odometry") if topic in self.playable]
         recorded = [topic for topic in self.bag.of_type(TRANSFORMS) if not _is_static(topic)]
         kind = message_class(TRANSFORMS)
-        if self.options.no_tf or recorded or not played or kind is None:
+        if self.options.no_tf or not played or kind is None:
             return "", None
         topic = max(played, key=lambda name: self.bag.counts[name])
+        if recorded:
+            missing = self._missing_transform(topic)
+            target = next((name for name in recorded if name in self.playable), "")
+            if not missing or not target:
+                return "", None
+            self.get_logger().info(
+                f"the bag's {target} has no {missing}: it is derived from {topic} (--no-tf disables this)"
+            )
+            return topic, self.playable[target]
         # A robot in a namespace may have a /tf of its own; then its static transforms are there, too.
         static = sorted(topic for topic in self.playable if _is_static(topic))
         target = static[0].removesuffix("_static") if static else "/tf"
         self.get_logger().info(f"the bag has no {target}: it is derived from {topic} (--no-tf disables this)")
         return topic, self.create_publisher(kind, target, 100)
+
+    def _missing_transform(self, odometry: str) -> str:
+        """The transform of an odometry topic, in words, if the transforms at the start of the bag do not contain it."""
+        tree, frames = TransformTree(), ("", "")
+        topics = [odometry, *self.bag.of_type(TRANSFORMS)]
+        for message in self.bag.messages(topics, stop=self.bag.start + _SEARCHED):
+            try:
+                decoded = message.decode()
+                if message.topic != odometry:
+                    for (parent, child), matrix in decoding.decode_transforms(decoded).items():
+                        tree.add(parent, child, matrix)
+                elif not frames[0]:
+                    frames = decoded.header.frame_id or "odom", decoded.child_frame_id or "base_link"
+            except ValueError:
+                continue
+            if frames[0] and tree.find(*frames) is not None:
+                return ""
+        return f"{frames[0]} → {frames[1]}" if frames[0] else ""
 
     def wait_for_subscribers(self) -> None:
         """Wait for a first subscriber, and then a little longer for further ones."""
@@ -121,10 +165,16 @@ class BagPlayer(Node):
                 break
         return published
 
-    def _publish_earlier_transforms(self, start: int) -> None:
-        """Publish the static transforms before the start: they hold from then on."""
-        static = [topic for topic in self.playable if _is_static(topic)]
-        for message in self.bag.messages(static, stop=start) if static and start > self.bag.start else ():
+    def _publish_earlier(self, start: int) -> None:
+        """Publish what holds since before the start: all static transforms, and the last message of latched topics."""
+        latched = self.bag.latched & set(self.playable)
+        last: dict[str, BagMessage] = {}
+        for message in self.bag.messages(latched, stop=start) if latched and start > self.bag.start else ():
+            if _is_static(message.topic):
+                self.playable[message.topic].publish(message.cdr())
+            else:
+                last[message.topic] = message
+        for message in last.values():
             self.playable[message.topic].publish(message.cdr())
 
     def _publish_pose(self, message: BagMessage) -> None:
@@ -140,7 +190,7 @@ class BagPlayer(Node):
 
     def _play_once(self) -> int:
         start = self.bag.start + int(self.options.start * 1e9)
-        self._publish_earlier_transforms(start)
+        self._publish_earlier(start)
         length = self.options.duration if self.options.duration is not None else (self.bag.end - start) * 1e-9
         stop = start + int(length * 1e9)
         published = 0
@@ -190,13 +240,14 @@ def main(arguments: list[str] | None = None) -> int:
     for variable in _PROFILES:
         os.environ.setdefault(variable, str(share_directory() / "config" / "fastdds_large_messages.xml"))
     try:
+        refuse_given_parameters(command_line, "bag_player")
         initialise(command_line, SignalHandlerOptions.ALL)
         with BagReader(options.bag or share_directory() / "bags" / "demo") as bag:
             player = BagPlayer(bag, options)
             player.get_logger().info(
                 f"playing {bag.path}: {bag.duration:.1f} s, {len(player.playable)} topics, {bag.message_count} messages"
             )
-            for warning in bag.warnings:
+            for warning in (*bag.warnings, *idle_remappings(command_line, player)):
                 player.get_logger().warning(warning)
             published = player.play()
             player.get_logger().info(f"published {published} messages")

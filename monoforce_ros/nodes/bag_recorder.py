@@ -13,14 +13,16 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from monoforce_ros.bags import BagWriter
+from monoforce_ros.core import OptionParser
 from monoforce_ros.messages import message_class, missing_package
-from monoforce_ros.nodes.arguments import NodeArgumentParser, own_arguments, topic_name
+from monoforce_ros.nodes.arguments import own_arguments, refuse_given_parameters, topic_name
+from monoforce_ros.nodes.clocks import STEADY
 from monoforce_ros.nodes.parameters import refuse_unknown_parameters
 from monoforce_ros.nodes.process import initialise
 
 
 def _arguments(arguments: list[str]) -> argparse.Namespace:
-    parser = NodeArgumentParser(
+    parser = OptionParser(
         prog="bag_recorder", description="Record topics into a rosbag2 bag until interrupted (SIGINT or SIGTERM)."
     )
     parser.add_argument("out", help="folder of the bag; must not exist")
@@ -40,8 +42,8 @@ class BagRecorder(Node):
         self._topics = None if topics is None else {self.resolve_topic_name(topic) for topic in topics}
         self._subscribed: set[str] = set()
         self.recorded = 0
-        self._timer = self.create_timer(0.2, self._subscribe_new)
-        self._flusher = self.create_timer(1.0, bag.flush)
+        self._timer = self.create_timer(0.2, self._subscribe_new, clock=STEADY)
+        self._flusher = self.create_timer(1.0, bag.flush, clock=STEADY)
         self._subscribe_new()
 
     @property
@@ -72,14 +74,14 @@ class BagRecorder(Node):
             self.create_subscription(
                 kind,
                 topic,
-                partial(self._write, topic, types[0]),
+                partial(self._write, topic, types[0], latched),
                 quality,
                 raw=True,
             )
             self.get_logger().info(f"recording {topic} ({types[0]})")
 
-    def _write(self, topic: str, message_type: str, data: bytes) -> None:
-        self._bag.write_serialized(topic, message_type, data, time.time_ns())
+    def _write(self, topic: str, message_type: str, latched: bool, data: bytes) -> None:
+        self._bag.write_serialized(topic, message_type, data, time.time_ns(), latched=latched)
         self.recorded += 1
 
 
@@ -88,6 +90,7 @@ def main(arguments: list[str] | None = None) -> int:
     command_line = sys.argv if arguments is None else ["bag_recorder", *arguments]
     options = _arguments(own_arguments(command_line[1:]))
     try:
+        refuse_given_parameters(command_line, "bag_recorder")
         initialise(command_line)
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)

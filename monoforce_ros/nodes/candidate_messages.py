@@ -54,8 +54,9 @@ def candidate_costs(
 ) -> bytes:
     """``sensor_msgs/PointCloud2``: a point at the end of each candidate, with command, cost and every term as fields.
 
-    ``x_25``, ``y_25`` and so on are the position after that percentage of the horizon. The message type is standard;
-    planners read it by field names, and RViz can colour it by cost.
+    Of a robot that moves sideways ``lateral_speed`` is a field. ``x_25``, ``y_25`` and so on are positions after that
+    percentage of the horizon. The message type is standard; planners read it by field names, and RViz can colour it by
+    cost.
     """
     end = transform_points(motion.odometry_from_terrain, rollout.position[:, -1].double().cpu().numpy())
     rotation = motion.odometry_from_terrain[:3, :3] @ rollout.rotation[:, -1].double().cpu().numpy()
@@ -66,6 +67,7 @@ def candidate_costs(
         "heading": np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]),
         "speed": commands[:, 0],
         "yaw_rate": commands[:, 1],
+        **({"lateral_speed": commands[:, 2]} if commands.shape[-1] > 2 else {}),
         "cost": assessment.cost.cpu().numpy(),
         "feasible": assessment.feasible.cpu().numpy().astype(np.float32),
     }

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from nav_msgs.msg import Path
 from rclpy.node import Node
-from sensor_msgs.msg import PointCloud2
+from sensor_msgs.msg import JointState, PointCloud2
 from std_msgs.msg import Float32MultiArray
 from visualization_msgs.msg import MarkerArray
 
@@ -25,6 +25,7 @@ from monoforce_ros.planning import (
     CandidateSettings,
     CostWeights,
     Limits,
+    Refinement,
     assess,
     fan_of_arcs,
     force_every,
@@ -32,7 +33,7 @@ from monoforce_ros.planning import (
     refine,
 )
 from monoforce_ros.prediction import Prediction, Predictor
-from monoforce_ros.robots import load_robot
+from monoforce_ros.robots import RobotModel, load_robot
 
 PART = "candidates"
 TYPED_MESSAGE = "monoforce_msgs/msg/Candidates"
@@ -58,6 +59,7 @@ class CandidateOutput:
             fan = CandidateSettings(
                 settings.candidates, tuple(settings.candidate_speeds), settings.candidate_yaw_rate,
                 curvature=robot.maximum_curvature,
+                lateral=min(robot.maximum_lateral_speed, max(settings.candidate_speeds)) if _crabs(robot) else 0.0,
             )  # fmt: skip
             self._fan = fan_of_arcs(fan)
         self._requested: tuple[float, np.ndarray] | None = None
@@ -69,6 +71,8 @@ class CandidateOutput:
             "candidate_costs": node.create_publisher(PointCloud2, "predicted/candidate_costs", 1),
             "best_path": node.create_publisher(Path, "predicted/best_path", 1),
         }
+        if robot.flippers:
+            self._publishers["flipper_angles"] = node.create_publisher(JointState, "predicted/flipper_angles", 1)
         # If the message package is built, planners get everything in one typed message.
         if typed := message_class(TYPED_MESSAGE):
             self._publishers["candidate_rollouts"] = node.create_publisher(typed, "predicted/candidate_rollouts", 1)
@@ -115,24 +119,34 @@ class CandidateOutput:
         delay = min(round(settings.candidate_delay / self._predictor.options.time_step), self._predictor.steps - 1)
         start, steps = self._predictor.history + delay, self._predictor.steps - delay
         stamps = self._predictor.command_stamps(prediction.stamp)[:start]
-        # Candidates have no lateral speed.
-        before = commands.sample(stamps, timeout=settings.command_timeout)[:, :2]
+        before = commands.sample(stamps, timeout=settings.command_timeout)
+        # A planner's sequences have no lateral speed.
+        width = max(0, before.shape[-1] - sequences.shape[-1])
+        sequences = np.pad(sequences, ((0, 0), (0, 0), (0, width)))
         twists = over_horizon(sequences, before, steps)
         rollout, assessment = self._assess(prediction, twists)
-        if settings.refine_seconds and assessment.best is not None:
-            refined = over_horizon(self._refined(prediction, before, sequences[assessment.best]), before, steps)
-            refined_rollout, refined_assessment = self._assess(prediction, refined)
+        angles = self._commanded_flippers(prediction)
+        # Speed and yaw rate are refined, of candidates that do not move sideways.
+        if settings.refine_seconds and assessment.best is not None and not sequences[assessment.best][:, 2:].any():
+            found = self._refined(prediction, before[:, :2], sequences[assessment.best][:, :2])
+            best = np.pad(found.sequence[None], ((0, 0), (0, 0), (0, before.shape[-1] - 2)))
+            refined = over_horizon(best, before, steps)
+            refined_rollout, refined_assessment = self._assess(prediction, refined, found.flippers)
             twists = np.concatenate([twists, refined])
             rollout, assessment = rollout.joined(refined_rollout), assessment.joined(refined_assessment)
-        data = {
+            if found.flippers is not None and assessment.best == len(twists) - 1:
+                angles = found.flippers
+        data: dict[str, object] = {
             "candidates": messages.candidate_markers(motion, rollout, assessment, frame_id),
             "candidate_costs": messages.candidate_costs(motion, rollout, twists[:, start], assessment, frame_id),
         }
         if assessment.best is not None:
+            if angles is not None:
+                data["flipper_angles"] = self._flipper_angles(prediction, angles, delay)
             data["best_path"] = messages.best_path(motion, rollout, assessment.best, frame_id, settings.path_time_step)
         if "candidate_rollouts" in self._publishers:
             data["candidate_rollouts"] = messages.candidate_rollouts(
-                motion, rollout, self._predictor.robot, twists[:, self._predictor.history :], assessment, frame_id,
+                motion, rollout, self._predictor.robot, twists[:, self._predictor.history :, :2], assessment, frame_id,
                 settings.path_time_step,
             )  # fmt: skip
         self._statistics["feasible candidates"] = f"{int(assessment.feasible.sum())} of {len(twists)}"
@@ -158,19 +172,39 @@ class CandidateOutput:
         self._health.report(PART, WARN, f"{settings.candidate_topic}: {problem}; {fallback}", reason="silent")
         return self._fan
 
-    def _assess(self, prediction: Prediction, twists: np.ndarray) -> tuple[Rollout, Assessment]:
+    def _commanded_flippers(self, prediction: Prediction) -> np.ndarray | None:
+        """Angles that the flippers are commanded over the horizon ``[T, F]`` [rad]; None without flippers."""
+        if prediction.joints is None:
+            return None
+        told = prediction.joints.flippers(1, self._predictor.steps, self._predictor.options.time_step)
+        return None if told is None else told[0].double().numpy()
+
+    def _flipper_angles(self, prediction: Prediction, angles: np.ndarray, delay: int) -> JointState:
+        """The best candidate's flipper angles at its start, stamped with that time."""
+        message = JointState()
+        step_time = self._predictor.options.time_step
+        stamp = prediction.stamp + round(delay * step_time * 1e9)
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
+        message.name = [flipper.name for flipper in self._predictor.robot.flippers]
+        message.position = angles[delay].tolist()
+        return message
+
+    def _assess(
+        self, prediction: Prediction, twists: np.ndarray, flippers: np.ndarray | None = None
+    ) -> tuple[Rollout, Assessment]:
         motions = [prediction.motion] * len(twists)
         rollout = self._predictor.roll_out(
             prediction.terrain, motions, twists, with_forces=False, with_contact=True, force_every=self._force_every,
-            joints=prediction.joints,
+            joints=prediction.joints, flippers=None if flippers is None else flippers[None],
         )  # fmt: skip
-        commanded = torch.from_numpy(twists[:, self._predictor.history :]).float()
+        # Costs are of the forward speed: moving sideways alone costs no slip.
+        commanded = torch.from_numpy(twists[:, self._predictor.history :, :2]).float()
         robot = self._predictor.robot
         weights, limits = self._weights, self._limits
         return rollout, assess(rollout, prediction.terrain, robot, commanded, weights=weights, limits=limits)
 
-    def _refined(self, prediction: Prediction, before: np.ndarray, best: np.ndarray) -> np.ndarray:
-        """The best candidate's refined commands at every step ``[1, T, 2]``."""
+    def _refined(self, prediction: Prediction, before: np.ndarray, best: np.ndarray) -> Refinement:
+        """The best candidate, refined."""
         budget = self._settings.refine_seconds
         found = refine(
             self._predictor, prediction, before, best, weights=self._weights, limits=self._limits,
@@ -184,4 +218,8 @@ class CandidateOutput:
             self._statistics["refined cost"] = (
                 f"not refined: a round takes {1e3 * self._round_seconds:.0f} ms, refine_seconds is {budget:g}"
             )
-        return found.sequence[None]
+        return found
+
+
+def _crabs(robot: RobotModel) -> bool:
+    return robot.steered is not None and robot.steered.crabs

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from geometry_msgs.msg import Twist, TwistStamped
+from rclpy.duration import Duration
 from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.publisher import Publisher
+
+from monoforce_ros.nodes.clocks import STEADY
 
 STAMPED, PLAIN = "geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist"
 _CLASSES = {STAMPED: TwistStamped, PLAIN: Twist}
@@ -39,7 +44,7 @@ class CommandOutput:
         # Fully qualified node names with the types that they expect.
         self._listened: set[tuple[str, str]] = set()
         self._bystanders: list[str] = []
-        self._timer = node.create_timer(0.5, self._update)
+        self._timer = node.create_timer(0.5, self._update, clock=STEADY)
         self._update()
 
     @property
@@ -59,12 +64,14 @@ class CommandOutput:
         """Fully qualified names of the nodes that listen and are not of this package."""
         return ", ".join(sorted({name for name, _ in self._listened})) or "no node"
 
-    def publish(self, speed: float, yaw_rate: float, frame_id: str) -> None:
-        """Publish forward speed [m/s] and yaw rate [rad/s]."""
+    def publish(self, command: Sequence[float], frame_id: str) -> None:
+        """Publish forward speed [m/s], yaw rate [rad/s] and, if there are three, the speed to the left [m/s]."""
         if self._publisher is None:
             return
         twist = Twist()
-        twist.linear.x, twist.angular.z = speed, yaw_rate
+        twist.linear.x, twist.angular.z = command[:2]
+        if len(command) > 2:
+            twist.linear.y = command[2]
         if self.type == PLAIN:
             self._publisher.publish(twist)
             return
@@ -72,6 +79,11 @@ class CommandOutput:
         message.header.stamp = self._node.get_clock().now().to_msg()
         message.header.frame_id = frame_id
         self._publisher.publish(message)
+
+    def flush(self, seconds: float) -> None:
+        """Wait until reliable listeners have received everything, at most ``seconds``."""
+        if self._publisher is not None:
+            self._publisher.wait_for_all_acked(Duration(seconds=seconds))
 
     def _update(self) -> None:
         self._listened, bystanders = set(), set()

@@ -10,6 +10,9 @@ import importlib
 import signal
 from types import FrameType
 
+_ANSWERED_EARLY = ("predictor", "path_selector")
+"""Nodes with nothing but ROS arguments on their command line, which is checked before torch is loaded."""
+
 
 def _end(number: int, frame: FrameType | None) -> None:
     raise SystemExit(0)
@@ -18,6 +21,10 @@ def _end(number: int, frame: FrameType | None) -> None:
 def _run(name: str, arguments: list[str] | None) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _end)
+    if name in _ANSWERED_EARLY:
+        early: int | None = importlib.import_module("monoforce_ros.nodes.process").answered(name, arguments)
+        if early is not None:
+            return early
     # rclpy replaces these handlers when the node initialises it.
     status: int = importlib.import_module(f"monoforce_ros.nodes.{name}").main(arguments)
     return status

@@ -7,7 +7,10 @@ import time
 from dataclasses import dataclass, field
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.clock import ROSClock
 from rclpy.node import Node
+
+from monoforce_ros.nodes.clocks import STEADY
 
 OK, WARN, ERROR, STALE = (
     DiagnosticStatus.OK,
@@ -18,6 +21,9 @@ OK, WARN, ERROR, STALE = (
 _REPEATED = 2.0
 """A state that returns within this time [s] is logged only if it lasts: a part that keeps changing between two states
 would fill the log."""
+_CLOCK_STANDS = 2.0
+"""Time without a change of ``/clock`` [s] from which on it is said to stand: bag players and simulators publish it at
+10 Hz or more."""
 
 
 @dataclass
@@ -56,8 +62,9 @@ class Health:
         self._node = node
         self._lock = threading.Lock()
         self._parts = {name: _Part() for name in parts}
+        self._clock_time, self._clock_changed = -1, time.monotonic()
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self._timer = node.create_timer(1.0, self._tick)
+        self._timer = node.create_timer(1.0, self._tick, clock=STEADY)
 
     def report(self, part: str, level: bytes, message: str, *, reason: str = "", **values: object) -> None:
         """Set a part's state.
@@ -83,8 +90,25 @@ class Health:
         if changed:
             self.publish()
 
+    def _watch_clock(self, now: float) -> None:
+        """Report under ``use_sim_time`` whether time passes."""
+        clock = self._node.get_clock()
+        if not (isinstance(clock, ROSClock) and clock.ros_time_is_active):
+            return
+        simulated = clock.now().nanoseconds
+        if simulated != self._clock_time:
+            self._clock_time, self._clock_changed = simulated, now
+        still = now - self._clock_changed
+        if simulated and still < _CLOCK_STANDS:
+            self.report("clock", OK, "receiving /clock")
+        elif still >= _CLOCK_STANDS:
+            state = "time on /clock stands still" if simulated else "there are no messages on /clock"
+            advice = "start what publishes it (bag_player --clock, a simulator), or set use_sim_time to false"
+            self.report("clock", WARN, f"use_sim_time is true, but {state}: {advice}", reason=state)
+
     def _tick(self) -> None:
         now = time.monotonic()
+        self._watch_clock(now)
         with self._lock:
             # Parts that nobody reported yet have no line either.
             due = [

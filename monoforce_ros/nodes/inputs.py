@@ -64,12 +64,12 @@ class Inputs:
         self.frame_id = ""
         self.child_frame_id = ""
         self.dropped = 0
+        self._commands: deque[tuple[int, np.ndarray]] = deque()
         self._clear()
 
     def _clear(self) -> None:
         self._last_stamps.clear()
         self._states: deque[MotionState] = deque()
-        self._commands: deque[tuple[int, np.ndarray]] = deque()
         self._newest: dict[str, Received] = {}
         self._intervals: dict[str, int] = {}
         self._waiting: deque[dict[str, Received]] = deque()
@@ -80,6 +80,8 @@ class Inputs:
         last = self._last_stamps.get(topic)
         if last is not None and stamp < last - TIME_JUMP:
             self._clear()
+            # Commands of the new time may have come first.
+            self._commands = deque(entry for entry in self._commands if entry[0] <= stamp + TIME_JUMP)
             self._on_time_jump(topic, (last - stamp) * NANOSECOND)
         elif last is not None and stamp < last:
             return False
@@ -97,16 +99,30 @@ class Inputs:
                 self._states.popleft()
             self.changed.notify_all()
 
-    def add_command(self, topic: str, stamp: int, twist: np.ndarray) -> None:
-        """Keep a command; one without a stamp (0) gets the stamp of the newest odometry, the only clock available."""
+    def add_command(self, stamp: int, twist: np.ndarray) -> None:
+        """Keep a command; one without a stamp (0) gets the stamp of the newest odometry, the only clock available.
+
+        One that is older than its predecessor by more than :data:`TIME_JUMP` replaces all earlier ones.
+        """
         with self.changed:
             if not stamp:
                 stamp = self._states[-1].stamp if self._states else 0
-            if not stamp or not self._admit(topic, stamp):
+            if not stamp:
+                return
+            # Commands may come from another computer: a jump of its clock says nothing of the robot's sensors.
+            if self._commands and stamp < self._commands[-1][0] - TIME_JUMP:
+                self._commands.clear()
+            elif self._commands and stamp < self._commands[-1][0]:
                 return
             self._commands.append((stamp, twist))
             while self._commands[0][0] < stamp - RETENTION:
                 self._commands.popleft()
+
+    @property
+    def motion_stamp(self) -> int:
+        """Stamp of the newest odometry [ns]; 0 without any."""
+        with self.changed:
+            return self._states[-1].stamp if self._states else 0
 
     def add_sensor(self, topic: str, stamp: int, message: Any) -> None:
         """Keep a sensor's newest message; a complete set waits for odometry."""

@@ -11,13 +11,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from monoforce_ros.core import most_similar, nearest
 from monoforce_ros.nodes.parameter_files import read_sections, refuse_misnamed_sections, section_matches
 from monoforce_ros.nodes.schema import (
     SCHEMAS,
     ParameterEntry,
     ParameterValue,
-    most_similar,
-    nearest,
     read_schema,
     schema_path,
 )

@@ -15,4 +15,5 @@ def odometry_transform(odometry: Any) -> Any:
         MessageError: the odometry is not finite.
     """
     state, frame_id, child_frame_id = decoding.decode_odometry(odometry)
-    return builders.transforms(state.stamp, frame_id, {child_frame_id or "base_link": state.odometry_from_base})
+    pose = {child_frame_id or "base_link": state.odometry_from_base}
+    return builders.transforms(state.stamp, frame_id or "odom", pose)

@@ -13,8 +13,8 @@ from typing import Any
 
 import yaml
 
-from monoforce_ros.core import write_text
-from monoforce_ros.nodes.schema import SCHEMAS, ParameterEntry, most_similar, nearest, read_schema, schema_path
+from monoforce_ros.core import most_similar, nearest, write_text
+from monoforce_ros.nodes.schema import SCHEMAS, ParameterEntry, read_schema, schema_path
 
 _WIDTH = 110
 

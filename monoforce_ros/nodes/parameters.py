@@ -14,10 +14,15 @@ from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from monoforce_ros.nodes.schema import SCHEMAS, ParameterEntry, ParameterValue, nearest, read_schema, schema_path
+from monoforce_ros.core import nearest
+from monoforce_ros.nodes.schema import (
+    ParameterEntry,
+    ParameterValue,
+    no_parameters,
+    of_every_node,
+    parameter_owners,
+)
 
-_OF_EVERY_NODE = ("use_sim_time", "start_type_description_service", "qos_overrides.")
-"""Parameters that rclpy itself declares or understands; the last one is a prefix."""
 _SOMETIMES = "read-only while the node is configured"
 
 
@@ -56,16 +61,14 @@ def refuse_unknown_parameters(node: Node, entries: Iterable[ParameterEntry] = ()
     Parameters of the package's other nodes are only logged: several nodes may share a file with the key ``/**``.
     """
     known = {name for entry in entries for name in (entry.name, entry.formerly) if name}
-    others = {entry.name: other for other in SCHEMAS for entry in read_schema(schema_path(other))}
+    others = parameter_owners()
     unused = []
     # rclpy keeps the values given on the command line and in files only here.
     for name in node._parameter_overrides:
-        if name in known or name.startswith(_OF_EVERY_NODE):
+        if name in known or of_every_node(name):
             continue
-        if not known:
-            raise ValueError(
-                f"unknown parameter {name!r}: {node.get_name()} has no parameters; --help lists its options"
-            )
+        if name not in others and not known:
+            raise ValueError(f"unknown parameter {name!r}: {no_parameters(node.get_name())}")
         if name not in others:
             meant = nearest(name, known | {"use_sim_time"})
             raise ValueError(f"unknown parameter {name!r}{meant or ';'} --help lists all parameters")
@@ -103,7 +106,10 @@ def _declare(
     except (InvalidParameterTypeException, InvalidParameterValueException) as error:
         expected = f"{entry.type} {entry.range_text}".strip()
         got = node._parameter_overrides[name].value if name in node._parameter_overrides else default
-        raise ValueError(f"parameter {name}: got {got!r}, expected {expected} {entry.unit}".rstrip()) from error
+        text = f"parameter {name}: got {got!r}, expected {expected} {entry.unit}".rstrip()
+        # ROS takes no integer for a floating-point number.
+        whole = entry.type == "double" and isinstance(got, int) and not isinstance(got, bool)
+        raise ValueError(f"{text}: write {got}.0" if whole else text) from error
     if (value is not None or name == entry.name) and (reason := complaint(entry, value)):
         raise ValueError(f"parameter {name}: {reason}")
     return value

@@ -16,8 +16,10 @@ from sensor_msgs.msg import PointCloud2
 
 from monoforce_ros.core import NANOSECOND, FrameError, MotionState, RobotFrames, TransformHistory, pose_matrix
 from monoforce_ros.messages import decoding
+from monoforce_ros.nodes.clocks import STEADY
 from monoforce_ros.nodes.command_output import CommandOutput
 from monoforce_ros.nodes.course import TRANSFORM_TIMEOUT, Course, CourseFrames
+from monoforce_ros.nodes.flipper_output import FlipperOutput
 from monoforce_ros.nodes.frames import TransformListener
 from monoforce_ros.nodes.health import ERROR, OK, WARN, Health
 from monoforce_ros.nodes.parameters import declare_parameters
@@ -25,7 +27,14 @@ from monoforce_ros.nodes.process import run_schema_node
 from monoforce_ros.nodes.progress_check import WINDOW, ProgressCheck
 from monoforce_ros.nodes.schema import read_schema, schema_path
 from monoforce_ros.nodes.subscriptions import AdaptiveSubscription
-from monoforce_ros.planning import CostToGo, SelectionWeights, cost_to_go, plan_target, select_candidate
+from monoforce_ros.planning import (
+    COMMAND_FIELDS,
+    CostToGo,
+    SelectionWeights,
+    cost_to_go,
+    plan_target,
+    select_candidate,
+)
 
 PART = "choice"
 DISTANCE = "distance to the goal [m]"
@@ -82,7 +91,7 @@ class PathSelectorNode(Node):
         self._received: Course | None = None
         self._motion: MotionState | None = None
         self._odometry_frame = self._base_name = ""
-        self._offset_problem = ""
+        self._odometry_problem = ""
         self._started = time.monotonic()
         self._first_odometry = 0.0
         self._odometry_stamp: int | None = None
@@ -90,12 +99,13 @@ class PathSelectorNode(Node):
         self._arrivals: dict[str, float] = {}
         self._candidates: Candidates | None = None
         self._moving = self._driving = False
-        self._last_command = (0.0, 0.0)
+        self._last_command: tuple[float, ...] = (0.0, 0.0)
         self._progress = ProgressCheck()
         self._map: tuple[np.ndarray, float, np.ndarray] | None = None
         self._map_frame = ""
         self._cost_to_go: CostToGo | None = None
         self._commands = CommandOutput(self, settings.command_topic, settings.command_type)
+        self._flippers = FlipperOutput(self, settings.flipper_command_topic, settings.timeout)
         self._inputs = {
             "odometry": self._subscribe(settings.odometry_topic, "nav_msgs/msg/Odometry", Odometry, self._on_odometry),
             "candidates": self._subscribe(
@@ -113,8 +123,8 @@ class PathSelectorNode(Node):
             self.create_subscription(kind, wanted[1], callback, QoSProfile(depth=1, reliability=reliability))
             for reliability in (ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT)
         ]
-        self._command_timer = self.create_timer(1.0 / settings.command_rate, self._publish_command)
-        self._watch_timer = self.create_timer(0.5, self._watch_inputs)
+        self._command_timer = self.create_timer(1.0 / settings.command_rate, self._publish_command, clock=STEADY)
+        self._watch_timer = self.create_timer(0.5, self._watch_inputs, clock=STEADY)
         waiting = f"waiting for a {wanted[0]} on {self.resolve_topic_name(wanted[1])}"
         self.health.report(PART, OK, waiting, reason="waiting")
         self.get_logger().info(waiting)
@@ -160,12 +170,15 @@ class PathSelectorNode(Node):
             self._in_odometry(course)
 
     def _on_odometry(self, message: Odometry) -> None:
+        self._arrivals["odometry"] = time.monotonic()
         try:
             state, frame_id, child = decoding.decode_odometry(message)
+            if not state.stamp:
+                raise decoding.MessageError("the stamps are zero: the state estimator does not set them")
         except decoding.MessageError as error:
+            self._odometry_problem = str(error)
             self.health.report("odometry", ERROR, str(error), reason="unusable")
             return
-        self._arrivals["odometry"] = time.monotonic()
         if state.stamp != self._odometry_stamp:
             self._odometry_stamp, self._advanced = state.stamp, self._arrivals["odometry"]
         self._first_odometry = self._first_odometry or self._arrivals["odometry"]
@@ -175,10 +188,10 @@ class PathSelectorNode(Node):
         try:
             offset = self.frames.odometry_child(child, self.transforms.tree)
         except FrameError as error:
-            self._offset_problem = self.transforms.explained(error)
-            self.health.report("odometry", ERROR, self._offset_problem, reason="frame")
+            self._odometry_problem = self.transforms.explained(error)
+            self.health.report("odometry", ERROR, self._odometry_problem, reason="frame")
             return
-        self._offset_problem = ""
+        self._odometry_problem = ""
         self._motion = state.of_base(offset)
         self._base_name = self.frames.base_name(child, self.transforms.tree.frames)
         on_robot = {child or self._base_name: offset, self._base_name: np.eye(4)}
@@ -186,7 +199,8 @@ class PathSelectorNode(Node):
         if self._driving:
             motion = self._motion
             seconds = motion.stamp * NANOSECOND
-            self._progress.add(seconds, self._last_command, motion.position[:2], motion.heading)
+            speed, yaw_rate = self._last_command[:2]
+            self._progress.add(seconds, (speed, yaw_rate), motion.position[:2], motion.heading)
         self.health.report("odometry", OK, "receiving odometry")
 
     def _on_candidates(self, message: PointCloud2) -> None:
@@ -227,10 +241,18 @@ class PathSelectorNode(Node):
             return
         self._last_command = command or (0.0, 0.0)
         self._moving = command is not None or self._course is not None
-        self._commands.publish(*self._last_command, self._base_name or self.settings.base_frame or _BASE_FRAME)
+        self._commands.publish(self._last_command, self._base_name or self.settings.base_frame or _BASE_FRAME)
+        if command is not None:
+            self._flippers.forward()
 
-    def _command(self) -> tuple[float, float] | None:
-        """Speed [m/s] and yaw rate [rad/s] to publish; None to stop."""
+    def stand(self) -> None:
+        """Command a robot that was moving to stop: the node ends."""
+        self._course = None
+        self._publish_command()
+        self._commands.flush(0.5)
+
+    def _command(self) -> tuple[float, ...] | None:
+        """Speed [m/s], yaw rate [rad/s] and, of robots that move sideways, lateral speed [m/s]; None to stop."""
         if self._course is None:
             return None
         try:
@@ -243,7 +265,7 @@ class PathSelectorNode(Node):
             self.health.report(PART, ERROR, str(refusal), reason="refused")
             return None
 
-    def _drive(self, course: Course) -> tuple[float, float] | None:
+    def _drive(self, course: Course) -> tuple[float, ...] | None:
         """The best candidate's command; None if the goal is reached.
 
         Raises:
@@ -271,15 +293,15 @@ class PathSelectorNode(Node):
             raise Stop(str(error), "fields") from error
         if best is None:
             raise Stop("no candidate is feasible", "infeasible")
-        command = float(candidates.fields["speed"][best]), float(candidates.fields["yaw_rate"][best])
+        command = tuple(float(candidates.fields[name][best]) for name in COMMAND_FIELDS if name in candidates.fields)
         self._report_driving(distance, command)
         return command
 
     def _usable_motion(self) -> MotionState:
         """The newest motion of the base; raises ``Stop`` if it is missing, old or of an unknown frame."""
         source = self._inputs["odometry"]
-        if self._offset_problem:
-            raise Stop(self._offset_problem, "child frame")
+        if self._odometry_problem:
+            raise Stop(self._odometry_problem, "odometry")
         if self._motion is None:
             raise Stop(f"no odometry: the position is unknown ({source.silence_cause})", "no odometry")
         # Stamps cannot detect this: without odometry there are no new candidates either, so their age stays constant.
@@ -346,7 +368,7 @@ class PathSelectorNode(Node):
             self._cost_to_go = found
         return found
 
-    def _report_driving(self, distance: float, command: tuple[float, float]) -> None:
+    def _report_driving(self, distance: float, command: tuple[float, ...]) -> None:
         """Say that the robot drives only if its odometry shows it."""
         moving, values = self._progress.moving, {DISTANCE: f"{distance:.2f}"}
         if moving:
@@ -363,7 +385,7 @@ class PathSelectorNode(Node):
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the node; ``--help`` lists its parameters, which config/path_selector.schema.yaml defines."""
-    return run_schema_node("path_selector", PathSelectorNode, arguments)
+    return run_schema_node("path_selector", PathSelectorNode, arguments, at_the_end=PathSelectorNode.stand)
 
 
 if __name__ == "__main__":

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import sys
 import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from types import SimpleNamespace
 
@@ -20,17 +19,18 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState, Poin
 from visualization_msgs.msg import MarkerArray
 
 from monoforce_ros.bags import camera_info_topic
-from monoforce_ros.core import CommandTrack, FrameError, RobotFrames, pose_matrix
+from monoforce_ros.core import NANOSECOND, CommandTrack, FrameError, RobotFrames, pose_matrix
 from monoforce_ros.effects import corrected_commands, corrected_motion
 from monoforce_ros.messages import decoding
 from monoforce_ros.nodes import prediction_messages as encoders
 from monoforce_ros.nodes.background_worker import BackgroundWorker
 from monoforce_ros.nodes.candidate_output import CandidateOutput
+from monoforce_ros.nodes.clocks import STEADY
 from monoforce_ros.nodes.costmap_output import CostmapOutput
 from monoforce_ros.nodes.ensemble_output import EnsembleOutput
 from monoforce_ros.nodes.frames import TransformListener
 from monoforce_ros.nodes.health import ERROR, OK, STALE, WARN, Health
-from monoforce_ros.nodes.inputs import Inputs, Received
+from monoforce_ros.nodes.inputs import TIME_JUMP, Inputs, Received
 from monoforce_ros.nodes.joint_input import JointInput
 from monoforce_ros.nodes.managed import ManagedNode
 from monoforce_ros.nodes.monitor_output import MonitorOutput
@@ -39,15 +39,18 @@ from monoforce_ros.nodes.process import run_schema_node
 from monoforce_ros.nodes.rate_limiter import RateLimiter
 from monoforce_ros.nodes.schema import read_schema, schema_path
 from monoforce_ros.nodes.sensor_decoder import LIDAR, SensorDecoder
-from monoforce_ros.nodes.subscriptions import AdaptiveSubscription
+from monoforce_ros.nodes.subscriptions import AdaptiveSubscription, command_types
 from monoforce_ros.perception import TerrainSource, TrustReport, choose_terrain_source
-from monoforce_ros.physics import PhysicsOptions
+from monoforce_ros.physics import PhysicsOptions, read_soil
 from monoforce_ros.prediction import FORCE_INTERVAL, Prediction, Predictor
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainDefaults
 
 _TRANSFORMS_PATIENCE = 2.0
 """Time after the start in which a missing transform is no error [s]: /tf_static takes as long to be discovered."""
+_MOST_ODD = 5
+"""Commands of another time in a row that are reported: when a bag starts anew, the first ones precede its odometry."""
+_ZERO_STAMPS = "the stamps are zero: the {} does not set them"
 
 
 @dataclass(frozen=True)
@@ -89,7 +92,7 @@ class PredictorNode(ManagedNode):
             self.robot,
             self._terrain_source(),
             horizon=settings.horizon,
-            options=PhysicsOptions(time_step=settings.time_step),
+            options=PhysicsOptions(time_step=settings.time_step, soil=read_soil(settings.soil)),
         )
         self._force_every = max(1, round(FORCE_INTERVAL / settings.time_step))
         self.get_logger().info("preparing the physics; on first use the kernels are compiled, which takes about 10 s")
@@ -118,6 +121,8 @@ class PredictorNode(ManagedNode):
             continues = settings.flipper_motion == "continue"
             self.joints = JointInput(self.robot, continues=continues, timeout=settings.odometry_timeout)
         self._arrivals: dict[str, float] = {}
+        self._motion_arrival = 0.0
+        self._odd_commands = 0
         self._started = time.monotonic()
         self._predictions = 0
         self._last_prediction = self._started
@@ -140,7 +145,7 @@ class PredictorNode(ManagedNode):
     def begin(self) -> None:
         """Start predicting."""
         self._started = self._last_prediction = time.monotonic()
-        self._watch = self.create_timer(0.5, self._watch_inputs)
+        self._watch = self.create_timer(0.5, self._watch_inputs, clock=STEADY)
         self._running = True
         self._comparison = BackgroundWorker("comparison", self._compare, self.settings.comparison_niceness)
         self._worker = threading.Thread(target=self._work, name="prediction", daemon=True)
@@ -223,7 +228,7 @@ class PredictorNode(ManagedNode):
             "commands": AdaptiveSubscription(
                 self,
                 settings.command_topic,
-                self._command_types(),
+                command_types(steering_angles=self.robot.steered is not None),
                 self._on_command,
                 depth=small,
                 follow_listeners=True,
@@ -259,16 +264,6 @@ class PredictorNode(ManagedNode):
         """Whether the robot can move sideways."""
         return self.robot.steered is not None and self.robot.steered.crabs
 
-    def _command_types(self) -> dict[str, type]:
-        types: dict[str, type] = {"geometry_msgs/msg/TwistStamped": TwistStamped, "geometry_msgs/msg/Twist": Twist}
-        if self.robot.steered is not None:
-            try:
-                ackermann = importlib.import_module("ackermann_msgs.msg")
-            except ImportError:
-                return types
-            types["ackermann_msgs/msg/AckermannDriveStamped"] = ackermann.AckermannDriveStamped
-        return types
-
     # Callbacks decode small messages, keep large ones undecoded, and never raise.
 
     def _on_odometry(self, message: Odometry) -> None:
@@ -278,6 +273,9 @@ class PredictorNode(ManagedNode):
         except decoding.MessageError as error:
             self.health.report("odometry", ERROR, str(error), reason="unusable")
             return
+        if not state.stamp:
+            self.health.report("odometry", ERROR, _ZERO_STAMPS.format("state estimator"), reason="zero stamp")
+            return
         try:
             pose = self.frames.odometry_child(child_frame_id, self.transforms.tree)
         except FrameError as error:
@@ -286,6 +284,7 @@ class PredictorNode(ManagedNode):
                 self.health.report("odometry", ERROR, self.transforms.explained(error), reason="frame")
             return
         self.inputs.add_motion("odometry", state.of_base(pose), frame_id, child_frame_id)
+        self._motion_arrival = time.monotonic()
         self.health.report("odometry", OK, "receiving odometry")
 
     def _on_command(self, message: Twist | TwistStamped) -> None:
@@ -299,8 +298,29 @@ class PredictorNode(ManagedNode):
         except decoding.MessageError as error:
             self.health.report("commands", ERROR, str(error), reason="unusable")
             return
-        self.inputs.add_command("commands", decoding.stamp_of(message), twist)
-        self.health.report("commands", OK, "receiving commands")
+        stamp = decoding.stamp_of(message)
+        self.inputs.add_command(stamp, twist)
+        problem = self._command_clock(stamp)
+        self._odd_commands = self._odd_commands + 1 if problem else 0
+        if self._odd_commands >= _MOST_ODD:
+            self.health.report("commands", WARN, problem, reason="clock")
+        else:
+            self.health.report("commands", OK, "receiving commands")
+
+    def _command_clock(self, stamp: int) -> str:
+        """Why a command that has just arrived cannot take effect: its stamp is of another clock; empty if it can."""
+        odometry = self.inputs.motion_stamp
+        if not stamp or not odometry:
+            return ""
+        silence, limit = time.monotonic() - self._motion_arrival, self.settings.command_timeout
+        late = (odometry - stamp) * NANOSECOND
+        if late > limit:
+            what = f"are stamped {late:.1f} s before the odometry and ignored (command_timeout: {limit:g} s)"
+        elif silence < 0.5 * self.settings.data_timeout and -late - silence > TIME_JUMP * NANOSECOND:
+            what = f"are stamped {-late - silence:.1f} s after the odometry and take effect only then"
+        else:
+            return ""
+        return f"commands {what}: synchronise the clocks of the computers that stamp them, or stamp commands with zero"
 
     def _on_joints(self, part: str, message: JointState) -> None:
         assert self.joints is not None
@@ -318,9 +338,7 @@ class PredictorNode(ManagedNode):
         self._arrivals[part] = time.monotonic()
         stamp = decoding.stamp_of(message)
         if stamp == 0:
-            self.health.report(
-                part, ERROR, "the stamps are zero: the sensor driver does not set them", reason="zero stamp"
-            )
+            self.health.report(part, ERROR, _ZERO_STAMPS.format("sensor driver"), reason="zero stamp")
             return
         self.inputs.add_sensor(part, stamp, message)
 
@@ -401,6 +419,8 @@ class PredictorNode(ManagedNode):
             commands = corrected_commands(self.inputs.commands(), self.robot.effects)
             twists = commands.sample(stamps, timeout=self.settings.command_timeout)
             joints = None if self.joints is None else self.joints.at(stamp)
+            if joints is not None and self.robot.flippers:
+                observation = replace(observation, flipper_angles=joints.start[-len(self.robot.flippers) :])
             prediction = self.predictor.predict(
                 observation, motion, twists, force_every=self._force_every, joints=joints
             )

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Callable
 from contextlib import suppress
+from types import FrameType
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -14,13 +16,19 @@ from rclpy.signals import SignalHandlerOptions
 from monoforce_ros.nodes.arguments import (
     check_parameter_files,
     command_line,
+    idle_remappings,
     parameter_files,
+    refuse_given_parameters,
     refuse_other_nodes,
     refuse_stray_arguments,
 )
+from monoforce_ros.nodes.clocks import STEADY
 from monoforce_ros.nodes.parameter_files import read_sections
 from monoforce_ros.nodes.parameters import parameter_help
 from monoforce_ros.nodes.schema import read_schema, schema_path
+
+_SET_UP = 2.0
+"""Time after which a node has all its topics [s]: the simulator adds one with each first message."""
 
 
 def _spin(node: Node, executor: SingleThreadedExecutor) -> None:
@@ -31,6 +39,8 @@ def run_node[NodeType: Node](
     make_node: Callable[[], NodeType],
     arguments: list[str] | None = None,
     work: Callable[[NodeType, SingleThreadedExecutor], None] = _spin,
+    *,
+    at_the_end: Callable[[NodeType], None] | None = None,
 ) -> int:
     """Spin a node until SIGINT or SIGTERM.
 
@@ -38,6 +48,8 @@ def run_node[NodeType: Node](
         make_node: creates the node; called after rclpy is initialised.
         arguments: arguments of the command line.
         work: spins the node; the default only processes callbacks.
+        at_the_end: called at the end, also on SIGINT and SIGTERM, while the node can still publish, which rclpy's own
+            handling of signals would end at once. Only for the default ``work``.
 
     Returns:
         exit status: 0 after a regular end, 1 if the node could not start (its ``ValueError`` or ``OSError``, or an
@@ -48,7 +60,9 @@ def run_node[NodeType: Node](
     executor: SingleThreadedExecutor | None = None
     try:
         try:
-            initialise(arguments)
+            if at_the_end is not None:
+                _handle_signals(_interrupt)
+            initialise(arguments, None if at_the_end is None else SignalHandlerOptions.NO)
             node = make_node()
             full_name = node.get_fully_qualified_name()
             refuse_other_nodes(words, full_name)
@@ -62,7 +76,11 @@ def run_node[NodeType: Node](
         executor.add_node(node)
         for warning in warnings:
             node.get_logger().warning(warning)
-        work(node, executor)
+        _watch_remappings(words, node)
+        if at_the_end is None:
+            work(node, executor)
+        else:
+            _spin_until_signalled(executor)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except Exception:
@@ -70,6 +88,10 @@ def run_node[NodeType: Node](
         if rclpy.ok():
             raise
     finally:
+        if at_the_end is not None and node is not None and rclpy.ok():
+            # A second signal is for those who cannot wait.
+            with suppress(KeyboardInterrupt):
+                at_the_end(node)
         # The signal that ended the context may reach Python a moment later.
         for end in (executor and executor.shutdown, node and node.destroy_node, rclpy.try_shutdown):
             with suppress(KeyboardInterrupt):
@@ -78,8 +100,75 @@ def run_node[NodeType: Node](
     return 0
 
 
+def _handle_signals(handler: Callable[[int, FrameType | None], None]) -> None:
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, handler)
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
+
+
+def _spin_until_signalled(executor: SingleThreadedExecutor) -> None:
+    """Process callbacks until a signal comes, and return between two of them. A second signal interrupts at once."""
+    signalled = False
+
+    def end(number: int, frame: FrameType | None) -> None:
+        nonlocal signalled
+        if signalled:
+            raise KeyboardInterrupt
+        signalled = True
+
+    _handle_signals(end)
+    while rclpy.ok() and not signalled:
+        executor.spin_once(timeout_sec=0.1)
+
+
+def _watch_remappings(words: list[str], node: Node) -> None:
+    """Warn about remappings that rename nothing, once the node has all its topics."""
+    if not {"-r", "--remap"} & set(words):
+        return
+
+    def check() -> None:
+        if getattr(node, "configured", True):
+            timer.cancel()
+            for warning in idle_remappings(words, node):
+                node.get_logger().warning(warning)
+
+    timer = node.create_timer(_SET_UP, check, clock=STEADY)
+
+
+def answered(name: str, arguments: list[str] | None = None) -> int | None:
+    """Exit status of a command line that starts no node, because it asks for help or is wrong; else None.
+
+    It needs no more than the schema: a node that loads torch is spared that.
+
+    Args:
+        name: name of the executable and of its schema.
+        arguments: arguments of the command line.
+    """
+    words, entries = command_line(arguments), read_schema(schema_path(name))
+    if {"-h", "--help"} & set(words):
+        print(parameter_help(name, entries))
+        return 0
+    try:
+        names = [name for entry in entries for name in (entry.name, entry.formerly) if name]
+        refuse_stray_arguments(words, names)
+        refuse_given_parameters(words, name, names)
+        for path in parameter_files(words):
+            read_sections(path)
+    except ValueError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return None
+
+
 def run_schema_node[NodeType: Node](
-    name: str, make_node: Callable[[], NodeType], arguments: list[str] | None = None
+    name: str,
+    make_node: Callable[[], NodeType],
+    arguments: list[str] | None = None,
+    *,
+    at_the_end: Callable[[NodeType], None] | None = None,
 ) -> int:
     """Run a node whose command line holds nothing but ROS arguments, or print its parameters for ``--help``.
 
@@ -87,20 +176,13 @@ def run_schema_node[NodeType: Node](
         name: name of the executable and of its schema.
         make_node: creates the node.
         arguments: arguments of the command line.
+        at_the_end: as :func:`run_node`.
 
     Returns:
         exit status, as :func:`run_node`; 1 also for an argument that is not ROS's.
     """
-    words, entries = command_line(arguments), read_schema(schema_path(name))
-    if {"-h", "--help"} & set(words):
-        print(parameter_help(name, entries))
-        return 0
-    try:
-        refuse_stray_arguments(words, (entry.name for entry in entries))
-    except ValueError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    return run_node(make_node, arguments)
+    status = answered(name, arguments)
+    return run_node(make_node, arguments, at_the_end=at_the_end) if status is None else status
 
 
 def initialise(arguments: list[str] | None, signals: SignalHandlerOptions | None = None) -> None:

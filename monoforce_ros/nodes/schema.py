@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import difflib
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -125,13 +123,16 @@ def read_schema(path: Path) -> list[ParameterEntry]:
     ]
 
 
-def most_similar(name: str, known: Iterable[str]) -> list[str]:
-    """The most similar known name, as a list of at most one."""
-    # 0.6 is difflib's own default: words that share most of their letters in order.
-    return difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
+def of_every_node(name: str) -> bool:
+    """Whether rclpy itself declares or understands a parameter."""
+    return name in ("use_sim_time", "start_type_description_service") or name.startswith("qos_overrides.")
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
-    """``; did you mean …?`` with the most similar known name, or nothing if none is similar."""
-    found = most_similar(name, known)
-    return f"; did you mean {found[0]!r}?" if found else ""
+def parameter_owners() -> dict[str, str]:
+    """Node of each parameter; a parameter of several nodes counts for the last of them."""
+    return {entry.name: node for node in SCHEMAS for entry in read_schema(schema_path(node))}
+
+
+def no_parameters(node: str) -> str:
+    """The answer to a parameter for a node that has none, only options."""
+    return f"{node} has no parameters; --help lists its options"

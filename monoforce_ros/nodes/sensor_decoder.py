@@ -65,7 +65,7 @@ class SensorDecoder:
             if part == "odometry":
                 continue
             try:
-                pose = self._frames.sensor_pose(entry.message.header.frame_id, self._transforms)
+                pose = self._sensor_pose(entry, track, maximum_gap)
                 pose = track.base_between(entry.stamp, stamp, maximum_gap=maximum_gap) @ pose
                 if part == LIDAR:
                     cloud = transform_points(pose, decoding.decode_cloud(entry.message))
@@ -81,6 +81,17 @@ class SensorDecoder:
         if not received.keys() <= {"odometry"} and cloud is None and not images:
             return None
         return Observation(stamp, cloud, images, cameras, poses)
+
+    def _sensor_pose(self, entry: Received, track: MotionTrack, maximum_gap: float) -> np.ndarray:
+        def odometry_from_base() -> np.ndarray:
+            return track.at(entry.stamp, maximum_gap=maximum_gap).odometry_from_base
+
+        return self._frames.sensor_pose(
+            entry.message.header.frame_id,
+            self._transforms,
+            odometry_frame=track.frame_id or "odom",
+            odometry_from_base=odometry_from_base,
+        )
 
     def _image(self, part: str, message: Image | CompressedImage) -> tuple[np.ndarray, CameraModel]:
         camera = self._cameras.get(part)

@@ -7,21 +7,23 @@ import sys
 import time
 from typing import Any
 
+import numpy as np
 import rclpy
-from geometry_msgs.msg import Twist, TwistStamped
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import JointState
 
 from monoforce_ros.bags import builders, type_store
+from monoforce_ros.core import OptionParser
 from monoforce_ros.messages import decoding, message_class, missing_package
-from monoforce_ros.nodes.arguments import NodeArgumentParser, own_arguments, seconds, seed
+from monoforce_ros.nodes.arguments import own_arguments, refuse_given_parameters, seconds, seed
 from monoforce_ros.nodes.frames import TRANSFORMS
 from monoforce_ros.nodes.odometry_transform import odometry_transform
 from monoforce_ros.nodes.parameters import refuse_unknown_parameters
 from monoforce_ros.nodes.process import run_node
-from monoforce_ros.nodes.subscriptions import AdaptiveSubscription
+from monoforce_ros.nodes.subscriptions import AdaptiveSubscription, command_types
 from monoforce_ros.synthetic import GROUNDS, LiveSettings, LiveWorld
 
 _ODOMETRY_RATE = 50.0
@@ -33,9 +35,10 @@ _MAXIMUM_LAG = 0.5
 
 
 def _arguments(arguments: list[str]) -> argparse.Namespace:
-    parser = NodeArgumentParser(
+    parser = OptionParser(
         prog="simulator",
-        description="Drive a simulated robot through ROS: cmd_vel in; odom, points and images out.",
+        description="Drive a simulated robot through ROS: cmd_vel (and flipper_commands) in; odom, joint_states, "
+        "points and images out.",
     )
     parser.add_argument("--seed", type=seed, default=12, help="seed of the world (%(default)s)")
     parser.add_argument("--robot", default="husky", metavar="NAME|FILE.yaml", help="robot name or file (%(default)s)")
@@ -68,11 +71,16 @@ class SimulatorNode(Node):
         self._subscription = AdaptiveSubscription(
             self,
             "cmd_vel",
-            {"geometry_msgs/msg/TwistStamped": TwistStamped, "geometry_msgs/msg/Twist": Twist},
+            command_types(steering_angles=world.robot.wheelbase is not None),
             self._on_command,
             depth=5,
             follow_listeners=True,
         )
+        self._flippers = np.array([arm.angle for arm in world.robot.flippers])
+        if len(self._flippers):
+            self._flipper_subscription = AdaptiveSubscription(
+                self, "flipper_commands", {"sensor_msgs/msg/JointState": JointState}, self._on_flippers, depth=5
+            )
         if message_class(TRANSFORMS) is None:
             self.get_logger().warning(f"no transforms are published on /tf: {missing_package(TRANSFORMS)}")
         else:
@@ -84,14 +92,29 @@ class SimulatorNode(Node):
             self._publish("/tf_static", sensors)
         self._next_output = dict.fromkeys(("odometry", "cloud", "images"), 0.0)
 
-    def _on_command(self, message: Twist | TwistStamped) -> None:
+    def _on_command(self, message: Any) -> None:
+        robot = self._world.robot
         try:
-            speed, rate = decoding.decode_command(message)
+            if hasattr(message, "drive") and robot.wheelbase is not None:
+                command = decoding.decode_ackermann(message, robot.wheelbase)
+            else:
+                command = decoding.decode_command(message, lateral=robot.crabs)
         except decoding.MessageError as error:
             self.get_logger().warning(f"cmd_vel: {error}", throttle_duration_sec=2.0)
             return
         self._last_command = self._world.time
-        self._world.simulation.drive(float(speed), float(rate))
+        self._world.simulation.drive(*command.tolist())
+
+    def _on_flippers(self, message: JointState) -> None:
+        """Move to the commanded angles; flippers that the message does not name hold theirs."""
+        names = [arm.name for arm in self._world.robot.flippers]
+        try:
+            angles, _ = decoding.decode_joints(message, names)
+        except decoding.MessageError as error:
+            self.get_logger().warning(f"flipper_commands: {error}", throttle_duration_sec=2.0)
+            return
+        self._flippers = np.where(np.isfinite(angles), angles, self._flippers)
+        self._world.simulation.move_flippers(self._flippers)
 
     def advance(self, until: float, origin: float) -> None:
         """Simulate up to a time and publish the outputs that are due.
@@ -114,6 +137,7 @@ class SimulatorNode(Node):
         if self._due("odometry", _ODOMETRY_RATE):
             odometry = world.odometry(stamp)
             self._publish("odom", odometry)
+            self._publish("joint_states", world.joint_states(stamp))
             if "/tf" in self._outputs:
                 self._publish("/tf", odometry_transform(odometry))
 
@@ -151,6 +175,7 @@ def main(arguments: list[str] | None = None) -> int:
     command_line = sys.argv if arguments is None else ["simulator", *arguments]
     options = _arguments(own_arguments(command_line[1:]))
     try:
+        refuse_given_parameters(command_line, "simulator")
         world = LiveWorld(_settings(options))
     except (ValueError, OSError, RuntimeError) as error:
         print(f"error: {error}", file=sys.stderr)

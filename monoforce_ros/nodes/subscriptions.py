@@ -2,14 +2,34 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from geometry_msgs.msg import Twist, TwistStamped
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
+
+from monoforce_ros.nodes.clocks import STEADY
+
+
+def command_types(*, steering_angles: bool) -> dict[str, type]:
+    """Message classes of velocity commands by type name, in order of preference.
+
+    Args:
+        steering_angles: also ``AckermannDriveStamped``, where its package is installed.
+    """
+    types: dict[str, type] = {"geometry_msgs/msg/TwistStamped": TwistStamped, "geometry_msgs/msg/Twist": Twist}
+    if steering_angles:
+        try:
+            ackermann = importlib.import_module("ackermann_msgs.msg")
+        except ImportError:
+            return types
+        types["ackermann_msgs/msg/AckermannDriveStamped"] = ackermann.AckermannDriveStamped
+    return types
 
 
 @dataclass(frozen=True)
@@ -62,7 +82,7 @@ class AdaptiveSubscription:
         self._subscribed: _Offer | None = None
         self.wrong_type = ""
         """Types on the topic if none of them is usable."""
-        self._timer = node.create_timer(0.5, self._update)
+        self._timer = node.create_timer(0.5, self._update, clock=STEADY)
         self._update()
 
     @property

@@ -41,6 +41,23 @@ def support_points(robot: RobotModel, motion: MotionState, stiffness: float) -> 
     return points
 
 
+def lowest_support(robot: RobotModel, motion: MotionState, flipper_angles: np.ndarray, stiffness: float) -> float:
+    """Height of level ground under a robot that rests on the lowest points of its moved flippers [m], in terrain axes.
+
+    Args:
+        robot: its flippers, wheels and tracks.
+        motion: the robot's pose.
+        flipper_angles: measured ``[F]`` [rad]; NaN: as in the file.
+        stiffness: of the ground [N/m³].
+    """
+    assert robot.flipper_angles is not None
+    at_rest = robot.flipper_angles.double().cpu().numpy()
+    posed = robot.posed(torch.from_numpy(np.where(np.isfinite(flipper_angles), flipper_angles, at_rest)))
+    points = posed.points[posed.point_drives >= 0].double().cpu().numpy()
+    heights = np.sort(transform_points(motion.terrain_from_base, points)[:, 2])
+    return float(heights[: max(4, len(heights) // 20)].mean()) + rest_depth(robot, stiffness)
+
+
 def align_to_ground(terrain: TerrainMap, support: np.ndarray) -> TerrainMap:
     """A predicted map, shifted near the robot so that it passes through the support points.
 

@@ -25,6 +25,8 @@ class Observation:
     cameras: Mapping[str, CameraModel] = field(default_factory=dict)
     base_from_cameras: Mapping[str, np.ndarray] = field(default_factory=dict)
     """Pose ``[4, 4]`` of each camera in the base frame."""
+    flipper_angles: np.ndarray | None = None
+    """Measured angles of the robot's flippers ``[F]`` [rad], NaN where unknown; None: as in its file."""
 
 
 class TerrainSource(Protocol):

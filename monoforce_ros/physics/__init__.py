@@ -5,14 +5,19 @@ from monoforce_ros.physics.neural_ode import OdeOptions
 from monoforce_ros.physics.options import PhysicsOptions
 from monoforce_ros.physics.rest import rest_depth
 from monoforce_ros.physics.rollout import rollout
+from monoforce_ros.physics.soil import SOILS, Soil, SoilError, read_soil
 from monoforce_ros.physics.state import Rollout, State
 
 __all__ = [
+    "SOILS",
     "OdeOptions",
     "PhysicsOptions",
     "Rollout",
+    "Soil",
+    "SoilError",
     "State",
     "TerrainLookup",
+    "read_soil",
     "rest_depth",
     "rollout",
 ]

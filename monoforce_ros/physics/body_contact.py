@@ -14,6 +14,7 @@ from monoforce_ros.physics.lookup import TerrainLookup
 from monoforce_ros.physics.options import PhysicsOptions
 from monoforce_ros.physics.problem import Problem
 from monoforce_ros.physics.rotation import cross_matrix
+from monoforce_ros.physics.soil_contact import SoilContact
 
 _WORTH_TESTING = 4096
 """Number of points of all trajectories from which the test for nearby points takes less time than it saves: with a
@@ -48,6 +49,8 @@ class BodyContact:
     yield_speed: Tensor
     """Yield speed of vegetation, ``[B]`` [m/s]."""
     options: PhysicsOptions
+    soil: SoilContact | None = None
+    """Soft soil, with faces in base axes ``[3, N]``."""
 
     @classmethod
     def of(cls, problem: Problem, options: PhysicsOptions) -> BodyContact:
@@ -69,6 +72,15 @@ class BodyContact:
             rolling_resistance=rolling,
             yield_speed=yield_speed,
             options=options,
+            soil=None
+            if problem.soil is None
+            else SoilContact(
+                parameters=problem.soil,
+                faces=problem.point_faces.T,
+                widths=problem.point_strips[:, 0],
+                curvatures=problem.point_strips[:, 1],
+                belted=(problem.point_drives >= 0).to(problem.points),
+            ),
         )
 
     def part(self, chosen: Tensor) -> BodyContact:
@@ -81,6 +93,7 @@ class BodyContact:
             areas=self.areas[chosen],
             weights=self.weights[:, chosen],
             drives=self.drives[chosen],
+            soil=self.soil and self.soil.part(chosen),
         )
 
     def at(
@@ -127,6 +140,7 @@ class BodyContact:
             self.yield_speed,
             self.options,
             step_time=step_time,
+            soil=self.soil and replace(self.soil, faces=rotation @ self.soil.faces),
         )
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from monoforce_ros.physics.lookup import Ground
 from monoforce_ros.physics.options import PhysicsOptions
 from monoforce_ros.physics.rotation import cross
+from monoforce_ros.physics.soil_contact import SoilContact
 
 STEEPEST_SOIL, RIGID_SLOPE = math.cos(math.radians(45.0)), math.cos(math.radians(60.0))
 """Vertical components of the normal between which ground goes from soil to something rigid: soil does not stand
@@ -19,6 +20,28 @@ RIGID_FACTOR = 50.0
 """Factor on stiffness and damping where a face of the hull meets rigid ground head-on. A Husky at 1 m/s that pushes
 with its full traction (25 J, and 4 J per cm) stops within about 1 cm at a contact 5 cm wide and 10 cm high if the
 stiffness is 1e8 N/m³, 50 times that of firm soil; on soil's own it would need 12 cm, more than a post is thick."""
+
+
+FLAT_TREAD = 0.9
+"""Cosine of the angle to the ground within which a belt's surface moves along it at the belt's full speed (26°): tyres
+and tracks lie flat in their contact. On the circle, a wheel that sinks by 8 mm would roll 1 % slower than its rim, and
+one that is sampled every 30° 3.4 % slower, because its two lowest samples are 15° from the bottom."""
+
+
+def tread(belt: Tensor, along: Tensor) -> Tensor:
+    """Speed of the surface of a flattened belt along the ground ``[B, N]`` [m/s].
+
+    Args:
+        belt: its velocity on the circle, ``[B, 3, N]`` [m/s].
+        along: the ground's direction along the wheel, ``[B, 3, N]``.
+    """
+    fastest = torch.sqrt((belt * belt).sum(1) + 1e-12)
+    return ((belt * along).sum(1) / FLAT_TREAD).clamp(-fastest, fastest)
+
+
+def steepness(normal: Tensor) -> Tensor:
+    """From 0 where soil stands to 1 where ground is rigid, ``[B, N]``, by the ground's normal ``[B, 3, N]``."""
+    return ((STEEPEST_SOIL - normal[:, 2]) / (STEEPEST_SOIL - RIGID_SLOPE)).clamp(0.0, 1.0)
 
 
 def against_hull(outward: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
@@ -33,7 +56,7 @@ def against_hull(outward: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
         normal: unit normal of the ground, ``[B, 3, N]``.
     """
     head_on = (outward * normal).sum(1)
-    steep = ((STEEPEST_SOIL - normal[:, 2]) / (STEEPEST_SOIL - RIGID_SLOPE)).clamp(0.0, 1.0)
+    steep = steepness(normal)
     mirrored = normal - (2.0 * steep * head_on.clamp_min(0.0))[:, None] * outward
     mirrored = mirrored * torch.rsqrt((mirrored * mirrored).sum(1, keepdim=True) + 1e-12)
     # Where nothing is mirrored the normal stays as it is, to the last bit.
@@ -82,12 +105,14 @@ def contact(
     options: PhysicsOptions,
     step_time: float | None = None,
     grip: Tensor | None = None,
+    soil: SoilContact | None = None,
 ) -> Contact:
     """Forces on body points (paper III-C and III-D).
 
     The normal force is a spring and a damper at the penetration, per area, and never pulls. Tangential forces are
     regularised Coulomb friction with a friction ellipse, ``-N diag(μ) s / sqrt(|s|² + ε²)`` at slip ``s``, or the
-    paper's ``μ m g (σ(-s) - ½)``. Faces of the hull meet steep ground stiffly, see :func:`against_hull`.
+    paper's ``μ m g (σ(-s) - ½)``. Faces of the hull meet steep ground stiffly, see :func:`against_hull`. On soft soil
+    pressure and shear are those of :class:`SoilContact`.
 
     Args:
         ground: terrain under the points.
@@ -107,6 +132,7 @@ def contact(
         step_time: time over which the spring follows the motion [s] (default: the time step); 0 gives the
             instantaneous force.
         grip: 0 for points of wheels that roll freely, which have no longitudinal friction, else 1, ``[N]``; None: 1.
+        soil: soft soil where ground is not too steep for it; None: firm ground.
     """
     normal = ground.normal
     if options.normal_force == "vertical":
@@ -115,13 +141,18 @@ def contact(
     depth = (ground.height - points[:, 2]) * normal[:, 2]
     touching = depth > 0
     touching_areas = areas * touching
+    upward = normal
     normal, rigid = against_hull(outward, normal)
+    if soil is not None:
+        soft = 1.0 - steepness(upward)
+        normal, facing = soil.direction(upward, normal, soft)
     lateral = lateral if lateral.ndim == 3 else lateral[..., None]
     across = lateral - (lateral * normal).sum(1, keepdim=True) * normal
     across = across * torch.rsqrt((across * across).sum(1, keepdim=True) + 1e-12)
     directions = torch.stack([normal, cross(across, normal), across], dim=2)
     point_velocity = (directions * velocities[:, :, None]).sum(1)
-    slip = point_velocity[:, 1:] + (directions[:, :, 1:] * belt_velocities[:, :, None]).sum(1)
+    belt_speeds = torch.stack([tread(belt_velocities, directions[:, :, 1]), (across * belt_velocities).sum(1)], dim=1)
+    slip = point_velocity[:, 1:] + belt_speeds
 
     softness, drag = ground_factors[..., None].unbind(1)
     stiffness, ground_damping = ground.stiffness / softness * rigid, ground.damping / softness * rigid
@@ -137,7 +168,23 @@ def contact(
     if grip is not None:
         held = torch.stack([grip, torch.ones_like(grip)])
         slip, friction = slip * held, friction * held
-    if options.tangential_force == "coulomb":
+    if soil is not None:
+        slip_speed = torch.sqrt((slip * slip).sum(1) + options.slip_regularisation**2)
+        soft_ground = soil.pressure(
+            depth, -point_velocity[:, 0], slip, (cross(across, upward) * velocities).sum(1),
+            point_velocity[:, 1] if grip is None else grip * point_velocity[:, 1],
+            (directions[:, :, 1] * belt_velocities).sum(1), -(upward * belt_velocities).sum(1), softness,
+            options.time_step if step_time is None else step_time, options.slip_regularisation,
+        )  # fmt: skip
+        yielding = touching_areas * soft * facing
+        held_by = ground.friction * (1.0 - soft) * load + yielding * soft_ground.shear
+        load = (1.0 - soft) * load + yielding * soft_ground.load
+        pressing = (1.0 - soft) * pressing + yielding * soft_ground.pressing
+        normal_gain = (1.0 - soft) * normal_gain + yielding * soft_ground.gain
+        factors = friction_factors[..., None] if grip is None else friction_factors[..., None] * held
+        tangential_gain = factors * (held_by / slip_speed)[:, None]
+        tangential_force = -tangential_gain * slip
+    elif options.tangential_force == "coulomb":
         per_speed = load * torch.rsqrt((slip * slip).sum(1) + options.slip_regularisation**2)
         tangential_gain = friction * per_speed[:, None]
         tangential_force = -tangential_gain * slip

@@ -117,7 +117,9 @@ class _System(nn.Module):
     def tensors(self) -> tuple[Tensor, ...]:
         """All tensors on which the derivative depends and that may require gradients."""
         body, loads = self.body, self.loads
+        soil = () if body.soil is None else (body.soil.parameters,)
         return (
+            *soil,
             body.lookup.channels, body.points, body.tangents, body.areas, body.weights, body.speeds,
             body.friction_factors, body.ground_factors, body.rolling_resistance, body.yield_speed,
             loads.weight, loads.linear_drag, loads.quadratic_drag, loads.wrench, self.mass, self.inertia,
@@ -125,10 +127,13 @@ class _System(nn.Module):
 
     def with_tensors(self, tensors: tuple[Tensor, ...]) -> _System:
         """The same system with other :attr:`tensors`."""
+        body = self.body
+        if body.soil is not None:
+            body, tensors = replace(body, soil=replace(body.soil, parameters=tensors[0])), tensors[1:]
         channels, points, tangents, areas, weights, speeds, friction, ground, rolling, yield_speed, *rest = tensors
         *loads, mass, inertia = rest
         body = replace(
-            self.body, lookup=self.body.lookup.with_channels(channels), points=points, tangents=tangents, areas=areas,
+            body, lookup=body.lookup.with_channels(channels), points=points, tangents=tangents, areas=areas,
             weights=weights, speeds=speeds, friction_factors=friction, ground_factors=ground,
             rolling_resistance=rolling, yield_speed=yield_speed,
         )  # fmt: skip

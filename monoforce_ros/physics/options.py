@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from monoforce_ros.physics.soil import Soil
+
 LOOKUPS = ("bilinear", "constant")
 NORMAL_FORCES = ("normal", "vertical")
 TANGENTIAL_FORCES = ("coulomb", "sigmoid", "none")
@@ -25,6 +27,9 @@ class PhysicsOptions:
     """[m/s²]."""
     slip_regularisation: float = 0.02
     """Slip speed at which Coulomb friction reaches 71 % of its maximum [m/s]."""
+    soil: Soil | None = None
+    """Soft soil instead of the map's stiffness, damping and friction, except where ground is too steep for soil; needs
+    ``coulomb``. None: firm ground."""
 
     def __post_init__(self):
         for name, value, choices in (
@@ -40,3 +45,5 @@ class PhysicsOptions:
             raise ValueError(
                 f"physics option slip_regularisation: got {self.slip_regularisation}, expected 1e-5 to 1 m/s"
             )
+        if self.soil is not None and self.tangential_force != "coulomb":
+            raise ValueError(f"physics option soil: got tangential_force {self.tangential_force!r}, expected 'coulomb'")

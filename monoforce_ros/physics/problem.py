@@ -10,6 +10,7 @@ from torch import Tensor
 from monoforce_ros.effects import applied_setup
 from monoforce_ros.physics.articulation import Articulation, BodyMass
 from monoforce_ros.physics.contact_summary import ContactSummary
+from monoforce_ros.physics.soil import Soil
 from monoforce_ros.physics.state import State
 from monoforce_ros.robots import Controls, RobotModel
 from monoforce_ros.terrain import TerrainMap
@@ -41,6 +42,8 @@ class Problem:
     """``[N]`` int64; -1 on the hull."""
     point_outward: Tensor
     """Unit normal of the hull, outwards, ``[N, 3]``; zero on belts."""
+    point_strips: Tensor
+    """Width [m] and curvature [1/m] of the surface, ``[N, 2]``, where the ground is soft soil; else zeros."""
     mass: Tensor
     """``[B]`` [kg]."""
     centre_of_mass: Tensor
@@ -59,6 +62,8 @@ class Problem:
     """Divisor of stiffness and damping [-], and vegetation drag per area, height and speed [N s/m⁴], ``[B, 2]``."""
     wrench: Tensor
     """Body-frame force and torque per feature of the motion, ``[B, 6, F]``."""
+    soil: Tensor | None = None
+    """Parameters of soft soil, ``[B, 9]``; None: firm ground."""
     articulation: Articulation | None = None
     """What moves in the body; None if nothing does."""
 
@@ -70,6 +75,7 @@ class Problem:
         controls: Tensor | Controls,
         state: State,
         time_step: float = 0.01,
+        soil: Soil | None = None,
     ) -> tuple[Problem, Tensor]:
         """The problem and a mask of the trajectories with finite inputs, ``[B]`` bool.
 
@@ -123,6 +129,7 @@ class Problem:
             point_tangents=robot.point_tangents,
             point_drives=robot.point_drives,
             point_outward=torch.zeros_like(robot.points) if robot.point_outward is None else robot.point_outward,
+            point_strips=_strips(robot, soil),
             mass=robot.mass.expand(batch),
             centre_of_mass=centre_of_mass,
             inertia=robot.inertia.expand(batch, 3, 3),
@@ -132,6 +139,7 @@ class Problem:
             vegetation=vegetation,
             ground_factors=torch.stack([setup.softness.expand(batch), loads.vegetation_drag.expand(batch)], dim=-1),
             wrench=loads.wrench.expand(batch, 6, -1),
+            soil=None if soil is None else soil.table(position, batch),
             articulation=articulation,
         )
         return problem, finite
@@ -145,6 +153,13 @@ class Problem:
     def steps(self) -> int:
         """Number of time steps."""
         return self.drive_speeds.shape[1]
+
+    @property
+    def point_faces(self) -> Tensor:
+        """Outward unit normals of hull and belts in the base frame, ``[N, 3]``."""
+        # A belt runs along its tangent, across the y axis of the part that carries it.
+        x, _, z = self.point_tangents.unbind(-1)
+        return self.point_outward + torch.stack([-z, torch.zeros_like(x), x], dim=-1)
 
     @property
     def body_mass(self) -> BodyMass:
@@ -178,6 +193,17 @@ class Motion:
     """``[B, T + 1, J]``."""
     belts: Tensor | None = None
     """Surface speeds of the drives, ``[B, T + 1, D]``."""
+
+
+def _strips(robot: RobotModel, soil: Soil | None) -> Tensor:
+    """Width and curvature at each point ``[N, 2]``."""
+    if soil is None:
+        return torch.zeros_like(robot.points[:, :2])
+    if robot.point_widths is None or robot.point_curvatures is None:
+        raise ValueError(
+            f"soil: got robot {robot.name!r} without point_widths and point_curvatures, expected one of load_robot"
+        )
+    return torch.stack([robot.point_widths, robot.point_curvatures], dim=-1)
 
 
 _JOINT_INPUTS = ("joint_angles", "joint_rates", "start_angles", "start_rates")

@@ -42,7 +42,8 @@ def rollout(
     ``(M + Δt D) Δv = Δt f``, which is stable for any stiffness, damping and friction.
 
     Differentiable in the terrain's channels, drive speeds, start state, mass, centre of mass, inertia and friction.
-    Uses the precision and device of ``state``; inputs are not modified.
+    On soft soil (``options.soil``) also in its parameters. Uses the precision and device of ``state``; inputs are not
+    modified.
 
     Args:
         terrain: one map for all trajectories, or a batch ``[B]`` of maps.
@@ -74,7 +75,7 @@ def rollout(
     _check_joints(robot, controls, (batch, drive_speeds.shape[1]))
     if terrain.batch_size not in (None, 1, batch):
         raise ValueError(f"terrain: got a batch of {terrain.batch_size} maps, expected 1 or {batch}")
-    problem, finite = Problem.pose(terrain, robot, controls, state, options.time_step)
+    problem, finite = Problem.pose(terrain, robot, controls, state, options.time_step, options.soil)
     if ode is not None:
         if problem.articulation is not None:
             raise ValueError(

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from monoforce_ros.physics.articulation import Articulation, LinkPoses, coordinate_torque
 from monoforce_ros.physics.body_contact import BodyContact
-from monoforce_ros.physics.contact import Contact, contact
+from monoforce_ros.physics.contact import Contact, contact, tread
 from monoforce_ros.physics.loads import LoadModel
 from monoforce_ros.physics.options import PhysicsOptions
 from monoforce_ros.physics.problem import Motion, Problem
@@ -124,6 +124,8 @@ class _System:
             body.yield_speed,
             self.options,
             grip=self.moving.grip,
+            soil=body.soil
+            and replace(body.soil, faces=(turns @ problem.point_faces[..., None])[..., 0].transpose(1, 2)),
         )
         return arms, touch, belt
 
@@ -138,7 +140,7 @@ class _System:
 
     def drive_jacobian(self, touch: Contact, belt: Tensor) -> Tensor:
         """Slip of the points along and across by the speeds of drives with dynamics, ``[B, K_drives, 2 N]``."""
-        slips = (touch.directions[:, :, 1:] * belt[:, :, None]).sum(1)
+        slips = torch.stack([tread(belt, touch.directions[:, :, 1]), (touch.directions[:, :, 2] * belt).sum(1)], dim=1)
         rows = [(slips * driven).flatten(1) for driven in self.driven]
         return torch.stack(rows, 1) if rows else slips.new_zeros(len(slips), 0, slips[0].numel())
 

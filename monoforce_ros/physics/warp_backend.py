@@ -15,12 +15,14 @@ from monoforce_ros.physics.clusters import point_clusters
 from monoforce_ros.physics.contact_summary import STEEP, ContactSummary
 from monoforce_ros.physics.options import PhysicsOptions
 from monoforce_ros.physics.problem import Motion, Problem
+from monoforce_ros.physics.soil import SOIL_PARAMETERS
 from monoforce_ros.physics.warp_kernels import forces_kernel, integrate_kernel, summarise_kernel
 from monoforce_ros.physics.warp_launch import (
     CHUNK,
     INPUTS,
     Arguments,
     Fixed,
+    Surface,
     adjoint,
     contiguous,
     in_parallel,
@@ -64,6 +66,7 @@ def integrate(
             problem.gravity_tilt,
             problem.resistance,
             problem.wrench,
+            problem.mass.new_zeros(1, SOIL_PARAMETERS) if problem.soil is None else problem.soil,
         )
 
     start = (problem.centre, problem.rotation, problem.velocity, problem.angular_velocity)
@@ -72,15 +75,15 @@ def integrate(
         clusters = point_clusters(problem.points)
     else:
         clusters = warp_joints.clusters_by_link(problem.points, moving.point_links)
-    outward = problem.point_outward
-    fixed = Fixed(options, terrain.grid, drives[clusters.order], outward[clusters.order], clusters)
+    surface = Surface(drives, problem.point_outward, problem.point_strips)
+    fixed = Fixed(options, terrain.grid, surface.ordered(clusters.order), clusters)
     # Points of a cluster are contiguous.
     ordered = inputs(tuple(t[clusters.order] for t in sampled))
     if moving is not None:
         motion = warp_joints.integrate(problem, moving, fixed, ordered, start)
         if not problem.steps or not (with_forces or with_contact):
             return motion
-        fixed = Fixed(options, terrain.grid, drives, outward, clusters)
+        fixed = Fixed(options, terrain.grid, surface, clusters)
         return warp_joints.with_forces(motion, problem, moving, fixed, inputs(sampled), force_every)
     states: tuple[Tensor, ...] = _Integrate.apply(fixed, *ordered, *start)
     centre, rotation, velocity, angular_velocity = states
@@ -91,7 +94,7 @@ def integrate(
     if with_contact and not with_forces and not with_gradient:
         sums = _launch_summary(fixed, force_every, contiguous(ordered), contiguous(states))
         return replace(motion, contact=ContactSummary.split(sums, problem.drive_speeds.shape[2]))
-    fixed = Fixed(options, terrain.grid, drives, outward, clusters)
+    fixed = Fixed(options, terrain.grid, surface, clusters)
     normal, tangential, forces = _Forces.apply(fixed, force_every, *inputs(sampled), *states)
     return replace(motion, normal_forces=normal, tangential_forces=tangential, forces=forces)
 
@@ -156,7 +159,7 @@ def _launch(
     backward = state_gradients is not None
     device = str(inputs[0].device)
     double, kinds = precision(inputs[0])
-    kernel = integrate_kernel(double)
+    kernel = integrate_kernel(double, fixed.soft)
     # Computed before the threads start; otherwise each would compute it.
     fixed.ceilings(inputs[0])
 
@@ -203,7 +206,7 @@ def _launch_forces(
     device = str(tensors[0].device)
     inputs, states = tensors[: len(INPUTS)], tensors[len(INPUTS) :]
     double, kinds = precision(tensors[0])
-    kernel = forces_kernel(double)
+    kernel = forces_kernel(double, fixed.soft)
     fixed.ceilings(inputs[0])
 
     def work(part: tuple[int, int]) -> list[Tensor]:
@@ -230,7 +233,7 @@ def _launch_summary(fixed: Fixed, every: int, inputs: Sequence[Tensor], states: 
     batch, steps, drives = inputs[6].shape
     device = str(inputs[0].device)
     double, kinds = precision(inputs[0])
-    kernel = summarise_kernel(double)
+    kernel = summarise_kernel(double, fixed.soft)
     sums = inputs[0].new_zeros((batch, -(-steps // every), 2 * drives + 8))
     arguments = Arguments(fixed, inputs, states)
     result = wp.from_torch(sums, dtype=kinds.scalar)

@@ -285,7 +285,7 @@ def _launch(
     backward = state_gradients is not None
     device = str(inputs[0].device)
     double, kinds = precision(inputs[0])
-    kernel = integrate_joints_kernel(double, differentiable)
+    kernel = integrate_joints_kernel(double, differentiable, fixed.soft)
     # Computed before the threads start; otherwise each would compute it.
     fixed.ceilings(inputs[0])
 
@@ -323,7 +323,7 @@ def _launch_forces(
     number = len(INPUTS) + 2
     inputs, states, links = tensors[:number], tensors[number:-2], tensors[-2:]
     double, kinds = precision(tensors[0])
-    kernel = forces_joints_kernel(double, differentiable)
+    kernel = forces_joints_kernel(double, differentiable, fixed.soft)
     fixed.ceilings(inputs[0])
 
     def work(part: tuple[int, int]) -> list[Tensor]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -30,22 +31,44 @@ _threads: ThreadPoolExecutor | None = None
 
 INPUTS = (
     "height", "material", "points", "areas", "tangents", "share", "speeds", "mass", "centre_of_mass", "inertia",
-    "friction", "ground_factors", "tilt", "resistance", "wrench",
+    "friction", "ground_factors", "tilt", "resistance", "wrench", "soil",
 )  # fmt: skip
 """Kernel inputs with gradients, other than the states."""
 STATES = ("centre", "rotation", "velocity", "angular_velocity")
 
 
+@dataclass(frozen=True)
+class Surface:
+    """What the body points stand for."""
+
+    drives: Tensor
+    """Drive index of each point, ``[N]`` int32; -1 on the hull."""
+    outward: Tensor
+    """Unit normal of the hull, zero on belts, ``[N, 3]``."""
+    strips: Tensor
+    """Width [m] and curvature [1/m] of the surface, ``[N, 2]``."""
+
+    def ordered(self, order: Tensor) -> Surface:
+        """The same in another order of the points ``[N]`` (indices)."""
+        return Surface(self.drives[order], self.outward[order], self.strips[order])
+
+
 class Fixed:
     """Inputs of a launch without gradients."""
 
-    def __init__(self, options: PhysicsOptions, grid: Grid, drives: Tensor, outward: Tensor, clusters: PointClusters):
+    def __init__(self, options: PhysicsOptions, grid: Grid, surface: Surface, clusters: PointClusters):
         self.options = options
         self.grid = grid
-        self.drives = drives.contiguous()
-        self.outward = outward.detach().contiguous()
+        self.drives = surface.drives.contiguous()
+        self.outward = surface.outward.detach().contiguous()
+        self.strips = surface.strips.detach().contiguous()
         self.clusters = clusters
         self._ceilings: tuple[Tensor, Tensor] | None = None
+
+    @property
+    def soft(self) -> bool:
+        """Whether the ground is soft soil."""
+        return self.options.soil is not None
 
     def ceilings(self, height: Tensor) -> tuple[Tensor, Tensor]:
         """The highest ground near each node, against which clusters and groups are tested."""
@@ -104,6 +127,7 @@ class Arguments:
         body.tangents, body.share = self.inputs["tangents"], self.inputs["share"]
         body.drives = wp.from_torch(fixed.drives, dtype=wp.int32)
         body.outward = wp.from_torch(fixed.outward, dtype=kinds.vec3)
+        body.strips = wp.from_torch(fixed.strips, dtype=kinds.vec2)
         for name, boxes in (("cluster", clusters.clusters), ("group", clusters.groups)):
             setattr(body, f"{name}_centres", wp.from_torch(boxes.centres, dtype=kinds.vec3))
             setattr(body, f"{name}_halves", wp.from_torch(boxes.halves, dtype=kinds.vec3))
@@ -137,7 +161,7 @@ def precision(tensor: Tensor) -> tuple[bool, Types]:
 def elements(kinds: Types) -> dict[str, Any]:
     """Warp element types of inputs and states."""
     s, v2, v3, v4, m = kinds.scalar, kinds.vec2, kinds.vec3, kinds.vec4, kinds.mat33
-    inputs = (s, v4, v3, s, v3, s, s, s, v3, m, v2, v2, v2, v4, kinds.wrench)
+    inputs = (s, v4, v3, s, v3, s, s, s, v3, m, v2, v2, v2, v4, kinds.wrench, kinds.soil)
     return dict(zip((*INPUTS, *STATES), (*inputs, v3, m, v3, v3), strict=True))
 
 

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from monoforce_ros.planning.occupancy_grid import AlignedGrid, Occupancy, occupancy, speed_mask
     from monoforce_ros.planning.plan_follower import plan_target
     from monoforce_ros.planning.refinement import Refinement, refine
-    from monoforce_ros.planning.selection import WAYPOINTS, SelectionWeights, select_candidate
+    from monoforce_ros.planning.selection import COMMAND_FIELDS, WAYPOINTS, SelectionWeights, select_candidate
 else:
     __getattr__ = lazy_exports(
         __name__,
@@ -45,6 +45,7 @@ else:
                 "refine",
             ),
             "selection": (
+                "COMMAND_FIELDS",
                 "SelectionWeights",
                 "WAYPOINTS",
                 "select_candidate",
@@ -53,6 +54,7 @@ else:
     )
 
 __all__ = [
+    "COMMAND_FIELDS",
     "TERMS",
     "WAYPOINTS",
     "AlignedGrid",

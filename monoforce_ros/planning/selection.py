@@ -16,6 +16,8 @@ _LOOKAHEAD = 0.5
 """Lookahead distance [m]."""
 _PROGRESS = 0.1
 """Smallest progress towards the goal for which a candidate is better than standing [m]."""
+COMMAND_FIELDS = ("speed", "yaw_rate", "lateral_speed")
+"""Fields of a candidate's command; the last one only of robots that move sideways."""
 FIELDS = (
     *("x", "y", "heading", "speed", "yaw_rate", "cost", "feasible"),
     *(f"{axis}_{share}" for share in WAYPOINTS for axis in "xy"),
@@ -46,17 +48,19 @@ def select_candidate(
     goal: np.ndarray,
     weights: SelectionWeights = SelectionWeights(),
     cost_to_go: CostToGo | None = None,
-    previous_command: tuple[float, float] | None = None,
+    previous_command: tuple[float, ...] | None = None,
 ) -> int | None:
     """Index of the best feasible candidate; None without a feasible one.
 
     Args:
-        candidates: :data:`FIELDS`, each ``[N]``; positions and headings in the odometry frame.
+        candidates: :data:`FIELDS` and, of robots that move sideways, ``lateral_speed``, each ``[N]``; positions and
+            headings in the odometry frame.
         robot: position of the robot ``[2]`` [m].
         goal: position of the goal ``[2]`` [m].
         weights: weights of the criteria.
         cost_to_go: path lengths to the goal around obstacles; without it, straight distances are used.
-        previous_command: forward speed [m/s] and yaw rate [rad/s] of the last command.
+        previous_command: forward speed [m/s] and yaw rate [rad/s] of the last command, and its lateral speed [m/s] if
+            the candidates have one.
 
     Raises:
         ValueError: a field is missing.
@@ -91,16 +95,17 @@ def select_candidate(
     # The final heading of a candidate that passes the goal does not matter.
     misalignment = np.where(nearest_at_end, misalignment, 0.0)
     # Standing makes no progress; allow it only if no feasible candidate does.
-    standing = (np.abs(candidates["speed"]) < 1e-6) & (np.abs(candidates["yaw_rate"]) < 1e-6)
+    commands = np.column_stack([candidates[name] for name in COMMAND_FIELDS if name in candidates])
+    standing = (np.abs(commands) < 1e-6).all(axis=1)
     if (feasible & ~standing & (start - remaining > _PROGRESS)).any():
         feasible = feasible & ~standing
     reach = max(float(np.linalg.norm(end - robot, axis=1).max()), 0.1)
     score = weights.cost * candidates["cost"] + weights.distance * remaining / reach
     score = score + weights.heading * misalignment + weights.clearance * proximity
     if previous_command is not None:
-        commands = np.column_stack([candidates["speed"], candidates["yaw_rate"]])
         largest = np.maximum(np.abs(commands).max(axis=0), 1e-6)
-        score = score + weights.change * (np.abs(commands - previous_command) / largest).mean(axis=1)
+        previous = np.resize([*previous_command, 0.0], commands.shape[1])
+        score = score + weights.change * (np.abs(commands - previous) / largest).mean(axis=1)
     return int(np.where(feasible, score, np.inf).argmin())
 
 

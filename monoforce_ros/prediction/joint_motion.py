@@ -15,11 +15,18 @@ class JointMotion:
     """Joints at the start of a prediction; steering then follows the commands, flippers these targets."""
 
     start: np.ndarray
-    """Angles of all joints ``[J]`` [rad]."""
+    """Angles of all joints ``[J]``, or ``[B, J]`` for each prediction of a batch [rad]; NaN where unknown."""
     flipper_targets: np.ndarray
     """Commanded angles of the flippers at the start ``[F]`` [rad]."""
     flipper_rates: np.ndarray
     """Rates at which these change ``[F]`` [rad/s]; 0 holds them."""
+    program: np.ndarray | None = None
+    """Commanded angles of the flippers at each step ``[B, T, F]`` [rad] instead, NaN where unknown."""
+
+    @classmethod
+    def recorded(cls, start: np.ndarray, program: np.ndarray | None) -> JointMotion:
+        """Of a recording: measured angles ``[B, J]`` and the program of the flippers ``[B, T, F]`` [rad]."""
+        return cls(start, np.zeros(0), np.zeros(0), program)
 
     @classmethod
     def of(
@@ -56,6 +63,8 @@ class JointMotion:
 
     def flippers(self, batch: int, steps: int, time_step: float) -> torch.Tensor | None:
         """Commanded angles of the flippers over a horizon, ``[B, T, F]`` [rad]; None without flippers."""
+        if self.program is not None:
+            return torch.as_tensor(self.program, dtype=torch.float32)
         if not len(self.flipper_targets):
             return None
         times = time_step * np.arange(1, steps + 1)[:, None]

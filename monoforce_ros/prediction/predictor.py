@@ -128,14 +128,19 @@ class Predictor:
         with_contact: bool = False,
         force_every: int = 1,
         joints: JointMotion | None = None,
+        flippers: np.ndarray | None = None,
     ) -> Rollout:
-        """Roll out motions ``[B]`` under twists ``[B, history + T, 2]`` on one map or a batch of maps."""
+        """Roll out motions ``[B]`` under twists ``[B, history + T, 2]`` on one map or a batch of maps.
+
+        ``flippers`` are commanded angles ``[B, T, F]`` [rad] in place of those of ``joints``.
+        """
         with torch.no_grad():
             commands = torch.as_tensor(twists, dtype=torch.float32)
             start = start_states(motions)
             return self.differentiable_roll_out(
                 terrain, motions, commands, start, self.robot,
                 with_forces=with_forces, with_contact=with_contact, force_every=force_every, joints=joints,
+                flippers=None if flippers is None else torch.as_tensor(flippers, dtype=torch.float32),
             )  # fmt: skip
 
     def differentiable_roll_out(
@@ -150,13 +155,15 @@ class Predictor:
         with_contact: bool = False,
         force_every: int = 1,
         joints: JointMotion | None = None,
+        flippers: torch.Tensor | None = None,
     ) -> Rollout:
         """As :meth:`roll_out` but with gradients, for given start states and a given variant of the robot."""
         batch, step = len(twists), self.options.time_step
-        start, flippers = None, None
+        start = None
         if joints is not None:
             start = torch.as_tensor(joints.start, dtype=torch.float32).expand(batch, -1)
-            flippers = joints.flippers(batch, twists.shape[1] - self.history, step)
+            if flippers is None:
+                flippers = joints.flippers(batch, twists.shape[1] - self.history, step)
         given = controls(robot, twists, step, history=self.history, joint_start=start, flippers=flippers)
         # The terrain frame turns with the robot's heading; effects fixed in the odometry frame are rotated into it.
         heading = torch.tensor([motion.heading for motion in motions], dtype=torch.float32)

@@ -12,7 +12,7 @@ _FEWEST = 6
 
 def belt_outline(
     length: float, rear_radius: float, front_radius: float, spacing: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Sample the tight belt around two circles in its own plane (x forward, z up, origin half-way between them).
 
     Args:
@@ -23,7 +23,8 @@ def belt_outline(
 
     Returns:
         positions ``[n, 2]`` (x, z) [m]; unit tangents ``[n, 2]`` in the direction in which the surface moves relative
-        to the body when the drive runs forward (backwards at the bottom); arc length of each sample ``[n]`` [m].
+        to the body when the drive runs forward (backwards at the bottom); arc length of each sample ``[n]`` [m];
+        curvature there ``[n]`` [1/m], 0 on the straight parts.
     """
     # Angle of the straight parts, which are tangents of both circles, to the line between the centres.
     tilt = 0.0 if length == 0.0 else math.asin(np.clip((rear_radius - front_radius) / length, -1.0, 1.0))
@@ -39,8 +40,10 @@ def belt_outline(
     else:
         pieces.append(_arc(rear, front_radius, math.pi / 2, 3 * math.pi / 2, spacing, fewest))
     positions, directions, lengths = (np.concatenate(parts) for parts in zip(*pieces, strict=True))
+    radii = [front_radius, np.inf, rear_radius, np.inf] if length > 0.0 else [front_radius, front_radius]
+    curvatures = [np.full(len(piece[0]), 1.0 / radius) for piece, radius in zip(pieces, radii, strict=True)]
     # The outline runs forwards along the bottom; the belt of a robot that drives forward moves the other way.
-    return positions, -directions, lengths
+    return positions, -directions, lengths, np.concatenate(curvatures)
 
 
 def _arc(

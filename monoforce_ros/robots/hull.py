@@ -16,7 +16,7 @@ TOP_SPACING = 0.2
 """Largest distance between samples of the top [m], which touches the ground only if the robot lies on its back."""
 
 
-def box_samples(size: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def box_samples(size: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Sample the surface of a box with edges along the axes and its centre at the origin.
 
     The areas of each face's samples add up to the face, so that forces do not depend on the spacing.
@@ -26,7 +26,8 @@ def box_samples(size: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarra
         spacing: distance between samples [m] if it is below :data:`FACE_SPACING`; larger values do not matter.
 
     Returns:
-        points ``[n, 3]`` [m]; areas ``[n]`` [m²]; unit normals of the faces, outwards ``[n, 3]``.
+        points ``[n, 3]`` [m]; areas ``[n]`` [m²]; unit normals of the faces, outwards ``[n, 3]``; the shorter edge
+        of each sample's face ``[n]`` [m].
     """
     factor = min(1.0, spacing / FACE_SPACING)
     face, edge, top = factor * FACE_SPACING, factor * EDGE_SPACING, factor * TOP_SPACING
@@ -45,7 +46,9 @@ def box_samples(size: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarra
             parts.append(_face(size, axis, side, (_middles(along, edge), lowest)))
             parts.append(_face(size, axis, side, (_middles(along, face), rows)))
     points, areas, normals = (np.concatenate(values) for values in zip(*parts, strict=True))
-    return points, areas, normals
+    # The face across an axis has the other two edges.
+    shorter = np.array([min(np.delete(size, axis)) for axis in range(3)])
+    return points, areas, normals, np.abs(normals) @ shorter
 
 
 def _middles(length: float, spacing: float) -> tuple[np.ndarray, np.ndarray]:

@@ -125,6 +125,8 @@ class _Reader(FieldChecks):
             point_tangents=tensor(np.concatenate(samples.tangents)),
             point_drives=torch.as_tensor(point_drives, dtype=torch.int64),
             point_outward=tensor(np.concatenate(samples.outward)),
+            point_widths=tensor(np.concatenate(samples.widths)),
+            point_curvatures=tensor(np.concatenate(samples.curvatures)),
             drive_names=tuple(samples.drives),
             drive_offsets=tensor(drive_offsets),
             friction_longitudinal=tensor(
@@ -290,7 +292,7 @@ class _Reader(FieldChecks):
     ) -> None:
         centre = self.vector(content["centre"], f"{where}.centre", 3, 20.0, "m")
         width = self.number(content["width"], f"{where}.width", 0.005, 3.0, "m")
-        outline, directions, lengths = belt_outline(*shape, spacing)
+        outline, directions, lengths, curvatures = belt_outline(*shape, spacing)
         rows = max(2, math.ceil(width / (2 * spacing)))
         across = (np.arange(rows) + 0.5) / rows * width - width / 2
         positions = np.concatenate(
@@ -298,6 +300,8 @@ class _Reader(FieldChecks):
         )
         tangents = np.stack([directions[:, 0], np.zeros(len(directions)), directions[:, 1]], axis=1)
         samples.add(positions, np.tile(lengths * width / rows, rows), np.tile(tangents, (rows, 1)), content["drive"])
+        samples.widths.append(np.full(len(positions), width))
+        samples.curvatures.append(np.tile(curvatures, rows))
 
     def box(self, content: Any, where: str, samples: _Samples, spacing: float) -> None:
         box = self.mapping(content, where, {"name", "centre", "size"}, ["centre", "size"])
@@ -305,8 +309,10 @@ class _Reader(FieldChecks):
         size = self.vector(box["size"], f"{where}.size", 3, 20.0, "m")
         if (size <= 0).any():
             raise self.fail(f"{where}.size", size.tolist(), "positive edge lengths [m]")
-        points, areas, normals = box_samples(size, spacing)
+        points, areas, normals, shorter = box_samples(size, spacing)
         samples.add(centre + points, areas, np.zeros_like(points), None, normals)
+        samples.widths.append(shorter)
+        samples.curvatures.append(np.zeros(len(points)))
 
     def sensors(self, content: Any) -> dict[str, torch.Tensor]:
         if not isinstance(content, Mapping):
@@ -341,6 +347,8 @@ class _Samples:
         self.tangents: list[np.ndarray] = []
         self.point_drives: list[np.ndarray] = []
         self.outward: list[np.ndarray] = []
+        self.widths: list[np.ndarray] = []
+        self.curvatures: list[np.ndarray] = []
         self.point_flippers: list[np.ndarray] = []
         self.point_joints: list[np.ndarray] = []
         self.radii: dict[str, float] = {}

@@ -84,6 +84,10 @@ class RobotModel:
     """Index of the flipper of each point, ``[N]`` int64; -1 elsewhere."""
     point_outward: Tensor | None = None
     """Unit normal of the hull at each point, outwards, ``[N, 3]``; zero on belts. None stands for zeros."""
+    point_widths: Tensor | None = None
+    """Width of the belt or shorter edge of the hull's face at each point, ``[N]`` [m]; soft soil needs it."""
+    point_curvatures: Tensor | None = None
+    """Curvature of the belt along its way, ``[N]`` [1/m]; 0 where it is straight and on the hull."""
     effects: tuple[tuple[str, Mapping[str, float | Tensor]], ...] = ()
     """Effects of the robot: names and parameter values, see :mod:`monoforce_ros.effects`."""
     effect_intervals: tuple[tuple[str, Mapping[str, tuple[float, float]]], ...] = ()
@@ -132,7 +136,10 @@ class RobotModel:
     def with_points(self, keep: Tensor) -> RobotModel:
         """The robot with only the points ``keep`` ``[N]`` bool; mass and inertia stay."""
         flippers = None if self.point_flippers is None else self.point_flippers[keep]
-        outward = None if self.point_outward is None else self.point_outward[keep]
+
+        def kept(values: Tensor | None) -> Tensor | None:
+            return None if values is None else values[keep]
+
         return replace(
             self,
             points=self.points[keep],
@@ -140,7 +147,9 @@ class RobotModel:
             point_tangents=self.point_tangents[keep],
             point_drives=self.point_drives[keep],
             point_flippers=flippers,
-            point_outward=outward,
+            point_outward=kept(self.point_outward),
+            point_widths=kept(self.point_widths),
+            point_curvatures=kept(self.point_curvatures),
             point_joints=None if self.point_joints is None else self.point_joints[keep],
             point_grip=None if self.point_grip is None else self.point_grip[keep],
         )
@@ -159,6 +168,14 @@ class RobotModel:
     def ground_clearance(self) -> float:
         """Height of the base frame above the lowest driven point [m]."""
         return -float(self.points[self.point_drives >= 0][:, 2].min())
+
+    @property
+    def underside(self) -> Tensor:
+        """Points at the bottom of wheels, tracks and flippers, which level ground carries ``[n, 3]`` [m]."""
+        backwards = self.point_tangents[:, 0]
+        # Small wheels have twelve samples, of which the lowest is up to 15° from the bottom.
+        limit = -0.97 if bool((backwards < -0.97).any()) else float(backwards.min()) + 0.02
+        return self.points[backwards < limit]
 
     def posed(self, angles: Tensor) -> RobotModel:
         """The robot with its flippers at ``angles`` [rad] ``[F]``, including the change of its mass properties.

@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from monoforce_ros.core import OptionParser
 from monoforce_ros.reporting import progress_bar
 from monoforce_ros.synthetic.random_streams import DEFAULT_SEED
 from monoforce_ros.synthetic.terrain_shape import GROUNDS
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
 def build_parser() -> argparse.ArgumentParser:
     """The command line's options."""
-    parser = argparse.ArgumentParser(
+    parser = OptionParser(
         prog="synthesize",
         description="Record bags in simulated worlds: hills, ramp, kerbs, rocks, walls, trees, mud and tall grass.",
     )
@@ -67,9 +68,24 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--commands",
         default="random",
-        metavar="random|steps|sweep|straight|circle|spin|FILE.csv",
-        help="command profile: random follows the world's track, steps covers all motion regimes near the start; "
-        "a file has the columns t,v,w in s, m/s, rad/s (%(default)s)",
+        metavar="random|steps|sweep|straight|circle|spin|crab|FILE.csv",
+        help="command profile: random follows the world's track, steps covers all motion regimes near the start; crab "
+        "moves sideways; a file has the columns t,v,w in s, m/s, rad/s, or t,v,w,y with the speed to the left in m/s "
+        "(%(default)s)",
+    )
+    parser.add_argument(
+        "--command-type",
+        choices=("twist", "ackermann"),
+        default="twist",
+        help="twist: TwistStamped on /cmd_vel; ackermann: AckermannDriveStamped on /ackermann_cmd, for cars "
+        "(%(default)s)",
+    )
+    parser.add_argument(
+        "--flippers",
+        default="hold",
+        metavar="hold|steps|FILE.csv",
+        help="program of flippers, recorded on /flipper_commands: steps moves them at random; a file has a header "
+        "t,NAME,... and angles in rad, linear in between (%(default)s)",
     )
     parser.add_argument(
         "--odometry",
@@ -217,6 +233,8 @@ def _settings(options: argparse.Namespace) -> RecordingSettings:
         duration=options.duration,
         robot=options.robot or "husky",
         commands=options.commands,
+        command_type=options.command_type,
+        flippers=options.flippers,
         terrain=TerrainSettings(
             roughness=options.terrain_roughness, flat=options.flat, bare=options.bare, ground=options.ground
         ),

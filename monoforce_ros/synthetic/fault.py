@@ -20,6 +20,7 @@ class Simulation(Protocol):
     wheel_bodies: list[int]
     tyres: list[int]
     tyre_friction: np.ndarray
+    driven: np.ndarray
 
     @property
     def time(self) -> float:
@@ -78,6 +79,8 @@ class Fault:
 
     in_catalogue: ClassVar[bool] = True
     """Whether the catalogue of effects has an effect of this name."""
+    needs: ClassVar[str] = ""
+    """``steering`` or ``flippers`` for a fault of these joints."""
     parameters: ClassVar[dict[str, Parameter]] = {}
     """Declared parameters by name; ``NAME:VALUE`` sets the first one."""
 
@@ -92,6 +95,12 @@ class Fault:
         self.values = {name: values.get(name, entry.default) for name, entry in self.parameters.items()}
         """Value of each parameter."""
 
+    def complaint(self, robot: Vehicle) -> str:
+        """Why a robot cannot have this fault; empty if it can."""
+        if not self.needs or getattr(robot, self.needs):
+            return ""
+        return f"{type(self).__name__}: got the robot {robot.name}, expected one with {self.needs}"
+
     def modify_spec(self, spec: mujoco.MjSpec, robot: Vehicle) -> None:
         """Change the model before it is compiled."""
 
@@ -101,6 +110,10 @@ class Fault:
     def wheel_speeds(self, time: float, speeds: np.ndarray) -> np.ndarray:
         """Wheel speeds received by the servos for commanded ones ``[wheels]`` [rad/s]; called at every step."""
         return speeds
+
+    def joint_targets(self, simulation: Simulation, targets: np.ndarray) -> np.ndarray:
+        """Angles that the servos of steering and flippers hold, from intended ones ``[n]`` [rad], at every step."""
+        return targets
 
     def apply_forces(self, simulation: Simulation) -> None:
         """Add forces to ``data.xfrc_applied``, which has been cleared for this step."""

@@ -43,7 +43,8 @@ class ActuatorLag(Fault):
 
     @override
     def modify_spec(self, spec: mujoco.MjSpec, robot: Vehicle) -> None:
-        for servo in spec.actuators:
+        for wheel in robot.driven:
+            servo = spec.actuator(wheel.joint)
             servo.dyntype = mujoco.mjtDyn.mjDYN_FILTEREXACT
             servo.dynprm[0] = self.time_constant
 
@@ -56,15 +57,16 @@ class ActuatorSaturation(Fault):
     @override
     def modify_model(self, simulation: Simulation) -> None:
         robot = simulation.robot
-        simulation.model.actuator_forcelimited[:] = 1
-        self._largest = self.limit / np.array([wheel.radius for wheel in robot.wheels])
+        self._count = len(simulation.driven)
+        simulation.model.actuator_forcelimited[: self._count] = 1
+        self._largest = self.limit / np.array([wheel.radius for wheel in robot.driven])
         self._stall = 6.0 * robot.mass * 9.81 * robot.wheels[0].radius / len(robot.wheels)
         self.apply_forces(simulation)
 
     @override
     def apply_forces(self, simulation: Simulation) -> None:
-        fraction = simulation.wheel_states()[1] / self._largest
-        limits = simulation.model.actuator_forcerange
+        fraction = simulation.wheel_states()[1][simulation.driven] / self._largest
+        limits = simulation.model.actuator_forcerange[: self._count]
         limits[:, 1] = self._stall * np.clip(1.0 - fraction, 0.0, 1.0)
         limits[:, 0] = -self._stall * np.clip(1.0 + fraction, 0.0, 1.0)
 
@@ -104,8 +106,8 @@ class DriveAsymmetry(Fault):
 
     @override
     def modify_spec(self, spec: mujoco.MjSpec, robot: Vehicle) -> None:
-        for servo, wheel in zip(spec.actuators, robot.wheels, strict=True):
-            servo.gainprm[0] *= 1.0 - 0.5 * self.difference * np.sign(wheel.centre[1])
+        for wheel in robot.driven:
+            spec.actuator(wheel.joint).gainprm[0] *= 1.0 - 0.5 * self.difference * np.sign(wheel.centre[1])
 
 
 class FrictionScale(Fault):
@@ -125,8 +127,9 @@ class TurningScrub(Fault):
 
     @override
     def modify_spec(self, spec: mujoco.MjSpec, robot: Vehicle) -> None:
+        carriers = {"": 0.0} | {arm.name: arm.place[0] for arm in robot.arms}
         for wheel in robot.wheels:
-            spec.body(wheel.joint).pos[0] = wheel.centre[0] * self.wheelbase_factor
+            spec.body(wheel.joint).pos[0] = wheel.centre[0] * self.wheelbase_factor - carriers[wheel.arm]
 
 
 class RollingResistance(Fault):
@@ -284,6 +287,93 @@ class GyroBias(Fault):
     @override
     def gyro_offset(self) -> float:
         return self.bias
+
+
+class SteeringLag(Fault):
+    """A viscous steering gear: a damper of the steered wheels that their servos have to overcome."""
+
+    needs = "steering"
+    time_constant = Parameter(0.4, 0.05, 1.5)
+
+    @override
+    def modify_spec(self, spec: mujoco.MjSpec, robot: Vehicle) -> None:
+        for pivot in robot.steering:
+            spec.joint(pivot.name).damping = [self.time_constant * spec.actuator(pivot.name).gainprm[0], 0.0, 0.0]
+
+
+class SteeringOffset(Fault):
+    """A bent steering rod: wheels that are mounted on their hubs at an angle."""
+
+    needs = "steering"
+    offset = Parameter(0.05, -0.3, 0.3)
+
+    @override
+    def modify_spec(self, spec: mujoco.MjSpec, robot: Vehicle) -> None:
+        for wheel in robot.wheels:
+            if wheel.pivot is not None and wheel.pivot.servo is not None:
+                spec.joint(wheel.pivot.name).ref = -self.offset
+
+
+class SteeringGain(Fault):
+    """Servos that turn further or less than they are told, such as by another linkage."""
+
+    needs = "steering"
+    gain = Parameter(0.75, 0.4, 1.4, neutral=1.0)
+
+    @override
+    def modify_spec(self, spec: mujoco.MjSpec, robot: Vehicle) -> None:
+        for pivot in robot.steering:
+            spec.actuator(pivot.name).gainprm[0] *= self.gain
+
+
+class SteeringDeadband(Fault):
+    """Play between servo and hub: within it nothing but the caster trail of the wheels aligns them."""
+
+    needs = "steering"
+    width = Parameter(0.06, 0.01, 0.25)
+    _TRAIL = 0.25
+    """Of the wheel behind its steering axis, over its radius."""
+
+    @override
+    def modify_spec(self, spec: mujoco.MjSpec, robot: Vehicle) -> None:
+        for wheel in robot.wheels:
+            if wheel.pivot is not None and wheel.pivot.servo is not None:
+                spec.joint(wheel.pivot.name).pos[0] += self._TRAIL * wheel.radius
+
+    @override
+    def modify_model(self, simulation: Simulation) -> None:
+        model, names = simulation.model, [pivot.name for pivot in simulation.robot.steering]
+        self._servos = [model.actuator(name).id for name in names]
+        self._joints = [model.joint(name).qposadr[0] for name in names]
+        # The servo's damping acts through the play, too.
+        model.actuator_biasprm[self._servos, 2] *= 0.1
+
+    @override
+    def joint_targets(self, simulation: Simulation, targets: np.ndarray) -> np.ndarray:
+        angles, count = simulation.data.qpos[self._joints], len(self._joints)
+        error = targets[:count] - angles
+        engaged = np.sign(error) * np.maximum(np.abs(error) - self.width, 0.0)
+        return np.concatenate([angles + engaged, targets[count:]])
+
+
+class BlockedFlipper(Fault):
+    """Seized gears: a damper that no motor moves, at the flippers whose value is one half or more."""
+
+    needs = "flippers"
+    front_left = Parameter(1.0, 0.0, 1.0)
+    front_right = Parameter(0.0, 0.0, 1.0)
+    rear_left = Parameter(0.0, 0.0, 1.0)
+    rear_right = Parameter(0.0, 0.0, 1.0)
+    _DAMPING = 1e4
+    """[N m s/rad] per kilogram of the robot."""
+
+    @override
+    def modify_spec(self, spec: mujoco.MjSpec, robot: Vehicle) -> None:
+        for arm in robot.flippers:
+            end = "front" if arm.centre[0] >= arm.place[0] else "rear"
+            side = "left" if arm.place[1] >= 0.0 else "right"
+            if self.values[f"{end}_{side}"] >= 0.5:
+                spec.joint(arm.name).damping = [self._DAMPING * robot.mass, 0.0, 0.0]
 
 
 class FadingDrive(Fault):

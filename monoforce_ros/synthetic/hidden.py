@@ -66,6 +66,8 @@ def parse_hidden(text: str) -> Fault:
 def draw_hidden(seed: int, excluded: Sequence[str] = ()) -> tuple[Fault, ...]:
     """Random faults: none, one, two of different names, or one that is not in the catalogue of effects.
 
+    Faults of steering and flippers are never drawn, since most robots have neither.
+
     Parameters deviate from their neutral value by 0.6 to 1.4 times as much as the default does, within their range.
 
     Args:
@@ -76,7 +78,11 @@ def draw_hidden(seed: int, excluded: Sequence[str] = ()) -> tuple[Fault, ...]:
     kind = str(random.choice([name for name, _ in _KINDS], p=[probability for _, probability in _KINDS]))
     count = {"nothing": 0, "pair": 2}.get(kind, 1)
     in_catalogue = kind != "out_of_catalogue"
-    names = [n for n, f in sorted(FAULTS.items()) if f.in_catalogue == in_catalogue and n not in excluded]
+    names = [
+        name
+        for name, fault in sorted(FAULTS.items())
+        if fault.in_catalogue == in_catalogue and not fault.needs and name not in excluded
+    ]
     drawn = []
     for name in random.choice(names, count, replace=False):
         values = {}

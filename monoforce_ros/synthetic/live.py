@@ -92,6 +92,12 @@ class LiveWorld:
         motion = (state.position, state.quaternion, state.linear_velocity, state.angular_velocity)
         return builders.odometry(stamp, ODOM_FRAME, self.robot.base_frame, *motion)
 
+    def joint_states(self, stamp: int) -> object | None:
+        """Current ``sensor_msgs/JointState`` of wheels, steering, casters and flippers; None if only wheels move."""
+        if not (self.robot.servos or self.robot.casters):
+            return None
+        return builders.joint_state(stamp, self.simulation.joint_names, *self.simulation.joint_states())
+
     def cloud(self, stamp: int) -> object | None:
         """Current ``sensor_msgs/PointCloud2``; None without a lidar."""
         if self._lidar is None:

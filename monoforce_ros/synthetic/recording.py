@@ -19,6 +19,7 @@ from monoforce_ros.core import write_text
 from monoforce_ros.synthetic.command_profile import CommandProfile, make_profile
 from monoforce_ros.synthetic.fault import Fault
 from monoforce_ros.synthetic.faults import VegetationDrag
+from monoforce_ros.synthetic.flipper_program import HOLD, make_flipper_program
 from monoforce_ros.synthetic.hidden import write_truth
 from monoforce_ros.synthetic.labels import world_labels, write_labels
 from monoforce_ros.synthetic.odometry import Odometry, OdometrySettings
@@ -57,8 +58,10 @@ class RecordingSettings:
             depend on the recorded sensors.
         duration: [s].
         robot: name or YAML file.
-        commands: ``random``, ``steps``, ``sweep``, ``straight``, ``circle``, ``spin`` or a CSV file with the columns
-            t,v,w.
+        commands: ``random``, ``steps``, ``sweep``, ``straight``, ``circle``, ``spin``, ``crab`` or a CSV file with the
+            columns t,v,w or t,v,w,y.
+        command_type: ``twist``, or ``ackermann`` to record steering angles as AckermannDriveStamped.
+        flippers: ``hold``, ``steps`` or a CSV file with the columns t and names of flippers.
         terrain: the ground.
         camera: settings of every camera, or None to record no images.
         cameras: number of cameras, one to four: front, left, right and rear. A camera that the robot file lacks is the
@@ -79,6 +82,8 @@ class RecordingSettings:
     duration: float = 10.0
     robot: str = "husky"
     commands: str = "random"
+    command_type: str = "twist"
+    flippers: str = HOLD
     terrain: TerrainSettings = field(default_factory=TerrainSettings)
     camera: CameraSettings | None = field(default_factory=CameraSettings)
     lidar: LidarSettings | None = field(default_factory=LidarSettings)
@@ -98,6 +103,8 @@ class RecordingSettings:
             raise ValueError(f"duration: got {self.duration}, expected 0.1 to 3600 s")
         if self.cameras is not None and not 1 <= self.cameras <= len(_SIDES):
             raise ValueError(f"cameras: got {self.cameras}, expected 1 to {len(_SIDES)}")
+        if self.command_type not in ("twist", "ackermann"):
+            raise ValueError(f"command type: got {self.command_type!r}, expected twist or ackermann")
         if (self.terrain.flat or self.terrain.bare) and any(isinstance(p, VegetationDrag) for p in self.hidden or ()):
             raise ValueError("hidden vegetation_drag: got a world without vegetation; leave out --flat and --bare")
 
@@ -148,13 +155,25 @@ def record(out: Path, settings: RecordingSettings, progress: Callable[[float], o
         robot = world.robot()
         rig = () if settings.camera is None else world.rig(robot)
         robot = dataclasses.replace(robot, sensors=_with_rig(robot, rig))
+    if settings.command_type == "ackermann" and robot.wheelbase is None:
+        raise ValueError(f"command type: got ackermann for {robot.name}, which is no car, expected twist")
+    problems = [problem for fault in settings.hidden or () if (problem := fault.complaint(robot))]
+    if problems:
+        raise ValueError(f"hidden {problems[0]}")
     with BagWriter(out, storage=settings.storage, overwrite=settings.overwrite) as bag:
         scenery = build_scenery(settings.terrain, settings.seed) if settings.world is None else world.scenery
         if settings.world is not None and settings.commands == "random":
             profile = world.driver(robot)
         else:
             random = random_stream(settings.seed, "commands")
-            profile = make_profile(settings.commands, scenery.route, random, robot.maximum_speed)
+            profile = make_profile(
+                settings.commands,
+                scenery.route,
+                random,
+                robot.maximum_speed,
+                robot.maximum_curvature,
+                crabs=robot.crabs,
+            )
         session = _Session(bag, settings, robot, scenery, profile, rig)
         try:
             summary = session.run(progress or (lambda seconds: None))
@@ -204,6 +223,9 @@ class _Session:
         model = build_model(scenery, robot, settings.seed, fields_of_view, hidden)
         self.simulation = Simulation(model, scenery, robot, hidden)
         self._odometry = Odometry(settings.odometry, random_stream(settings.seed, "odometry"), hidden)
+        self._flippers = make_flipper_program(
+            settings.flippers, robot.flippers, random_stream(settings.seed, "flippers")
+        )
         self._command_offset = round(1e9 * sum(fault.command_stamp_offset for fault in hidden))
         self._pose_offset = round(1e9 * sum(fault.pose_stamp_offset for fault in hidden))
         self._gyro_offset = np.array([0.0, 0.0, sum(fault.gyro_offset for fault in hidden)])
@@ -303,10 +325,21 @@ class _Session:
     def _write_command(self) -> None:
         state = self.simulation.state()
         position = (state.position + self.simulation.odom_origin)[:2]
-        forward, yaw_rate = self._profile.command(self.simulation.time, position, state.heading)
-        self.simulation.drive(forward, yaw_rate)
+        command = self._profile.command(self.simulation.time, position, state.heading)
+        self.simulation.drive(*command)
         stamp = self._stamp + self._command_offset
-        self._write("/cmd_vel", builders.twist_stamped(stamp, self._robot.base_frame, forward, yaw_rate))
+        if self._settings.command_type == "ackermann":
+            assert self._robot.wheelbase is not None
+            angle = steering_angle(command[0], command[1], self._robot.wheelbase, self._robot.maximum_curvature)
+            message = builders.ackermann_drive(stamp, self._robot.base_frame, command[0], angle)
+            self._write("/ackermann_cmd", message)
+        else:
+            self._write("/cmd_vel", builders.twist_stamped(stamp, self._robot.base_frame, *command))
+        if self._flippers is not None:
+            angles = self._flippers.angles(self.simulation.time)
+            self.simulation.move_flippers(angles)
+            names = [arm.name for arm in self._robot.flippers]
+            self._write("/flipper_commands", builders.joint_state(stamp, names, angles, []))
 
     def _write_odometry(self) -> None:
         true = self.simulation.state()
@@ -319,8 +352,8 @@ class _Session:
         self._deliver(self._stamp)
 
     def _write_wheels(self) -> None:
-        names = [wheel.joint for wheel in self._robot.wheels]
-        self._write("/joint_states", builders.joint_state(self._stamp, names, *self.simulation.wheel_states()))
+        names = self.simulation.joint_names
+        self._write("/joint_states", builders.joint_state(self._stamp, names, *self.simulation.joint_states()))
 
     def _write_imu(self) -> None:
         turning, force = self._imu.read()
@@ -351,6 +384,20 @@ class _Session:
             )  # fmt: skip
             self._write(f"/{frame}/image_raw/compressed", self._workers.submit(encode))
             self._write(f"/{frame}/camera_info", info)
+
+
+def steering_angle(forward: float, yaw_rate: float, wheelbase: float, maximum_curvature: float) -> float:
+    """Angle of the bicycle's wheel that turns as commanded [rad]; 0 at standstill.
+
+    Args:
+        forward: speed [m/s].
+        yaw_rate: [rad/s].
+        wheelbase: of the bicycle [m].
+        maximum_curvature: that the steering reaches [1/m].
+    """
+    if abs(forward) < 1e-3:
+        return 0.0
+    return math.atan(wheelbase * float(np.clip(yaw_rate / forward, -maximum_curvature, maximum_curvature)))
 
 
 def _robots_cameras(robot: Vehicle, settings: CameraSettings | None) -> tuple[RecordedCamera, ...]:

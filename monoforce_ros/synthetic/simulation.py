@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from monoforce_ros.synthetic import vehicle, world
 from monoforce_ros.synthetic.fault import Fault
 from monoforce_ros.synthetic.graphics import mujoco
+from monoforce_ros.synthetic.joint_servos import JointServos
 from monoforce_ros.synthetic.scenery import Scenery
 from monoforce_ros.synthetic.vehicle import Vehicle
 
@@ -51,7 +52,7 @@ class BaseState:
 
 
 class Simulation:
-    """A robot in a world, at rest on the ground and driven by wheel speeds.
+    """A robot in a world, at rest on the ground and driven by wheel speeds and by the angles of its joints.
 
     The odom frame is the world frame, shifted to where the base frame comes to rest before the start: its z axis points
     up, and the robot starts at its origin with a heading of 0.
@@ -64,6 +65,8 @@ class Simulation:
         wheel_bodies: ids of the wheel bodies.
         tyres: ids of the wheel geometries that touch the ground.
         tyre_friction: friction coefficient of each tyre on ordinary ground ``[wheels]``.
+        driven: indices of the wheels that the model's first actuators turn, in their order; those of steering and
+            flippers follow.
     """
 
     def __init__(self, model: mujoco.MjModel, scenery: Scenery, robot: Vehicle, hidden: Sequence[Fault] = ()):
@@ -75,7 +78,12 @@ class Simulation:
         self.wheel_bodies = [model.body(wheel.joint).id for wheel in robot.wheels]
         self.tyres = [model.geom(wheel.surface).id for wheel in robot.wheels]
         self.tyre_friction = model.geom_friction[self.tyres, 0].copy()
-        self._commanded = np.zeros(len(robot.wheels))
+        self.driven = np.array([index for index, wheel in enumerate(robot.wheels) if wheel.driven], int)
+        self._speeds = np.zeros(len(robot.wheels))
+        self._steering = np.zeros(len(robot.steering))
+        self._rest = np.array([0.0] * len(robot.steering) + [arm.angle for arm in robot.flippers])
+        self._flippers = self._rest[len(robot.steering) :]
+        self._servos = JointServos(robot.servos, self._rest, world.TIME_STEP) if robot.servos else None
         # Most steps are on ordinary ground, where one look-up in these masks suffices.
         x, y = scenery.ground.grid()
         positions = np.stack([x, y], axis=-1)
@@ -91,6 +99,11 @@ class Simulation:
         joints = [model.joint(wheel.joint) for wheel in robot.wheels]
         self._wheel_positions = [joint.qposadr[0] for joint in joints]
         self._wheel_velocities = [joint.dofadr[0] for joint in joints]
+        moving = [pivot.name for pivot in (*robot.steering, *robot.casters)] + [arm.name for arm in robot.flippers]
+        self.joint_names = (*(wheel.joint for wheel in robot.wheels), *moving)
+        """Names of the joints of :meth:`joint_states`."""
+        self._joints = [model.joint(name) for name in moving]
+        self._offsets = np.array([0.0] * (len(moving) - len(robot.flippers)) + [arm.angle for arm in robot.flippers])
         mujoco.mj_forward(model, self.data)
         self.steps = 0
         self._faults_active = False
@@ -110,13 +123,20 @@ class Simulation:
         """Time since the robot came to rest [s]."""
         return self.steps * world.TIME_STEP
 
-    def drive(self, forward: float, yaw_rate: float) -> None:
-        """Command a forward speed [m/s] and a yaw rate [rad/s], held until the next call."""
-        self._commanded = self.robot.wheel_speeds(forward, yaw_rate)
+    def drive(self, forward: float, yaw_rate: float, lateral: float = 0.0) -> None:
+        """Command a forward speed [m/s], a yaw rate [rad/s] and, of a robot that crabs, a speed to the left [m/s].
+
+        Commands hold until the next call.
+        """
+        self._speeds, self._steering = self.robot.command(forward, yaw_rate, lateral)
+
+    def move_flippers(self, angles: np.ndarray) -> None:
+        """Command angles of the flippers ``[F]`` [rad], held until the next call."""
+        self._flippers = np.array(angles, float)
 
     def step(self) -> None:
         """Advance by ``world.TIME_STEP``."""
-        speeds = self._commanded
+        speeds, angles = self._speeds, np.concatenate([self._steering, self._flippers])
         self.data.xfrc_applied[:] = 0.0
         grass = self.grass_forces()
         if grass is not None:
@@ -126,7 +146,14 @@ class Simulation:
                 speeds = fault.wheel_speeds(self.time, speeds)
                 fault.apply_forces(self)
             self._set_friction()
-        self.data.ctrl[:] = speeds
+        self.data.ctrl[: len(self.driven)] = speeds[self.driven]
+        if self._servos is not None:
+            # The model's zero is the angle in the robot file.
+            targets = self._servos.step(angles) - self._rest
+            if self._faults_active:
+                for fault in self._hidden:
+                    targets = fault.joint_targets(self, targets)
+            self.data.ctrl[len(self.driven) :] = targets
         mujoco.mj_step(self.model, self.data)
         self.steps += 1
 
@@ -157,6 +184,15 @@ class Simulation:
     def wheel_states(self) -> tuple[np.ndarray, np.ndarray]:
         """Angle [rad] and speed [rad/s] of each wheel, positive forwards."""
         return self.data.qpos[self._wheel_positions].copy(), self.data.qvel[self._wheel_velocities].copy()
+
+    def joint_states(self) -> tuple[np.ndarray, np.ndarray]:
+        """Angle [rad] and rate [rad/s] of wheels, steering, casters and flippers, in the order of ``joint_names``."""
+        angles, speeds = self.wheel_states()
+        if not self._joints:
+            return angles, speeds
+        moved = np.array([self.data.qpos[joint.qposadr[0]] for joint in self._joints]) + self._offsets
+        rates = np.array([self.data.qvel[joint.dofadr[0]] for joint in self._joints])
+        return np.concatenate([angles, moved]), np.concatenate([speeds, rates])
 
     def mishap(self) -> str | None:
         """Why the simulation cannot continue, or None."""

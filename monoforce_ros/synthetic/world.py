@@ -55,6 +55,7 @@ def build_model(
     """
     spec = mujoco.MjSpec()
     spec.option.timestep = TIME_STEP
+    spec.compiler.degree = False
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     _add_ground(spec, scenery)

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from monoforce_ros.bags import BagError, Recording, SmoothedMotion, add_read_options, read_options, smooth
-from monoforce_ros.core import write_bytes, write_text
+from monoforce_ros.core import OptionParser, write_bytes, write_text
 from monoforce_ros.reporting import figure_png, progress
 from monoforce_ros.robots import RobotFileError, RobotModel, load_robot, shipped_robots
 from monoforce_ros.terrain import TerrainDefaults, TerrainError, save_terrain
@@ -76,7 +76,7 @@ class FittedTrajectory:
 
 def build_parser() -> argparse.ArgumentParser:
     """The parser of the command line."""
-    parser = argparse.ArgumentParser(
+    parser = OptionParser(
         prog="fit_terrain",
         description="Fit the supporting terrain (H_t*) to recorded motion by gradient descent through the physics, and "
         "map the visible terrain (H_g*) from lidar sweeps. Writes a map, a figure and metrics for each trajectory. "
@@ -194,8 +194,9 @@ def _fit_one(
                 recording, motion, robot, grid, pose, start=first_sweep, stop=stop, material=material
             )
         fit = fit_terrain(
-            motion, recording.commands, robot, start=start, length=options.length, visible=visible, settings=settings
-        )
+            motion, recording.commands, robot, start=start, length=options.length, visible=visible, settings=settings,
+            joints=recording.joints,
+        )  # fmt: skip
     except (TerrainError, ValueError) as error:
         return replace(trajectory, error=str(error))
     figures = FitFigures.of(fit)

@@ -361,6 +361,8 @@ def _motion(
     rotations = turn @ chunks.rotations[usable] @ mirror
     # Angular velocity is a pseudovector: a reflection also flips its sign.
     handedness = -1.0 if mirrored else 1.0
+    # A mirror image turns the other way, and moves to the other side.
+    mirrored_twist = np.array([1.0, handedness, handedness], np.float32)
     angular_velocities = chunks.angular_velocities[usable] @ mirror * handedness
     return {
         "map_of": np.zeros(len(usable), np.int64),
@@ -368,5 +370,5 @@ def _motion(
         "rotations": rotations.astype(np.float32),
         "velocity": np.einsum("wij,wj->wi", rotations[:, 0], chunks.velocities[usable] @ mirror).astype(np.float32),
         "angular_velocity": np.einsum("wij,wj->wi", rotations[:, 0], angular_velocities).astype(np.float32),
-        "twists": chunks.twists[usable] * np.array([1.0, handedness], np.float32),
+        "twists": chunks.twists[usable] * mirrored_twist[: chunks.twists.shape[-1]],
     }

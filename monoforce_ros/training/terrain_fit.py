@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.nn import functional
 
-from monoforce_ros.bags import Windows, cut_windows
+from monoforce_ros.bags import JointRecord, Windows, cut_windows
 from monoforce_ros.core import CommandTrack, MotionTrack, homogeneous, transform_points
 from monoforce_ros.effects import controls
 from monoforce_ros.physics import PhysicsOptions, State, rest_depth, rollout
@@ -119,6 +119,7 @@ def fit_terrain(
     settings: FitSettings = FitSettings(),
     backend: str = "auto",
     progress: Callable[[], None] = lambda: None,
+    joints: JointRecord | None = None,
 ) -> TerrainFit:
     """Fit heights, and optionally friction, to a driven trajectory.
 
@@ -137,6 +138,7 @@ def fit_terrain(
         settings: settings of the fit.
         backend: backend of the rollout.
         progress: called after each step of the descent.
+        joints: recorded joints of the robot, if there are any.
 
     Raises:
         ValueError: there is no odometry for a single chunk.
@@ -145,8 +147,9 @@ def fit_terrain(
     pose = trajectory_frame(motion, start)
     local = _within(motion, start, length)
     windows = cut_windows(
-        local, commands, length=settings.chunk, stride=settings.chunk, sample_time=_SAMPLE_TIME, maximum_gap=0.5
-    )
+        local, commands, length=settings.chunk, stride=settings.chunk, sample_time=_SAMPLE_TIME, maximum_gap=0.5,
+        joints=joints,
+    )  # fmt: skip
     traced, contact_mask = traced_heights(local, robot, pose, grid, material.stiffness)
     initial = _initial_heights(traced, contact_mask, visible)
     geometric = initial if visible is None else visible.geometric_height.numpy()
@@ -199,7 +202,11 @@ class _Chunks:
             angular_velocity=tensor((rotation @ windows.angular_velocities[:, 0, :, None])[..., 0]),
         )
         with torch.no_grad():
-            self.controls = controls(robot, tensor(windows.twists), self.options.time_step, history=windows.history)
+            self.controls = controls(
+                robot, tensor(windows.twists), self.options.time_step, history=windows.history,
+                joint_start=None if windows.joint_start is None else tensor(windows.joint_start),
+                flippers=None if windows.flippers is None else tensor(windows.flippers),
+            )  # fmt: skip
 
     def roll_out(self, terrain: TerrainMap, backend: str) -> tuple[Tensor, Tensor]:
         """Positions ``[chunks, K, 3]`` [m] and rotations ``[chunks, K, 3, 3]`` at the sampled times."""
@@ -317,7 +324,7 @@ def traced_heights(
     motion: MotionTrack, robot: RobotModel, pose: np.ndarray, grid: Grid, stiffness: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Heights traced by the undersides of wheels and tracks ``[rows, columns]`` [m], and the contact mask."""
-    underside = robot.points[robot.point_tangents[:, 0] < -0.97].double().numpy()
+    underside = robot.underside.double().numpy()
     inverse = np.linalg.inv(pose)
     rotations = Rotation.from_quat(motion.quaternions).as_matrix()
     underside_points = [

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from monoforce_ros.bags import BagError, add_read_options, read_options
-from monoforce_ros.core import write_text
+from monoforce_ros.core import OptionParser, write_text
 from monoforce_ros.encoder import (
     SENSORS,
     CheckpointError,
@@ -87,7 +87,7 @@ class _RenamedOption(argparse.Action):
 
 def build_parser() -> argparse.ArgumentParser:
     """The parser of the command line."""
-    parser = argparse.ArgumentParser(
+    parser = OptionParser(
         prog="train",
         description="Train the terrain encoder on recordings of images, odometry, commands and lidar sweeps. The same "
         "command resumes an interrupted training. Use torchrun to train with several processes.",

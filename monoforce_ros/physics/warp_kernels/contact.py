@@ -7,7 +7,10 @@ from typing import Any
 import warp as wp
 
 from monoforce_ros.physics.contact import RIGID_FACTOR, RIGID_SLOPE, STEEPEST_SOIL
+from monoforce_ros.physics.soil_contact import FACING
+from monoforce_ros.physics.warp_kernels.soil import soil_pressure
 from monoforce_ros.physics.warp_kernels.structs import types
+from monoforce_ros.physics.warp_kernels.tread import tread_function
 
 CONSTANT_LOOKUP, BILINEAR_LOOKUP = 0, 1
 VERTICAL_FORCE, NORMAL_FORCE = 0, 1
@@ -29,10 +32,11 @@ class ContactFunctions:
 
 
 @cache
-def contact_functions(double: bool) -> ContactFunctions:
-    """Device functions in float64 (``double``) or float32."""
+def contact_functions(double: bool, soft: bool) -> ContactFunctions:
+    """Device functions in float64 (``double``) or float32, on firm ground or on ``soft`` soil."""
     t = types(double)
     scalar, vec2, vec3, vec4, mat33 = t.scalar, t.vec2, t.vec3, t.vec4, t.mat33
+    pressure, tread = soil_pressure(double), tread_function(double)
     Ground, Body, Robots, States, State, Options, Touch = (
         t.Ground, t.Body, t.Robots, t.States, t.State, t.Options, t.Touch
     )  # fmt: skip
@@ -168,12 +172,22 @@ def contact_functions(double: bool) -> ContactFunctions:
             # Faces of the hull meet steep ground stiffly, and it pushes them inwards.
             depth = gap * normal[2]
             outward = turned * body.outward[i]
+            if wp.static(soft):
+                upwards = normal
             head_on = wp.dot(outward, normal)
             steep = wp.clamp((scalar(STEEPEST_SOIL) - normal[2]) * scalar(STEEPENING), scalar(0.0), scalar(1.0))
             if head_on > scalar(0.0):
                 mirrored = normal - scalar(2.0) * steep * head_on * outward
                 normal = mirrored * (scalar(1.0) / wp.sqrt(wp.dot(mirrored, mirrored) + scalar(1.0e-12)))
             rigid = scalar(1.0) + scalar(RIGID_GAIN) * steep * wp.abs(head_on)
+            if wp.static(soft):
+                # The face of a belt lies along its tangent, across the y axis of its link.
+                runs = body.tangents[i]
+                face = turned * (body.outward[i] + vec3(-runs[2], scalar(0.0), runs[0]))
+                push = (scalar(1.0) - wp.dot(face, face)) * upwards - face
+                facing = wp.clamp(scalar(1.0) + wp.dot(push, upwards) / scalar(FACING), scalar(0.0), scalar(1.0))
+                mixed = (scalar(1.0) - steep) * push + steep * normal
+                normal = mixed * (scalar(1.0) / wp.sqrt(wp.dot(mixed, mixed) + scalar(1.0e-12)))
             stiffness = material[0] / ground_factors[0] * rigid
             ground_damping = material[1] / ground_factors[0] * rigid
             resistance = robots.resistance[b]
@@ -191,7 +205,7 @@ def contact_functions(double: bool) -> ContactFunctions:
             along = wp.cross(across, normal)
             velocity_along = wp.dot(velocity, along)
             velocity_across = wp.dot(velocity, across)
-            slip_along = grip * (velocity_along + wp.dot(belt, along))
+            slip_along = grip * (velocity_along + tread(belt, along))
             slip_across = velocity_across + wp.dot(belt, across)
             friction_along = grip * material[2] * factors[0]
             friction_across = material[2] * factors[1]
@@ -199,20 +213,40 @@ def contact_functions(double: bool) -> ContactFunctions:
             force_across = scalar(0.0)
             gain_along = scalar(0.0)
             gain_across = scalar(0.0)
-            if options.tangential == 1:
-                per_speed = load / wp.sqrt(slip_along * slip_along + slip_across * slip_across + options.slip_square)
-                gain_along = friction_along * per_speed
-                gain_across = friction_across * per_speed
+            if wp.static(soft):
+                slip_speed = wp.sqrt(slip_along * slip_along + slip_across * slip_across + options.slip_square)
+                yields = pressure(
+                    robots.soil[b], body.strips[i], wp.where(body.drives[i] >= 0, scalar(1.0), scalar(0.0)), depth,
+                    approach, vec2(slip_along, slip_across), wp.dot(velocity, wp.cross(across, upwards)),
+                    grip * velocity_along, wp.dot(belt, along), -wp.dot(belt, upwards),
+                    ground_factors[0], options.time_step, options.slip_square,
+                )  # fmt: skip
+                yielding = area * (scalar(1.0) - steep) * facing
+                held_by = (material[2] * steep * load + yielding * yields[3]) / slip_speed
+                load = steep * load + yielding * yields[0]
+                pressing = steep * pressing + yielding * yields[1]
+                normal_gain = steep * normal_gain + yielding * yields[2]
+                gain_along = grip * factors[0] * held_by
+                gain_across = factors[1] * held_by
                 force_along = -gain_along * slip_along
                 force_across = -gain_across * slip_across
-            if options.tangential == 2:
-                weight = robots.mass[b] * options.gravity * body.share[i]
-                active_along = scalar(1.0) / (scalar(1.0) + wp.exp(slip_along))
-                active_across = scalar(1.0) / (scalar(1.0) + wp.exp(slip_across))
-                force_along = friction_along * weight * (active_along - scalar(0.5))
-                force_across = friction_across * weight * (active_across - scalar(0.5))
-                gain_along = friction_along * weight * active_along * (scalar(1.0) - active_along)
-                gain_across = friction_across * weight * active_across * (scalar(1.0) - active_across)
+            if wp.static(not soft):
+                if options.tangential == 1:
+                    per_speed = load / wp.sqrt(
+                        slip_along * slip_along + slip_across * slip_across + options.slip_square
+                    )
+                    gain_along = friction_along * per_speed
+                    gain_across = friction_across * per_speed
+                    force_along = -gain_along * slip_along
+                    force_across = -gain_across * slip_across
+                if options.tangential == 2:
+                    weight = robots.mass[b] * options.gravity * body.share[i]
+                    active_along = scalar(1.0) / (scalar(1.0) + wp.exp(slip_along))
+                    active_across = scalar(1.0) / (scalar(1.0) + wp.exp(slip_across))
+                    force_along = friction_along * weight * (active_along - scalar(0.5))
+                    force_across = friction_across * weight * (active_across - scalar(0.5))
+                    gain_along = friction_along * weight * active_along * (scalar(1.0) - active_along)
+                    gain_across = friction_across * weight * active_across * (scalar(1.0) - active_across)
             touch.grip_force = vec2(force_along, force_across)
             touch.grip_gain = vec2(gain_along, gain_across)
             # Rolling resistance and vegetation depend on the velocity of the body, not on slip.

@@ -7,14 +7,16 @@ import warp as wp
 
 from monoforce_ros.physics.warp_kernels.contact import contact_functions
 from monoforce_ros.physics.warp_kernels.structs import types
+from monoforce_ros.physics.warp_kernels.tread import tread_function
 
 
 @cache
-def forces_joints_kernel(double: bool, differentiable: bool) -> Any:
+def forces_joints_kernel(double: bool, differentiable: bool, soft: bool) -> Any:
     """The kernel in float64 (``double``) or float32, with its adjoint or, compiled sooner, without."""
     t = types(double)
-    functions = contact_functions(double)
+    functions = contact_functions(double, soft)
     state_at, touch_ground, over_the_step = functions.state_at, functions.touch_ground, functions.over_the_step
+    tread = tread_function(double)
     scalar, vec3 = t.scalar, t.vec3
     Ground, Body, Robots, States, Options = t.Ground, t.Body, t.Robots, t.States, t.Options
     Joints, Links = t.Joints, t.Links
@@ -76,7 +78,7 @@ def forces_joints_kernel(double: bool, differentiable: bool) -> Any:
                     gained = states.belts[b, step + 1, drive] - speed
                     acted = acted - gained * vec3(
                         scalar(0.0),
-                        touch.grip_gain[0] * wp.dot(belt, touch.along),
+                        touch.grip_gain[0] * tread(belt, touch.along),
                         touch.grip_gain[1] * wp.dot(belt, touch.across),
                     )
             normal_forces[b, slot, i] = acted[0]

@@ -17,10 +17,10 @@ from monoforce_ros.physics.warp_kernels.structs import types
 
 
 @cache
-def integrate_kernel(double: bool) -> Any:
-    """The kernel in float64 (``double``) or float32."""
+def integrate_kernel(double: bool, soft: bool) -> Any:
+    """The kernel in float64 (``double``) or float32, on firm ground or on ``soft`` soil."""
     t = types(double)
-    functions = contact_functions(double)
+    functions = contact_functions(double, soft)
     loads_at = external_loads(double)
     rigid = body_functions(double)
     state_at, may_touch, below_ground, touch_ground, belt_speed = (

@@ -13,10 +13,10 @@ from monoforce_ros.physics.warp_kernels.structs import types
 
 
 @cache
-def integrate_joints_kernel(double: bool, differentiable: bool) -> Any:
+def integrate_joints_kernel(double: bool, differentiable: bool, soft: bool) -> Any:
     """The kernel in float64 (``double``) or float32, with its adjoint or, compiled sooner, without."""
     t = types(double)
-    functions, rigid, moving = contact_functions(double), body_functions(double), joint_functions(double)
+    functions, rigid, moving = contact_functions(double, soft), body_functions(double), joint_functions(double)
     loads_at = external_loads(double)
     state_at, may_touch, below_ground, touch_ground = (
         functions.state_at, functions.may_touch, functions.below_ground, functions.touch_ground

@@ -11,6 +11,7 @@ import warp as wp
 
 from monoforce_ros.physics.warp_kernels.body import body_functions
 from monoforce_ros.physics.warp_kernels.structs import types
+from monoforce_ros.physics.warp_kernels.tread import tread_function
 
 SLOWEST = 1e-3
 SHIFT, SPIN, DRIFT, AXIS, ORIGIN, PLACE = range(6)
@@ -35,6 +36,7 @@ class JointFunctions:
 def joint_functions(double: bool) -> JointFunctions:
     """Device functions in float64 (``double``) or float32."""
     t = types(double)
+    tread = tread_function(double)
     exponential = body_functions(double).exponential
     scalar, vec2, vec3, mat33 = t.scalar, t.vec2, t.vec3, t.mat33
     Robots, States, Joints, Links, Touch, Body = t.Robots, t.States, t.Joints, t.Links, t.Touch, t.Body
@@ -229,7 +231,7 @@ def joint_functions(double: bool) -> JointFunctions:
             drive = joints.coordinates[joints.number + body.drives[i]]
             if drive >= 0:
                 belt = links.turns[thread, slot, link] * body.tangents[i]
-                slips = vec2(wp.dot(belt, touch.along), wp.dot(belt, touch.across))
+                slips = vec2(tread(belt, touch.along), wp.dot(belt, touch.across))
                 weighted = wp.cw_mul(touch.grip_gain, slips)
                 wp.atomic_add(work.values, thread, slot, drive, 2, wp.dot(slips, touch.grip_force))
                 wp.atomic_add(work.joined, thread, slot, drive, drive, wp.dot(weighted, slips))

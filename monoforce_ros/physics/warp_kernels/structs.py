@@ -4,13 +4,14 @@ Warp needs annotations as objects, not strings, so modules of this package must 
 ``from __future__ import annotations``.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
 from typing import Any
 
 import warp as wp
 
 from monoforce_ros.effects import FEATURES
+from monoforce_ros.physics.soil import Soil
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,7 @@ class Types:
     vec4: Any
     mat33: Any
     features: Any
+    soil: Any
     wrench: Any
     Ground: Any
     Body: Any
@@ -45,6 +47,7 @@ def types(double: bool) -> Types:
     vec4 = wp.types.vector(length=4, dtype=scalar)
     mat33 = wp.types.matrix(shape=(3, 3), dtype=scalar)
     features = wp.types.vector(length=len(FEATURES), dtype=scalar)
+    soil_values = wp.types.vector(length=len(fields(Soil)), dtype=scalar)
     wrench_matrix = wp.types.matrix(shape=(6, len(FEATURES)), dtype=scalar)
 
     @wp.struct
@@ -67,6 +70,7 @@ def types(double: bool) -> Types:
         share: wp.array(dtype=scalar)  # of the robot's weight
         drives: wp.array(dtype=wp.int32)  # -1 on the hull
         outward: wp.array(dtype=vec3)  # normal of the hull, zero on belts
+        strips: wp.array(dtype=vec2)  # width and curvature of the surface, where the ground is soft soil
         cluster_centres: wp.array(dtype=vec3)
         cluster_halves: wp.array(dtype=vec3)
         cluster_edges: wp.array(dtype=wp.int32)
@@ -85,6 +89,7 @@ def types(double: bool) -> Types:
         tilt: wp.array(dtype=vec2)  # of gravity
         resistance: wp.array(dtype=vec4)  # rolling, linear drag, quadratic drag, yield speed of vegetation
         wrench: wp.array(dtype=wrench_matrix)
+        soil: wp.array(dtype=soil_values)  # parameters of soft soil
 
     @wp.struct
     class States:  # [B, T + 1]
@@ -160,6 +165,7 @@ def types(double: bool) -> Types:
         vec4,
         mat33,
         features,
+        soil_values,
         wrench_matrix,
         Ground,
         Body,

@@ -10,10 +10,10 @@ from monoforce_ros.physics.warp_kernels.structs import types
 
 
 @cache
-def summarise_kernel(double: bool) -> Any:
-    """The kernel in float64 (``double``) or float32."""
+def summarise_kernel(double: bool, soft: bool) -> Any:
+    """The kernel in float64 (``double``) or float32, on firm ground or on ``soft`` soil."""
     t = types(double)
-    functions = contact_functions(double)
+    functions = contact_functions(double, soft)
     state_at, may_touch, touch_ground, belt_speed, over_the_step = (
         functions.state_at, functions.may_touch, functions.touch_ground, functions.belt_speed, functions.over_the_step
     )  # fmt: skip

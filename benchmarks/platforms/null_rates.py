@@ -1,0 +1,106 @@
+"""How often healthy drives would raise a false alarm, and how often true effects are significant, by ``drive_share``.
+
+    scripts/run.sh python benchmarks/platforms/null_rates.py --work out/platforms --label LABEL
+
+For every recorded drive it prints the adjusted p-value of the most significant effect alone, for several values of the
+variance between healthy drives of one robot as a share of that between segments of its commissioning drive
+(``drive_share`` of ``discrepancy/thresholds.py``), and for all drives the share below ``effect_rate``. The smallest
+value at which healthy drives stay above that rate as often as stated is the one to choose.
+Needs recordings and commissioned platforms: run.py makes both.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from benchmark_case import CASE_KINDS, SETS, Case, all_cases
+from case_recording import CaseFiles
+from case_search import search_of
+from tqdm import tqdm
+
+from monoforce_ros.core import write_text
+from monoforce_ros.discrepancy.thresholds import Thresholds
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--work", type=Path, default=Path("out/platforms"), help="folder of run.py (out/platforms)")
+    parser.add_argument("--label", required=True, help="results of run.py whose commissioned platforms are used")
+    parser.add_argument("--set", choices=sorted(SETS), default="choosing", help="set of seeds (choosing)")
+    parser.add_argument(
+        "--kind", choices=CASE_KINDS, nargs="+", default=["empty", "single"], help="kinds of drives (empty single)"
+    )
+    parser.add_argument(
+        "--shares", type=float, nargs="+", default=[0.0, 0.1, 0.25, 0.5, 0.8, 1.25], help="values of drive_share"
+    )
+    parser.add_argument("--json", type=Path, help="write the rows to this file")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    rows = []
+    for case in tqdm([case for case in all_cases(options.set) if case.kind in options.kind], unit="drive"):
+        files = CaseFiles.of(case, options.work)
+        nominal = options.work / "results" / options.label / "nominal" / case.platform_name / "platform.yaml"
+        if not (files.truth.exists() and nominal.exists()):
+            continue
+        row = measured(case, files, nominal, options.shares)
+        if row is not None:
+            rows.append(row)
+            tqdm.write(row_line(row))
+    if not rows:
+        print(f"no drive of these kinds is recorded and commissioned in {options.work}: run run.py", file=sys.stderr)
+        return 1
+    for kind in options.kind:
+        print(summary(kind, [row for row in rows if row["kind"] == kind], options.shares))
+    if options.json:
+        write_text(options.json, json.dumps(rows, indent=1) + "\n")
+    return 0
+
+
+def measured(case: Case, files: CaseFiles, nominal_file: Path, shares: Sequence[float]) -> dict | None:
+    """The row of a drive; None where nothing can be compared."""
+    truth = json.loads(files.truth.read_text())
+    search = search_of(files, nominal_file) if truth["usable"] else None
+    if search is None or search.nominal is None:
+        return None
+    smallest = []
+    for share in shares:
+        results = search.screened(replace(search.thresholds, drive_share=share))
+        best = min(results, key=lambda result: result.adjusted)
+        smallest.append((best.name, best.adjusted))
+    return {
+        "case": case.name,
+        "kind": case.kind,
+        "hidden": [entry["name"] for entry in truth["hidden"]],
+        "loss_ratio": float(search.loss_of(()).mean()) / search.nominal.loss,
+        "smallest": smallest,
+    }
+
+
+def row_line(row: dict) -> str:
+    """One line about a drive."""
+    hidden = "+".join(row["hidden"]) or "nothing"
+    text = ", ".join(f"{p:.3f} {name}" for name, p in row["smallest"])
+    return f"{row['case']:44s} {hidden:24s} loss {row['loss_ratio']:5.2f} of healthy: {text}"
+
+
+def summary(kind: str, rows: Sequence[dict], shares: Sequence[float]) -> str:
+    """Shares of drives with a significant effect."""
+    if not rows:
+        return f"{kind}: no drive"
+    rate = Thresholds().effect_rate
+    text = f"{kind}: of {len(rows)} drives with an effect below {rate:g}:"
+    for number, share in enumerate(shares):
+        text += f" {sum(row['smallest'][number][1] <= rate for row in rows)} at {share:g},"
+    logarithms = np.log([row["loss_ratio"] for row in rows])
+    return f"{text[:-1]}; RMS of the logarithm of the loss ratio {float(np.sqrt(np.mean(logarithms**2))):.2f}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
