@@ -58,16 +58,17 @@ def fused(encoder: Encoder, precision: str = "float32") -> Encoder:
 def packed(encoder: Encoder) -> Encoder:
     """A fused encoder whose weights are pre-packed in oneDNN's memory layout, with activations fused; changed in place.
 
-    The encoder must stay on the CPU. It is returned unchanged if PyTorch was built without oneDNN.
+    The encoder must stay on the CPU. Convolutions stay as they are in a type that oneDNN does not pack here: all if
+    PyTorch was built without oneDNN, those in bfloat16 on processors without AVX-512.
     """
-    if not _can_pack():
-        return encoder
     for parent in list(encoder.modules()):
         if isinstance(parent, NormedConvolution):
             activation = _ACTIVATIONS[nn.ReLU6 if parent.bounded else None]
-            for name, part in list(parent.named_children()):
-                if isinstance(part, nn.Conv2d):
-                    setattr(parent, name, _PackedConvolution(part, activation))
+            convolutions = {name: part for name, part in parent.named_children() if isinstance(part, nn.Conv2d)}
+            if not all(map(_packs, convolutions.values())):
+                continue
+            for name, part in convolutions.items():
+                setattr(parent, name, _PackedConvolution(part, activation))
             parent.bounded = False
         elif isinstance(parent, nn.Sequential):
             _pack_sequence(parent)
@@ -77,7 +78,7 @@ def packed(encoder: Encoder) -> Encoder:
 def _pack_sequence(parent: nn.Sequential) -> None:
     parts = [(name, part) for name, part in parent.named_children() if not isinstance(part, nn.Identity)]
     for (name, part), (next_name, following) in pairwise([*parts, ("", None)]):
-        if isinstance(part, nn.Conv2d):
+        if isinstance(part, nn.Conv2d) and _packs(part):
             activation = type(following) if type(following) in _ACTIVATIONS else None
             setattr(parent, name, _PackedConvolution(part, _ACTIVATIONS[activation]))
             if activation is not None:
@@ -116,19 +117,25 @@ class _PackedConvolution(nn.Module):
         )
 
 
+def _packs(convolution: nn.Conv2d) -> bool:
+    return _can_pack(convolution.weight.dtype)
+
+
 @cache
-def _can_pack() -> bool:
-    """Whether this PyTorch has the operations of :class:`_PackedConvolution` and they give the right result."""
+def _can_pack(dtype: torch.dtype) -> bool:
+    """Whether PyTorch has the operations of :class:`_PackedConvolution` for this processor, and they are right."""
     # No random numbers: the caller's random state must not change.
     plain = skip_init(nn.Conv2d, 4, 4, 3, padding=1).requires_grad_(False)
     plain.weight.copy_(torch.linspace(-0.1, 0.1, 144).view(4, 4, 3, 3))
     plain.bias.copy_(torch.linspace(-1.0, 1.0, 4))
-    features = torch.linspace(-8.0, 8.0, 4 * 64).view(1, 4, 8, 8)
+    plain = plain.to(dtype)
+    features = torch.linspace(-8.0, 8.0, 4 * 64).view(1, 4, 8, 8).to(dtype)
     try:
         found = _PackedConvolution(plain, _ACTIVATIONS[nn.ReLU6])(features)
     except (AttributeError, RuntimeError):
         return False
-    return torch.allclose(found, functional.relu6(plain(features)), atol=1e-4)
+    # Values up to 6: bfloat16 has 8 significant bits.
+    return torch.allclose(found, functional.relu6(plain(features)), atol=1e-4 if dtype == torch.float32 else 0.1)
 
 
 def _rounded(weight: Tensor) -> Tensor:
