@@ -138,7 +138,7 @@ def robot(peer, start, request):
     assert "Traceback" not in process.output
 
 
-@pytest.mark.parametrize("robot", ["flipper_command_topic:=flipper_commands", "command_rate:=10.0"], indirect=True)
+@pytest.mark.parametrize("robot", ["flipper_output_topic:=flipper_commands", "command_rate:=10.0"], indirect=True)
 def test_flipper_angles_are_passed_on_only_where_a_topic_is_named_and_while_driving(robot, request):
     node, prefix = robot.peer.node, robot.prefix
     heard: list = []

@@ -105,7 +105,7 @@ class PathSelectorNode(Node):
         self._map_frame = ""
         self._cost_to_go: CostToGo | None = None
         self._commands = CommandOutput(self, settings.command_topic, settings.command_type)
-        self._flippers = FlipperOutput(self, settings.flipper_command_topic, settings.timeout)
+        self._flippers = FlipperOutput(self, settings.flipper_output_topic, settings.timeout)
         self._inputs = {
             "odometry": self._subscribe(settings.odometry_topic, "nav_msgs/msg/Odometry", Odometry, self._on_odometry),
             "candidates": self._subscribe(
