@@ -227,7 +227,9 @@ def test_an_injected_delay_is_named_added_and_closes_the_gap(
     assert done.returncode == 0, done.stderr
     report = json.loads((out / "report.json").read_text())
     assert report["verdict"] == "effect_found"
-    (effect,) = report["effects"]
+    effect, *others = report["effects"]
+    # The robot was never commissioned: what its file misses may stay beside the delay, in a part of the recording.
+    assert all(2 * other["found_again"][0] < other["found_again"][1] for other in others)
     # Commands and poses cannot distinguish a late base from a late pose clock; the gyro in the bag does.
     assert effect["name"] == "command_delay"
     assert "pose_clock_offset" not in effect["indistinguishable"]

@@ -227,7 +227,10 @@ def test_random_faults_cover_all_kinds_and_are_reproducible():
     counts = [len(faults) for faults in drawn]
     assert 0.12 < counts.count(0) / 400 < 0.28
     assert 0.12 < counts.count(2) / 400 < 0.28
-    assert {type(fault) for faults in drawn for fault in faults} == set(FAULTS.values())
+    # Those of joints are not drawn: most robots have none.
+    assert {type(fault) for faults in drawn for fault in faults} == {
+        fault for fault in FAULTS.values() if not fault.needs
+    }
     out_of_catalogue = [faults for faults in drawn if any(not fault.in_catalogue for fault in faults)]
     assert out_of_catalogue and all(len(faults) == 1 for faults in out_of_catalogue)
     first, again = draw_hidden(7), draw_hidden(7)

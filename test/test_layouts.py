@@ -20,7 +20,15 @@ RVIZ = {
 # What Foxglove's 3D panel draws of the nodes' types: no GridCells.
 FOXGLOVE = {"PointCloud2", "OccupancyGrid", "MarkerArray", "Path", "Odometry"}
 # Tables of numbers, and messages for other programs, are not for a 3D view.
-NOT_DRAWN = {"candidate_costs", "candidate_rollouts", "path_spread", "live_gap", "speed_filter_info", "grid_map"}
+NOT_DRAWN = {
+    "candidate_costs",
+    "candidate_rollouts",
+    "path_spread",
+    "live_gap",
+    "speed_filter_info",
+    "grid_map",
+    "flipper_angles",
+}
 
 
 def published() -> dict[str, tuple[str, bool]]:

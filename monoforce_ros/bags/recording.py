@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -26,7 +27,10 @@ from monoforce_ros.core import (
     nearest_stamp,
 )
 from monoforce_ros.messages import decoding
-from monoforce_ros.robots import RobotModel
+
+if TYPE_CHECKING:
+    # Players of bags start without physics.
+    from monoforce_ros.robots import RobotModel
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 COMMANDS = ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist")
