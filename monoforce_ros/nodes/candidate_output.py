@@ -176,8 +176,8 @@ class CandidateOutput:
         """Angles that the flippers are commanded over the horizon ``[T, F]`` [rad]; None without flippers."""
         if prediction.joints is None:
             return None
-        told = prediction.joints.flippers(1, self._predictor.steps, self._predictor.options.time_step)
-        return None if told is None else told[0].double().numpy()
+        commanded_flippers = prediction.joints.flippers(1, self._predictor.steps, self._predictor.options.time_step)
+        return None if commanded_flippers is None else commanded_flippers[0].double().numpy()
 
     def _flipper_angles(self, prediction: Prediction, angles: np.ndarray, delay: int) -> JointState:
         """The best candidate's flipper angles at its start, stamped with that time."""

@@ -181,8 +181,8 @@ class _FlipperProgram:
             return cls(torch.zeros(0, 0), torch.zeros(steps, 0), torch.zeros(0), torch.zeros(0), torch.zeros(0, 0))
         whole = angles.float().expand(predictor.steps, -1)
         if prediction.joints is not None:
-            told = prediction.joints.flippers(1, predictor.steps, predictor.options.time_step)
-            whole = whole if told is None else told[0]
+            commanded_flippers = prediction.joints.flippers(1, predictor.steps, predictor.options.time_step)
+            whole = whole if commanded_flippers is None else commanded_flippers[0]
         whole = whole if given is None else torch.as_tensor(given, dtype=torch.float32)
         if whole.shape != (predictor.steps, len(joints)):
             raise ValueError(f"flippers: got shape {tuple(whole.shape)}, expected [{predictor.steps}, {len(joints)}]")

@@ -315,7 +315,7 @@ class SteeringOffset(Fault):
 
 
 class SteeringGain(Fault):
-    """Servos that turn further or less than they are told, such as by another linkage."""
+    """Servos that turn further or less than commanded, such as by another linkage."""
 
     needs = "steering"
     gain = Parameter(0.75, 0.4, 1.4, neutral=1.0)
