@@ -63,7 +63,10 @@ def stages(encoder: TerrainEncoder, cameras: list[CameraView], repeats: int) -> 
     size = config.grid.rows * config.grid.columns
     batch = encoder_input(cameras, SUPPORT, config)
     with torch.no_grad():
-        depth, features = encoder._lift(batch)
+        def depths_and_features():
+            return encoder.lifted(*encoder.image_features(batch.images), batch.rays, batch.origins)
+
+        depth, features = depths_and_features()
         points = lifted_points(batch.rays, batch.origins, encoder.depths)
         cells = map_cells(points, config)
         dtype = encoder.lift.weight.dtype
@@ -75,7 +78,7 @@ def stages(encoder: TerrainEncoder, cameras: list[CameraView], repeats: int) -> 
         return {
             "geometry and resizing": timed(lambda: encoder_input(cameras, SUPPORT, config), repeats),
             "backbone": timed(lambda: encoder.backbone(images), repeats),
-            "backbone, neck and depths": timed(lambda: encoder._lift(batch), repeats),
+            "backbone, neck and depths": timed(depths_and_features, repeats),
             "points and cells": timed(
                 lambda: map_cells(lifted_points(batch.rays, batch.origins, encoder.depths), config), repeats
             ),

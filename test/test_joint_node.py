@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from sensor_msgs.msg import JointState
 
 from monoforce_ros.bags import builders
 
@@ -85,25 +84,6 @@ def test_commanded_angles_move_the_flippers_over_the_horizon(peer, predictor):
 
     _, pitch = predicted(peer, predictor, joints=measured([0.3, 0.3, -0.14, -0.14]), commands=turning)
     assert pitch > 0.1
-
-
-def test_the_best_candidate_s_flipper_angles_are_published(peer, start):
-    process = start(
-        "predictor", "--ros-args", "-r", "__node:=climber", "-p", "robot:=marv", "-p", "terrain_source:=flat",
-        "-p", "horizon:=1.0", "-p", "candidates:=4", "-p", "candidate_delay:=0.2", "-p", "refine_seconds:=0.5",
-        "-r", "predicted/flipper_angles:=climber_angles",
-    )  # fmt: skip
-    process.wait_for("predicting 1 s ahead for marv", 240.0)
-    heard: list = []
-    peer.node.create_subscription(JointState, "/climber_angles", heard.append, 1)
-    for _ in range(40):
-        drive(peer, joints=measured([0.2, 0.2, -0.1, -0.1]))
-        if heard:
-            break
-    assert heard, process.output[-2000:]
-    assert list(heard[-1].name) == NAMES
-    assert np.abs(np.array(heard[-1].position) - [0.2, 0.2, -0.1, -0.1]).max() < 0.5
-    assert process.stop() == 0
 
 
 @pytest.mark.parametrize(
