@@ -153,6 +153,11 @@ class Engine:
         base = spec.worldbody.add_body(name="base", pos=[0.0, 0.0, robot.ground_clearance])
         base.add_freejoint()
         self.wheels = [self._wheel_entry(wheel) for wheel in content.get("wheels", [])]
+        steered = robot.steered
+        self.differentials = {
+            f"differential_{index}": [robot.drive_names[drive] for drive in drives]
+            for index, drives in enumerate(() if steered is None else steered.differentials)
+        }
         self.arms = {joint.name: joint for joint in robot.joints if joint.kind == "flipper"}
         for entry in content.get("flippers", []):
             self.wheels += self._flipper_wheels(spec, base, entry)
@@ -184,6 +189,11 @@ class Engine:
         pivots = {e["wheel"]: e for section in ("steering", "casters") for e in content.get(section, [])}
         for wheel in self.wheels:
             self._add_wheel(spec, base, wheel, wheel_mass, share, springs, pivots, mass)
+        # A differential is a tendon: as long as the mean of its wheels' angles, it pulls at all of them alike.
+        for name, wheels in self.differentials.items():
+            tendon = spec.add_tendon(name=name)
+            for wheel in wheels:
+                tendon.wrap_joint(wheel, 1.0 / len(wheels))
 
     def _wheel_entry(self, wheel: Mapping[str, Any]) -> dict[str, Any]:
         steered = self.robot.steered is not None
@@ -259,7 +269,9 @@ class Engine:
         )  # fmt: skip
         if wheel["drive"] is not None:
             axle.armature = share * _GEAR_INERTIA * (wheel["radius"] / 0.165) ** 2
-            servo = spec.add_actuator(name=f"{name}_drive", target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+            behind = next((tendon for tendon, wheels in self.differentials.items() if name in wheels), None)
+            through = mujoco.mjtTrn.mjTRN_JOINT if behind is None else mujoco.mjtTrn.mjTRN_TENDON
+            servo = spec.add_actuator(name=f"{name}_drive", target=behind or name, trntype=through)
             # One motor turns a belt, and all of it acts on whichever of the belt's wheels carries the load. With a
             # share of it on each wheel, the robot slows down where it stands on few of them.
             belt = wheel["carrier"] is not None
@@ -276,6 +288,10 @@ class Engine:
         names = self.robot.joint_names
         angles = None if given.joint_angles is None else given.joint_angles[0].double().numpy()
         speeds = given.drive_speeds[0].double().numpy()
+        for wheels in self.differentials.values():
+            # Servos at one differential act on the same mean speed.
+            behind = [self.robot.drive_names.index(wheel) for wheel in wheels]
+            speeds[:, behind] = speeds[:, behind].mean(axis=1, keepdims=True)
         positions, rotations = [], []
         for index in range(-round(_SETTLE / STEP), len(speeds) + 1):
             if index >= 0:

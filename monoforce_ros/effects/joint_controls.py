@@ -63,6 +63,12 @@ def controls(
                 start = _placed(start[:, None], moved, begin[:, None])[:, 0]
             followed = _followed(robot, moved, steering[:, history:], begin, time_step)
         angles, rates = _placed(angles, moved, followed[0]), _placed(rates, moved, followed[1])
+        return Controls(
+            robot.steered.divided(speeds[:, history:], followed[0]),
+            angles,
+            rates,
+            start_angles=None if joint_start is None else start,
+        )
     if flippers is not None:
         moved = list(range(len(robot.joints) - count, len(robot.joints)))
         begin = start[:, moved]

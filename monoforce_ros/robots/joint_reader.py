@@ -321,12 +321,15 @@ class JointReader:
             maximum_power=share * values["maximum_power"],
         )
 
-    def steered_drive(self, places: Sequence[np.ndarray], wheels: Sequence[str]) -> SteeredDrive | None:
+    def steered_drive(
+        self, places: Sequence[np.ndarray], wheels: Sequence[str], motors: Mapping[str, Sequence[int]]
+    ) -> SteeredDrive | None:
         """Inverse kinematics of a steered robot; None for the others.
 
         Args:
             places: centre of each drive's wheel, each ``[3]`` [m].
             wheels: name of each drive's wheel.
+            motors: indices of the drives that each motor turns.
         """
         if not self.steers:
             return None
@@ -344,6 +347,9 @@ class JointReader:
             joint_places=torch.tensor(pivots, dtype=torch.float32),
             joint_limits=torch.tensor([self.joints[index].high for index in steering], dtype=torch.float32),
             reference_x=reference,
+            differentials=tuple(tuple(turned) for turned in motors.values() if len(turned) > 1)
+            if self.kind == ACKERMANN
+            else (),
         )
 
     def _turning_axle(self, steering: Mapping[int, int]) -> float:

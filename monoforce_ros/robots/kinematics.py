@@ -40,6 +40,8 @@ class SteeredDrive:
     """Largest angle of each to either side, ``[S]`` [rad]."""
     reference_x: float
     """Position of the axle about which the robot turns (``ackermann``), or of the point that a command means [m]."""
+    differentials: tuple[tuple[int, ...], ...] = ()
+    """Drives that share a motor through a differential, for each differential (``ackermann``)."""
 
     @property
     def crabs(self) -> bool:
@@ -77,6 +79,47 @@ class SteeredDrive:
         """Steering angle of each drive's wheel ``[..., D]`` from those of the joints ``[..., S]``; 0 if not steered."""
         padded = torch.cat([angles, torch.zeros_like(angles[..., :1])], dim=-1)
         return padded[..., list(self.drive_joints)]
+
+    def divided(self, speeds: Tensor, angles: Tensor) -> Tensor:
+        """Drive speeds ``[..., D]`` [m/s] behind the differentials.
+
+        A motor turns its differential at the mean of the speeds commanded for its wheels. The wheels share it as the
+        lengths of their paths, which follow from where the wheels point, not from what was commanded: a differential
+        resists no turn.
+
+        Args:
+            speeds: commanded, ``[..., D]`` [m/s].
+            angles: of the steering joints, ``[..., S]`` [rad].
+        """
+        if not self.differentials:
+            return speeds
+        curvature = self.curvature(angles)[..., None]
+        turned = self.steering_of_drives(angles)
+        wheels = self.drive_places.to(speeds)
+        along, across = 1.0 - curvature * wheels[:, 1], curvature * (wheels[:, 0] - self.reference_x)
+        paths = along * torch.cos(turned) + across * torch.sin(turned)
+        behind = list(speeds.unbind(-1))
+        for wheels_of_motor in self.differentials:
+            chosen = list(wheels_of_motor)
+            mean, path = speeds[..., chosen].mean(-1), paths[..., chosen]
+            for index, share in zip(chosen, (path / path.mean(-1, keepdim=True)).unbind(-1), strict=True):
+                behind[index] = mean * share
+        return torch.stack(behind, dim=-1)
+
+    def curvature(self, angles: Tensor) -> Tensor:
+        """Curvature of the turn about the axle at ``reference_x`` in which steered wheels slip sideways least.
+
+        Args:
+            angles: of the steering joints, ``[..., S]`` [rad]; those of a real linkage fit no turn exactly.
+
+        Returns:
+            ``[...]`` [1/m], limited to what the steering reaches.
+        """
+        places = self.joint_places.to(angles)
+        slopes = (places[:, 0] - self.reference_x) * torch.cos(angles) + places[:, 1] * torch.sin(angles)
+        fitted = (slopes * torch.sin(angles)).sum(-1) / (slopes * slopes).sum(-1).clamp_min(1e-9)
+        limit = self.maximum_curvature
+        return fitted.clamp(-limit, limit)
 
     def _about_one_centre(self, twist: Tensor) -> tuple[Tensor, Tensor]:
         forward, yaw_rate = twist[..., :1], twist[..., 1:2]

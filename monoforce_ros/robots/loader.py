@@ -153,7 +153,7 @@ class _Reader(FieldChecks):
             if samples.free
             else None,
             motors=moving.motors(samples.members, samples.radii, len(samples.drives)),
-            steered=moving.steered_drive(middles, samples.drives),
+            steered=moving.steered_drive(middles, samples.drives, samples.members),
             maximum_lateral_speed=self.number(
                 command.get("maximum_lateral_speed", math.inf), "command.maximum_lateral_speed", 0.01, math.inf, "m/s"
             ),

@@ -72,6 +72,7 @@ class Simulation:
     def __init__(self, model: mujoco.MjModel, scenery: Scenery, robot: Vehicle, hidden: Sequence[Fault] = ()):
         self.model, self.data = model, mujoco.MjData(model)
         self.robot = robot
+        self._differentials = [list(turned) for turned in robot.differentials]
         self._scenery, self._hidden = scenery, hidden
         self._cell = scenery.ground.resolution
         self.base = model.body(vehicle.BODY).id
@@ -146,6 +147,11 @@ class Simulation:
                 speeds = fault.wheel_speeds(self.time, speeds)
                 fault.apply_forces(self)
             self._set_friction()
+        if self._differentials:
+            # The servos of one differential act on the same mean speed.
+            speeds = np.array(speeds)
+            for turned in self._differentials:
+                speeds[turned] = speeds[turned].mean()
         self.data.ctrl[: len(self.driven)] = speeds[self.driven]
         if self._servos is not None:
             # The model's zero is the angle in the robot file.

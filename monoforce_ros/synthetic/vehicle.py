@@ -140,6 +140,12 @@ class Vehicle:
             )
         return self.sensors[frame]
 
+    @property
+    def differentials(self) -> tuple[tuple[int, ...], ...]:
+        """Indices of the wheels behind each differential."""
+        names = sorted({wheel.differential for wheel in self.wheels} - {""})
+        return tuple(tuple(i for i, wheel in enumerate(self.wheels) if wheel.differential == name) for name in names)
+
     def wheel_speeds(self, forward: float, yaw_rate: float, lateral: float = 0.0) -> np.ndarray:
         """Wheel speeds ``[wheels]`` [rad/s] of a command; see :meth:`command`."""
         return self.command(forward, yaw_rate, lateral)[0]
@@ -178,6 +184,10 @@ class Vehicle:
             carriers[arm.name] = arm.add_to(base, self.mass, carried, wheel_mass), arm.place
         for wheel in self.wheels:
             wheel.add_to(spec, *carriers[wheel.arm], self.mass, len(self.wheels), wheel_mass)
+        for turned in self.differentials:
+            tendon = spec.add_tendon(name=self.wheels[turned[0]].differential)
+            for index in turned:
+                tendon.wrap_joint(self.wheels[index].joint, 1.0 / len(turned))
         for pivot in self.steering:
             add_joint_servo(spec, pivot, self.mass)
         for arm in self.flippers:

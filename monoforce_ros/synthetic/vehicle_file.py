@@ -96,7 +96,17 @@ def _wheel(
         is_scaled=steers or robot.point_grip is not None,
         is_balanced=steers or robot.point_grip is not None,
         maximum_torque=force * radius / (1 if steers else count),
+        differential=_differential(name, robot),
     )
+
+
+def _differential(wheel: str, robot: RobotModel) -> str:
+    """Name of the differential that drives a wheel; empty if it has a motor of its own."""
+    if robot.steered is not None:
+        for index, drives in enumerate(robot.steered.differentials):
+            if wheel in [robot.drive_names[drive] for drive in drives]:
+                return f"differential_{index}"
+    return ""
 
 
 def _pivot(wheel: str, centre: np.ndarray, robot: RobotModel, content: Mapping[str, Any]) -> Pivot | None:

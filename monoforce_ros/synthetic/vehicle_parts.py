@@ -138,6 +138,8 @@ class Wheel:
     it: wheels that turn a robot by skidding are out of balance, as they were when the bags and tables were recorded."""
     maximum_torque: float = math.inf
     """Of its motor at standstill [N m]."""
+    differential: str = ""
+    """Name of the differential through which it is driven; empty: by a servo of its own."""
 
     @property
     def joint(self) -> str:
@@ -200,7 +202,10 @@ class Wheel:
             contype=0, conaffinity=0,
         )  # fmt: skip
         if self.driven:
-            servo = spec.add_actuator(name=self.joint, target=self.joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+            # A differential is a tendon: as long as the mean of its wheels' angles, it pulls at all of them alike.
+            target = self.differential or self.joint
+            through = mujoco.mjtTrn.mjTRN_TENDON if self.differential else mujoco.mjtTrn.mjTRN_JOINT
+            servo = spec.add_actuator(name=self.joint, target=target, trntype=through)
             servo.set_to_velocity(kv=share * _SERVO_GAIN * scale)
             _limit_torque(servo, self.maximum_torque)
 
