@@ -16,7 +16,7 @@ from monoforce_ros.robots import load_robot
 STEP = 0.01
 STRONG = {
     "steering_lag": {"time_constant": 0.31},
-    "steering_deadband": {"width": 0.03},
+    "steering_deadband": {"width": 0.25, "alignment": 0.8},
     "steering_gain": {"gain": 0.8},
     "steering_offset": {"offset": -0.04},
     "blocked_flipper": {"front_left": 0.7, "front_right": 0.2, "rear_left": 0.4, "rear_right": 0.3},
@@ -46,7 +46,7 @@ def given(robot, name, batch=1, seconds=0.6):
     """Controls with steps of the steering, or flippers that move."""
     steps = round(seconds / STEP)
     time = torch.linspace(0.0, seconds, steps + 20, dtype=torch.float64)
-    twists = torch.stack([0.8 + 0.0 * time, 0.5 * torch.sign(torch.sin(9.0 * time))], dim=-1)
+    twists = torch.stack([0.8 + 0.0 * time, 0.2 + 0.5 * torch.sign(torch.sin(9.0 * time))], dim=-1)
     flippers = None
     if CATALOGUE[name].needs == "flippers":
         start = robot.flipper_angles
@@ -138,8 +138,14 @@ def test_steering_effects_have_their_closed_forms(tmp_path):
     np.testing.assert_allclose(changed, 0.7 * plain, atol=1e-9)
     plain, changed = steered(tmp_path, angles, steering_offset={"offset": 0.05})
     np.testing.assert_allclose(changed[1:], plain[1:] + 0.05, atol=1e-9)
-    plain, changed = steered(tmp_path, angles, steering_deadband={"width": 0.03})
-    np.testing.assert_allclose(changed, np.sign(plain) * np.maximum(np.abs(plain) - 0.03, 0.0), atol=1e-9)
+    # Play holds the angle without alignment; with it the angle decays over the way.
+    plain, changed = steered(tmp_path, angles, steering_deadband={"width": 0.03, "alignment": 0.0})
+    np.testing.assert_allclose(changed[6:105], plain[50] - 0.03, atol=1e-9)
+    np.testing.assert_allclose(changed[106:165], plain[130] + 0.03, atol=1e-9)
+    straight = np.r_[np.full(50, 0.2), np.zeros(150)]
+    plain, changed = steered(tmp_path, straight, steering_deadband={"width": 0.03, "alignment": 0.8})
+    way = 2.0 * STEP * np.arange(1, 149)
+    np.testing.assert_allclose(changed[52:], 0.03 * np.exp(-0.8 * way), atol=2e-4)
     plain, changed = steered(tmp_path, angles, steering_lag={"time_constant": 0.25})
     rise = np.arange(1, 100) * STEP
     np.testing.assert_allclose(changed[6:105], plain[50] * (1.0 - np.exp(-rise / 0.25)), atol=1e-9)

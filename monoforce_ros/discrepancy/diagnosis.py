@@ -23,6 +23,7 @@ from monoforce_ros.discrepancy.comparison import (
 from monoforce_ros.discrepancy.estimates import EffectEstimate
 from monoforce_ros.discrepancy.explanation import DiagnosisSettings, explain
 from monoforce_ros.discrepancy.fit import Fit
+from monoforce_ros.discrepancy.flippers import BLOCKED
 from monoforce_ros.discrepancy.gap import (
     Localisation,
     NoiseFloor,
@@ -187,6 +188,13 @@ def diagnose(
         effects, gap = (*effects, bias_estimate(gyro)), {**gap, "yaw_rate_gyro": bias_row(gyro)}
         remarks = (*decision.remarks, "the gyro measures a rotation that the poses do not show")
         decision = replace(decision, verdict=Verdict.EFFECT_FOUND, remarks=remarks)
+    if sensors.flippers is not None:
+        if decision.verdict in (Verdict.NO_DISCREPANCY, Verdict.NO_IMPROVEMENT, Verdict.EFFECT_FOUND):
+            # How the flippers move is measured, whatever it does to the path.
+            others = tuple(effect for effect in effects if effect.name != BLOCKED)
+            effects, gap = (*others, sensors.flippers.estimate), {**gap, "flippers": sensors.flippers.row}
+            decision = replace(decision, verdict=Verdict.EFFECT_FOUND)
+        decision = replace(decision, remarks=(*decision.remarks, sensors.flippers.summary()))
     if left_out:
         decision = replace(decision, remarks=(*decision.remarks, *left_out))
     if sensors.wheels is not None:

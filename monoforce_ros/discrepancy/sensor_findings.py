@@ -1,4 +1,4 @@
-"""Sensor findings: what gyro and wheel speeds measure, as effects and estimates of a diagnosis."""
+"""Sensor findings: what gyro, wheel speeds and joint angles measure, as effects and estimates of a diagnosis."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from monoforce_ros.discrepancy.clocks import GyroFinding, compare_with_gyro
 from monoforce_ros.discrepancy.comparison import GapRow
 from monoforce_ros.discrepancy.estimates import EffectEstimate, ParameterEstimate
+from monoforce_ros.discrepancy.flippers import BLOCKED, FlipperFinding, compare_with_commands
 from monoforce_ros.discrepancy.hypothesis import Effects, Evidence
 from monoforce_ros.discrepancy.selection import Search
 from monoforce_ros.discrepancy.verdict import Decision, Verdict
@@ -30,6 +31,7 @@ class SensorFindings:
     """Values that a sensor suggests."""
     excluded: tuple[str, ...] = ()
     """Effects that a sensor rules out."""
+    flippers: FlipperFinding | None = None
 
     @classmethod
     def of(cls, evidence: Evidence, robot: RobotModel, *, commissioned: bool) -> SensorFindings:
@@ -42,15 +44,20 @@ class SensorFindings:
         gyro = compare_with_gyro(evidence.smoothed, evidence.gyro)
         wheels = compare_with_wheels(evidence.commands, evidence.wheels, robot)
         excluded: tuple[str, ...] = () if gyro is None else ("pose_clock_offset",)
+        flippers = compare_with_commands(evidence.joints, robot, evidence.smoothed.motion.stamps)
         if not commissioned and not any(CATALOGUE[name].stage == "command" for name, _ in robot.effects):
-            return cls(gyro, wheels, measured_effects(gyro, wheels, robot), excluded=excluded)
+            known = measured_effects(gyro, wheels, flippers, robot)
+            return cls(gyro, wheels, known, excluded=excluded, flippers=flippers)
         hints, unchanged = ((), ()) if wheels is None else changed_drives(wheels, robot)
-        return cls(gyro, wheels, measured_effects(gyro, None, robot), hints, excluded + unchanged)
+        known = measured_effects(gyro, None, flippers, robot)
+        return cls(gyro, wheels, known, hints, excluded + unchanged, flippers)
 
     def with_interval(self, estimate: EffectEstimate, search: Search) -> EffectEstimate:
-        """The estimate with the confidence interval of the gyro or of the wheels where these measured it."""
+        """The estimate with the confidence interval of the sensor that measured it, if one did."""
         if estimate.name not in dict(search.known):
             return estimate
+        if self.flippers is not None and estimate.name == BLOCKED:
+            return self.flippers.estimate
         if self.gyro is not None and estimate.name == "pose_clock_offset":
             half_width = self.gyro.offset_half_width
         elif self.wheels is not None and estimate.name in dict(self.wheels.effects):
@@ -62,12 +69,16 @@ class SensorFindings:
         return EffectEstimate(estimate.name, parameters)
 
 
-def measured_effects(gyro: GyroFinding | None, wheels: WheelFinding | None, robot: RobotModel) -> Effects:
-    """Effects that the gyro and the wheel speeds measure, that of the gyro first."""
+def measured_effects(
+    gyro: GyroFinding | None, wheels: WheelFinding | None, flippers: FlipperFinding | None, robot: RobotModel
+) -> Effects:
+    """Effects that the gyro, the wheel speeds and the joint angles measure, that of the gyro first."""
     measured: Effects = ()
     if gyro is not None and gyro.poses_late and "pose_clock_offset" not in dict(robot.effects):
         measured = (("pose_clock_offset", {"offset": gyro.offset}),)
-    return measured if wheels is None else measured + wheels.effects
+    if wheels is not None:
+        measured += wheels.effects
+    return measured if flippers is None else (*measured, flippers.effect)
 
 
 def refine_clock(search: Search, gyro: GyroFinding) -> None:

@@ -100,6 +100,11 @@ def _tilt(values: _Values) -> str:
     return f"Down is {angle:.1f}° off: the ground slopes, or the localisation is tilted."
 
 
+def _flippers(values: _Values) -> str:
+    lost = [f"the {place.replace('_', ' ')} one {100 * share:.0f} %" for place, share in values.items() if share > 0.0]
+    return f"Flippers lose a part of their commanded motion: {', '.join(lost)}."
+
+
 _FINDINGS: dict[str, Callable[[_Values], str]] = {
     "command_delay": lambda v: f"The drives react {v['delay']:.2f} s late to every command.",
     "actuator_lag": lambda v: (
@@ -135,6 +140,16 @@ _FINDINGS: dict[str, Callable[[_Values], str]] = {
     "sensor_lever_arm": lambda v: (
         f"The poses are those of a point {_sides(v['x'], v['y'], 'm')} of the robot's base frame."
     ),
+    "steering_lag": lambda v: (
+        f"The steering is sluggish: {v['time_constant']:.2f} s after a change of the command a third is still missing."
+    ),
+    "steering_offset": lambda v: (
+        f"At a straight command the wheels point {abs(math.degrees(v['offset'])):.1f}° to the "
+        f"{'left' if v['offset'] > 0 else 'right'}."
+    ),
+    "steering_gain": lambda v: f"The wheels turn {_change(v['gain'], 'less', 'further')} than commanded.",
+    "steering_deadband": lambda v: f"The steering has a play of ±{math.degrees(v['width']):.1f}°.",
+    "blocked_flipper": lambda v: _flippers(v),
     "gyro_bias": lambda v: f"The gyro reads {math.degrees(v['bias']):+.2f}°/s at rest.",
 }
 _REMEDIES = {
@@ -156,6 +171,11 @@ _REMEDIES = {
     "command_clock_offset": "synchronise the clocks of planner and base",
     "sensor_yaw_offset": "measure how the localisation's sensor is mounted, and correct its transform",
     "sensor_lever_arm": "measure where the localisation's sensor is mounted, and correct its transform",
+    "steering_lag": "look at the steering servo, its supply and its gear",
+    "steering_offset": "centre the steering: rod, toe and the servo's zero",
+    "steering_gain": "compare the wheels' angles with the commanded ones, and correct the linkage or its ratio",
+    "steering_deadband": "look for play in rods, joints and gear of the steering",
+    "blocked_flipper": "look at gear, clutch and motor of this flipper",
     "gyro_bias": "calibrate the gyro while the robot stands",
     LEARNED: "repeat the manoeuvre with the largest error at half the speed, and look at the robot meanwhile",
 }
@@ -179,4 +199,9 @@ _CAUSES = {
     "command_clock_offset": "a wrong command clock",
     "sensor_yaw_offset": "a localisation sensor mounted at an angle",
     "sensor_lever_arm": "a localisation sensor mounted elsewhere",
+    "steering_lag": "sluggish steering",
+    "steering_offset": "wheels that do not point straight",
+    "steering_gain": "wheels that turn more or less than commanded",
+    "steering_deadband": "play in the steering",
+    "blocked_flipper": "a flipper that does not follow",
 }

@@ -1,5 +1,6 @@
 """The catalogue of effects, which extend the physics. A new effect is one file in this package and a test."""
 
+from monoforce_ros.effects.blocked_flipper import flipper_place
 from monoforce_ros.effects.catalogue import (
     CATALOGUE,
     EffectError,
@@ -41,6 +42,7 @@ __all__ = [
     "corrected_motion",
     "drive_speeds",
     "effect_values",
+    "flipper_place",
     "identifiable_effects",
     "per_trajectory",
     "recorded_commands",

@@ -30,9 +30,10 @@ class BlockedFlipper(Effect):
 
     def flipper_angles(self, targets: Tensor, start: Tensor, values: Values, flippers: tuple[Flipper, ...]) -> Tensor:
         """Targets with this effect applied; see :class:`Effect`."""
-        lost = torch.stack([values[_place(flipper)].expand(len(targets)) for flipper in flippers], dim=-1)
+        lost = torch.stack([values[flipper_place(flipper)].expand(len(targets)) for flipper in flippers], dim=-1)
         return targets - lost[:, None] * (targets - start[:, None])
 
 
-def _place(flipper: Flipper) -> str:
+def flipper_place(flipper: Flipper) -> str:
+    """Parameter of a flipper: ``front_left`` and the like."""
     return f"{flipper.end}_{'left' if flipper.joint[1] >= 0 else 'right'}"

@@ -152,7 +152,7 @@ def commanded(robot: RobotModel, twists: Tensor, time_step: float) -> tuple[Tens
         if effect.acts_on_steering and steering.shape[-1]:
             steering = effect.drive_speeds(steering, values, time_step, torch.zeros_like(steering[0, 0]))
         if effect.needs == "steering" and steering.shape[-1]:
-            steering = effect.steering_angles(steering, values, time_step)
+            steering = effect.steering_angles(steering, speeds, values, time_step)
     return speeds, steering
 
 

@@ -130,11 +130,12 @@ class Effect(ABC):
         """
         return speeds
 
-    def steering_angles(self, angles: Tensor, values: Values, time_step: float) -> Tensor:
+    def steering_angles(self, angles: Tensor, speeds: Tensor, values: Values, time_step: float) -> Tensor:
         """Steering angles ``[B, T, S]`` [rad] from commanded ones, of an effect that needs ``steering``.
 
         Args:
             angles: commanded angles ``[B, T, S]`` [rad], including those before the start.
+            speeds: of the drives at the same times ``[B, T, D]`` [m/s].
             values: parameter values.
             time_step: time between angles [s].
         """

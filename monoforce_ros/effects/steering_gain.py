@@ -24,6 +24,6 @@ class SteeringGain(Effect):
     manoeuvre = "slight and sharp turns to both sides"
     separated_by: ClassVar = {"steering_deadband": "slight and sharp turns to both sides"}
 
-    def steering_angles(self, angles: Tensor, values: Values, time_step: float) -> Tensor:
+    def steering_angles(self, angles: Tensor, speeds: Tensor, values: Values, time_step: float) -> Tensor:
         """Steering angles with this effect applied; see :class:`Effect`."""
         return per_trajectory(values["gain"], 3) * angles

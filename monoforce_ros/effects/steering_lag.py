@@ -28,6 +28,6 @@ class SteeringLag(Effect):
         "actuator_lag": "steps of the steering and of the speed, each alone",
     }
 
-    def steering_angles(self, angles: Tensor, values: Values, time_step: float) -> Tensor:
+    def steering_angles(self, angles: Tensor, speeds: Tensor, values: Values, time_step: float) -> Tensor:
         """Steering angles with this effect applied; see :class:`Effect`."""
         return lagged(angles, values["time_constant"], time_step)

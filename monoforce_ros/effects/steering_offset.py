@@ -30,6 +30,6 @@ class SteeringOffset(Effect):
         "sensor_yaw_offset": "straight stretches long enough to bend",
     }
 
-    def steering_angles(self, angles: Tensor, values: Values, time_step: float) -> Tensor:
+    def steering_angles(self, angles: Tensor, speeds: Tensor, values: Values, time_step: float) -> Tensor:
         """Steering angles with this effect applied; see :class:`Effect`."""
         return angles + per_trajectory(values["offset"], 3)
