@@ -100,9 +100,8 @@ def compare_with_commands(joints: JointRecord | None, robot: RobotModel, stamps:
     if not complete.any():
         return None
     wanted, begin, end = wanted[complete], begin[complete], end[complete]
-    followed, _ = servo_response(
-        *(torch.as_tensor(values) for values in (np.clip(wanted, low, high), begin, lags, rates)), _STEP
-    )
+    targets, from_angles = torch.as_tensor(np.clip(wanted, low, high)), torch.as_tensor(begin)
+    followed, _ = servo_response(targets, from_angles, torch.as_tensor(lags), torch.as_tensor(rates), _STEP)
     commanded, measured = followed[:, -1].numpy() - begin, end - begin
     shares = []
     for index, flipper in enumerate(robot.flippers):
