@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from monoforce_ros.core import CommandTrack, MotionTrack
 from monoforce_ros.discrepancy.fit import first_values, fit_effects
 from monoforce_ros.discrepancy.hypothesis import EvidenceWindows, Predictions, window_starts
+from monoforce_ros.discrepancy.selection import Search
 from monoforce_ros.effects import CATALOGUE, drive_speeds
 from monoforce_ros.physics import State, rollout
 from monoforce_ros.robots import load_robot
@@ -26,6 +27,26 @@ def rough_and_grassy():
     x, y = (torch.from_numpy(values).float() for values in np.meshgrid(GRID.x, GRID.y))
     ground = 0.04 * torch.sin(2.1 * x) * torch.cos(1.7 * y)
     return TerrainMap.from_height(ground, GRID, geometric_height=ground + 0.4 * torch.sigmoid(2.0 * x))
+
+
+def driven(robot, terrain=None):
+    """Windows of a drive at random commands by a robot with the effects of its file."""
+    random = np.random.default_rng(4)
+    commanded = np.repeat(random.uniform([-0.3, -1.2], [1.0, 1.2], (18, 2)), 150, axis=0)
+    speeds = drive_speeds(robot, torch.as_tensor(commanded[None], dtype=torch.float32), 0.01)
+    ground = TerrainMap.flat(Grid.square(2.0, 1.0)) if terrain is None else terrain
+    result = rollout(ground, robot, speeds, State.at_rest(0.14), with_forces=False)
+    rotations = Rotation.from_matrix(result.rotation[0, ::5].double().numpy())
+    motion = MotionTrack(
+        (10**9 + np.arange(len(rotations)) * 50_000_000).astype(np.int64),
+        result.position[0, ::5].double().numpy(),
+        rotations.as_quat(),
+        rotations.inv().apply(result.velocity[0, ::5].double().numpy()),
+        rotations.inv().apply(result.angular_velocity[0, ::5].double().numpy()),
+    )
+    commands = CommandTrack(10**9 + np.arange(len(commanded)) * 10_000_000, commanded)
+    starts = window_starts(motion, [slice(0, len(motion))], 2.0, 1.0)
+    return EvidenceWindows(motion, commands, starts, 2.0, SAMPLES, terrain, None if terrain is None else np.eye(4))
 
 
 @pytest.mark.parametrize(
@@ -49,22 +70,7 @@ def test_injected_values_are_recovered_from_motion(name, parameters, tolerance):
         terrain = rough_and_grassy()
     if name == "vegetation_drag":
         injected["yield_speed"] = 0.5
-    robot, random = replace(husky, effects=((name, injected),)), np.random.default_rng(4)
-    commanded = np.repeat(random.uniform([-0.3, -1.2], [1.0, 1.2], (18, 2)), 150, axis=0)
-    speeds = drive_speeds(robot, torch.as_tensor(commanded[None], dtype=torch.float32), 0.01)
-    ground = TerrainMap.flat(Grid.square(2.0, 1.0)) if terrain is None else terrain
-    result = rollout(ground, robot, speeds, State.at_rest(0.14), with_forces=False)
-    rotations = Rotation.from_matrix(result.rotation[0, ::5].double().numpy())
-    motion = MotionTrack(
-        (10**9 + np.arange(len(rotations)) * 50_000_000).astype(np.int64),
-        result.position[0, ::5].double().numpy(),
-        rotations.as_quat(),
-        rotations.inv().apply(result.velocity[0, ::5].double().numpy()),
-        rotations.inv().apply(result.angular_velocity[0, ::5].double().numpy()),
-    )
-    commands = CommandTrack(10**9 + np.arange(len(commanded)) * 10_000_000, commanded)
-    starts = window_starts(motion, [slice(0, len(motion))], 2.0, 1.0)
-    data = EvidenceWindows(motion, commands, starts, 2.0, SAMPLES, terrain, None if terrain is None else np.eye(4))
+    data = driven(replace(husky, effects=((name, injected),)), terrain)
     predictions = Predictions(husky, data)
     before, floor = (np.abs(predictions.residuals([effects])[0]).mean() for effects in ((), ((name, injected),)))
     fit = fit_effects(predictions, first_values(CATALOGUE[name]), SCALE)
@@ -75,3 +81,12 @@ def test_injected_values_are_recovered_from_motion(name, parameters, tolerance):
     after = np.abs(predictions.residuals([fit.effects])[0]).mean()
     assert after < max(0.25 * before, 1.1 * floor)
     assert after < 0.9 * before
+
+
+def test_friction_that_fell_far_below_that_of_the_file_is_found():
+    """Far from it, nothing changes at first: values near 1 say as little as those near the file's."""
+    file = replace(load_robot("husky"), effects=(("friction_scale", {"factor": 0.4}),))
+    data = driven(replace(file, effects=(("friction_scale", {"factor": 0.05}),)))
+    found = Search(file, data, SCALE).run(1, exchange=False).best
+    assert found.names == ("friction_scale",)
+    assert dict(found.effects)["friction_scale"]["factor"] == pytest.approx(0.05, rel=0.1)

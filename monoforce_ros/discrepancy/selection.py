@@ -509,11 +509,27 @@ class Search:
         starts = first_values(effect)
         if name in self._own and effect.stage != "measurement":
             known = {key: float(value) for key, value in dict(self._own[name]).items()}
-            starts = [((name, {**known, **dict(values)}),) for ((_, values),) in starts]
+            starts = [((name, {**known, **_changed(effect, values, known)}),) for ((_, values),) in starts]
             starts.append(((name, {key: known.get(key, value) for key, value in starts[0][0][1].items()}),))
         if name in self._hints:
             starts.append(((name, {**dict(starts[0][0][1]), **dict(self._hints[name])}),))
         return starts
+
+
+def _changed(effect: Effect, values: Mapping[str, float], known: Mapping[str, float]) -> dict[str, float]:
+    """Initial values of a fit where the robot's file has ``known`` ones: as far from these as ``values`` from neutral.
+
+    A factor is multiplied, other parameters are added. Limits, whose neutral value is infinite, stay as they are.
+    """
+    parameters, changed = {parameter.name: parameter for parameter in effect.parameters}, {}
+    for key, value in values.items():
+        parameter = parameters[key]
+        if key not in known or not np.isfinite(parameter.neutral) or not np.isfinite(known[key]):
+            changed[key] = value
+            continue
+        moved = known[key] * value if parameter.neutral == 1.0 else known[key] + value - parameter.neutral
+        changed[key] = float(np.clip(moved, parameter.low, parameter.high))
+    return changed
 
 
 def _key(effects: Effects) -> tuple[tuple[object, ...], ...]:

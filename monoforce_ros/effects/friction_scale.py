@@ -23,6 +23,11 @@ class FrictionScale(Effect):
     separated_by: ClassVar = {"turning_scrub": "turns on the spot and hard starts"}
     commissioning_start: ClassVar = {"factor": 1.0}
 
+    def first_values(self) -> list[dict[str, float]]:
+        """Initial values for a fit. Friction acts only where more of it is asked for: what is far lower looks like no
+        change at all from values near 1."""
+        return [{"factor": factor} for factor in (0.1, 0.2, 0.4, 0.7, 1.4)]
+
     def setup(self, setup: Setup, values: Values) -> Setup:
         """The setup with this effect applied."""
         robot, factor = setup.robot, values["factor"]
