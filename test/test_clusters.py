@@ -1,5 +1,7 @@
 """Clusters of body points, and forces summed without a look at each point."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -116,3 +118,14 @@ def test_sums_carry_gradients():
         gradients.append(torch.autograd.grad(total, given)[0])
     assert float(gradients[0].abs().max()) > 0
     torch.testing.assert_close(gradients[0], gradients[1], rtol=1e-6, atol=1e-6)
+
+
+@settings(max_examples=40, deadline=None)
+@given(reach=st.integers(0, 12), rows=st.integers(1, 30), columns=st.integers(1, 30))
+def test_the_ceiling_is_the_highest_node_within_reach(reach, rows, columns):
+    height = torch.randn(2, rows, columns)
+    boxes = point_clusters(torch.zeros(1, 3)).clusters
+    boxes = dataclasses.replace(boxes, halves=torch.tensor([[max(reach - 2.0, 0.0), 0.0, 0.0]]))
+    reach = max(reach, 2)
+    pooled = torch.nn.functional.max_pool2d(height[:, None], 2 * reach + 1, 1, reach)[:, 0]
+    assert torch.equal(boxes.ceiling(height, 1.0), pooled)
