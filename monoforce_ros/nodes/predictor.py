@@ -18,7 +18,7 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState, PointCloud2
 from visualization_msgs.msg import MarkerArray
 
-from monoforce_ros.bags import camera_info_topic
+from monoforce_ros.bags import camera_info_topics
 from monoforce_ros.core import NANOSECOND, CommandTrack, FrameError, RobotFrames, pose_matrix
 from monoforce_ros.effects import corrected_commands, corrected_motion
 from monoforce_ros.messages import decoding
@@ -242,6 +242,7 @@ class PredictorNode(ManagedNode):
                 for part, topic in (("joints", settings.joint_topic), ("flippers", settings.flipper_command_topic))
             ]
         images = {"sensor_msgs/msg/CompressedImage": CompressedImage, "sensor_msgs/msg/Image": Image}
+        self._camera_info_subscriptions: list[AdaptiveSubscription] = []
         info_topics = iter([*settings.camera_info_topics, *[""] * len(self.sensor_topics)])
         for part, topic in self.sensor_topics.items():
             types = {"sensor_msgs/msg/PointCloud2": PointCloud2} if part == LIDAR else images
@@ -249,15 +250,19 @@ class PredictorNode(ManagedNode):
                 self, topic, types, partial(self._on_sensor, part), depth=large, reliability=settings.image_qos
             )
             if part != LIDAR:
-                info = AdaptiveSubscription(
-                    self,
-                    next(info_topics) or camera_info_topic(topic),
-                    {"sensor_msgs/msg/CameraInfo": CameraInfo},
-                    partial(self.decoder.set_camera_info, part),
-                    depth=small,
-                )
-                self.decoder.add_camera(part, info.topic)
-                self._subscriptions_by_part[f"{part} info"] = info
+                given = next(info_topics)
+                infos = [
+                    AdaptiveSubscription(
+                        self,
+                        info_topic,
+                        {"sensor_msgs/msg/CameraInfo": CameraInfo},
+                        partial(self.decoder.set_camera_info, part),
+                        depth=small,
+                    )
+                    for info_topic in ([given] if given else camera_info_topics(topic))
+                ]
+                self.decoder.add_camera(part, " or ".join(info.topic for info in infos))
+                self._camera_info_subscriptions += infos
 
     @property
     def _crabs(self) -> bool:
@@ -358,7 +363,7 @@ class PredictorNode(ManagedNode):
         now, limit = time.monotonic(), self.settings.data_timeout
         for part, subscription in self._subscriptions_by_part.items():
             silence = now - self._arrivals.get(part, self._started)
-            if part.endswith(" info") or silence < limit:
+            if silence < limit:
                 continue
             cause = subscription.silence_cause
             if part == "commands":
