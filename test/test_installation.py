@@ -144,11 +144,12 @@ def test_messages_are_built_with_the_headers_of_the_environment_wherever_it_was_
     for name, folders in old.items():
         (folder / f"{name}.cmake").write_text(target.format(*folders))
     (folder / "plain.cmake").write_text('set(x "${_IMPORT_PREFIX}/include/std_msgs")\n')
-    script = f"root=/; source {ROOT}/scripts/environment.sh; set_include_folders {tmp_path} /h/include/python3.12 /a/numpy/include"
+    headers, arrays = "/h/include/python3.12", "/a/numpy/include"
+    script = f"root=/; source {ROOT}/scripts/environment.sh; set_include_folders {tmp_path} {headers} {arrays}"
     for _ in range(2):
         subprocess.run(["bash", "-euo", "pipefail", "-c", script], check=True)
     for name in old:
-        assert (folder / f"{name}.cmake").read_text() == target.format("/h/include/python3.12", "/a/numpy/include")
+        assert (folder / f"{name}.cmake").read_text() == target.format(headers, arrays)
     assert (folder / "plain.cmake").read_text() == 'set(x "${_IMPORT_PREFIX}/include/std_msgs")\n'
 
 
