@@ -137,10 +137,11 @@ def test_messages_are_built_with_the_headers_of_the_environment_wherever_it_was_
     folder = tmp_path / "share" / "std_msgs" / "cmake"
     folder.mkdir(parents=True)
     target = '  INTERFACE_INCLUDE_DIRECTORIES "{};{};${{_IMPORT_PREFIX}}/include/std_msgs"\n'
+    packages = "lib/python3.12/site-packages/numpy/_core/include"
     old = {
-        "wheel": ("/opt/python/cp312/include/python3.12", "/opt/python/cp312/lib/python3.12/site-packages/numpy/_core/include"),
-        "moved": ("/usr/include/python3.12", "/home/me/old/.venv/lib/python3.12/site-packages/numpy/_core/include"),
-    }  # fmt: skip
+        "wheel": ("/opt/python/cp312/include/python3.12", f"/opt/python/cp312/{packages}"),
+        "moved": ("/usr/include/python3.12", f"/home/me/old/.venv/{packages}"),
+    }
     for name, folders in old.items():
         (folder / f"{name}.cmake").write_text(target.format(*folders))
     (folder / "plain.cmake").write_text('set(x "${_IMPORT_PREFIX}/include/std_msgs")\n')
