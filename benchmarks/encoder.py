@@ -63,6 +63,7 @@ def stages(encoder: TerrainEncoder, cameras: list[CameraView], repeats: int) -> 
     size = config.grid.rows * config.grid.columns
     batch = encoder_input(cameras, SUPPORT, config)
     with torch.no_grad():
+
         def depths_and_features():
             return encoder.lifted(*encoder.image_features(batch.images), batch.rays, batch.origins)
 
