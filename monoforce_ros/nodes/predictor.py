@@ -28,7 +28,7 @@ from monoforce_ros.nodes.candidate_output import CandidateOutput
 from monoforce_ros.nodes.clocks import STEADY
 from monoforce_ros.nodes.costmap_output import CostmapOutput
 from monoforce_ros.nodes.ensemble_output import EnsembleOutput
-from monoforce_ros.nodes.frames import TransformListener
+from monoforce_ros.nodes.frames import TRANSFORMS_PATIENCE, TransformListener
 from monoforce_ros.nodes.health import ERROR, OK, STALE, WARN, Health
 from monoforce_ros.nodes.inputs import TIME_JUMP, Inputs, Received
 from monoforce_ros.nodes.joint_input import JointInput
@@ -46,8 +46,6 @@ from monoforce_ros.prediction import FORCE_INTERVAL, Prediction, Predictor
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainDefaults
 
-_TRANSFORMS_PATIENCE = 2.0
-"""Time after the start in which a missing transform is no error [s]: /tf_static takes as long to be discovered."""
 _MOST_ODD = 5
 """Commands of another time in a row that are reported: when a bag starts anew, the first ones precede its odometry."""
 _ZERO_STAMPS = "the stamps are zero: the {} does not set them"
@@ -126,6 +124,7 @@ class PredictorNode(ManagedNode):
         self._started = time.monotonic()
         self._predictions = 0
         self._last_prediction = self._started
+        self._first_odometry = 0.0
         self._durations: list[float] = []
         self.monitor = MonitorOutput(self, self.predictor, self.health)
         with_candidates = settings.candidates or settings.candidate_topic
@@ -273,6 +272,7 @@ class PredictorNode(ManagedNode):
 
     def _on_odometry(self, message: Odometry) -> None:
         self._arrivals["odometry"] = time.monotonic()
+        self._first_odometry = self._first_odometry or self._arrivals["odometry"]
         try:
             state, frame_id, child_frame_id = decoding.decode_odometry(message)
         except decoding.MessageError as error:
@@ -285,7 +285,7 @@ class PredictorNode(ManagedNode):
             pose = self.frames.odometry_child(child_frame_id, self.transforms.tree)
         except FrameError as error:
             # Transforms may be on their way.
-            if self.transforms.unavailable or time.monotonic() - self._started > _TRANSFORMS_PATIENCE:
+            if self.transforms.unavailable or time.monotonic() - self._first_odometry > TRANSFORMS_PATIENCE:
                 self.health.report("odometry", ERROR, self.transforms.explained(error), reason="frame")
             return
         self.inputs.add_motion("odometry", state.of_base(pose), frame_id, child_frame_id)
