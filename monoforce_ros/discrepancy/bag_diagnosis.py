@@ -16,6 +16,7 @@ from monoforce_ros.discrepancy.diagnosis import Diagnosis, DiagnosisSettings, di
 from monoforce_ros.discrepancy.gap import noisy_motions
 from monoforce_ros.discrepancy.ground import Ground, choose_ground
 from monoforce_ros.discrepancy.hypothesis import Effects, Evidence, corrected_evidence, window_starts
+from monoforce_ros.discrepancy.learned import LEARNED
 from monoforce_ros.discrepancy.motion_check import motion_faults
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.nominal_residual import residual_complaint
@@ -154,6 +155,7 @@ def diagnose_bag(
         settings=settings,
         progress=progress,
     )
+    diagnosis = without_blame_for_ground(diagnosis, ground)
     large = residual_complaint(None if nominal is None else nominal.residual, evidence.smoothed, evidence.commands)
     doubts = [text for text in (ground.complaint, large) if text]
     if diagnosis.verdict == Verdict.NOT_IDENTIFIABLE:
@@ -194,6 +196,19 @@ def diagnose_bag(
     }
     report, page = write_diagnosis(out, diagnosis, inputs, robot_file, doubts)
     return BagDiagnosis(bag, diagnosis, report, page, robot_file, recording.warnings, tuple(doubts), ground)
+
+
+def without_blame_for_ground(diagnosis: Diagnosis, ground: Ground) -> Diagnosis:
+    """The diagnosis; ``not_identifiable`` where an error without a name may be that of ground that no map shows."""
+    named = [effect for effect in diagnosis.effects if effect.name != LEARNED] or diagnosis.known_parts
+    if diagnosis.verdict != Verdict.UNKNOWN_EFFECT or named or not ground.unexplained:
+        return diagnosis
+    return Diagnosis(
+        Verdict.NOT_IDENTIFIABLE,
+        advice=(ground.unexplained,),
+        noise_floor=diagnosis.noise_floor,
+        commissioned=diagnosis.commissioned,
+    )
 
 
 def _in_file(robot: RobotModel, name: str) -> dict[str, float]:
