@@ -134,18 +134,19 @@ def test_an_error_without_a_name_on_hills_without_a_map_is_not_called_an_effect(
     nameless = [
         diagnosed((0.5, None), (8.0, None), effects=(), verdict=Verdict.UNKNOWN_EFFECT, commissioned=False),
         diagnosed((0.5, 0.3), (8.0, 6.0), effects=(formula,), verdict=Verdict.UNKNOWN_EFFECT),
+        diagnosed((0.5, None), (8.0, None), effects=(), verdict=Verdict.UNKNOWN_EFFECT, known_parts=(DELAY,)),
     ]
     for found in nameless:
         judged = without_blame_for_ground(found, traced)
         assert judged.verdict is Verdict.NOT_IDENTIFIABLE and judged.commissioned is found.commissioned
+        assert judged.known_parts == found.known_parts and not judged.effects
         top = headline(judged)
         assert top.sentence == "This recording cannot be diagnosed." and top.findings == (traced.unexplained,)
         assert "ground is not level" in diagnosis_page(judged, {}, None)
         # On a map, or on level ground, it is the robot's.
         assert without_blame_for_ground(found, Ground("lidar", "map")) is found
     # What has a name stands, and so does a healthy robot.
-    parts = diagnosed((0.5, None), (8.0, None), effects=(), verdict=Verdict.UNKNOWN_EFFECT, known_parts=(DELAY,))
-    for kept in (parts, diagnosed((0.5, 0.06), (8.0, 1.0)), Diagnosis(Verdict.NO_DISCREPANCY)):
+    for kept in (diagnosed((0.5, 0.06), (8.0, 1.0)), Diagnosis(Verdict.NO_DISCREPANCY)):
         assert without_blame_for_ground(kept, traced) is kept
 
 

@@ -16,7 +16,6 @@ from monoforce_ros.discrepancy.diagnosis import Diagnosis, DiagnosisSettings, di
 from monoforce_ros.discrepancy.gap import noisy_motions
 from monoforce_ros.discrepancy.ground import Ground, choose_ground
 from monoforce_ros.discrepancy.hypothesis import Effects, Evidence, corrected_evidence, window_starts
-from monoforce_ros.discrepancy.learned import LEARNED
 from monoforce_ros.discrepancy.motion_check import motion_faults
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.nominal_residual import residual_complaint
@@ -200,11 +199,11 @@ def diagnose_bag(
 
 def without_blame_for_ground(diagnosis: Diagnosis, ground: Ground) -> Diagnosis:
     """The diagnosis; ``not_identifiable`` where an error without a name may be that of ground that no map shows."""
-    named = [effect for effect in diagnosis.effects if effect.name != LEARNED] or diagnosis.known_parts
-    if diagnosis.verdict != Verdict.UNKNOWN_EFFECT or named or not ground.unexplained:
+    if diagnosis.verdict != Verdict.UNKNOWN_EFFECT or not ground.unexplained:
         return diagnosis
     return Diagnosis(
         Verdict.NOT_IDENTIFIABLE,
+        known_parts=diagnosis.known_parts,
         advice=(ground.unexplained,),
         noise_floor=diagnosis.noise_floor,
         commissioned=diagnosis.commissioned,
