@@ -5,6 +5,7 @@ import subprocess
 
 import numpy as np
 import pytest
+from matplotlib.collections import PathCollection
 from scipy.integrate import trapezoid
 from scipy.spatial.transform import Rotation
 
@@ -12,10 +13,13 @@ from monoforce_ros.bags import BagWriter, Recording, builders
 from monoforce_ros.core import MotionState
 from monoforce_ros.evaluation import observe
 from monoforce_ros.evaluation.cli import main
+from monoforce_ros.evaluation.figures import prediction_figure
 from monoforce_ros.evaluation.metrics import Poses, bootstrap_interval, position_errors, rotation_errors, summarise
 from monoforce_ros.evaluation.recording_evaluation import MAXIMUM_SPREAD, constant_velocity
+from monoforce_ros.evaluation.view import LARGEST_DRAWN_FORCE, PredictionView
 from monoforce_ros.reporting import card, definition_list, folded_list, page, write_between
 from monoforce_ros.robots import load_robot
+from monoforce_ros.terrain import Grid, TerrainMap
 
 
 def test_errors_are_metres_and_degrees():
@@ -35,6 +39,19 @@ def test_a_summary_counts_only_windows_that_stay_on_the_map_and_are_measured():
     assert summary.mean_along == pytest.approx(np.mean([1, 2, 2, 4]))
     assert summarise(errors, usable, 1).windows == 3
     assert summarise(errors, np.zeros((4, 3), bool), 1).windows == 0
+
+
+def test_forces_that_would_cover_the_picture_are_shortened_in_their_direction():
+    forces = np.array([[0.0, 0.0, 0.25], [30.0, 0.0, -40.0], [0.0, 0.0, 0.0]])
+    map_, eye = TerrainMap.flat(Grid.square(2.0, 0.5)), np.eye(3)[None]
+    still = MotionState(0, np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3))
+    view = PredictionView(still, map_, np.zeros(1), np.zeros((1, 3)), eye, np.zeros((3, 3)), forces)
+    expected = [[0.0, 0.0, 0.25], [0.6 * LARGEST_DRAWN_FORCE, 0.0, -0.8 * LARGEST_DRAWN_FORCE], [0.0, 0.0, 0.0]]
+    np.testing.assert_allclose(view.drawn_forces, expected)
+    robot = load_robot("husky")
+    (above, *_) = prediction_figure(view, robot).axes
+    (dots,) = (found for found in above.collections if isinstance(found, PathCollection) and len(found.get_offsets()))
+    assert dots.get_sizes().max() <= 260 * LARGEST_DRAWN_FORCE + 1e-6
 
 
 def test_the_interval_of_a_mean_covers_it():

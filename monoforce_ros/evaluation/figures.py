@@ -199,7 +199,8 @@ def _draw_robot(axes: Axes, robot: RobotModel, position: np.ndarray, rotation: n
 
 def _draw_forces(axes: Axes, view: PredictionView) -> None:
     """Loaded contact points, sized by the load, and the horizontal part of the forces as arrows."""
-    load = np.linalg.norm(view.contact_forces, axis=1)
+    forces = view.drawn_forces
+    load = np.linalg.norm(forces, axis=1)
     axes.scatter(
         view.contact_points[:, 0],
         view.contact_points[:, 1],
@@ -208,11 +209,11 @@ def _draw_forces(axes: Axes, view: PredictionView) -> None:
         alpha=0.55,
         linewidths=0,
         zorder=4,
-        label="contact force",
     )
+    axes.scatter([], [], s=40, color=_FORCE, alpha=0.55, linewidths=0, label="contact force")
     axes.quiver(
         *view.contact_points[:, :2].T,
-        *(view.contact_forces[:, :2] * 4.0).T,
+        *(forces[:, :2] * 4.0).T,
         angles="xy",
         scale_units="xy",
         scale=1.0,
