@@ -198,7 +198,7 @@ def _draw_robot(axes: Axes, robot: RobotModel, position: np.ndarray, rotation: n
 
 
 _METRES_PER_WEIGHT = 4.0
-"""Length of the arrow of a horizontal force of the robot's weight [m]: a tenth of it per wheel, as in turns, is visible."""
+"""Length of the arrow of a horizontal force of the robot's weight [m]: a twentieth of it, as in turns, is visible."""
 _LONGEST_ARROW = 0.5
 """Longest arrow [m], about half of a robot, so that forces at the start do not hide the path."""
 
