@@ -1,10 +1,12 @@
 """The evaluation: metrics in closed form, and the installed command on a recording."""
 
 import json
+import re
 import subprocess
 
 import numpy as np
 import pytest
+from conftest import ROOT
 from matplotlib.collections import PathCollection
 from scipy.integrate import trapezoid
 from scipy.spatial.transform import Rotation
@@ -81,7 +83,7 @@ def test_the_baseline_follows_an_arc(rate):
 def report(executables, demo_bag, tmp_path_factory):
     out = tmp_path_factory.mktemp("evaluation")
     done = subprocess.run(
-        [str(executables / "evaluate"), str(demo_bag), "--out", str(out), "--stride", "0.8", "--quiet"],
+        [str(executables / "evaluate"), str(demo_bag), "--out", str(out), "--quiet"],
         capture_output=True,
         text=True,
         timeout=200,
@@ -98,6 +100,22 @@ def test_the_report_compares_with_the_baseline_at_every_horizon(report):
         assert rows["1"]["position_error_m"]["windows"] >= 10
         assert rows["5"]["rotation_error_deg"]["mean"] > 0
     assert "Δx 5 s [m]" in printed and "report.html" in printed
+
+
+def test_the_readme_states_the_errors_of_the_bundled_recording(report):
+    """Of today's physics, as far as the last digit and other processors allow."""
+    text = (ROOT / "README.md").read_text()
+    rows = {
+        "physics on lidar terrain": "physics",
+        "physics on flat ground": "physics, flat ground",
+        "constant velocity, flat ground": "constant velocity, flat ground",
+    }
+    for row, method in rows.items():
+        cells = text.split(f"| {row} | ")[1].split("\n")[0].split(" | ")
+        stated = [float(re.match(r"[\d.]+", cell).group()) for cell in cells]
+        columns = [(name, h) for name in ("position_error_m", "rotation_error_deg") for h in ("1", "2", "5")]
+        measured = [report[1]["methods"][method][h][name]["median"] for name, h in columns]
+        np.testing.assert_allclose(stated, measured, rtol=0.15, atol=0.03, err_msg=row)
 
 
 def test_physics_beats_constant_velocity_on_the_demo_recording(report):
