@@ -69,7 +69,7 @@ def draw(recording: Recording, seconds: float) -> Figure:
         left.plot(path[step, 0] + radius * np.cos(circle), path[step, 1] + radius * np.sin(circle),
                   color="#1454c8", linewidth=1.2, linestyle="--",
                   label="contains 90 % of the outcomes" if step == 100 else None)  # fmt: skip
-    left.set(xlim=(-1.5, 6.0), ylim=(-4.2, 4.2), aspect="equal", xlabel="ahead [m]", ylabel="to the left [m]")
+    left.set(xlim=(-1.5, 6.0), ylim=(-4.2, 4.2), aspect="equal", xlabel="forward x [m]", ylabel="left y [m]")
     left.set_title("candidates: green low cost, red high cost, grey infeasible")
     left.legend(loc="lower left", fontsize=8)
     grid = occupancy(terrain, np.eye(4), slope_limit=0.5, step_limit=0.15)
@@ -80,7 +80,7 @@ def draw(recording: Recording, seconds: float) -> Figure:
     right.set_facecolor("#9aa7b5")
     right.imshow(values, origin="lower", extent=extent, cmap="gray_r", vmin=0, vmax=100)
     right.plot(path[:, 0], path[:, 1], color="#1454c8", linewidth=2.5)
-    right.set(xlim=(-1.5, 6.0), ylim=(-4.2, 4.2), aspect="equal", xlabel="ahead [m]")
+    right.set(xlim=(-1.5, 6.0), ylim=(-4.2, 4.2), aspect="equal", xlabel="forward x [m]")
     right.set_title("occupancy for Nav2: black lethal, blue-grey unknown")
     return figure
 

@@ -53,3 +53,10 @@ use_ros_wheels() {
   export AMENT_PREFIX_PATH="$venv${AMENT_PREFIX_PATH:+:$AMENT_PREFIX_PATH}"
   export PATH="$venv/bin:$PATH"
 }
+
+# The exported CMake targets of the wheels in the environment $1 name the folders of the headers of Python and NumPy where the
+# wheels were built, or where an earlier call found them. Sets them to $2 and $3.
+set_include_folders() {
+  { grep -rlZE '"/[^"]*/(include/python3|numpy/[^;"]*include)' "$1"/share/*/cmake || true; } | xargs -0r sed -i \
+    -e "s#/[^;\"]*/include/python3[.0-9]*#$2#g" -e "s#/[^;\"]*/numpy/[^;\"]*include#$3#g"
+}

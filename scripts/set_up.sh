@@ -103,15 +103,14 @@ interfaces() {
     return
   fi
   use_ros_wheels
-  # Exported CMake targets of the wheels contain paths of the machine that built them; replace these.
   headers=$("$venv/bin/python" -c 'import sysconfig; print(sysconfig.get_paths()["include"])')
-  arrays=$("$venv/bin/python" -c 'import numpy; print(numpy.get_include())')
+  # Without links: several checkouts may share an environment.
+  arrays=$("$venv/bin/python" -c 'import numpy, os; print(os.path.realpath(numpy.get_include()))')
   if [ ! -f "$headers/Python.h" ]; then
     say "no headers of Python in $headers: messages are not built, their tests will be skipped (sudo apt install python3-dev)"
     return
   fi
-  { grep -rlZ '"/opt/python/' "$venv"/share/*/cmake || true; } | xargs -0r sed -i \
-    -e "s#/opt/python/[^;\"]*/include/python3[.0-9]*#$headers#g" -e "s#/opt/python/[^;\"]*/numpy/[^;\"]*include#$arrays#g"
+  set_include_folders "$venv" "$headers" "$arrays"
   # An installed ROS has the complete packages; what an earlier call built into install/ does not count.
   for package in msg_defs/*/package.xml; do
     package=$(dirname "$package")

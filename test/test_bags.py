@@ -8,7 +8,7 @@ from nav_msgs.msg import Odometry
 from rclpy.serialization import deserialize_message
 
 from monoforce_ros.bags import BagError, BagReader, BagWriter, Recording, builders
-from monoforce_ros.bags.recording import camera_info_topic, find_transform
+from monoforce_ros.bags.recording import camera_info_topics, find_transform
 
 START = 1_700_000_000_000_000_000
 
@@ -238,13 +238,15 @@ def test_messages_out_of_order_are_sorted_by_their_stamps(tmp_path):
 @pytest.mark.parametrize(
     ("image", "info"),
     [
-        ("/cam/image_raw", "/cam/camera_info"),
-        ("/cam/image_raw/compressed", "/cam/camera_info"),
-        ("image", "camera_info"),
+        ("/cam/image_raw", ("/cam/camera_info", "/cam/image_raw/camera_info")),
+        ("/cam/image_raw/compressed", ("/cam/camera_info", "/cam/image_raw/camera_info")),
+        ("/camera_0/color/compressed", ("/camera_0/camera_info", "/camera_0/color/camera_info")),
+        ("/image", ("/camera_info", "/image/camera_info")),
+        ("image", ("camera_info", "image/camera_info")),
     ],
 )
 def test_camera_info_topics_follow_image_transport(image, info):
-    assert camera_info_topic(image) == info
+    assert camera_info_topics(image) == info
 
 
 def test_transforms_are_chained_in_both_directions():

@@ -166,10 +166,16 @@ def test_the_former_name_of_the_retention_time_still_works_with_a_warning(start)
     assert process.stop() == 0
 
 
-def test_compressed_images_are_found_on_the_same_topic_name(start, peer, predictor):
+@pytest.mark.parametrize(
+    ("topic", "info"),
+    [
+        ("/front/image_raw/compressed", INFO),
+        ("/sensors/camera_0/color/compressed", "/sensors/camera_0/color/camera_info"),
+    ],
+)
+def test_compressed_images_and_their_calibration_are_found(start, peer, predictor, topic, info):
     # Another node of the same kind with the compressed topic; the first goes on undisturbed.
     checkpoint = next(word for word in predictor._process.args if "checkpoint" in word).split(":=")[1]
-    topic = "/front/image_raw/compressed"
     other = start(
         "predictor", "--ros-args", "-r", "__ns:=/second",
         "-p", "odometry_topic:=/odom", "-p", "command_topic:=/cmd_vel",
@@ -185,7 +191,7 @@ def test_compressed_images_are_found_on_the_same_topic_name(start, peer, predict
     while not found and time.monotonic() < deadline:
         for _ in range(4):
             peer.publish(topic, builders.compressed_image(peer.now, "camera_front", "jpeg", data))
-            peer.publish(INFO, information(peer.now))
+            peer.publish(info, information(peer.now))
             peer.drive(0.2, cloud=lambda stamp: None)
     assert found, other.output
     assert other.stop() == 0

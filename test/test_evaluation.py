@@ -1,10 +1,13 @@
 """The evaluation: metrics in closed form, and the installed command on a recording."""
 
 import json
+import re
 import subprocess
 
 import numpy as np
 import pytest
+from conftest import ROOT
+from matplotlib.collections import PathCollection
 from scipy.integrate import trapezoid
 from scipy.spatial.transform import Rotation
 
@@ -12,10 +15,13 @@ from monoforce_ros.bags import BagWriter, Recording, builders
 from monoforce_ros.core import MotionState
 from monoforce_ros.evaluation import observe
 from monoforce_ros.evaluation.cli import main
+from monoforce_ros.evaluation.figures import prediction_figure
 from monoforce_ros.evaluation.metrics import Poses, bootstrap_interval, position_errors, rotation_errors, summarise
 from monoforce_ros.evaluation.recording_evaluation import MAXIMUM_SPREAD, constant_velocity
+from monoforce_ros.evaluation.view import LARGEST_DRAWN_FORCE, PredictionView
 from monoforce_ros.reporting import card, definition_list, folded_list, page, write_between
 from monoforce_ros.robots import load_robot
+from monoforce_ros.terrain import Grid, TerrainMap
 
 
 def test_errors_are_metres_and_degrees():
@@ -35,6 +41,19 @@ def test_a_summary_counts_only_windows_that_stay_on_the_map_and_are_measured():
     assert summary.mean_along == pytest.approx(np.mean([1, 2, 2, 4]))
     assert summarise(errors, usable, 1).windows == 3
     assert summarise(errors, np.zeros((4, 3), bool), 1).windows == 0
+
+
+def test_forces_that_would_cover_the_picture_are_shortened_in_their_direction():
+    forces = np.array([[0.0, 0.0, 0.25], [30.0, 0.0, -40.0], [0.0, 0.0, 0.0]])
+    map_, eye = TerrainMap.flat(Grid.square(2.0, 0.5)), np.eye(3)[None]
+    still = MotionState(0, np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3))
+    view = PredictionView(still, map_, np.zeros(1), np.zeros((1, 3)), eye, np.zeros((3, 3)), forces)
+    expected = [[0.0, 0.0, 0.25], [0.6 * LARGEST_DRAWN_FORCE, 0.0, -0.8 * LARGEST_DRAWN_FORCE], [0.0, 0.0, 0.0]]
+    np.testing.assert_allclose(view.drawn_forces, expected)
+    robot = load_robot("husky")
+    (above, *_) = prediction_figure(view, robot).axes
+    (dots,) = (found for found in above.collections if isinstance(found, PathCollection) and len(found.get_offsets()))
+    assert dots.get_sizes().max() <= 260 * LARGEST_DRAWN_FORCE + 1e-6
 
 
 def test_the_interval_of_a_mean_covers_it():
@@ -64,7 +83,7 @@ def test_the_baseline_follows_an_arc(rate):
 def report(executables, demo_bag, tmp_path_factory):
     out = tmp_path_factory.mktemp("evaluation")
     done = subprocess.run(
-        [str(executables / "evaluate"), str(demo_bag), "--out", str(out), "--stride", "0.8", "--quiet"],
+        [str(executables / "evaluate"), str(demo_bag), "--out", str(out), "--quiet"],
         capture_output=True,
         text=True,
         timeout=200,
@@ -81,6 +100,22 @@ def test_the_report_compares_with_the_baseline_at_every_horizon(report):
         assert rows["1"]["position_error_m"]["windows"] >= 10
         assert rows["5"]["rotation_error_deg"]["mean"] > 0
     assert "Δx 5 s [m]" in printed and "report.html" in printed
+
+
+def test_the_readme_states_the_errors_of_the_bundled_recording(report):
+    """Of today's physics, as far as the last digit and other processors allow."""
+    text = (ROOT / "README.md").read_text()
+    rows = {
+        "physics on lidar terrain": "physics",
+        "physics on flat ground": "physics, flat ground",
+        "constant velocity, flat ground": "constant velocity, flat ground",
+    }
+    for row, method in rows.items():
+        cells = text.split(f"| {row} | ")[1].split("\n")[0].split(" | ")
+        stated = [float(re.match(r"[\d.]+", cell).group()) for cell in cells]
+        columns = [(name, h) for name in ("position_error_m", "rotation_error_deg") for h in ("1", "2", "5")]
+        measured = [report[1]["methods"][method][h][name]["median"] for name, h in columns]
+        np.testing.assert_allclose(stated, measured, rtol=0.15, atol=0.03, err_msg=row)
 
 
 def test_physics_beats_constant_velocity_on_the_demo_recording(report):

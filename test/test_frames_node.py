@@ -82,6 +82,25 @@ def test_an_offset_is_asked_for_and_applied_once_tf_has_it(peer, start, tf_type)
     assert process.stop() == 0
 
 
+@pytest.mark.parametrize("node", ["predictor", "path_selector"])
+def test_transforms_that_come_just_after_the_odometry_are_waited_for_without_an_error(peer, start, tf_type, node):
+    prefix = f"late_{node}"
+    source = ["-p", "terrain_source:=flat"] if node == "predictor" else []
+    transforms = "-r", "/tf:=tf", "-r", "/tf_static:=tf_static"
+    process = start(node, "--ros-args", "-r", f"__ns:=/{prefix}", *transforms, *source)
+    # Later than anything that counts from the start of the node.
+    process.wait_for("odometry: no messages for", 120.0)
+    feed = Feed(peer, prefix)
+    feed.until(lambda: False, 1.0)
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    publisher = peer.node.create_publisher(tf_type, f"/{prefix}/tf_static", latched)
+    message = builders.transforms(peer.now, f"{prefix}/base_footprint", {f"{prefix}/base_link": pose_matrix(OFFSET)})
+    publisher.publish(bytes(type_store().serialize_cdr(message, message.__msgtype__)))
+    assert feed.until(lambda: "receiving odometry" in process.output, 15.0), process.output
+    assert "the offset between them is unknown" not in process.output
+    assert process.stop() == 0
+
+
 def test_an_offset_may_be_a_parameter(peer, start):
     process = start(
         "predictor", "--ros-args", "-r", "__ns:=/robot2", "-p", "horizon:=1.0",

@@ -6,8 +6,10 @@ from dataclasses import replace
 import pytest
 
 from monoforce_ros.discrepancy import Diagnosis, EffectEstimate, ParameterEstimate, Verdict
+from monoforce_ros.discrepancy.bag_diagnosis import without_blame_for_ground
 from monoforce_ros.discrepancy.comparison import GapRow
 from monoforce_ros.discrepancy.credibility import complaint
+from monoforce_ros.discrepancy.ground import Ground
 from monoforce_ros.discrepancy.headline import Tone, explained, headline
 from monoforce_ros.discrepancy.page import diagnosis_page
 from monoforce_ros.discrepancy.report import report_content, summary_lines
@@ -124,6 +126,28 @@ def test_a_model_that_misses_the_healthy_robot_does_not_say_that_nothing_is_wron
     assert headline(nothing, []).sentence.startswith("Nothing is wrong")
     top = headline(nothing, ["the commissioned model misses the healthy robot by 17 cm"])
     assert top.tone is Tone.PARTLY and "with doubts" in top.sentence
+
+
+def test_an_error_without_a_name_on_hills_without_a_map_is_not_called_an_effect():
+    traced = Ground("traced", "traced by the wheels", unexplained="the ground is not level and no map shows it")
+    formula = replace(DELAY, name="learned_term")
+    nameless = [
+        diagnosed((0.5, None), (8.0, None), effects=(), verdict=Verdict.UNKNOWN_EFFECT, commissioned=False),
+        diagnosed((0.5, 0.3), (8.0, 6.0), effects=(formula,), verdict=Verdict.UNKNOWN_EFFECT),
+        diagnosed((0.5, None), (8.0, None), effects=(), verdict=Verdict.UNKNOWN_EFFECT, known_parts=(DELAY,)),
+    ]
+    for found in nameless:
+        judged = without_blame_for_ground(found, traced)
+        assert judged.verdict is Verdict.NOT_IDENTIFIABLE and judged.commissioned is found.commissioned
+        assert judged.known_parts == found.known_parts and not judged.effects
+        top = headline(judged)
+        assert top.sentence == "This recording cannot be diagnosed." and top.findings == (traced.unexplained,)
+        assert "ground is not level" in diagnosis_page(judged, {}, None)
+        # On a map, or on level ground, it is the robot's.
+        assert without_blame_for_ground(found, Ground("lidar", "map")) is found
+    # What has a name stands, and so does a healthy robot.
+    for kept in (diagnosed((0.5, 0.06), (8.0, 1.0)), Diagnosis(Verdict.NO_DISCREPANCY)):
+        assert without_blame_for_ground(kept, traced) is kept
 
 
 def test_doubts_take_the_green_away():

@@ -133,6 +133,27 @@ def test_run_within_run_says_nothing(tmp_path):
     assert ended.stderr == ""
 
 
+def test_messages_are_built_with_the_headers_of_the_environment_wherever_it_was_before(tmp_path):
+    folder = tmp_path / "share" / "std_msgs" / "cmake"
+    folder.mkdir(parents=True)
+    target = '  INTERFACE_INCLUDE_DIRECTORIES "{};{};${{_IMPORT_PREFIX}}/include/std_msgs"\n'
+    packages = "lib/python3.12/site-packages/numpy/_core/include"
+    old = {
+        "wheel": ("/opt/python/cp312/include/python3.12", f"/opt/python/cp312/{packages}"),
+        "moved": ("/usr/include/python3.12", f"/home/me/old/.venv/{packages}"),
+    }
+    for name, folders in old.items():
+        (folder / f"{name}.cmake").write_text(target.format(*folders))
+    (folder / "plain.cmake").write_text('set(x "${_IMPORT_PREFIX}/include/std_msgs")\n')
+    headers, arrays = "/h/include/python3.12", "/a/numpy/include"
+    script = f"root=/; source {ROOT}/scripts/environment.sh; set_include_folders {tmp_path} {headers} {arrays}"
+    for _ in range(2):
+        subprocess.run(["bash", "-euo", "pipefail", "-c", script], check=True)
+    for name in old:
+        assert (folder / f"{name}.cmake").read_text() == target.format(headers, arrays)
+    assert (folder / "plain.cmake").read_text() == 'set(x "${_IMPORT_PREFIX}/include/std_msgs")\n'
+
+
 def test_the_container_takes_the_steps_of_the_page():
     page = (ROOT / "docs" / "install.md").read_text()
     dockerfile = re.sub(r"\\\n\s*", "", (ROOT / "Dockerfile").read_text())

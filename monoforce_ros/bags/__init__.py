@@ -12,7 +12,7 @@ from monoforce_ros.bags.recording import (
     ODOMETRY,
     Frame,
     Recording,
-    camera_info_topic,
+    camera_info_topics,
     find_transform,
     nearest_frame,
 )
@@ -40,7 +40,7 @@ __all__ = [
     "Windows",
     "add_read_options",
     "builders",
-    "camera_info_topic",
+    "camera_info_topics",
     "cut_windows",
     "find_transform",
     "nearest_frame",

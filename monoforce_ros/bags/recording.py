@@ -250,15 +250,18 @@ def find_transform(transforms: dict[tuple[str, str], np.ndarray], parent: str, c
     return TransformTree(transforms).find(parent, child)
 
 
-def camera_info_topic(image_topic: str) -> str:
-    """The CameraInfo topic of an image topic, by the convention of image_transport.
+def camera_info_topics(image_topic: str) -> tuple[str, str]:
+    """Where the CameraInfo of an image topic may be, likeliest first.
 
-    >>> camera_info_topic("/camera/front/image_raw/compressed")
-    '/camera/front/camera_info'
+    By the convention of image_transport it is beside the topic of the raw image. Drivers that name the raw image by its
+    namespace (``color`` with ``color/compressed``) have it below that topic.
+
+    >>> camera_info_topics("/camera/front/image_raw/compressed")
+    ('/camera/front/camera_info', '/camera/front/image_raw/camera_info')
     """
-    parts = image_topic.rsplit("/", 2)
-    base = image_topic.rsplit("/", 1)[0] if parts[-1] == "compressed" else image_topic
-    return f"{base.rsplit('/', 1)[0]}/camera_info" if "/" in base else "camera_info"
+    base = image_topic.removesuffix("/compressed")
+    space, slash, _ = base.rpartition("/")
+    return f"{space}{slash}camera_info", f"{base}/camera_info"
 
 
 def _is_commanded(topic: str) -> bool:
@@ -421,9 +424,9 @@ class _Collector:
                 for topic in image_topics
             },
             cameras={
-                topic: self.cameras[camera_info_topic(topic)]
+                topic: self.cameras[found[0]]
                 for topic in image_topics
-                if camera_info_topic(topic) in self.cameras
+                if (found := [info for info in camera_info_topics(topic) if info in self.cameras])
             },
             static_transforms=self.transforms,
             topics={role: topic for role, topic in self.chosen.items() if topic},

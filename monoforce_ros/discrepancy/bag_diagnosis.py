@@ -154,6 +154,7 @@ def diagnose_bag(
         settings=settings,
         progress=progress,
     )
+    diagnosis = without_blame_for_ground(diagnosis, ground)
     large = residual_complaint(None if nominal is None else nominal.residual, evidence.smoothed, evidence.commands)
     doubts = [text for text in (ground.complaint, large) if text]
     if diagnosis.verdict == Verdict.NOT_IDENTIFIABLE:
@@ -194,6 +195,19 @@ def diagnose_bag(
     }
     report, page = write_diagnosis(out, diagnosis, inputs, robot_file, doubts)
     return BagDiagnosis(bag, diagnosis, report, page, robot_file, recording.warnings, tuple(doubts), ground)
+
+
+def without_blame_for_ground(diagnosis: Diagnosis, ground: Ground) -> Diagnosis:
+    """The diagnosis; ``not_identifiable`` where an error without a name may be that of ground that no map shows."""
+    if diagnosis.verdict != Verdict.UNKNOWN_EFFECT or not ground.unexplained:
+        return diagnosis
+    return Diagnosis(
+        Verdict.NOT_IDENTIFIABLE,
+        known_parts=diagnosis.known_parts,
+        advice=(ground.unexplained,),
+        noise_floor=diagnosis.noise_floor,
+        commissioned=diagnosis.commissioned,
+    )
 
 
 def _in_file(robot: RobotModel, name: str) -> dict[str, float]:

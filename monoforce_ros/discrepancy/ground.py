@@ -35,6 +35,9 @@ class Ground:
     complaint: str = ""
     """Why this is not the ground that the robot drove on; empty if nothing speaks against it."""
 
+    unexplained: str = ""
+    """Why an error without a name may be the ground's; empty if a map shows the ground, or it is level."""
+
     @property
     def unknown(self) -> bool:
         """Whether the robot drove over ground that no map shows."""
@@ -71,7 +74,13 @@ def choose_ground(terrain: str, recording: Recording, smoothed: SmoothedMotion, 
     complaint = ""
     if terrain == "auto" and slope > LEVEL_SLOPE and plane <= _SHARE_OF_PLANE:
         degrees = np.degrees(slope)
-        return Ground("traced", f"traced by the wheels: slopes of {degrees:.1f}° by the poses, and {reason}")
+        unexplained = (
+            f"the ground is not level (slopes of {degrees:.1f}° by the poses, root mean square) and no map shows it "
+            f"({reason}): what its trace along the poses leaves unexplained may be the ground's; record a lidar, or "
+            "give a map of fit_terrain (--terrain)"
+        )
+        description = f"traced by the wheels: slopes of {degrees:.1f}° by the poses, and {reason}"
+        return Ground("traced", description, unexplained=unexplained)
     if slope > LEVEL_SLOPE:
         remedy = "use --terrain lidar or a map" if recording.clouds else "record a lidar, or give a map of fit_terrain"
         what = f"the ground is not level (slopes of {np.degrees(slope):.1f}° by the poses, root mean square)"
@@ -82,7 +91,7 @@ def choose_ground(terrain: str, recording: Recording, smoothed: SmoothedMotion, 
             )
             remedy = "level the localisation's frame by its IMU, or " + remedy
         complaint = f"{what}; level ground is assumed ({said}), so that slopes may pass for an effect: {remedy}"
-    return Ground("flat", f"level ({said})", complaint)
+    return Ground("flat", f"level ({said})", complaint, complaint)
 
 
 def slope_of(smoothed: SmoothedMotion) -> tuple[float, float]:

@@ -16,7 +16,7 @@ from monoforce_ros.bags import (
     ReadOptions,
     Recording,
     SmoothedMotion,
-    camera_info_topic,
+    camera_info_topics,
     smooth,
 )
 from monoforce_ros.core import NANOSECOND, MotionTrack
@@ -139,7 +139,8 @@ def _cloud_findings(recording: Recording, robot: RobotModel) -> Iterator[Finding
 def _image_findings(recording: Recording, robot: RobotModel) -> Iterator[Finding]:
     for topic, frames in recording.images.items():
         if topic not in recording.cameras:
-            yield warning(f"{topic}: no CameraInfo on {camera_info_topic(topic)}; images cannot be used without it")
+            expected = " or ".join(camera_info_topics(topic))
+            yield warning(f"{topic}: no CameraInfo on {expected}; images cannot be used without it")
             continue
         camera = recording.cameras[topic]
         try:

@@ -197,9 +197,18 @@ def _draw_robot(axes: Axes, robot: RobotModel, position: np.ndarray, rotation: n
     axes.plot(*np.stack([position[:2], nose]).T, color="white", linewidth=1.4)
 
 
+_METRES_PER_WEIGHT = 4.0
+"""Length of the arrow of a horizontal force of the robot's weight [m]: a twentieth of it, as in turns, is visible."""
+_LONGEST_ARROW = 0.5
+"""Longest arrow [m], about half of a robot, so that forces at the start do not hide the path."""
+
+
 def _draw_forces(axes: Axes, view: PredictionView) -> None:
     """Loaded contact points, sized by the load, and the horizontal part of the forces as arrows."""
-    load = np.linalg.norm(view.contact_forces, axis=1)
+    forces = view.drawn_forces
+    load = np.linalg.norm(forces, axis=1)
+    arrows = forces[:, :2] * _METRES_PER_WEIGHT
+    arrows *= np.minimum(1.0, _LONGEST_ARROW / np.maximum(np.linalg.norm(arrows, axis=1, keepdims=True), 1e-12))
     axes.scatter(
         view.contact_points[:, 0],
         view.contact_points[:, 1],
@@ -208,11 +217,11 @@ def _draw_forces(axes: Axes, view: PredictionView) -> None:
         alpha=0.55,
         linewidths=0,
         zorder=4,
-        label="contact force",
     )
+    axes.scatter([], [], s=40, color=_FORCE, alpha=0.55, linewidths=0, label="contact force")
     axes.quiver(
         *view.contact_points[:, :2].T,
-        *(view.contact_forces[:, :2] * 4.0).T,
+        *arrows.T,
         angles="xy",
         scale_units="xy",
         scale=1.0,

@@ -147,7 +147,7 @@ def _draw_path(
 def _draw_forces(
     canvas: np.ndarray, camera: CameraModel, camera_from_terrain: np.ndarray, view: PredictionView
 ) -> np.ndarray:
-    tips = view.contact_points + view.contact_forces
+    tips = view.contact_points + view.drawn_forces
     lower, lower_ok = _project(camera, transform_points(camera_from_terrain, view.contact_points))
     upper, upper_ok = _project(camera, transform_points(camera_from_terrain, tips))
     for start, end in zip(lower[lower_ok & upper_ok], upper[lower_ok & upper_ok], strict=True):

@@ -16,6 +16,11 @@ from monoforce_ros.prediction import FORCE_LENGTH, Prediction, contact_points, f
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import Grid, TerrainMap
 
+LARGEST_DRAWN_FORCE = 0.5
+"""Length up to which forces are drawn, over the robot's weight: twice the load of each of four wheels at rest.
+
+Impacts, and maps that cut through a wheel at the start, give forces that would cover the picture."""
+
 
 @dataclass(frozen=True)
 class PredictionView:
@@ -33,6 +38,12 @@ class PredictionView:
     """Loaded contact points at some times along the path, ``[k, 3]`` [m]."""
     contact_forces: np.ndarray
     """Contact forces over the robot's weight, ``[k, 3]`` [-]."""
+
+    @property
+    def drawn_forces(self) -> np.ndarray:
+        """Contact forces for pictures, ``[k, 3]`` [-]: larger ones are shortened to :data:`LARGEST_DRAWN_FORCE`."""
+        size = np.linalg.norm(self.contact_forces, axis=1, keepdims=True)
+        return self.contact_forces * np.minimum(1.0, LARGEST_DRAWN_FORCE / np.maximum(size, 1e-12))
 
     @classmethod
     def of_prediction(cls, prediction: Prediction, robot: RobotModel) -> PredictionView:

@@ -11,6 +11,9 @@ from monoforce_ros.core import FrameError, TransformHistory, TransformTree
 from monoforce_ros.messages import MessageError, decoding, message_class, missing_package
 
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
+TRANSFORMS_PATIENCE = 2.0
+"""Time after the first odometry in which a missing transform is no error [s]: /tf_static takes as long to be
+discovered."""
 
 
 class TransformListener:

@@ -20,7 +20,7 @@ from monoforce_ros.nodes.clocks import STEADY
 from monoforce_ros.nodes.command_output import CommandOutput
 from monoforce_ros.nodes.course import TRANSFORM_TIMEOUT, Course, CourseFrames
 from monoforce_ros.nodes.flipper_output import FlipperOutput
-from monoforce_ros.nodes.frames import TransformListener
+from monoforce_ros.nodes.frames import TRANSFORMS_PATIENCE, TransformListener
 from monoforce_ros.nodes.health import ERROR, OK, WARN, Health
 from monoforce_ros.nodes.parameters import declare_parameters
 from monoforce_ros.nodes.process import run_schema_node
@@ -189,7 +189,9 @@ class PathSelectorNode(Node):
             offset = self.frames.odometry_child(child, self.transforms.tree)
         except FrameError as error:
             self._odometry_problem = self.transforms.explained(error)
-            self.health.report("odometry", ERROR, self._odometry_problem, reason="frame")
+            # Transforms may be on their way.
+            if self.transforms.unavailable or time.monotonic() - self._first_odometry > TRANSFORMS_PATIENCE:
+                self.health.report("odometry", ERROR, self._odometry_problem, reason="frame")
             return
         self._odometry_problem = ""
         self._motion = state.of_base(offset)

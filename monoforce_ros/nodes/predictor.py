@@ -18,7 +18,7 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState, PointCloud2
 from visualization_msgs.msg import MarkerArray
 
-from monoforce_ros.bags import camera_info_topic
+from monoforce_ros.bags import camera_info_topics
 from monoforce_ros.core import NANOSECOND, CommandTrack, FrameError, RobotFrames, pose_matrix
 from monoforce_ros.effects import corrected_commands, corrected_motion
 from monoforce_ros.messages import decoding
@@ -28,7 +28,7 @@ from monoforce_ros.nodes.candidate_output import CandidateOutput
 from monoforce_ros.nodes.clocks import STEADY
 from monoforce_ros.nodes.costmap_output import CostmapOutput
 from monoforce_ros.nodes.ensemble_output import EnsembleOutput
-from monoforce_ros.nodes.frames import TransformListener
+from monoforce_ros.nodes.frames import TRANSFORMS_PATIENCE, TransformListener
 from monoforce_ros.nodes.health import ERROR, OK, STALE, WARN, Health
 from monoforce_ros.nodes.inputs import TIME_JUMP, Inputs, Received
 from monoforce_ros.nodes.joint_input import JointInput
@@ -46,8 +46,6 @@ from monoforce_ros.prediction import FORCE_INTERVAL, Prediction, Predictor
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainDefaults
 
-_TRANSFORMS_PATIENCE = 2.0
-"""Time after the start in which a missing transform is no error [s]: /tf_static takes as long to be discovered."""
 _MOST_ODD = 5
 """Commands of another time in a row that are reported: when a bag starts anew, the first ones precede its odometry."""
 _ZERO_STAMPS = "the stamps are zero: the {} does not set them"
@@ -126,6 +124,7 @@ class PredictorNode(ManagedNode):
         self._started = time.monotonic()
         self._predictions = 0
         self._last_prediction = self._started
+        self._first_odometry = 0.0
         self._durations: list[float] = []
         self.monitor = MonitorOutput(self, self.predictor, self.health)
         with_candidates = settings.candidates or settings.candidate_topic
@@ -242,6 +241,7 @@ class PredictorNode(ManagedNode):
                 for part, topic in (("joints", settings.joint_topic), ("flippers", settings.flipper_command_topic))
             ]
         images = {"sensor_msgs/msg/CompressedImage": CompressedImage, "sensor_msgs/msg/Image": Image}
+        self._camera_info_subscriptions: list[AdaptiveSubscription] = []
         info_topics = iter([*settings.camera_info_topics, *[""] * len(self.sensor_topics)])
         for part, topic in self.sensor_topics.items():
             types = {"sensor_msgs/msg/PointCloud2": PointCloud2} if part == LIDAR else images
@@ -249,15 +249,19 @@ class PredictorNode(ManagedNode):
                 self, topic, types, partial(self._on_sensor, part), depth=large, reliability=settings.image_qos
             )
             if part != LIDAR:
-                info = AdaptiveSubscription(
-                    self,
-                    next(info_topics) or camera_info_topic(topic),
-                    {"sensor_msgs/msg/CameraInfo": CameraInfo},
-                    partial(self.decoder.set_camera_info, part),
-                    depth=small,
-                )
-                self.decoder.add_camera(part, info.topic)
-                self._subscriptions_by_part[f"{part} info"] = info
+                given = next(info_topics)
+                infos = [
+                    AdaptiveSubscription(
+                        self,
+                        info_topic,
+                        {"sensor_msgs/msg/CameraInfo": CameraInfo},
+                        partial(self.decoder.set_camera_info, part),
+                        depth=small,
+                    )
+                    for info_topic in ([given] if given else camera_info_topics(topic))
+                ]
+                self.decoder.add_camera(part, " or ".join(info.topic for info in infos))
+                self._camera_info_subscriptions += infos
 
     @property
     def _crabs(self) -> bool:
@@ -268,6 +272,7 @@ class PredictorNode(ManagedNode):
 
     def _on_odometry(self, message: Odometry) -> None:
         self._arrivals["odometry"] = time.monotonic()
+        self._first_odometry = self._first_odometry or self._arrivals["odometry"]
         try:
             state, frame_id, child_frame_id = decoding.decode_odometry(message)
         except decoding.MessageError as error:
@@ -280,7 +285,7 @@ class PredictorNode(ManagedNode):
             pose = self.frames.odometry_child(child_frame_id, self.transforms.tree)
         except FrameError as error:
             # Transforms may be on their way.
-            if self.transforms.unavailable or time.monotonic() - self._started > _TRANSFORMS_PATIENCE:
+            if self.transforms.unavailable or time.monotonic() - self._first_odometry > TRANSFORMS_PATIENCE:
                 self.health.report("odometry", ERROR, self.transforms.explained(error), reason="frame")
             return
         self.inputs.add_motion("odometry", state.of_base(pose), frame_id, child_frame_id)
@@ -358,7 +363,7 @@ class PredictorNode(ManagedNode):
         now, limit = time.monotonic(), self.settings.data_timeout
         for part, subscription in self._subscriptions_by_part.items():
             silence = now - self._arrivals.get(part, self._started)
-            if part.endswith(" info") or silence < limit:
+            if silence < limit:
                 continue
             cause = subscription.silence_cause
             if part == "commands":
