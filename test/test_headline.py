@@ -1,5 +1,6 @@
 """The first screen of a diagnosis follows the verdict and what is explained on held-out data."""
 
+import math
 import re
 from dataclasses import replace
 
@@ -9,7 +10,7 @@ from monoforce_ros.discrepancy import Diagnosis, EffectEstimate, ParameterEstima
 from monoforce_ros.discrepancy.bag_diagnosis import without_blame_for_ground
 from monoforce_ros.discrepancy.comparison import GapRow
 from monoforce_ros.discrepancy.credibility import complaint
-from monoforce_ros.discrepancy.ground import Ground
+from monoforce_ros.discrepancy.ground import beyond_commissioning
 from monoforce_ros.discrepancy.headline import Tone, explained, headline
 from monoforce_ros.discrepancy.page import diagnosis_page
 from monoforce_ros.discrepancy.report import report_content, summary_lines
@@ -129,7 +130,7 @@ def test_a_model_that_misses_the_healthy_robot_does_not_say_that_nothing_is_wron
 
 
 def test_an_error_without_a_name_on_hills_without_a_map_is_not_called_an_effect():
-    traced = Ground("traced", "traced by the wheels", unexplained="the ground is not level and no map shows it")
+    reason = "the ground is not level and no map shows it"
     formula = replace(DELAY, name="learned_term")
     nameless = [
         diagnosed((0.5, None), (8.0, None), effects=(), verdict=Verdict.UNKNOWN_EFFECT, commissioned=False),
@@ -137,17 +138,29 @@ def test_an_error_without_a_name_on_hills_without_a_map_is_not_called_an_effect(
         diagnosed((0.5, None), (8.0, None), effects=(), verdict=Verdict.UNKNOWN_EFFECT, known_parts=(DELAY,)),
     ]
     for found in nameless:
-        judged = without_blame_for_ground(found, traced)
+        judged = without_blame_for_ground(found, reason)
         assert judged.verdict is Verdict.NOT_IDENTIFIABLE and judged.commissioned is found.commissioned
         assert judged.known_parts == found.known_parts and not judged.effects
         top = headline(judged)
-        assert top.sentence == "This recording cannot be diagnosed." and top.findings == (traced.unexplained,)
+        assert top.sentence == "This recording cannot be diagnosed." and top.findings == (reason,)
         assert "ground is not level" in diagnosis_page(judged, {}, None)
         # On a map, or on level ground, it is the robot's.
-        assert without_blame_for_ground(found, Ground("lidar", "map")) is found
+        assert without_blame_for_ground(found, "") is found
     # What has a name stands, and so does a healthy robot.
     for kept in (diagnosed((0.5, 0.06), (8.0, 1.0)), Diagnosis(Verdict.NO_DISCREPANCY)):
-        assert without_blame_for_ground(kept, traced) is kept
+        assert without_blame_for_ground(kept, reason) is kept
+
+
+def test_ground_that_is_steeper_than_where_the_robot_was_commissioned_gets_a_doubt():
+    degree = math.radians(1.0)
+    assert beyond_commissioning(6.0 * degree, 0.5 * degree).startswith(
+        "the robot was commissioned on ground with slopes of 0.5°"
+    )
+    assert "commission it with a recording of such ground" in beyond_commissioning(6.0 * degree, 4.0 * degree)
+    # About as steep, level, or unknown.
+    for slope, commissioned in ((5.0, 4.0), (2.5, 0.1), (2.0, 4.0)):
+        assert not beyond_commissioning(slope * degree, commissioned * degree)
+    assert not beyond_commissioning(10.0 * degree, None)
 
 
 def test_doubts_take_the_green_away():

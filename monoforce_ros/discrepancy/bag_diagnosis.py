@@ -14,7 +14,7 @@ from monoforce_ros.discrepancy.comparison import GapRow, HeldOut, compare, gap_t
 from monoforce_ros.discrepancy.credibility import complaint
 from monoforce_ros.discrepancy.diagnosis import Diagnosis, DiagnosisSettings, diagnose
 from monoforce_ros.discrepancy.gap import noisy_motions
-from monoforce_ros.discrepancy.ground import Ground, choose_ground
+from monoforce_ros.discrepancy.ground import Ground, beyond_commissioning, choose_ground, slope_of
 from monoforce_ros.discrepancy.hypothesis import Effects, Evidence, corrected_evidence, window_starts
 from monoforce_ros.discrepancy.motion_check import motion_faults
 from monoforce_ros.discrepancy.nominal import NominalModel
@@ -154,9 +154,12 @@ def diagnose_bag(
         settings=settings,
         progress=progress,
     )
-    diagnosis = without_blame_for_ground(diagnosis, ground)
+    steeper = beyond_commissioning(slope_of(evidence.smoothed)[0], None if nominal is None else nominal.slope)
+    diagnosis = without_blame_for_ground(diagnosis, ground.unexplained or steeper)
     large = residual_complaint(None if nominal is None else nominal.residual, evidence.smoothed, evidence.commands)
-    doubts = [text for text in (ground.complaint, large) if text]
+    # Named effects stay, with this doubt.
+    steeper = steeper if diagnosis.effects else ""
+    doubts = [text for text in (ground.complaint, steeper, large) if text]
     if diagnosis.verdict == Verdict.NOT_IDENTIFIABLE:
         diagnosis = _with_wheels(diagnosis, evidence, model)
     robot_file = None
@@ -197,14 +200,19 @@ def diagnose_bag(
     return BagDiagnosis(bag, diagnosis, report, page, robot_file, recording.warnings, tuple(doubts), ground)
 
 
-def without_blame_for_ground(diagnosis: Diagnosis, ground: Ground) -> Diagnosis:
-    """The diagnosis; ``not_identifiable`` where an error without a name may be that of ground that no map shows."""
-    if diagnosis.verdict != Verdict.UNKNOWN_EFFECT or not ground.unexplained:
+def without_blame_for_ground(diagnosis: Diagnosis, unexplained: str) -> Diagnosis:
+    """The diagnosis; ``not_identifiable`` where an error without a name may be the ground's.
+
+    Args:
+        diagnosis: of a recording.
+        unexplained: why the error may be the ground's; empty if it is not.
+    """
+    if diagnosis.verdict != Verdict.UNKNOWN_EFFECT or not unexplained:
         return diagnosis
     return Diagnosis(
         Verdict.NOT_IDENTIFIABLE,
         known_parts=diagnosis.known_parts,
-        advice=(ground.unexplained,),
+        advice=(unexplained,),
         noise_floor=diagnosis.noise_floor,
         commissioned=diagnosis.commissioned,
     )

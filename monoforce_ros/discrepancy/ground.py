@@ -18,6 +18,9 @@ LEVEL_SLOPE = np.arcsin(0.05)
 On it gravity pulls with a twentieth of the weight, the typical rolling resistance of the catalogue: more would be taken
 for an effect.
 """
+STEEPER = np.sqrt(2.0)
+"""Ground that is so many times as steep as where the robot was commissioned leaves a residual that nobody has seen:
+what slopes contribute to its variance grows with their square, to twice as much."""
 _SHARE_OF_PLANE = 0.8
 """Share of the heights' variance above which one plane describes the ground: most of it, with room for noise."""
 _APART = 1.0
@@ -92,6 +95,22 @@ def choose_ground(terrain: str, recording: Recording, smoothed: SmoothedMotion, 
             remedy = "level the localisation's frame by its IMU, or " + remedy
         complaint = f"{what}; level ground is assumed ({said}), so that slopes may pass for an effect: {remedy}"
     return Ground("flat", f"level ({said})", complaint, complaint)
+
+
+def beyond_commissioning(slope: float, commissioned: float | None) -> str:
+    """Why an error without a name may be that of steeper ground than the healthy robot was seen on; empty if not.
+
+    Args:
+        slope: of the recording, root mean square [rad].
+        commissioned: that of the recordings by which the robot was commissioned; None if unknown.
+    """
+    if commissioned is None or slope <= max(LEVEL_SLOPE, STEEPER * commissioned):
+        return ""
+    return (
+        f"the robot was commissioned on ground with slopes of {np.degrees(commissioned):.1f}°, and drives over slopes "
+        f"of {np.degrees(slope):.1f}° here (root mean square): how large its errors are there when it is healthy is "
+        "not known; commission it with a recording of such ground, too (diagnose --commission BAG BAG)"
+    )
 
 
 def slope_of(smoothed: SmoothedMotion) -> tuple[float, float]:

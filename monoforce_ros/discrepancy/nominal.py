@@ -41,6 +41,8 @@ class NominalModel:
     terms: np.ndarray | None = None
     """Coefficients of the residual's variance, ``[3, len(TERMS)]`` (:mod:`residual_model`); None: the same residual in
     all windows."""
+    slope: float | None = None
+    """Root mean square slope of the ground on which the robot was commissioned [rad]; None if unknown."""
 
     def residual_in(self, data: EvidenceWindows) -> np.ndarray:
         """RMS residual of the healthy robot in each window, ``[W, K, 3]`` [m, m, rad]."""
@@ -88,7 +90,9 @@ class NominalModel:
             "segments": self.segments,
             "loss": float(f"{self.loss:.4g}"),
             "loss_spread": float(f"{self.loss_spread:.4g}"),
-        } | ({} if self.terms is None else {"residual_terms": self._named_terms()})
+        } | ({} if self.terms is None else {"residual_terms": self._named_terms()}) | (
+            {} if self.slope is None else {"slope_rad": float(f"{self.slope:.3g}")}
+        )  # fmt: skip
 
     def _named_terms(self) -> dict[str, dict[str, float]]:
         assert self.terms is not None
@@ -114,6 +118,7 @@ class NominalModel:
             variation = {str(name): float(value) for name, value in dict(entry.get("variation") or {}).items()}
             numbers = [float(entry.get(key, value)) for key, value in (("loss", 0.5), ("loss_spread", 0.0))]
             segments = int(entry.get("segments", 0))
+            slope = None if entry.get("slope_rad") is None else float(entry["slope_rad"])
             named = entry.get("residual_terms")
             terms = None
             if named is not None:
@@ -126,12 +131,17 @@ class NominalModel:
                 f"{robot_file(robot)}: commissioning: variation, loss and loss_spread: expected finite numbers of 0 or "
                 "more; commission the robot again"
             )
+        if slope is not None and not 0.0 <= slope <= np.pi / 2:
+            raise RobotFileError(
+                f"{robot_file(robot)}: commissioning.slope_rad: got {slope}, expected 0 to 1.57; commission the robot "
+                "again"
+            )
         if terms is not None and not (np.isfinite(terms).all() and (terms >= 0).all()):
             raise RobotFileError(
                 f"{robot_file(robot)}: commissioning.residual_terms: expected finite numbers of 0 or more; commission "
                 "the robot again"
             )
-        return cls(residual, variation, segments, loss=numbers[0], loss_spread=numbers[1], terms=terms)
+        return cls(residual, variation, segments, loss=numbers[0], loss_spread=numbers[1], terms=terms, slope=slope)
 
 
 def _coefficients(name: str) -> int:
