@@ -209,6 +209,9 @@ def test_bounds_and_intervals_that_hold_neutral_are_no_findings(estimate):
         effect("payload", mass=(17.0, 10.0, 24.0), x=(0.0, -0.1, 0.1), y=(0.0, -0.1, 0.1)),
         effect("actuator_saturation", limit=(0.6, 0.58, 0.62)),
         effect("rolling_resistance", coefficient=(0.2, 0.15, 0.25)),
+        # The whole of a share: a dead drive, a flipper that does not move.
+        effect("drive_loss", loss=(-1.0, -1.0, -0.97)),
+        effect("blocked_flipper", front_left=(0.0, 0.0, 0.0), rear_right=(1.0, 0.98, 1.02)),
     ],
     ids=lambda estimate: estimate.name,
 )

@@ -19,7 +19,8 @@ Fits differentiate with steps of this size (``fit.py``): they cannot tell nearer
 def complaint(estimate: EffectEstimate, nominal: Mapping[str, float] | None = None) -> str:
     """Why an estimate is no finding, in one sentence; empty where it may be one.
 
-    Two kinds are refused. A value at a bound of its parameter says where the search stopped, not what the robot does.
+    Two kinds are refused. A value at a bound of its parameter says where the search stopped, not what the robot does,
+    unless a robot can have it, as one whose drive is dead.
     An effect all of whose intervals hold the neutral value may as well be absent. Parameters that act only together
     with another one (the place of a payload, without its mass) do not count: those that do are the main parameter and
     the others of its unit.
@@ -72,6 +73,8 @@ def _acting(estimate: EffectEstimate, effect: Effect) -> list[str]:
 
 def _reached_bound(value: ParameterEstimate, known: Parameter) -> float | None:
     """The bound of its range that a value reaches, or None. A bound that is the neutral value bounds nothing."""
+    if known.attainable:
+        return None
     for bound in (known.low, known.high):
         if bound != known.neutral and abs(value.value - bound) <= RESOLUTION * known.scale:
             return bound

@@ -20,7 +20,9 @@ class BlockedFlipper(Effect):
     formula = "q ← q_0 + (1 - share) (q_cmd - q_0)"
     source = "blocked gear, slipping clutch or dead motor that its gear holds"
     parameters = tuple(
-        Parameter(place, "-", 0.0, 0.0, 1.0, 0.5, f"lost share of the {place.replace('_', ' ')} flipper")
+        Parameter(
+            place, "-", 0.0, 0.0, 1.0, 0.5, f"lost share of the {place.replace('_', ' ')} flipper", attainable=True
+        )
         for place in _PLACES
     )
     order = 75

@@ -27,7 +27,16 @@ class DriveLoss(Effect):
     formula = "u_left ← (1 - max(loss, 0)) u, u_right ← (1 - max(-loss, 0)) u"
     source = "dead motor, slipping belt or clutch; a drive that rolls freely is not covered"
     parameters = (
-        Parameter("loss", "-", 0.0, -1.0, 1.0, 0.3, "share of the speed; positive: the left side, negative: the right"),
+        Parameter(
+            "loss",
+            "-",
+            0.0,
+            -1.0,
+            1.0,
+            0.3,
+            "share of the speed; positive: the left side, negative: the right",
+            attainable=True,
+        ),
     )
     order = 65
     identified = ("loss",)

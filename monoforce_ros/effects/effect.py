@@ -35,6 +35,8 @@ class Parameter:
     meaning: str
     resolution: float = 0.0
     """Smallest change that predictions show; finite differences are at least as large."""
+    attainable: bool = False
+    """Whether a robot can have the values at the bounds, as the whole of a share; else they only limit a search."""
 
 
 @dataclass(frozen=True)

@@ -51,10 +51,12 @@ class Parameter:
         default: default value, in SI units.
         low, high: smallest and largest value.
         neutral: value at which the fault has no effect; random values scale the distance from it.
+        one_of_many: the default holds only where no parameter is named: naming one part leaves the others healthy.
     """
 
-    def __init__(self, default: float, low: float, high: float, *, neutral: float = 0.0):
+    def __init__(self, default: float, low: float, high: float, *, neutral: float = 0.0, one_of_many: bool = False):
         self.default, self.low, self.high, self.neutral = default, low, high, neutral
+        self.one_of_many = one_of_many
 
     def __set_name__(self, owner: type[Fault], name: str) -> None:
         self._name = name

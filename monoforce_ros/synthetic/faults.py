@@ -360,7 +360,7 @@ class BlockedFlipper(Fault):
     """Seized gears: a damper that no motor moves, at the flippers whose value is one half or more."""
 
     needs = "flippers"
-    front_left = Parameter(1.0, 0.0, 1.0)
+    front_left = Parameter(1.0, 0.0, 1.0, one_of_many=True)
     front_right = Parameter(0.0, 0.0, 1.0)
     rear_left = Parameter(0.0, 0.0, 1.0)
     rear_right = Parameter(0.0, 0.0, 1.0)

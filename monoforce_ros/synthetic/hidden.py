@@ -42,7 +42,11 @@ def parse_hidden(text: str) -> Fault:
     if name not in FAULTS:
         raise ValueError(f"--hide: got {name!r}, expected one of {', '.join(sorted(FAULTS))}")
     kind = FAULTS[name]
-    values = {name: entry.default for name, entry in kind.parameters.items()}
+    names_some = "=" in rest
+    values = {
+        name: entry.neutral if names_some and entry.one_of_many else entry.default
+        for name, entry in kind.parameters.items()
+    }
     for number, part in enumerate(filter(None, rest.split(","))):
         parameter, equals, value = part.partition("=")
         if not equals:
