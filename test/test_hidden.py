@@ -253,6 +253,12 @@ def test_any_text_is_a_fault_or_a_clear_error(text):
         assert type(fault) in FAULTS.values()
 
 
+def test_naming_one_flipper_leaves_the_others_healthy():
+    assert parse_hidden("blocked_flipper").values["front_left"] == 1.0
+    values = parse_hidden("blocked_flipper:rear_left=1").values
+    assert {place for place, share in values.items() if share} == {"rear_left"}
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
