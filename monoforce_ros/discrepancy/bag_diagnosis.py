@@ -14,7 +14,7 @@ from monoforce_ros.discrepancy.comparison import GapRow, HeldOut, compare, gap_t
 from monoforce_ros.discrepancy.credibility import complaint
 from monoforce_ros.discrepancy.diagnosis import Diagnosis, DiagnosisSettings, diagnose
 from monoforce_ros.discrepancy.gap import noisy_motions
-from monoforce_ros.discrepancy.ground import Ground, beyond_commissioning, choose_ground, slope_of
+from monoforce_ros.discrepancy.ground import Ground, beyond_commissioning, choose_ground
 from monoforce_ros.discrepancy.hypothesis import Effects, Evidence, corrected_evidence, window_starts
 from monoforce_ros.discrepancy.motion_check import motion_faults
 from monoforce_ros.discrepancy.nominal import NominalModel
@@ -154,7 +154,7 @@ def diagnose_bag(
         settings=settings,
         progress=progress,
     )
-    steeper = beyond_commissioning(slope_of(evidence.smoothed)[0], None if nominal is None else nominal.slope)
+    steeper = beyond_commissioning(ground.slope, None if nominal is None else nominal.slope)
     diagnosis = without_blame_for_ground(diagnosis, ground.unexplained or steeper)
     large = residual_complaint(None if nominal is None else nominal.residual, evidence.smoothed, evidence.commands)
     # Named effects stay, with this doubt.

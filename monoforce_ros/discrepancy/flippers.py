@@ -107,8 +107,8 @@ def compare_with_commands(joints: JointRecord | None, robot: RobotModel, stamps:
     for index, flipper in enumerate(robot.flippers):
         place = flipper_place(flipper)
         share, width = _lost(commanded[:, index], measured[:, index])
-        told = share - width > max(_SMALLEST_SHARE, float(known.get(place, 0.0)))
-        shares.append((place, min(1.0, share), width) if told else (place, 0.0, 0.0))
+        loses = share - width > max(_SMALLEST_SHARE, float(known.get(place, 0.0)))
+        shares.append((place, min(1.0, share), width) if loses else (place, 0.0, 0.0))
     if not any(share for _, share, _ in shares):
         return None
     left = measured - commanded * (1.0 - np.array([share for _, share, _ in shares]))

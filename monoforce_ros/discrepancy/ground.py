@@ -35,6 +35,8 @@ class Ground:
     """``flat``, ``lidar``, ``traced`` or a file."""
     description: str
     """For reports: what was taken and why."""
+    slope: float
+    """Root mean square slope by the measured poses [rad]; see :func:`slope_of`."""
     complaint: str = ""
     """Why this is not the ground that the robot drove on; empty if nothing speaks against it."""
 
@@ -56,23 +58,23 @@ def choose_ground(terrain: str, recording: Recording, smoothed: SmoothedMotion, 
         smoothed: the measured motion, whose roll, pitch and heights show whether ground is level.
         robot: its file may know the pose of the lidar.
     """
+    slope, plane = slope_of(smoothed)
     if terrain == "lidar":
-        return Ground(terrain, f"lidar map of {len(recording.clouds)} sweeps")
+        return Ground(terrain, f"lidar map of {len(recording.clouds)} sweeps", slope)
     if terrain == "traced":
-        return Ground(terrain, "traced by the wheels along the measured poses")
+        return Ground(terrain, "traced by the wheels along the measured poses", slope)
     if terrain not in ("auto", "flat"):
-        return Ground(terrain, f"map {Path(terrain).name}")
+        return Ground(terrain, f"map {Path(terrain).name}", slope)
     reason = "no clouds in the bag"
     if terrain == "auto" and recording.clouds:
         try:
             points, frame = recording.cloud(recording.clouds[0])
             recording.sensor_pose(frame, robot.base_frame, robot.sensors)
             if len(points):
-                return Ground("lidar", f"lidar map of {len(recording.clouds)} sweeps (the bag has clouds)")
+                return Ground("lidar", f"lidar map of {len(recording.clouds)} sweeps (the bag has clouds)", slope)
             reason = "the bag's clouds are empty"
         except (BagError, ValueError) as error:
             reason = f"clouds cannot be used: {error}"
-    slope, plane = slope_of(smoothed)
     said = "as asked for" if terrain == "flat" else reason
     complaint = ""
     if terrain == "auto" and slope > LEVEL_SLOPE and plane <= _SHARE_OF_PLANE:
@@ -83,7 +85,7 @@ def choose_ground(terrain: str, recording: Recording, smoothed: SmoothedMotion, 
             "give a map of fit_terrain (--terrain)"
         )
         description = f"traced by the wheels: slopes of {degrees:.1f}° by the poses, and {reason}"
-        return Ground("traced", description, unexplained=unexplained)
+        return Ground("traced", description, slope, unexplained=unexplained)
     if slope > LEVEL_SLOPE:
         remedy = "use --terrain lidar or a map" if recording.clouds else "record a lidar, or give a map of fit_terrain"
         what = f"the ground is not level (slopes of {np.degrees(slope):.1f}° by the poses, root mean square)"
@@ -94,7 +96,7 @@ def choose_ground(terrain: str, recording: Recording, smoothed: SmoothedMotion, 
             )
             remedy = "level the localisation's frame by its IMU, or " + remedy
         complaint = f"{what}; level ground is assumed ({said}), so that slopes may pass for an effect: {remedy}"
-    return Ground("flat", f"level ({said})", complaint, complaint)
+    return Ground("flat", f"level ({said})", slope, complaint, complaint)
 
 
 def beyond_commissioning(slope: float, commissioned: float | None) -> str:

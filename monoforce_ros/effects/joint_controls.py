@@ -50,6 +50,7 @@ def controls(
         measured = joint_start.to(speeds)
         start = torch.where(measured.isnan(), start, measured)
     angles, rates = start[:, None].expand(-1, steps, -1), torch.zeros_like(start)[:, None].expand(-1, steps, -1)
+    driven = speeds[:, history:]
     if steering.shape[-1]:
         assert robot.steered is not None
         moved = list(robot.steered.joints)
@@ -63,12 +64,7 @@ def controls(
                 start = _placed(start[:, None], moved, begin[:, None])[:, 0]
             followed = _followed(robot, moved, steering[:, history:], begin, time_step)
         angles, rates = _placed(angles, moved, followed[0]), _placed(rates, moved, followed[1])
-        return Controls(
-            robot.steered.divided(speeds[:, history:], followed[0]),
-            angles,
-            rates,
-            start_angles=None if joint_start is None else start,
-        )
+        driven = robot.steered.divided(driven, followed[0])
     if flippers is not None:
         moved = list(range(len(robot.joints) - count, len(robot.joints)))
         begin = start[:, moved]
@@ -76,7 +72,7 @@ def controls(
         targets = _flipper_targets(robot, torch.where(targets.isnan(), begin[:, None], targets), begin)
         turned, turning = _followed(robot, moved, targets, begin, time_step)
         angles, rates = _placed(angles, moved, turned), _placed(rates, moved, turning)
-    return Controls(speeds[:, history:], angles, rates, start_angles=None if joint_start is None else start)
+    return Controls(driven, angles, rates, start_angles=None if joint_start is None else start)
 
 
 def _flipper_targets(robot: RobotModel, targets: Tensor, start: Tensor) -> Tensor:
