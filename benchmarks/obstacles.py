@@ -82,12 +82,16 @@ class Block:
 
 def blocks(robot: RobotModel) -> list[Block]:
     """Obstacles for a robot: at its middle, beside it and at a wheel; lower and higher than its underside."""
-    hull = robot.points[robot.point_drives < 0]
+    outward = robot.point_outward
+    assert outward is not None
+    # Faces to both sides are the hull's alone; wheels have a front and a rear.
+    hull = robot.points[outward[:, 1] != 0.0]
     low = float(hull[:, 2].min()) + robot.ground_clearance
     high = float(hull[:, 2].max()) + robot.ground_clearance
     side = float(hull[:, 1].max()) / 2
     driven = robot.points[robot.point_drives >= 0]
     wheel = float((driven[:, 1].max() + driven[driven[:, 1] > 0][:, 1].min()) / 2)
+    rim = float(robot.points[:, 1].max())
     return [
         Block("post 5 cm", 0.0, (0.05, 0.05, 1.0)),
         Block("post 10 cm", 0.0, (0.10, 0.10, 1.0)),
@@ -99,6 +103,7 @@ def blocks(robot: RobotModel) -> list[Block]:
         Block("trunk 20 cm before a wheel", wheel, (0.20, 0.20, 2.0), round=True),
         Block("post 10 cm before a wheel", wheel, (0.10, 0.10, 1.0)),
         Block("post 5 cm before a wheel", wheel, (0.05, 0.05, 1.0)),
+        Block("post 5 cm before a wheel's outer rim", rim, (0.05, 0.05, 1.0)),
         Block("kerb, a third of the clearance", 0.0, (0.3, 6.0, low / 3)),
         Block("kerb, two thirds of the hull", 0.0, (0.3, 6.0, low + 0.67 * (high - low))),
         Block("bar at half the hull", 0.0, (0.10, 6.0, high), clearance=(low + high) / 2),

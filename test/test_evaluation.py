@@ -52,7 +52,8 @@ def test_forces_that_would_cover_the_picture_are_shortened_in_their_direction():
     np.testing.assert_allclose(view.drawn_forces, expected)
     robot = load_robot("husky")
     (above, *_) = prediction_figure(view, robot).axes
-    (dots,) = (found for found in above.collections if isinstance(found, PathCollection) and len(found.get_offsets()))
+    scattered = (found for found in above.collections if isinstance(found, PathCollection))
+    (dots,) = (found for found in scattered if len(found.get_offsets()) == len(forces))
     assert dots.get_sizes().max() <= 260 * LARGEST_DRAWN_FORCE + 1e-6
 
 

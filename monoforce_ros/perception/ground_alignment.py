@@ -96,8 +96,8 @@ def clear_footprint(terrain: TerrainMap, robot: RobotModel, motion: MotionState)
     """
     grid, pose = terrain.grid, motion.terrain_from_base
     (rear, right), (front, left) = (bound.cpu().double().numpy()[:2] for bound in robot.bounds)
-    hull = robot.points[robot.point_drives < 0]
-    underside = float(hull[:, 2].min()) if len(hull) else 0.0
+    below = robot.points[robot.point_outward[:, 2] < 0.0] if robot.point_outward is not None else robot.points[:0]
+    underside = float(below[:, 2].min()) if len(below) else 0.0
     if abs(np.linalg.det(pose[:2, :2])) < 0.1:  # the robot lies on its side
         return terrain
     # Intersection of the vertical through each cell with the plane of the hull's underside, in base axes.

@@ -1,4 +1,4 @@
-"""Hull: samples of a box's surface, fine where the ground and what stands on it can touch it."""
+"""Hull: samples of boxes and of wheels' front and rear, fine where the ground and what stands on it can touch them."""
 
 from __future__ import annotations
 
@@ -14,6 +14,37 @@ EDGE_SPACING = 0.025
 edge is narrow there."""
 TOP_SPACING = 0.2
 """Largest distance between samples of the top [m], which touches the ground only if the robot lies on its back."""
+
+CLIMBABLE = 1.75
+"""Height over a wheel's radius up to which an obstacle meets the tread alone, which may climb it. In MuJoCo, Husky,
+Jackal and Warthog (friction 0.8, 1 m/s) climb kerbs of 0.8, 1.3 and 1.5 radii and are stopped by 1.0, 1.4, 1.7."""
+
+
+def wheel_samples(radius: float, width: float, spacing: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Sample the front and the rear of a wheel about its centre, for what is too high to be climbed.
+
+    A tread is as soft as the ground and has few samples across: a thin post would slip past them or push the wheel
+    aside. In a height map an obstacle reaches from the ground up, so that one row across the wheel at the height of
+    :data:`CLIMBABLE` feels whatever is higher, and nothing else.
+
+    Args:
+        radius, width: of the wheel [m].
+        spacing: as in :func:`box_samples`.
+
+    Returns:
+        points ``[n, 3]`` [m]; areas ``[n]`` [m²], in all the upper half of the wheel as seen from the front and the
+        rear; unit normals, outwards ``[n, 3]``.
+    """
+    count = max(2, math.ceil(width / (min(1.0, spacing / FACE_SPACING) * EDGE_SPACING) - 1e-9)) + 1
+    # From edge to edge: a post may meet the outermost of the wheel.
+    across = np.linspace(-width / 2, width / 2, count)
+    ends = np.repeat([-1.0, 1.0], count)
+    points = np.stack([radius * ends, np.tile(across, 2), np.full(2 * count, (CLIMBABLE - 1.0) * radius)], axis=1)
+    normals = np.stack([ends, np.zeros(2 * count), np.zeros(2 * count)], axis=1)
+    # The outermost samples stand for half as much as the others.
+    share = np.full(count, 1.0 / (count - 1))
+    share[[0, -1]] /= 2.0
+    return points, radius * width * np.tile(share, 2), normals
 
 
 def box_samples(size: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

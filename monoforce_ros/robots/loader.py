@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from monoforce_ros.core import share_directory
 from monoforce_ros.robots.belt import belt_outline
 from monoforce_ros.robots.checks import FieldChecks, RobotFileError
-from monoforce_ros.robots.hull import box_samples
+from monoforce_ros.robots.hull import box_samples, wheel_samples
 from monoforce_ros.robots.joint_reader import JointReader, WheelEntry
 from monoforce_ros.robots.robot_model import Flipper, RobotModel
 
@@ -233,7 +233,13 @@ class _Reader(FieldChecks):
         own = wheel.name if moving.steers or wheel.drive is None else wheel.drive
         first = len(samples.points)
         self.belt({**content, "drive": own}, where, (0.0, wheel.radius, wheel.radius), samples, spacing)
-        samples.point_joints[first][:] = moving.carrier.get(wheel.name, -1)
+        width = float(content["width"])
+        points, areas, normals = wheel_samples(wheel.radius, width, spacing)
+        samples.add(wheel.centre + points, areas, np.zeros_like(points), None, normals)
+        samples.widths.append(np.full(len(points), min(wheel.radius, width)))
+        samples.curvatures.append(np.zeros(len(points)))
+        for part in range(first, len(samples.points)):
+            samples.point_joints[part][:] = moving.carrier.get(wheel.name, -1)
         if wheel.drive is None:
             samples.free.add(own)
         else:
