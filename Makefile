@@ -64,6 +64,7 @@ clean:
 bench: build interfaces
 	@mkdir -p out
 	@scripts/run.sh python benchmarks/rollout.py --json out/rollout.json
+	@scripts/run.sh python benchmarks/joints.py --json out/joints.json
 	@scripts/run.sh python benchmarks/integrators.py --json out/integrators.json
 	@scripts/run.sh python benchmarks/mujoco_check.py --json out/mujoco_check.json
 	@scripts/run.sh python benchmarks/encoder.py --json out/encoder.json

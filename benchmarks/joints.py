@@ -12,21 +12,30 @@ import argparse
 import dataclasses
 import json
 import statistics
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
+import yaml
 
 from monoforce_ros.core import write_text
 from monoforce_ros.effects import controls
 from monoforce_ros.physics import State, rollout
-from monoforce_ros.robots import Controls, RobotModel, load_robot
+from monoforce_ros.robots import Controls, RobotModel, load_robot, robot_file
 from monoforce_ros.terrain import Grid, TerrainMap
 
 STEP, STEPS = 0.01, 500
-ROBOTS = ("rally_car", "offroad_car", "marv")
+CASES = (
+    ("rally_car", "steering", ("suspension", "motors")),
+    ("rally_car", "steering, springs and motors", ()),
+    ("offroad_car", "steering", ("suspension", "motors")),
+    ("offroad_car", "steering, springs and motors", ()),
+    ("marv", "flippers", ()),
+)
+"""Robot, what moves, and sections of its file that are left out."""
 BATCHES = (1, 64)
 
 
@@ -61,9 +70,18 @@ def work(robot: RobotModel, given: Controls, batch: int, *, backward: bool) -> C
     return run
 
 
-def compare(name: str, batch: int, *, backward: bool, quick: bool) -> dict:
+def robot_without(name: str, sections: Sequence[str]) -> RobotModel:
+    """A shipped robot without some sections of its file."""
+    content = yaml.safe_load(robot_file(name).read_text())
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"{name}.yaml"
+        path.write_text(yaml.safe_dump({key: value for key, value in content.items() if key not in sections}))
+        return load_robot(path)
+
+
+def compare(name: str, left_out: Sequence[str], batch: int, *, backward: bool, quick: bool) -> dict:
     """Medians of rollouts with and without motion of the joints."""
-    robot = load_robot(name)
+    robot = robot_without(name, left_out)
     moving = commanded(robot, batch, 50 if quick else STEPS)
     still = dataclasses.replace(
         robot, joints=(), flippers=(), steered=None, motors=(), point_joints=None, point_grip=None, joint_angles=None
@@ -94,15 +112,15 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     rows = []
-    print("| robot | joints | points | case | still [ms] | moving [ms] | ratio |\n|---|---|---|---|---|---|---|")
-    for name in ROBOTS:
+    print("| robot | moves | points | case | still [ms] | moving [ms] | ratio |\n|---|---|---|---|---|---|---|")
+    for name, what, left_out in CASES:
         for backward in (False, True):
             for batch in BATCHES:
-                row = compare(name, batch, backward=backward, quick=options.quick)
+                row = {"moves": what} | compare(name, left_out, batch, backward=backward, quick=options.quick)
                 rows.append(row)
                 case = f"B = {batch}, {'forward + backward' if backward else 'forward'}"
                 print(
-                    f"| {name} | {row['joints']} | {row['points']} | {case} | {1e3 * row['still_s']:.1f} | "
+                    f"| {name} | {what} | {row['points']} | {case} | {1e3 * row['still_s']:.1f} | "
                     f"{1e3 * row['moving_s']:.1f} | {row['ratio']:.2f} |",
                     flush=True,
                 )

@@ -46,6 +46,17 @@ def test_the_rollout_benchmark_writes_its_figures(tmp_path):
     assert len(content["effects"]) == 2
 
 
+def test_the_benchmark_of_joints_writes_its_ratios(tmp_path):
+    out = tmp_path / "joints.json"
+    done = subprocess.run(
+        [sys.executable, "benchmarks/joints.py", "--quick", "--json", str(out)],
+        cwd=ROOT, capture_output=True, text=True, timeout=200, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    rows = json.loads(out.read_text())["rows"]
+    assert len(rows) == 20 and all(row["ratio"] == row["moving_s"] / row["still_s"] for row in rows)
+
+
 def test_the_encoder_benchmark_writes_its_figures(tmp_path):
     out = tmp_path / "encoder.json"
     done = subprocess.run(

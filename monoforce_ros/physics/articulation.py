@@ -130,6 +130,8 @@ class Articulation:
             rates=_history(target_rates, start_rates, free),
             belts=speeds.new_zeros(batch, steps + 1, drives),
         )
+        if not any(motor is not None for motor in motors):
+            return replace(built, belts=_history(speeds, speeds[:, 0] if steps else built.belts[:, 0], powered))
         rolling = built._rolling_speeds(robot, velocity, rates)
         return replace(built, belts=_history(speeds, rolling, powered))
 
@@ -153,63 +155,77 @@ class Articulation:
             rates: ``[B, J]`` [rad/s].
             body: mass properties at the rest angles; None neglects that they change, about the base frame.
         """
-        batch, like = angles.shape[0], angles
-        zero, identity = like.new_zeros(batch, 3), torch.eye(3, dtype=like.dtype, device=like.device)
-        turns, shifts, spins, drifts = [identity.expand(batch, 3, 3)], [zero], [zero], [zero]
-        axes, origins, places, place_rates = [], [], [], []
-        for joint, (slides, parent) in enumerate(zip(self.slides, self.parents, strict=True)):
-            carrier = parent + 1
-            axis = turns[carrier] @ self.axes[joint]
-            origin = turns[carrier] @ self.origins[joint] + shifts[carrier]
-            moved = (angles[:, joint] - self.rest[joint])[:, None]
-            speed = rates[:, joint, None]
-            if slides:
-                turns.append(turns[carrier])
-                shifts.append(shifts[carrier] + axis * moved)
-                spins.append(spins[carrier])
-                drifts.append(drifts[carrier] + axis * speed)
-            else:
-                turn = exponential_map(axis * moved) @ turns[carrier]
-                turns.append(turn)
-                shifts.append(origin - turn @ self.origins[joint])
-                spins.append(spins[carrier] + axis * speed)
-                drifts.append(drifts[carrier] - torch.linalg.cross(axis * speed, origin))
-            axes.append(axis)
-            origins.append(origin)
-            place = turns[-1] @ self.places[joint] + shifts[-1]
-            places.append(place)
-            place_rates.append(torch.linalg.cross(spins[-1], place) + drifts[-1])
+        links = self._links(angles, rates)
+        zero = links.shifts[0]
         if body is None:
-            centre, centre_rate, inertia = zero, zero, identity.expand(batch, 3, 3)
+            centre, centre_rate, inertia = zero, zero, links.turns[0]
         else:
-            centre, centre_rate = body.centre, zero
+            centre, centre_rate = self._centre(links, body)
             inertia = body.inertia
-            for joint, (place, rate) in enumerate(zip(places, place_rates, strict=True)):
-                share = (self.masses[joint] / body.mass)[:, None]
-                centre = centre + share * (place - self.places[joint])
-                centre_rate = centre_rate + share * rate
+            for joint, place in enumerate(links.places):
                 before, after = self.places[joint] - body.centre, place - body.centre
                 inertia = inertia + self.masses[joint] * (_square(after) - _square(before))
             # The sum is about the centre of mass at the rest angles.
             inertia = inertia - body.mass[:, None, None] * _square(centre - body.centre)
         return LinkPoses(
-            turns=torch.stack(turns, 1),
-            shifts=torch.stack([shift - centre for shift in shifts], 1),
-            spins=torch.stack(spins, 1),
+            turns=torch.stack(links.turns, 1),
+            shifts=torch.stack([shift - centre for shift in links.shifts], 1),
+            spins=torch.stack(links.spins, 1),
             drifts=torch.stack(
                 [
                     torch.linalg.cross(spin, centre) + drift - centre_rate
-                    for spin, drift in zip(spins, drifts, strict=True)
+                    for spin, drift in zip(links.spins, links.drifts, strict=True)
                 ],
                 1,
             ),
-            axes=_stacked(axes, zero),
-            origins=_stacked([origin - centre for origin in origins], zero),
-            places=_stacked([place - centre for place in places], zero),
+            axes=_stacked(links.axes, zero),
+            origins=_stacked([origin - centre for origin in links.origins], zero),
+            places=_stacked([place - centre for place in links.places], zero),
             centre=centre,
             centre_rate=centre_rate,
             inertia=inertia,
         )
+
+    def _links(self, angles: Tensor, rates: Tensor) -> _Links:
+        """Poses of all links in the base frame."""
+        batch, like = angles.shape[0], angles
+        zero, identity = like.new_zeros(batch, 3), torch.eye(3, dtype=like.dtype, device=like.device)
+        links = _Links([identity.expand(batch, 3, 3)], [zero], [zero], [zero], [], [], [])
+        # Turns of all joints in one call: most of a single trajectory's time goes into the number of calls.
+        own = exponential_map(self.axes * (angles - self.rest)[..., None]) if len(self.slides) else None
+        for joint, (slides, parent) in enumerate(zip(self.slides, self.parents, strict=True)):
+            carrier = parent + 1
+            turned, shift = links.turns[carrier], links.shifts[carrier]
+            spin, drift = links.spins[carrier], links.drifts[carrier]
+            axis = turned @ self.axes[joint]
+            origin = turned @ self.origins[joint] + shift
+            motion = axis * rates[:, joint, None]
+            if slides:
+                links.turns.append(turned)
+                links.shifts.append(shift + axis * (angles[:, joint] - self.rest[joint])[:, None])
+                links.spins.append(spin)
+                links.drifts.append(drift + motion)
+            else:
+                assert own is not None
+                turn = turned @ own[:, joint]
+                links.turns.append(turn)
+                links.shifts.append(origin - turn @ self.origins[joint])
+                links.spins.append(spin + motion)
+                links.drifts.append(drift - torch.linalg.cross(motion, origin))
+            links.axes.append(axis)
+            links.origins.append(origin)
+            links.places.append(links.turns[-1] @ self.places[joint] + links.shifts[-1])
+        return links
+
+    def _centre(self, links: _Links, body: BodyMass) -> tuple[Tensor, Tensor]:
+        """Centre of mass in the base frame ``[B, 3]`` [m] and its velocity there [m/s]."""
+        centre, centre_rate = body.centre, torch.zeros_like(body.centre)
+        for joint, place in enumerate(links.places):
+            share = (self.masses[joint] / body.mass)[:, None]
+            centre = centre + share * (place - self.places[joint])
+            moving = torch.linalg.cross(links.spins[joint + 1], place) + links.drifts[joint + 1]
+            centre_rate = centre_rate + share * moving
+        return centre, centre_rate
 
     def centres(self, angles: Tensor, rates: Tensor, body: BodyMass) -> tuple[Tensor, Tensor]:
         """Centre of mass in the base frame and its velocity at all steps, each ``[B, S, 3]``.
@@ -222,8 +238,9 @@ class Articulation:
         if not bool((self.masses > 0).any()):
             centre = body.centre[:, None].expand(batch, steps, 3)
             return centre, torch.zeros_like(centre)
-        poses = self.poses(angles.flatten(0, 1), rates.flatten(0, 1), body.repeated(steps))
-        return poses.centre.unflatten(0, (batch, steps)), poses.centre_rate.unflatten(0, (batch, steps))
+        links = self._links(angles.flatten(0, 1), rates.flatten(0, 1))
+        centre, centre_rate = self._centre(links, body.repeated(steps))
+        return centre.unflatten(0, (batch, steps)), centre_rate.unflatten(0, (batch, steps))
 
     def world_poses(self, angles: Tensor, rates: Tensor, rotation: Tensor, body: BodyMass) -> LinkPoses:
         """Poses in terrain axes at many steps, as a batch ``[B S]``.
@@ -290,6 +307,19 @@ class BodyMass:
     def repeated(self, steps: int) -> BodyMass:
         """The same for each of ``steps`` steps of a trajectory, ``[B S]``."""
         return BodyMass(*(value.repeat_interleave(steps, 0) for value in (self.mass, self.centre, self.inertia)))
+
+
+@dataclass(frozen=True)
+class _Links:
+    """Links and joints in the base frame, as lists of ``[B, ...]``; the body itself is the first link."""
+
+    turns: list[Tensor]
+    shifts: list[Tensor]
+    spins: list[Tensor]
+    drifts: list[Tensor]
+    axes: list[Tensor]
+    origins: list[Tensor]
+    places: list[Tensor]
 
 
 @dataclass(frozen=True)

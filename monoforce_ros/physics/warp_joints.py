@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
+import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
@@ -78,6 +80,14 @@ def with_forces(
 
 def clusters_by_link(points: Tensor, links: Tensor) -> PointClusters:
     """Clusters of points ``[N, 3]``; each cluster and each group belongs to one link."""
+    data = (points.detach().cpu().double().numpy().tobytes(), links.cpu().numpy().astype(np.int64).tobytes())
+    return _clusters_by_link(*data, points.dtype, points.device)
+
+
+@lru_cache(maxsize=32)
+def _clusters_by_link(places: bytes, carriers: bytes, dtype: torch.dtype, device: torch.device) -> PointClusters:
+    points = torch.from_numpy(np.frombuffer(places).reshape(-1, 3).copy()).to(dtype=dtype, device=device)
+    links = torch.from_numpy(np.frombuffer(carriers, np.int64).copy()).to(device)
     parts = []
     for link in torch.unique(links):
         chosen = torch.nonzero(links == link)[:, 0]
