@@ -264,3 +264,23 @@ def test_a_gpu_that_is_not_there_is_said_in_one_line(executables, ros_environmen
     assert done.returncode == 1
     assert "parameter device: got 'cuda', but PyTorch finds no CUDA device" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (
+            ["evaluate", "bag", "--checkpoint", "/a.safetensors"],
+            "--checkpoint has no effect with --terrain lidar: it needs",
+        ),
+        (["evaluate", "bag", "--terrain", "flat", "--images", "/front"], "--images has no effect with --terrain flat"),
+        (["evaluate", "bag", "--check", "--images", "/typo"], "--images has no effect with --check"),
+        (["synthesize", "out", "--camera", "none", "--cameras", "3"], "--cameras has no effect with --camera none"),
+        (["synthesize", "out", "--lidar", "none", "--lidar-rate", "3"], "--lidar-rate has no effect with --lidar none"),
+    ],
+)
+def test_options_without_effect_are_refused(executables, tmp_path, words, message):
+    done = subprocess.run(
+        [executables / words[0], *words[1:]], cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 2 and message in done.stderr and not list(tmp_path.iterdir())

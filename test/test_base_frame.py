@@ -72,30 +72,39 @@ def test_errors_do_not_depend_on_the_frame_of_the_odometry(recording, displaced)
     assert error(displaced) > right + 0.02
 
 
-def write(path, child: str, moving: bool):
-    """Odometry of ``child`` and its place on /tf, fixed or moving."""
+def write(path, child: str, offset: str):
+    """Odometry of ``child`` and base_link in it on /tf: ``fixed``, ``moving``, or ``absent``."""
     with BagWriter(path) as bag:
         for i in range(100):
             at = START + i * 50_000_000
             odometry = builders.odometry(at, "odom", child, [0.02 * i, 0, 0], [0, 0, 0, 1], [0.4, 0, 0], [0] * 3)
             bag.write("/odom", odometry, at)
-            height = 0.1 + (0.002 * i if moving else 0.0)
-            bag.write("/tf", builders.transforms(at, child, {"base_link": pose_matrix([0, 0, height, 0, 0, 0])}), at)
+            height = 0.1 + (0.002 * i if offset == "moving" else 0.0)
+            if offset != "absent":
+                pose = pose_matrix([0, 0, height, 0, 0, 0])
+                bag.write("/tf", builders.transforms(at, child, {"base_link": pose}), at)
             bag.write("/tf", builders.transforms(at, "odom", {child: pose_matrix([0.02 * i, 0, 0, 0, 0, 0])}), at)
             bag.write("/cmd_vel", builders.twist(0.4, 0.0), at)
     return path
 
 
-def test_transforms_on_tf_count_if_they_hold_still(tmp_path):
-    fixed = Recording.open(write(tmp_path / "fixed", "base_footprint", False))
+def test_transforms_on_tf_are_applied_whether_they_hold_still_or_move(tmp_path):
+    fixed = Recording.open(write(tmp_path / "fixed", "base_footprint", "fixed"))
     assert fixed.in_base_frame("base_link").motion.positions[0, 2] == pytest.approx(0.1)
-    moving = Recording.open(write(tmp_path / "moving", "base_footprint", True))
+    # A stabilised footprint moves in the body: as online, each pose is completed by the newest transform.
+    moving = Recording.open(write(tmp_path / "moving", "base_footprint", "moving"))
+    heights = moving.in_base_frame("base_link").motion.positions[:, 2]
+    np.testing.assert_allclose(heights[10:], 0.1 + 0.002 * np.arange(10, 100), atol=0.0021)
+    # Through a frame that is fixed on the body.
+    mast = replace(moving, static_transforms={("base_link", "mast"): pose_matrix([0, 0, 1.0, 0, 0, 0])})
+    np.testing.assert_allclose(mast.in_base_frame("mast").motion.positions[:, 2], heights + 1.0, atol=1e-9)
+    absent = Recording.open(write(tmp_path / "absent", "base_footprint", "absent"))
     with pytest.raises(BagError, match="offset between them is unknown"):
-        moving.in_base_frame("base_link")
+        absent.in_base_frame("base_link")
 
 
 def test_evaluate_takes_the_offset_from_its_options(tmp_path, executables, ros_environment):
-    bag = write(tmp_path / "moving", "base_footprint", True)
+    bag = write(tmp_path / "absent", "base_footprint", "absent")
     command = [executables / "evaluate", "--check", bag]
 
     def run(*options: str):
@@ -112,7 +121,7 @@ def test_evaluate_takes_the_offset_from_its_options(tmp_path, executables, ros_e
 
 
 def test_a_diagnosis_needs_the_offset_as_an_evaluation_does(tmp_path):
-    bag, robot = write(tmp_path / "moving", "base_footprint", True), load_robot("husky")
+    bag, robot = write(tmp_path / "absent", "base_footprint", "absent"), load_robot("husky")
     with pytest.raises(BagError, match=r"frame 'base_footprint'.*refer to 'base_link'.*--odometry-child-pose"):
         read_evidence(bag, robot, "flat")
     reading = ReadOptions(odometry_child_pose=(0.0, 0.0, -0.1, 0.0, 0.0, 0.0))
@@ -126,7 +135,7 @@ def test_a_diagnosis_needs_the_offset_as_an_evaluation_does(tmp_path):
 
 @pytest.mark.parametrize("tool", ["diagnose", "diagnose --commission", "fit_terrain", "train"])
 def test_every_tool_asks_for_the_offset_and_has_the_option_that_it_names(tool, tmp_path, executables, ros_environment):
-    bag = write(tmp_path / "moving", "base_footprint", True)
+    bag = write(tmp_path / "absent", "base_footprint", "absent")
     name, *options = tool.split()
     command = [executables / name, *options, bag, "--out", tmp_path / "out"]
 

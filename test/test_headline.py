@@ -138,17 +138,26 @@ def test_an_error_without_a_name_on_hills_without_a_map_is_not_called_an_effect(
         diagnosed((0.5, None), (8.0, None), effects=(), verdict=Verdict.UNKNOWN_EFFECT, known_parts=(DELAY,)),
     ]
     for found in nameless:
-        judged = without_blame_for_ground(found, reason)
+        judged = without_blame_for_ground(found, reason, named=False)
         assert judged.verdict is Verdict.NOT_IDENTIFIABLE and judged.commissioned is found.commissioned
         assert judged.known_parts == found.known_parts and not judged.effects
         top = headline(judged)
         assert top.sentence == "This recording cannot be diagnosed." and top.findings == (reason,)
         assert "ground is not level" in diagnosis_page(judged, {}, None)
         # On a map, or on level ground, it is the robot's.
-        assert without_blame_for_ground(found, "") is found
+        assert without_blame_for_ground(found, "", named=True) is found
     # What has a name stands, and so does a healthy robot.
     for kept in (diagnosed((0.5, 0.06), (8.0, 1.0)), Diagnosis(Verdict.NO_DISCREPANCY)):
-        assert without_blame_for_ground(kept, reason) is kept
+        assert without_blame_for_ground(kept, reason, named=True) is kept
+    # Forces that slopes exert may pass for effects, where the robot is not known on slopes; delays may not.
+    scrub = effect("turning_scrub", track_width_factor=(1.23, 1.16, 1.31))
+    slips = diagnosed((0.5, 0.06), (8.0, 1.0), effects=(scrub, DELAY))
+    assert without_blame_for_ground(slips, reason, named=False) is slips
+    judged = without_blame_for_ground(slips, reason, named=True)
+    assert judged.verdict is Verdict.NOT_IDENTIFIABLE and judged.known_parts == (scrub, DELAY) and not judged.fitted
+    assert judged.advice == (
+        reason, "on known ground this would mean: The robot turns 19 % less than its wheels ask for.",
+    )  # fmt: skip
 
 
 def test_ground_that_is_steeper_than_where_the_robot_was_commissioned_gets_a_doubt():

@@ -5,7 +5,7 @@ import rclpy
 from conftest import ROOT
 
 from monoforce_ros.nodes.parameter_files import parameter_file_text, read_sections, section_matches
-from monoforce_ros.nodes.parameters import declare_parameters, parameter_help
+from monoforce_ros.nodes.parameters import declare_parameters, parameter_help, settings_without_effect
 from monoforce_ros.nodes.schema import SCHEMAS, ParameterEntry, read_schema
 
 ENTRY = ParameterEntry("retention", "double", 1.5, "How long.", 0.0, 10.0, "s", formerly="memory")
@@ -122,3 +122,38 @@ def test_sections_match_nodes_as_in_ros(tmp_path):
     assert not section_matches("/predictor", "/left/predictor")
     assert section_matches("/*/other", "/left/other") and not section_matches("/*/other", "/a/left/other")
     assert section_matches("/**", "/left/other") and section_matches("/**/other", "/other")
+
+
+def test_parameters_that_have_no_effect_are_said(declared):
+    entries = read_schema(ROOT / "config" / "predictor.schema.yaml")
+
+    def said(*parameters):
+        return settings_without_effect(entries, declared(*parameters, entries=entries)[1])
+
+    assert said() == said("terrain_source:=camera") == []
+    assert (
+        said("checkpoint:=/a.safetensors", "terrain_source:=lidar_camera", "ensemble:=8", "ensemble_scale:=2.0") == []
+    )
+    assert said("candidate_topic:=/planner", "candidate_delay:=0.2", "limit_roll:=0.3") == []
+    assert said("checkpoint:=/a.safetensors") == [
+        "checkpoint has no effect: it needs terrain_source camera or lidar_camera, and terrain_source is lidar"
+    ]
+    assert said("refine_seconds:=0.1", "ensemble_scale:=2.0", "candidates:=0") == [
+        "refine_seconds has no effect: it needs candidates or candidate_topic, and candidates is off, "
+        "candidate_topic is off",
+        "ensemble_scale has no effect: it needs ensemble, and ensemble is off",
+    ]
+
+
+def test_every_condition_of_a_schema_names_parameters_and_values_that_exist():
+    for node in SCHEMAS:
+        entries = {entry.name: entry for entry in read_schema(ROOT / "config" / f"{node}.schema.yaml")}
+        for entry in entries.values():
+            for name, accepted in entry.used_with.items():
+                assert accepted is True or set(accepted) < set(entries[name].choices)
+
+
+def test_whole_numbers_in_a_list_are_answered_with_what_to_write(declared):
+    speeds = ParameterEntry("speeds", "double_array", [0.5, 1.0], "Speeds.", unit="m/s")
+    with pytest.raises(ValueError, match=r"got \[0, 1\], expected a list of numbers m/s: write \[0.0, 1.0\]"):
+        declared("speeds:=[0, 1]", entries=(speeds,))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -71,6 +71,9 @@ class Recording:
     """Poses ``[4, 4]`` by parent and child frame: those on /tf_static, and those on /tf that hold still."""
     topics: dict[str, str]
     """Topic used for each of ``odometry``, ``commands``, ``cloud``, ``imu``, ``joints`` and ``flipper_commands``."""
+    moving: dict[tuple[str, str], tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
+    """Stamps ``[M]`` [ns] and poses ``[M, 4, 4]`` by parent and child frame: those on /tf that move, one of them being
+    the odometry's child frame."""
     warnings: tuple[str, ...] = ()
     """Defects of the bag and of single messages, which were skipped."""
     angular_velocity: AngularVelocityTrack | None = None
@@ -210,11 +213,28 @@ class Recording:
         """
         frames = RobotFrames(base_frame, odometry_child_pose=odometry_child_pose, file_frame=file_frame)
         child, tree = self.motion.child_frame_id, TransformTree(self.static_transforms)
+        name = frames.base_name(child, {*tree.frames, *(frame.lstrip("/") for pair in self.moving for frame in pair)})
         try:
             pose = frames.odometry_child(child, tree)
         except FrameError as error:
-            raise BagError(f"{self.path}: {error}") from error
-        return replace(self, motion=self.motion.of_base(pose, frames.base_name(child, tree.frames)))
+            moving = self._moving_child(name)
+            if moving is None:
+                raise BagError(f"{self.path}: {error}") from error
+            pose = moving
+        return replace(self, motion=self.motion.of_base(pose, name))
+
+    def _moving_child(self, base: str) -> np.ndarray | None:
+        """Pose of the odometry's child frame in the base frame at each pose, ``[N, 4, 4]``; None if /tf has none."""
+        child = self.motion.child_frame_id.lstrip("/")
+        for pair, (stamps, poses) in self.moving.items():
+            parent, other = (frame.lstrip("/") for frame in pair)
+            beside = parent if other == child else other
+            fixed = TransformTree(self.static_transforms).find(base, beside) if beside != base else np.eye(4)
+            if fixed is not None:
+                # The newest one at the time, as online.
+                found = poses[np.clip(np.searchsorted(stamps, self.motion.stamps, side="right") - 1, 0, None)]
+                return fixed @ (found if other == child else np.linalg.inv(found))
+        return None
 
     def _decoded(self, frames: Sequence[Frame]) -> Iterator[tuple[Frame, Message]]:
         """Messages of frames of one topic, each once, in the order of the bag."""
@@ -321,6 +341,8 @@ class _Collector:
         self.cameras: dict[str, CameraModel] = {}
         self.transforms: dict[tuple[str, str], np.ndarray] = {}
         self._moving: set[tuple[str, str]] = set()
+        self._newest: dict[tuple[str, str], np.ndarray] = {}
+        self._series: dict[tuple[str, str], list[tuple[int, np.ndarray]]] = {}
         self.warnings: list[str] = []
         self.choices: list[str] = []
 
@@ -338,6 +360,7 @@ class _Collector:
                 state, frame_id, child_frame_id = decoding.decode_odometry(decoded)
                 self.frames = (frame_id, child_frame_id)
                 self.states.append((stamp, state))
+                self._take_moving(stamp)
             elif message.topic == self.chosen["commands"]:
                 self.twists.append((stamp, self._command(decoded)))
             elif message.topic == self.chosen["imu"]:
@@ -385,11 +408,21 @@ class _Collector:
         for frames, matrix in found.items():
             if static:
                 self.transforms[frames] = matrix
-            elif frames not in self._moving:
+                continue
+            self._newest[frames] = matrix
+            if frames not in self._moving:
                 first = self.transforms.setdefault(frames, matrix)
                 if np.abs(first - matrix).max() > FIXED:
                     self._moving.add(frames)
                     del self.transforms[frames]
+
+    def _take_moving(self, stamp: int) -> None:
+        """Keep the transforms beside the odometry's child frame at an odometry message, all but its pose."""
+        odometry, child = (frame.lstrip("/") for frame in self.frames)
+        for frames, matrix in self._newest.items():
+            names = {frame.lstrip("/") for frame in frames}
+            if child in names and odometry not in names:
+                self._series.setdefault(frames, []).append((stamp, matrix))
 
     def recording(self, image_topics: list[str]) -> Recording:
         if not self.states:
@@ -429,6 +462,11 @@ class _Collector:
                 if (found := [info for info in camera_info_topics(topic) if info in self.cameras])
             },
             static_transforms=self.transforms,
+            moving={
+                frames: (stamps, np.array(poses))
+                for frames, (stamps, poses) in ((frames, _in_order(kept)) for frames, kept in self._series.items())
+                if frames in self._moving
+            },
             topics={role: topic for role, topic in self.chosen.items() if topic},
             warnings=tuple(self.warnings),
             choices=tuple(self.choices),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any, NoReturn, override
 
 
@@ -32,6 +32,12 @@ class OptionParser(argparse.ArgumentParser):
         if message.startswith("unrecognized arguments: "):
             message += nearest(unknown[0].split("=")[0], self._known_options())
         super().error(message)
+
+    def refuse_without_effect(self, options: argparse.Namespace, names: Sequence[str], reason: str) -> None:
+        """End with an error if one of the options, which have no effect for a ``reason``, differs from its default."""
+        for name in names:
+            if getattr(options, name) != self.get_default(name):
+                self.error(f"--{name.replace('_', '-')} has no effect {reason}")
 
     def _known_options(self) -> set[str]:
         """Options of this parser and, as it also reports those that they do not know, of its subcommands."""

@@ -140,20 +140,25 @@ class MotionTrack:
         """The motion of the base, if this is the motion of a frame with pose ``[4, 4]`` in the base frame.
 
         Args:
-            base_from_child: pose of the frame that was measured.
+            base_from_child: pose of the frame that was measured, or its poses ``[N, 4, 4]``; how fast these change is
+                neglected in the velocities.
             base_frame: name of the base frame.
         """
         if np.allclose(base_from_child, np.eye(4), atol=1e-9):
             return replace(self, child_frame_id=base_frame)
         child_from_base = np.linalg.inv(base_from_child)
-        turn, lever = base_from_child[:3, :3], child_from_base[:3, 3]
+        turn, lever = base_from_child[..., :3, :3], child_from_base[..., :3, 3]
         rotations = Rotation.from_quat(self.quaternions)
+
+        def turned(vectors: np.ndarray) -> np.ndarray:
+            return np.asarray((turn @ vectors[..., None])[..., 0])
+
         return replace(
             self,
             positions=self.positions + rotations.apply(lever),
-            quaternions=(rotations * Rotation.from_matrix(child_from_base[:3, :3])).as_quat(),
-            linear_velocities=(self.linear_velocities + np.cross(self.angular_velocities, lever)) @ turn.T,
-            angular_velocities=self.angular_velocities @ turn.T,
+            quaternions=(rotations * Rotation.from_matrix(child_from_base[..., :3, :3])).as_quat(),
+            linear_velocities=turned(self.linear_velocities + np.cross(self.angular_velocities, lever)),
+            angular_velocities=turned(self.angular_velocities),
             child_frame_id=base_frame,
         )
 

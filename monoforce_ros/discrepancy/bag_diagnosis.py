@@ -24,6 +24,7 @@ from monoforce_ros.discrepancy.step_errors import compare_after_steps
 from monoforce_ros.discrepancy.terrain_evidence import supporting_terrain, traced_terrain
 from monoforce_ros.discrepancy.verdict import Verdict
 from monoforce_ros.discrepancy.wheels import compare_with_wheels
+from monoforce_ros.discrepancy.wording import finding
 from monoforce_ros.effects import CATALOGUE
 from monoforce_ros.robots import RobotModel, fingerprint, load_robot, write_robot
 from monoforce_ros.robots import robot_file as robot_file_of
@@ -155,7 +156,9 @@ def diagnose_bag(
         progress=progress,
     )
     steeper = beyond_commissioning(ground.slope, None if nominal is None else nominal.slope)
-    diagnosis = without_blame_for_ground(diagnosis, ground.unexplained or steeper)
+    # A robot that was commissioned on such slopes is known there, without a map, too.
+    known = nominal is not None and nominal.slope is not None and not steeper
+    diagnosis = without_blame_for_ground(diagnosis, ground.unexplained or steeper, named=ground.uneven and not known)
     large = residual_complaint(None if nominal is None else nominal.residual, evidence.smoothed, evidence.commands)
     # Named effects stay, with this doubt.
     steeper = steeper if diagnosis.effects else ""
@@ -200,19 +203,25 @@ def diagnose_bag(
     return BagDiagnosis(bag, diagnosis, report, page, robot_file, recording.warnings, tuple(doubts), ground)
 
 
-def without_blame_for_ground(diagnosis: Diagnosis, unexplained: str) -> Diagnosis:
-    """The diagnosis; ``not_identifiable`` where an error without a name may be the ground's.
+def without_blame_for_ground(diagnosis: Diagnosis, unexplained: str, *, named: bool) -> Diagnosis:
+    """The diagnosis; ``not_identifiable`` where the error may be the ground's.
 
     Args:
         diagnosis: of a recording.
-        unexplained: why the error may be the ground's; empty if it is not.
+        unexplained: why an error without a name may be the ground's; empty if it is not.
+        named: whether forces that slopes exert may pass for effects, too: those of contact and body. Slopes neither
+            delay a command nor turn a sensor.
     """
-    if diagnosis.verdict != Verdict.UNKNOWN_EFFECT or not unexplained:
+    forces = [effect for effect in diagnosis.effects if CATALOGUE[effect.name].stage in ("contact", "body")]
+    blamed = diagnosis.verdict == Verdict.UNKNOWN_EFFECT or (named and bool(forces))
+    if not blamed or not unexplained:
         return diagnosis
+    is_named = diagnosis.verdict == Verdict.EFFECT_FOUND
+    forces = forces if is_named else []
     return Diagnosis(
         Verdict.NOT_IDENTIFIABLE,
-        known_parts=diagnosis.known_parts,
-        advice=(unexplained,),
+        known_parts=diagnosis.effects if is_named else diagnosis.known_parts,
+        advice=(unexplained, *(f"on known ground this would mean: {finding(effect)}" for effect in forces)),
         noise_floor=diagnosis.noise_floor,
         commissioned=diagnosis.commissioned,
     )

@@ -21,7 +21,7 @@ from monoforce_ros.discrepancy.fit import (
     with_values,
 )
 from monoforce_ros.discrepancy.gap import noise_floor, noisy_motions, residual_scale
-from monoforce_ros.discrepancy.ground import slope_of
+from monoforce_ros.discrepancy.ground import slopes_of
 from monoforce_ros.discrepancy.hypothesis import Effects, Evidence, EvidenceWindows, Predictions, window_starts
 from monoforce_ros.discrepancy.nominal import SEGMENT, NominalModel
 from monoforce_ros.discrepancy.preflight import complaints
@@ -109,7 +109,7 @@ def commission(
     residuals = _held_out_residuals(prepared, fits, merged.effects)
     progress(0.85, "variation between segments")
     nominal = _nominal(prepared, merged.effects, residuals)
-    nominal = replace(nominal, slope=max(slope_of(evidence.smoothed)[0] for evidence in recordings))
+    nominal = replace(nominal, slope=max(slopes_of(evidence.smoothed).total for evidence in recordings))
     progress(1.0, "done")
     return estimate_effects(merged, {}), nominal
 

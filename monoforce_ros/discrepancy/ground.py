@@ -21,8 +21,6 @@ for an effect.
 STEEPER = np.sqrt(2.0)
 """Ground that is so many times as steep as where the robot was commissioned leaves a residual that nobody has seen:
 what slopes contribute to its variance grows with their square, to twice as much."""
-_SHARE_OF_PLANE = 0.8
-"""Share of the heights' variance above which one plane describes the ground: most of it, with room for noise."""
 _APART = 1.0
 """Distance over which slopes are taken from heights [m]."""
 
@@ -36,12 +34,14 @@ class Ground:
     description: str
     """For reports: what was taken and why."""
     slope: float
-    """Root mean square slope by the measured poses [rad]; see :func:`slope_of`."""
+    """Root mean square slope by the measured poses [rad]; see :func:`slopes_of`."""
     complaint: str = ""
     """Why this is not the ground that the robot drove on; empty if nothing speaks against it."""
 
     unexplained: str = ""
     """Why an error without a name may be the ground's; empty if a map shows the ground, or it is level."""
+    uneven: bool = False
+    """Whether no map shows slopes that differ from place to place: forces that these exert may pass for effects."""
 
     @property
     def unknown(self) -> bool:
@@ -58,11 +58,13 @@ def choose_ground(terrain: str, recording: Recording, smoothed: SmoothedMotion, 
         smoothed: the measured motion, whose roll, pitch and heights show whether ground is level.
         robot: its file may know the pose of the lidar.
     """
-    slope, plane = slope_of(smoothed)
+    slopes = slopes_of(smoothed)
+    slope, uneven = slopes.total, slopes.uneven > LEVEL_SLOPE
     if terrain == "lidar":
         return Ground(terrain, f"lidar map of {len(recording.clouds)} sweeps", slope)
     if terrain == "traced":
-        return Ground(terrain, "traced by the wheels along the measured poses", slope)
+        unexplained = _by_trace(slope, "as asked for") if uneven else ""
+        return Ground(terrain, "traced by the wheels along the measured poses", slope, "", unexplained, uneven)
     if terrain not in ("auto", "flat"):
         return Ground(terrain, f"map {Path(terrain).name}", slope)
     reason = "no clouds in the bag"
@@ -77,26 +79,29 @@ def choose_ground(terrain: str, recording: Recording, smoothed: SmoothedMotion, 
             reason = f"clouds cannot be used: {error}"
     said = "as asked for" if terrain == "flat" else reason
     complaint = ""
-    if terrain == "auto" and slope > LEVEL_SLOPE and plane <= _SHARE_OF_PLANE:
-        degrees = np.degrees(slope)
-        unexplained = (
-            f"the ground is not level (slopes of {degrees:.1f}° by the poses, root mean square) and no map shows it "
-            f"({reason}): what its trace along the poses leaves unexplained may be the ground's; record a lidar, or "
-            "give a map of fit_terrain (--terrain)"
-        )
-        description = f"traced by the wheels: slopes of {degrees:.1f}° by the poses, and {reason}"
-        return Ground("traced", description, slope, unexplained=unexplained)
+    if terrain == "auto" and uneven:
+        description = f"traced by the wheels: slopes of {np.degrees(slope):.1f}° by the poses, and {reason}"
+        return Ground("traced", description, slope, "", _by_trace(slope, reason), uneven)
     if slope > LEVEL_SLOPE:
         remedy = "use --terrain lidar or a map" if recording.clouds else "record a lidar, or give a map of fit_terrain"
         what = f"the ground is not level (slopes of {np.degrees(slope):.1f}° by the poses, root mean square)"
-        if plane > _SHARE_OF_PLANE:
+        if not uneven:
             what = (
-                f"the poses lie in a plane that is tilted by {np.degrees(slope):.1f}°: the ground slopes, or z of the "
-                "localisation is not against gravity"
+                f"the poses lie in a plane that is tilted by {np.degrees(slopes.plane):.1f}°: the ground slopes, or "
+                "z of the localisation is not against gravity"
             )
             remedy = "level the localisation's frame by its IMU, or " + remedy
         complaint = f"{what}; level ground is assumed ({said}), so that slopes may pass for an effect: {remedy}"
-    return Ground("flat", f"level ({said})", slope, complaint, complaint)
+    return Ground("flat", f"level ({said})", slope, complaint, complaint, uneven)
+
+
+def _by_trace(slope: float, reason: str) -> str:
+    """Why an error may be the ground's where the ground is only known along the poses."""
+    return (
+        f"the ground is not level (slopes of {np.degrees(slope):.1f}° by the poses, root mean square) and no map shows "
+        f"it ({reason}): what its trace along the poses leaves unexplained may be the ground's; record a lidar, give a "
+        "map of fit_terrain (--terrain), or commission the robot with a recording of such ground"
+    )
 
 
 def beyond_commissioning(slope: float, commissioned: float | None) -> str:
@@ -115,12 +120,23 @@ def beyond_commissioning(slope: float, commissioned: float | None) -> str:
     )
 
 
-def slope_of(smoothed: SmoothedMotion) -> tuple[float, float]:
-    """Root mean square slope of the ground that the robot drove over, by its poses, beyond their noise [rad].
+@dataclass(frozen=True)
+class Slopes:
+    """Slopes of the ground that a robot drove over, by its poses [rad]."""
 
-    Also returns the share of the variance of the heights that one tilted plane explains. The slope is the larger of two
-    estimates: the tilt of the robot, without one that it keeps in its own axes as a sensor mounted at an angle has; and
-    the change of its height along the way.
+    total: float
+    """Root mean square, beyond the noise of the poses."""
+    plane: float
+    """Tilt of the plane that fits the heights best."""
+    uneven: float
+    """Root mean square of what differs from that plane."""
+
+
+def slopes_of(smoothed: SmoothedMotion) -> Slopes:
+    """Slopes of the ground under a measured motion.
+
+    Root mean squares are the larger of two estimates: the tilt of the robot, without one that it keeps in its own axes
+    as a sensor mounted at an angle has; and the change of its height along the way.
     """
     motion = smoothed.motion
     rotations = Rotation.from_quat(motion.quaternions).as_matrix()
@@ -135,22 +151,33 @@ def slope_of(smoothed: SmoothedMotion) -> tuple[float, float]:
     matrix = rows.reshape(-1, 4)
     prior = np.diag([1.0, 1.0, 0.0, 0.0]) * 0.02 * len(up) + 1e-9 * np.eye(4)
     solution = np.linalg.solve(matrix.T @ matrix + prior, matrix.T @ up.ravel())
-    tilts = up - solution[:2]
-    tilt = float(np.mean((tilts**2).sum(axis=1))) - 2.0 * smoothed.rotation_noise**2
-    heights = []
+    places = np.c_[motion.positions[:, :2], np.ones(len(motion))]
+    plane = np.linalg.lstsq(places, motion.positions[:, 2], rcond=1e-6)[0]
+
+    def root_mean_square(tilts: np.ndarray, heights: np.ndarray) -> float:
+        tilt = float(np.mean((tilts**2).sum(axis=1))) - 2.0 * smoothed.rotation_noise**2
+        return float(np.sqrt(max(tilt, _rise(smoothed, heights), 0.0)))
+
+    return Slopes(
+        root_mean_square(up - solution[:2], motion.positions[:, 2]),
+        float(np.arctan(np.hypot(*plane[:2]))),
+        root_mean_square(up - rows @ solution, motion.positions[:, 2] - places @ plane),
+    )
+
+
+def _rise(smoothed: SmoothedMotion, heights: np.ndarray) -> float:
+    """Mean square slope of heights ``[N]`` [m] along the way, beyond their noise."""
+    motion, changes = smoothed.motion, []
     for stretch in smoothed.stretches:
         places = motion.positions[stretch]
         along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(places[:, :2], axis=0), axis=1))]
         if along[-1] < 2 * _APART or (motion.stamps[stretch][-1] - motion.stamps[stretch][0]) * NANOSECOND < 2.0:
             continue
         keep = np.r_[True, np.diff(along) > 1e-6]
-        heights.append(np.diff(np.interp(np.arange(0.0, along[-1], _APART), along[keep], places[keep, 2])) / _APART)
-    rise = 0.0
-    if heights:
-        steps = np.concatenate(heights)
-        # A height that drifts as a whole is no slope; the median is robust against jumps of a localisation.
-        rise = float(np.median(np.abs(steps)) / 0.6745) ** 2 - 2.0 * (smoothed.position_noise / _APART) ** 2
-    places = np.c_[motion.positions[:, :2], np.ones(len(motion))]
-    height = motion.positions[:, 2]
-    off = height - places @ np.linalg.lstsq(places, height, rcond=None)[0]
-    return float(np.sqrt(max(tilt, rise, 0.0))), 1.0 - float(off.var() / max(height.var(), 1e-12))
+        even = np.interp(np.arange(0.0, along[-1], _APART), along[keep], heights[stretch][keep])
+        changes.append(np.diff(even) / _APART)
+    if not changes:
+        return 0.0
+    # A height that drifts as a whole is no slope; the median is robust against jumps of a localisation.
+    middle = float(np.median(np.abs(np.concatenate(changes))) / 0.6745)
+    return middle**2 - 2.0 * (smoothed.position_noise / _APART) ** 2

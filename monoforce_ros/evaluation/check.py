@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import (
     DETECTED,
+    FIXED,
     BagError,
     BagReader,
     ReadOptions,
@@ -117,9 +118,12 @@ def _offset_findings(measured: MotionTrack, base: MotionTrack) -> Iterator[Findi
     # Rounded, and without the sign of a negative zero.
     x, y, z = np.round(turn.apply(base.positions[0] - measured.positions[0]), 3) + 0.0
     angle = float((turn * Rotation.from_quat(base.quaternions[0])).magnitude())
+    offsets = Rotation.from_quat(measured.quaternions).inv().apply(base.positions - measured.positions)
+    moves = float(np.ptp(offsets, axis=0).max())
+    varies = f" at first (by the transforms on /tf it moves by {100 * moves:.0f} cm)" if moves > FIXED else ""
     yield ok(
         f"frames: {base.child_frame_id} is at ({x:.3f}, {y:.3f}, {z:.3f}) m and turned by {np.degrees(angle):.1f}° in "
-        f"{measured.child_frame_id}; this offset is applied to the odometry"
+        f"{measured.child_frame_id}{varies}; this offset is applied to the odometry"
     )
 
 

@@ -29,7 +29,7 @@ from monoforce_ros.evaluation.recording_evaluation import (
 from monoforce_ros.evaluation.report import Picture, terminal_table, write_reports
 from monoforce_ros.evaluation.view import PredictionView
 from monoforce_ros.messages import MessageError
-from monoforce_ros.perception import SOURCES, choose_terrain_source
+from monoforce_ros.perception import CAMERA_SOURCES, SOURCES, choose_terrain_source
 from monoforce_ros.physics import SOILS, PhysicsOptions, SoilError, read_soil
 from monoforce_ros.prediction import Predictor
 from monoforce_ros.reporting import figure_png
@@ -53,7 +53,10 @@ class _FormerOption(argparse.Action):
         setattr(namespace, self.dest, values)
 
 
-def _parser() -> argparse.ArgumentParser:
+_OF_CAMERAS = ("checkpoint", "retention_time", "images")
+
+
+def _parser() -> OptionParser:
     parser = OptionParser(
         prog="evaluate",
         description="Predict along a recording and compare with the measured motion. Writes report.html, report.json "
@@ -126,6 +129,12 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error(f"--friction: got {options.friction}, expected 0 to 3")
     if not 0 <= options.retention_time <= 600:
         parser.error(f"--retention-time: got {options.retention_time}, expected 0 to 600 s")
+    if options.check:
+        unused = ("terrain", *_OF_CAMERAS, "friction", "soil", "horizons", "stride")
+        parser.refuse_without_effect(options, unused, "with --check")
+    elif options.terrain not in CAMERA_SOURCES:
+        sources = " or ".join(CAMERA_SOURCES)
+        parser.refuse_without_effect(options, _OF_CAMERAS, f"with --terrain {options.terrain}: it needs {sources}")
     try:
         if options.check:
             bag = options.bag or share_directory() / "bags" / "demo"

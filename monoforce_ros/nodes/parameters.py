@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.expand_topic_name import expand_topic_name
@@ -78,6 +79,27 @@ def refuse_unknown_parameters(node: Node, entries: Iterable[ParameterEntry] = ()
         node.get_logger().warning(f"not used by this node: {', '.join(sorted(unused))} (of {owners})")
 
 
+def settings_without_effect(entries: Iterable[ParameterEntry], settings: SimpleNamespace) -> list[str]:
+    """A sentence for each parameter that differs from its default but is not used with the others' values."""
+    found = []
+    for entry in entries:
+        if getattr(settings, entry.name) == entry.default:
+            continue
+        values = {name: getattr(settings, name) for name in entry.used_with}
+        used = [
+            bool(value) if entry.used_with[name] is True else value in entry.used_with[name]
+            for name, value in values.items()
+        ]
+        if used and not any(used):
+            states = ", ".join(f"{name} is {value or 'off'}" for name, value in values.items())
+            needed = " or ".join(
+                name if accepted is True else f"{name} {' or '.join(accepted)}"
+                for name, accepted in entry.used_with.items()
+            )
+            found.append(f"{entry.name} has no effect: it needs {needed}, and {states}")
+    return found
+
+
 def _deprecated_value(node: Node, entry: ParameterEntry) -> ParameterValue | None:
     """The value set under an entry's deprecated name, which is undeclared again after reading."""
     value = _declare(node, entry, entry.formerly, None)
@@ -104,15 +126,23 @@ def _declare(
     try:
         value = node.declare_parameter(name, declared, descriptor).value
     except (InvalidParameterTypeException, InvalidParameterValueException) as error:
-        expected = f"{entry.type} {entry.range_text}".strip()
+        expected = entry.expected if entry.type.endswith("_array") else f"{entry.type} {entry.range_text}".strip()
         got = node._parameter_overrides[name].value if name in node._parameter_overrides else default
+        got = list(got) if entry.type.endswith("_array") and not isinstance(got, str) and np.ndim(got) == 1 else got
         text = f"parameter {name}: got {got!r}, expected {expected} {entry.unit}".rstrip()
-        # ROS takes no integer for a floating-point number.
-        whole = entry.type == "double" and isinstance(got, int) and not isinstance(got, bool)
-        raise ValueError(f"{text}: write {got}.0" if whole else text) from error
+        if entry.type.startswith("double") and _whole(got):
+            # ROS takes no integers for floating-point numbers.
+            text += f": write {[float(number) for number in got] if isinstance(got, list) else float(got)}"
+        raise ValueError(text) from error
     if (value is not None or name == entry.name) and (reason := complaint(entry, value)):
         raise ValueError(f"parameter {name}: {reason}")
     return value
+
+
+def _whole(value: Any) -> bool:
+    """Whether a value is an integer or a list of them."""
+    listed = value if isinstance(value, list) else [value]
+    return bool(listed) and all(isinstance(number, int) and not isinstance(number, bool) for number in listed)
 
 
 def complaint(entry: ParameterEntry, value: Any) -> str:

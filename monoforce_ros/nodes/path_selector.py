@@ -22,7 +22,7 @@ from monoforce_ros.nodes.course import TRANSFORM_TIMEOUT, Course, CourseFrames
 from monoforce_ros.nodes.flipper_output import FlipperOutput
 from monoforce_ros.nodes.frames import TRANSFORMS_PATIENCE, TransformListener
 from monoforce_ros.nodes.health import ERROR, OK, WARN, Health
-from monoforce_ros.nodes.parameters import declare_parameters
+from monoforce_ros.nodes.parameters import declare_parameters, settings_without_effect
 from monoforce_ros.nodes.process import run_schema_node
 from monoforce_ros.nodes.progress_check import WINDOW, ProgressCheck
 from monoforce_ros.nodes.schema import read_schema, schema_path
@@ -71,7 +71,14 @@ class PathSelectorNode(Node):
 
     def __init__(self) -> None:
         super().__init__("path_selector")
-        self.settings = settings = declare_parameters(self, read_schema(schema_path("path_selector")))
+        entries = read_schema(schema_path("path_selector"))
+        self.settings = settings = declare_parameters(self, entries)
+        for text in settings_without_effect(entries, settings):
+            self.get_logger().warning(text)
+        if settings.plan_topic and settings.goal_topic != next(e.default for e in entries if e.name == "goal_topic"):
+            self.get_logger().warning(
+                f"goal_topic has no effect: goals are not used with plan_topic {settings.plan_topic}"
+            )
         self.weights = SelectionWeights(
             settings.weight_cost,
             settings.weight_distance,

@@ -34,7 +34,7 @@ from monoforce_ros.nodes.inputs import TIME_JUMP, Inputs, Received
 from monoforce_ros.nodes.joint_input import JointInput
 from monoforce_ros.nodes.managed import ManagedNode
 from monoforce_ros.nodes.monitor_output import MonitorOutput
-from monoforce_ros.nodes.parameters import declare_parameters, follow_changes
+from monoforce_ros.nodes.parameters import declare_parameters, follow_changes, settings_without_effect
 from monoforce_ros.nodes.process import run_schema_node
 from monoforce_ros.nodes.rate_limiter import RateLimiter
 from monoforce_ros.nodes.schema import read_schema, schema_path
@@ -69,7 +69,7 @@ class PredictorNode(ManagedNode):
 
     def __init__(self) -> None:
         super().__init__("predictor")
-        entries = read_schema(schema_path("predictor"))
+        self._entries = entries = read_schema(schema_path("predictor"))
         changeable = [entry.name for entry in entries if entry.name != "autostart"]
         self.settings = declare_parameters(self, entries, changeable=changeable)
         self.candidates: CandidateOutput | None = None
@@ -85,7 +85,11 @@ class PredictorNode(ManagedNode):
     def set_up(self) -> None:
         """Load robot and encoder, subscribe to inputs, advertise outputs."""
         settings = self.settings
+        for text in settings_without_effect(self._entries, settings):
+            self.get_logger().warning(text)
         self.robot = load_robot(settings.robot)
+        if settings.flipper_motion == "continue" and not self.robot.flippers:
+            self.get_logger().warning(f"flipper_motion has no effect: {self.robot.name} has no flippers")
         self.predictor = Predictor(
             self.robot,
             self._terrain_source(),

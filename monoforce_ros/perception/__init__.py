@@ -6,11 +6,12 @@ from monoforce_ros.perception.fusion import LidarCameraTerrain
 from monoforce_ros.perception.ground_alignment import support_points
 from monoforce_ros.perception.lidar import LidarTerrain
 from monoforce_ros.perception.observation import Observation, TerrainSource
-from monoforce_ros.perception.sources import SOURCES, choose_terrain_source
+from monoforce_ros.perception.sources import CAMERA_SOURCES, SOURCES, choose_terrain_source
 from monoforce_ros.perception.trace import DrivenGround, traced_ground
 from monoforce_ros.perception.trust import TerrainTrust, TrustedTerrain, TrustReport
 
 __all__ = [
+    "CAMERA_SOURCES",
     "SOURCES",
     "DrivenGround",
     "EncoderTerrain",

@@ -16,6 +16,7 @@ from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import Grid, TerrainDefaults
 
 SOURCES = ("lidar", "camera", "lidar_camera", "flat")
+CAMERA_SOURCES = ("camera", "lidar_camera")
 """Names of the terrain sources."""
 
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from monoforce_ros.synthetic.varied.settings import WorldSettings
 
 
-def build_parser() -> argparse.ArgumentParser:
+def build_parser() -> OptionParser:
     """The command line's options."""
     parser = OptionParser(
         prog="synthesize",
@@ -145,6 +145,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _list_faults()
     if options.set == ["list"]:
         return _list_settings()
+    if options.camera == "none":
+        parser.refuse_without_effect(options, ("cameras", "distortion", "camera_rate"), "with --camera none")
+    if options.lidar == "none":
+        parser.refuse_without_effect(options, ("lidar_rate",), "with --lidar none")
     outs = [options.out]
     if options.count is not None:
         if not 1 <= options.count <= 10_000:
