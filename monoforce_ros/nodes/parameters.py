@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Callable, Iterable
+from array import array
+from collections.abc import Callable, Iterable, Sequence
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.expand_topic_name import expand_topic_name
@@ -87,8 +87,8 @@ def settings_without_effect(entries: Iterable[ParameterEntry], settings: SimpleN
             continue
         values = {name: getattr(settings, name) for name in entry.used_with}
         used = [
-            bool(value) if entry.used_with[name] is True else value in entry.used_with[name]
-            for name, value in values.items()
+            bool(values[name]) if accepted is True else values[name] in accepted
+            for name, accepted in entry.used_with.items()
         ]
         if used and not any(used):
             states = ", ".join(f"{name} is {value or 'off'}" for name, value in values.items())
@@ -128,15 +128,21 @@ def _declare(
     except (InvalidParameterTypeException, InvalidParameterValueException) as error:
         expected = entry.expected if entry.type.endswith("_array") else f"{entry.type} {entry.range_text}".strip()
         got = node._parameter_overrides[name].value if name in node._parameter_overrides else default
-        got = list(got) if entry.type.endswith("_array") and not isinstance(got, str) and np.ndim(got) == 1 else got
+        # rclpy keeps lists as arrays or tuples.
+        got = list(got) if isinstance(got, Sequence | array) and not isinstance(got, str) else got
         text = f"parameter {name}: got {got!r}, expected {expected} {entry.unit}".rstrip()
         if entry.type.startswith("double") and _whole(got):
             # ROS takes no integers for floating-point numbers.
-            text += f": write {[float(number) for number in got] if isinstance(got, list) else float(got)}"
+            text += f": write {_floating(got)}"
         raise ValueError(text) from error
     if (value is not None or name == entry.name) and (reason := complaint(entry, value)):
         raise ValueError(f"parameter {name}: {reason}")
     return value
+
+
+def _floating(value: Any) -> Any:
+    """A number, or each of a list, as floating-point numbers."""
+    return [float(number) for number in value] if isinstance(value, list) else float(value)
 
 
 def _whole(value: Any) -> bool:

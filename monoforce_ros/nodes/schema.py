@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import yaml
 
@@ -41,7 +41,7 @@ class ParameterEntry:
     """Whether it may be changed while the node runs."""
     formerly: str = ""
     """Deprecated name under which a value is still accepted at start-up."""
-    used_with: Mapping[str, bool | Sequence[str]] = field(default_factory=dict)
+    used_with: Mapping[str, Literal[True] | Sequence[str]] = field(default_factory=dict)
     """Parameters without which it has no effect: any one of them set (True), or with one of these values."""
 
     @property
