@@ -17,15 +17,16 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import numpy as np
 import torch
 import yaml
+from rollout import bumpy_ground
 
 from monoforce_ros.core import write_text
 from monoforce_ros.effects import controls
-from monoforce_ros.physics import State, rollout
+from monoforce_ros.physics import State
+from monoforce_ros.physics import rollout as predict
 from monoforce_ros.robots import Controls, RobotModel, load_robot, robot_file
-from monoforce_ros.terrain import Grid, TerrainMap
+from monoforce_ros.terrain import TerrainMap
 
 STEP, STEPS = 0.01, 500
 CASES = (
@@ -53,16 +54,14 @@ def commanded(robot: RobotModel, batch: int, steps: int) -> Controls:
 
 def work(robot: RobotModel, given: Controls, batch: int, *, backward: bool) -> Callable[[], None]:
     """A rollout, or one with its gradient by the terrain's height."""
-    grid = Grid.square(25.6, 0.1)
-    x, y = np.meshgrid(grid.x, grid.y)
-    height = torch.from_numpy((0.08 * np.sin(1.3 * x) * np.cos(0.9 * y)).astype(np.float32))
-    height = height.requires_grad_(backward)
-    terrain = TerrainMap.from_height(height, grid)
+    ground = bumpy_ground()
+    height = ground.height.requires_grad_(backward)
+    terrain = TerrainMap.from_height(height, ground.grid)
     state = State.at_rest(robot.ground_clearance, batch=batch)
 
     def run() -> None:
         with torch.set_grad_enabled(backward):
-            result = rollout(terrain, robot, given, state, with_forces=False)
+            result = predict(terrain, robot, given, state, with_forces=False)
             if backward:
                 height.grad = None
                 result.position[:, ::50].sum().backward()

@@ -35,12 +35,16 @@ SPACING = 0.066
 """Point spacing that gives about 200 points for the Husky [m]."""
 
 
-def problem(robot: RobotModel, batch: int, steps: int, device: str) -> tuple:
-    """A bumpy map and a fan of arcs, as in planning."""
+def bumpy_ground() -> TerrainMap:
+    """Hills of 8 cm."""
     grid = Grid.square(25.6, 0.1)
     x, y = np.meshgrid(grid.x, grid.y)
-    height = torch.from_numpy((0.08 * np.sin(1.3 * x) * np.cos(0.9 * y)).astype(np.float32))
-    terrain = TerrainMap.from_height(height, grid).to(device=device)
+    return TerrainMap.from_height(torch.from_numpy((0.08 * np.sin(1.3 * x) * np.cos(0.9 * y)).astype(np.float32)), grid)
+
+
+def problem(robot: RobotModel, batch: int, steps: int, device: str) -> tuple:
+    """A bumpy map and a fan of arcs, as in planning."""
+    terrain = bumpy_ground().to(device=device)
     fan = torch.stack([torch.linspace(0.3, 1.0, batch), torch.linspace(-0.6, 0.6, batch)], dim=-1)
     speeds = robot.drive_speeds(fan[:, None].expand(batch, steps, 2)).to(device)
     state = State.at_rest(0.14, batch=batch)

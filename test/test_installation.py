@@ -140,7 +140,7 @@ def test_messages_are_built_with_the_headers_of_the_environment_wherever_it_was_
     packages = "lib/python3.12/site-packages/numpy/_core/include"
     old = {
         "wheel": ("/opt/python/cp312/include/python3.12", f"/opt/python/cp312/{packages}"),
-        "moved": ("/usr/include/python3.12", f"/home/me/old/.venv/{packages}"),
+        "moved": ("/usr/include/python3.12", f"{tmp_path}/old/.venv/{packages}"),
     }
     for name, folders in old.items():
         (folder / f"{name}.cmake").write_text(target.format(*folders))

@@ -150,7 +150,15 @@ def test_every_condition_of_a_schema_names_parameters_and_values_that_exist():
         entries = {entry.name: entry for entry in read_schema(ROOT / "config" / f"{node}.schema.yaml")}
         for entry in entries.values():
             for name, accepted in entry.used_with.items():
-                assert accepted is True or set(accepted) < set(entries[name].choices)
+                assert isinstance(accepted, bool) or set(accepted) < set(entries[name].choices)
+
+
+def test_a_goal_is_not_used_beside_a_plan(declared):
+    entries = read_schema(ROOT / "config" / "path_selector.schema.yaml")
+    assert settings_without_effect(entries, declared("goal_topic:=/goal", entries=entries)[1]) == []
+    assert settings_without_effect(entries, declared("goal_topic:=/goal", "plan_topic:=/plan", entries=entries)[1]) == [
+        "goal_topic has no effect: it needs plan_topic off, and plan_topic is /plan"
+    ]
 
 
 def test_whole_numbers_in_a_list_are_answered_with_what_to_write(declared):

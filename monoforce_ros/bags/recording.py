@@ -409,20 +409,24 @@ class _Collector:
             if static:
                 self.transforms[frames] = matrix
                 continue
-            self._newest[frames] = matrix
+            self._keep_beside_child(frames, matrix)
             if frames not in self._moving:
                 first = self.transforms.setdefault(frames, matrix)
                 if np.abs(first - matrix).max() > FIXED:
                     self._moving.add(frames)
                     del self.transforms[frames]
 
-    def _take_moving(self, stamp: int) -> None:
-        """Keep the transforms beside the odometry's child frame at an odometry message, all but its pose."""
+    def _keep_beside_child(self, frames: tuple[str, str], matrix: np.ndarray) -> None:
+        """Keep a transform of the odometry's child frame, other than its pose, as the newest one."""
         odometry, child = (frame.lstrip("/") for frame in self.frames)
+        names = [frame.lstrip("/") for frame in frames]
+        if child in names and odometry not in names:
+            self._newest[frames] = matrix
+
+    def _take_moving(self, stamp: int) -> None:
+        """Keep the newest transforms of the odometry's child frame at the stamp of an odometry message."""
         for frames, matrix in self._newest.items():
-            names = {frame.lstrip("/") for frame in frames}
-            if child in names and odometry not in names:
-                self._series.setdefault(frames, []).append((stamp, matrix))
+            self._series.setdefault(frames, []).append((stamp, matrix))
 
     def recording(self, image_topics: list[str]) -> Recording:
         if not self.states:

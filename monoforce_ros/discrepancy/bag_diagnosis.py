@@ -213,15 +213,14 @@ def without_blame_for_ground(diagnosis: Diagnosis, unexplained: str, *, named: b
             delay a command nor turn a sensor.
     """
     forces = [effect for effect in diagnosis.effects if CATALOGUE[effect.name].stage in ("contact", "body")]
-    blamed = diagnosis.verdict == Verdict.UNKNOWN_EFFECT or (named and bool(forces))
-    if not blamed or not unexplained:
+    nameless = diagnosis.verdict == Verdict.UNKNOWN_EFFECT
+    if not unexplained or not (nameless or (named and forces)):
         return diagnosis
-    is_named = diagnosis.verdict == Verdict.EFFECT_FOUND
-    forces = forces if is_named else []
+    meanings = () if nameless else tuple(f"on known ground this would mean: {finding(effect)}" for effect in forces)
     return Diagnosis(
         Verdict.NOT_IDENTIFIABLE,
-        known_parts=diagnosis.effects if is_named else diagnosis.known_parts,
-        advice=(unexplained, *(f"on known ground this would mean: {finding(effect)}" for effect in forces)),
+        known_parts=diagnosis.known_parts if nameless else diagnosis.effects,
+        advice=(unexplained, *meanings),
         noise_floor=diagnosis.noise_floor,
         commissioned=diagnosis.commissioned,
     )

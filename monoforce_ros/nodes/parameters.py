@@ -87,13 +87,15 @@ def settings_without_effect(entries: Iterable[ParameterEntry], settings: SimpleN
             continue
         values = {name: getattr(settings, name) for name in entry.used_with}
         used = [
-            bool(values[name]) if accepted is True else values[name] in accepted
+            bool(values[name]) == accepted if isinstance(accepted, bool) else values[name] in accepted
             for name, accepted in entry.used_with.items()
         ]
         if used and not any(used):
             states = ", ".join(f"{name} is {value or 'off'}" for name, value in values.items())
             needed = " or ".join(
-                name if accepted is True else f"{name} {' or '.join(accepted)}"
+                f"{name}{'' if accepted else ' off'}"
+                if isinstance(accepted, bool)
+                else f"{name} {' or '.join(accepted)}"
                 for name, accepted in entry.used_with.items()
             )
             found.append(f"{entry.name} has no effect: it needs {needed}, and {states}")
@@ -131,24 +133,20 @@ def _declare(
         # rclpy keeps lists as arrays or tuples.
         got = list(got) if isinstance(got, Sequence | array) and not isinstance(got, str) else got
         text = f"parameter {name}: got {got!r}, expected {expected} {entry.unit}".rstrip()
-        if entry.type.startswith("double") and _whole(got):
-            # ROS takes no integers for floating-point numbers.
-            text += f": write {_floating(got)}"
+        # ROS takes no integers for floating-point numbers.
+        if entry.type == "double" and isinstance(got, int) and _whole([got]):
+            text += f": write {float(got)}"
+        if entry.type == "double_array" and isinstance(got, list) and _whole(got):
+            text += f": write {[float(number) for number in got]}"
         raise ValueError(text) from error
     if (value is not None or name == entry.name) and (reason := complaint(entry, value)):
         raise ValueError(f"parameter {name}: {reason}")
     return value
 
 
-def _floating(value: Any) -> Any:
-    """A number, or each of a list, as floating-point numbers."""
-    return [float(number) for number in value] if isinstance(value, list) else float(value)
-
-
-def _whole(value: Any) -> bool:
-    """Whether a value is an integer or a list of them."""
-    listed = value if isinstance(value, list) else [value]
-    return bool(listed) and all(isinstance(number, int) and not isinstance(number, bool) for number in listed)
+def _whole(values: Sequence[Any]) -> bool:
+    """Whether these are integers."""
+    return bool(values) and all(isinstance(number, int) and not isinstance(number, bool) for number in values)
 
 
 def complaint(entry: ParameterEntry, value: Any) -> str:

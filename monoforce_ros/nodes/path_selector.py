@@ -75,10 +75,6 @@ class PathSelectorNode(Node):
         self.settings = settings = declare_parameters(self, entries)
         for text in settings_without_effect(entries, settings):
             self.get_logger().warning(text)
-        if settings.plan_topic and settings.goal_topic != next(e.default for e in entries if e.name == "goal_topic"):
-            self.get_logger().warning(
-                f"goal_topic has no effect: goals are not used with plan_topic {settings.plan_topic}"
-            )
         self.weights = SelectionWeights(
             settings.weight_cost,
             settings.weight_distance,

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import yaml
 
@@ -41,8 +41,9 @@ class ParameterEntry:
     """Whether it may be changed while the node runs."""
     formerly: str = ""
     """Deprecated name under which a value is still accepted at start-up."""
-    used_with: Mapping[str, Literal[True] | Sequence[str]] = field(default_factory=dict)
-    """Parameters without which it has no effect: any one of them set (True), or with one of these values."""
+    used_with: Mapping[str, bool | Sequence[str]] = field(default_factory=dict)
+    """Parameters without which it has no effect: any one of them set (True), not set (False), or with one of these
+    values."""
 
     @property
     def range_text(self) -> str:

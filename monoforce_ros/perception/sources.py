@@ -16,8 +16,9 @@ from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import Grid, TerrainDefaults
 
 SOURCES = ("lidar", "camera", "lidar_camera", "flat")
-CAMERA_SOURCES = ("camera", "lidar_camera")
 """Names of the terrain sources."""
+CAMERA_SOURCES = ("camera", "lidar_camera")
+"""Those that use images."""
 
 
 def choose_terrain_source(

@@ -130,9 +130,8 @@ class Articulation:
             rates=_history(target_rates, start_rates, free),
             belts=speeds.new_zeros(batch, steps + 1, drives),
         )
-        if not any(motor is not None for motor in motors):
-            return replace(built, belts=_history(speeds, speeds[:, 0] if steps else built.belts[:, 0], powered))
-        rolling = built._rolling_speeds(robot, velocity, rates)
+        # Other drives turn as commanded from the start.
+        rolling = built._rolling_speeds(robot, velocity, rates) if any(motors) else built.belts[:, 0]
         return replace(built, belts=_history(speeds, rolling, powered))
 
     def _rolling_speeds(self, robot: RobotModel, velocity: Tensor, rates: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Hull: samples of boxes and of wheels' front and rear, fine where the ground and what stands on it can touch them."""
+"""Hull: samples of boxes and of wheels' front and rear, fine where ground and obstacles can touch them."""
 
 from __future__ import annotations
 
