@@ -65,8 +65,9 @@ def test_recording_checking_and_evaluating_run_as_written(executables, tmp_path)
         if name == "synthesize" and "drives" in arguments:
             # Several recordings go to folders of their seeds.
             arguments[arguments.index("drives")] = f"drives/00{arguments[arguments.index('--seed') + 1]}"
-            index = arguments.index("--count")
-            del arguments[index : index + 2]
+            for option in ("--count", "--camera-rate"):
+                index = arguments.index(option)
+                del arguments[index : index + 2]
             arguments[arguments.index("--duration") + 1] = "8"
             arguments += ["--camera", "none"]
         elif name != "evaluate" or "drives/0031" not in arguments:
