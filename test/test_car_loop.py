@@ -45,7 +45,7 @@ def reached(peer, start, robot, target, *, seconds=150.0):
         peer.node.destroy_subscription(subscription)
     peer.node.destroy_publisher(goals)
     for process in (selector, predictor, simulator):
-        assert process.stop() == 0, process.output[-1500:]
+        assert process.stop() == 0, process.output[-8000:]
     return np.array([[m.twist.linear.x, m.twist.angular.z, m.twist.linear.y] for m in commands]), joints
 
 

@@ -135,7 +135,7 @@ class Broken(ManagedNode):
         self.create_timer(1.0, self.pause)
         self.no_such_attribute.load()
 
-def work(node, executor):
+def work(node, executor, signals):
     configured = node.trigger_configure()
     print(configured.name, [node._state_machine.current_state[1]], len(list(node.timers)))
 

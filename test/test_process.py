@@ -36,6 +36,36 @@ def test_a_callback_that_outlives_its_context_is_no_fault(shut_down, ros_environ
     assert ("a fault of the node" in done.stderr) != shut_down
 
 
+WORKING = """
+import os, signal, sys, time
+from rclpy.node import Node
+from monoforce_ros.nodes.process import run_node
+
+class Working(Node):
+    def __init__(self):
+        super().__init__("working")
+        self.create_timer(0.05, self.tick)
+
+    def tick(self):
+        os.kill(os.getpid(), signal.{name})
+        time.sleep(0.2)
+        self.count_publishers("/anything")
+        print("finished", flush=True)
+
+sys.exit(run_node(Working, []))
+"""
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_a_signal_interrupts_no_callback(name, ros_environment):
+    # Python's exception inside rclpy's C++ part, which takes a message or waits, ended nodes with a crash.
+    done = subprocess.run(
+        [sys.executable, "-c", WORKING.format(name=name)],
+        env=ros_environment, capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout) == (0, "finished\n"), done.stderr
+
+
 INTERRUPTED = """
 import os, signal, sys, time, rclpy
 from rclpy.node import Node

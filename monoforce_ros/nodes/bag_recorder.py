@@ -8,7 +8,7 @@ import time
 from functools import partial
 
 import rclpy
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
@@ -18,7 +18,7 @@ from monoforce_ros.messages import message_class, missing_package
 from monoforce_ros.nodes.arguments import own_arguments, refuse_given_parameters, topic_name
 from monoforce_ros.nodes.clocks import STEADY
 from monoforce_ros.nodes.parameters import refuse_unknown_parameters
-from monoforce_ros.nodes.process import initialise
+from monoforce_ros.nodes.process import Signals, initialise
 
 
 def _arguments(arguments: list[str]) -> argparse.Namespace:
@@ -91,6 +91,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = _arguments(own_arguments(command_line[1:]))
     try:
         refuse_given_parameters(command_line, "bag_recorder")
+        signals = Signals()
         initialise(command_line)
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -100,8 +101,10 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         with BagWriter(options.out, storage=options.storage, overwrite=options.overwrite, keep=True) as bag:
             recorder = BagRecorder(bag, options.topics)
+            executor = SingleThreadedExecutor()
+            executor.add_node(recorder)
             try:
-                rclpy.spin(recorder)
+                signals.spin(executor)
             except (KeyboardInterrupt, ExternalShutdownException):
                 pass
             finally:

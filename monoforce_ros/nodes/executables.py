@@ -25,7 +25,7 @@ def _run(name: str, arguments: list[str] | None) -> int:
         early: int | None = importlib.import_module("monoforce_ros.nodes.process").answered(name, arguments)
         if early is not None:
             return early
-    # rclpy replaces these handlers when the node initialises it.
+    # The node replaces these handlers when it starts.
     status: int = importlib.import_module(f"monoforce_ros.nodes.{name}").main(arguments)
     return status
 

@@ -27,18 +27,53 @@ from monoforce_ros.nodes.parameter_files import read_sections
 from monoforce_ros.nodes.parameters import parameter_help
 from monoforce_ros.nodes.schema import read_schema, schema_path
 
+_LONGEST_WAIT = 0.1
+"""Time after which a signal is noticed at the latest while no callback runs [s]."""
 _SET_UP = 2.0
 """Time after which a node has all its topics [s]: the simulator adds one with each first message."""
 
 
-def _spin(node: Node, executor: SingleThreadedExecutor) -> None:
-    executor.spin()
+class Signals:
+    """SIGINT and SIGTERM of this process, instead of rclpy's own handling of them.
+
+    rclpy lets Python raise ``KeyboardInterrupt`` wherever it is. Inside its C++ part, which takes a message or waits,
+    that becomes a ``RuntimeError`` or a segmentation fault. Here a node at work only learns that it shall end, between
+    two callbacks.
+    """
+
+    def __init__(self) -> None:
+        self.received = False
+        self._deferred = False
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._handle)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        # While a node starts, and for those who cannot wait: at once.
+        at_once = self.received or not self._deferred
+        self.received = True
+        if at_once:
+            raise KeyboardInterrupt
+
+    def defer(self) -> None:
+        """From now on the first signal is only noted."""
+        self._deferred = True
+
+    @property
+    def running(self) -> bool:
+        """Whether neither a signal nor anything else has ended the node."""
+        return rclpy.ok() and not self.received
+
+    def spin(self, executor: SingleThreadedExecutor) -> None:
+        """Process callbacks until a signal comes."""
+        self.defer()
+        while self.running:
+            executor.spin_once(timeout_sec=_LONGEST_WAIT)
 
 
 def run_node[NodeType: Node](
     make_node: Callable[[], NodeType],
     arguments: list[str] | None = None,
-    work: Callable[[NodeType, SingleThreadedExecutor], None] = _spin,
+    work: Callable[[NodeType, SingleThreadedExecutor, Signals], None] | None = None,
     *,
     at_the_end: Callable[[NodeType], None] | None = None,
 ) -> int:
@@ -47,22 +82,20 @@ def run_node[NodeType: Node](
     Args:
         make_node: creates the node; called after rclpy is initialised.
         arguments: arguments of the command line.
-        work: spins the node; the default only processes callbacks.
-        at_the_end: called at the end, also on SIGINT and SIGTERM, while the node can still publish, which rclpy's own
-            handling of signals would end at once. Only for the default ``work``.
+        work: spins the node while :attr:`Signals.running`; the default only processes callbacks.
+        at_the_end: called at the end, also on SIGINT and SIGTERM, while the node can still publish.
 
     Returns:
         exit status: 0 after a regular end, 1 if the node could not start (its ``ValueError`` or ``OSError``, or an
         error in the command line, is printed as one line).
     """
     words = command_line(arguments)
+    signals = Signals()
     node: NodeType | None = None
     executor: SingleThreadedExecutor | None = None
     try:
         try:
-            if at_the_end is not None:
-                _handle_signals(_interrupt)
-            initialise(arguments, None if at_the_end is None else SignalHandlerOptions.NO)
+            initialise(arguments)
             node = make_node()
             full_name = node.get_fully_qualified_name()
             refuse_other_nodes(words, full_name)
@@ -70,21 +103,22 @@ def run_node[NodeType: Node](
         except (ValueError, OSError) as error:
             print(f"error: {error}", file=sys.stderr)
             return 1
-        if not rclpy.ok():
+        if not signals.running:
             return 0
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         for warning in warnings:
             node.get_logger().warning(warning)
         _watch_remappings(words, node)
-        if at_the_end is None:
-            work(node, executor)
+        signals.defer()
+        if work is None:
+            signals.spin(executor)
         else:
-            _spin_until_signalled(executor)
+            work(node, executor, signals)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except Exception:
-        # A signal shuts the context down at once; what the node, a callback or the executor does with it then fails.
+        # What a callback or the executor does with a context that was shut down fails.
         if rclpy.ok():
             raise
     finally:
@@ -92,36 +126,11 @@ def run_node[NodeType: Node](
             # A second signal is for those who cannot wait.
             with suppress(KeyboardInterrupt):
                 at_the_end(node)
-        # The signal that ended the context may reach Python a moment later.
         for end in (executor and executor.shutdown, node and node.destroy_node, rclpy.try_shutdown):
             with suppress(KeyboardInterrupt):
                 if end:
                     end()
     return 0
-
-
-def _handle_signals(handler: Callable[[int, FrameType | None], None]) -> None:
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, handler)
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
-
-
-def _spin_until_signalled(executor: SingleThreadedExecutor) -> None:
-    """Process callbacks until a signal comes, and return between two of them. A second signal interrupts at once."""
-    signalled = False
-
-    def end(number: int, frame: FrameType | None) -> None:
-        nonlocal signalled
-        if signalled:
-            raise KeyboardInterrupt
-        signalled = True
-
-    _handle_signals(end)
-    while rclpy.ok() and not signalled:
-        executor.spin_once(timeout_sec=0.1)
 
 
 def _watch_remappings(words: list[str], node: Node) -> None:
@@ -185,8 +194,11 @@ def run_schema_node[NodeType: Node](
     return run_node(make_node, arguments, at_the_end=at_the_end) if status is None else status
 
 
-def initialise(arguments: list[str] | None, signals: SignalHandlerOptions | None = None) -> None:
-    """Initialise rclpy; what it cannot parse in the command line becomes a ``ValueError``."""
+def initialise(arguments: list[str] | None, signals: SignalHandlerOptions = SignalHandlerOptions.NO) -> None:
+    """Initialise rclpy, by default without its handling of signals (see :class:`Signals`).
+
+    What it cannot parse in the command line becomes a ``ValueError``.
+    """
     for path in parameter_files(command_line(arguments)):
         read_sections(path)
     try:

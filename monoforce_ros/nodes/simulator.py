@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from functools import partial
 from typing import Any
 
 import numpy as np
-import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -22,7 +22,7 @@ from monoforce_ros.nodes.arguments import own_arguments, refuse_given_parameters
 from monoforce_ros.nodes.frames import TRANSFORMS
 from monoforce_ros.nodes.odometry_transform import odometry_transform
 from monoforce_ros.nodes.parameters import refuse_unknown_parameters
-from monoforce_ros.nodes.process import run_node
+from monoforce_ros.nodes.process import Signals, run_node
 from monoforce_ros.nodes.subscriptions import AdaptiveSubscription, command_types
 from monoforce_ros.synthetic import GROUNDS, LiveSettings, LiveWorld
 
@@ -187,16 +187,18 @@ def main(arguments: list[str] | None = None) -> int:
         return node
 
     try:
-        return run_node(make_node, command_line, lambda node, executor: _run(node, executor, world, options.duration))
+        return run_node(make_node, command_line, partial(_run, world=world, duration=options.duration))
     finally:
         world.close()
 
 
-def _run(node: SimulatorNode, executor: SingleThreadedExecutor, world: LiveWorld, duration: float) -> None:
+def _run(
+    node: SimulatorNode, executor: SingleThreadedExecutor, signals: Signals, *, world: LiveWorld, duration: float
+) -> None:
     """Keep the simulated time in step with real time."""
     began = time.monotonic()
     origin = node.get_clock().now().nanoseconds * 1e-9
-    while rclpy.ok() and world.time < duration:
+    while signals.running and world.time < duration:
         now = time.monotonic() - began
         if now - world.time > _MAXIMUM_LAG:
             # The computer is too slow: the world and its stamps fall behind instead of jumping.
