@@ -50,13 +50,16 @@ def write(
         for i, time in enumerate(times):
             at = START + round(1e9 * time)
             if not (gap and 8.0 < time < 11.0):
-                turn = Rotation.from_euler("z", heading[i]).as_quat()
+                # A height that a sine of the place gives; the pitch follows from it.
+                slope = extra.get("slope", 0.0) * np.cos(place[i, 0] / 0.8)
+                height = 0.8 * extra.get("slope", 0.0) * np.sin(place[i, 0] / 0.8)
+                turn = Rotation.from_euler("ZY", [heading[i], -slope * np.cos(heading[i])]).as_quat()
                 stamp = at - round(1e9 * clock)
                 odometry = builders.odometry(
                     stamp,
                     "odom",
                     frame,
-                    [*place[i], 0],
+                    [*place[i], height],
                     turn,
                     [sign * speed[i], 0, 0],
                     [0, 0, commanded(time - delay)[1]],
@@ -66,8 +69,9 @@ def write(
                     bag.write("/platform/odom", odometry, at)
             if commands:
                 bag.write("/cmd_vel", builders.twist_stamped(at, "base_link", *commanded(time)), at)
-            if i % 4 == 0:
+            if i % 4 == 0 and extra.get("clouds", True):
                 bag.write("/points", builders.point_cloud(at, "lidar", np.ones((5, 3))), at)
+            if i % 4 == 0:
                 if camera:
                     image = builders.image(at, "camera_front", np.full((4, 6, 3), 9, np.uint8))
                     bag.write("/camera_front/image_raw", image, at)
@@ -178,3 +182,11 @@ def test_a_robot_that_turns_less_than_commanded_follows_its_commands(yaw_gain):
     delay, correlation = command_delay(motion, commands)
     assert delay == pytest.approx(0.2, abs=0.03)
     assert correlation > 0.6
+
+
+@pytest.mark.parametrize("clouds", [False, True])
+def test_slopes_that_no_map_shows_are_said_before_diagnose_meets_them(tmp_path, husky, clouds):
+    check = check_bag(write(tmp_path / "hills", slope=0.2, clouds=clouds), husky)
+    said = texts(check, Level.WARNING)
+    assert ("ground, for diagnose: the ground is not level" in said) is not clouds, said
+    assert check.usable

@@ -21,7 +21,7 @@ from monoforce_ros.bags import (
     smooth,
 )
 from monoforce_ros.core import NANOSECOND, MotionTrack
-from monoforce_ros.discrepancy import command_delay, motion_faults
+from monoforce_ros.discrepancy import choose_ground, command_delay, motion_faults
 from monoforce_ros.evaluation.findings import Finding, Level, missing, note, ok, warning
 from monoforce_ros.evaluation.topic_check import IMU, TopicCheck
 from monoforce_ros.robots import RobotModel
@@ -106,6 +106,9 @@ def _contents(
     yield from sensors
     if not any(finding.level is Level.OK for finding in sensors):
         yield note("neither clouds nor images can be used: only `--terrain flat` is possible")
+    ground = choose_ground("auto", recording, smoothed, robot)
+    if doubt := ground.complaint or ground.unexplained:
+        yield warning(f"ground, for diagnose: {doubt}")
     if not any(topic.message_type == IMU for topic in topics):
         yield note("no IMU: a gyro bias or a delayed pose clock is harder to identify")
 
