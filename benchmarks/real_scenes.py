@@ -25,12 +25,15 @@ from monoforce_ros.datasets import DatasetError
 from monoforce_ros.encoder import TerrainEncoder, load_encoder
 from monoforce_ros.reporting import figure_png
 from monoforce_ros.robots import load_robot
-from monoforce_ros.training.adaptation import adapt
+from monoforce_ros.training.adaptation import adapt, keep_obstacles
 from monoforce_ros.training.judgement import BAND, CAMERAS, Judgement, judge, judged_maps
 from monoforce_ros.training.losses import HIGHEST, LOWEST
 from monoforce_ros.training.recording_samples import RecordingSamples, read_samples
 from monoforce_ros.training.scene_samples import scene_samples
-from monoforce_ros.training.world_samples import FIRST_WORLD, world_samples
+from monoforce_ros.training.world_samples import FIRST_WORLD, HELD_OUT_WORLD, world_samples
+
+CHOOSING_WORLDS = 6
+"""Worlds that choose how much of an adaptation is kept, as many as `train --adapt` takes by default."""
 
 
 @torch.no_grad()
@@ -123,11 +126,15 @@ def main() -> None:
         first = FIRST_WORLD
         files = [world_samples(first + i, encoder.config, options.samples) for i in range(options.adapt)]
         replay = [read_samples(file) for file in files]
+        files = [world_samples(HELD_OUT_WORLD + i, encoder.config, options.samples) for i in range(CHOOSING_WORLDS)]
+        choosing = [read_samples(file) for file in files]
         drawn = []
         for scene in scenes:
             others = [other for other in scenes if other is not scene]
             robot = load_robot(robot_of(scene.name))
             adapted = adapt(encoder, robot, others, replay, options.samples / f"without_{scene.name}")
+            adapted, share = keep_obstacles(encoder, adapted, choosing)
+            print(f"{scene.name}: kept {share:.0%} of the change")
             assert isinstance(adapted, TerrainEncoder), "a copy of the encoder"
             rows.append((scene.name, "adapted on the others", judge(adapted, [scene])))
             drawn.append((scene, pictures(adapted, scene)))

@@ -1,5 +1,6 @@
 """Adaptation: own samples and randomised worlds together, judged on what neither training saw."""
 
+import copy
 import json
 
 import numpy as np
@@ -8,7 +9,14 @@ import torch
 
 from monoforce_ros.encoder import EncoderConfig, load_encoder, new_encoder, save_encoder
 from monoforce_ros.robots import load_robot
-from monoforce_ros.training.adaptation import AdaptationSettings, adapt, balanced, compare, split_recording
+from monoforce_ros.training.adaptation import (
+    AdaptationSettings,
+    adapt,
+    balanced,
+    compare,
+    keep_obstacles,
+    split_recording,
+)
 from monoforce_ros.training.judgement import CAMERAS, SWEEP, calibrated, judge, judged_maps
 from monoforce_ros.training.recording_samples import SamplesError, read_samples
 from monoforce_ros.training.sample_extraction import extract_samples
@@ -110,9 +118,23 @@ def test_adaptation_mends_an_encoder_of_another_robot(recording, world, tmp_path
     assert result.before.median > 0.15 and result.after.median < 0.8 * result.before.median
     assert result.after.support < 0.8 * result.before.support
     assert result.worlds_after is not None and "randomised worlds: obstacles seen" in result.summary
-    # The encoder that was adapted is untouched, and the result is on disk.
-    assert torch.equal(start.heads.weight, biased)
-    assert torch.equal(load_encoder(tmp_path / "encoder.safetensors").heads.weight, adapted.heads.weight)
+    assert torch.equal(start.heads.weight, biased), "the encoder that was adapted is untouched"
+
+
+@pytest.mark.parametrize(("height", "share"), [(0.4, 1.0), (-0.1, 0.5), (-2.0, 0.0)])
+def test_no_more_of_a_change_is_kept_than_lets_obstacles_be_detected(encoder, world, height, share):
+    def raised(by):
+        result = copy.deepcopy(encoder)
+        with torch.no_grad():
+            result.heads.bias[0] += by
+        return result
+
+    # An encoder that takes everything for an obstacle, cells over 15 cm, and a copy that does not any more.
+    before, adapted = raised(0.5), raised(height)
+    assert judge(before, [world]).obstacles > 0.95
+    found, kept = keep_obstacles(before, adapted, [world])
+    assert kept == share and judge(found, [world]).obstacles > 0.93
+    assert (found.heads.bias[0] - encoder.heads.bias[0]).item() == pytest.approx(0.5 + share * (height - 0.5), abs=1e-6)
 
 
 @pytest.mark.unhurried
@@ -123,9 +145,10 @@ def test_the_executable_adapts_to_a_bag(executables, demo_bag, tmp_path):
     save_encoder(new_encoder(CONFIG), tmp_path / "start.safetensors")
     done = run(
         executables, demo_bag, "--adapt", "--start-from", tmp_path / "start.safetensors", "--out", tmp_path / "out",
-        "--steps", 2, "--worlds", 1, "--threads", 1, "--quiet",
+        "--steps", 2, "--worlds", 1, "--held-out-worlds", 2, "--threads", 1, "--quiet",
     )  # fmt: skip
     assert "held-out part: error of the visible surface" in done.stdout
     assert "randomised worlds: obstacles seen" in done.stdout and "checkpoint:=" in done.stdout
     written = json.loads((tmp_path / "out" / "adaptation.json").read_text())
-    assert set(written) == {"before", "after", "worlds_before", "worlds_after"}
+    assert set(written) == {"before", "after", "worlds_before", "worlds_after", "share"}
+    assert load_encoder(tmp_path / "out" / "encoder.safetensors").config.map_size == CONFIG.map_size

@@ -9,11 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from monoforce_ros.encoder import Encoder, save_encoder
+from monoforce_ros.encoder import Encoder
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.training.judgement import CAMERAS, SWEEP, Judgement, judge
 from monoforce_ros.training.losses import LossWeights
 from monoforce_ros.training.recording_samples import RecordingSamples, SamplesError
+from monoforce_ros.training.samples import Augmentation
 from monoforce_ros.training.trainer import Process, Trainer, TrainingSettings
 
 HELD_OUT_SHARE = 0.25
@@ -22,6 +23,10 @@ GAP = 3.0
 """Time between the training part and the held-out part of a recording, so that their images differ [s]."""
 REPLAY_WORLDS = 8
 """Randomised worlds that are trained on alongside, so that walls and grass are not forgotten."""
+SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
+"""Shares of the change of the weights that :func:`keep_obstacles` tries."""
+LOST_OBSTACLES = 0.02
+"""How far the share of detected obstacles may fall: a requirement, not a measurement."""
 
 
 @dataclass(frozen=True)
@@ -46,13 +51,16 @@ class Adaptation:
     worlds_before: Judgement | None
     worlds_after: Judgement | None
     """On randomised worlds that neither training saw; None without them."""
+    share: float = 1.0
+    """Share of the change of the weights that was kept; see :func:`keep_obstacles`."""
 
     @property
     def summary(self) -> str:
         """The result in words."""
         lines = [
+            f"kept {self.share:.0%} of the change, so that obstacles in randomised worlds stay detected",
             f"held-out part: error of the visible surface {_cm(self.before.median)} → {_cm(self.after.median)} "
-            f"(level ground {_cm(self.before.level)})"
+            f"(level ground {_cm(self.before.level)})",
         ]
         if np.isfinite(self.before.support):
             lines.append(
@@ -116,9 +124,47 @@ def adapt(
     )  # fmt: skip
     trainer = Trainer(adapted, robot, balanced(own, replay), [], out, training, Process("cpu"))
     trainer.run(report)
-    adapted.eval()
-    save_encoder(adapted, out / "encoder.safetensors")
-    return adapted
+    return adapted.eval()
+
+
+def blend(before: Encoder, after: Encoder, share: float) -> Encoder:
+    """An encoder whose weights lie between those of two of one configuration: 0 gives ``before``, 1 ``after``."""
+    start, end = before.state_dict(), after.state_dict()
+    result = copy.deepcopy(after)
+    result.load_state_dict({
+        name: value + share * (end[name] - value) if value.is_floating_point() else end[name]
+        for name, value in start.items()
+    })  # fmt: skip
+    return result.eval()
+
+
+def keep_obstacles(
+    before: Encoder, adapted: Encoder, worlds: Sequence[RecordingSamples], report: Callable[[], object] = lambda: None
+) -> tuple[Encoder, float]:
+    """The encoder nearest to the adapted one that still detects the obstacles of other worlds, and its share.
+
+    Weights between those of a network and of its fine-tuned copy keep most of what either can do (Wortsman et al.,
+    Robust fine-tuning of zero-shot models, CVPR 2022). The largest of :data:`SHARES` is taken with which the share of
+    obstacle cells that are detected falls by no more than :data:`LOST_OBSTACLES`.
+
+    Args:
+        before: encoder before the adaptation.
+        adapted: its fine-tuned copy.
+        worlds: randomised worlds of neither training, other ones than the result is judged on.
+        report: called after each judgement.
+    """
+    sensors = _sensors(before)
+    wanted = judge(before, worlds, sensors).obstacles - LOST_OBSTACLES
+    report()
+    for share in SHARES:
+        found = blend(before, adapted, share)
+        if share == 0.0:
+            break
+        obstacles = judge(found, worlds, sensors).obstacles
+        report()
+        if not obstacles < wanted:
+            break
+    return found, share
 
 
 def balanced(own: Sequence[RecordingSamples], replay: Sequence[RecordingSamples]) -> list[RecordingSamples]:
@@ -135,12 +181,17 @@ def compare(
     after: Encoder,
     held_out: Sequence[RecordingSamples],
     worlds: Sequence[RecordingSamples],
+    share: float = 1.0,
 ) -> Adaptation:
     """Errors before and after on samples that neither training saw."""
-    sensors = CAMERAS if before.config.takes_images else SWEEP
+    sensors = _sensors(before)
     judged = [judge(encoder, held_out, sensors) for encoder in (before, after)]
     others = [judge(encoder, worlds, sensors) if worlds else None for encoder in (before, after)]
-    return Adaptation(judged[0], judged[1], others[0], others[1])
+    return Adaptation(judged[0], judged[1], others[0], others[1], share)
+
+
+def _sensors(encoder: Encoder) -> Augmentation:
+    return CAMERAS if encoder.config.takes_images else SWEEP
 
 
 def _cm(metres: float) -> str:

@@ -31,7 +31,15 @@ from monoforce_ros.encoder import (
 from monoforce_ros.reporting import progress, progress_bar
 from monoforce_ros.robots import RobotFileError, RobotModel, fingerprint, load_robot, shipped_robots, write_robot
 from monoforce_ros.synthetic import STYLES
-from monoforce_ros.training.adaptation import REPLAY_WORLDS, AdaptationSettings, adapt, compare, split_recording
+from monoforce_ros.training.adaptation import (
+    REPLAY_WORLDS,
+    SHARES,
+    AdaptationSettings,
+    adapt,
+    compare,
+    keep_obstacles,
+    split_recording,
+)
 from monoforce_ros.training.depth_training import DepthSettings, DepthTrainer, depth_errors
 from monoforce_ros.training.image_features import image_features
 from monoforce_ros.training.judgement import CAMERAS, SWEEP, calibrated
@@ -48,9 +56,16 @@ from monoforce_ros.training.trainer import (
 )
 from monoforce_ros.training.training_state import TrainingError
 from monoforce_ros.training.vegetation_fit import EFFECT, fit_vegetation
-from monoforce_ros.training.world_samples import FIRST_WORLD, PLACES, WORLD_STYLES, world_samples, world_settings
+from monoforce_ros.training.world_samples import (
+    FIRST_WORLD,
+    HELD_OUT_WORLD,
+    JUDGED_WORLD,
+    PLACES,
+    WORLD_STYLES,
+    world_samples,
+    world_settings,
+)
 
-_HELD_OUT_WORLDS = 430_000
 _JUDGED_IMAGES = 256
 """Images on which the training of depth is judged before and after."""
 
@@ -103,7 +118,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--places", type=int, default=PLACES, metavar="N", help="places in each world (default: "
                         "%(default)s)")  # fmt: skip
     parser.add_argument("--held-out-worlds", type=int, default=12, metavar="N", help="worlds to validate on where no "
-                        "recording is held out (default: %(default)s)")  # fmt: skip
+                        "recording is held out; with --adapt half of them choose how much of the change is kept, half "
+                        "judge it (default: %(default)s)")  # fmt: skip
     parser.add_argument("--world-styles", nargs="+", choices=sorted(STYLES), default=list(WORLD_STYLES),
                         metavar="STYLE", help=f"styles that alternate, of {', '.join(sorted(STYLES))} (default: "
                         f"{' '.join(WORLD_STYLES)})")  # fmt: skip
@@ -229,7 +245,7 @@ def _train(options: argparse.Namespace, process: Process) -> None:
         )
         if options.worlds and not validation:
             validation = _world_samples(
-                range(_HELD_OUT_WORLDS, _HELD_OUT_WORLDS + options.held_out_worlds), config, options
+                range(HELD_OUT_WORLD, HELD_OUT_WORLD + options.held_out_worlds), config, options
             )
     if options.samples_only:
         return
@@ -308,7 +324,10 @@ def _adapt(options: argparse.Namespace) -> None:
     parts = [split_recording(recording) for recording in recordings]
     count = options.worlds or REPLAY_WORLDS
     replay = _world_samples(range(options.world_seed, options.world_seed + count), encoder.config, options)
-    judging = _world_samples(range(_HELD_OUT_WORLDS, _HELD_OUT_WORLDS + 3), encoder.config, options)
+    choosing, judging = (
+        _world_samples(range(first, first + max(options.held_out_worlds // 2, 1)), encoder.config, options)
+        for first in (HELD_OUT_WORLD, JUDGED_WORLD)
+    )
     defaults = AdaptationSettings()
     given = options.steps != TrainingSettings.steps, options.rate != TrainingSettings.rate
     settings = AdaptationSettings(
@@ -321,7 +340,10 @@ def _adapt(options: argparse.Namespace) -> None:
             bar.update()
 
         adapted = adapt(encoder, robot, [part[0] for part in parts], replay, options.out, settings, advance)
-    result = compare(encoder, adapted, [part[1] for part in parts], judging)
+    with progress_bar(len(SHARES), label="obstacles", unit="judgement", quiet=options.quiet) as bar:
+        adapted, share = keep_obstacles(encoder, adapted, choosing, bar.update)
+    save_encoder(adapted, options.out / "encoder.safetensors")
+    result = compare(encoder, adapted, [part[1] for part in parts], judging, share)
     write_text(options.out / "adaptation.json", json.dumps(asdict(result), indent=1) + "\n")
     print(result.summary)
     print(f"use it with checkpoint:={options.out / 'encoder.safetensors'}")

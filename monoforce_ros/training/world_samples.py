@@ -32,6 +32,8 @@ from monoforce_ros.training.recording_samples import (
 
 FIRST_WORLD = 420_000
 """First seed of the worlds for training; docs/protocol.md lists the seeds of each purpose."""
+HELD_OUT_WORLD, JUDGED_WORLD = 430_000, 438_000
+"""First seeds of the worlds on which something is chosen, and of those on which an adaptation is judged."""
 PLACES = 16
 """Places of each world: the drawing of a world takes as long as seven images."""
 WORLD_STYLES = ("varied", "site")
