@@ -339,6 +339,44 @@ def test_motors_without_limits_change_nothing(tmp_path):
     assert torch.equal(first.position, second.position) and torch.equal(first.forces, second.forces)
 
 
+@pytest.mark.parametrize("backend", ["torch", "warp"])
+@pytest.mark.parametrize("torque", [300.0, 1e4, 1e6])
+def test_a_torque_that_nothing_can_carry_is_as_good_as_no_limit(tmp_path, torque, backend):
+    """A limit far beyond the wheels' grip: all of it at once overshot the speed, more in each step."""
+    motor = {"drives": ["left", "right"], "maximum_torque": torque}
+    plain = written(tmp_path, husky_like(name="plain"))
+    strong = written(tmp_path, husky_like(name="strong", motors=[motor]))
+    given = torch.cat([torch.tensor(pair).double().expand(1, 150, 2) for pair in ([0.8, 1.1], [-0.7, -0.3])], 1)
+    found = [
+        rollout(level(size=8.0), robot, given, standing(robot), backend=backend, with_forces=False)
+        for robot in (plain, strong)
+    ]
+    assert float((found[0].position - found[1].position)[0, -1].norm()) < 0.1
+    belts = found[1].drive_speeds
+    assert belts is not None
+    assert float((belts[0, 20:150] - given[0, 0]).abs().max()) < 0.01
+    assert float((belts[0, 170:] - given[0, -1]).abs().max()) < 0.02
+    # Grip accelerates the robot in a step by no more than a tenth of the speed that it is asked for.
+    assert float(found[1].velocity.norm(dim=-1).max()) < 1.1 * 1.0
+
+
+@pytest.mark.parametrize("backend", ["torch", "warp"])
+@pytest.mark.parametrize("torque", [300.0, 1e4])
+def test_strong_flippers_keep_to_their_rate_and_reach_their_angle(tmp_path, torque, backend):
+    content = yaml.safe_load(robot_file("marv").read_text())
+    for flipper in content["flippers"]:
+        flipper["maximum_torque"] = torque
+    robot = written(tmp_path, content)
+    program = torch.full((1, 250, 4), -0.14).double()
+    program[:, 50:] = -0.9
+    given = controls(robot, torch.zeros(1, 250, 2).double(), 0.01, flippers=program)
+    result = rollout(level(size=4.0), robot, given, standing(robot), backend=backend, with_forces=False)
+    assert result.joint_angles is not None and result.joint_rates is not None
+    assert float(result.joint_rates.abs().max()) < 1.02 * content["flippers"][0]["maximum_rate"]
+    assert result.joint_angles[0, -1].tolist() == pytest.approx([-0.9] * 4, abs=0.01)
+    assert float(result.velocity.norm(dim=-1).max()) < 0.5
+
+
 def test_a_servo_reaches_its_speed_and_the_robot_with_it(tmp_path):
     motor = {"drives": ["left", "right"], "stall_torque": 60.0, "no_load_speed": 12.0, "inertia": 0.05}
     robot = written(tmp_path, husky_like(motors=[motor]))

@@ -21,6 +21,8 @@ PARAMETERS = (
 """Columns of :attr:`Articulation.parameters`, fields of :class:`Coordinate`."""
 UNLIMITED = 1e30
 """Stands for infinity: a product with zero stays zero."""
+ROUNDS = 3
+"""How often the servos that reach their limits are searched for in a step: one that does may load another."""
 SLOWEST = 1e-3
 """Smallest rate at which a power limits a torque [rad/s or m/s]; below it the torque limits do."""
 
@@ -64,6 +66,12 @@ class Articulation:
     def size(self) -> int:
         """Number of coordinates."""
         return max(self.coordinates, default=-1) + 1
+
+    @property
+    def has_limits(self) -> bool:
+        """Whether a servo or motor can give less torque than it is asked for."""
+        limits = [PARAMETERS.index(name) for name in ("stall_torque", "maximum_torque", "maximum_power")]
+        return bool((self.parameters[:, limits] < UNLIMITED).any())
 
     @property
     def dynamic_joints(self) -> list[int]:
@@ -373,8 +381,18 @@ class LinkPoses:
         )
 
 
+@dataclass(frozen=True)
+class Servos:
+    """Where coordinates are and are to be, each ``[B, K]`` [rad or m, per second]."""
+
+    angle: Tensor
+    rate: Tensor
+    target: Tensor
+    target_rate: Tensor
+
+
 def coordinate_torque(
-    parameters: Tensor, angle: Tensor, rate: Tensor, target: Tensor, target_rate: Tensor, time_step: float
+    parameters: Tensor, servos: Servos, time_step: float, limited: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Torque of springs, servos and stops, and the rate at which it decreases with the coordinate's rate.
 
@@ -382,29 +400,63 @@ def coordinate_torque(
 
     Args:
         parameters: ``[K, 11]``, see :data:`PARAMETERS`.
-        angle, rate, target, target_rate: ``[B, K]``.
+        servos: where the coordinates are and are to be.
         time_step: [s].
+        limited: direction in which the servo gives all that it can, 1 or -1, or 0 where it can give what it is asked
+            for, ``[B, K]``; None stands for zeros. See :func:`newly_limited`.
 
     Returns:
         torque ``[B, K]`` [N m] and gain ``[B, K]`` [N m s/rad], never negative.
     """
-    _, stiffness, damping, preload, stall, no_load, strongest, power, low, high, stop = parameters.unbind(-1)
+    _, _, _, preload, *_, low, high, stop = parameters.unbind(-1)
+    torque, gain = _servo(parameters, servos, time_step)
+    if limited is not None:
+        limit, falls = _limit(parameters, servos.rate, limited)
+        torque = torch.where(limited != 0, limited * limit, torque)
+        gain = torch.where(limited != 0, falls, gain)
+    angle = servos.angle
+    ahead = angle + time_step * servos.rate
+    beyond = torch.where(angle > high, ahead - high, torch.where(angle < low, ahead - low, 0.0))
+    outside = (angle > high) | (angle < low)
+    return torque - preload - stop * beyond, gain + torch.where(outside, time_step * stop, 0.0)
+
+
+def newly_limited(parameters: Tensor, servos: Servos, time_step: float, change: Tensor, limited: Tensor) -> Tensor:
+    """Direction in which servos would exceed their limits in a step, 1 or -1, else 0, ``[B, K]``.
+
+    The torque counts that a servo gives in the step, not that it starts with: a stiff one asks for far more than takes
+    it to its target. Given all of that at once, a strong motor would overshoot, more in each step.
+
+    Args:
+        parameters, servos, time_step: as for :func:`coordinate_torque`.
+        change: change of the rates in this step, with the servos that are not ``limited`` unlimited, ``[B, K]``.
+        limited: directions that are known already, ``[B, K]``.
+    """
+    demand, gain = _servo(parameters, servos, time_step)
+    given = demand - gain * change
+    side = torch.where(given >= 0, 1.0, -1.0).to(given)
+    limit, falls = _limit(parameters, servos.rate, side)
+    exceeds = side * given > limit - side * falls * change
+    return torch.where(exceeds & (limited == 0), side, torch.zeros_like(side))
+
+
+def _servo(parameters: Tensor, servos: Servos, time_step: float) -> tuple[Tensor, Tensor]:
+    """Torque of springs and servos without limits, and the rate at which it decreases with the coordinate's rate."""
+    _, stiffness, damping, *_ = parameters.unbind(-1)
     gain = damping + time_step * stiffness
-    demand = stiffness * (target - angle) + gain * (target_rate - rate)
-    sign = torch.where(demand >= 0, 1.0, -1.0).to(demand)
-    forward = (sign * rate).clamp_min(0.0)
+    return stiffness * (servos.target - servos.angle) + gain * (servos.target_rate - servos.rate), gain
+
+
+def _limit(parameters: Tensor, rate: Tensor, side: Tensor) -> tuple[Tensor, Tensor]:
+    """Largest torque in a direction (1 or -1), and the rate at which it decreases with the rate in that direction."""
+    _, _, _, _, stall, no_load, strongest, power, *_ = parameters.unbind(-1)
+    forward = (side * rate).clamp_min(0.0)
     curve = stall * (1.0 - forward / no_load).clamp_min(0.0)
     by_power = power / forward.clamp_min(SLOWEST)
     limit = torch.minimum(torch.minimum(curve, by_power), strongest.expand_as(curve))
-    saturated = demand.abs() > limit
     falls = torch.where((curve <= limit) & (forward > 0) & (forward < no_load), stall / no_load, 0.0)
     falls = falls + torch.where((by_power <= limit) & (forward > SLOWEST), by_power / forward.clamp_min(SLOWEST), 0.0)
-    torque = torch.where(saturated, sign * limit, demand) - preload
-    gain = torch.where(saturated, falls, gain)
-    ahead = angle + time_step * rate
-    beyond = torch.where(angle > high, ahead - high, torch.where(angle < low, ahead - low, 0.0))
-    outside = (angle > high) | (angle < low)
-    return torque - stop * beyond, gain + torch.where(outside, time_step * stop, 0.0)
+    return limit, falls
 
 
 def _square(arm: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from monoforce_ros.physics.articulation import Articulation, LinkPoses, coordinate_torque
+from monoforce_ros.physics.articulation import ROUNDS, Articulation, LinkPoses, Servos, coordinate_torque, newly_limited
 from monoforce_ros.physics.body_contact import BodyContact
 from monoforce_ros.physics.contact import Contact, contact, tread
 from monoforce_ros.physics.loads import LoadModel
@@ -45,17 +45,17 @@ def integrate(
         tangential = jacobian.unflatten(2, (3, -1))[:, :, 1:].flatten(2)
         external = loads.at(rotation, velocity, angular_velocity, poses.inertia)
         weight = loads.weight / problem.mass[:, None]
-        torque, torque_gain, inertia = system.coordinates(angles, rates, belts, step, poses, weight)
+        servos = system.servos(angles, rates, belts, step)
+        hanging, inertia = system.hanging(poses, weight), system.parameters[:, 0]
         wrench = torch.cat([jacobian @ force[..., None], driven @ grip_force[..., None]], 1)[..., 0]
         damping = (jacobian * gain[:, None]) @ jacobian.transpose(1, 2)
         mixed = (tangential * grip_gain[:, None]) @ driven.transpose(1, 2)
         belts_part = (driven * grip_gain[:, None]) @ driven.transpose(1, 2)
         damping = torch.cat([torch.cat([damping, mixed], 2), torch.cat([mixed.transpose(1, 2), belts_part], 2)], 1)
-        masses = system.mass_matrix(poses.inertia, inertia, torque_gain)
-        matrix = masses + step_time * (damping + external.drag[:, None, None] * linear_part)
-        right = step_time * (wrench + torch.cat([external.force, external.torque, torque], -1))
-        # Without error checks: a trajectory that diverged is marked invalid and must not end the others.
-        change = torch.linalg.solve_ex(matrix, right[..., None])[0][..., 0]
+        matrix = system.mass_matrix(poses.inertia, inertia)
+        matrix = matrix + step_time * (damping + external.drag[:, None, None] * linear_part)
+        acting = wrench + torch.cat([external.force, external.torque, hanging], -1)
+        change = system.change(matrix, acting, servos)
         if with_forces and step % force_every == 0:
             joints = jacobian.shape[1]
             loss = touch.gain * (change[:, None, :joints] @ jacobian).unflatten(2, (3, -1))[:, 0]
@@ -96,6 +96,7 @@ class _System:
         self.driven = [(problem.point_drives == drive).to(problem.points) for drive in self.drives]
         drives = [drive + len(moving.slides) for drive in self.drives]
         self.parameters = moving.parameters[[*self.joints, *drives]]
+        self.has_limits = moving.has_limits
 
     def contact(
         self, poses: LinkPoses, centre: Tensor, velocity: Tensor, angular_velocity: Tensor, belts: Tensor
@@ -144,36 +145,63 @@ class _System:
         rows = [(slips * driven).flatten(1) for driven in self.driven]
         return torch.stack(rows, 1) if rows else slips.new_zeros(len(slips), 0, slips[0].numel())
 
-    def coordinates(
-        self, angles: Tensor, rates: Tensor, belts: Tensor, step: int, poses: LinkPoses, weight: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Torques of springs, servos, motors and weights on the coordinates ``[B, K]``, their gains, and inertias."""
+    def servos(self, angles: Tensor, rates: Tensor, belts: Tensor, step: int) -> Servos:
+        """The coordinates at the start of a step."""
         moving, joints, drives = self.moving, self.joints, self.drives
-        position = torch.cat([angles[:, joints], torch.zeros_like(belts[:, drives])], -1)
-        speed = torch.cat([rates[:, joints], belts[:, drives]], -1)
         commanded = self.problem.drive_speeds[:, step, drives]
-        target = torch.cat([moving.target_angles[:, step, joints], torch.zeros_like(commanded)], -1)
-        target_rate = torch.cat([moving.target_rates[:, step, joints], commanded], -1)
-        torque, gain = coordinate_torque(self.parameters, position, speed, target, target_rate, self.options.time_step)
-        hanging = [
-            moving.masses[joint]
-            * (weight * torch.linalg.cross(poses.axes[:, joint], poses.places[:, joint] - poses.origins[:, joint])).sum(
-                -1
-            )
-            for joint in joints
-        ]
-        for column, load in enumerate(hanging):
-            torque = torch.cat([torque[:, :column], (torque[:, column] + load)[:, None], torque[:, column + 1 :]], -1)
-        return torque, gain, self.parameters[:, 0]
+        return Servos(
+            torch.cat([angles[:, joints], torch.zeros_like(belts[:, drives])], -1),
+            torch.cat([rates[:, joints], belts[:, drives]], -1),
+            torch.cat([moving.target_angles[:, step, joints], torch.zeros_like(commanded)], -1),
+            torch.cat([moving.target_rates[:, step, joints], commanded], -1),
+        )
 
-    def mass_matrix(self, inertia: Tensor, coordinate_inertia: Tensor, torque_gain: Tensor) -> Tensor:
-        """Masses of body and coordinates, with the implicit part of their torques, ``[B, 6 + K, 6 + K]``."""
+    def hanging(self, poses: LinkPoses, weight: Tensor) -> Tensor:
+        """Torques of the joints' own weights on the coordinates ``[B, K]``."""
+        found = weight.new_zeros(len(weight), len(self.parameters))
+        if not self.joints:
+            return found
+        joints = self.joints
+        levers = poses.places[:, joints] - poses.origins[:, joints]
+        turning = torch.linalg.cross(poses.axes[:, joints], levers) * weight[:, None]
+        torques = self.moving.masses[joints] * turning.sum(-1)
+        return torch.cat([torques, found[:, len(joints) :]], -1)
+
+    def change(self, matrix: Tensor, acting: Tensor, servos: Servos) -> Tensor:
+        """Change of the velocities of body and coordinates in a step, ``[B, 6 + K]``.
+
+        Args:
+            matrix: of masses and contact, ``[B, 6 + K, 6 + K]``.
+            acting: all forces but those of springs, servos and stops, ``[B, 6 + K]``.
+            servos: of :meth:`servos`.
+        """
+        limited = torch.zeros_like(servos.rate)
+        if self.has_limits:
+            with torch.no_grad():
+                for _ in range(ROUNDS):
+                    change = self._solved(matrix, acting, servos, limited)[:, 6:]
+                    found = newly_limited(self.parameters, servos, self.options.time_step, change, limited)
+                    if not bool(found.any()):
+                        break
+                    limited = limited + found
+        return self._solved(matrix, acting, servos, limited)
+
+    def _solved(self, matrix: Tensor, acting: Tensor, servos: Servos, limited: Tensor) -> Tensor:
+        step_time = self.options.time_step
+        torque, gain = coordinate_torque(self.parameters, servos, step_time, limited if self.has_limits else None)
+        body = torch.zeros_like(acting[:, :6])
+        matrix = matrix + step_time * torch.diag_embed(torch.cat([body, gain], -1))
+        right = step_time * (acting + torch.cat([body, torque], -1))
+        # Without error checks: a trajectory that diverged is marked invalid and must not end the others.
+        return torch.linalg.solve_ex(matrix, right[..., None])[0][..., 0]
+
+    def mass_matrix(self, inertia: Tensor, coordinate_inertia: Tensor) -> Tensor:
+        """Masses of body and coordinates, ``[B, 6 + K, 6 + K]``."""
         batch, size = len(inertia), 6 + len(coordinate_inertia)
         matrix = inertia.new_zeros(batch, size, size)
         matrix[:, 0:3, 0:3] = self.problem.mass[:, None, None] * torch.eye(3).to(inertia)
         matrix[:, 3:6, 3:6] = inertia
-        diagonal = torch.diag_embed(coordinate_inertia + self.options.time_step * torque_gain)
-        matrix[:, 6:, 6:] = diagonal
+        matrix[:, 6:, 6:] = torch.diag_embed(coordinate_inertia)
         return matrix
 
     def advanced(

@@ -110,6 +110,7 @@ class _Joints:
 
     def __init__(self, moving: Articulation, order: Tensor):
         self.number, self.size = len(moving.slides), moving.size
+        self.limited = int(moving.has_limits)
         self.links = 1 + self.number
         self.drives = moving.belts.shape[-1]
         self.dynamic_joints, self.dynamic_drives = moving.dynamic_joints, moving.dynamic_drives
@@ -166,7 +167,7 @@ class _Arguments:
             state_gradients=state_gradients and state_gradients[:_BODY_STATES],
         )  # fmt: skip
         moving = kinds.Joints()
-        moving.number, moving.size = joints.number, joints.size
+        moving.number, moving.size, moving.limited = joints.number, joints.size, joints.limited
         for name, value in joints.vectors.items():
             setattr(moving, name, wp.from_torch(value, dtype=kinds.vec3))
         for name, value in joints.scalars.items():
@@ -274,7 +275,7 @@ def _scratch(joints: _Joints, kinds: Any, like: Tensor, width: int, slots: int, 
     work.block = array(kinds.scalar, 6, 6) if joints.size else array(kinds.scalar, 1, 1)
     work.joined = array(kinds.scalar, dense, inner)
     work.pivots, work.factor = array(kinds.scalar, dense, dense), array(kinds.scalar, dense, dense)
-    work.values = array(kinds.scalar, dense, 5)
+    work.values = array(kinds.scalar, dense, 6)
     if gradients:
         work.block_gradient, work.joined_gradient = work.block.grad, work.joined.grad
         work.values_gradient = work.values.grad

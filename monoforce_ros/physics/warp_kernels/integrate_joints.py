@@ -24,8 +24,8 @@ def integrate_joints_kernel(double: bool, differentiable: bool, soft: bool) -> A
     exponential, gains_of, upper_block, lower_block, solved, Blocks = (
         rigid.exponential, rigid.gains_of, rigid.upper_block, rigid.lower_block, rigid.solved, rigid.Blocks
     )  # fmt: skip
-    pose_links, torque_at, couple, clear, solve, Work = (
-        moving.pose_links, moving.torque_at, moving.couple, moving.clear, moving.solve, moving.Work
+    pose_links, load_at, find_limits, couple, clear, solve, Work = (
+        moving.pose_links, moving.load_at, moving.find_limits, moving.couple, moving.clear, moving.solve, moving.Work
     )  # fmt: skip
     scalar, vec3 = t.scalar, t.vec3
     Ground, Body, Robots, States, Options = t.Ground, t.Body, t.Robots, t.States, t.Options
@@ -149,27 +149,16 @@ def integrate_joints_kernel(double: bool, differentiable: bool, soft: bool) -> A
                         work.block[thread, slot, 3 + r, 3 + c] = blocks.lower[r, c]
                         work.block[thread, slot, 3 + r, c] = blocks.side[c, r]
                 weight = loads.weight / mass
+                if joints.limited == 1:
+                    find_limits(joints, robots, states, links, work, b, step, thread, slot, weight, h)
                 for entry in range(joints.number + drives):
                     k = joints.coordinates[entry]
                     if k >= 0:
-                        found = torque_at(
-                            joints, entry, scalar(0.0), states.belts[b, step, wp.max(entry - joints.number, 0)],
-                            scalar(0.0), robots.speeds[b, step, wp.max(entry - joints.number, 0)], h,
+                        limited = work.values[thread, slot, k, 5]
+                        found = load_at(
+                            joints, robots, states, links, b, step, thread, slot, entry, limited, weight, h
                         )  # fmt: skip
-                        hanging = scalar(0.0)
-                        if entry < joints.number:
-                            found = torque_at(
-                                joints, entry, states.angles[b, step, entry], states.rates[b, step, entry],
-                                joints.target_angles[b, step, entry], joints.target_rates[b, step, entry], h,
-                            )  # fmt: skip
-                            if joints.masses[entry] > scalar(0.0):
-                                lever = (
-                                    links.frames[thread, slot, entry + 1, 5] - links.frames[thread, slot, entry + 1, 4]
-                                )
-                                hanging = joints.masses[entry] * wp.dot(
-                                    weight, wp.cross(links.frames[thread, slot, entry + 1, 3], lever)
-                                )
-                        work.values[thread, slot, k, 0] = h * (found[0] + hanging + work.values[thread, slot, k, 2])
+                        work.values[thread, slot, k, 0] = h * (found[0] + work.values[thread, slot, k, 2])
                         work.values[thread, slot, k, 1] = joints.parameters[entry, 0] + h * found[1]
                 solve(joints, work, thread, slot, h)
                 new_linear = state.linear + vec3(

@@ -16,8 +16,9 @@ from monoforce_ros.physics.warp_kernels.tread import tread_function
 SLOWEST = 1e-3
 SHIFT, SPIN, DRIFT, AXIS, ORIGIN, PLACE = range(6)
 """Columns of a link's frames."""
-TORQUE, GAIN, CONTACT, FORWARD, CHANGE = range(5)
+TORQUE, GAIN, CONTACT, FORWARD, CHANGE, LIMITED = range(6)
 """Columns of the values of a coordinate."""
+ROUNDS = 3
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,8 @@ class JointFunctions:
     """Device functions and structs of one precision."""
 
     pose_links: Any
-    torque_at: Any
+    load_at: Any
+    find_limits: Any
     couple: Any
     clear: Any
     solve: Any
@@ -51,7 +53,7 @@ def joint_functions(double: bool) -> JointFunctions:
         joined: wp.array4d(dtype=scalar)  # contact gains between coordinates, then body and coordinates, [K + 6, K]
         pivots: wp.array4d(dtype=scalar)  # of the factorisation L D Lᵀ, [K + 6, K + 6]
         factor: wp.array4d(dtype=scalar)
-        values: wp.array4d(dtype=scalar)  # of each coordinate, then of the body, [K + 6, 5]
+        values: wp.array4d(dtype=scalar)  # of each coordinate, then of the body, [K + 6, 6]
         block_gradient: wp.array4d(
             dtype=scalar
         )  # memory of the gradients of these three, for the adjoint of the solver
@@ -136,28 +138,50 @@ def joint_functions(double: bool) -> JointFunctions:
                 links.frames[thread, slot, link, 5] = turned * (work.frames[thread, slot, link, 5] - middle)
 
     @wp.func
-    def torque_at(
+    def servo_at(
         joints: Joints, entry: int, angle: scalar, rate: scalar, target: scalar, target_rate: scalar, h: scalar
     ) -> vec2:
-        # Torque of springs, servos and stops, and the rate at which it decreases with the coordinate's rate.
+        # Torque of springs and servos without limits, and the rate at which it decreases with the coordinate's rate.
         gain = joints.parameters[entry, 2] + h * joints.parameters[entry, 1]
-        demand = joints.parameters[entry, 1] * (target - angle) + gain * (target_rate - rate)
-        sign = wp.where(demand >= scalar(0.0), scalar(1.0), scalar(-1.0))
-        forward = wp.max(sign * rate, scalar(0.0))
+        return vec2(joints.parameters[entry, 1] * (target - angle) + gain * (target_rate - rate), gain)
+
+    @wp.func
+    def limit_at(joints: Joints, entry: int, rate: scalar, side: scalar) -> vec2:
+        # Largest torque in a direction, and the rate at which it decreases with the rate in that direction.
+        forward = wp.max(side * rate, scalar(0.0))
         stall = joints.parameters[entry, 4]
         no_load = joints.parameters[entry, 5]
         curve = stall * wp.max(scalar(1.0) - forward / no_load, scalar(0.0))
         moving = wp.max(forward, scalar(SLOWEST))
         by_power = joints.parameters[entry, 7] / moving
         limit = wp.min(wp.min(curve, by_power), joints.parameters[entry, 6])
-        torque = demand
-        if wp.abs(demand) > limit:
-            torque = sign * limit
-            gain = scalar(0.0)
-            if curve <= limit and forward > scalar(0.0) and forward < no_load:
-                gain = gain + stall / no_load
-            if by_power <= limit and forward > scalar(SLOWEST):
-                gain = gain + by_power / moving
+        falls = scalar(0.0)
+        if curve <= limit and forward > scalar(0.0) and forward < no_load:
+            falls = falls + stall / no_load
+        if by_power <= limit and forward > scalar(SLOWEST):
+            falls = falls + by_power / moving
+        return vec2(limit, falls)
+
+    @wp.func
+    def torque_at(
+        joints: Joints,
+        entry: int,
+        angle: scalar,
+        rate: scalar,
+        target: scalar,
+        target_rate: scalar,
+        limited: scalar,
+        h: scalar,
+    ) -> vec2:
+        # Torque of springs, servos and stops, and the rate at which it decreases with the coordinate's rate.
+        found = servo_at(joints, entry, angle, rate, target, target_rate, h)
+        torque = found[0]
+        gain = found[1]
+        if limited != scalar(0.0):
+            side = wp.where(limited > scalar(0.0), scalar(1.0), scalar(-1.0))
+            most = limit_at(joints, entry, rate, side)
+            torque = side * most[0]
+            gain = most[1]
         torque = torque - joints.parameters[entry, 3]
         low = joints.parameters[entry, 8]
         high = joints.parameters[entry, 9]
@@ -170,6 +194,40 @@ def joint_functions(double: bool) -> JointFunctions:
             torque = torque - stop * (ahead - low)
             gain = gain + h * stop
         return vec2(torque, gain)
+
+    @wp.func
+    def load_at(
+        joints: Joints,
+        robots: Robots,
+        states: States,
+        links: Links,
+        b: int,
+        step: int,
+        thread: int,
+        slot: int,
+        entry: int,
+        limited: scalar,
+        weight: vec3,
+        h: scalar,
+    ) -> vec2:
+        # Torque on a joint's or drive's coordinate without contact, and the rate at which it decreases.
+        found = vec2()
+        if entry < joints.number:
+            found = torque_at(
+                joints, entry, states.angles[b, step, entry], states.rates[b, step, entry],
+                joints.target_angles[b, step, entry], joints.target_rates[b, step, entry], limited, h,
+            )  # fmt: skip
+            if joints.masses[entry] > scalar(0.0):
+                lever = links.frames[thread, slot, entry + 1, 5] - links.frames[thread, slot, entry + 1, 4]
+                turning = wp.dot(weight, wp.cross(links.frames[thread, slot, entry + 1, 3], lever))
+                found = found + vec2(joints.masses[entry] * turning, scalar(0.0))
+        else:
+            drive = entry - joints.number
+            found = torque_at(
+                joints, entry, scalar(0.0), states.belts[b, step, drive], scalar(0.0), robots.speeds[b, step, drive],
+                limited, h,
+            )  # fmt: skip
+        return found
 
     @wp.func
     def motion_along(joints: Joints, links: Links, thread: int, slot: int, j: int, touch: Touch, arm: vec3) -> vec3:
@@ -248,6 +306,7 @@ def joint_functions(double: bool) -> JointFunctions:
         size = joints.size
         for k in range(size):
             work.values[thread, slot, k, 2] = scalar(0.0)
+            work.values[thread, slot, k, 5] = scalar(0.0)
             for r in range(size + 6):
                 work.joined[thread, slot, r, k] = scalar(0.0)
 
@@ -319,6 +378,79 @@ def joint_functions(double: bool) -> JointFunctions:
                     if i == j:
                         work.values_gradient[thread, slot, i, 1] = work.values_gradient[thread, slot, i, 1] + gradient
 
+    @wp.func
+    def find_limits(
+        joints: Joints,
+        robots: Robots,
+        states: States,
+        links: Links,
+        work: Work,
+        b: int,
+        step: int,
+        thread: int,
+        slot: int,
+        weight: vec3,
+        h: scalar,
+    ):
+        # Which servos give all that they can in this step (``newly_limited`` of articulation.py).
+        drives = robots.speeds.shape[2]
+        # Whether the last round found one, in a column that the body's rows do not use.
+        work.values[thread, slot, joints.size, 5] = scalar(1.0)
+        for _round in range(ROUNDS):
+            if work.values[thread, slot, joints.size, 5] == scalar(1.0):
+                for entry in range(joints.number + drives):
+                    k = joints.coordinates[entry]
+                    if k >= 0:
+                        known = work.values[thread, slot, k, 5]
+                        found = load_at(
+                            joints, robots, states, links, b, step, thread, slot, entry, known, weight, h
+                        )  # fmt: skip
+                        work.values[thread, slot, k, 0] = h * (found[0] + work.values[thread, slot, k, 2])
+                        work.values[thread, slot, k, 1] = joints.parameters[entry, 0] + h * found[1]
+                solve(joints, work, thread, slot, h)
+                work.values[thread, slot, joints.size, 5] = scalar(0.0)
+                for entry in range(joints.number + drives):
+                    k = joints.coordinates[entry]
+                    if k >= 0 and work.values[thread, slot, k, 5] == scalar(0.0):
+                        rate = scalar(0.0)
+                        servo = vec2()
+                        if entry < joints.number:
+                            rate = states.rates[b, step, entry]
+                            servo = servo_at(
+                                joints, entry, states.angles[b, step, entry], rate,
+                                joints.target_angles[b, step, entry], joints.target_rates[b, step, entry], h,
+                            )  # fmt: skip
+                        else:
+                            rate = states.belts[b, step, entry - joints.number]
+                            servo = servo_at(
+                                joints, entry, scalar(0.0), rate, scalar(0.0),
+                                robots.speeds[b, step, entry - joints.number], h,
+                            )  # fmt: skip
+                        change = work.values[thread, slot, k, 4]
+                        given = servo[0] - servo[1] * change
+                        side = wp.where(given >= scalar(0.0), scalar(1.0), scalar(-1.0))
+                        most = limit_at(joints, entry, rate, side)
+                        if side * given > most[0] - side * most[1] * change:
+                            work.values[thread, slot, k, 5] = side
+                            work.values[thread, slot, joints.size, 5] = scalar(1.0)
+
+    # Which servos are limited has no gradient.
+    @wp.func_grad(find_limits)
+    def adjoint_find_limits(
+        joints: Joints,
+        robots: Robots,
+        states: States,
+        links: Links,
+        work: Work,
+        b: int,
+        step: int,
+        thread: int,
+        slot: int,
+        weight: vec3,
+        h: scalar,
+    ):
+        pass
+
     # The adjoint of a kernel repeats the functions that it calls before it differentiates them. These write what is
     # still in the arrays.
     @wp.func_replay(pose_links)
@@ -367,4 +499,20 @@ def joint_functions(double: bool) -> JointFunctions:
     def repeat_solution(joints: Joints, work: Work, thread: int, slot: int, h: scalar):
         pass
 
-    return JointFunctions(pose_links, torque_at, couple, clear, solve, Work)
+    @wp.func_replay(find_limits)
+    def repeat_limits(
+        joints: Joints,
+        robots: Robots,
+        states: States,
+        links: Links,
+        work: Work,
+        b: int,
+        step: int,
+        thread: int,
+        slot: int,
+        weight: vec3,
+        h: scalar,
+    ):
+        pass
+
+    return JointFunctions(pose_links, load_at, find_limits, couple, clear, solve, Work)

@@ -139,6 +139,7 @@ def types(double: bool) -> Types:
     class Joints:  # J joints, then D drives; K of them with dynamics
         number: int  # J
         size: int  # K
+        limited: int  # whether servos have limits
         axes: wp.array(dtype=vec3)  # [J]
         origins: wp.array(dtype=vec3)
         places: wp.array(dtype=vec3)
