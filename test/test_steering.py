@@ -67,6 +67,86 @@ def test_a_turn_beyond_the_steering_limit_has_the_smallest_radius(tmp_path):
         assert torch.sign(angles).tolist() == [math.copysign(1.0, yaw_rate)] * 2
 
 
+def tricycle(trail=0.0, scrub=0.0, limit=1.0, front=False, **changes):
+    """Two wheels on one axle, driven, and one that is steered behind them or in front; its pivot is beside it."""
+    x = 1.2 if front else -1.2
+    content = car(
+        name="tricycle", mass=300.0, inertia_box=[1.8, 1.0, 0.6], centre_of_mass=[x / 3, 0.0, 0.05], hull=[], **changes
+    )
+    content["wheels"] = [
+        {"name": "left", "drive": "left", "centre": [0.0, 0.5, 0.0], "radius": 0.2, "width": 0.1},
+        {"name": "right", "drive": "right", "centre": [0.0, -0.5, 0.0], "radius": 0.2, "width": 0.1},
+        {"name": "third", "drive": None, "centre": [x + trail, scrub, 0.0], "radius": 0.2, "width": 0.1},
+    ]
+    content["steering"] = [{"name": "fork", "wheel": "third", "maximum_angle": limit, "pivot": [x, 0.0, 0.0]}]
+    return content
+
+
+@pytest.mark.parametrize("front", [True, False])
+@pytest.mark.parametrize(("trail", "scrub"), [(0.15, 0.0), (-0.12, 0.0), (0.0, 0.15), (0.1, -0.1)])
+def test_a_wheel_beside_its_pivot_rolls_about_the_commanded_centre(tmp_path, front, trail, scrub):
+    robot = written(tmp_path, tricycle(trail, scrub, front=front))
+    forward, yaw_rate = 0.5, 0.15
+    speeds, (angle,) = robot.command(torch.tensor([forward, yaw_rate]).double())
+    pivot, angle = (1.2 if front else -1.2), float(angle)
+    centre = (
+        pivot + trail * math.cos(angle) - scrub * math.sin(angle),
+        trail * math.sin(angle) + scrub * math.cos(angle),
+    )
+    velocity = (forward - yaw_rate * centre[1], yaw_rate * centre[0])
+    assert -math.sin(angle) * velocity[0] + math.cos(angle) * velocity[1] == pytest.approx(0.0, abs=1e-6)
+    assert speeds.tolist()[:2] == pytest.approx([0.5 - 0.15 * 0.5, 0.5 + 0.15 * 0.5])
+    steered = robot.steered
+    assert steered is not None
+    assert float(steered.curvature(torch.tensor([angle]).double())) == pytest.approx(yaw_rate / forward, rel=1e-5)
+    # At the limit of the joint, too.
+    limit = robot.command(torch.tensor([0.1, 5.0]).double())[1]
+    assert float(limit.abs().max()) == pytest.approx(1.0, abs=1e-5)
+
+
+def test_the_wheels_of_a_turn_may_roll_backwards_inside_it(tmp_path):
+    """A forklift turns about a point between its front wheels."""
+    robot = written(tmp_path, tricycle(limit=1.48))
+    speeds, angles = robot.command(torch.tensor([0.2, 1.0]).double())
+    assert float(angles[0]) == pytest.approx(-math.atan(1.2 / 0.2))
+    assert speeds.tolist()[:2] == pytest.approx([-0.3, 0.7])
+    terrain, start = level(size=8.0), standing(robot)
+    result = driven(robot, controls(robot, twists(robot, 0.2, 1.0, steps=300), STEP), terrain, start)
+    assert float(result.angular_velocity[0, 200:, 2].mean()) == pytest.approx(1.0, rel=0.1)
+
+
+@pytest.mark.parametrize("offset", [(0.12, 0.0), (0.0, 0.15), (-0.08, 0.1)])
+@pytest.mark.parametrize("twist", [(0.0, 0.6, 0.0), (0.1, 0.5, -0.4), (-0.3, 0.4, 0.0), (0.3, 0.0, 0.3)])
+def test_wheels_beside_their_pivots_roll_along_their_own_velocities(tmp_path, offset, twist):
+    content = rover(limit=1.57)
+    pivots = []
+    for joint, wheel in zip(content["steering"], content["wheels"], strict=True):
+        x, y, z = wheel["centre"]
+        # Outward, as hubs are.
+        wheel["centre"] = [x + offset[0], y + math.copysign(offset[1], y), z]
+        joint["pivot"] = [x, y, 0.0]
+        pivots.append((x, y, offset[0], math.copysign(offset[1], y)))
+    robot = written(tmp_path, content)
+    forward, yaw_rate, lateral = twist
+    speeds, angles = robot.command(torch.tensor(twist).double())
+    for speed, angle, (x, y, trail, scrub) in zip(speeds.tolist(), angles.tolist(), pivots, strict=True):
+        cos, sin = math.cos(angle), math.sin(angle)
+        place = (x + trail * cos - scrub * sin, y + trail * sin + scrub * cos)
+        velocity = (forward - yaw_rate * place[1], lateral + yaw_rate * place[0])
+        assert -sin * velocity[0] + cos * velocity[1] == pytest.approx(0.0, abs=1e-6)
+        assert speed == pytest.approx(cos * velocity[0] + sin * velocity[1], abs=1e-6)
+
+
+def test_a_car_at_its_largest_speed_keeps_the_commanded_curvature(tmp_path):
+    robot = written(tmp_path, car(command={"track_width": 1.5, "maximum_speed": 4.0}))
+    slow = robot.command(torch.tensor([4.0, 0.4]).double())
+    fast = robot.command(torch.tensor([12.0, 1.2]).double())
+    assert all(torch.allclose(first, second) for first, second in zip(slow, fast, strict=True))
+    # A lateral speed keeps its direction as well.
+    rolls = written(tmp_path, rover(command={"track_width": 0.6, "maximum_speed": 1.0}))
+    assert torch.allclose(*(rolls.command(torch.tensor(t).double())[1] for t in ([1.0, 0.0, 0.5], [3.0, 0.0, 1.5])))
+
+
 def test_four_steered_wheels_crab_and_turn_on_the_spot(tmp_path):
     robot = written(tmp_path, rover())
     speeds, angles = robot.command(torch.tensor([0.3, 0.0, 0.3]).double())

@@ -336,6 +336,10 @@ class JointReader:
         steering = [index for index, joint in enumerate(self.joints) if joint.kind == STEERING]
         position = {joint: place for place, joint in enumerate(steering)}
         pivots = np.array([self.joints[index].origin[:2] for index in steering]).reshape(-1, 2)
+        turned = {
+            self.carrier[wheel.name]: wheel.centre[:2] for wheel in self.wheels.values() if wheel.name in self.carrier
+        }
+        centres = np.array([turned[index] for index in steering]).reshape(-1, 2)
         reference = self.reference_x
         if reference is None:
             reference = self._turning_axle(position) if self.kind == ACKERMANN else 0.0
@@ -345,6 +349,7 @@ class JointReader:
             drive_joints=tuple(position.get(self.carrier.get(name, -1), -1) for name in wheels),
             joints=tuple(steering),
             joint_places=torch.tensor(pivots, dtype=torch.float32),
+            joint_offsets=torch.tensor(centres - pivots, dtype=torch.float32),
             joint_limits=torch.tensor([self.joints[index].high for index in steering], dtype=torch.float32),
             reference_x=reference,
             differentials=tuple(tuple(turned) for turned in motors.values() if len(turned) > 1)

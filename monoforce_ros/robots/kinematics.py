@@ -16,7 +16,9 @@ STEERED_KINDS = (ACKERMANN, FOUR_WHEEL_STEERING, INDEPENDENT)
 STANDSTILL = 1e-3
 """Speed below which a robot stands, and its steering is straight [m/s]; commands are not that fine."""
 _WIDEST = 0.95
-"""Largest curvature times half the track, so that no wheel stands in the centre of the turn."""
+"""Largest curvature times the distance of a pivot to the side, so that no steered wheel stands in the turn's centre."""
+_LARGEST_SINE = 0.999
+"""Of the angle that a pivot's trail adds: within the trail's reach no angle lets the wheel roll."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,8 @@ class SteeredDrive:
     """Indices of the steering joints in the robot's joints, ``S`` of them."""
     joint_places: Tensor
     """Pivot of each steering joint, ``[S, 2]`` (x, y) [m]."""
+    joint_offsets: Tensor
+    """Centre of each steered wheel relative to its pivot at angle 0, ``[S, 2]`` (trail ahead, scrub) [m]."""
     joint_limits: Tensor
     """Largest angle of each to either side, ``[S]`` [rad]."""
     reference_x: float
@@ -56,14 +60,16 @@ class SteeredDrive:
     @property
     def maximum_curvature(self) -> float:
         """Largest curvature that the steering reaches with all wheels about one centre [1/m] (``ackermann``)."""
-        ahead = (self.joint_places[:, 0] - self.reference_x).abs().double()
+        ahead = (self.joint_places[:, 0] - self.reference_x).double()
         aside = self.joint_places[:, 1].abs().double()
-        slope = torch.tan(self.joint_limits.double().clamp(max=1.57))
-        steers = ahead > 1e-6
+        trail = self.joint_offsets[:, 0].double() * torch.sign(ahead)
+        sine, cosine = (part(self.joint_limits.double().clamp(max=1.57)) for part in (torch.sin, torch.cos))
+        steers = ahead.abs() > 1e-6
         if not bool(steers.any()):
             return 0.0
-        reached = float((slope / (ahead + slope * aside))[steers].min())
-        widest = float(torch.cat([aside, self.drive_places[:, 1].abs().double()]).max())
+        # The wheel inside the turn, at its limit, rolls along this curvature.
+        reached = float((sine / (ahead.abs() * cosine + trail + aside * sine).clamp_min(1e-3))[steers].min())
+        widest = float(aside.max())
         return min(reached, _WIDEST / widest) if widest > 0 else reached
 
     def command(self, twist: Tensor) -> tuple[Tensor, Tensor]:
@@ -94,10 +100,7 @@ class SteeredDrive:
         if not self.differentials:
             return speeds
         curvature = self.curvature(angles)[..., None]
-        turned = self.steering_of_drives(angles)
-        wheels = self.drive_places.to(speeds)
-        along, across = 1.0 - curvature * wheels[:, 1], curvature * (wheels[:, 0] - self.reference_x)
-        paths = along * torch.cos(turned) + across * torch.sin(turned)
+        paths = self._rolling(torch.ones_like(curvature), curvature, torch.zeros_like(curvature), angles)
         behind = list(speeds.unbind(-1))
         for wheels_of_motor in self.differentials:
             chosen = list(wheels_of_motor)
@@ -116,7 +119,8 @@ class SteeredDrive:
             ``[...]`` [1/m], limited to what the steering reaches.
         """
         places = self.joint_places.to(angles)
-        slopes = (places[:, 0] - self.reference_x) * torch.cos(angles) + places[:, 1] * torch.sin(angles)
+        trails = self.joint_offsets[:, 0].to(angles)
+        slopes = (places[:, 0] - self.reference_x) * torch.cos(angles) + places[:, 1] * torch.sin(angles) + trails
         fitted = (slopes * torch.sin(angles)).sum(-1) / (slopes * slopes).sum(-1).clamp_min(1e-9)
         limit = self.maximum_curvature
         return fitted.clamp(-limit, limit)
@@ -126,31 +130,55 @@ class SteeredDrive:
         drives = forward.abs() > STANDSTILL
         limit = self.maximum_curvature
         curvature = torch.where(drives, yaw_rate / torch.where(drives, forward, 1.0), 0.0).clamp(-limit, limit)
-        places = self.joint_places.to(twist)
-        angles = torch.atan2(curvature * (places[:, 0] - self.reference_x), 1.0 - curvature * places[:, 1])
-        wheels = self.drive_places.to(twist)
-        along, across = 1.0 - curvature * wheels[:, 1], curvature * (wheels[:, 0] - self.reference_x)
-        turned = self.steering_of_drives(angles)
-        return forward * (along * torch.cos(turned) + across * torch.sin(turned)), angles
+        along, across = self._velocities(self.joint_places.to(twist), torch.ones_like(forward), curvature, 0.0)
+        trails = curvature * self.joint_offsets[:, 0].to(twist)
+        angles = torch.atan2(across, along) + _trailing(trails, torch.hypot(along, across))
+        return forward * self._rolling(torch.ones_like(forward), curvature, 0.0, angles), angles
 
     def _along_its_velocity(self, twist: Tensor) -> tuple[Tensor, Tensor]:
         forward, yaw_rate = twist[..., :1], twist[..., 1:2]
         lateral = twist[..., 2:3] if twist.shape[-1] > 2 else torch.zeros_like(forward)
-
-        def velocities(places: Tensor) -> tuple[Tensor, Tensor]:
-            return forward - yaw_rate * places[:, 1], lateral + yaw_rate * (places[:, 0] - self.reference_x)
-
-        along, across = velocities(self.joint_places.to(twist))
+        along, across = self._velocities(self.joint_places.to(twist), forward, yaw_rate, lateral)
         moves = torch.hypot(along.detach(), across.detach()) > STANDSTILL
         # The wheel's line has no direction: it never turns by more than a right angle, and rolls backwards instead.
-        backwards = along < 0
-        angles = torch.where(
-            moves,
-            torch.atan2(torch.where(backwards, -across, across), torch.where(moves, along.abs(), 1.0)),
-            0.0,
-        )
+        direction = torch.where(along < 0, -1.0, 1.0).to(along)
+        along, across = torch.where(moves, along.abs(), 1.0), torch.where(moves, direction * across, 0.0)
+        trails = direction * yaw_rate * self.joint_offsets[:, 0].to(twist)
+        angles = torch.atan2(across, along) + _trailing(trails, torch.hypot(along, across))
         limits = self.joint_limits.to(twist)
-        angles = torch.minimum(torch.maximum(angles, -limits), limits)
-        along, across = velocities(self.drive_places.to(twist))
+        angles = torch.where(moves, torch.minimum(torch.maximum(angles, -limits), limits), 0.0)
+        return self._rolling(forward, yaw_rate, lateral, angles), angles
+
+    def _velocities(
+        self, places: Tensor, forward: Tensor, yaw_rate: Tensor, lateral: Tensor | float
+    ) -> tuple[Tensor, Tensor]:
+        """Velocities of places ``[N, 2]`` forward and to the left, each ``[..., N]``, in a motion ``[..., 1]`` of the
+        reference point."""
+        return forward - yaw_rate * places[:, 1], lateral + yaw_rate * (places[:, 0] - self.reference_x)
+
+    def _rolling(self, forward: Tensor, yaw_rate: Tensor, lateral: Tensor | float, angles: Tensor) -> Tensor:
+        """Speed of each drive's wheel along its rolling direction ``[..., D]``, with the joints at angles ``[..., S]``.
+
+        A wheel beside its pivot is slower in a turn, as the pivot's circle is the larger one.
+        """
+        joints = list(self.drive_joints)
+        steered = torch.tensor([joint >= 0 for joint in joints], device=angles.device)
+        # Of wheels that are not steered, the last row counts for nothing.
+        pivots, offsets = (
+            torch.cat([table, table.new_zeros(1, 2)])[joints].to(angles)
+            for table in (self.joint_places, self.joint_offsets)
+        )
+        places = torch.where(steered[:, None], pivots, self.drive_places.to(angles))
+        along, across = self._velocities(places, forward, yaw_rate, lateral)
         turned = self.steering_of_drives(angles)
-        return along * torch.cos(turned) + across * torch.sin(turned), angles
+        return along * torch.cos(turned) + across * torch.sin(turned) - yaw_rate * offsets[:, 1]
+
+
+def _trailing(trails: Tensor, speeds: Tensor) -> Tensor:
+    """Angle by which a wheel ahead of its pivot turns further, so that its centre moves along it [rad].
+
+    Args:
+        trails: speed to the side of the wheel's centre relative to the pivot, ``[..., S]`` [m/s].
+        speeds: of the pivot, ``[..., S]`` [m/s].
+    """
+    return torch.asin((trails / speeds).clamp(-_LARGEST_SINE, _LARGEST_SINE))

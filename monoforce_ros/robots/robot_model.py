@@ -218,8 +218,16 @@ class RobotModel:
         )
 
     def limited_twist(self, twist: Tensor) -> Tensor:
-        """A commanded twist ``[..., 2]`` or ``[..., 3]`` (forward, yaw rate, lateral) within the robot's limits."""
+        """A commanded twist ``[..., 2]`` or ``[..., 3]`` (forward, yaw rate, lateral) within the robot's limits.
+
+        At its largest speed a steered robot keeps the curvature: its wheels stay where the steering turned them.
+        """
         forward = twist[..., :1].clamp(-self.maximum_speed, self.maximum_speed)
+        if self.steered is not None:
+            asked = twist[..., :1].abs()
+            too_fast = asked > self.maximum_speed
+            share = torch.where(too_fast, self.maximum_speed / torch.where(too_fast, asked, 1.0), 1.0)
+            twist = torch.cat([forward, share * twist[..., 1:]], dim=-1)
         yaw_rate = twist[..., 1:2].clamp(-self.maximum_yaw_rate, self.maximum_yaw_rate)
         lateral = twist[..., 2:].clamp(-self.maximum_lateral_speed, self.maximum_lateral_speed)
         return torch.cat([forward, yaw_rate, lateral], dim=-1)

@@ -57,6 +57,7 @@ from monoforce_ros.training.trainer import (
 from monoforce_ros.training.training_state import TrainingError
 from monoforce_ros.training.vegetation_fit import EFFECT, fit_vegetation
 from monoforce_ros.training.world_samples import (
+    CHOOSING_WORLD,
     FIRST_WORLD,
     HELD_OUT_WORLD,
     JUDGED_WORLD,
@@ -326,7 +327,7 @@ def _adapt(options: argparse.Namespace) -> None:
     replay = _world_samples(range(options.world_seed, options.world_seed + count), encoder.config, options)
     choosing, judging = (
         _world_samples(range(first, first + max(options.held_out_worlds // 2, 1)), encoder.config, options)
-        for first in (HELD_OUT_WORLD, JUDGED_WORLD)
+        for first in (CHOOSING_WORLD, JUDGED_WORLD)
     )
     defaults = AdaptationSettings()
     given = options.steps != TrainingSettings.steps, options.rate != TrainingSettings.rate

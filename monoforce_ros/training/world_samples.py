@@ -32,8 +32,10 @@ from monoforce_ros.training.recording_samples import (
 
 FIRST_WORLD = 420_000
 """First seed of the worlds for training; docs/protocol.md lists the seeds of each purpose."""
-HELD_OUT_WORLD, JUDGED_WORLD = 430_000, 438_000
-"""First seeds of the worlds on which something is chosen, and of those on which an adaptation is judged."""
+HELD_OUT_WORLD, CHOOSING_WORLD, JUDGED_WORLD = 430_000, 434_000, 438_000
+"""First seeds of the worlds that validate a training, choose how much of an adaptation is kept, and judge the latter.
+
+They differ: the shipped encoder was chosen on the first as the best, and is better there than elsewhere."""
 PLACES = 16
 """Places of each world: the drawing of a world takes as long as seven images."""
 WORLD_STYLES = ("varied", "site")
