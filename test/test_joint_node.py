@@ -91,6 +91,7 @@ def test_commanded_angles_move_the_flippers_over_the_horizon(peer, predictor):
     [
         (measured([np.nan, 0.0, 0.0, 0.0]), "got no finite position of ['front_left'], expected finite numbers"),
         (measured([0.1], ["elbow"]), "got the joints ['elbow'], expected some of"),
+        (measured([-40.0, 0.0, 0.0, 50.0]), "got -40, 50 for ['front_left', 'rear_right'], expected angles within"),
         (lambda stamp: builders.joint_state(stamp, NAMES, [0.1], [0.0]), "got 1 values of position for 4 names"),
         (lambda stamp: builders.joint_state(0, NAMES, [0.1] * 4, [0.0] * 4), "the stamps are zero"),
     ],
@@ -102,6 +103,12 @@ def test_bad_joint_states_are_named(peer, predictor, bad, text):
         "joints"
     )
     assert predictor.running
+    # Nothing is predicted from the angles of the robot's file instead.
+    peer.settle()
+    peer.clear()
+    drive(peer, joints=bad)
+    peer.settle()
+    assert not peer.received["/predicted/path"]
 
 
 def test_late_joint_states_stop_the_predictions(peer, predictor):
@@ -110,6 +117,6 @@ def test_late_joint_states_stop_the_predictions(peer, predictor):
     peer.settle()
     peer.begin()
     drive(peer, seconds=1.0)
-    assert peer.until(lambda: "joint states: the newest is" in (peer.status("prediction") or (0, ""))[1], 5.0)
+    assert peer.until(lambda: "joint states: the newest of" in (peer.status("prediction") or (0, ""))[1], 5.0)
     assert not peer.received["/predicted/path"]
     predicted(peer, predictor, joints=measured([-0.14] * 4))

@@ -253,7 +253,8 @@ def decode_joints(message: Any, names: Sequence[str]) -> tuple[np.ndarray, np.nd
     Other joints are ignored. What the message does not contain is NaN: joints that it does not name, and rates or
     angles of a message without velocities or positions.
 
-    Raises ``MessageError`` if no joint is known, a list has another length than the names, or a value is not finite.
+    Raises ``MessageError`` if no joint is known, a list has another length than the names, or a value is not finite or
+    beyond two turns.
     """
     index = {str(name): place for place, name in enumerate(message.name)}
     known = [name for name in names if name in index]
@@ -268,8 +269,18 @@ def decode_joints(message: Any, names: Sequence[str]) -> tuple[np.ndarray, np.nd
         bad = [name for name in known if len(values) and not np.isfinite(values[index[name]])]
         if bad:
             raise MessageError(f"joint states: got no finite {label} of {bad}, expected finite numbers")
+        if label == "position" and (far := [name for name in known if len(values) and _is_far(values[index[name]])]):
+            got = ", ".join(f"{values[index[name]]:g}" for name in far)
+            raise MessageError(
+                f"joint states: got {got} for {far}, expected angles within two turns: are they degrees?"
+            )
         found.append(listed)
     return found[0], found[1]
+
+
+def _is_far(angle: float) -> bool:
+    """Whether an angle [rad] is none of a joint that steers, swivels or lifts: more than two turns."""
+    return abs(angle) > 4.0 * np.pi
 
 
 def decode_ackermann(message: Any, wheelbase: float) -> np.ndarray:

@@ -24,31 +24,39 @@ class JointInput:
     def __init__(self, robot: RobotModel, *, continues: bool, timeout: float):
         self._robot, self._continues, self._timeout = robot, continues, timeout
         self._lock = threading.Lock()
-        self._measured: tuple[int, np.ndarray, np.ndarray] | None = None
+        self._stamps = np.zeros(len(robot.joints), np.int64)
+        """When each joint was measured last [ns]; 0: never."""
+        self._angles, self._rates = (np.full(len(robot.joints), np.nan) for _ in range(2))
+        self._fault = ""
+        """Why the last message cannot be used."""
         self._commanded: tuple[int, np.ndarray, np.ndarray] | None = None
 
     def clear(self) -> None:
         """Forget everything, after a backward time jump."""
         with self._lock:
-            self._measured = self._commanded = None
+            self._stamps[:], self._fault, self._commanded = 0, "", None
 
     def measure(self, message: JointState) -> None:
         """Keep measured angles. Drivers may publish joints in several messages: each joint keeps its newest.
 
-        Raises ``MessageError`` if the message is unusable; earlier measurements are then forgotten.
+        Messages of other joints alone are ignored while this robot's are measured.
+
+        Raises ``MessageError`` if the message is unusable; there are no joints then until a usable one.
         """
         try:
             stamp = self._stamp(message)
             angles, rates = decoding.decode_joints(message, self._robot.joint_names)
-        except decoding.MessageError:
+        except decoding.MessageError as error:
             with self._lock:
-                self._measured = None
+                foreign = not set(message.name) & set(self._robot.joint_names)
+                if foreign and self._stamps.any() and decoding.stamp_of(message) - self._stamps.max() <= self._limit:
+                    return
+                self._fault = str(error)
             raise
         with self._lock:
-            if self._measured is not None and 0 <= stamp - self._measured[0] <= self._limit:
-                angles = np.where(np.isfinite(angles), angles, self._measured[1])
-                rates = np.where(np.isfinite(rates), rates, self._measured[2])
-            self._measured = stamp, angles, rates
+            known = np.isfinite(angles)
+            self._stamps[known], self._angles[known], self._rates[known] = stamp, angles[known], rates[known]
+            self._fault = ""
 
     def command(self, message: JointState) -> None:
         """Keep commanded angles or rates of flippers; raises ``MessageError`` if the message is unusable."""
@@ -78,23 +86,27 @@ class JointInput:
         """Joints for a prediction from ``stamp`` [ns]; None if none were ever measured or commanded.
 
         Raises:
-            ValueError: the newest measurement is older than the timeout.
+            ValueError: the newest message is unusable, or a joint that was measured is not within the timeout.
         """
         with self._lock:
-            measured, commanded = self._measured, self._commanded
-        if measured is None and commanded is None:
+            stamps, angles, rates = self._stamps.copy(), self._angles.copy(), self._rates.copy()
+            commanded, fault = self._commanded, self._fault
+        if fault:
+            raise ValueError(fault)
+        measured = stamps > 0
+        if not measured.any() and commanded is None:
             return None
         unknown = np.full(len(self._robot.joints), np.nan)
-        angles, rates = unknown, unknown
-        if measured is not None:
-            age = stamp - measured[0]
-            if age > self._limit:
-                raise ValueError(
-                    f"joint states: the newest is {1e-9 * age:.1f} s older than the sensor data, expected at most "
-                    f"{self._timeout:g} s"
-                )
-            angles = measured[1]
-            rates = measured[2] if self._continues else unknown
+        ages = np.where(measured, stamp - stamps, 0)
+        worst = int(np.abs(ages).argmax())
+        if abs(ages[worst]) > self._limit:
+            relation = "older" if ages[worst] > 0 else "newer"
+            raise ValueError(
+                f"joint states: the newest of {self._robot.joint_names[worst]} is {1e-9 * abs(ages[worst]):.1f} s "
+                f"{relation} than the sensor data, expected at most {self._timeout:g} s"
+            )
+        angles = np.where(measured, angles, unknown)
+        rates = np.where(measured, rates, unknown) if self._continues else unknown
         targets, target_rates = unknown, unknown
         if commanded is not None and stamp - commanded[0] <= self._limit:
             targets, target_rates = commanded[1:]
