@@ -1,5 +1,7 @@
 """The body is closed: narrow obstacles stop the hull where they stop it in MuJoCo, however it is sampled."""
 
+from dataclasses import replace
+
 import numpy as np
 import obstacles
 import pytest
@@ -52,6 +54,33 @@ def test_no_post_of_one_cell_passes_through_the_hull(husky, lateral, speed):
     inside = (local[:, 0].abs() < 0.49 - 0.08) & (local[:, 1].abs() < 0.21 - 0.08)
     assert bool(result.valid.all()) and not bool(inside.any())
     assert abs(float(result.position[0, -1, 0])) < 1.35
+
+
+@pytest.mark.parametrize("mass", [None, 8000.0])
+@pytest.mark.parametrize(("name", "speed"), [("warthog", 0.5), ("warthog", 2.0), ("offroad_car", 1.0)])
+def test_a_thin_post_stops_a_heavy_robot(name, speed, mass):
+    """What holds a Husky yields to the traction of a car; a post gives way to none of them."""
+    robot, content = load_robot(name), yaml.safe_load(robot_file(name).read_text())
+    if mass is not None:
+        robot = replace(robot, mass=torch.tensor(mass), inertia=robot.inertia * (mass / robot.mass))
+    box = content["hull"][0]
+    front, across = float(robot.points[:, 0].max()), float(box["size"][1])
+    seconds = 1.0 + 1.5 / speed
+    grid = Grid.square(16.0, 0.05)
+    for share in (-0.35, 0.0, 0.2):
+        row, column = (
+            int(np.argmin(np.abs(np.asarray(axis) - v)))
+            for axis, v in ((grid.y, share * across), (grid.x, front + 0.5))
+        )
+        height = torch.zeros(grid.rows, grid.columns)
+        height[row, column] = 1.0
+        twists = torch.tensor([speed, 0.0]).expand(1, round(100 * seconds), 2)
+        state = State.at_rest(robot.ground_clearance)
+        result = rollout(TerrainMap.from_height(height, grid), robot, drive_speeds(robot, twists, 0.01), state)
+        post = torch.tensor([float(grid.x[column]), float(grid.y[row]), 0.0]) - result.position[0]
+        local = (result.rotation[0].transpose(1, 2) @ post[..., None])[..., 0].numpy() - np.array(box["centre"])
+        inside = (np.array(box["size"]) / 2 - np.abs(local))[:, :2].min(axis=1)
+        assert bool(result.valid.all()) and inside.max() < 0.03
 
 
 @pytest.mark.parametrize("resolution", [0.05, 0.1])

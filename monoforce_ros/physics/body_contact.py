@@ -34,6 +34,8 @@ class BodyContact:
     """Unit normal of the hull at each point, zero on belts, ``[3, N]`` in base axes."""
     areas: Tensor
     """Area of each point, ``[N]`` [m²]."""
+    masses: Tensor
+    """``[B]`` [kg]."""
     weights: Tensor
     """Share of the robot's weight per point, ``[B, N]`` [N]."""
     speeds: Tensor
@@ -63,6 +65,7 @@ class BodyContact:
             tangents=problem.point_tangents.T,
             outward=problem.point_outward.T,
             areas=problem.point_areas,
+            masses=problem.mass,
             weights=problem.mass[:, None] * options.gravity * share,
             # Index -1, the hull, selects the zero at the end.
             speeds=torch.cat([problem.drive_speeds, torch.zeros_like(problem.drive_speeds[..., :1])], dim=-1),
@@ -133,6 +136,7 @@ class BodyContact:
             rotation @ self.outward,
             rotation[..., 1],
             self.areas,
+            self.masses,
             self.weights,
             self.friction_factors,
             self.ground_factors,

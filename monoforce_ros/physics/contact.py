@@ -16,10 +16,11 @@ from monoforce_ros.physics.soil_contact import SoilContact
 STEEPEST_SOIL, RIGID_SLOPE = math.cos(math.radians(45.0)), math.cos(math.radians(60.0))
 """Vertical components of the normal between which ground goes from soil to something rigid: soil does not stand
 steeper than about 45°, its angle of repose; beyond 60° it is a trunk, a wall or a kerb."""
-RIGID_FACTOR = 50.0
-"""Factor on stiffness and damping where a face of the hull meets rigid ground head-on. A Husky at 1 m/s that pushes
-with its full traction (25 J, and 4 J per cm) stops within about 1 cm at a contact 5 cm wide and 10 cm high if the
-stiffness is 1e8 N/m³, 50 times that of firm soil; on soil's own it would need 12 cm, more than a post is thick."""
+RIGID_PER_MASS, LEAST_RIGID = 1.0, 50.0
+"""Factor on stiffness and damping where a face of the hull meets rigid ground head-on, for each kilogram of the robot,
+and the smallest one. A robot at 1 m/s that pushes with its full traction (0.5 J per kilogram, and 0.08 J per cm) stops
+within about 1 cm at a contact 5 cm wide and 10 cm high if the stiffness is 2e6 N/m³ per kilogram, and that of firm soil
+is 2e6 N/m³; on soil's own a robot of 50 kg would need 12 cm, more than a post is thick."""
 
 
 FLAT_TREAD = 0.9
@@ -44,7 +45,7 @@ def steepness(normal: Tensor) -> Tensor:
     return ((STEEPEST_SOIL - normal[:, 2]) / (STEEPEST_SOIL - RIGID_SLOPE)).clamp(0.0, 1.0)
 
 
-def against_hull(outward: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
+def against_hull(outward: Tensor, normal: Tensor, masses: Tensor) -> tuple[Tensor, Tensor]:
     """How steep ground pushes on faces of the hull: the direction ``[B, 3, N]`` and a factor on it ``[B, N]``.
 
     Ground pushes a face inwards. A map holds a thin post as a ridge, whose far side would push the face outwards once
@@ -54,6 +55,7 @@ def against_hull(outward: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
     Args:
         outward: unit normal of the hull in terrain axes, zero on belts, ``[B, 3, N]``.
         normal: unit normal of the ground, ``[B, 3, N]``.
+        masses: of the robots, ``[B]`` [kg].
     """
     head_on = (outward * normal).sum(1)
     steep = steepness(normal)
@@ -61,7 +63,8 @@ def against_hull(outward: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
     mirrored = mirrored * torch.rsqrt((mirrored * mirrored).sum(1, keepdim=True) + 1e-12)
     # Where nothing is mirrored the normal stays as it is, to the last bit.
     direction = torch.where((head_on > 0.0)[:, None], mirrored, normal)
-    return direction, 1.0 + (RIGID_FACTOR - 1.0) * steep * head_on.abs()
+    factor = (RIGID_PER_MASS * masses).clamp_min(LEAST_RIGID)[:, None]
+    return direction, 1.0 + (factor - 1.0) * steep * head_on.abs()
 
 
 @dataclass(frozen=True)
@@ -97,6 +100,7 @@ def contact(
     outward: Tensor,
     lateral: Tensor,
     areas: Tensor,
+    masses: Tensor,
     weights: Tensor,
     friction_factors: Tensor,
     ground_factors: Tensor,
@@ -122,6 +126,7 @@ def contact(
         outward: unit normal of the hull at the points, zero on belts, ``[B, 3, N]``.
         lateral: the robot's y axis, ``[B, 3]``, or that of each point's wheel, ``[B, 3, N]``.
         areas: area of each point, ``[N]`` [m²].
+        masses: of the robots, ``[B]`` [kg].
         weights: share of the robot's weight m g per point, ``[B, N]`` or ``[N]`` [N] (``sigmoid`` only).
         friction_factors: longitudinal and lateral factor on the ground's friction, ``[B, 2]``.
         ground_factors: divisor of the ground's stiffness and damping [-], and force of vegetation per area, height and
@@ -142,7 +147,7 @@ def contact(
     touching = depth > 0
     touching_areas = areas * touching
     upward = normal
-    normal, rigid = against_hull(outward, normal)
+    normal, rigid = against_hull(outward, normal, masses)
     if soil is not None:
         soft = 1.0 - steepness(upward)
         normal, facing = soil.direction(upward, normal, soft)

@@ -118,6 +118,7 @@ class _System:
             (turns @ problem.point_outward[..., None])[..., 0].transpose(1, 2),
             turns[..., 1].transpose(1, 2),
             body.areas,
+            body.masses,
             body.weights,
             body.friction_factors,
             body.ground_factors,

@@ -6,7 +6,7 @@ from typing import Any
 
 import warp as wp
 
-from monoforce_ros.physics.contact import RIGID_FACTOR, RIGID_SLOPE, STEEPEST_SOIL
+from monoforce_ros.physics.contact import LEAST_RIGID, RIGID_PER_MASS, RIGID_SLOPE, STEEPEST_SOIL
 from monoforce_ros.physics.soil_contact import FACING
 from monoforce_ros.physics.warp_kernels.soil import soil_pressure
 from monoforce_ros.physics.warp_kernels.structs import types
@@ -16,7 +16,6 @@ CONSTANT_LOOKUP, BILINEAR_LOOKUP = 0, 1
 VERTICAL_FORCE, NORMAL_FORCE = 0, 1
 NO_FRICTION, COULOMB, SIGMOID = 0, 1, 2
 STEEPENING = 1.0 / (STEEPEST_SOIL - RIGID_SLOPE)
-RIGID_GAIN = RIGID_FACTOR - 1.0
 
 
 @dataclass(frozen=True)
@@ -179,7 +178,8 @@ def contact_functions(double: bool, soft: bool) -> ContactFunctions:
             if head_on > scalar(0.0):
                 mirrored = normal - scalar(2.0) * steep * head_on * outward
                 normal = mirrored * (scalar(1.0) / wp.sqrt(wp.dot(mirrored, mirrored) + scalar(1.0e-12)))
-            rigid = scalar(1.0) + scalar(RIGID_GAIN) * steep * wp.abs(head_on)
+            factor = wp.max(scalar(RIGID_PER_MASS) * robots.mass[b], scalar(LEAST_RIGID))
+            rigid = scalar(1.0) + (factor - scalar(1.0)) * steep * wp.abs(head_on)
             if wp.static(soft):
                 # The face of a belt lies along its tangent, across the y axis of its link.
                 runs = body.tangents[i]
