@@ -359,3 +359,67 @@ def test_wheels_that_roll_freely_are_drawn_so(tmp_path):
     out.write_text(robot_file_text(conversion, path))
     labels = draw_robot(load_robot(out), conversion.content).axes[2].get_legend_handles_labels()[1]
     assert "rolls freely" in labels
+
+
+def caster(angle, kind="continuous", extra=""):
+    """A fork that is drawn turned by an angle, and its wheel behind it."""
+    shape = round_shape('cylinder radius="0.05" length="0.02"', "1.5707963 0 0")
+    return (
+        link("fork_link", mass=0.2)
+        + joint("fork", kind, "base_link", "fork_link", "-0.3 0 0", "0 0 1", extra, rpy=f"0 0 {angle}")
+        + link("roller_link", shape, mass=0.2, inertia=0.001)
+        + joint("roller", "continuous", "fork_link", "roller_link", "-0.03 0 -0.05")
+    )
+
+
+@pytest.mark.parametrize("angle", [0.7, -1.2, 1.5, 2.9])
+def test_casters_that_are_drawn_turned_are_straightened(tmp_path, angle):
+    straight, turned = (
+        convert(robot(tmp_path, *small_robot(caster(drawn)), name=f"robot{number}.urdf"))
+        for number, drawn in enumerate((0.0, angle))
+    )
+    assert [wheel["name"] for wheel in turned.content["wheels"]] == ["left", "right", "roller"]
+    found, expected = turned.content["wheels"][2]["centre"], straight.content["wheels"][2]["centre"]
+    # The wheel may lie in front of the fork as well as behind it: it trails as soon as the robot drives.
+    pivot = turned.content["casters"][0]["pivot"]
+    assert abs(found[0] - pivot[0]) == pytest.approx(0.03, abs=1e-5)
+    assert found[1:] == pytest.approx(expected[1:], abs=1e-5)
+    assert any("fork: drawn turned to the side" in warning for warning in turned.warnings)
+    assert not any("drawn turned" in warning for warning in straight.warnings)
+
+
+def test_two_wheels_on_one_vertical_joint_are_refused_with_what_to_do(tmp_path):
+    second = wheel("other", "-0.03 0.02 -0.05", parent="fork_link", radius=0.05)
+    path = robot(tmp_path, *small_robot(caster(0.0) + second))
+    with pytest.raises(UrdfError, match="joint fork turns the wheels .*not supported; leave one of a pair out"):
+        convert(path)
+    assert len(convert(path, hints={"other_link": "ignore"}).content["wheels"]) == 3
+
+
+def test_a_body_without_mass_and_an_inertia_of_a_point_are_reported(tmp_path):
+    parts = (caster(0.0), wheel("left_wheel", "0 0.15 0"), wheel("right_wheel", "0 -0.15 0"))
+    shape = box("0.7 0.45 0.2", "0 0 0.1")
+    found = convert(robot(tmp_path, link("base_link", shape), *parts))
+    assert any("without mass: the body, base_link" in warning for warning in found.warnings)
+    found = convert(robot(tmp_path, link("base_link", shape, mass=25.0, inertia=1e-3), *parts))
+    assert any("inertia of base_link: a radius of gyration of 0.6 cm" in warning for warning in found.warnings)
+    found = convert(robot(tmp_path, link("base_link", shape, mass=25.0, inertia=0.5), *parts))
+    assert not any("inertia of" in warning or "without mass" in warning for warning in found.warnings)
+
+
+def test_a_tilted_steering_axis_is_said(tmp_path):
+    limits = '<limit lower="-0.6" upper="0.6" velocity="1" effort="1"/>'
+    fork = (
+        link("fork_link", mass=0.2)
+        + joint("fork", "revolute", "base_link", "fork_link", "0.4 0 0", "-0.26 0 0.966", limits)
+        + wheel("front", "0.05 0 0", parent="fork_link")
+    )
+    found = convert(robot(tmp_path, *small_robot(fork)))
+    assert any("fork: turns front about an axis that is tilted by 15°" in guess for guess in found.guesses)
+
+
+def test_a_number_with_a_comma_is_named_with_its_place(tmp_path):
+    path = robot(tmp_path, *small_robot(caster(0.0)))
+    path.write_text(path.read_text().replace('<mass value="4.0"/>', '<mass value="4,0"/>'))
+    with pytest.raises(UrdfError, match="link base_link: mass: value: got '4,0', expected numbers with a decimal"):
+        read_description(path)

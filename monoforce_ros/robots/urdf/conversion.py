@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from monoforce_ros.robots.urdf.description import Description, Joint
+from monoforce_ros.robots.urdf.description import Description, Joint, Link
 from monoforce_ros.robots.urdf.errors import UrdfError
 from monoforce_ros.robots.urdf.geometry import DIRECTIONS, Frames, belt_shape, flipper_shape
 from monoforce_ros.robots.urdf.hull import find_hull
-from monoforce_ros.robots.urdf.parts import BeltPart, Parts, WheelPart, find_parts
+from monoforce_ros.robots.urdf.parts import BeltPart, Parts, WheelPart, drawn_aside, find_parts
 from monoforce_ros.robots.urdf.review import SAME_AXLE, review, side_of
 from monoforce_ros.robots.urdf.sensors import find_sensors
 from monoforce_ros.robots.urdf.supports import find_supports
@@ -24,6 +24,11 @@ _FASTEST = 100.0
 """Velocity limits from this on [rad/s] are placeholders: URDF requires a number even where there is no limit."""
 _LARGEST_STEERING = 1.4
 """Steering limits above this [rad] are placeholders; beyond it a wheel is nearly across."""
+_TILTED = 3.0
+"""Tilt of a steering axis from which it is reported [deg]."""
+_HEAVY, _POINT = 0.1, 0.05
+"""Links are heavy from this share of the robot's mass; a radius of gyration below this share of a shape's diagonal is
+that of a point (a rod has 0.29, a box at least 0.17)."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +75,8 @@ class _Converter:
         self.warnings: list[str] = []
         if options.forward not in DIRECTIONS:
             raise UrdfError(f"forward {options.forward!r}: expected one of {', '.join(DIRECTIONS)}")
-        self.frames = Frames(description, self._base(), options.forward)
+        self.frames = self._straightened(Frames(description, self._base(), options.forward))
+        self.description = self.frames.description
         self.parts = self._with_supports(find_parts(self.frames, options.hints))
 
     def fail(self, message: str) -> UrdfError:
@@ -90,6 +96,16 @@ class _Converter:
         found = "base_link" if "base_link" in links else self.description.root
         self.guess(f"base frame {found}: {'by its name' if found == 'base_link' else 'the root link'}")
         return found
+
+    def _straightened(self, frames: Frames) -> Frames:
+        """The description with its casters straight ahead."""
+        angles = drawn_aside(frames, self.options.hints)
+        for name, angle in angles.items():
+            self.warnings.append(
+                f"caster {name}: drawn turned to the side; its angle 0 in the robot file is {angle:.3f} rad in the "
+                "description"
+            )
+        return replace(frames, description=frames.description.turned(angles)) if angles else frames
 
     def _with_supports(self, parts: Parts) -> Parts:
         """The parts, and casters that are fixed to the body."""
@@ -165,10 +181,14 @@ class _Converter:
         without = [name for name in self._moving_links() if not self._carried_mass(name)]
         if without:
             self.warnings.append(f"without mass: {', '.join(without[:6])}; the robot's mass may be too small")
+        body = list(self.description.subtree(self.frames.base, ("fixed",)))
+        if len(self.frames.points(body)) and not sum(self.description.links[name].mass for name in body):
+            self.warnings.append(f"without mass: the body, {self.frames.base}; the robot's mass is far too small")
         poses = {link.name: self.frames.link(link.name) for link in heavy}
         places = np.array([poses[link.name][:3, :3] @ link.centre + poses[link.name][:3, 3] for link in heavy])
         masses = np.array([link.mass for link in heavy])
         centre = masses @ places / masses.sum()
+        self._check_inertias(heavy, float(masses.sum()))
         inertia = np.zeros((3, 3))
         for link, place in zip(heavy, places, strict=True):
             turn, arm = poses[link.name][:3, :3], place - centre
@@ -181,6 +201,20 @@ class _Converter:
             )
         self.guess(f"mass {masses.sum():.4g} kg: the sum over {len(heavy)} links, at the zero position of all joints")
         return float(masses.sum()), centre, inertia
+
+    def _check_inertias(self, links: Sequence[Link], total: float) -> None:
+        """Name heavy links whose inertia is that of a point, not of their shape."""
+        for link in links:
+            points = np.concatenate(
+                [shape.placed(np.eye(4)) for shape in link.shapes or link.visuals] or [np.zeros((1, 3))]
+            )
+            extent = float(np.linalg.norm(np.ptp(points, axis=0)))
+            gyration = math.sqrt(max(np.linalg.eigvalsh(link.inertia)[-1], 0.0) / link.mass)
+            if link.mass > _HEAVY * total and gyration < _POINT * extent:
+                self.warnings.append(
+                    f"inertia of {link.name}: a radius of gyration of {100 * gyration:.1f} cm for a shape of "
+                    f"{extent:.2f} m; is it a placeholder?"
+                )
 
     def _moving_links(self) -> list[str]:
         turning = [wheel.joint.child for wheel in self.parts.wheels if wheel.joint.kind != "fixed"]
@@ -348,9 +382,11 @@ class _Converter:
                 "file to the left; change the sign of its angles in JointState"
             )
         entry["pivot"] = _numbers(self.frames.origin(joint))
-        self.guess(
-            f"steering {joint.name}: turns {wheel.name} about a vertical axis, {math.degrees(limit):.0f}° to each side"
+        tilt = math.degrees(math.acos(min(abs(self.frames.axis(joint)[2]), 1.0)))
+        about = (
+            f"an axis that is tilted by {tilt:.0f}°, as if it were vertical" if tilt > _TILTED else "a vertical axis"
         )
+        self.guess(f"steering {joint.name}: turns {wheel.name} about {about}, {math.degrees(limit):.0f}° to each side")
         return entry
 
     def _caster_entry(self, wheel: WheelPart) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -19,6 +19,11 @@ from monoforce_ros.robots.urdf.shapes import MeshFiles, Shape, read_shape
 
 MAXIMUM_URDF_BYTES = 10_000_000
 MAXIMUM_LINKS = 5_000
+_NUMBERS = frozenset((
+    "xyz", "rpy", "value", "ixx", "ixy", "ixz", "iyy", "iyz", "izz", "radius", "length", "size", "scale", "lower",
+    "upper", "effort", "velocity", "damping", "friction",
+))  # fmt: skip
+"""Attributes of links and joints that hold numbers."""
 MOVING = ("continuous", "revolute", "prismatic")
 
 
@@ -90,6 +95,15 @@ class Description:
             if through is None or joint.kind in through:
                 yield from self.subtree(joint.child, through)
 
+    def turned(self, angles: Mapping[str, float]) -> Description:
+        """The description with joints at other angles [rad] than 0, which become its zero position."""
+        joints = dict(self.joints)
+        for name, angle in angles.items():
+            turn = np.eye(4)
+            turn[:3, :3] = Rotation.from_rotvec(angle * joints[name].axis).as_matrix()
+            joints[name] = replace(joints[name], pose=joints[name].pose @ turn)
+        return replace(self, joints=joints, poses=_link_poses(self.root, joints))
+
 
 def read_description(
     path: str | Path,
@@ -122,6 +136,10 @@ def read_description(
     if len(joints) < len(parsed.joints):
         raise UrdfError(f"{path}: two joints have the same name; names must be unique")
     root = _root(links, joints, path)
+    return Description(path, parsed.name or path.stem, root, links, joints, _actuated(tree), _link_poses(root, joints))
+
+
+def _link_poses(root: str, joints: Mapping[str, Joint]) -> dict[str, np.ndarray]:
     poses = {root: np.eye(4)}
     pending = [root]
     while pending:
@@ -130,7 +148,7 @@ def read_description(
             if joint.parent == parent:
                 poses[joint.child] = poses[parent] @ joint.pose
                 pending.append(joint.child)
-    return Description(path, parsed.name or path.stem, root, links, joints, _actuated(tree), poses)
+    return poses
 
 
 def _text(path: Path, xacro_arguments: Sequence[str], packages: Mapping[str, Path]) -> str:
@@ -182,9 +200,23 @@ def _parsed(text: str, path: Path) -> tuple[Any, ElementTree.Element]:
     try:
         return urdf.URDF.from_xml_string(kept), ElementTree.fromstring(text)
     except Exception as error:  # the parser raises plain exceptions for invalid elements
-        raise UrdfError(f"{path}: not a valid URDF: {error}") from error
+        raise UrdfError(f"{path}: not a valid URDF: {_no_number(tree) or error}") from error
     finally:
         core.on_error = before
+
+
+def _no_number(tree: ElementTree.Element) -> str:
+    """The first link or joint with a value that is no number, for which the parser names no place; empty if none."""
+    for part in tree:
+        for element in part.iter():
+            for name in sorted(_NUMBERS.intersection(element.keys())):
+                for word in element.get(name, "").split():
+                    try:
+                        float(word)
+                    except ValueError:
+                        where = f"{part.tag} {part.get('name')}: {element.tag}: {name}"
+                        return f"{where}: got {element.get(name)!r}, expected numbers with a decimal point"
+    return ""
 
 
 def _actuated(tree: ElementTree.Element) -> frozenset[str]:

@@ -19,6 +19,8 @@ _FLIPPER = re.compile(r"flipper", re.IGNORECASE)
 _CASTER = re.compile(r"caster|castor|swivel", re.IGNORECASE)
 _ONE_AXIS = 0.05
 """Rockers turn about one axis if their pivots differ by less than this along x and z [m]."""
+_STRAIGHT = 0.999
+"""Smallest lateral component of the axis of a wheel that is drawn straight (2.6°)."""
 _TRAIL = 0.15
 """Smallest trail of a caster in wheel radii, where neither actuation nor names tell it from steering."""
 
@@ -68,6 +70,32 @@ class Parts:
     left_out: frozenset[str]
     """Links that belong to none of the bodies (hint ``ignore``)."""
     notes: tuple[str, ...]
+
+
+def drawn_aside(frames: Frames, hints: Mapping[str, str]) -> dict[str, float]:
+    """Angles [rad] that bring casters which are drawn turned to the side to straight ahead, by joint.
+
+    A caster's wheel is one about a horizontal axis; drawn at an angle, that axis is not lateral.
+    """
+    angles: dict[str, float] = {}
+    joints = frames.description.joints.values()
+    if not any(joint.kind == "continuous" and abs(frames.axis(joint)[1]) > ALIGNED for joint in joints):
+        # All wheels point elsewhere: it is the frame that is turned.
+        return angles
+    for swivel in joints:
+        upright = frames.axis(swivel)[2]
+        kinds = {hints.get(swivel.name), hints.get(swivel.child)}
+        if swivel.kind != "continuous" or abs(upright) < ALIGNED or kinds & {"fixed", "ignore", "steering"}:
+            continue
+        for joint in frames.description.children(swivel.child):
+            axis = frames.axis(joint)
+            if joint.kind != "continuous" or abs(axis[2]) > 1.0 - ALIGNED or abs(axis[1]) > _STRAIGHT:
+                continue
+            # The smaller of the two turns that make the axis lateral.
+            turn = np.arctan2(axis[0], axis[1])
+            turn -= np.pi * np.round(turn / np.pi)
+            angles[swivel.name] = float(turn * np.sign(upright))
+    return angles
 
 
 def find_parts(frames: Frames, hints: Mapping[str, str]) -> Parts:
@@ -125,6 +153,7 @@ class _Finder:
             for wheel in wheels
         )
         self._check_mimics(wheels, flippers)
+        self._check_pairs(wheels)
         self._told_still(wheels, flippers, (*rockers, *level), taken)
         parts = [part for joint in flippers for part in self._flipper_parts(joint)]
         return Parts(wheels, tuple(tracks), tuple(parts), rockers, ignored, tuple(self.notes))
@@ -292,6 +321,21 @@ class _Finder:
                     f"are not supported; remove the mimic tag (the drive's kinematics couple the wheels), or pass "
                     f"--hint {joint.name}=fixed"
                 )
+
+    def _check_pairs(self, wheels: Sequence[WheelPart]) -> None:
+        carried: dict[str, str] = {}
+        for wheel in wheels:
+            for joint in (wheel.steering, wheel.swivel):
+                if joint is None:
+                    continue
+                if joint.name in carried:
+                    raise UrdfError(
+                        f"{self.description.path}: joint {joint.name} turns the wheels {carried[joint.name]} and "
+                        f"{wheel.name}: an axle or a pair of wheels on one vertical joint is not supported; leave one "
+                        f"of a pair out (--hint {wheel.joint.child}=ignore), or hold the axle straight (--hint "
+                        f"{joint.name}=fixed)"
+                    )
+                carried[joint.name] = wheel.name
 
     def _told_still(
         self, wheels: Sequence[WheelPart], flippers: Sequence[Joint], rockers: Sequence[Joint], taken: set[str]
