@@ -151,16 +151,18 @@ def integrate_joints_kernel(double: bool, differentiable: bool, soft: bool) -> A
                 weight = loads.weight / mass
                 if joints.limited == 1:
                     find_limits(joints, robots, states, links, work, b, step, thread, slot, weight, h)
-                for entry in range(joints.number + drives):
-                    k = joints.coordinates[entry]
-                    if k >= 0:
-                        limited = work.values[thread, slot, k, 5]
-                        found = load_at(
-                            joints, robots, states, links, b, step, thread, slot, entry, limited, weight, h
-                        )  # fmt: skip
-                        work.values[thread, slot, k, 0] = h * (found[0] + work.values[thread, slot, k, 2])
-                        work.values[thread, slot, k, 1] = joints.parameters[entry, 0] + h * found[1]
-                solve(joints, work, thread, slot, h)
+                # The search may have ended with the solution; an adjoint needs the steps to it.
+                if joints.limited == 0 or keep == 1 or work.values[thread, slot, size, 5] == scalar(1.0):
+                    for entry in range(joints.number + drives):
+                        k = joints.coordinates[entry]
+                        if k >= 0:
+                            limited = work.values[thread, slot, k, 5]
+                            found = load_at(
+                                joints, robots, states, links, b, step, thread, slot, entry, limited, weight, h
+                            )  # fmt: skip
+                            work.values[thread, slot, k, 0] = h * (found[0] + work.values[thread, slot, k, 2])
+                            work.values[thread, slot, k, 1] = joints.parameters[entry, 0] + h * found[1]
+                    solve(joints, work, thread, slot, h)
                 new_linear = state.linear + vec3(
                     work.values[thread, slot, size, 4],
                     work.values[thread, slot, size + 1, 4],
