@@ -111,13 +111,18 @@ def blocks(robot: RobotModel) -> list[Block]:
     ]
 
 
+def distance(robot: RobotModel) -> float:
+    """Distance of an obstacle's middle from the base frame [m]: well before the front of a long robot, too."""
+    return max(DISTANCE, float(robot.points[:, 0].max()) + 0.8)
+
+
 def in_mujoco(robot: str | Path, block: Block, speed: float) -> np.ndarray:
     """Final position ``[3]`` [m] in the odom frame."""
     scenery = build_scenery(TerrainSettings(flat=True, bare=True), 1)
     vehicle = Vehicle.load(robot)
     origin = Simulation(build_model(scenery, vehicle, 1, {}), scenery, vehicle).odom_origin
     ground = float(scenery.ground.height_at(origin[:2]))
-    obstacle = block.obstacle(origin[0] + DISTANCE, ground)
+    obstacle = block.obstacle(origin[0] + distance(load_robot(robot)), ground)
     scenery = replace(scenery, obstacles=(replace(obstacle, position=obstacle.position + origin[:2]),))
     simulation = Simulation(build_model(scenery, vehicle, 1, {}), scenery, vehicle)
     simulation.drive(speed, 0.0)
@@ -131,7 +136,7 @@ def in_rollout(robot: RobotModel, block: Block, speed: float, resolution: float)
     twists = torch.tensor([speed, 0.0]).expand(1, round(SECONDS / STEP), 2)
     start = State.at_rest(robot.ground_clearance)
     result = rollout(
-        block.terrain(DISTANCE, resolution), robot, drive_speeds(robot, twists, STEP), start, with_forces=False
+        block.terrain(distance(robot), resolution), robot, drive_speeds(robot, twists, STEP), start, with_forces=False
     )
     return result.position[0, -1].numpy() - np.array([0.0, 0.0, robot.ground_clearance])
 
