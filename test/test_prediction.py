@@ -75,7 +75,7 @@ def test_a_wall_just_ahead_does_not_reach_into_the_robot():
         places = predictor.roll_out(terrain, [still], twists).position[0].numpy()
         return np.linalg.norm(places - places[0], axis=1)
 
-    assert pushed(seen, twists).max() > 0.2, "without clearing the footprint"
+    assert pushed(seen, twists).max() < 0.06, "the start is cleared in any case"
     assert pushed(terrain, twists).max() < 0.03
     assert terrain.height.max() > 0.5, "the wall itself stays"
     # Driving forward, the robot is stopped by the wall.

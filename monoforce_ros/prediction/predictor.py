@@ -12,6 +12,7 @@ from monoforce_ros.effects import controls, turned_effects
 from monoforce_ros.perception import Observation, TerrainSource
 from monoforce_ros.physics import PhysicsOptions, Rollout, State, rollout
 from monoforce_ros.prediction.joint_motion import JointMotion
+from monoforce_ros.prediction.start_clearance import with_clear_start
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import Grid, TerrainMap
 
@@ -167,7 +168,16 @@ class Predictor:
         given = controls(robot, twists, step, history=self.history, joint_start=start, flippers=flippers)
         # The terrain frame turns with the robot's heading; effects fixed in the odometry frame are rotated into it.
         heading = torch.tensor([motion.heading for motion in motions], dtype=torch.float32)
+        terrain = with_clear_start(terrain, self._at_start(robot, joints), state)
         return rollout(
             terrain, turned_effects(robot, heading), given, state, options=self.options, with_forces=with_forces,
             with_contact=with_contact, force_every=force_every,
         )  # fmt: skip
+
+    @staticmethod
+    def _at_start(robot: RobotModel, joints: JointMotion | None) -> RobotModel:
+        """The robot with its flippers as measured, where one set of angles holds for all predictions."""
+        if joints is None or not robot.flippers or joints.start.ndim != 1:
+            return robot
+        angles = joints.start[-len(robot.flippers) :]
+        return robot.posed(torch.as_tensor(angles)) if np.isfinite(angles).all() else robot
