@@ -159,3 +159,21 @@ def test_commands_without_a_stamp_are_dated_by_odometry():
     moved(kept, 7 * SECOND)
     kept.add_command(0, np.ones(2))
     assert kept.commands().stamps.tolist() == [7 * SECOND]
+
+
+def test_another_frame_of_the_odometry_is_another_motion():
+    kept, _ = inputs(["lidar"])
+    for stamp in range(1, 5):
+        moved(kept, stamp * 100_000_000)
+    state = MotionState(500_000_000, np.array([100.0, 0.0, 0.0]), np.eye(3), np.zeros(3), np.zeros(3))
+    kept.add_motion("odometry", state, "map", "base_link")
+    assert kept.frame_id == "map" and len(kept.motion()) == 1
+
+
+def test_what_came_before_a_pause_is_forgotten():
+    kept, _ = inputs(["lidar"])
+    moved(kept, 100_000_000)
+    kept.forget()
+    assert kept.motion_stamp == 0
+    moved(kept, 50_000_000)
+    assert kept.motion_stamp == 50_000_000

@@ -75,6 +75,11 @@ def test_a_manager_configures_activates_pauses_and_takes_down(peer, start):
     peer.clear()
     peer.drive(1.5)
     assert not peer.received["/predicted/path"]
+    # What came meanwhile is old by now.
+    assert change(peer, "/managed", Transition.TRANSITION_ACTIVATE)
+    peer.spin(1.5)
+    assert not peer.received["/predicted/path"], "an old prediction"
+    assert change(peer, "/managed", Transition.TRANSITION_DEACTIVATE)
     assert change(peer, "/managed", Transition.TRANSITION_CLEANUP)
     # A second life is like the first.
     assert change(peer, "/managed", Transition.TRANSITION_CONFIGURE)

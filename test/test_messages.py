@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from geometry_msgs.msg import Twist
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from nav_msgs.msg import GridCells, Path
@@ -182,6 +183,13 @@ def test_quaternions_are_read_as_x_y_z_w():
     assert (frame, child, state.stamp) == ("odom", "base_link", STAMP)
     np.testing.assert_allclose(state.rotation @ [1, 0, 0], [0, 1, 0], atol=1e-12)
     assert state.heading == pytest.approx(np.pi / 2)
+
+
+def test_commands_that_no_robot_can_follow_are_refused():
+    command = Twist()
+    command.linear.x = 1000.0
+    with pytest.raises(MessageError, match=r"got \[1000\.0, 0\.0\], expected at most 100 m/s"):
+        decoding.decode_command(command)
 
 
 def test_commands_of_both_types_are_decoded_and_nan_is_refused():

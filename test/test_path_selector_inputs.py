@@ -1,6 +1,8 @@
 """What path_selector says and does for each of its inputs: missing, of another type, quality of service or frame."""
 
 import signal
+import subprocess
+import sys
 import time
 
 import numpy as np
@@ -207,6 +209,31 @@ def test_a_robot_that_drives_is_stopped_when_the_selector_ends(robot, how):
     assert robot.live(10.0, until=lambda: robot.driven), robot.status()
     assert robot.process.stop(how) == 0
     assert robot.peer.until(lambda: not robot.driven, 2.0)
+
+
+LISTENER = """
+import rclpy
+from geometry_msgs.msg import Twist
+rclpy.init()
+node = rclpy.create_node("dashboard")
+node.create_subscription(Twist, "{topic}", lambda message: None, 1)
+rclpy.spin(node)
+"""
+
+
+def test_a_base_is_stopped_before_another_type_is_published(robot, ros_environment):
+    """A dashboard that listens to the other type takes the commands from a base, which may keep its last one."""
+    robot.listen(TwistStamped)
+    robot.send_goal(50.0, 0.0)
+    assert robot.live(10.0, until=lambda: robot.driven), robot.status()
+    code = LISTENER.format(topic=f"/{robot.prefix}/cmd_vel")
+    listener = subprocess.Popen([sys.executable, "-c", code], env=ros_environment)
+    try:
+        assert robot.live(20.0, until=lambda: "no longer hears the commands" in robot.process.output)
+        assert robot.peer.until(lambda: not robot.driven, 2.0), "the base keeps the last command"
+    finally:
+        listener.kill()
+        listener.wait()
 
 
 def test_odometry_with_stamps_of_zero_is_refused(robot):
@@ -501,3 +528,12 @@ def test_progress_is_what_odometry_shows_of_the_commanded_motion(speed, moving):
     for step in range(30, 60):
         check.add(0.1 * step, (0.0, 0.6), np.zeros(2), 0.1 * step * 0.4)
     assert check.moving, "turning on the spot is motion"
+
+
+@pytest.mark.parametrize(("yaw_rate", "drift"), [(0.02, 0.003), (0.05, 0.01), (0.17, 0.02)])
+def test_a_heading_that_drifts_is_no_motion_of_a_robot_that_is_stuck(yaw_rate, drift):
+    check, random = ProgressCheck(), np.random.default_rng(1)
+    for step in range(60):
+        check.add(0.05 * step, (0.5, yaw_rate), 0.001 * random.standard_normal(2), 0.05 * step * drift)
+        assert not check.moving
+    assert check.moving is False

@@ -21,6 +21,7 @@ from monoforce_ros.planning import (
     over_horizon,
     select_candidate,
 )
+from monoforce_ros.planning.selection import FIELDS
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainMap
 
@@ -368,3 +369,29 @@ def test_robots_that_crab_get_candidates_that_move_sideways():
     assert fan_of_arcs(CandidateSettings(count=5, speeds=(0.8,), lateral=0.5)).shape == (5, 4, 3)
     with pytest.raises(ValueError, match="candidate lateral speed"):
         CandidateSettings(lateral=-1.0)
+
+
+@pytest.mark.parametrize(("name", "value"), [("x", np.nan), ("heading", np.inf), ("speed", np.nan), ("speed", 1e6)])
+def test_a_candidate_that_no_robot_can_drive_is_left_out_and_spoils_no_other(name, value):
+    """Diverged rollouts have no positions."""
+    fields = {field: np.zeros(3) for field in FIELDS} | {"feasible": np.ones(3), "speed": np.full(3, 0.5)}
+    for share, along in ((25, 0.5), (50, 1.0), (75, 1.5), (100, 2.0)):
+        x, y = ("x", "y") if share == 100 else (f"x_{share}", f"y_{share}")
+        fields |= {x: along * np.array([0.7, 1.0, 0.7]), y: along * np.array([0.7, 0.0, -0.7])}
+    fields["heading"] = np.array([0.8, 0.0, -0.8])
+    goal, robot = np.array([8.0, 0.0]), np.zeros(2)
+    assert select_candidate(fields, robot, goal) == 1
+    for bad, expected in ((0, 1), (2, 1), (1, 0)):
+        changed = {key: values.copy() for key, values in fields.items()}
+        changed[name][bad] = value
+        assert select_candidate(changed, robot, goal) == expected
+    assert select_candidate({**fields, name: np.full(3, value)}, robot, goal) is None
+
+
+def test_large_maps_are_coarsened_before_they_are_searched():
+    data = np.zeros((3000, 3000), np.int16)
+    data[:2900, 1440:1560] = 100
+    found = cost_to_go(data, 0.05, np.zeros(2), np.array([100.0, 75.0]), radius=0.3)
+    assert found.cost.size <= 1_000_000 and found.resolution >= 0.15
+    # Around the wall, through the gap of 5 m at its end.
+    assert 150.0 < float(found.at(np.array([[50.0, 75.0]]))[0]) < 180.0

@@ -309,6 +309,8 @@ def decode_command(message: Any, *, lateral: bool = False) -> np.ndarray:
         raise MessageError(
             f"command: got forward speed {command[0]}, yaw rate {command[1]}{sideways}; expected finite numbers"
         )
+    if np.abs(command).max() > MAXIMUM_SPEED:
+        raise MessageError(f"command: got {command.tolist()}, expected at most {MAXIMUM_SPEED:g} m/s and rad/s")
     return command
 
 

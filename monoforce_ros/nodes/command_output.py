@@ -41,6 +41,8 @@ class CommandOutput:
         self.type = ""
         """Message type that is published; empty while it changes."""
         self._publisher: Publisher | None = None
+        self._moves = False
+        """Whether the last command was to move."""
         # Fully qualified node names with the types that they expect.
         self._listened: set[tuple[str, str]] = set()
         self._bystanders: list[str] = []
@@ -68,6 +70,7 @@ class CommandOutput:
         """Publish forward speed [m/s], yaw rate [rad/s] and, if there are three, the speed to the left [m/s]."""
         if self._publisher is None:
             return
+        self._moves = any(command)
         twist = Twist()
         twist.linear.x, twist.angular.z = command[:2]
         if len(command) > 2:
@@ -106,6 +109,7 @@ class CommandOutput:
         if wanted == self.type:
             return
         if self._publisher is not None:
+            self._leave(wanted)
             self._node.destroy_publisher(self._publisher)
         self.type, self._publisher = "", None
         try:
@@ -115,6 +119,18 @@ class CommandOutput:
             self._node.get_logger().debug(f"{self.topic}: {error}")
             return
         self.type = wanted
+
+    def _leave(self, wanted: str) -> None:
+        """Stop a base that the present type moves, before another type is published: it may hold its last command."""
+        hearing = ", ".join(sorted(name for name, kind in self._listened if kind == self.type))
+        if self._moves:
+            self.publish((0.0, 0.0), "")
+            self.flush(0.2)
+        if hearing:
+            self._node.get_logger().warning(
+                f"{self.topic}: from now on {wanted} is published, for a node listens to it; {hearing} expects "
+                f"{self.type} and no longer hears the commands: set `command_type` to choose"
+            )
 
     def _is_bystander(self, name: str, namespace: str) -> bool:
         """Whether a node listens to commands only to predict or to record.

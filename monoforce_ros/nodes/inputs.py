@@ -75,6 +75,11 @@ class Inputs:
         self._waiting: deque[dict[str, Received]] = deque()
         self._first_sensor = 0.0
 
+    def forget(self) -> None:
+        """Discard all data: what came before, as while the node was paused, is no longer current."""
+        with self.changed:
+            self._clear()
+
     def _admit(self, topic: str, stamp: int) -> bool:
         """Whether a message may be used: it is not older than its predecessor, or the first one after a time jump."""
         last = self._last_stamps.get(topic)
@@ -93,6 +98,10 @@ class Inputs:
         with self.changed:
             if not self._admit(topic, state.stamp) or (self._states and state.stamp == self._states[-1].stamp):
                 return
+            if self._states and frame_id != self.frame_id:
+                # Another estimator: poses in different frames do not belong to one motion.
+                self._states.clear()
+                self._waiting.clear()
             self.frame_id, self.child_frame_id = frame_id, child_frame_id
             self._states.append(state)
             while self._states[0].stamp < state.stamp - RETENTION:

@@ -6,6 +6,7 @@ import os
 import sys
 import threading
 import time
+from collections import deque
 from dataclasses import dataclass, replace
 from functools import partial
 from types import SimpleNamespace
@@ -48,6 +49,8 @@ from monoforce_ros.terrain import Grid, TerrainDefaults
 
 _MOST_ODD = 5
 """Commands of another time in a row that are reported: when a bag starts anew, the first ones precede its odometry."""
+_LATE = 0.6
+"""Age from which candidates are late [s]: the default `timeout` of path_selector, which stops the robot then."""
 _ZERO_STAMPS = "the stamps are zero: the {} does not set them"
 
 
@@ -124,6 +127,8 @@ class PredictorNode(ManagedNode):
             self.joints = JointInput(self.robot, continues=continues, timeout=settings.odometry_timeout)
         self._arrivals: dict[str, float] = {}
         self._motion_arrival = 0.0
+        self._frame_changes: deque[float] = deque(maxlen=2)
+        """When the odometry's frame changed last."""
         self._odd_commands = 0
         self._started = time.monotonic()
         self._predictions = 0
@@ -148,6 +153,7 @@ class PredictorNode(ManagedNode):
     def begin(self) -> None:
         """Start predicting."""
         self._started = self._last_prediction = time.monotonic()
+        self.inputs.forget()
         self._watch = self.create_timer(0.5, self._watch_inputs, clock=STEADY)
         self._running = True
         self._comparison = BackgroundWorker("comparison", self._compare, self.settings.comparison_niceness)
@@ -292,8 +298,15 @@ class PredictorNode(ManagedNode):
             if self.transforms.unavailable or time.monotonic() - self._first_odometry > TRANSFORMS_PATIENCE:
                 self.health.report("odometry", ERROR, self.transforms.explained(error), reason="frame")
             return
+        if (before := self.inputs.frame_id) and frame_id != before:
+            self._frame_changes.append(time.monotonic())
         self.inputs.add_motion("odometry", state.of_base(pose), frame_id, child_frame_id)
         self._motion_arrival = time.monotonic()
+        recent = [change for change in self._frame_changes if time.monotonic() - change < self.settings.data_timeout]
+        if len(recent) > 1:
+            message = f"its frame changes between {before!r} and {frame_id!r}: do two nodes publish on the topic?"
+            self.health.report("odometry", ERROR, message, reason="frames")
+            return
         self.health.report("odometry", OK, "receiving odometry")
 
     def _on_command(self, message: Twist | TwistStamped) -> None:
@@ -496,6 +509,14 @@ class PredictorNode(ManagedNode):
         if self.candidates is None and self.ensemble is None:
             return
         dropped = self._comparison.dropped if self._comparison is not None else 0
+        behind = (self.inputs.motion_stamp - job.prediction.stamp) * NANOSECOND
+        if behind > _LATE:
+            message = (
+                f"candidates and ensemble are {behind:.1f} s behind the odometry: this computer is too slow for them; "
+                "fewer `candidates`, a lower `rate` or a shorter `horizon`"
+            )
+            self.health.report("comparison", WARN, message, reason="slow", skipped_predictions=dropped)
+            return
         self.health.report("comparison", OK, "candidates and ensemble are up to date", skipped_predictions=dropped)
 
     def _publish(self, name: str, data: bytes) -> None:

@@ -20,6 +20,8 @@ _MISSED = 0.5
 """A robot is said to stand only if the estimate excludes this share of the commanded motion."""
 _SMALLEST = 0.1
 """Smallest commanded motion that is judged [m, rad]."""
+_COMPARABLE = 0.5
+"""Share of the larger of the two commanded motions [m, rad] from which the smaller one alone may show motion."""
 _FEWEST = 6
 """Fewest poses that show motion: with fewer, their noise is unknown."""
 
@@ -70,10 +72,15 @@ class ProgressCheck:
         full = bool(time[-1] - time[0] > 0.8 * WINDOW)
         driving = _moved(along, np.array([x, y]), full=full)
         turning = _moved(turned, heading[None], full=full)
-        if driving or turning:
-            return True
-        # Of the two, the larger one is what the robot is commanded to do.
-        return driving if _length(along) >= _length(turned) else turning
+        # Of the two, the larger one is what the robot is commanded to do. The other counts only if it is hardly less: a
+        # tenth of a slight turn is the drift of a heading.
+        lengths = _length(along), _length(turned)
+        (larger, main), (smaller, other) = sorted(zip(lengths, (driving, turning), strict=True), key=_by_length)[::-1]
+        return True if other and smaller > _COMPARABLE * larger else main
+
+
+def _by_length(entry: tuple[float, bool | None]) -> float:
+    return entry[0]
 
 
 def _length(steps: np.ndarray) -> float:

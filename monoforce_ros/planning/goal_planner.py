@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,8 @@ from scipy.sparse.csgraph import dijkstra
 
 UNKNOWN, LETHAL = -1, 100
 """Values of unknown and of lethal cells in costmaps."""
+MAXIMUM_CELLS = 1_000_000
+"""Cells of a map that are searched as they are; larger maps are coarsened first."""
 _CELL = 0.2
 """Edge of the cells of the search [m]; smaller cells cost time and find the same path."""
 _LETHAL_FACTOR, _COSTLY_FACTOR, _UNKNOWN_FACTOR = 30.0, 2.0, 1.5
@@ -81,6 +84,9 @@ def cost_to_go(data: np.ndarray, resolution: float, origin: np.ndarray, goal: np
     """
     if data.size == 0 or data.ndim != 2:
         raise ValueError(f"costmap: got shape {data.shape}, expected rows and columns")
+    # The search takes 0.15 s for so many cells, and the robot waits for it.
+    if (pooled := math.ceil(math.sqrt(data.size / MAXIMUM_CELLS))) > 1:
+        data, resolution = _coarser(data, pooled), resolution * pooled
     lethal = data >= LETHAL
     distance = distance_transform_edt(~lethal) * resolution if lethal.any() else np.full(data.shape, np.inf)
     proximity = np.clip(1.0 - (distance - radius) / _MARGIN, 0.0, 1.0)

@@ -23,6 +23,8 @@ FIELDS = (
     *(f"{axis}_{share}" for share in WAYPOINTS for axis in "xy"),
 )
 """Required fields of the candidates."""
+MAXIMUM_COMMAND = 100.0
+"""Largest command of a candidate [m/s, rad/s]; larger ones are no robot's."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,8 @@ def select_candidate(
 ) -> int | None:
     """Index of the best feasible candidate; None without a feasible one.
 
+    Candidates with values that are not finite or commands above :data:`MAXIMUM_COMMAND` are left out.
+
     Args:
         candidates: :data:`FIELDS` and, of robots that move sideways, ``lateral_speed``, each ``[N]``; positions and
             headings in the odometry frame.
@@ -68,6 +72,15 @@ def select_candidate(
     missing = [name for name in FIELDS if name not in candidates]
     if missing:
         raise ValueError(f"candidates: fields {missing} are missing; got {sorted(candidates)}")
+    names = [*FIELDS, *(name for name in COMMAND_FIELDS if name in candidates and name not in FIELDS)]
+    finite = np.all([np.isfinite(candidates[name]) for name in names if name != "cost"], axis=0)
+    sane = np.all([np.abs(candidates[name]) <= MAXIMUM_COMMAND for name in names if name in COMMAND_FIELDS], axis=0)
+    usable = np.flatnonzero(finite & sane)
+    if len(usable) < len(finite):
+        # A diverged rollout has no place; its values would spoil the scores of all others.
+        rest = {name: values[usable] for name, values in candidates.items()}
+        found = select_candidate(rest, robot, goal, weights, cost_to_go, previous_command) if len(usable) else None
+        return None if found is None else int(usable[found])
     feasible = (candidates["feasible"] > 0.5) & np.isfinite(candidates["cost"])
     if not feasible.any():
         return None
