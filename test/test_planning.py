@@ -395,3 +395,20 @@ def test_large_maps_are_coarsened_before_they_are_searched():
     assert found.cost.size <= 1_000_000 and found.resolution >= 0.15
     # Around the wall, through the gap of 5 m at its end.
     assert 150.0 < float(found.at(np.array([[50.0, 75.0]]))[0]) < 180.0
+
+
+def test_a_robot_that_leans_beyond_a_limit_may_get_away(husky):
+    """A slope that turned out steeper than predicted must not hold the robot for ever."""
+    angle, limits = 0.35, Limits(pitch=0.3)
+    cos, sin = np.cos(angle), np.sin(angle)
+    heights = np.where(X < 1.2, np.tan(angle) * X, np.tan(angle) * 1.2 + np.tan(0.65) * (X - 1.2))
+    terrain = terrain_of(heights)
+    fan = np.array([[0.0, 0.0], [0.0, 0.4], [0.8, 0.0]])[:, None]
+    twists = torch.from_numpy(over_horizon(fan, np.zeros((0, 2)), STEPS)).float()
+    rotation = torch.tensor([[cos, 0.0, -sin], [0.0, 1.0, 0.0], [sin, 0.0, cos]]).float().expand(3, 3, 3)
+    place = torch.tensor([0.0, 0.0, husky.ground_clearance / cos]).float().expand(3, 3)
+    state = State(place, rotation, torch.zeros(3, 3), torch.zeros(3, 3))
+    result = rollout(terrain, husky, husky.drive_speeds(twists), state, options=PhysicsOptions(), with_contact=True)
+    found = assess(result, terrain, husky, twists, limits=limits)
+    assert float(found.terms["pitch"].min()) > 1.1, "all of them lean too far at the start"
+    assert found.feasible.tolist() == [True, True, False], "standing and turning lean no further, driving uphill does"

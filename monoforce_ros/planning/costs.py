@@ -75,6 +75,10 @@ def force_every(time_step: float) -> int:
     return max(1, round(_FORCE_INTERVAL / time_step))
 
 
+_FURTHER = 0.05
+"""Share of the limit by which a robot that leans beyond it may lean further for a moment, as it starts to move."""
+
+
 @dataclass(frozen=True)
 class Assessment:
     """Costs and feasibility of ``N`` candidates."""
@@ -134,9 +138,9 @@ def assess(
         raise ValueError(f"costs: got twists {tuple(twists.shape)}, expected {expected} for the rollout")
     weight = robot.mass * _GRAVITY
     step = rollout.force_every * float(rollout.times[1] - rollout.times[0])
-    rotation = rollout.rotation[:, 1:]
-    roll = torch.atan2(rotation[..., 2, 1], rotation[..., 2, 2]).abs().amax(dim=1)
-    pitch = torch.asin(rotation[..., 2, 0].clamp(-1.0, 1.0)).abs().amax(dim=1)
+    rolls = torch.atan2(rollout.rotation[..., 2, 1], rollout.rotation[..., 2, 2]).abs()
+    pitches = torch.asin(rollout.rotation[..., 2, 0].clamp(-1.0, 1.0)).abs()
+    roll, pitch = (angles[:, 1:].amax(dim=1) for angles in (rolls, pitches))
     load = _smoothed(contact.load.sum(dim=2), step)
     raw = {
         "roll": roll,
@@ -151,7 +155,10 @@ def assess(
     terms = {name: torch.nan_to_num(raw[name] / getattr(limits, name), nan=torch.inf) for name in TERMS}
     cost = sum(getattr(weights, name) * terms[name] for name in TERMS)
     cost = torch.where(rollout.valid, cost, torch.inf)
-    feasible = torch.stack([value <= 1.0 for value in terms.values()]).all(dim=0) & rollout.valid
+    # A robot that leans beyond a limit already has to get away: what does not tilt it further is feasible.
+    leans = {"roll": rolls[:, 0] / limits.roll, "pitch": pitches[:, 0] / limits.pitch}
+    most = {name: (leans[name] + _FURTHER).clamp_min(1.0) if name in leans else 1.0 for name in TERMS}
+    feasible = torch.stack([value <= most[name] for name, value in terms.items()]).all(dim=0) & rollout.valid
     return Assessment(terms, cost, feasible)
 
 
