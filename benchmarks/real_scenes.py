@@ -30,7 +30,7 @@ from monoforce_ros.training.judgement import BAND, CAMERAS, Judgement, judge, ju
 from monoforce_ros.training.losses import HIGHEST, LOWEST
 from monoforce_ros.training.recording_samples import RecordingSamples, read_samples
 from monoforce_ros.training.scene_samples import scene_samples
-from monoforce_ros.training.world_samples import CHOOSING_WORLD, FIRST_WORLD, world_samples
+from monoforce_ros.training.world_samples import CHOOSING_WORLD, REPLAY_WORLD, world_samples
 
 CHOOSING_WORLDS = 6
 """Worlds that choose how much of an adaptation is kept, as many as `train --adapt` takes by default."""
@@ -123,7 +123,7 @@ def main() -> None:
     rows = [(scene.name, "as shipped", judge(encoder, [scene])) for scene in scenes]
     drawn = [(scene, pictures(encoder, scene)) for scene in scenes]
     if options.adapt:
-        first = FIRST_WORLD
+        first = REPLAY_WORLD
         files = [world_samples(first + i, encoder.config, options.samples) for i in range(options.adapt)]
         replay = [read_samples(file) for file in files]
         files = [world_samples(CHOOSING_WORLD + i, encoder.config, options.samples) for i in range(CHOOSING_WORLDS)]

@@ -62,6 +62,7 @@ from monoforce_ros.training.world_samples import (
     HELD_OUT_WORLD,
     JUDGED_WORLD,
     PLACES,
+    REPLAY_WORLD,
     WORLD_STYLES,
     world_samples,
     world_settings,
@@ -115,7 +116,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--worlds", type=int, default=0, metavar="N", help="also train on N randomised worlds, with "
                         "the simulator's surfaces as targets (default: %(default)s)")  # fmt: skip
     parser.add_argument("--world-seed", type=int, default=FIRST_WORLD, metavar="SEED", help="of the first world "
-                        "(default: %(default)s)")  # fmt: skip
+                        f"(default: %(default)s; {REPLAY_WORLD} with --adapt, which the shipped encoder has not "
+                        "seen)")  # fmt: skip
     parser.add_argument("--places", type=int, default=PLACES, metavar="N", help="places in each world (default: "
                         "%(default)s)")  # fmt: skip
     parser.add_argument("--held-out-worlds", type=int, default=12, metavar="N", help="worlds to validate on where no "
@@ -324,7 +326,8 @@ def _adapt(options: argparse.Namespace) -> None:
     recordings = _samples(options.bags, robot, encoder.config, options, "samples")
     parts = [split_recording(recording) for recording in recordings]
     count = options.worlds or REPLAY_WORLDS
-    replay = _world_samples(range(options.world_seed, options.world_seed + count), encoder.config, options)
+    first = REPLAY_WORLD if options.world_seed == FIRST_WORLD else options.world_seed
+    replay = _world_samples(range(first, first + count), encoder.config, options)
     choosing, judging = (
         _world_samples(range(first, first + max(options.held_out_worlds // 2, 1)), encoder.config, options)
         for first in (CHOOSING_WORLD, JUDGED_WORLD)

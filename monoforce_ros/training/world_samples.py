@@ -32,6 +32,9 @@ from monoforce_ros.training.recording_samples import (
 
 FIRST_WORLD = 420_000
 """First seed of the worlds for training; docs/protocol.md lists the seeds of each purpose."""
+REPLAY_WORLD = 428_000
+"""First seed of the worlds that an adaptation trains on alongside: none that the shipped encoder was trained on. Of
+those it knows the obstacles by heart, so that they keep none of what it sees elsewhere (docs/training.md)."""
 HELD_OUT_WORLD, CHOOSING_WORLD, JUDGED_WORLD = 430_000, 434_000, 438_000
 """First seeds of the worlds that validate a training, choose how much of an adaptation is kept, and judge the latter.
 
