@@ -131,12 +131,15 @@ def in_mujoco(robot: str | Path, block: Block, speed: float) -> np.ndarray:
     return simulation.state().position
 
 
-def in_rollout(robot: RobotModel, block: Block, speed: float, resolution: float) -> np.ndarray:
-    """Final position ``[3]`` [m]."""
+def in_rollout(
+    robot: RobotModel, block: Block, speed: float, resolution: float, ahead: float | None = None
+) -> np.ndarray:
+    """Final position ``[3]`` [m], with the block ``ahead`` [m] (default: as :func:`distance` says)."""
+    ahead = distance(robot) if ahead is None else ahead
     twists = torch.tensor([speed, 0.0]).expand(1, round(SECONDS / STEP), 2)
     start = State.at_rest(robot.ground_clearance)
     result = rollout(
-        block.terrain(distance(robot), resolution), robot, drive_speeds(robot, twists, STEP), start, with_forces=False
+        block.terrain(ahead, resolution), robot, drive_speeds(robot, twists, STEP), start, with_forces=False
     )
     return result.position[0, -1].numpy() - np.array([0.0, 0.0, robot.ground_clearance])
 
