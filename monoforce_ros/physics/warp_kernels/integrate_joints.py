@@ -24,8 +24,9 @@ def integrate_joints_kernel(double: bool, differentiable: bool, soft: bool) -> A
     exponential, gains_of, upper_block, lower_block, solved, Blocks = (
         rigid.exponential, rigid.gains_of, rigid.upper_block, rigid.lower_block, rigid.solved, rigid.Blocks
     )  # fmt: skip
-    pose_links, load_at, find_limits, couple, clear, solve, Work = (
-        moving.pose_links, moving.load_at, moving.find_limits, moving.couple, moving.clear, moving.solve, moving.Work
+    pose_links, load_coordinates, find_limits, couple, clear, solve, Work = (
+        moving.pose_links, moving.load_coordinates, moving.find_limits, moving.couple, moving.clear, moving.solve,
+        moving.Work,
     )  # fmt: skip
     scalar, vec3 = t.scalar, t.vec3
     Ground, Body, Robots, States, Options = t.Ground, t.Body, t.Robots, t.States, t.Options
@@ -153,15 +154,7 @@ def integrate_joints_kernel(double: bool, differentiable: bool, soft: bool) -> A
                     find_limits(joints, robots, states, links, work, b, step, thread, slot, weight, h)
                 # The search may have ended with the solution; an adjoint needs the steps to it.
                 if joints.limited == 0 or keep == 1 or work.values[thread, slot, size, 5] == scalar(1.0):
-                    for entry in range(joints.number + drives):
-                        k = joints.coordinates[entry]
-                        if k >= 0:
-                            limited = work.values[thread, slot, k, 5]
-                            found = load_at(
-                                joints, robots, states, links, b, step, thread, slot, entry, limited, weight, h
-                            )  # fmt: skip
-                            work.values[thread, slot, k, 0] = h * (found[0] + work.values[thread, slot, k, 2])
-                            work.values[thread, slot, k, 1] = joints.parameters[entry, 0] + h * found[1]
+                    load_coordinates(joints, robots, states, links, work, b, step, thread, slot, weight, h)
                     solve(joints, work, thread, slot, h)
                 new_linear = state.linear + vec3(
                     work.values[thread, slot, size, 4],

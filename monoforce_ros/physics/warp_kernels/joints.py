@@ -26,7 +26,7 @@ class JointFunctions:
     """Device functions and structs of one precision."""
 
     pose_links: Any
-    load_at: Any
+    load_coordinates: Any
     find_limits: Any
     couple: Any
     clear: Any
@@ -379,6 +379,29 @@ def joint_functions(double: bool) -> JointFunctions:
                         work.values_gradient[thread, slot, i, 1] = work.values_gradient[thread, slot, i, 1] + gradient
 
     @wp.func
+    def load_coordinates(
+        joints: Joints,
+        robots: Robots,
+        states: States,
+        links: Links,
+        work: Work,
+        b: int,
+        step: int,
+        thread: int,
+        slot: int,
+        weight: vec3,
+        h: scalar,
+    ):
+        # Right sides and diagonals of the coordinates in the system, with the servos that are known to be limited.
+        for entry in range(joints.number + robots.speeds.shape[2]):
+            k = joints.coordinates[entry]
+            if k >= 0:
+                limited = work.values[thread, slot, k, 5]
+                found = load_at(joints, robots, states, links, b, step, thread, slot, entry, limited, weight, h)
+                work.values[thread, slot, k, 0] = h * (found[0] + work.values[thread, slot, k, 2])
+                work.values[thread, slot, k, 1] = joints.parameters[entry, 0] + h * found[1]
+
+    @wp.func
     def find_limits(
         joints: Joints,
         robots: Robots,
@@ -398,15 +421,7 @@ def joint_functions(double: bool) -> JointFunctions:
         work.values[thread, slot, joints.size, 5] = scalar(1.0)
         for _round in range(ROUNDS):
             if work.values[thread, slot, joints.size, 5] == scalar(1.0):
-                for entry in range(joints.number + drives):
-                    k = joints.coordinates[entry]
-                    if k >= 0:
-                        known = work.values[thread, slot, k, 5]
-                        found = load_at(
-                            joints, robots, states, links, b, step, thread, slot, entry, known, weight, h
-                        )  # fmt: skip
-                        work.values[thread, slot, k, 0] = h * (found[0] + work.values[thread, slot, k, 2])
-                        work.values[thread, slot, k, 1] = joints.parameters[entry, 0] + h * found[1]
+                load_coordinates(joints, robots, states, links, work, b, step, thread, slot, weight, h)
                 solve(joints, work, thread, slot, h)
                 work.values[thread, slot, joints.size, 5] = scalar(0.0)
                 for entry in range(joints.number + drives):
@@ -515,4 +530,4 @@ def joint_functions(double: bool) -> JointFunctions:
     ):
         pass
 
-    return JointFunctions(pose_links, load_at, find_limits, couple, clear, solve, Work)
+    return JointFunctions(pose_links, load_coordinates, find_limits, couple, clear, solve, Work)
