@@ -129,6 +129,10 @@ def test_what_is_for_a_node_of_another_name_is_refused(words, right):
         ),
         ("path_selector --ros-args -p max_sped:=1.0", "unknown parameter 'max_sped'; --help lists all parameters"),
         ("predictor --ros-args -p odometry_topic:=odom!", "got 'odom!', expected a topic such as '/odom': topic name"),
+        (
+            "path_selector --ros-args --params-file {overridden}",
+            "/** sets timeout to 2.0 after /path_selector set it to",
+        ),
         ("path_selector --ros-args --params-file {repeated}", "has '/**' twice, again in line 4: merge both into one"),
         ("simulator --fat", "unrecognized arguments: --fat; did you mean '--flat'?"),
         ("bag_player --rte 3", "unrecognized arguments: --rte; did you mean '--rate'?"),
@@ -143,11 +147,12 @@ def test_what_is_for_a_node_of_another_name_is_refused(words, right):
     ],
 )
 def test_a_wrong_command_line_ends_the_start_in_one_line(executables, ros_environment, tmp_path, command, message):
-    files = {name: tmp_path / f"{name}.yaml" for name in ("misnamed", "beside", "repeated")}
+    files = {name: tmp_path / f"{name}.yaml" for name in ("misnamed", "beside", "repeated", "overridden")}
     section = "ros__parameters:\n    timeout: 1.0\n"
     files["misnamed"].write_text(f"path_selector:\n  {section}path_selectr:\n  {section}")
     files["beside"].write_text(f"/**:\n  timeout: 2.0\n  {section}")
     files["repeated"].write_text(2 * f"/**:\n  {section}")
+    files["overridden"].write_text(f"path_selector:\n  {section}/**:\n  {section.replace('1.0', '2.0')}")
     schema = ROOT / "config" / "predictor.schema.yaml"
     filled = command.format(schema=schema, out=tmp_path / "bag", **files)
     name, *words = filled.split()

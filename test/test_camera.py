@@ -51,6 +51,7 @@ def test_a_resized_image_keeps_its_rays():
         ({"distortion": np.zeros(3)}, "expected 0, 4, 5, 8, 12 or 14"),
         ({"distortion_model": "wide"}, "got 'wide'"),
         ({"width": 0}, "expected at least one pixel"),
+        ({"distortion_model": "equidistant", "distortion": np.full(5, 0.01)}, "'equidistant', expected 4 coefficients"),
         ({"matrix": np.full((3, 3), np.nan)}, "finite"),
     ],
 )
@@ -58,3 +59,34 @@ def test_invalid_calibrations_are_refused(change, message):
     fields = {"width": 640, "height": 480, "matrix": MATRIX, "distortion": np.zeros(5)} | change
     with pytest.raises(ValueError, match=message):
         CameraModel(**fields)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"distortion": np.array([1e6, 0.0, 0.0, 0.0, 0.0])}, "a lens would show only"),
+        # Coefficients of a fisheye, read as those of a pinhole with distortion.
+        ({"distortion": np.array([-4.0, 9.0, 0.0, 0.0, -12.0])}, "a lens would show only"),
+        ({"distortion_model": "equidistant", "distortion": np.array([-5.0, 3.0, 0.0, 0.0])}, "a lens would show only"),
+        ({"matrix": np.array([[400.0, 0, 1e5], [0, 400.0, 240], [0, 0, 1]])}, "principal point"),
+    ],
+)
+def test_calibrations_of_no_lens_are_refused(change, message):
+    fields = {"width": 640, "height": 480, "matrix": MATRIX, "distortion": np.zeros(5)} | change
+    with pytest.raises(ValueError, match=message):
+        CameraModel(**fields).check()
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_calibrations_of_lenses_pass(lens):
+    model = camera(lens)
+    model.check()
+    # A crop beside the optical axis, and one far finer.
+    beside = model.matrix + np.array([[0, 0, 900.0], [0, 0, 0], [0, 0, 0]])
+    CameraModel(model.width, model.height, beside, np.zeros(0)).check()
+    model.resized(4 * model.width, 4 * model.height).check()
+
+
+def test_coefficients_of_a_fisheye_may_be_padded_with_zeros():
+    padded = CameraModel(640, 480, MATRIX, np.array([-0.02, 0.003, 0.0, 0.0, 0.0]), "equidistant")
+    padded.check()

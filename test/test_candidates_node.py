@@ -223,3 +223,33 @@ def test_candidates_of_a_planner_are_compared_and_refined(peer, start):
     terms = np.array(message.terms).reshape(count, len(message.term_names))
     assert "roll" in message.term_names and np.isfinite(terms).all() and len(message.costs) == count
     assert message.best == int(np.argmin(np.where(message.feasible, message.costs, np.inf)))
+
+
+def test_candidates_that_come_too_late_are_reported(peer, start):
+    """A bag played ten times as fast asks ten times as much of the computer; path_selector would stop the robot."""
+    names = ("-r", "__ns:=/late", "-p", "odometry_topic:=/late/odom", "-p", "command_topic:=/late/cmd_vel")
+    sizes = ("-p", "candidates:=400", "-p", "horizon:=5.0", "-p", "terrain_source:=flat")
+    process = start("predictor", "--ros-args", *names, *sizes)
+    process.wait_for("predicting 5 s ahead")
+
+    def status() -> tuple[int, str]:
+        for array in reversed(peer.received["/diagnostics"]):
+            for entry in array.status:
+                if entry.name == "late/predictor: comparison":
+                    return int.from_bytes(entry.level, "little"), entry.message
+        return -1, ""
+
+    def live(pace: int, until) -> bool:
+        for _ in range(400):
+            peer.now += pace * 50_000_000
+            message = builders.odometry(peer.now, "odom", "base_link", [1.0, 2.0, 0.3], [0, 0, 0, 1], [0] * 3, [0] * 3)
+            peer.publish("/late/odom", message)
+            peer.spin(0.05)
+            if until():
+                return True
+        return False
+
+    assert live(20, lambda: status()[0] == 1 and "behind the odometry: this computer is too slow" in status()[1]), (
+        status()
+    )
+    assert process.stop() == 0

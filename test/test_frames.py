@@ -36,6 +36,13 @@ def test_a_path_is_found_up_and_down_the_tree(tree):
     assert tree.find("base_link", "moon") is None and tree.find("base_link", "nowhere") is None
 
 
+def test_the_transforms_of_a_path_are_named(tree):
+    edges = [("odom", "base_footprint"), ("base_footprint", "base_link"), ("base_link", "lidar")]
+    assert tree.path("odom", "lidar") == edges and tree.path("lidar", "/odom") == edges[::-1]
+    assert tree.path("lidar", "nowhere") == tree.path("odom", "moon") == []
+    assert tree.path("lidar", "lidar") == []
+
+
 def test_a_missing_path_says_where_it_breaks(tree):
     found = tree.missing_path("base_link", "moon")
     assert found.startswith("'base_link' is connected with base_footprint, lidar, odom, and 'moon' with earth")

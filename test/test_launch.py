@@ -57,6 +57,17 @@ def test_one_file_serves_both_nodes(file):
     }  # fmt: skip
 
 
+def test_a_general_section_comes_before_that_of_one_node(file):
+    general = "/**:\n  ros__parameters:\n    rate: 4.0\n    robot: marv\n"
+    own = "predictor:\n  ros__parameters:\n    rate: 7.0\n"
+    (plan,) = plan_nodes({"params_file": file(general + own)})
+    assert plan.parameters == {"rate": 7.0, "robot": "marv"}
+    with pytest.raises(ValueError, match=r"/\*\* sets rate to 4.0 after /predictor set it to 7.0, and ROS takes the"):
+        plan_nodes({"params_file": file(own + general)})
+    # Where both say the same, the order does not matter.
+    assert plan_nodes({"params_file": file(own.replace("7.0", "4.0") + general)})
+
+
 @pytest.mark.parametrize("key", ["path_selector", "/left/path_selector"])
 def test_parameters_for_a_node_that_is_not_started_are_mentioned(file, key):
     section = f"{key}:\n  ros__parameters:\n    timeout: 2.0\n"

@@ -38,18 +38,19 @@ class Robot:
         self.transforms: dict = {}
         self.place, self.heading, self.speed = np.zeros(2), 0.0, 0.0
         self.child, self.frame, self.odometry_frame = "base_link", "odom", "odom"
+        self.origin = np.zeros(2)
         self.commands: list = []
         self.base = None
         self.obeys = False
         self.travelled = 0.0
 
-    def listen(self, kind: type) -> None:
+    def listen(self, kind: type, quality: QoSProfile = BEST_EFFORT) -> None:
         """Become a base that listens to one type of command."""
         node = self.peer.node
         if self.base is not None:
             node.destroy_subscription(self.base)
         self.commands.clear()
-        self.base = node.create_subscription(kind, f"/{self.prefix}/cmd_vel", self.commands.append, BEST_EFFORT)
+        self.base = node.create_subscription(kind, f"/{self.prefix}/cmd_vel", self.commands.append, quality)
 
     def send_goal(self, x: float, y: float, frame: str = "odom", stamp: int = 0) -> None:
         assert self.peer.until(lambda: self.goals.get_subscription_count() > 1, 10.0)
@@ -74,7 +75,7 @@ class Robot:
             if odometry:
                 turn = [0, 0, np.sin(self.heading / 2), np.cos(self.heading / 2)]
                 message = builders.odometry(
-                    stamp, self.odometry_frame, self.child, [*self.place, 0], turn, [0] * 3, [0] * 3
+                    stamp, self.odometry_frame, self.child, [*(self.place + self.origin), 0], turn, [0] * 3, [0] * 3
                 )
                 self.odometry.publish(bytes(type_store().serialize_cdr(message, message.__msgtype__)))
             if candidates and step % 4 == 0:
@@ -322,6 +323,93 @@ def test_commands_that_nobody_hears_are_no_drive(robot):
     assert "driving" not in robot.process.output
 
 
+def test_a_base_that_the_commands_do_not_reach_is_no_listener(robot):
+    """A latched subscription gets nothing from a publisher of commands, which are never latched."""
+    robot.listen(TwistStamped, QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+    robot.send_goal(50.0, 0.0)
+    assert robot.live(10.0, until=robot.says("asks for a quality of service that is not offered (/peer: ")), (
+        robot.status()
+    )
+    assert "driving" not in robot.process.output and "odometry shows no motion" not in robot.process.output
+    robot.listen(TwistStamped)
+    assert robot.live(10.0, until=lambda: robot.driven), robot.status()
+
+
+def test_other_drivers_on_the_same_topic_are_named(robot):
+    robot.listen(TwistStamped)
+    joystick = rclpy.create_node("joystick", namespace=f"/{robot.prefix}", context=robot.peer.node.context)
+    joystick.create_publisher(TwistStamped, "cmd_vel", 1)
+    robot.send_goal(50.0, 0.0)
+    named = f"/{robot.prefix}/cmd_vel is also published by /{robot.prefix}/joystick"
+    assert robot.live(10.0, until=lambda: named in robot.process.output), robot.process.output
+    joystick.destroy_node()
+
+
+def test_a_robot_that_moves_against_its_commands_is_stopped_and_its_goal_dropped(robot):
+    """With a wrong sign the robot would run away from its goal, ever faster."""
+    robot.listen(TwistStamped)
+    robot.send_goal(50.0, 0.0)
+    assert robot.live(10.0, until=lambda: robot.driven), robot.status()
+    robot.speed = -0.5
+    assert robot.live(10.0, until=robot.says("the goal is dropped and the robot stopped: it moves against")), (
+        robot.status()
+    )
+    robot.live(1.5)
+    robot.commands.clear()
+    robot.live(1.0)
+    assert not robot.commands, "it is commanded although its goal was dropped"
+
+
+def test_several_commands_to_stand_follow_the_last_one_that_moves(robot):
+    """A base with a best-effort subscription may miss one, and hold its last command."""
+    robot.listen(TwistStamped)
+    robot.send_goal(50.0, 0.0)
+    assert robot.live(10.0, until=lambda: robot.driven), robot.status()
+    robot.commands.clear()
+    robot.send_goal(*robot.place)
+    assert robot.live(10.0, until=robot.says("the goal is reached")), robot.status()
+    robot.live(1.5)
+    still = [command for command in robot.commands if command.twist.linear.x == 0.0]
+    assert len(still) >= 4 and robot.commands[-1].twist.linear.x == 0.0
+    robot.commands.clear()
+    robot.live(1.0)
+    assert not robot.commands
+
+
+def test_far_from_the_origin_of_odometry_candidates_are_too_coarse(robot):
+    """In UTM coordinates the 32-bit numbers of a cloud are half a metre apart."""
+    robot.origin = np.array([443_000.0, 5_540_000.0])
+    robot.listen(TwistStamped)
+    robot.send_goal(443_050.0, 5_540_000.0)
+    assert robot.live(10.0, until=robot.says("odometry is 5540 km from the origin of 'odom'")), robot.status()
+    assert not robot.driven
+
+
+def test_a_transform_that_is_not_sent_any_more_is_named(robot):
+    robot.listen(TwistStamped)
+    robot.obeys = True
+    robot.send_goal(50.0, 0.0, frame="map_9")
+    robot.send_transform("map_9", "odom", [0.0] * 6)
+    assert robot.live(10.0, until=robot.says("driving to the goal")), robot.status()
+    silent = "driving on an old transform: map_9 → odom has not been sent for"
+    assert robot.live(10.0, until=robot.says(silent)), robot.status()
+    assert robot.status()[0] == WARN
+    robot.send_transform("map_9", "odom", [0.0] * 6)
+    assert robot.live(5.0, until=robot.says("driving to the goal")), robot.status()
+
+
+@pytest.mark.parametrize("robot", ["plan_topic:=plan"], indirect=True)
+def test_the_point_of_a_plan_that_is_not_finite_is_named(robot):
+    plans = robot.peer.node.create_publisher(Path, f"/{robot.prefix}/plan", 1)
+    assert robot.peer.until(lambda: plans.get_subscription_count() > 0, 10.0)
+    plan = Path()
+    plan.header.frame_id = "odom"
+    plan.poses = [PoseStamped() for _ in range(5)]
+    plan.poses[2].pose.position.y = float("nan")
+    plans.publish(plan)
+    assert robot.live(5.0, until=robot.says("the plan is not finite at point 3 of 5 (0, nan, 0)")), robot.status()
+
+
 @pytest.mark.parametrize("robot", ["command_type:=twist"], indirect=True)
 def test_a_fixed_type_that_the_base_does_not_expect_is_named(robot):
     robot.listen(TwistStamped)
@@ -528,6 +616,32 @@ def test_progress_is_what_odometry_shows_of_the_commanded_motion(speed, moving):
     for step in range(30, 60):
         check.add(0.1 * step, (0.0, 0.6), np.zeros(2), 0.1 * step * 0.4)
     assert check.moving, "turning on the spot is motion"
+
+
+def against(speed: float, yaw_rate: float, share: float, *, seconds: float = 4.0, turns: float = 0.0) -> set[str]:
+    """What ProgressCheck says of a robot that carries out a share of its command, which may change its sign."""
+    check, random, said = ProgressCheck(), np.random.default_rng(2), set()
+    place, heading, actual = np.zeros(2), 0.0, np.zeros(2)
+    for step in range(round(20 * seconds)):
+        sign = -1.0 if turns and (0.05 * step) % (2 * turns) >= turns else 1.0
+        # The base follows with a lag of 0.5 s.
+        actual += 0.1 * (sign * share * np.array([speed, yaw_rate]) - actual)
+        place = place + 0.05 * actual[0] * np.array([np.cos(heading), np.sin(heading)])
+        heading += 0.05 * actual[1]
+        measured = place + 0.02 * random.standard_normal(2)
+        check.add(0.05 * step, (sign * speed, sign * yaw_rate), measured, heading + 0.01 * random.standard_normal())
+        said.add(check.opposed)
+    return said - {""}
+
+
+def test_motion_against_the_command_is_found_and_nothing_else_is_taken_for_it():
+    assert against(0.5, 0.0, -1.0) == {"speed"} and against(-0.5, 0.0, -0.8) == {"speed"}
+    assert against(0.0, 0.6, -1.0) == {"yaw rate"} and against(0.5, 0.5, -0.9) == {"speed"}
+    # Slow, stuck, and sliding back a little; and changes of direction, after which the base still moves the other way.
+    for share in (1.0, 0.3, 0.0, -0.2):
+        assert not against(0.5, 0.5, share)
+    for turns in (0.5, 1.0, 2.0, 3.0):
+        assert not against(0.5, 0.6, 1.0, seconds=12.0, turns=turns)
 
 
 @pytest.mark.parametrize(("yaw_rate", "drift"), [(0.02, 0.003), (0.05, 0.01), (0.17, 0.02)])

@@ -11,9 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from monoforce_ros.core import MotionState
 from monoforce_ros.perception import SOURCES, FlatTerrain, Observation, choose_terrain_source
+from monoforce_ros.perception.clearance import clear_of_robot, with_clear_start
 from monoforce_ros.perception.encoder_terrain import encoder_threads
 from monoforce_ros.perception.fusion import apply_compliance
-from monoforce_ros.perception.ground_alignment import align_to_ground, clear_footprint
+from monoforce_ros.perception.ground_alignment import align_to_ground
 from monoforce_ros.physics import State, rollout
 from monoforce_ros.prediction import Predictor, start_states
 from monoforce_ros.robots import load_robot
@@ -68,7 +69,7 @@ def test_a_wall_just_ahead_does_not_reach_into_the_robot():
     still = MotionState(0, np.zeros(3), Rotation.from_euler("z", 0.7).as_matrix(), np.zeros(3), np.zeros(3))
     predictor = Predictor(robot, choose_terrain_source("lidar", robot), horizon=1.0)
     seen = predictor.source.terrain(Observation(0, sweep(0.62)), still)
-    terrain = clear_footprint(seen, robot, still)
+    terrain = clear_of_robot(seen, robot, still)
     twists = np.zeros((1, len(predictor.command_stamps(0)), 2))
 
     def pushed(terrain, twists):
@@ -82,20 +83,14 @@ def test_a_wall_just_ahead_does_not_reach_into_the_robot():
     assert pushed(terrain, twists + np.array([0.5, 0.0]))[-1] < 0.25
 
 
-def test_only_cells_that_reach_into_the_hull_are_lowered():
-    robot, grid = load_robot("husky"), Grid.square(6.4, 0.1)
-    tilted = MotionState(0, np.zeros(3), Rotation.from_euler("yx", [0.2, 0.1]).as_matrix(), np.zeros(3), np.zeros(3))
-    x, y = np.meshgrid(grid.x, grid.y)
-    high = TerrainMap.from_height(torch.ones(grid.rows, grid.columns), grid)
-    cleared = clear_footprint(high, robot, tilted).height.numpy()
-    hull = tilted.rotation @ [0.3, 0.1, 0.0]
-    row, column, _ = grid.cells(hull[None, :2])
-    assert cleared[row[0], column[0]] == pytest.approx(hull[2], abs=0.03)
-    assert (cleared[(np.abs(x) > 0.65) | (np.abs(y) > 0.5)] == 1.0).all()
-    low = TerrainMap.from_height(torch.full((grid.rows, grid.columns), -0.5), grid)
-    assert clear_footprint(low, robot, tilted) is low
-    on_its_side = MotionState(0, np.zeros(3), Rotation.from_euler("x", np.pi / 2).as_matrix(), *np.zeros((2, 3)))
-    assert clear_footprint(high, robot, on_its_side) is high
+def test_the_map_of_a_prediction_is_the_one_that_it_was_made_on():
+    robot = load_robot("husky")
+    still = MotionState(0, np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3))
+    predictor = Predictor(robot, choose_terrain_source("lidar", robot), horizon=1.0)
+    observation, twists = Observation(0, sweep(0.62)), np.zeros((len(predictor.command_stamps(0)), 2))
+    seen, made = predictor.source.terrain(observation, still), predictor.predict(observation, still, twists)
+    assert not torch.equal(made.terrain.height, seen.height)
+    assert torch.equal(made.terrain.height, with_clear_start(seen, robot, start_states([still])).height)
 
 
 def test_a_predicted_map_meets_the_wheels_and_is_unchanged_elsewhere():

@@ -1,14 +1,17 @@
 """A robot that a map shows inside an obstacle is not thrown out of it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from monoforce_ros.core import MotionState
 from monoforce_ros.perception import FlatTerrain
+from monoforce_ros.perception.clearance import with_clear_start
 from monoforce_ros.physics import State
-from monoforce_ros.prediction import Predictor
-from monoforce_ros.prediction.start_clearance import with_clear_start
+from monoforce_ros.prediction import Predictor, start_states
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap
 
@@ -78,3 +81,21 @@ def test_each_map_of_a_batch_is_cleared_for_its_own_robot():
     cleared = with_clear_start(TerrainMap.stack(walls), robot, state)
     alone = with_clear_start(walls[0], robot, State.at_rest(0.0))
     assert torch.equal(cleared.height[0], alone.height) and torch.equal(cleared.height[1], walls[1].height)
+
+
+def test_every_cell_under_a_tilted_robot_is_lowered_to_it_and_no_other():
+    robot, grid = load_robot("husky"), Grid.square(6.4, 0.1)
+    tilt = Rotation.from_euler("yx", [0.2, 0.1]).as_matrix()
+    state = start_states([MotionState(0, np.zeros(3), tilt, np.zeros(3), np.zeros(3))])
+    x, y = np.meshgrid(grid.x, grid.y)
+    high = TerrainMap.from_height(torch.ones(grid.rows, grid.columns), grid)
+    cleared = with_clear_start(high, robot, state).height.numpy()
+    assert (cleared[(np.abs(x) < 0.4) & (np.abs(y) < 0.25)] < 0.2).all()
+    assert (cleared[(np.abs(x) > 0.65) | (np.abs(y) > 0.5)] == 1.0).all()
+    low = TerrainMap.from_height(torch.full((grid.rows, grid.columns), -0.5), grid)
+    assert with_clear_start(low, robot, state) is low
+    # Among rigid things, what was only interpolated beside the robot is lowered, too.
+    nothing = torch.zeros_like(high.observed)
+    unseen = with_clear_start(replace(high, observed=nothing), robot, state, rigid=True).height.numpy()
+    assert (unseen <= cleared).all() and (unseen < 1.0).sum() > (cleared < 1.0).sum()
+    assert (unseen[(np.abs(x) > 0.75) | (np.abs(y) > 0.6)] == 1.0).all()

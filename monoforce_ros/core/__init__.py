@@ -19,6 +19,7 @@ from monoforce_ros.core.regimes import FAST_SHARE, motion_regimes
 from monoforce_ros.core.shared_files import share_directory
 from monoforce_ros.core.statistics import huber
 from monoforce_ros.core.tracks import (
+    LARGEST_COMMAND,
     NANOSECOND,
     AngularVelocityTrack,
     CommandTrack,
@@ -31,6 +32,7 @@ from monoforce_ros.core.transform_history import PoseHistory, TransformHistory
 
 __all__ = [
     "FAST_SHARE",
+    "LARGEST_COMMAND",
     "NANOSECOND",
     "AngularVelocityTrack",
     "CameraModel",

@@ -8,6 +8,16 @@ import cv2
 import numpy as np
 
 DISTORTION_MODELS = ("plumb_bob", "rational_polynomial", "equidistant")
+_MOST_OBLIQUE = np.tan(np.radians(80.0))
+"""Slope of a ray that a perspective image without fisheye can begin at: beyond it a pixel spans several degrees."""
+_SAME_PIXEL = 2.0
+"""Largest distance [px] between a pixel and the projection of its own ray."""
+_MOST_DISTORTED = 10.0
+"""Largest factor by which distortion may move a pixel away from the centre or towards it: at half of a field of view of
+160°, a perspective image is 4 times as far from its centre as that of an equidistant lens."""
+_CONSISTENT = 0.5
+"""Smallest share of the image in which pixels and rays have to agree: calibrations fit the centre, and a polynomial may
+fold in the corners of a wide lens."""
 
 
 @dataclass(frozen=True)
@@ -43,11 +53,53 @@ class CameraModel:
             raise ValueError(
                 f"distortion: got {self.distortion.tolist()}, expected 0, 4, 5, 8, 12 or 14 finite coefficients"
             )
+        # Some drivers pad the four coefficients with zeros.
+        if self.distortion_model == "equidistant" and np.any(self.distortion[4:] != 0.0):
+            raise ValueError(
+                f"distortion: got {self.distortion.tolist()} with distortion model 'equidistant', expected 4 "
+                "coefficients: are they of another model?"
+            )
 
     @property
     def is_distorted(self) -> bool:
         """Whether any distortion coefficient differs from zero."""
         return bool(np.any(self.distortion != 0.0))
+
+    def check(self) -> None:
+        """Raise ``ValueError`` if no lens has these values.
+
+        A camera looks along its optical axis; where pixels have rays, the rays have these pixels; and distortion moves
+        pixels by less than an order of magnitude.
+        """
+        u, v = np.meshgrid(*(np.linspace(0.0, size - 1.0, 9) for size in (self.width, self.height)))
+        pixels = np.stack([u.ravel(), v.ravel()], axis=1)
+        centre = self.matrix[:2, 2]
+        if self.distortion_model != "equidistant":
+            outside = np.maximum(0.0, np.maximum(-centre, centre - [self.width - 1.0, self.height - 1.0]))
+            if (slope := float(np.linalg.norm(outside / self.matrix[[0, 1], [0, 1]]))) > _MOST_OBLIQUE:
+                raise ValueError(
+                    f"camera matrix: got the principal point ({centre[0]:g}, {centre[1]:g}) px of an image of "
+                    f"{self.width} × {self.height} px, expected one in the image or near it: the whole image would lie "
+                    f"more than {np.degrees(np.arctan(slope)):.0f}° beside the optical axis"
+                )
+        with np.errstate(all="ignore"):
+            rays = self.rays(pixels)
+            seen = np.isfinite(rays).all(axis=1) & (np.abs(rays) < 1e6).all(axis=1)
+            back = np.full(pixels.shape, np.inf)
+            if seen.any():
+                back[seen] = self._projected(rays[seen])
+            straight = np.linalg.norm((pixels - centre) / self.matrix[[0, 1], [0, 1]], axis=1)
+            bent = np.linalg.norm(rays[:, :2], axis=1)
+            bent = np.arctan(bent) if self.distortion_model == "equidistant" else bent
+            factor = np.maximum(straight, 1e-9) / np.maximum(bent, 1e-9)
+            alike = (factor < _MOST_DISTORTED) & (factor > 1.0 / _MOST_DISTORTED)
+            agree = float((alike & (np.linalg.norm(back - pixels, axis=1) < _SAME_PIXEL)).mean())
+        if agree < _CONSISTENT:
+            raise ValueError(
+                f"distortion: got {self.distortion.tolist()}, with which a lens would show only {100 * agree:.0f} % of "
+                f"the image, expected at least {100 * _CONSISTENT:.0f} %: are the coefficients of another model "
+                f"than {self.distortion_model!r}, or of another image size?"
+            )
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pixels of points in the camera frame.
@@ -65,14 +117,7 @@ class CameraModel:
         # angle of the image's corners are projected.
         visible = (points[:, 2] > 0.05) & (self._slope(points) <= self._corner_slope() * 1.05)
         if visible.any():
-            zero = np.zeros(3)
-            if self.distortion_model == "equidistant":
-                projected, _ = cv2.fisheye.projectPoints(
-                    points[visible][:, None], zero, zero, self.matrix, self._fisheye()
-                )
-            else:
-                projected, _ = cv2.projectPoints(points[visible][:, None], zero, zero, self.matrix, self.distortion)
-            pixels[visible] = projected.reshape(-1, 2)
+            pixels[visible] = self._projected(points[visible])
         inside = (pixels >= -0.5).all(axis=1) & (pixels[:, 0] < self.width - 0.5) & (pixels[:, 1] < self.height - 0.5)
         pixels[~inside] = np.nan
         return pixels, inside
@@ -107,6 +152,15 @@ class CameraModel:
         matrix[1, 1] *= scale[1]
         matrix[:2, 2] = (matrix[:2, 2] + 0.5) * scale - 0.5
         return CameraModel(width, height, matrix, self.distortion, self.distortion_model, self.frame_id)
+
+    def _projected(self, points: np.ndarray) -> np.ndarray:
+        """Pixels ``[n, 2]`` of points ``[n, 3]`` in front of the camera."""
+        zero = np.zeros(3)
+        if self.distortion_model == "equidistant":
+            projected, _ = cv2.fisheye.projectPoints(points[:, None], zero, zero, self.matrix, self._fisheye())
+        else:
+            projected, _ = cv2.projectPoints(points[:, None], zero, zero, self.matrix, self.distortion)
+        return projected.reshape(-1, 2)
 
     def _fisheye(self) -> np.ndarray:
         return self.distortion[:4] if self.distortion.size else np.zeros(4)

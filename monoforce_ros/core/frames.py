@@ -45,6 +45,26 @@ class TransformTree:
         target, source, without = (name.lstrip("/") for name in (target, source, without))
         return self._reached(target, source, without).get(source)
 
+    def path(self, target: str, source: str) -> list[tuple[str, str]]:
+        """The transforms, as (parent, child), that :meth:`find` composes; empty if there are none."""
+        target, source = target.lstrip("/"), source.lstrip("/")
+        came_from: dict[str, tuple[str, bool]] = {}
+        frontier = [target]
+        while frontier and source not in came_from:
+            following = []
+            for frame in frontier:
+                for neighbour, (_, downwards) in list(self._neighbours.get(frame, {}).items()):
+                    if neighbour not in came_from and neighbour != target:
+                        came_from[neighbour] = frame, downwards
+                        following.append(neighbour)
+            frontier = following
+        edges, frame = [], source
+        while frame in came_from:
+            before, downwards = came_from[frame]
+            edges.append((before, frame) if downwards else (frame, before))
+            frame = before
+        return edges[::-1]
+
     def descends(self, frame: str, ancestor: str) -> bool:
         """Whether a frame is a child of another one, or a child of its children."""
         known, frontier = {ancestor.lstrip("/")}, [ancestor.lstrip("/")]

@@ -10,6 +10,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from monoforce_ros.core.geometry import homogeneous
 
 NANOSECOND = 1e-9
+LARGEST_COMMAND = 100.0
+"""Larger commands are no robot's and are refused [m/s, rad/s]."""
 
 
 class StaleDataError(ValueError):
@@ -35,6 +37,11 @@ class MotionState:
     def heading(self) -> float:
         """Yaw of the base's x axis [rad]."""
         return float(np.arctan2(self.rotation[1, 0], self.rotation[0, 0]))
+
+    @property
+    def rounding(self) -> float:
+        """Distance of 32-bit numbers, as clouds hold them, at the position [m]."""
+        return float(np.spacing(np.float32(np.abs(self.position).max())))
 
     def onwards(self, seconds: float) -> MotionState:
         """The state extrapolated at constant velocities in base axes, stamp unchanged; itself if ``seconds`` ≤ 0."""

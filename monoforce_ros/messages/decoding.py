@@ -10,14 +10,12 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from monoforce_ros.core import CameraModel, MotionState
+from monoforce_ros.core import LARGEST_COMMAND, CameraModel, MotionState
 
 MAXIMUM_IMAGE_PIXELS = 64_000_000
 MAXIMUM_CLOUD_POINTS = 8_000_000
 MAXIMUM_COMMANDS = 1000
 """In one sequence."""
-MAXIMUM_SPEED = 100.0
-"""Larger commands are refused [m/s, rad/s]."""
 
 _POINT_DTYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 # encoding → (dtype, channels, OpenCV's conversion to RGB). Bayer names of ROS start with the first pixels of the first
@@ -136,7 +134,7 @@ def decode_camera_info(message: Any) -> CameraModel:
     coefficients = np.asarray(message.d, np.float64)
     # Drivers write "plumb_bob" with eight coefficients; OpenCV's rational model takes them as they are.
     try:
-        return CameraModel(
+        camera = CameraModel(
             width=int(message.width),
             height=int(message.height),
             matrix=np.asarray(message.k, np.float64).reshape(3, 3),
@@ -144,8 +142,10 @@ def decode_camera_info(message: Any) -> CameraModel:
             distortion_model={"fisheye": "equidistant"}.get(model, model),
             frame_id=message.header.frame_id,
         )
+        camera.check()
     except ValueError as error:
         raise MessageError(f"CameraInfo: {error}") from error
+    return camera
 
 
 def decode_cloud(message: Any) -> np.ndarray:
@@ -309,8 +309,8 @@ def decode_command(message: Any, *, lateral: bool = False) -> np.ndarray:
         raise MessageError(
             f"command: got forward speed {command[0]}, yaw rate {command[1]}{sideways}; expected finite numbers"
         )
-    if np.abs(command).max() > MAXIMUM_SPEED:
-        raise MessageError(f"command: got {command.tolist()}, expected at most {MAXIMUM_SPEED:g} m/s and rad/s")
+    if np.abs(command).max() > LARGEST_COMMAND:
+        raise MessageError(f"command: got {command.tolist()}, expected at most {LARGEST_COMMAND:g} m/s and rad/s")
     return command
 
 
@@ -319,7 +319,7 @@ def decode_command_sequences(message: Any, maximum: int) -> np.ndarray:
     [rad/s] ``[N, K, 2]``.
 
     Raises:
-        MessageError: other dimensions, values that are not finite or above :data:`MAXIMUM_SPEED`, or more than
+        MessageError: other dimensions, values that are not finite or above :data:`LARGEST_COMMAND`, or more than
             ``maximum`` sequences.
     """
     sizes = tuple(int(dimension.size) for dimension in message.layout.dim)
@@ -336,8 +336,8 @@ def decode_command_sequences(message: Any, maximum: int) -> np.ndarray:
             f"command sequences: got {len(values)} numbers with an offset of {offset}, expected "
             f"{sizes[0] * sizes[1] * 2} after it"
         )
-    if not np.isfinite(values).all() or np.abs(values).max() > MAXIMUM_SPEED:
-        raise MessageError(f"command sequences: not all values are finite and below {MAXIMUM_SPEED:g} m/s or rad/s")
+    if not np.isfinite(values).all() or np.abs(values).max() > LARGEST_COMMAND:
+        raise MessageError(f"command sequences: not all values are finite and below {LARGEST_COMMAND:g} m/s or rad/s")
     return values[offset:].reshape(sizes).astype(np.float64)
 
 

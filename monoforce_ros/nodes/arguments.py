@@ -13,7 +13,12 @@ from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
 
 from monoforce_ros.core import most_similar, nearest
-from monoforce_ros.nodes.parameter_files import read_sections, refuse_misnamed_sections, section_matches
+from monoforce_ros.nodes.parameter_files import (
+    read_sections,
+    refuse_misnamed_sections,
+    refuse_overridden_sections,
+    section_matches,
+)
 from monoforce_ros.nodes.schema import no_parameters, of_every_node, parameter_owners
 
 
@@ -85,13 +90,14 @@ def check_parameter_files(arguments: Sequence[str], node: str) -> list[str]:
         node: fully qualified name of the node.
 
     Raises:
-        ValueError: a file is missing, is no parameter file, or has a misnamed section.
+        ValueError: a file is missing, is no parameter file, or has a section that is misnamed or overrides another.
     """
     warnings = []
     for path in parameter_files(arguments):
         sections = read_sections(path)
         others = {name: values for name, values in sections.items() if not section_matches(name, node)}
         refuse_misnamed_sections(path, others, [node])
+        refuse_overridden_sections(path, sections, [node])
         if not any(section_matches(section, node) for section in sections):
             warnings.append(
                 f"{path} has no parameters for {node}: its sections are {', '.join(sorted(sections))}; expected {node} "

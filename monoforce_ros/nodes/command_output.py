@@ -5,15 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from geometry_msgs.msg import Twist, TwistStamped
-from rclpy.duration import Duration
+from rclpy.duration import Duration, Infinite
 from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.publisher import Publisher
+from rclpy.qos import LivelinessPolicy, QoSCompatibility, QoSProfile, qos_check_compatible
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from monoforce_ros.nodes.clocks import STEADY
 
 STAMPED, PLAIN = "geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist"
 _CLASSES = {STAMPED: TwistStamped, PLAIN: Twist}
 _CHOICES = {"twist_stamped": STAMPED, "twist": PLAIN}
+_QUALITY = QoSProfile(
+    depth=10, deadline=Infinite, liveliness=LivelinessPolicy.AUTOMATIC, liveliness_lease_duration=Infinite
+)
+"""Reliable and volatile: a base that starts later must not receive an old command. The rest are the defaults, as the
+ROS graph shows them; unstated, they could not be compared."""
 _RECORDERS = ("bag_recorder", "rosbag2_recorder")
 """Names of the recorders of this package and of ``ros2 bag record``."""
 _UNKNOWN = "_NODE_NAME_UNKNOWN_"
@@ -46,6 +53,9 @@ class CommandOutput:
         # Fully qualified node names with the types that they expect.
         self._listened: set[tuple[str, str]] = set()
         self._bystanders: list[str] = []
+        # Fully qualified names of listeners that this publisher's quality of service does not reach, with the reason.
+        self._unreached: dict[str, str] = {}
+        self._rivals: set[str] = set()
         self._timer = node.create_timer(0.5, self._update, clock=STEADY)
         self._update()
 
@@ -58,6 +68,9 @@ class CommandOutput:
         if kinds:
             expected = ", ".join(sorted(kinds))
             return f"{self.topic}: its listeners expect {expected} ({self.listeners})"
+        if self._unreached:
+            causes = "; ".join(f"{name}: {reason}" for name, reason in sorted(self._unreached.items()))
+            return f"{self.topic}: its listener asks for a quality of service that is not offered ({causes})"
         only = f" but {', '.join(self._bystanders)}, which cannot move the robot" if self._bystanders else ""
         return f"nothing listens to {self.topic}{only}"
 
@@ -65,6 +78,11 @@ class CommandOutput:
     def listeners(self) -> str:
         """Fully qualified names of the nodes that listen and are not of this package."""
         return ", ".join(sorted({name for name, _ in self._listened})) or "no node"
+
+    @property
+    def rivals(self) -> str:
+        """Fully qualified names of the other nodes that publish on the topic."""
+        return ", ".join(sorted(self._rivals))
 
     def publish(self, command: Sequence[float], frame_id: str) -> None:
         """Publish forward speed [m/s], yaw rate [rad/s] and, if there are three, the speed to the left [m/s]."""
@@ -89,16 +107,20 @@ class CommandOutput:
             self._publisher.wait_for_all_acked(Duration(seconds=seconds))
 
     def _update(self) -> None:
-        self._listened, bystanders = set(), set()
+        self._listened, self._unreached, bystanders = set(), {}, set()
+        own = self._node.get_fully_qualified_name()
+        publishers = self._node.get_publishers_info_by_topic(self.topic)
+        self._rivals = {_full_name(info) for info in publishers if info.node_name != _UNKNOWN} - {own}
         for info in self._node.get_subscriptions_info_by_topic(self.topic):
-            if info.node_name == _UNKNOWN:
-                self._listened.add(("a node without a name", info.topic_type))
+            unnamed = info.node_name == _UNKNOWN
+            name = "a node without a name" if unnamed else _full_name(info)
+            if name == own:
                 continue
-            name = f"{info.node_namespace}/{info.node_name}".replace("//", "/")
-            if name == self._node.get_fully_qualified_name():
-                continue
-            if self._is_bystander(info.node_name, info.node_namespace):
+            compatible, reason = qos_check_compatible(_QUALITY, info.qos_profile)
+            if not unnamed and self._is_bystander(info.node_name, info.node_namespace):
                 bystanders.add(name)
+            elif compatible == QoSCompatibility.ERROR:
+                self._unreached[name] = reason.replace("ERROR: ", " ").strip(" ;")
             else:
                 self._listened.add((name, info.topic_type))
         self._bystanders = sorted(bystanders)
@@ -113,7 +135,7 @@ class CommandOutput:
             self._node.destroy_publisher(self._publisher)
         self.type, self._publisher = "", None
         try:
-            self._publisher = self._node.create_publisher(_CLASSES[wanted], self.topic, 10)
+            self._publisher = self._node.create_publisher(_CLASSES[wanted], self.topic, _QUALITY)
         except RuntimeError as error:
             # The middleware may still be removing the publisher of the other type: the next call tries again.
             self._node.get_logger().debug(f"{self.topic}: {error}")
@@ -147,3 +169,7 @@ class CommandOutput:
         # Some of its topics may be remapped; candidates alone may also come from a node that drives the base.
         outputs = {topic.rpartition("/predicted/")[2] for topic, _ in published if "/predicted/" in topic}
         return len(outputs) > 1 or "path" in outputs
+
+
+def _full_name(info: TopicEndpointInfo) -> str:
+    return f"{info.node_namespace}/{info.node_name}".replace("//", "/")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 from rclpy.node import Node
@@ -31,6 +32,8 @@ class TransformListener:
         self.tree = TransformTree()
         self._history = history
         self._node = node
+        # Steady time of the last arrival [s] of transforms that are not static.
+        self._arrivals: dict[tuple[str, str], float] = {}
         kind = message_class(TRANSFORMS)
         self.unavailable = "" if kind is not None else f"/tf cannot be read: {missing_package(TRANSFORMS)}"
         """Why no transforms can be received; empty where they can."""
@@ -46,6 +49,17 @@ class TransformListener:
         """An error about frames, and that transforms cannot be received if that is the reason."""
         return f"{error}. {self.unavailable}" if self.unavailable else str(error)
 
+    def silence(self, target: str, source: str) -> tuple[str, float]:
+        """The transform between two frames that has been silent the longest, in words, and for how long [s].
+
+        Static transforms are never silent; without others it is an empty text and 0 s.
+        """
+        path = [edge for edge in self.tree.path(target, source) if edge in self._arrivals]
+        if not path:
+            return "", 0.0
+        parent, child = min(path, key=lambda edge: self._arrivals[edge])
+        return f"{parent} → {child}", time.monotonic() - self._arrivals[parent, child]
+
     def _on_static_transforms(self, message: Any) -> None:
         self._on_transforms(message, static=True)
 
@@ -57,6 +71,11 @@ class TransformListener:
             return
         for (parent, child), matrix in found.items():
             self.tree.add(parent, child, matrix)
+            edge = parent.lstrip("/"), child.lstrip("/")
+            if static:
+                self._arrivals.pop(edge, None)
+            else:
+                self._arrivals[edge] = time.monotonic()
         if self._history is None:
             return
         for entry in message.transforms:

@@ -12,7 +12,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from monoforce_ros.core import most_similar, nearest
-from monoforce_ros.nodes.parameter_files import read_sections, refuse_misnamed_sections, section_matches
+from monoforce_ros.nodes.parameter_files import (
+    read_sections,
+    refuse_misnamed_sections,
+    refuse_overridden_sections,
+    section_matches,
+)
 from monoforce_ros.nodes.schema import (
     SCHEMAS,
     ParameterEntry,
@@ -212,8 +217,9 @@ def _from_file(path: Path, nodes: Sequence[_Node], namespace: str) -> list[dict[
     used = set()
     for node in nodes:
         parameters: dict[str, ParameterValue] = {}
+        wanted = (f"/{namespace}/{node.name}".replace("//", "/"), f"/{node.name}")
+        refuse_overridden_sections(path, sections, wanted)
         for section, values in sections.items():
-            wanted = (f"/{namespace}/{node.name}".replace("//", "/"), f"/{node.name}")
             if any(section_matches(section, name) for name in wanted):
                 used.add(section)
                 parameters |= _checked(path, section, node, values)

@@ -152,6 +152,31 @@ def refuse_misnamed_sections(path: Path, sections: Mapping[str, Mapping[str, Any
             )
 
 
+def refuse_overridden_sections(path: Path, sections: Mapping[str, Mapping[str, Any]], nodes: Sequence[str]) -> None:
+    """Raise ``ValueError`` for a section for several nodes that changes what an earlier section says for one of them.
+
+    ROS takes the sections in the order of the file, so that the general value would win.
+
+    Args:
+        path: the file, for the message.
+        sections: its sections, in their order.
+        nodes: fully qualified names that one node answers to.
+    """
+    own: dict[str, tuple[str, Any]] = {}
+    for section, values in sections.items():
+        if not any(section_matches(section, node) for node in nodes):
+            continue
+        for name, value in values.items():
+            earlier, kept = own.get(name, ("", value))
+            if "*" in section and kept != value:
+                raise ValueError(
+                    f"parameter file {path}: {section} sets {name} to {value!r} after {earlier} set it to {kept!r}, "
+                    f"and ROS takes the later value: put {section} before {earlier}"
+                )
+            if "*" not in section:
+                own[name] = section, value
+
+
 def section_matches(section: str, node: str) -> bool:
     """Whether a section is for a node, both fully qualified; ``*`` is one part of the name, ``**`` any number."""
 

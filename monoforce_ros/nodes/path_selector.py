@@ -40,6 +40,12 @@ PART = "choice"
 DISTANCE = "distance to the goal [m]"
 _BASE_FRAME = "base_link"
 """Of REP 105; used unless the parameter names another one."""
+HALTS = 5
+"""Commands to stand after the last one that moves: a best-effort base may miss some."""
+_COARSEST = 0.05
+"""Largest rounding of the candidates' positions [m]: half of the distance that counts as progress."""
+_PAUSE = 0.03
+"""Time between the commands to stand at the end of the node [s]."""
 _TWICE = 0.2
 """Time within which the same goal from the other subscription arrives [s]."""
 
@@ -101,7 +107,9 @@ class PathSelectorNode(Node):
         self._advanced = 0.0
         self._arrivals: dict[str, float] = {}
         self._candidates: Candidates | None = None
-        self._moving = self._driving = False
+        self._driving = False
+        self._halting = 0
+        """Commands to stand that are still to be sent."""
         self._last_command: tuple[float, ...] = (0.0, 0.0)
         self._progress = ProgressCheck()
         self._map: tuple[np.ndarray, float, np.ndarray] | None = None
@@ -153,8 +161,10 @@ class PathSelectorNode(Node):
 
     def _set_course(self, kind: str, frame_id: str, stamp: int, places: list[list[float]]) -> None:
         points = np.array(places)
-        if not np.isfinite(points).all():
-            message = f"the {kind} {points[-1, :2].tolist()} is not finite and is ignored"
+        if len(bad := np.flatnonzero(~np.isfinite(points).all(axis=1))):
+            place = f"({points[bad[0], 0]:g}, {points[bad[0], 1]:g}, {points[bad[0], 2]:g})"
+            which = f" at point {bad[0] + 1} of {len(points)}" if len(points) > 1 else ""
+            message = f"the {kind} is not finite{which} {place} and is ignored"
             self.health.report(PART, ERROR, message, reason="goal")
             return
         course, previous = Course(kind, frame_id, stamp, points, time.monotonic()), self._received
@@ -242,10 +252,13 @@ class PathSelectorNode(Node):
         if command is None:
             self._progress.clear()
         # Without a goal nothing is published; a robot that was moving is commanded to stop first.
-        if command is None and not self._moving:
+        if command is not None or self._course is not None:
+            self._halting = HALTS
+        elif self._halting:
+            self._halting -= 1
+        else:
             return
         self._last_command = command or (0.0, 0.0)
-        self._moving = command is not None or self._course is not None
         self._commands.publish(self._last_command, self._base_name or self.settings.base_frame or _BASE_FRAME)
         if command is not None:
             self._flippers.forward()
@@ -253,8 +266,11 @@ class PathSelectorNode(Node):
     def stand(self) -> None:
         """Command a robot that was moving to stop: the node ends."""
         self._course = None
-        self._publish_command()
-        self._commands.flush(0.5)
+        # A best-effort base acknowledges nothing, and what this process still holds when it ends is lost.
+        while self._halting:
+            self._publish_command()
+            self._commands.flush(0.5)
+            time.sleep(_PAUSE)
 
     def _command(self) -> tuple[float, ...] | None:
         """Speed [m/s], yaw rate [rad/s] and, of robots that move sideways, lateral speed [m/s]; None to stop."""
@@ -299,7 +315,13 @@ class PathSelectorNode(Node):
         if best is None:
             raise Stop("no candidate is feasible", "infeasible")
         command = tuple(float(candidates.fields[name][best]) for name in COMMAND_FIELDS if name in candidates.fields)
-        self._report_driving(distance, command)
+        if self._progress.opposed == "speed":
+            raise Refusal(
+                f"the {course.kind} is dropped and the robot stopped: it moves against its commands "
+                f"({self._last_command[0]:.2f} m/s is sent to {self._commands.topic}, odometry shows the opposite): "
+                "does somebody else drive it, or has the base or the odometry the wrong sign?"
+            )
+        self._report_driving(course, distance, command)
         return command
 
     def _usable_motion(self) -> MotionState:
@@ -317,6 +339,13 @@ class PathSelectorNode(Node):
         frozen = time.monotonic() - self._advanced
         if frozen > self.settings.timeout:
             raise Stop(f"odometry has repeated the same stamp for {frozen:.1f} s: the position is unknown", "frozen")
+        if self._motion.rounding > _COARSEST:
+            far = f"{np.abs(self._motion.position).max() / 1e3:.0f} km from the origin of {self._odometry_frame!r}"
+            raise Stop(
+                f"odometry is {far}, where the 32-bit positions of candidates are {100 * self._motion.rounding:.0f} cm "
+                "apart: use an odometry frame that begins near the robot (REP 105)",
+                "far",
+            )
         return self._motion
 
     def _in_odometry(self, course: Course) -> np.ndarray:
@@ -373,10 +402,31 @@ class PathSelectorNode(Node):
             self._cost_to_go = found
         return found
 
-    def _report_driving(self, distance: float, command: tuple[float, ...]) -> None:
+    def _silent_transform(self, course: Course) -> str:
+        """Which transform from the course's frame is not sent any more, as when localisation has ended; or empty."""
+        name, silence = self.transforms.silence(course.frame_id, self._odometry_frame) if course.frame_id else ("", 0.0)
+        if silence <= self.settings.data_timeout:
+            return ""
+        return f"{name} has not been sent for {silence:.1f} s (is localisation running?)"
+
+    def _report_driving(self, course: Course, distance: float, command: tuple[float, ...]) -> None:
         """Say that the robot drives only if its odometry shows it."""
         moving, values = self._progress.moving, {DISTANCE: f"{distance:.2f}"}
-        if moving:
+        if others := self._commands.rivals:
+            self.get_logger().warning(
+                f"{self._commands.topic} is also published by {others}: a base that hears two drivers follows neither",
+                throttle_duration_sec=60.0,
+            )
+        values["other publishers of commands"] = others or "none"
+        if self._progress.opposed == "yaw rate":
+            message = f"the robot turns against its commands: {command[1]:.2f} rad/s is sent to {self._commands.topic}"
+            advice = "does somebody else drive it, or has the base or the odometry the wrong sign?"
+            self.health.report(
+                PART, WARN, f"{message}, odometry shows the opposite: {advice}", reason="opposed", **values
+            )
+        elif moving and (silent := self._silent_transform(course)):
+            self.health.report(PART, WARN, f"driving on an old transform: {silent}", reason="old transform", **values)
+        elif moving:
             self.health.report(PART, OK, "driving to the goal", reason="driving", **values)
         elif moving is None:
             message = f"commands are sent to {self._commands.listeners}, odometry shows no motion yet"

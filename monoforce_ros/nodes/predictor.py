@@ -51,6 +51,8 @@ _MOST_ODD = 5
 """Commands of another time in a row that are reported: when a bag starts anew, the first ones precede its odometry."""
 _LATE = 0.6
 """Age from which candidates are late [s]: the default `timeout` of path_selector, which stops the robot then."""
+_COARSE = 0.01
+"""Distance of the 32-bit numbers of clouds at the robot [m] that is mentioned; 10 km from the origin it is 1 mm."""
 _ZERO_STAMPS = "the stamps are zero: the {} does not set them"
 
 
@@ -306,6 +308,14 @@ class PredictorNode(ManagedNode):
         if len(recent) > 1:
             message = f"its frame changes between {before!r} and {frame_id!r}: do two nodes publish on the topic?"
             self.health.report("odometry", ERROR, message, reason="frames")
+            return
+        if state.rounding > _COARSE:
+            message = (
+                f"positions {np.abs(state.position).max() / 1e3:.0f} km from the origin of {frame_id!r}: point clouds "
+                f"hold 32-bit numbers, which are {100 * state.rounding:.0f} cm apart there; use an odometry frame that "
+                "begins near the robot (REP 105), and map for the world"
+            )
+            self.health.report("odometry", WARN, message, reason="far")
             return
         self.health.report("odometry", OK, "receiving odometry")
 

@@ -22,6 +22,12 @@ _SMALLEST = 0.1
 """Smallest commanded motion that is judged [m, rad]."""
 _COMPARABLE = 0.5
 """Share of the larger of the two commanded motions [m, rad] from which the smaller one alone may show motion."""
+_OPPOSED = 0.5
+"""Smallest share of the commanded motion, in the other direction, from which on a robot moves against its commands: one
+that slides back while its wheels grip, or whose sensors drift, shows less; wrong signs show about 1."""
+_OPPOSED_TURN = 0.5
+"""Smallest commanded turn within the window [rad] that is judged so: the heading of a robot that pulls to one side
+drifts against slighter ones."""
 _FEWEST = 6
 """Fewest poses that show motion: with fewer, their noise is unknown."""
 
@@ -64,19 +70,45 @@ class ProgressCheck:
         """Whether the robot moves as commanded; None while the odometry shows neither."""
         if len(self._samples) < _FEWEST:
             return None
-        time, speed, yaw_rate, x, y, heading = np.array(self._samples).T
-        heading = np.unwrap(heading)
-        step = np.diff(time)
-        along = (speed[:-1] * step) * np.array([np.cos(heading[:-1]), np.sin(heading[:-1])])
-        turned = (yaw_rate[:-1] * step)[None]
-        full = bool(time[-1] - time[0] > 0.8 * WINDOW)
-        driving = _moved(along, np.array([x, y]), full=full)
-        turning = _moved(turned, heading[None], full=full)
+        along, position, turned, heading, _, full = self._motion()
+        driving, turning = _moved(along, position, full=full), _moved(turned, heading, full=full)
         # Of the two, the larger one is what the robot is commanded to do. The other counts only if it is hardly less: a
         # tenth of a slight turn is the drift of a heading.
         lengths = _length(along), _length(turned)
         (larger, main), (smaller, other) = sorted(zip(lengths, (driving, turning), strict=True), key=_by_length)[::-1]
         return True if other and smaller > _COMPARABLE * larger else main
+
+    @property
+    def opposed(self) -> str:
+        """The motion that goes against its commands, ``speed`` or ``yaw rate``; empty if the odometry shows none.
+
+        Only commands that kept their sign over the whole window are judged: after a change of direction every robot
+        moves against its commands for a while.
+        """
+        if len(self._samples) < _FEWEST:
+            return ""
+        along, position, turned, heading, one_way, full = self._motion()
+        for name, steps, measured, smallest, kept in (
+            ("speed", along, position, _SMALLEST, one_way[0]),
+            ("yaw rate", turned, heading, _OPPOSED_TURN, one_way[1]),
+        ):
+            if full and kept and _length(steps) > smallest and (found := _share(steps, measured)) is not None:
+                share, margin = found
+                if share + margin < -_OPPOSED:
+                    return name
+        return ""
+
+    def _motion(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, tuple[bool, bool], bool]:
+        """Commanded steps and measured positions, the same of the heading, whether each command kept its sign (at most
+        zero in between), and whether the window is full.
+        """
+        time, speed, yaw_rate, x, y, heading = np.array(self._samples).T
+        heading = np.unwrap(heading)
+        step = np.diff(time)
+        along = (speed[:-1] * step) * np.array([np.cos(heading[:-1]), np.sin(heading[:-1])])
+        one_way = bool((speed >= 0).all() or (speed <= 0).all()), bool((yaw_rate >= 0).all() or (yaw_rate <= 0).all())
+        full = bool(time[-1] - time[0] > 0.8 * WINDOW)
+        return along, np.array([x, y]), (yaw_rate[:-1] * step)[None], heading[None], one_way, full
 
 
 def _by_length(entry: tuple[float, bool | None]) -> float:
@@ -89,6 +121,18 @@ def _length(steps: np.ndarray) -> float:
 
 def _moved(steps: np.ndarray, measured: np.ndarray, *, full: bool) -> bool | None:
     """Whether measured positions ``[d, n]`` follow commanded steps ``[d, n - 1]``; None if that is uncertain."""
+    if (found := _share(steps, measured)) is None:
+        return None
+    share, margin = found
+    if share > margin and share + margin > _SHARE:
+        return True
+    return False if full and _length(steps) > _SMALLEST and share + margin < _MISSED else None
+
+
+def _share(steps: np.ndarray, measured: np.ndarray) -> tuple[float, float] | None:
+    """The share of commanded steps ``[d, n - 1]`` that positions ``[d, n]`` show, and its margin at the rate
+    :data:`_ERROR_RATE`; None without commanded steps.
+    """
     dimensions, count = measured.shape
     commanded = np.concatenate([np.zeros((dimensions, 1)), np.cumsum(steps, axis=1)], axis=1)
     commanded -= commanded.mean(axis=1, keepdims=True)
@@ -105,7 +149,4 @@ def _moved(steps: np.ndarray, measured: np.ndarray, *, full: bool) -> bool | Non
     repeats = (1.0 + lag) / (1.0 - lag) if (lag := min(max(lag, 0.0), 0.95)) else 1.0
     freedom = max(dimensions * (count / repeats - 1.0) - 1.0, 1.0)
     error = np.sqrt(spread * repeats / (dimensions * (count - 1.0) - 1.0) / power)
-    margin = float(stdtrit(freedom, 1.0 - _ERROR_RATE) * error)
-    if share > margin and share + margin > _SHARE:
-        return True
-    return False if full and _length(steps) > _SMALLEST and share + margin < _MISSED else None
+    return share, float(stdtrit(freedom, 1.0 - _ERROR_RATE) * error)

@@ -1,5 +1,6 @@
 """Perception: terrain maps from the robot's sensors (lidar, cameras, both, or none), each behind one interface."""
 
+from monoforce_ros.perception.clearance import with_clear_start
 from monoforce_ros.perception.encoder_terrain import EncoderTerrain
 from monoforce_ros.perception.flat import FlatTerrain
 from monoforce_ros.perception.fusion import LidarCameraTerrain
@@ -26,4 +27,5 @@ __all__ = [
     "choose_terrain_source",
     "support_points",
     "traced_ground",
+    "with_clear_start",
 ]

@@ -8,7 +8,7 @@ from typing import ClassVar
 import torch
 
 from monoforce_ros.core import MotionState
-from monoforce_ros.perception.ground_alignment import clear_footprint
+from monoforce_ros.perception.clearance import clear_of_robot
 from monoforce_ros.perception.lidar import LidarTerrain
 from monoforce_ros.perception.observation import Observation, TerrainSource
 from monoforce_ros.terrain import Grid, TerrainMap
@@ -71,5 +71,5 @@ class LidarCameraTerrain:
         if not observation.images:
             return self.lidar.terrain(observation, motion)
         fused = apply_compliance(self.lidar.terrain(observation, motion), self.camera.terrain(observation, motion))
-        # What is still high is rigid. (Not done for a lidar alone: grass around the robot would look like a wall.)
-        return clear_footprint(fused, self.lidar.robot, motion)
+        # What is still high is rigid.
+        return clear_of_robot(fused, self.lidar.robot, motion)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import torch
 
@@ -15,10 +14,6 @@ from monoforce_ros.terrain import TerrainMap
 
 _FULL_WITHIN, _NONE_BEYOND = 0.15, 0.7
 """Distances from the support points up to which heights are fully corrected, and beyond which not at all [m]."""
-
-_TOLERANCE = 0.03
-"""How far ground may reach above the lowest point of a wheel or track within a cell [m]."""
-
 
 _AT_THE_BOTTOM = -0.97
 """Largest forward component of the surface's direction of motion at the bottom of a wheel, which rolls backwards."""
@@ -86,31 +81,3 @@ def align_to_ground(terrain: TerrainMap, support: np.ndarray) -> TerrainMap:
     geometric_height = terrain.geometric_height.clone()
     geometric_height[up, across] += change
     return replace(terrain, height=height, geometric_height=geometric_height)
-
-
-def clear_footprint(terrain: TerrainMap, robot: RobotModel, motion: MotionState) -> TerrainMap:
-    """A map whose surface does not reach into the robot.
-
-    No sensor sees the ground below the robot; heights interpolated there from a wall nearby would push the robot from
-    the start. Cells below the robot are lowered to its underside; so are neighbouring cells without a measurement.
-    """
-    grid, pose = terrain.grid, motion.terrain_from_base
-    (rear, right), (front, left) = (bound.cpu().double().numpy()[:2] for bound in robot.bounds)
-    below = robot.points[robot.point_outward[:, 2] < 0.0] if robot.point_outward is not None else robot.points[:0]
-    underside = float(below[:, 2].min()) if len(below) else 0.0
-    if abs(np.linalg.det(pose[:2, :2])) < 0.1:  # the robot lies on its side
-        return terrain
-    # Intersection of the vertical through each cell with the plane of the hull's underside, in base axes.
-    cells = np.stack(np.meshgrid(grid.x, grid.y), axis=-1) - pose[:2, 2] * underside
-    ahead, lateral = np.moveaxis(cells @ np.linalg.inv(pose[:2, :2]).T, -1, 0)
-    inside = (ahead > rear) & (ahead < front) & (lateral > right) & (lateral < left)
-    limit = np.where(inside, pose[2, 0] * ahead + pose[2, 1] * lateral + pose[2, 2] * underside, np.inf)
-    # Wheels and tracks reach lower; between their points and the cells' centres the ground may slope.
-    points = transform_points(pose, robot.points.cpu().double().numpy())
-    rows, columns, on_grid = grid.cells(points[:, :2])
-    np.minimum.at(limit, (rows[on_grid], columns[on_grid]), points[on_grid, 2] + _TOLERANCE)
-    widened = cv2.erode(limit.astype(np.float32), np.ones((3, 3), np.uint8), borderValue=np.inf)
-    highest = torch.from_numpy(np.where(terrain.observed.numpy(), limit, widened)).to(terrain.height)
-    if not bool((terrain.height > highest).any()):
-        return terrain
-    return replace(terrain, height=torch.minimum(terrain.height, highest))

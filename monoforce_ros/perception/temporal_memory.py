@@ -9,7 +9,8 @@ import numpy as np
 import torch
 
 from monoforce_ros.core import NANOSECOND, CameraModel, MotionState
-from monoforce_ros.perception.ground_alignment import align_to_ground, clear_footprint, support_points
+from monoforce_ros.perception.clearance import clear_of_robot
+from monoforce_ros.perception.ground_alignment import align_to_ground, support_points
 from monoforce_ros.perception.observation import Observation, TerrainSource
 from monoforce_ros.perception.trace import continues
 from monoforce_ros.robots import RobotModel
@@ -91,7 +92,7 @@ class TemporalMemory:
             return now
         joined = now.with_cells(torch.from_numpy(kept), dict(zip(CHANNELS, torch.from_numpy(values), strict=True)))
         support = support_points(self._robot, motion, self._stiffness)
-        return clear_footprint(align_to_ground(joined, support), self._robot, motion)
+        return clear_of_robot(align_to_ground(joined, support), self._robot, motion)
 
 
 def _equal(camera: CameraModel, other: CameraModel) -> bool:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from monoforce_ros.core import wrap_angle
+from monoforce_ros.core import LARGEST_COMMAND, wrap_angle
 from monoforce_ros.planning.goal_planner import CostToGo
 
 WAYPOINTS = (25, 50, 75)
@@ -23,8 +23,6 @@ FIELDS = (
     *(f"{axis}_{share}" for share in WAYPOINTS for axis in "xy"),
 )
 """Required fields of the candidates."""
-MAXIMUM_COMMAND = 100.0
-"""Largest command of a candidate [m/s, rad/s]; larger ones are no robot's."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +52,7 @@ def select_candidate(
 ) -> int | None:
     """Index of the best feasible candidate; None without a feasible one.
 
-    Candidates with values that are not finite or commands above :data:`MAXIMUM_COMMAND` are left out.
+    Candidates with values that are not finite or commands above :data:`LARGEST_COMMAND` are left out.
 
     Args:
         candidates: :data:`FIELDS` and, of robots that move sideways, ``lateral_speed``, each ``[N]``; positions and
@@ -74,7 +72,7 @@ def select_candidate(
         raise ValueError(f"candidates: fields {missing} are missing; got {sorted(candidates)}")
     names = [*FIELDS, *(name for name in COMMAND_FIELDS if name in candidates and name not in FIELDS)]
     finite = np.all([np.isfinite(candidates[name]) for name in names if name != "cost"], axis=0)
-    sane = np.all([np.abs(candidates[name]) <= MAXIMUM_COMMAND for name in names if name in COMMAND_FIELDS], axis=0)
+    sane = np.all([np.abs(candidates[name]) <= LARGEST_COMMAND for name in names if name in COMMAND_FIELDS], axis=0)
     usable = np.flatnonzero(finite & sane)
     if len(usable) < len(finite):
         # A diverged rollout has no place; its values would spoil the scores of all others.

@@ -9,10 +9,9 @@ import torch
 
 from monoforce_ros.core import MotionState, transform_points
 from monoforce_ros.effects import controls, turned_effects
-from monoforce_ros.perception import Observation, TerrainSource
+from monoforce_ros.perception import Observation, TerrainSource, with_clear_start
 from monoforce_ros.physics import PhysicsOptions, Rollout, State, rollout
 from monoforce_ros.prediction.joint_motion import JointMotion
-from monoforce_ros.prediction.start_clearance import with_clear_start
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import Grid, TerrainMap
 
@@ -115,7 +114,9 @@ class Predictor:
             force_every: interval of the steps at which contact forces are returned.
             joints: measured joints at the same time.
         """
-        terrain = self.source.terrain(observation, motion)
+        # Cleared here, too, so that the map that is shown is that of the prediction.
+        start = self._at_start(self.robot, joints), start_states([motion])
+        terrain = with_clear_start(self.source.terrain(observation, motion), *start)
         rolled = self.roll_out(terrain, [motion], twists[None], force_every=force_every, joints=joints)
         return Prediction(motion, terrain, rolled, joints)
 
