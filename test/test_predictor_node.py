@@ -192,6 +192,19 @@ def test_odometry_of_nan(peer, predictor):
     refused(peer, predictor, "odometry", "position or velocity is not finite", odometry=bad)
 
 
+def test_odometry_far_from_its_origin_is_used_with_a_warning(peer, predictor):
+    """Paths hold 64-bit numbers, clouds 32-bit ones: in UTM coordinates these are half a metre apart."""
+
+    def far(stamp):
+        place = [443_000.0, 5_540_000.0, 300.0]
+        return builders.odometry(stamp, "odom", "base_link", place, [0, 0, 0, 1], [0] * 3, [0] * 3)
+
+    peer.drive(1.4, odometry=far)
+    said = "positions 5540 km from the origin of 'odom': point clouds hold 32-bit numbers, which are 50 cm apart there"
+    assert peer.until(lambda: said in (peer.status("odometry") or (0, ""))[1], 5.0), peer.status("odometry")
+    healthy(peer, predictor)
+
+
 def test_odometry_with_a_zero_quaternion(peer, predictor):
     def bad(stamp):
         return builders.odometry(stamp, "odom", "base_link", [0, 0, 0], [0, 0, 0, 0], [0, 0, 0], [0] * 3)
