@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from monoforce_ros.physics.identity_cache import IdentityCache
 from monoforce_ros.physics.rotation import exponential_map
 from monoforce_ros.robots import Controls, Coordinate, RobotModel
 
@@ -102,45 +103,37 @@ class Articulation:
         if not commanded and not robot.moves_joints and robot.point_grip is None:
             return None
         batch, steps, drives = speeds.shape
-        joints, like = robot.joints, robot.points
-        number = len(joints)
-        rest = like.new_zeros(0) if robot.joint_angles is None else robot.joint_angles.to(like)
+        number = len(robot.joints)
+        given = (robot.joints, robot.motors, robot.joint_angles, robot.point_joints, robot.point_grip, robot.points)
+        parts = _parts.get((*given, robot.point_drives, robot.point_areas), lambda: _Parts.of(robot, drives))
+        rest = parts.rest
         targets = rest.expand(batch, steps, number) if controls.joint_angles is None else controls.joint_angles
         target_rates = torch.zeros_like(targets) if controls.joint_rates is None else controls.joint_rates
         targets, target_rates = targets.to(speeds), target_rates.to(speeds)
-        motors = robot.motors or (None,) * drives
-        dynamics = [*(joint.dynamics for joint in joints), *motors]
-        coordinates, found = [], 0
-        for entry in dynamics:
-            coordinates.append(found if entry is not None else -1)
-            found += entry is not None
         first = targets[:, 0] if steps else rest.expand(batch, number)
         start = first if controls.start_angles is None else controls.start_angles.to(speeds)
         start_rates = torch.zeros_like(start) if controls.start_rates is None else controls.start_rates.to(speeds)
-        free = torch.tensor([joint.dynamics is not None for joint in joints], device=like.device, dtype=torch.bool)
-        powered = torch.tensor([motor is not None for motor in motors], device=like.device)
-        point_joints = robot.point_joints
         built = cls(
-            axes=_table(like, [joint.axis for joint in joints]),
-            origins=_table(like, [joint.origin for joint in joints]),
-            places=_table(like, [joint.place for joint in joints]),
-            masses=like.new_tensor([joint.mass for joint in joints]),
+            axes=parts.axes,
+            origins=parts.origins,
+            places=parts.places,
+            masses=parts.masses,
             rest=rest,
-            slides=tuple(joint.slides for joint in joints),
-            parents=tuple(joint.parent for joint in joints),
-            point_links=torch.zeros_like(robot.point_drives) if point_joints is None else point_joints + 1,
-            grip=torch.ones_like(robot.point_areas) if robot.point_grip is None else robot.point_grip.to(like),
-            coordinates=tuple(coordinates),
-            parameters=_parameters(like, dynamics),
+            slides=parts.slides,
+            parents=parts.parents,
+            point_links=parts.point_links,
+            grip=parts.grip,
+            coordinates=parts.coordinates,
+            parameters=parts.parameters,
             target_angles=targets,
             target_rates=target_rates,
-            angles=_history(targets, start, free, target_rates, time_step),
-            rates=_history(target_rates, start_rates, free),
+            angles=_history(targets, start, parts.free, target_rates, time_step),
+            rates=_history(target_rates, start_rates, parts.free),
             belts=speeds.new_zeros(batch, steps + 1, drives),
         )
         # Other drives turn as commanded from the start.
-        rolling = built._rolling_speeds(robot, velocity, rates) if any(motors) else built.belts[:, 0]
-        return replace(built, belts=_history(speeds, rolling, powered))
+        rolling = built._rolling_speeds(robot, velocity, rates) if any(robot.motors) else built.belts[:, 0]
+        return replace(built, belts=_history(speeds, rolling, parts.powered))
 
     def _rolling_speeds(self, robot: RobotModel, velocity: Tensor, rates: Tensor) -> Tensor:
         """Surface speeds at which the drives roll at the start, ``[B, D]`` [m/s], from the motion in base axes."""
@@ -467,6 +460,55 @@ def _square(arm: Tensor) -> Tensor:
 
 def _stacked(listed: list[Tensor], like: Tensor) -> Tensor:
     return torch.stack(listed, 1) if listed else like.new_zeros(like.shape[0], 0, 3)
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """What a robot alone determines; fields as in :class:`Articulation`."""
+
+    axes: Tensor
+    origins: Tensor
+    places: Tensor
+    masses: Tensor
+    rest: Tensor
+    slides: tuple[bool, ...]
+    parents: tuple[int, ...]
+    point_links: Tensor
+    grip: Tensor
+    coordinates: tuple[int, ...]
+    parameters: Tensor
+    free: Tensor
+    """Whether a joint has dynamics, ``[J]`` bool."""
+    powered: Tensor
+    """Whether a drive has dynamics, ``[D]`` bool."""
+
+    @classmethod
+    def of(cls, robot: RobotModel, drives: int) -> _Parts:
+        joints, like, links = robot.joints, robot.points, robot.point_joints
+        motors = robot.motors or (None,) * drives
+        dynamics = [*(joint.dynamics for joint in joints), *motors]
+        coordinates, found = [], 0
+        for entry in dynamics:
+            coordinates.append(found if entry is not None else -1)
+            found += entry is not None
+        return cls(
+            axes=_table(like, [joint.axis for joint in joints]),
+            origins=_table(like, [joint.origin for joint in joints]),
+            places=_table(like, [joint.place for joint in joints]),
+            masses=like.new_tensor([joint.mass for joint in joints]),
+            rest=like.new_zeros(0) if robot.joint_angles is None else robot.joint_angles.to(like),
+            slides=tuple(joint.slides for joint in joints),
+            parents=tuple(joint.parent for joint in joints),
+            point_links=torch.zeros_like(robot.point_drives) if links is None else links + 1,
+            grip=torch.ones_like(robot.point_areas) if robot.point_grip is None else robot.point_grip.to(like),
+            coordinates=tuple(coordinates),
+            parameters=_parameters(like, dynamics),
+            free=torch.tensor([joint.dynamics is not None for joint in joints], device=like.device, dtype=torch.bool),
+            powered=torch.tensor([motor is not None for motor in motors], device=like.device),
+        )
+
+
+_parts: IdentityCache[_Parts] = IdentityCache()
 
 
 def _table(like: Tensor, rows: list[tuple[float, float, float]]) -> Tensor:

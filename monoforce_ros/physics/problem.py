@@ -10,6 +10,7 @@ from torch import Tensor
 from monoforce_ros.effects import applied_setup
 from monoforce_ros.physics.articulation import Articulation, BodyMass
 from monoforce_ros.physics.contact_summary import ContactSummary
+from monoforce_ros.physics.identity_cache import IdentityCache
 from monoforce_ros.physics.soil import Soil
 from monoforce_ros.physics.state import State
 from monoforce_ros.robots import Controls, RobotModel
@@ -128,7 +129,7 @@ class Problem:
             point_areas=robot.point_areas,
             point_tangents=robot.point_tangents,
             point_drives=robot.point_drives,
-            point_outward=torch.zeros_like(robot.points) if robot.point_outward is None else robot.point_outward,
+            point_outward=_no_normals(robot.points) if robot.point_outward is None else robot.point_outward,
             point_strips=_strips(robot, soil),
             mass=robot.mass.expand(batch),
             centre_of_mass=centre_of_mass,
@@ -198,12 +199,20 @@ class Motion:
 def _strips(robot: RobotModel, soil: Soil | None) -> Tensor:
     """Width and curvature at each point ``[N, 2]``."""
     if soil is None:
-        return torch.zeros_like(robot.points[:, :2])
+        return _zeros.get((robot.points,), lambda: torch.zeros_like(robot.points[:, :2]), values="strips")
     if robot.point_widths is None or robot.point_curvatures is None:
         raise ValueError(
             f"soil: got robot {robot.name!r} without point_widths and point_curvatures, expected one of load_robot"
         )
     return torch.stack([robot.point_widths, robot.point_curvatures], dim=-1)
+
+
+def _no_normals(points: Tensor) -> Tensor:
+    return _zeros.get((points,), lambda: torch.zeros_like(points), values="normals")
+
+
+_zeros: IdentityCache[Tensor] = IdentityCache()
+"""The same tensors for the same points, so that what follows from them is found again."""
 
 
 _JOINT_INPUTS = ("joint_angles", "joint_rates", "start_angles", "start_rates")

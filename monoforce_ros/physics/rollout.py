@@ -163,8 +163,10 @@ def _result(problem: Problem, motion: Motion, finite: Tensor, options: PhysicsOp
     states = (position, motion.rotation, velocity, motion.angular_velocity)
     valid = finite & torch.stack([torch.isfinite(t.detach()).flatten(1).all(1) for t in states]).all(0)
 
+    all_valid = bool(valid.all())
+
     def mark(values: Tensor) -> Tensor:
-        if bool(valid.all()):
+        if all_valid:
             return values
         return values.masked_fill(~valid.view(-1, *[1] * (values.ndim - 1)), torch.nan)
 
@@ -172,8 +174,8 @@ def _result(problem: Problem, motion: Motion, finite: Tensor, options: PhysicsOp
         return None if values is None else mark(values)
 
     grid, points = problem.terrain.grid, position.detach()[..., :2]
-    low = points.new_tensor([grid.extent[0], grid.extent[2]])
-    high = points.new_tensor([grid.extent[1], grid.extent[3]])
+    left, right, bottom, top = grid.extent
+    low, high = points.new_tensor([[left, bottom], [right, top]])
     return Rollout(
         times=options.time_step * torch.arange(problem.steps + 1, dtype=position.dtype, device=position.device),
         position=mark(position),

@@ -13,6 +13,7 @@ from torch import Tensor
 from monoforce_ros.physics import warp_joints
 from monoforce_ros.physics.clusters import point_clusters
 from monoforce_ros.physics.contact_summary import STEEP, ContactSummary
+from monoforce_ros.physics.identity_cache import IdentityCache
 from monoforce_ros.physics.options import PhysicsOptions
 from monoforce_ros.physics.problem import Motion, Problem
 from monoforce_ros.physics.soil import SOIL_PARAMETERS
@@ -22,7 +23,7 @@ from monoforce_ros.physics.warp_launch import (
     INPUTS,
     Arguments,
     Fixed,
-    Surface,
+    SampledBody,
     adjoint,
     contiguous,
     in_parallel,
@@ -41,22 +42,23 @@ def integrate(
     """Integrate with Warp; see :func:`monoforce_ros.physics.rollout`."""
     terrain = problem.terrain
     height = terrain.height if terrain.height.ndim == 3 else terrain.height[None]
-    listed = torch.broadcast_tensors(terrain.stiffness, terrain.damping, terrain.friction, problem.vegetation)
-    material = torch.stack(listed, dim=-1)
-    material = material if material.ndim == 4 else material[None]
+    channels = (terrain.stiffness, terrain.damping, terrain.friction)
+    # Candidates, ensembles and fits roll out again and again on one map.
+    material = _materials.get(
+        (*channels, terrain.geometric_height, terrain.height), lambda: _interleaved(*channels, problem.vegetation)
+    )
     # The kernel reads both at the same page, so maps with equal heights but different materials are repeated.
     pages = max(len(height), len(material))
     height, material = height.expand(pages, -1, -1), material.expand(pages, -1, -1, -1)
-    share = problem.point_areas / problem.point_areas.sum()
-    drives = problem.point_drives.to(torch.int32)
-    sampled = (problem.points, problem.point_areas, problem.point_tangents, share)
+    moving = problem.articulation
+    plain, ordered = _sampled_bodies(problem)
 
-    def inputs(body: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    def inputs(body: SampledBody) -> tuple[Tensor, ...]:
         """Kernel inputs in the order of :data:`INPUTS`."""
         return (
             height,
             material,
-            *body,
+            *body.sampled,
             problem.drive_speeds,
             problem.mass,
             problem.centre_of_mass,
@@ -70,33 +72,51 @@ def integrate(
         )
 
     start = (problem.centre, problem.rotation, problem.velocity, problem.angular_velocity)
-    moving = problem.articulation
-    if moving is None:
-        clusters = point_clusters(problem.points)
-    else:
-        clusters = warp_joints.clusters_by_link(problem.points, moving.point_links)
-    surface = Surface(drives, problem.point_outward, problem.point_strips)
-    fixed = Fixed(options, terrain.grid, surface.ordered(clusters.order), clusters)
-    # Points of a cluster are contiguous.
-    ordered = inputs(tuple(t[clusters.order] for t in sampled))
+    fixed, listed = Fixed(options, terrain, ordered), inputs(ordered)
     if moving is not None:
-        motion = warp_joints.integrate(problem, moving, fixed, ordered, start)
+        motion = warp_joints.integrate(problem, moving, fixed, listed, start)
         if not problem.steps or not (with_forces or with_contact):
             return motion
-        fixed = Fixed(options, terrain.grid, surface, clusters)
-        return warp_joints.with_forces(motion, problem, moving, fixed, inputs(sampled), force_every)
-    states: tuple[Tensor, ...] = _Integrate.apply(fixed, *ordered, *start)
+        fixed = Fixed(options, terrain, plain)
+        return warp_joints.with_forces(motion, problem, moving, fixed, inputs(plain), force_every)
+    states: tuple[Tensor, ...] = _Integrate.apply(fixed, *listed, *start)
     centre, rotation, velocity, angular_velocity = states
     motion = Motion(centre, rotation, velocity, angular_velocity)
     if not problem.steps or not (with_forces or with_contact):
         return motion
-    with_gradient = torch.is_grad_enabled() and any(t.requires_grad for t in (*ordered, *states))
+    with_gradient = torch.is_grad_enabled() and any(t.requires_grad for t in (*listed, *states))
     if with_contact and not with_forces and not with_gradient:
-        sums = _launch_summary(fixed, force_every, contiguous(ordered), contiguous(states))
+        sums = _launch_summary(fixed, force_every, contiguous(listed), contiguous(states))
         return replace(motion, contact=ContactSummary.split(sums, problem.drive_speeds.shape[2]))
-    fixed = Fixed(options, terrain.grid, surface, clusters)
-    normal, tangential, forces = _Forces.apply(fixed, force_every, *inputs(sampled), *states)
+    fixed = Fixed(options, terrain, plain)
+    normal, tangential, forces = _Forces.apply(fixed, force_every, *inputs(plain), *states)
     return replace(motion, normal_forces=normal, tangential_forces=tangential, forces=forces)
+
+
+def _interleaved(*channels: Tensor) -> Tensor:
+    """Stiffness, damping, friction and vegetation of each cell beside each other, ``[1 or B, rows, columns, 4]``."""
+    material = torch.stack(torch.broadcast_tensors(*channels), dim=-1)
+    return material if material.ndim == 4 else material[None]
+
+
+_materials: IdentityCache[Tensor] = IdentityCache(8)
+
+
+def _sampled_bodies(problem: Problem) -> tuple[SampledBody, SampledBody]:
+    """The body with its points in their own order, and with the points of each cluster beside each other."""
+    links = None if problem.articulation is None else problem.articulation.point_links
+    sampled = (problem.points, problem.point_areas, problem.point_tangents)
+    surface = (problem.point_drives, problem.point_outward, problem.point_strips)
+
+    def made() -> tuple[SampledBody, SampledBody]:
+        clusters = point_clusters(sampled[0]) if links is None else warp_joints.clusters_by_link(sampled[0], links)
+        plain = SampledBody((*sampled, sampled[1] / sampled[1].sum()), *surface, clusters)
+        return plain, plain.ordered()
+
+    return _bodies.get((*sampled, *surface, links), made)
+
+
+_bodies: IdentityCache[tuple[SampledBody, SampledBody]] = IdentityCache()
 
 
 class _Integrate(torch.autograd.Function):

@@ -14,14 +14,17 @@ from torch import Tensor
 
 from monoforce_ros.physics.articulation import Articulation
 from monoforce_ros.physics.clusters import PointClusters, joined, point_clusters
+from monoforce_ros.physics.identity_cache import IdentityCache
 from monoforce_ros.physics.problem import Motion, Problem
 from monoforce_ros.physics.warp_kernels import (
+    Types,
     forces_joints_kernel,
     integrate_joints_kernel,
     joint_functions,
 )
 from monoforce_ros.physics.warp_launch import (
     CHUNK,
+    CPU_THREADS,
     INPUTS,
     Arguments,
     Fixed,
@@ -40,7 +43,7 @@ def integrate(
     problem: Problem, moving: Articulation, fixed: Fixed, inputs: Sequence[Tensor], body: Sequence[Tensor]
 ) -> Motion:
     """The motion; ``inputs`` in the order of :data:`INPUTS` with points ordered by cluster, ``body`` its start."""
-    joints = _Joints(moving, fixed.clusters.order)
+    joints = _Joints.of(moving, fixed.clusters.order)
     extra = (_padded(moving.target_angles), _padded(moving.target_rates))
     histories = (_padded(moving.angles), _padded(moving.rates), moving.belts)
     states: tuple[Tensor, ...] = _Integrate.apply(fixed, joints, *inputs, *extra, *body, *histories)
@@ -70,7 +73,7 @@ def with_forces(
     axes, origins, places = (torch.cat([zero, value], 1) for value in (poses.axes, poses.origins, poses.places))
     frames = torch.stack([poses.shifts, poses.spins, poses.drifts, axes, origins, places], dim=2)
     links = (poses.turns.unflatten(0, (batch, steps)), frames.unflatten(0, (batch, steps)))
-    joints = _Joints(moving, torch.arange(len(moving.point_links), device=moving.point_links.device))
+    joints = _Joints.of(moving, None)
     extra = (_padded(moving.target_angles), _padded(moving.target_rates))
     states = (motion.centre, motion.rotation, motion.velocity, motion.angular_velocity)
     histories = (_padded(motion.angles), _padded(motion.rates), motion.belts)
@@ -108,7 +111,7 @@ def _padded(values: Tensor) -> Tensor:
 class _Joints:
     """Joints without gradients."""
 
-    def __init__(self, moving: Articulation, order: Tensor):
+    def __init__(self, moving: Articulation, order: Tensor | None):
         self.number, self.size = len(moving.slides), moving.size
         self.limited = int(moving.has_limits)
         self.links = 1 + self.number
@@ -124,14 +127,59 @@ class _Joints:
 
         self.vectors = {name: rows(getattr(moving, name)) for name in ("axes", "origins", "places")}
         self.scalars = {name: rows(getattr(moving, name)) for name in ("masses", "rest")}
-        self.scalars["grip"] = moving.grip[order].contiguous()
+        chosen = slice(None) if order is None else order
+        self.scalars["grip"] = moving.grip[chosen].contiguous()
         self.indices = {
             "slides": indices([int(slides) for slides in moving.slides]),
             "parents": indices(moving.parents),
             "coordinates": indices(moving.coordinates),
-            "links": moving.point_links[order].to(torch.int32).contiguous(),
+            "links": moving.point_links[chosen].to(torch.int32).contiguous(),
         }
-        self.parameters = moving.parameters.contiguous()
+        self.scalars["parameters"] = moving.parameters.contiguous()
+        self.on_cuda = device.type == "cuda"
+        self._arrays: dict[str, Any] = {}
+        self._idle: list[_Scratch] = []
+
+    @classmethod
+    def of(cls, moving: Articulation, order: Tensor | None) -> _Joints:
+        """Those of an articulation; ``order`` is that of the points, None for their own."""
+        tables = (moving.axes, moving.origins, moving.places, moving.masses, moving.rest, moving.parameters)
+        given = (*tables, moving.point_links, moving.grip, moving.slides, moving.parents, moving.coordinates, order)
+        return _joints.get(given, lambda: cls(moving, order))
+
+    def borrowed(self, kinds: Types, like: Tensor, width: int) -> _Scratch:
+        """Scratch arrays without gradients, which no other launch uses until they are given back."""
+        # Only lists' own operations, which are atomic, as launches run in several threads.
+        idle = self._idle
+        while idle:
+            try:
+                scratch = idle.pop()
+            except IndexError:
+                break
+            if scratch.width == width:
+                scratch.clear()
+                return scratch
+        return _Scratch(self, kinds, like, width)
+
+    def give_back(self, scratch: _Scratch) -> None:
+        """Let another launch have scratch arrays; those of launches that may still run are not kept."""
+        if not self.on_cuda and len(self._idle) < CPU_THREADS:
+            self._idle.append(scratch)
+
+    def struct(self, kinds: Types) -> Any:
+        """A kernel's struct, without the arrays that may have gradients."""
+        if not self._arrays:
+            listed = ((self.vectors, kinds.vec3), (self.scalars, kinds.scalar), (self.indices, wp.int32))
+            self._arrays = {
+                name: wp.from_torch(value, dtype=kind, requires_grad=False)
+                for table, kind in listed
+                for name, value in table.items()
+            }
+        struct = kinds.Joints()
+        struct.number, struct.size, struct.limited = self.number, self.size, self.limited
+        for name, array in self._arrays.items():
+            setattr(struct, name, array)
+        return struct
 
     def without_overwritten(self, gradients: Sequence[Tensor]) -> list[Tensor]:
         """Gradients of the given angles, rates and belts from those of the states: the kernel wrote some of these."""
@@ -143,6 +191,9 @@ class _Joints:
                 gradient[:, 1:, columns] = 0.0
             result.append(gradient)
         return result
+
+
+_joints: IdentityCache[_Joints] = IdentityCache()
 
 
 class _Arguments:
@@ -166,15 +217,7 @@ class _Arguments:
             fixed, inputs[:count], states[:_BODY_STATES], gradients=gradients,
             state_gradients=state_gradients and state_gradients[:_BODY_STATES],
         )  # fmt: skip
-        moving = kinds.Joints()
-        moving.number, moving.size, moving.limited = joints.number, joints.size, joints.limited
-        for name, value in joints.vectors.items():
-            setattr(moving, name, wp.from_torch(value, dtype=kinds.vec3))
-        for name, value in joints.scalars.items():
-            setattr(moving, name, wp.from_torch(value, dtype=kinds.scalar))
-        for name, value in joints.indices.items():
-            setattr(moving, name, wp.from_torch(value, dtype=wp.int32))
-        moving.parameters = wp.from_torch(joints.parameters, dtype=kinds.scalar)
+        moving = joints.struct(kinds)
         self.extra = [
             wp.from_torch(
                 value, dtype=kinds.scalar, requires_grad=gradients, grad=torch.zeros_like(value) if gradients else None
@@ -256,30 +299,40 @@ class _Forces(torch.autograd.Function):
         return (None, None, None, *found)
 
 
-def _scratch(joints: _Joints, kinds: Any, like: Tensor, width: int, slots: int, gradients: bool) -> list[Any]:
-    """Arrays between the loops of a step: links, coordinates, and sums over the points."""
-    links, total = joints.links, joints.size + 6
-    inner = max(1, joints.size)
+class _Scratch:
+    """Arrays between the loops of a step: links, coordinates, and sums over the points; zero at first."""
 
-    def array(kind: Any, *shape: int) -> Any:
-        values = like.new_zeros((width, slots, *shape))
-        gradient = torch.zeros_like(values) if gradients else None
-        return wp.from_torch(values, dtype=kind, requires_grad=gradients, grad=gradient)
+    def __init__(
+        self, joints: _Joints, kinds: Any, like: Tensor, width: int, slots: int = 1, *, gradients: bool = False
+    ):
+        self.width = width
+        self._tensors: list[Tensor] = []
+        links, inner = joints.links, max(1, joints.size)
 
-    posed = kinds.Links()
-    posed.turns, posed.frames = array(kinds.mat33, links, 3, 3), array(kinds.vec3, links, 6, 3)
-    work = joint_functions(like.dtype == torch.float64).Work()
-    work.turns, work.frames = array(kinds.mat33, links, 3, 3), array(kinds.vec3, links, 6, 3)
-    work.centre, work.inertia = array(kinds.vec3, 2, 3), array(kinds.mat33, 3, 3)
-    dense = total if joints.size else 1
-    work.block = array(kinds.scalar, 6, 6) if joints.size else array(kinds.scalar, 1, 1)
-    work.joined = array(kinds.scalar, dense, inner)
-    work.pivots, work.factor = array(kinds.scalar, dense, dense), array(kinds.scalar, dense, dense)
-    work.values = array(kinds.scalar, dense, 6)
-    if gradients:
-        work.block_gradient, work.joined_gradient = work.block.grad, work.joined.grad
-        work.values_gradient = work.values.grad
-    return [posed, work, array(kinds.vec3, 9, 3)]
+        def array(kind: Any, *shape: int) -> Any:
+            values = like.new_zeros((width, slots, *shape))
+            self._tensors.append(values)
+            gradient = torch.zeros_like(values) if gradients else None
+            return wp.from_torch(values, dtype=kind, requires_grad=gradients, grad=gradient)
+
+        posed = kinds.Links()
+        posed.turns, posed.frames = array(kinds.mat33, links, 3, 3), array(kinds.vec3, links, 6, 3)
+        work = joint_functions(like.dtype == torch.float64).Work()
+        work.turns, work.frames = array(kinds.mat33, links, 3, 3), array(kinds.vec3, links, 6, 3)
+        work.centre, work.inertia = array(kinds.vec3, 2, 3), array(kinds.mat33, 3, 3)
+        dense = joints.size + 6 if joints.size else 1
+        work.block = array(kinds.scalar, 6, 6) if joints.size else array(kinds.scalar, 1, 1)
+        work.joined = array(kinds.scalar, dense, inner)
+        work.pivots, work.factor = array(kinds.scalar, dense, dense), array(kinds.scalar, dense, dense)
+        work.values = array(kinds.scalar, dense, 6)
+        if gradients:
+            work.block_gradient, work.joined_gradient = work.block.grad, work.joined.grad
+            work.values_gradient = work.values.grad
+        self.structs = [posed, work, array(kinds.vec3, 9, 3)]
+
+    def clear(self) -> None:
+        """Set everything to zero."""
+        torch._foreach_zero_(self._tensors)
 
 
 def _launch(
@@ -306,11 +359,16 @@ def _launch(
         for chunk in range(first, first + count, CHUNK if backward else count):
             width = min(CHUNK, first + count - chunk) if backward else count
             # As without joints, the adjoint reads what the steps left in the scratch arrays.
-            scratch = _scratch(joints, kinds, inputs[0], width, max(1, steps) if backward else 1, backward)
-            values = [chunk, steps, int(backward), *arguments.structs, *scratch]
+            if backward:
+                scratch = _Scratch(joints, kinds, inputs[0], width, max(1, steps), gradients=True)
+            else:
+                scratch = joints.borrowed(kinds, inputs[0], width)
+            values = [chunk, steps, int(backward), *arguments.structs, *scratch.structs]
             wp.launch(kernel, dim=width, inputs=values, device=device, record_tape=False)
             if backward:
                 wp.launch(kernel, dim=width, inputs=values, device=device, record_tape=False, **adjoint(values))
+            else:
+                joints.give_back(scratch)
         return arguments.input_gradients() if backward else []
 
     # Compile here, because two threads must not compile at the same time.

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -13,9 +12,10 @@ import warp as wp
 from torch import Tensor
 
 from monoforce_ros.physics.clusters import PointClusters
+from monoforce_ros.physics.identity_cache import IdentityCache
 from monoforce_ros.physics.options import PhysicsOptions
 from monoforce_ros.physics.warp_kernels import COULOMB, NO_FRICTION, SIGMOID, Types, types
-from monoforce_ros.terrain import Grid
+from monoforce_ros.terrain import TerrainMap
 
 CPU_THREADS = 2
 """Simultaneous launches on the CPU; a launch uses one core and releases the GIL."""
@@ -34,35 +34,75 @@ INPUTS = (
     "friction", "ground_factors", "tilt", "resistance", "wrench", "soil",
 )  # fmt: skip
 """Kernel inputs with gradients, other than the states."""
+BODY_INPUTS = INPUTS[2:6]
+"""Those that are sampled over the body."""
 STATES = ("centre", "rotation", "velocity", "angular_velocity")
 
 
-@dataclass(frozen=True)
-class Surface:
-    """What the body points stand for."""
+class SampledBody:
+    """Points of a body with what they stand for, as arrays of a kernel.
 
-    drives: Tensor
-    """Drive index of each point, ``[N]`` int32; -1 on the hull."""
-    outward: Tensor
-    """Unit normal of the hull, zero on belts, ``[N, 3]``."""
-    strips: Tensor
-    """Width [m] and curvature [1/m] of the surface, ``[N, 2]``."""
+    Args:
+        sampled: points, areas, tangents and shares of the area, in the order of :data:`INPUTS`.
+        drives: drive index of each point, ``[N]``; -1 on the hull.
+        outward: unit normal of the hull, zero on belts, ``[N, 3]``.
+        strips: width [m] and curvature [1/m] of the surface, ``[N, 2]``.
+        clusters: clusters of the points.
+    """
 
-    def ordered(self, order: Tensor) -> Surface:
-        """The same in another order of the points ``[N]`` (indices)."""
-        return Surface(self.drives[order], self.outward[order], self.strips[order])
+    def __init__(
+        self, sampled: tuple[Tensor, ...], drives: Tensor, outward: Tensor, strips: Tensor, clusters: PointClusters
+    ):
+        self.sampled = sampled
+        self.drives = drives.to(torch.int32).contiguous()
+        self.outward = outward.detach().contiguous()
+        self.strips = strips.detach().contiguous()
+        self.clusters = clusters
+        # The arrays below do not keep their tensors.
+        self._kept = contiguous(sampled)
+        self._struct: Any = None
+
+    def ordered(self) -> SampledBody:
+        """The same with the points of each cluster beside each other."""
+        order = self.clusters.order
+        sampled = tuple(values[order] for values in self.sampled)
+        return SampledBody(sampled, self.drives[order], self.outward[order], self.strips[order], self.clusters)
+
+    def struct(self, kinds: Types) -> Any:
+        """The kernel's struct, without gradients; made once."""
+        if self._struct is None:
+            element = elements(kinds)
+            arrays = {
+                name: wp.from_torch(value, dtype=element[name], requires_grad=False)
+                for name, value in zip(BODY_INPUTS, self._kept, strict=True)
+            }
+            self._struct = self.filled(kinds, arrays)
+        return self._struct
+
+    def filled(self, kinds: Types, arrays: Mapping[str, Any]) -> Any:
+        """A kernel's struct with given arrays of points, areas, tangents and shares."""
+        body = kinds.Body()
+        for name in BODY_INPUTS:
+            setattr(body, name, arrays[name])
+        body.drives = wp.from_torch(self.drives, dtype=wp.int32)
+        body.outward = wp.from_torch(self.outward, dtype=kinds.vec3)
+        body.strips = wp.from_torch(self.strips, dtype=kinds.vec2)
+        for name, boxes in (("cluster", self.clusters.clusters), ("group", self.clusters.groups)):
+            setattr(body, f"{name}_centres", wp.from_torch(boxes.centres, dtype=kinds.vec3))
+            setattr(body, f"{name}_halves", wp.from_torch(boxes.halves, dtype=kinds.vec3))
+            setattr(body, f"{name}_edges", wp.from_torch(boxes.edges, dtype=wp.int32))
+        return body
 
 
 class Fixed:
     """Inputs of a launch without gradients."""
 
-    def __init__(self, options: PhysicsOptions, grid: Grid, surface: Surface, clusters: PointClusters):
+    def __init__(self, options: PhysicsOptions, terrain: TerrainMap, body: SampledBody):
         self.options = options
-        self.grid = grid
-        self.drives = surface.drives.contiguous()
-        self.outward = surface.outward.detach().contiguous()
-        self.strips = surface.strips.detach().contiguous()
-        self.clusters = clusters
+        self.grid = terrain.grid
+        self.body = body
+        self._heights = terrain.height
+        self.clusters = body.clusters
         self._ceilings: tuple[Tensor, Tensor] | None = None
 
     @property
@@ -73,10 +113,18 @@ class Fixed:
     def ceilings(self, height: Tensor) -> tuple[Tensor, Tensor]:
         """The highest ground near each node, against which clusters and groups are tested."""
         if self._ceilings is None:
-            boxes, resolution = (self.clusters.clusters, self.clusters.groups), self.grid.resolution
-            fine, coarse = (box.ceiling(height, resolution).contiguous() for box in boxes)
-            self._ceilings = fine, coarse
+            # ``height`` is the same on as many pages as the launch needs.
+            values = len(height), self.grid.resolution
+            self._ceilings = _ceilings.get((self._heights, self.clusters), lambda: self._highest(height), values=values)
         return self._ceilings
+
+    def _highest(self, height: Tensor) -> tuple[Tensor, Tensor]:
+        boxes, resolution = (self.clusters.clusters, self.clusters.groups), self.grid.resolution
+        fine, coarse = (box.ceiling(height, resolution).contiguous() for box in boxes)
+        return fine, coarse
+
+
+_ceilings: IdentityCache[tuple[Tensor, Tensor]] = IdentityCache(8)
 
 
 class Arguments:
@@ -102,6 +150,9 @@ class Arguments:
         self.double, kinds = precision(inputs[0])
         element = elements(kinds)
         named = dict(zip(INPUTS, inputs, strict=True))
+        if not gradients:
+            # The points are those of the body, whose struct is made already.
+            named = {name: value for name, value in named.items() if name not in BODY_INPUTS}
         self.inputs = {
             name: wp.from_torch(
                 value, dtype=element[name], requires_grad=gradients, grad=torch.zeros_like(value) if gradients else None
@@ -114,8 +165,8 @@ class Arguments:
             name: wp.from_torch(value, dtype=element[name], requires_grad=gradients, grad=gradient)
             for name, value, gradient in zip(STATES, states, state_gradients or (None,) * 4, strict=True)
         }
-        clusters = fixed.clusters
-        ground, body, robots, options = kinds.Ground(), kinds.Body(), kinds.Robots(), kinds.Options()
+        body = fixed.body.filled(kinds, self.inputs) if gradients else fixed.body.struct(kinds)
+        ground, robots, options = kinds.Ground(), kinds.Robots(), kinds.Options()
         ground.height, ground.material = self.inputs["height"], self.inputs["material"]
         ground.ceiling, ground.group_ceiling = (
             wp.from_torch(ceiling, dtype=kinds.scalar) for ceiling in fixed.ceilings(inputs[0])
@@ -123,15 +174,6 @@ class Arguments:
         ground.rows, ground.columns = fixed.grid.rows, fixed.grid.columns
         ground.origin_x, ground.origin_y = (kinds.scalar(value) for value in fixed.grid.origin)
         ground.inverse_resolution = kinds.scalar(1.0 / fixed.grid.resolution)
-        body.points, body.areas = self.inputs["points"], self.inputs["areas"]
-        body.tangents, body.share = self.inputs["tangents"], self.inputs["share"]
-        body.drives = wp.from_torch(fixed.drives, dtype=wp.int32)
-        body.outward = wp.from_torch(fixed.outward, dtype=kinds.vec3)
-        body.strips = wp.from_torch(fixed.strips, dtype=kinds.vec2)
-        for name, boxes in (("cluster", clusters.clusters), ("group", clusters.groups)):
-            setattr(body, f"{name}_centres", wp.from_torch(boxes.centres, dtype=kinds.vec3))
-            setattr(body, f"{name}_halves", wp.from_torch(boxes.halves, dtype=kinds.vec3))
-            setattr(body, f"{name}_edges", wp.from_torch(boxes.edges, dtype=wp.int32))
         for name in INPUTS[6:]:
             setattr(robots, name, self.inputs[name])
         options.time_step = kinds.scalar(fixed.options.time_step)
