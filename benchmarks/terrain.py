@@ -4,9 +4,10 @@
         [--docs FILE]
 
 records randomised worlds of the reporting seeds, evaluates every system on them with the paper's physics alone and with
-vegetation drag, and writes the tables, their strata and a log: date, commit, digests of the checkpoints, and how often
-the reporting seeds were used. Recorded worlds are kept in the folder: an interrupted run continues where it stopped.
-Give a system one checkpoint per training seed; without --checkpoint the shipped encoder is tested.
+vegetation drag, and writes the tables, their strata, a page with the worst predictions of each system, and a log: date,
+commit, digests of the checkpoints, and how often the reporting seeds were used. Recorded worlds are kept in the folder:
+an interrupted run continues where it stopped. Give a system one checkpoint per training seed; without --checkpoint the
+shipped encoder is tested.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import ClassVar
@@ -27,12 +28,25 @@ import torch
 from scipy.ndimage import map_coordinates
 from tqdm import tqdm
 
-from monoforce_ros.bags import BagError
+from monoforce_ros.bags import BagError, Recording
 from monoforce_ros.core import MotionState, write_text
 from monoforce_ros.evaluation import EvaluationError
-from monoforce_ros.evaluation.tables import CONSTANT, FLAT, LIDAR, SequenceErrors, System, evaluate_sequence
-from monoforce_ros.perception import Observation
-from monoforce_ros.reporting import write_between
+from monoforce_ros.evaluation.figures import CameraPicture, prediction_figure
+from monoforce_ros.evaluation.recording_evaluation import predict_at
+from monoforce_ros.evaluation.tables import (
+    CONSTANT,
+    FLAT,
+    HORIZON,
+    LIDAR,
+    SequenceErrors,
+    System,
+    evaluate_sequence,
+    terrain_source,
+)
+from monoforce_ros.evaluation.view import PredictionView
+from monoforce_ros.perception import FlatTerrain, Observation, TerrainSource
+from monoforce_ros.prediction import Predictor
+from monoforce_ros.reporting import figure_png, page, picture_card, write_between
 from monoforce_ros.robots import RobotModel, load_robot
 from monoforce_ros.synthetic import CameraSettings, LidarSettings, RecordingSettings, WorldSettings, record
 from monoforce_ros.synthetic.labels import labels_file
@@ -71,6 +85,8 @@ LEARNED = {
 }
 """Title and input of each learned system, by its name."""
 _RESAMPLES = 4000
+WORST = 3
+"""Number of worst predictions that are shown of each system."""
 _LIDAR = LidarSettings(rings=32, columns=360, rate=5.0)
 # The robots' own physics differ: drag was fitted for the Husky only.
 DRAG_ROBOT = ROOT / "models" / "husky_in_grass.yaml"
@@ -120,6 +136,12 @@ class Result:
     """ΔR [deg]."""
     windows: int
     strata: dict[str, str]
+    worst: int = 0
+    """Start of the window with the largest position error [ns]; 0 without any."""
+    worst_position: float = float("nan")
+    """Its error [m]."""
+    by_distance: dict[str, float] = field(default_factory=dict)
+    """Δx [m] of poses by the distance from the start."""
 
 
 def strata(described: Mapping[str, object]) -> dict[str, str]:
@@ -164,28 +186,91 @@ def record_world(folder: Path, seed: int, settings: WorldSettings, duration: flo
 def evaluate_world(bag: Path, checkpoints: Mapping[str, Sequence[Path]], physics: Sequence[str]) -> list[Result]:
     """Errors of every system and checkpoint on one world, with each kind of physics."""
     described = json.loads(world_file(bag).read_text())
-    systems: list[System] = [LIDAR, BOUND]
-    for name, files in checkpoints.items():
-        title, sensor = LEARNED[name]
-        systems += [System(f"{name}@{index}", title, sensor, file) for index, file in enumerate(files)]
-    systems += [FLAT, CONSTANT]
+    systems = [LIDAR, BOUND, *learned_systems(checkpoints), FLAT, CONSTANT]
     results = []
-    with np.load(labels_file(bag)) as stored:
-        labels = {name: stored[name] for name in ("support_height", "visible_height", "origin", "resolution")}
     for name in physics:
         robot = with_physics(load_robot(described["robot"]), name)
-        truth = TrueSupport(labels, Grid.square(), TerrainDefaults())
-        errors: dict[str, SequenceErrors] = evaluate_sequence(bag, robot, systems, {BOUND.key: truth})
+        errors: dict[str, SequenceErrors] = evaluate_sequence(bag, robot, systems, {BOUND.key: true_support(bag)})
         for system in systems:
             key, _, checkpoint = system.key.partition("@")
             found = errors[system.key]
             results.append(
                 Result(
                     key, checkpoint, int(described["seed"]), name, found.position, found.rotation, found.windows,
-                    strata(described),
+                    strata(described), found.worst, found.worst_position, found.by_distance,
                 )
             )  # fmt: skip
     return results
+
+
+def learned_systems(checkpoints: Mapping[str, Sequence[Path]]) -> list[System]:
+    """A system for each checkpoint."""
+    return [
+        System(f"{name}@{index}", *LEARNED[name], file)
+        for name, files in checkpoints.items()
+        for index, file in enumerate(files)
+    ]
+
+
+def true_support(bag: Path) -> TrueSupport:
+    """The ground of a recorded world."""
+    with np.load(labels_file(bag)) as stored:
+        labels = {name: stored[name] for name in ("support_height", "visible_height", "origin", "resolution")}
+    return TrueSupport(labels, Grid.square(), TerrainDefaults())
+
+
+def worst_cases(results: Sequence[Result], physics: str, count: int = WORST) -> dict[str, list[Result]]:
+    """The worst windows of each system that has a terrain, of different worlds, the worst one first."""
+    found: dict[str, list[Result]] = {}
+    ranked = sorted((r for r in results if r.physics == physics and r.worst), key=lambda r: -r.worst_position)
+    for result in ranked:
+        own = found.setdefault(result.system, [])
+        if result.system != CONSTANT.key and len(own) < count and result.world not in {r.world for r in own}:
+            own.append(result)
+    return {system: own for system, own in found.items() if own}
+
+
+def gallery(worlds: Path, results: Sequence[Result], checkpoints: Mapping[str, Sequence[Path]], physics: str) -> str:
+    """A page with the worst predictions of each system: the camera's view, and the map with both paths."""
+    cards = []
+    learned = {system.key: system for system in learned_systems(checkpoints)}
+    cases = worst_cases(results, physics)
+    for key, own in tqdm(cases.items(), desc="worst cases"):
+        for rank, result in enumerate(own, start=1):
+            bag = worlds / f"{result.world}"
+            robot = with_physics(load_robot(json.loads(world_file(bag).read_text())["robot"]), physics)
+            recording = Recording.open(bag, robot=robot).in_base_frame(robot.base_frame)
+            system = learned.get(f"{key}@{result.checkpoint}", {LIDAR.key: LIDAR, FLAT.key: FLAT}.get(key, BOUND))
+            if system is BOUND:
+                source: TerrainSource = true_support(bag)
+            elif system is FLAT:
+                source = FlatTerrain(robot, Grid.square(), TerrainDefaults())
+            else:
+                source = terrain_source(system, robot)
+            topics = tuple(recording.images) if "camera" in source.sensors else ()
+            prediction = predict_at(recording, Predictor(robot, source, horizon=HORIZON), result.worst, topics)
+            later = recording.motion.stamps - result.worst
+            figure = prediction_figure(
+                PredictionView.of_prediction(prediction, robot),
+                robot,
+                picture=CameraPicture.nearest(recording, robot, result.worst),
+                measured=recording.motion.positions[(later >= 0) & (later <= HORIZON * 1e9)],
+            )
+            seconds = (result.worst - recording.motion.stamps[0]) * 1e-9
+            about = ", ".join(f"{name}: {value}" for name, value in result.strata.items())
+            cards.append(
+                picture_card(
+                    figure_png(figure),
+                    alt=f"{system.title}, world {result.world}",
+                    heading=f"{system.title}: number {rank}, mean error {result.worst_position:.2f} m",
+                    caption=f"World {result.world}, {seconds:.0f} s into the recording. {about}.",
+                )
+            )
+    lead = (
+        f"The {WORST} worlds in which each system's worst prediction is farthest off, physics: {physics}. Orange: "
+        "predicted path. Dashed: measured path."
+    )
+    return page("Worst predictions of each terrain source", "".join(cards), lead=lead)
 
 
 PHYSICS: dict[str, Callable[[RobotModel], RobotModel]] = {
@@ -257,6 +342,11 @@ def strata_table(results: Sequence[Result], physics: str) -> str:
             cells = [f"{interval([r for r in own if r.system == key], 'position')[0]:.3f}" for key in systems]
             count = len({result.world for result in own})
             lines.append(f"| {criterion} | {stratum} | {count} | {' | '.join(cells)} |")
+    for distance in dict.fromkeys(name for result in chosen for name in result.by_distance):
+        own = [result for result in chosen if np.isfinite(result.by_distance.get(distance, np.nan))]
+        means = [np.mean([r.by_distance[distance] for r in own if r.system == key] or [np.nan]) for key in systems]
+        count = len({result.world for result in own})
+        lines.append(f"| distance | {distance} | {count} | {' | '.join(f'{mean:.3f}' for mean in means)} |")
     return "\n".join(lines)
 
 
@@ -359,11 +449,14 @@ def main() -> int:
     used = log_use(options.out / "terrain.log.jsonl", entry)
     write_text(options.out / "terrain.md", f"{text}\n{by_strata}\n")
     write_text(options.out / "terrain.json", json.dumps([asdict(result) for result in results], indent=1))
+    shown = gallery(options.out / "worlds", results, checkpoints, next(iter(PHYSICS)))
+    write_text(options.out / "worst_cases.html", shown)
     if options.docs is not None:
         write_between(options.docs, "terrain", f"{text}\n{by_strata}")
     print(text)
     print(
-        f"{options.out / 'terrain.md'}; these seeds were used {used} time(s), see {options.out / 'terrain.log.jsonl'}"
+        f"{options.out / 'terrain.md'}, {options.out / 'worst_cases.html'}; these seeds were used {used} time(s), see "
+        f"{options.out / 'terrain.log.jsonl'}"
     )
     return 0
 

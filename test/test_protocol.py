@@ -62,6 +62,24 @@ def test_tables_have_a_row_for_every_system_and_stratum():
     assert "| robot | marv | 2 |" in terrain.strata_table(rows, "paper")
 
 
+def test_strata_by_distance_leave_out_worlds_without_such_poses():
+    near, far = {"0 to 1 m": 0.1, "1 to 2.5 m": 0.3}, {"0 to 1 m": 0.2, "1 to 2.5 m": float("nan")}
+    rows = [result("lidar", "", 0, 0.1, by_distance=near), result("lidar", "", 1, 0.1, by_distance=far)]
+    text = terrain.strata_table([*rows, result("lidar", "", 2, float("nan"), windows=0)], "paper")
+    assert "| distance | 0 to 1 m | 2 | 0.150 |" in text and "| distance | 1 to 2.5 m | 1 | 0.300 |" in text
+
+
+def test_the_worst_predictions_of_each_system_are_of_different_worlds():
+    rows = [
+        result("lidar", "", world, 0.1, worst=1 + world, worst_position=error)
+        for world, error in ((0, 0.5), (0, 0.9), (1, 0.7), (2, 0.2), (3, 0.1), (4, 0.05))
+    ]
+    rows += [result("constant", "", 0, 0.1, worst=1, worst_position=3.0), result("flat", "", 5, float("nan"), windows=0)]
+    found = terrain.worst_cases(rows, "paper")
+    assert list(found) == ["lidar"] and [case.world for case in found["lidar"]] == [0, 1, 2]
+    assert found["lidar"][0].worst_position == 0.9
+
+
 def test_worlds_are_sorted_into_strata():
     described = {
         "vegetation_height": 0.5, "slope_deg": 9.0, "sky": "dusk", "misleading_ground": True, "cameras": 2,

@@ -84,6 +84,8 @@ def test_the_executable_writes_json_markdown_and_html(executables, demo_bag, che
     assert set(found["systems"]) == {"lidar", "lss", "lidar_network", "flat", "constant"}
     # The same numbers as computed directly, and all different.
     direct = evaluate_sequence(demo_bag, load_robot("husky"), [LIDAR, FLAT])
+    near, far = (direct["flat"].by_distance[name] for name in ("0 to 1 m", "2.5 to 6.4 m"))
+    assert near < far and direct["flat"].worst_position > direct["flat"].position and direct["flat"].worst
     for key in ("lidar", "flat"):
         value = found["systems"][key]["position"]["value"]
         assert value == pytest.approx(direct[key].position, rel=0.05)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,8 @@ MINIMUM_POSES = 5
 _RESAMPLES = 4000
 _HALF_MAP = 6.4
 """Half the edge length of the encoder's map [m]."""
+DISTANCES = (0.0, 1.0, 2.5, _HALF_MAP)
+"""Limits of the distances from the start by which errors are listed [m]."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,12 @@ class SequenceErrors:
     rotation: float
     """ΔR [deg] (equation 6)."""
     windows: int
+    worst: int = 0
+    """Start of the window with the largest position error [ns]; 0 without any."""
+    worst_position: float = float("nan")
+    """Its error [m]."""
+    by_distance: dict[str, float] = field(default_factory=dict)
+    """Mean position error [m] of poses by how far the robot has come from the start, see :data:`DISTANCES`."""
 
 
 @dataclass(frozen=True)
@@ -129,11 +138,24 @@ def _sequence(name: str, evaluation: RecordingEvaluation, method: str, chosen: n
     usable[:, 0] = False
     counted = usable.sum(axis=1) >= MINIMUM_POSES
 
-    def mean(errors: np.ndarray) -> float:
-        inside = np.where(usable[counted], errors[counted], 0.0).sum(axis=1) / usable[counted].sum(axis=1)
-        return float(inside.mean()) if counted.any() else float("nan")
+    if not counted.any():
+        return SequenceErrors(name, float("nan"), float("nan"), 0)
 
-    return SequenceErrors(name, mean(position), mean(rotation), int(counted.sum()))
+    def of_windows(errors: np.ndarray) -> np.ndarray:
+        return np.where(usable[counted], errors[counted], 0.0).sum(axis=1) / usable[counted].sum(axis=1)
+
+    away = np.linalg.norm(measured.positions[..., :2] - measured.positions[:, :1, :2], axis=-1)
+    by_distance = {}
+    for low, high in pairwise(DISTANCES):
+        chosen_poses = usable & counted[:, None] & (away >= low) & (away < high)
+        by_distance[f"{low:g} to {high:g} m"] = float(position[chosen_poses].mean()) if chosen_poses.any() else np.nan
+    moved, turned = of_windows(position), of_windows(rotation)
+    worst = int(moved.argmax())
+    return SequenceErrors(
+        name, float(moved.mean()), float(turned.mean()), int(counted.sum()),
+        worst=int(evaluation.stamps[chosen][counted][worst]), worst_position=float(moved[worst]),
+        by_distance=by_distance,
+    )  # fmt: skip
 
 
 def _on_map(measured: Poses) -> np.ndarray:
