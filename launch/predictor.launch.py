@@ -23,7 +23,9 @@ def _actions(context: LaunchContext) -> list[Action]:
     # Where another launch file was called, the arguments on the command line are first of all that file's.
     included = not any(Path(word).name == Path(__file__).name for word in sys.argv)
     given = {argument.name: LaunchConfiguration(argument.name).perform(context) for argument in launch_arguments()}
-    plans = plan_nodes(given, context.argv, included=included)
+    # What a file that includes this one passes on is no word of the command line.
+    passed = [f"{name}:={value}" for name, value in context.launch_configurations.items()] if included else []
+    plans = plan_nodes(given, [*context.argv, *passed], included=included)
     nodes = [
         Node(
             package="monoforce_ros",

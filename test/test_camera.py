@@ -5,7 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from monoforce_ros.bags import builders
 from monoforce_ros.core import CameraModel
+from monoforce_ros.messages import MessageError
+from monoforce_ros.messages.decoding import decode_camera_info
 
 MATRIX = np.array([[300.0, 0, 321.5], [0, 305.0, 238.0], [0, 0, 1]])
 LENSES = {
@@ -69,6 +72,12 @@ def test_invalid_calibrations_are_refused(change, message):
         ({"distortion": np.array([-4.0, 9.0, 0.0, 0.0, -12.0])}, "a lens would show only"),
         ({"distortion_model": "equidistant", "distortion": np.array([-5.0, 3.0, 0.0, 0.0])}, "a lens would show only"),
         ({"matrix": np.array([[400.0, 0, 1e5], [0, 400.0, 240], [0, 0, 1]])}, "principal point"),
+        ({"matrix": np.array([[400.0, 0, 640], [0, 400.0, 480], [0, 0, 1]])}, "is the matrix that of a larger image"),
+        ({"matrix": np.eye(3)}, "are they in pixels"),
+        ({"matrix": np.diag([3.6, 3.6, 1.0])}, "are they in pixels"),
+        ({"matrix": np.diag([1e6, 1e6, 1.0])}, "are they in pixels"),
+        ({"matrix": np.diag([100.0, 900.0, 1.0])}, "expected a ratio of at most 3"),
+        ({"matrix": MATRIX.T}, r"expected \[\[fx, s, cx\]"),
     ],
 )
 def test_calibrations_of_no_lens_are_refused(change, message):
@@ -85,6 +94,31 @@ def test_calibrations_of_lenses_pass(lens):
     beside = model.matrix + np.array([[0, 0, 900.0], [0, 0, 0], [0, 0, 0]])
     CameraModel(model.width, model.height, beside, np.zeros(0)).check()
     model.resized(4 * model.width, 4 * model.height).check()
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "focal"),
+    [(1920, 1080, 344), (1280, 720, 223), (1280, 960, 282), (1024, 1024, 293), (1024, 1024, 267), (640, 480, 120)],
+)
+def test_circular_fisheyes_with_black_corners_pass(width, height, focal):
+    """Of 180° to 220°; in half of the image, and beyond 90°, pixels have no ray with z > 0."""
+    matrix = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+    for coefficients in ([0.0] * 4, [0.02, -0.004, 0.001, 0.0], [-0.03, 0.002, -0.001, 0.0]):
+        CameraModel(width, height, matrix, np.array(coefficients), "equidistant").check()
+
+
+def test_binned_images_and_regions_have_the_rays_of_the_calibrated_one():
+    """CameraInfo describes the whole sensor; the image that is sent is a region of it, with pixels combined."""
+    info = builders.camera_info(0, "camera", 640, 480, MATRIX, [0.0] * 5)
+    full = decode_camera_info(info)
+    info.roi.x_offset, info.roi.y_offset, info.roi.width, info.roi.height = 100, 40, 400, 200
+    info.binning_x = info.binning_y = 2
+    part = decode_camera_info(info)
+    assert (part.width, part.height) == (200, 100)
+    np.testing.assert_allclose(part.rays(np.array([30.0, 20.0])), full.rays(np.array([160.5, 80.5])), atol=1e-9)
+    info.roi.width = 600
+    with pytest.raises(MessageError, match=r"roi: got 600 × 200 px at \(100, 40\), expected a part of 640 × 480"):
+        decode_camera_info(info)
 
 
 def test_coefficients_of_a_fisheye_may_be_padded_with_zeros():

@@ -122,7 +122,8 @@ def test_wrong_values_are_named_with_what_was_expected(given, message):
             "no node is called /predictr; did you mean 'predictor'",
         ),
         (
-            "predictor:\n  ros__parameters:\n    rate: 3.0\nforesight:\n  ros__parameters:\n    horizon: 3.0\n",
+            "predictor:\n  ros__parameters:\n    rate: 3.0\nforesight:\n  ros__parameters:\n    horizon: 3.0\n"
+            "    candidates: 8\n    robot: husky\n",
             "no node is called /foresight; expected /left/predictor or /\\*\\*",
         ),
         ("a: [", "is not YAML: line 1: expected the node content"),
@@ -144,8 +145,22 @@ def test_sections_for_other_packages_and_other_robots_are_left_alone(file):
     mine = "predictor:\n  ros__parameters:\n    rate: 3.0\n"
     others = "controller_server:\n  ros__parameters:\n    controller_frequency: 20.0\n    odom_topic: odom\n"
     others += "/right/predictor:\n  ros__parameters:\n    robot: marv\n/**/costmap:\n  ros__parameters: {}\n"
+    # Other packages have parameters of the same name as well.
+    others += (
+        "joint_state_publisher:\n  ros__parameters:\n    rate: 30\nteleop_node:\n  ros__parameters:\n    device: 0\n"
+    )
+    others += "local_costmap:\n  local_costmap:\n    ros__parameters:\n      robot_radius: 0.3\n"
     (plan,) = plan_nodes({"params_file": file(mine + others), "namespace": "left"})
     assert plan.parameters == {"rate": 3.0}
+
+
+def test_numbers_are_read_as_ros_reads_them(file):
+    """YAML 1.1 takes 1e-1 for text."""
+    path = file(
+        "path_selector:\n  ros__parameters:\n    goal_tolerance: 1e-1\n/**:\n  ros__parameters:\n    rate: 2e0\n"
+    )
+    predictor, selector = plan_nodes({"params_file": path, "path_selector": "true"})
+    assert selector.parameters == {"goal_tolerance": 0.1} and predictor.parameters == {"rate": 2.0}
 
 
 @pytest.mark.parametrize("node", ["predictor", "path_selector"])
@@ -256,7 +271,10 @@ def test_arguments_reach_the_nodes_and_unknown_ones_end_the_start_unless_another
     with pytest.raises(ValueError, match="unknown launch argument 'ns'; did you mean 'namespace'"):
         module._actions(MagicMock(argv=["ns:=left"]))
     monkeypatch.setattr(sys, "argv", ["ros2", "launch", "my_robot", "bringup.launch.py", "ns:=left"])
-    assert len(module._actions(MagicMock(argv=["ns:=left"]))) == 2
+    passed = {"ns": "left", "horizon": "3.0"}
+    assert len(module._actions(MagicMock(argv=["ns:=left"], launch_configurations=passed))) == 2
+    with pytest.raises(ValueError, match="unknown launch argument 'terrain_sourse'; did you mean 'terrain_source'"):
+        module._actions(MagicMock(argv=["ns:=left"], launch_configurations=passed | {"terrain_sourse": "lidar"}))
 
 
 def test_the_launch_file_mentions_parameters_of_a_node_that_it_does_not_start(launch_file, file):

@@ -42,6 +42,10 @@ class Robot:
         self.commands: list = []
         self.base = None
         self.obeys = False
+        self.drift = np.zeros(2)
+        """Velocity that no command causes [m/s]."""
+        self.signs = np.ones(2)
+        """Factors of forward speed and yaw rate with which the robot obeys."""
         self.travelled = 0.0
 
     def listen(self, kind: type, quality: QoSProfile = BEST_EFFORT) -> None:
@@ -67,10 +71,11 @@ class Robot:
             self.peer.now += 50_000_000
             if self.obeys and self.commands:
                 twist = getattr(self.commands[-1], "twist", self.commands[-1])
-                self.speed = twist.linear.x
-                self.heading += 0.05 * twist.angular.z
+                self.speed = self.signs[0] * twist.linear.x
+                self.heading += 0.05 * self.signs[1] * twist.angular.z
             self.travelled += 0.05 * self.speed
             self.place = self.place + 0.05 * self.speed * np.array([np.cos(self.heading), np.sin(self.heading)])
+            self.place = self.place + 0.05 * self.drift
             stamp = self.peer.now
             if odometry:
                 turn = [0, 0, np.sin(self.heading / 2), np.cos(self.heading / 2)]
@@ -360,6 +365,101 @@ def test_a_robot_that_moves_against_its_commands_is_stopped_and_its_goal_dropped
     assert not robot.commands, "it is commanded although its goal was dropped"
 
 
+def test_a_robot_that_turns_the_wrong_way_is_stopped_and_its_goal_dropped(robot):
+    robot.listen(TwistStamped)
+    robot.obeys, robot.signs = True, np.array([1.0, -1.0])
+    robot.send_goal(-2.0, 5.0)
+    assert robot.live(20.0, until=robot.says("the goal is dropped and the robot stopped: ")), robot.status()
+    robot.live(1.5)
+    assert not robot.driven and robot.travelled < 8.0, (robot.travelled, robot.status())
+
+
+@pytest.mark.parametrize("frozen", [True, False])
+def test_a_robot_that_does_not_follow_its_commands_is_stopped_in_the_end(robot, frozen):
+    """Stuck, or with odometry whose positions stand while its stamps go on; or a heading that is off by a quarter."""
+    robot.listen(TwistStamped)
+    robot.send_goal(50.0, 0.0)
+    assert robot.live(10.0, until=lambda: robot.driven), robot.status()
+    if not frozen:
+        robot.obeys, robot.signs = True, np.array([0.0, 0.0])
+        robot.drift = np.array([0.0, 0.5])
+        sideways = "the robot moves, but not as commanded: 0.50 m/s and 0.00 rad/s are sent to"
+        assert robot.live(10.0, until=robot.says(sideways)), robot.status()
+        assert "0.00 m/s forward, 0.50 m/s to the left" in robot.status()[1], robot.status()
+    assert robot.live(15.0, until=robot.says("it has not followed its commands for")), robot.status()
+    robot.live(1.5)
+    robot.commands.clear()
+    robot.live(1.0)
+    assert not robot.commands, "once it is free, it must not drive on by itself"
+
+
+@pytest.mark.parametrize("robot", ["progress_timeout:=3.0"], indirect=True)
+def test_a_goal_that_comes_no_nearer_is_dropped(robot):
+    """Behind a wall that no candidate avoids, the robot drives to and fro for ever."""
+    robot.listen(TwistStamped)
+    robot.obeys = True
+    robot.send_goal(50.0, 0.0)
+    assert robot.live(10.0, until=lambda: robot.place[0] > 0.5), robot.status()
+    robot.signs = np.array([0.15, 1.0])
+    robot.live(2.0)
+    assert "dropped" not in robot.process.output
+    robot.signs = np.array([0.12, 1.0])
+    robot.drift = np.array([-0.06, 0.0])
+    assert robot.live(15.0, until=robot.says("it has come no nearer to its goal for 3 s, 4")), robot.status()
+
+
+def test_odometry_that_begins_anew_drops_the_goal(robot):
+    """Where the goal is in the new frame is unknown: a robot that restarts must not drive on by itself."""
+    robot.listen(TwistStamped)
+    robot.obeys = True
+    robot.send_goal(9.0, 0.0)
+    assert robot.live(20.0, until=lambda: robot.place[0] > 3.5), robot.status()
+    robot.live(2.0, odometry=False)
+    assert not robot.driven
+    robot.place = np.zeros(2)
+    assert robot.live(5.0, until=robot.says("the goal is dropped and the robot stopped: odometry jumped by")), (
+        robot.status()
+    )
+    robot.live(1.0)
+    robot.commands.clear()
+    robot.live(1.0)
+    assert not robot.commands
+
+
+ECHO = """
+import rclpy
+from geometry_msgs.msg import Twist
+rclpy.init()
+node = rclpy.create_node("{name}")
+node.create_subscription(Twist, "{topic}", lambda message: None, 1)
+rclpy.spin(node)
+"""
+
+
+@pytest.mark.parametrize("name", ["_ros2cli_1234", "dashboard"])
+def test_who_hears_the_commands_is_told_from_who_listens_for_another_type(robot, ros_environment, name):
+    """A base that expects TwistStamped, beside another listener that expects Twist from the start."""
+    code = ECHO.format(name=name, topic=f"/{robot.prefix}/cmd_vel")
+    listener = subprocess.Popen([sys.executable, "-c", code], env=ros_environment)
+    try:
+        count = robot.peer.node.count_subscribers
+        assert robot.peer.until(lambda: count(f"/{robot.prefix}/cmd_vel") > 0, 20.0)
+        robot.listen(TwistStamped)
+        robot.obeys = True
+        robot.send_goal(50.0, 0.0)
+        if name == "dashboard":
+            # Twist has precedence; it must not be said that the base hears it.
+            warned = "is heard by /dashboard, but not by /peer: expects geometry_msgs/msg/TwistStamped"
+            assert robot.live(20.0, until=lambda: warned in robot.process.output), robot.process.output
+            assert robot.live(10.0, until=robot.says("the robot does not move")), robot.status()
+            assert "heard by /dashboard)" in robot.status()[1]
+        else:
+            assert robot.live(20.0, until=robot.says("driving to the goal")), robot.status()
+    finally:
+        listener.kill()
+        listener.wait()
+
+
 def test_several_commands_to_stand_follow_the_last_one_that_moves(robot):
     """A base with a best-effort subscription may miss one, and hold its last command."""
     robot.listen(TwistStamped)
@@ -439,6 +539,7 @@ def test_goals_in_the_map_are_transformed_by_tf(robot):
     assert robot.commands[-1].angular.z < 0.0
     # It is reached where the map says: (1, 7) in the map is 5 m ahead in the odometry frame.
     robot.place = np.array([5.0, 0.1])
+    robot.live(0.5)
     robot.send_goal(1.0, 7.0, frame="map_2")
     assert robot.live(10.0, until=robot.says("the goal is reached: 0.10 m away")), robot.status()
 
@@ -642,6 +743,23 @@ def test_motion_against_the_command_is_found_and_nothing_else_is_taken_for_it():
         assert not against(0.5, 0.5, share)
     for turns in (0.5, 1.0, 2.0, 3.0):
         assert not against(0.5, 0.6, 1.0, seconds=12.0, turns=turns)
+    # A wrong sign is found although the commands change theirs, as those of a closed loop do.
+    for turns in (2.5, 4.0):
+        assert against(0.0, 0.6, -1.0, seconds=16.0, turns=turns) == {"yaw rate"}
+
+
+def test_the_time_without_motion_as_commanded_is_counted():
+    check = ProgressCheck()
+    for step in range(80):
+        check.add(0.1 * step, (0.5, 0.0), np.array([0.05 * step, 0.0]), 0.0)
+    assert check.unfollowed < 1.0 and check.velocity.forward == pytest.approx(0.5)
+    for step in range(80, 140):
+        check.add(0.1 * step, (0.5, 0.0), np.array([4.0, 0.05 * (step - 80)]), 0.0)
+    assert check.unfollowed == pytest.approx(5.0, abs=1.0)
+    assert check.velocity.left == pytest.approx(0.5) and check.velocity.forward == pytest.approx(0.0, abs=1e-6)
+    for step in range(140, 180):
+        check.add(0.1 * step, (0.0, 0.0), np.array([4.0, 3.0]), 0.0)
+    assert check.unfollowed < 0.1 and check.velocity is None, "a robot that is commanded to stand follows"
 
 
 @pytest.mark.parametrize(("yaw_rate", "drift"), [(0.02, 0.003), (0.05, 0.01), (0.17, 0.02)])

@@ -74,7 +74,10 @@ def test_the_worst_predictions_of_each_system_are_of_different_worlds():
         result("lidar", "", world, 0.1, worst=1 + world, worst_position=error)
         for world, error in ((0, 0.5), (0, 0.9), (1, 0.7), (2, 0.2), (3, 0.1), (4, 0.05))
     ]
-    rows += [result("constant", "", 0, 0.1, worst=1, worst_position=3.0), result("flat", "", 5, float("nan"), windows=0)]
+    rows += [
+        result("constant", "", 0, 0.1, worst=1, worst_position=3.0),
+        result("flat", "", 5, float("nan"), windows=0),
+    ]
     found = terrain.worst_cases(rows, "paper")
     assert list(found) == ["lidar"] and [case.world for case in found["lidar"]] == [0, 1, 2]
     assert found["lidar"][0].worst_position == 0.9

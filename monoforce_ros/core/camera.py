@@ -16,8 +16,16 @@ _MOST_DISTORTED = 10.0
 """Largest factor by which distortion may move a pixel away from the centre or towards it: at half of a field of view of
 160°, a perspective image is 4 times as far from its centre as that of an equidistant lens."""
 _CONSISTENT = 0.5
-"""Smallest share of the image in which pixels and rays have to agree: calibrations fit the centre, and a polynomial may
-fold in the corners of a wide lens."""
+"""Smallest share of the image, or of 60° of a fisheye, in which pixels and rays have to agree: calibrations fit the
+centre, and a polynomial may fold in the corners of a wide lens."""
+_FISHEYE_ANGLE = np.radians(60.0)
+_CORNER = 0.95
+"""Share of both edges from which a principal point is in the corner: that of an image twice as large is at 1."""
+_MOST_OBLONG = 3.0
+"""Largest ratio of the focal lengths in pixels: a binned or anamorphic image is up to twice as wide."""
+_SHORTEST, _LONGEST = 0.05, 60.0
+"""Focal length over the image's shorter and longer edge: fields of view of 169° and 1° for a perspective camera; a
+circular fisheye of 220° has about 0.25."""
 
 
 @dataclass(frozen=True)
@@ -68,38 +76,76 @@ class CameraModel:
     def check(self) -> None:
         """Raise ``ValueError`` if no lens has these values.
 
-        A camera looks along its optical axis; where pixels have rays, the rays have these pixels; and distortion moves
-        pixels by less than an order of magnitude.
+        The matrix has a camera's form and field of view; a perspective camera looks along its optical axis; and
+        where distortion is defined, pixels have rays that lead back to them, within an order of magnitude of the ideal
+        lens.
         """
+        self._check_matrix()
+        seen = self._consistent_fisheye() if self.distortion_model == "equidistant" else self._consistent_pixels()
+        if seen < _CONSISTENT:
+            raise ValueError(
+                f"distortion: got {self.distortion.tolist()}, with which a lens would show only {100 * seen:.0f} % "
+                f"of its field of view, expected at least {100 * _CONSISTENT:.0f} %: are they of another model "
+                f"than {self.distortion_model!r}, or of another image size?"
+            )
+
+    def _check_matrix(self) -> None:
+        matrix, size = self.matrix, np.array([self.width, self.height])
+        focal, centre = matrix[[0, 1], [0, 1]], matrix[:2, 2]
+        if np.any(matrix[[1, 2, 2], [0, 0, 1]] != 0.0) or matrix[2, 2] != 1.0:
+            raise ValueError(f"camera matrix: got {matrix.tolist()}, expected [[fx, s, cx], [0, fy, cy], [0, 0, 1]]")
+        if not 1.0 / _MOST_OBLONG <= focal[0] / focal[1] <= _MOST_OBLONG:
+            raise ValueError(
+                f"camera matrix: got focal lengths {focal[0]:g} and {focal[1]:g} px, expected a ratio of at most "
+                f"{_MOST_OBLONG:g}"
+            )
+        if not _SHORTEST * size.min() <= focal.min() <= focal.max() <= _LONGEST * size.max():
+            raise ValueError(
+                f"camera matrix: got focal lengths {focal[0]:g} and {focal[1]:g} px for {size[0]} × {size[1]} px, "
+                f"expected {_SHORTEST:g} to {_LONGEST:g} times its edge: are they in pixels?"
+            )
+        if (centre > _CORNER * size).all():
+            raise ValueError(
+                f"camera matrix: got the principal point ({centre[0]:g}, {centre[1]:g}) px in the corner of an image "
+                f"of {size[0]} × {size[1]} px, expected one near its middle: is the matrix that of a larger image?"
+            )
+        if self.distortion_model == "equidistant":
+            return
+        outside = np.maximum(0.0, np.maximum(-centre, centre - size + 1.0))
+        if (slope := float(np.linalg.norm(outside / focal))) > _MOST_OBLIQUE:
+            raise ValueError(
+                f"camera matrix: got the principal point ({centre[0]:g}, {centre[1]:g}) px of an image of "
+                f"{size[0]} × {size[1]} px, expected one in the image or near it: the whole image would lie more than "
+                f"{np.degrees(np.arctan(slope)):.0f}° beside the optical axis"
+            )
+
+    def _consistent_fisheye(self) -> float:
+        """Share of 60° in which the angles of an equidistant lens grow with the distance from the centre."""
+        angles = np.linspace(0.0, _FISHEYE_ANGLE, 121)[1:]
+        coefficients = self._fisheye()
+        radii = angles * (1.0 + sum(k * angles ** (2 * n + 2) for n, k in enumerate(coefficients)))
+        grows = (np.diff(radii, prepend=0.0) > 0.0) & (radii < _MOST_DISTORTED * angles)
+        grows &= radii > angles / _MOST_DISTORTED
+        corners = np.array([[0, 0], [self.width, 0], [0, self.height], [self.width, self.height]]) - self.matrix[:2, 2]
+        # What lies beyond the image does not matter.
+        grows |= radii > np.linalg.norm(corners / self.matrix[[0, 1], [0, 1]], axis=1).max()
+        return float(np.logical_and.accumulate(grows).mean())
+
+    def _consistent_pixels(self) -> float:
+        """Share of the image of a perspective camera whose rays lead back to their pixels."""
         u, v = np.meshgrid(*(np.linspace(0.0, size - 1.0, 9) for size in (self.width, self.height)))
         pixels = np.stack([u.ravel(), v.ravel()], axis=1)
-        centre = self.matrix[:2, 2]
-        if self.distortion_model != "equidistant":
-            outside = np.maximum(0.0, np.maximum(-centre, centre - [self.width - 1.0, self.height - 1.0]))
-            if (slope := float(np.linalg.norm(outside / self.matrix[[0, 1], [0, 1]]))) > _MOST_OBLIQUE:
-                raise ValueError(
-                    f"camera matrix: got the principal point ({centre[0]:g}, {centre[1]:g}) px of an image of "
-                    f"{self.width} × {self.height} px, expected one in the image or near it: the whole image would lie "
-                    f"more than {np.degrees(np.arctan(slope)):.0f}° beside the optical axis"
-                )
         with np.errstate(all="ignore"):
             rays = self.rays(pixels)
             seen = np.isfinite(rays).all(axis=1) & (np.abs(rays) < 1e6).all(axis=1)
             back = np.full(pixels.shape, np.inf)
             if seen.any():
                 back[seen] = self._projected(rays[seen])
-            straight = np.linalg.norm((pixels - centre) / self.matrix[[0, 1], [0, 1]], axis=1)
+            straight = np.linalg.norm((pixels - self.matrix[:2, 2]) / self.matrix[[0, 1], [0, 1]], axis=1)
             bent = np.linalg.norm(rays[:, :2], axis=1)
-            bent = np.arctan(bent) if self.distortion_model == "equidistant" else bent
             factor = np.maximum(straight, 1e-9) / np.maximum(bent, 1e-9)
             alike = (factor < _MOST_DISTORTED) & (factor > 1.0 / _MOST_DISTORTED)
-            agree = float((alike & (np.linalg.norm(back - pixels, axis=1) < _SAME_PIXEL)).mean())
-        if agree < _CONSISTENT:
-            raise ValueError(
-                f"distortion: got {self.distortion.tolist()}, with which a lens would show only {100 * agree:.0f} % of "
-                f"the image, expected at least {100 * _CONSISTENT:.0f} %: are the coefficients of another model "
-                f"than {self.distortion_model!r}, or of another image size?"
-            )
+            return float((alike & (np.linalg.norm(back - pixels, axis=1) < _SAME_PIXEL)).mean())
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pixels of points in the camera frame.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -128,6 +129,25 @@ def _decode_raw(message: Any) -> np.ndarray:
     return pixels.copy() if conversion is None else cv2.cvtColor(pixels, conversion)
 
 
+def _binned(camera: CameraModel, message: Any) -> CameraModel:
+    """The camera of the image that is sent: a region of the calibrated one, with pixels combined (REP 104)."""
+    roi = getattr(message, "roi", None)
+    if roi is not None and roi.width and roi.height:
+        right, bottom = int(roi.x_offset) + int(roi.width), int(roi.y_offset) + int(roi.height)
+        if right > camera.width or bottom > camera.height:
+            raise ValueError(
+                f"roi: got {roi.width} × {roi.height} px at ({roi.x_offset}, {roi.y_offset}), expected a part of "
+                f"{camera.width} × {camera.height} px"
+            )
+        matrix = camera.matrix.copy()
+        matrix[:2, 2] -= (int(roi.x_offset), int(roi.y_offset))
+        camera = replace(camera, width=int(roi.width), height=int(roi.height), matrix=matrix)
+    across, down = (max(1, int(getattr(message, name, 0))) for name in ("binning_x", "binning_y"))
+    if across == down == 1:
+        return camera
+    return camera.resized(max(1, camera.width // across), max(1, camera.height // down))
+
+
 def decode_camera_info(message: Any) -> CameraModel:
     """``sensor_msgs/CameraInfo`` → CameraModel; raises ``MessageError`` if it is uncalibrated or inconsistent."""
     model = message.distortion_model or "plumb_bob"
@@ -143,6 +163,7 @@ def decode_camera_info(message: Any) -> CameraModel:
             frame_id=message.header.frame_id,
         )
         camera.check()
+        camera = _binned(camera, message)
     except ValueError as error:
         raise MessageError(f"CameraInfo: {error}") from error
     return camera

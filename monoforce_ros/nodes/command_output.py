@@ -21,8 +21,8 @@ _QUALITY = QoSProfile(
 )
 """Reliable and volatile: a base that starts later must not receive an old command. The rest are the defaults, as the
 ROS graph shows them; unstated, they could not be compared."""
-_RECORDERS = ("bag_recorder", "rosbag2_recorder")
-"""Names of the recorders of this package and of ``ros2 bag record``."""
+_WATCHERS = ("bag_recorder", "rosbag2_recorder", "_ros2cli_", "foxglove_bridge", "rosbridge_websocket", "rqt_gui_")
+"""Beginnings of the names of nodes that only watch: recorders, ``ros2 topic echo``, bridges to viewers."""
 _UNKNOWN = "_NODE_NAME_UNKNOWN_"
 """What ROS calls a node that is no ROS node, or whose name it has not received yet."""
 
@@ -56,6 +56,7 @@ class CommandOutput:
         # Fully qualified names of listeners that this publisher's quality of service does not reach, with the reason.
         self._unreached: dict[str, str] = {}
         self._rivals: set[str] = set()
+        self._reported = ""
         self._timer = node.create_timer(0.5, self._update, clock=STEADY)
         self._update()
 
@@ -66,8 +67,8 @@ class CommandOutput:
         if self.type in kinds:
             return ""
         if kinds:
-            expected = ", ".join(sorted(kinds))
-            return f"{self.topic}: its listeners expect {expected} ({self.listeners})"
+            expected, names = ", ".join(sorted(kinds)), ", ".join(sorted({name for name, _ in self._listened}))
+            return f"{self.topic}: its listeners expect {expected} ({names})"
         if self._unreached:
             causes = "; ".join(f"{name}: {reason}" for name, reason in sorted(self._unreached.items()))
             return f"{self.topic}: its listener asks for a quality of service that is not offered ({causes})"
@@ -76,8 +77,14 @@ class CommandOutput:
 
     @property
     def listeners(self) -> str:
-        """Fully qualified names of the nodes that listen and are not of this package."""
-        return ", ".join(sorted({name for name, _ in self._listened})) or "no node"
+        """Fully qualified names of the nodes that hear the commands, other than those that only watch."""
+        return ", ".join(sorted({name for name, kind in self._listened if kind == self.type})) or "no node"
+
+    @property
+    def unreached(self) -> str:
+        """Nodes that listen on the topic and do not hear the commands, with the reason."""
+        other = {name: f"expects {kind}" for name, kind in self._listened if kind != self.type}
+        return "; ".join(f"{name}: {reason}" for name, reason in sorted((other | self._unreached).items()))
 
     @property
     def rivals(self) -> str:
@@ -124,6 +131,7 @@ class CommandOutput:
             else:
                 self._listened.add((name, info.topic_type))
         self._bystanders = sorted(bystanders)
+        self._report_unreached()
         expected = {kind for _, kind in self._listened}
         # While nobody listens, the last type stays: a base that restarts asks for the same one.
         wanted = next((kind for kind in (PLAIN, STAMPED) if kind in expected), self.type or STAMPED)
@@ -142,6 +150,14 @@ class CommandOutput:
             return
         self.type = wanted
 
+    def _report_unreached(self) -> None:
+        """Warn of nodes that do not hear the commands while others do: one of them may be the base."""
+        hears = any(kind == self.type for _, kind in self._listened)
+        if hears and (text := self.unreached) and text != self._reported:
+            advice = "if one of these is the base, set `command_type`, or its subscription's quality of service"
+            self._node.get_logger().warning(f"{self.topic} is heard by {self.listeners}, but not by {text}: {advice}")
+        self._reported = self.unreached if hears else ""
+
     def _leave(self, wanted: str) -> None:
         """Stop a base that the present type moves, before another type is published: it may hold its last command."""
         hearing = ", ".join(sorted(name for name, kind in self._listened if kind == self.type))
@@ -159,7 +175,7 @@ class CommandOutput:
 
         A predictor may have any name: what it publishes shows what it is.
         """
-        if name in _RECORDERS:
+        if name.startswith(_WATCHERS):
             return True
         try:
             published = self._node.get_publisher_names_and_types_by_node(name, namespace)

@@ -239,7 +239,9 @@ def _checked(path: Path, section: str, node: _Node, values: Mapping[str, object]
     former = {entry.formerly: entry for entry in node.entries.values() if entry.formerly}
     others = {name for other in SCHEMAS for name in _Node.read(other).entries}
     for name, value in values.items():
-        if name.startswith("qos_overrides."):
+        if name.partition(".")[0] == "qos_overrides":
+            # The node says that they have no effect.
+            checked[name] = value  # type: ignore[assignment]
             continue
         entry = node.entries.get(name) or former.get(name)
         if entry is not None:

@@ -127,12 +127,16 @@ def _collect(content: Any, name: str, sections: dict[str, dict[str, Any]], stray
             _collect(value, f"{name}/{str(key).strip('/')}", sections, stray)
 
 
+_TELLING = 3
+"""Number of parameters that are all known here from which on a section is meant for this package."""
+
+
 def refuse_misnamed_sections(path: Path, sections: Mapping[str, Mapping[str, Any]], nodes: Sequence[str]) -> None:
     """Raise ``ValueError`` for a section that is meant for a node of this package and reaches none.
 
     A file may also have sections for nodes of other packages, and for this package's nodes in other namespaces. A
     section is taken for a misnamed one if its name resembles that of a node, or if this package's nodes have all
-    parameters in it.
+    parameters in it and these are several: one or two, such as ``rate``, may be another package's.
 
     Args:
         path: the file, for the message.
@@ -145,7 +149,7 @@ def refuse_misnamed_sections(path: Path, sections: Mapping[str, Mapping[str, Any
         name = section.rpartition("/")[2]
         if name in own or "*" in name:
             continue
-        if most_similar(name, own) or (values and set(values) <= known):
+        if most_similar(name, own) or (len(values) >= _TELLING and set(values) <= known):
             meant = nearest(name, own)
             raise ValueError(
                 f"parameter file {path}: no node is called {section}{meant or f'; expected {nodes[0]} or /**'}"

@@ -65,6 +65,11 @@ def refuse_unknown_parameters(node: Node, entries: Iterable[ParameterEntry] = ()
     others = parameter_owners()
     unused = []
     # rclpy keeps the values given on the command line and in files only here.
+    if ineffective := sorted(name for name in node._parameter_overrides if name.startswith("qos_overrides.")):
+        node.get_logger().warning(
+            f"without effect: {', '.join(ineffective)}: subscriptions follow the quality of service of their "
+            "publishers, publishers of this node offer the strictest one (ros2 topic info -v lists both)"
+        )
     for name in node._parameter_overrides:
         if name in known or of_every_node(name):
             continue

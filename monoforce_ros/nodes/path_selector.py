@@ -24,7 +24,7 @@ from monoforce_ros.nodes.frames import TRANSFORMS_PATIENCE, TransformListener
 from monoforce_ros.nodes.health import ERROR, OK, WARN, Health
 from monoforce_ros.nodes.parameters import declare_parameters, settings_without_effect
 from monoforce_ros.nodes.process import run_schema_node
-from monoforce_ros.nodes.progress_check import WINDOW, ProgressCheck
+from monoforce_ros.nodes.progress_check import PATIENCE, WINDOW, MeasuredVelocity, ProgressCheck
 from monoforce_ros.nodes.schema import read_schema, schema_path
 from monoforce_ros.nodes.subscriptions import AdaptiveSubscription
 from monoforce_ros.planning import (
@@ -42,6 +42,12 @@ _BASE_FRAME = "base_link"
 """Of REP 105; used unless the parameter names another one."""
 HALTS = 5
 """Commands to stand after the last one that moves: a best-effort base may miss some."""
+_NEARER = 0.2
+"""Smallest approach to the goal that counts as progress [m]."""
+_LONGER = 2.0
+"""What a plan grows by at once [m] if it was planned anew around something."""
+_JUMP = 1.0
+"""Distance by which odometry may jump without being another one [m]; and it may move at three times the speed."""
 _COARSEST = 0.05
 """Largest rounding of the candidates' positions [m]: half of the distance that counts as progress."""
 _PAUSE = 0.03
@@ -111,6 +117,8 @@ class PathSelectorNode(Node):
         self._halting = 0
         """Commands to stand that are still to be sent."""
         self._last_command: tuple[float, ...] = (0.0, 0.0)
+        # Smallest distance that was left [m] and when [s]; the distance that was left at the last command.
+        self._nearest, self._remaining = (np.inf, 0.0), np.inf
         self._progress = ProgressCheck()
         self._map: tuple[np.ndarray, float, np.ndarray] | None = None
         self._map_frame = ""
@@ -156,6 +164,11 @@ class PathSelectorNode(Node):
             self.health.report(PART, OK, "the plan is empty: standing", reason="empty plan")
             return
         header = message.header if message.header.frame_id else message.poses[0].header
+        frames = {pose.header.frame_id for pose in message.poses} - {"", header.frame_id}
+        if frames:
+            named = f"{header.frame_id!r}, and has poses in {', '.join(map(repr, sorted(frames)))}"
+            self.health.report(PART, ERROR, f"the plan is in {named}: it is ignored", reason="goal")
+            return
         stamp = header.stamp.sec * 10**9 + header.stamp.nanosec
         self._set_course("plan", header.frame_id, stamp, [[place.x, place.y, place.z] for place in places])
 
@@ -177,6 +190,7 @@ class PathSelectorNode(Node):
             end = points[-1]
             self.get_logger().info(f"new {kind}: to ({end[0]:.2f}, {end[1]:.2f}) in frame {frame_id or 'odometry'!r}")
             self._progress.clear()
+            self._nearest = np.inf, time.monotonic()
         # At once, as the robot may be moving; what is missing now may be there at the next command.
         with contextlib.suppress(Stop, Refusal):
             self._usable_motion()
@@ -207,7 +221,8 @@ class PathSelectorNode(Node):
                 self.health.report("odometry", ERROR, self._odometry_problem, reason="frame")
             return
         self._odometry_problem = ""
-        self._motion = state.of_base(offset)
+        before, self._motion = self._motion, state.of_base(offset)
+        self._drop_course_after_jump(before, self._motion)
         self._base_name = self.frames.base_name(child, self.transforms.tree.frames)
         on_robot = {child or self._base_name: offset, self._base_name: np.eye(4)}
         self._course_frames.add_odometry(frame_id, self._motion, on_robot)
@@ -217,6 +232,26 @@ class PathSelectorNode(Node):
             speed, yaw_rate = self._last_command[:2]
             self._progress.add(seconds, (speed, yaw_rate), motion.position[:2], motion.heading)
         self.health.report("odometry", OK, "receiving odometry")
+
+    def _drop_course_after_jump(self, before: MotionState | None, now: MotionState) -> None:
+        """Forget the goal if the odometry goes on elsewhere: the place of a goal in its frame is unknown then."""
+        if before is None or self._course is None:
+            return
+        seconds = abs(now.stamp - before.stamp) * NANOSECOND
+        measured = (float(np.linalg.norm(motion.linear_velocity)) for motion in (before, now))
+        speed = max(*measured, abs(self._last_command[0]))
+        # Where a robot comes to rest after its odometry has become silent is no jump, however long that was.
+        moved = float(np.linalg.norm(now.position - before.position))
+        if moved <= _JUMP + 3.0 * speed * min(seconds, self.settings.timeout):
+            return
+        self._drop(
+            f"the {self._course.kind} is dropped and the robot stopped: odometry jumped by {moved:.1f} m within "
+            f"{seconds:.1f} s: has it begun anew? Send it again"
+        )
+
+    def _drop(self, message: str) -> None:
+        self._course = None
+        self.health.report(PART, ERROR, message, reason="refused")
 
     def _on_candidates(self, message: PointCloud2) -> None:
         try:
@@ -282,8 +317,7 @@ class PathSelectorNode(Node):
             self.health.report(PART, WARN, f"stopped: {stop}", reason=stop.reason)
             return None
         except Refusal as refusal:
-            self._course = None
-            self.health.report(PART, ERROR, str(refusal), reason="refused")
+            self._drop(str(refusal))
             return None
 
     def _drive(self, course: Course) -> tuple[float, ...] | None:
@@ -315,12 +349,7 @@ class PathSelectorNode(Node):
         if best is None:
             raise Stop("no candidate is feasible", "infeasible")
         command = tuple(float(candidates.fields[name][best]) for name in COMMAND_FIELDS if name in candidates.fields)
-        if self._progress.opposed == "speed":
-            raise Refusal(
-                f"the {course.kind} is dropped and the robot stopped: it moves against its commands "
-                f"({self._last_command[0]:.2f} m/s is sent to {self._commands.topic}, odometry shows the opposite): "
-                "does somebody else drive it, or has the base or the odometry the wrong sign?"
-            )
+        self._check_progress(course, remaining if len(plan) > 1 else distance)
         self._report_driving(course, distance, command)
         return command
 
@@ -402,6 +431,39 @@ class PathSelectorNode(Node):
             self._cost_to_go = found
         return found
 
+    def _check_progress(self, course: Course, remaining: float) -> None:
+        """Raise ``Refusal`` for a robot that does not follow its commands, or comes no nearer to the goal.
+
+        Args:
+            course: what is driven to.
+            remaining: distance to the goal, or length of the plan that is left [m].
+        """
+        dropped = f"the {course.kind} is dropped and the robot stopped"
+        if opposed := self._progress.opposed:
+            sent = f"{self._sent(self._last_command)}, odometry shows the opposite {opposed}"
+            advice = "does somebody else drive it, or has the base or the odometry a wrong sign?"
+            raise Refusal(f"{dropped}: it moves against its commands ({sent}): {advice}")
+        if (seconds := self._progress.unfollowed) > PATIENCE:
+            velocity = self._progress.velocity
+            shown = "no motion" if velocity is None else _shown(velocity)
+            sent = f"{self._sent(self._last_command)}, odometry shows {shown}"
+            advice = "free it, or repair what commands or odometry pass through, then send it again"
+            raise Refusal(f"{dropped}: it has not followed its commands for {seconds:.0f} s ({sent}): {advice}")
+        now = time.monotonic()
+        nearest, since = self._nearest
+        # A plan around an obstacle that was not known before is longer at once.
+        if remaining < nearest - _NEARER or remaining > self._remaining + _LONGER or not self._driving:
+            self._nearest = nearest, since = remaining, now
+        self._remaining = remaining
+        if (limit := self.settings.progress_timeout) and now - since > limit:
+            raise Refusal(
+                f"{dropped}: it has come no nearer to its goal for {limit:g} s, {remaining:.1f} m are left: is it "
+                "within reach? (progress_timeout)"
+            )
+
+    def _sent(self, command: tuple[float, ...]) -> str:
+        return f"{command[0]:.2f} m/s and {command[1]:.2f} rad/s are sent to {self._commands.topic}"
+
     def _silent_transform(self, course: Course) -> str:
         """Which transform from the course's frame is not sent any more, as when localisation has ended; or empty."""
         name, silence = self.transforms.silence(course.frame_id, self._odometry_frame) if course.frame_id else ("", 0.0)
@@ -418,12 +480,11 @@ class PathSelectorNode(Node):
                 throttle_duration_sec=60.0,
             )
         values["other publishers of commands"] = others or "none"
-        if self._progress.opposed == "yaw rate":
-            message = f"the robot turns against its commands: {command[1]:.2f} rad/s is sent to {self._commands.topic}"
-            advice = "does somebody else drive it, or has the base or the odometry the wrong sign?"
-            self.health.report(
-                PART, WARN, f"{message}, odometry shows the opposite: {advice}", reason="opposed", **values
-            )
+        values["not reached by commands"] = self._commands.unreached or "none"
+        velocity = None if moving else self._progress.velocity
+        if velocity is not None:
+            message = f"the robot moves, but not as commanded: {self._sent(command)}, odometry shows {_shown(velocity)}"
+            self.health.report(PART, WARN, message, reason="astray", **values)
         elif moving and (silent := self._silent_transform(course)):
             self.health.report(PART, WARN, f"driving on an old transform: {silent}", reason="old transform", **values)
         elif moving:
@@ -432,10 +493,20 @@ class PathSelectorNode(Node):
             message = f"commands are sent to {self._commands.listeners}, odometry shows no motion yet"
             self.health.report(PART, OK, message, reason="starting", **values)
         else:
-            sent = f"{command[0]:.2f} m/s and {command[1]:.2f} rad/s are sent to {self._commands.topic}"
             heard = f"{self._commands.type}, heard by {self._commands.listeners}"
-            message = f"the robot does not move: {sent} ({heard}), odometry has shown no motion for {WINDOW:g} s"
+            message = (
+                f"the robot does not move: {self._sent(command)} ({heard}), odometry has shown no motion for "
+                f"{WINDOW:g} s"
+            )
             self.health.report(PART, WARN, message, reason="no motion", **values)
+
+
+def _shown(velocity: MeasuredVelocity) -> str:
+    sideways = f", {abs(velocity.left):.2f} m/s to the {'left' if velocity.left > 0 else 'right'}"
+    return (
+        f"{velocity.forward:.2f} m/s forward{sideways if abs(velocity.left) >= 0.05 else ''} and "
+        f"{velocity.yaw_rate:.2f} rad/s"
+    )
 
 
 def main(arguments: list[str] | None = None) -> int:

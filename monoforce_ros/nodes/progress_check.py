@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import stdtrit
@@ -25,11 +26,31 @@ _COMPARABLE = 0.5
 _OPPOSED = 0.5
 """Smallest share of the commanded motion, in the other direction, from which on a robot moves against its commands: one
 that slides back while its wheels grip, or whose sensors drift, shows less; wrong signs show about 1."""
+_LAGS = (0.0, 0.3, 0.6, 0.9, 1.2, 1.5)
+"""Lags of a base [s] with any of which its motion may follow commands that change their sign."""
 _OPPOSED_TURN = 0.5
 """Smallest commanded turn within the window [rad] that is judged so: the heading of a robot that pulls to one side
 drifts against slighter ones."""
+_CERTAIN = 6.0
+"""Smallest ratio of a mean velocity and its standard error at which it counts as motion, with noise that is correlated
+over several poses."""
+PATIENCE = 6.0
+"""Time without motion as commanded [s] after which a goal is dropped: three windows. Bases that start slowly have moved
+by then; what stands for longer is stuck, switched off or lost, and must not drive on by itself once it is free."""
 _FEWEST = 6
 """Fewest poses that show motion: with fewer, their noise is unknown."""
+
+
+@dataclass(frozen=True)
+class MeasuredVelocity:
+    """Mean velocity over the window, in the robot's axes at its middle."""
+
+    forward: float
+    """[m/s]."""
+    left: float
+    """[m/s]."""
+    yaw_rate: float
+    """[rad/s]."""
 
 
 class ProgressCheck:
@@ -43,10 +64,14 @@ class ProgressCheck:
     def __init__(self) -> None:
         # Time [s], speed [m/s], yaw rate [rad/s], x [m], y [m], heading [rad].
         self._samples: deque[tuple[float, float, float, float, float, float]] = deque()
+        # Earlier commands: time [s], speed [m/s], yaw rate [rad/s].
+        self._earlier: deque[tuple[float, float, float]] = deque()
+        self._followed = 0.0
 
     def clear(self) -> None:
         """Forget everything: the robot is not commanded to move."""
         self._samples.clear()
+        self._earlier.clear()
 
     def add(self, time: float, command: tuple[float, float], position: np.ndarray, heading: float) -> None:
         """Note a measured pose and the command in effect.
@@ -60,18 +85,26 @@ class ProgressCheck:
         if self._samples and time <= self._samples[-1][0]:
             if time == self._samples[-1][0]:
                 return
-            self._samples.clear()
+            self.clear()
+        if not self._samples:
+            self._followed = time
         self._samples.append((time, *command, float(position[0]), float(position[1]), heading))
         while time - self._samples[0][0] > WINDOW:
-            self._samples.popleft()
+            self._earlier.append(self._samples.popleft()[:3])
+        while self._earlier and time - self._earlier[0][0] > WINDOW + _LAGS[-1]:
+            self._earlier.popleft()
+        if self.moving or self._little_commanded:
+            self._followed = time
 
     @property
     def moving(self) -> bool | None:
         """Whether the robot moves as commanded; None while the odometry shows neither."""
         if len(self._samples) < _FEWEST:
             return None
-        along, position, turned, heading, _, full = self._motion()
-        driving, turning = _moved(along, position, full=full), _moved(turned, heading, full=full)
+        time, position, heading = self._measured()
+        along, turned = self._commanded(time, heading)
+        full = bool(time[-1] - time[0] > 0.8 * WINDOW)
+        driving, turning = _moved(along, position, full=full), _moved(turned, heading[None], full=full)
         # Of the two, the larger one is what the robot is commanded to do. The other counts only if it is hardly less: a
         # tenth of a slight turn is the drift of a heading.
         lengths = _length(along), _length(turned)
@@ -79,36 +112,82 @@ class ProgressCheck:
         return True if other and smaller > _COMPARABLE * larger else main
 
     @property
+    def unfollowed(self) -> float:
+        """Time for which the robot has been commanded to move without moving as commanded [s]."""
+        return self._samples[-1][0] - self._followed if self._samples else 0.0
+
+    @property
     def opposed(self) -> str:
         """The motion that goes against its commands, ``speed`` or ``yaw rate``; empty if the odometry shows none.
 
-        Only commands that kept their sign over the whole window are judged: after a change of direction every robot
-        moves against its commands for a while.
+        After a change of direction every robot moves against its commands for a while: then it counts only if no lag
+        explains the motion.
         """
         if len(self._samples) < _FEWEST:
             return ""
-        along, position, turned, heading, one_way, full = self._motion()
-        for name, steps, measured, smallest, kept in (
-            ("speed", along, position, _SMALLEST, one_way[0]),
-            ("yaw rate", turned, heading, _OPPOSED_TURN, one_way[1]),
-        ):
-            if full and kept and _length(steps) > smallest and (found := _share(steps, measured)) is not None:
-                share, margin = found
-                if share + margin < -_OPPOSED:
-                    return name
+        time, position, heading = self._measured()
+        if time[-1] - time[0] <= 0.8 * WINDOW:
+            return ""
+        given = np.array([*self._earlier, *(sample[:3] for sample in self._samples)])
+        for index, (name, smallest) in enumerate((("speed", _SMALLEST), ("yaw rate", _OPPOSED_TURN))):
+            measured = heading[None] if index else position
+            values = given[:, 1 + index]
+            lags = _LAGS[:1] if (values >= 0).all() or (values <= 0).all() else _LAGS
+            if all(_opposes(self._commanded(time, heading, lag)[index], measured, smallest) for lag in lags):
+                return name
         return ""
 
-    def _motion(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, tuple[bool, bool], bool]:
-        """Commanded steps and measured positions, the same of the heading, whether each command kept its sign (at most
-        zero in between), and whether the window is full.
-        """
-        time, speed, yaw_rate, x, y, heading = np.array(self._samples).T
-        heading = np.unwrap(heading)
+    @property
+    def velocity(self) -> MeasuredVelocity | None:
+        """The mean measured velocity; None if the odometry shows no motion of more than its noise."""
+        if len(self._samples) < _FEWEST:
+            return None
+        time, position, heading = self._measured()
+        span = time - time.mean()
+        power = float((span**2).sum())
+        rates, moves = [], False
+        for values in (*position, heading):
+            rate = float((span * (values - values.mean())).sum()) / power
+            scatter = values - values.mean() - rate * span
+            error = np.sqrt(float((scatter**2).sum()) / (len(time) - 2) / power)
+            moves |= abs(rate) * float(time[-1] - time[0]) > _SMALLEST and abs(rate) > _CERTAIN * error
+            rates.append(rate)
+        if not moves:
+            return None
+        middle = float(heading[len(heading) // 2])
+        cosine, sine = np.cos(middle), np.sin(middle)
+        return MeasuredVelocity(
+            float(cosine * rates[0] + sine * rates[1]), float(cosine * rates[1] - sine * rates[0]), rates[2]
+        )
+
+    @property
+    def _little_commanded(self) -> bool:
+        """Whether less motion is commanded within the window than can be judged."""
+        time, _, heading = self._measured()
+        return max(_length(steps) for steps in self._commanded(time, heading)) < _SMALLEST
+
+    def _measured(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Times [s], positions ``[2, n]`` [m] and headings [rad] within the window."""
+        time, _, _, x, y, heading = np.array(self._samples).T
+        return time, np.array([x, y]), np.unwrap(heading)
+
+    def _commanded(self, time: np.ndarray, heading: np.ndarray, lag: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+        """Steps ``[2, n - 1]`` [m] and turns ``[1, n - 1]`` [rad] between poses, of commands with a lag [s]."""
+        given = np.array([*self._earlier, *(sample[:3] for sample in self._samples)])
+        # The command in effect at a time; before the first one, the robot was not commanded to move.
+        index = np.searchsorted(given[:, 0], time[:-1] - lag + 1e-9, side="right") - 1
+        commands = np.where(index[:, None] >= 0, given[index, 1:], 0.0)
         step = np.diff(time)
-        along = (speed[:-1] * step) * np.array([np.cos(heading[:-1]), np.sin(heading[:-1])])
-        one_way = bool((speed >= 0).all() or (speed <= 0).all()), bool((yaw_rate >= 0).all() or (yaw_rate <= 0).all())
-        full = bool(time[-1] - time[0] > 0.8 * WINDOW)
-        return along, np.array([x, y]), (yaw_rate[:-1] * step)[None], heading[None], one_way, full
+        directions = np.array([np.cos(heading[:-1]), np.sin(heading[:-1])])
+        return commands[:, 0] * step * directions, (commands[:, 1] * step)[None]
+
+
+def _opposes(steps: np.ndarray, measured: np.ndarray, smallest: float) -> bool:
+    """Whether measured positions ``[d, n]`` go against commanded steps ``[d, n - 1]`` of at least a length."""
+    if _length(steps) <= smallest or (found := _share(steps, measured)) is None:
+        return False
+    share, margin = found
+    return share + margin < -_OPPOSED
 
 
 def _by_length(entry: tuple[float, bool | None]) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -19,6 +20,14 @@ SCHEMAS = ("predictor", "path_selector")
 
 _ELEMENTS = {"double_array": "double", "string_array": "string"}
 _WORDS = {"bool": "true or false", "integer": "an integer", "double": "a number", "string": "text"}
+
+
+def _number(value: Any) -> Any:
+    """A number that YAML 1.1 reads as text, such as 1e3, as ROS reads it; anything else unchanged."""
+    if isinstance(value, str):
+        with contextlib.suppress(ValueError):
+            return float(value)
+    return value
 
 
 @dataclass(frozen=True)
@@ -65,6 +74,7 @@ class ParameterEntry:
 
     def checked(self, value: Any) -> ParameterValue:
         """The value with the parameter's type; raises ``ValueError`` with what was got and what was expected."""
+        value = _number(value) if self.type == "double" else value
         try:
             return self._converted(value)
         except (TypeError, ValueError):
@@ -78,12 +88,6 @@ class ParameterEntry:
             value = yaml.safe_load(text)
         except yaml.YAMLError:
             value = text
-        if self.type == "double" and isinstance(value, str):
-            # YAML 1.1 reads 1e3 as text.
-            try:
-                value = float(value)
-            except ValueError:
-                value = text
         return self.checked(value)
 
     def _converted(self, value: Any) -> ParameterValue:
