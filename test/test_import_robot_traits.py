@@ -388,8 +388,26 @@ def test_casters_that_are_drawn_turned_are_straightened(tmp_path, angle):
     assert not any("drawn turned" in warning for warning in straight.warnings)
 
 
+def test_two_wheels_beside_each_other_on_one_swivel_are_one_wheel(tmp_path):
+    """Twin casters, as of office chairs: one strip, with the mass of both and no hull in its place."""
+    second = wheel("other", "-0.03 0.06 -0.05", parent="fork_link", radius=0.05)
+    one, both = (
+        convert(robot(tmp_path, *small_robot(caster(0.0) + more), name=f"robot{number}.urdf"))
+        for number, more in enumerate(("", second))
+    )
+    assert [entry["name"] for entry in both.content["wheels"]] == ["left", "right", "roller"]
+    alone, joined = one.content["wheels"][2], both.content["wheels"][2]
+    edges = [entry["centre"][1] - entry["width"] / 2 for entry in (alone, joined)]
+    assert edges[0] == pytest.approx(edges[1], abs=1e-5) and joined["radius"] == alone["radius"]
+    assert joined["width"] > 0.06 + alone["width"] / 2
+    assert both.content["mass"] > one.content["mass"] and both.content["hull"] == one.content["hull"]
+    assert any("run beside each other and are one wheel" in guess for guess in both.guesses)
+    assert len(both.content["casters"]) == 1
+
+
 def test_two_wheels_on_one_vertical_joint_are_refused_with_what_to_do(tmp_path):
-    second = wheel("other", "-0.03 0.02 -0.05", parent="fork_link", radius=0.05)
+    """An axle, or a wheel behind the other one."""
+    second = wheel("other", "-0.2 0.02 -0.05", parent="fork_link", radius=0.05)
     path = robot(tmp_path, *small_robot(caster(0.0) + second))
     with pytest.raises(UrdfError, match="joint fork turns the wheels .*not supported; leave one of a pair out"):
         convert(path)

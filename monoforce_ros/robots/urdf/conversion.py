@@ -116,7 +116,8 @@ class _Converter:
         )
 
     def _turning_with(self, wheel: WheelPart) -> list[str]:
-        return list(self.description.subtree(wheel.joint.child, ("fixed",)))
+        joints = (wheel.joint, wheel.twin)
+        return [link for joint in joints if joint for link in self.description.subtree(joint.child, ("fixed",))]
 
     def _base_frame(self) -> str:
         """Name of the robot file's base frame."""

@@ -31,8 +31,9 @@ def find_hull(frames: Frames, parts: Parts) -> Hull:
     description = frames.description
     taken = set(parts.left_out)
     for wheel in parts.wheels:
-        if wheel.joint.kind != "fixed":
-            taken |= set(description.subtree(wheel.joint.child, ("fixed",)))
+        for joint in (wheel.joint, wheel.twin):
+            if joint is not None and joint.kind != "fixed":
+                taken |= set(description.subtree(joint.child, ("fixed",)))
     for flipper in parts.flippers:
         taken |= set(description.subtree(flipper.link))
     used = {id(shape) for belt in parts.tracks for _, shape in belt.shapes}

@@ -37,6 +37,8 @@ class WheelPart:
     swivel: Joint | None = None
     rocker: Joint | None = None
     slider: Joint | None = None
+    twin: Joint | None = None
+    """Joint of a second wheel beside it, whose surface is part of ``shape``."""
     shapes: tuple[Shape, ...] = ()
     """Shapes of a body that a support was made of."""
     pivot: np.ndarray | None = None
@@ -70,6 +72,13 @@ class Parts:
     left_out: frozenset[str]
     """Links that belong to none of the bodies (hint ``ignore``)."""
     notes: tuple[str, ...]
+
+
+def _coaxial(first: WheelPart, second: WheelPart) -> bool:
+    """Whether two wheels have one axis and one radius."""
+    apart = np.abs(first.shape.centre - second.shape.centre)[[0, 2]].max()
+    radii = first.shape.radius, second.shape.radius
+    return bool(apart < 0.1 * min(radii) and max(radii) < 1.1 * min(radii))
 
 
 def drawn_aside(frames: Frames, hints: Mapping[str, str]) -> dict[str, float]:
@@ -153,6 +162,7 @@ class _Finder:
             for wheel in wheels
         )
         self._check_mimics(wheels, flippers)
+        wheels = self._merged_twins(wheels)
         self._check_pairs(wheels)
         self._told_still(wheels, flippers, (*rockers, *level), taken)
         parts = [part for joint in flippers for part in self._flipper_parts(joint)]
@@ -321,6 +331,31 @@ class _Finder:
                     f"are not supported; remove the mimic tag (the drive's kinematics couple the wheels), or pass "
                     f"--hint {joint.name}=fixed"
                 )
+
+    def _merged_twins(self, wheels: tuple[WheelPart, ...]) -> tuple[WheelPart, ...]:
+        """Wheels with those that run beside each other on one swivel joined: twin casters stand on one strip."""
+        kept: list[WheelPart] = []
+        for wheel in wheels:
+            beside = [
+                index
+                for index, other in enumerate(kept)
+                if wheel.swivel is not None and other.swivel is wheel.swivel and _coaxial(other, wheel)
+            ]
+            if not beside or kept[beside[0]].twin is not None:
+                kept.append(wheel)
+                continue
+            first = kept[beside[0]]
+            edges = [part.shape.centre[1] + side * part.shape.width / 2 for part in (first, wheel) for side in (-1, 1)]
+            centre = first.shape.centre.copy()
+            centre[1] = (min(edges) + max(edges)) / 2
+            shape = replace(first.shape, centre=centre, width=max(edges) - min(edges))
+            kept[beside[0]] = replace(first, shape=shape, twin=wheel.joint)
+            assert first.swivel is not None
+            self.notes.append(
+                f"caster {first.swivel.name}: {first.joint.name} and {wheel.joint.name} run beside each other and are "
+                f"one wheel, {shape.width:.3f} m wide; that they turn at different speeds when it swivels is left out"
+            )
+        return tuple(kept)
 
     def _check_pairs(self, wheels: Sequence[WheelPart]) -> None:
         carried: dict[str, str] = {}
