@@ -1,6 +1,7 @@
 """From measured motion to the state that a prediction starts from."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from monoforce_ros.perception.encoder_terrain import encoder_threads
 from monoforce_ros.perception.fusion import apply_compliance
 from monoforce_ros.perception.ground_alignment import align_to_ground
 from monoforce_ros.physics import State, rollout
+from monoforce_ros.planning.costs import assess, force_every
 from monoforce_ros.prediction import Predictor, start_states
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap
@@ -83,12 +85,49 @@ def test_a_wall_just_ahead_does_not_reach_into_the_robot():
     assert pushed(terrain, twists + np.array([0.5, 0.0]))[-1] < 0.25
 
 
+@pytest.mark.parametrize("heading", [0.0, 0.3, 0.7, 1.2])
+@pytest.mark.parametrize("wall", [0.5, 0.6, 0.7, 0.8, 0.9])
+def test_beside_a_wall_the_robot_stands_and_may_drive_away(wall, heading):
+    """The wall hides the ground before it: interpolated, its height would begin below the robot."""
+    robot = load_robot("husky")
+    turn = Rotation.from_euler("z", heading).as_matrix()
+    still = MotionState(0, np.zeros(3), turn, np.zeros(3), np.zeros(3))
+    predictor = Predictor(robot, choose_terrain_source("lidar", robot), horizon=3.0)
+    terrain = predictor.source.terrain(Observation(0, (sweep(wall) @ turn).astype(np.float32)), still)
+    twists = np.zeros((2, len(predictor.command_stamps(0)), 2))
+    twists[1, :, 0] = -0.4
+    rolled = predictor.roll_out(
+        terrain, [still] * 2, twists, with_contact=True, with_forces=False, force_every=force_every(0.01)
+    )
+    judged = assess(rolled, terrain, robot, torch.as_tensor(twists[:, predictor.history :], dtype=torch.float32))
+    # Behind it the lidar of this test sees no ground within 1.4 m.
+    pressed = {name: float(values.max()) for name, values in judged.terms.items() if name != "unobserved"}
+    assert max(pressed.values()) < 1.0, pressed
+    assert float(rolled.position[0].norm(dim=-1).max()) < 0.02
+    assert terrain.height.max() > 0.5, "the wall itself stays"
+
+
+def test_before_low_things_heights_are_interpolated():
+    """Grass, too, is seen from above only: a robot in it must not stand between walls."""
+    robot = load_robot("husky")
+    still = MotionState(0, np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3))
+    source = choose_terrain_source("lidar", robot)
+    grass = sweep(9.0)
+    grass[:, 2] += 0.35
+    terrain = source.terrain(Observation(0, grass.astype(np.float32)), still)
+    row, column, _ = terrain.grid.cells(np.array([[1.0, 0.0]]))
+    assert -0.05 < float(terrain.height[row[0], column[0]]) < 0.25, "between the ground that carries it and the grass"
+
+
 def test_the_map_of_a_prediction_is_the_one_that_it_was_made_on():
     robot = load_robot("husky")
     still = MotionState(0, np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3))
-    predictor = Predictor(robot, choose_terrain_source("lidar", robot), horizon=1.0)
-    observation, twists = Observation(0, sweep(0.62)), np.zeros((len(predictor.command_stamps(0)), 2))
-    seen, made = predictor.source.terrain(observation, still), predictor.predict(observation, still, twists)
+    grid = Grid.square()
+    inside = np.meshgrid(grid.x, grid.y)[0] > 0.35
+    seen = TerrainMap.from_height(torch.from_numpy(np.where(inside, 0.8, -0.131).astype(np.float32)), grid)
+    source = SimpleNamespace(sensors=(), grid=grid, terrain=lambda observation, motion: seen)
+    predictor = Predictor(robot, source, horizon=1.0)
+    made = predictor.predict(Observation(0), still, np.zeros((len(predictor.command_stamps(0)), 2)))
     assert not torch.equal(made.terrain.height, seen.height)
     assert torch.equal(made.terrain.height, with_clear_start(seen, robot, start_states([still])).height)
 

@@ -481,7 +481,9 @@ class PathSelectorNode(Node):
             )
         values["other publishers of commands"] = others or "none"
         values["not reached by commands"] = self._commands.unreached or "none"
-        velocity = None if moving else self._progress.velocity
+        # Every base takes a while to follow a new command.
+        late = not moving and self._progress.unfollowed > WINDOW
+        velocity = self._progress.velocity if late else None
         if velocity is not None:
             message = f"the robot moves, but not as commanded: {self._sent(command)}, odometry shows {_shown(velocity)}"
             self.health.report(PART, WARN, message, reason="astray", **values)

@@ -27,13 +27,17 @@ def support_points(robot: RobotModel, motion: MotionState, stiffness: float) -> 
         motion: the robot's pose.
         stiffness: stiffness of the ground [N/m³]; the wheels sink in by the rest depth.
     """
+    points = transform_points(motion.terrain_from_base, _lowest_points(robot))
+    points[:, 2] += rest_depth(robot, stiffness)
+    return points
+
+
+def _lowest_points(robot: RobotModel) -> np.ndarray:
+    """Bottoms of the wheels and tracks in the base frame ``[m, 3]`` [m]."""
     backwards = robot.point_tangents[:, 0]
     # Small wheels have twelve samples, of which the lowest is up to 15° from the bottom.
     limit = _AT_THE_BOTTOM if bool((backwards < _AT_THE_BOTTOM).any()) else float(np.cos(np.radians(16.0)) * -1.0)
-    lowest = robot.points[backwards < limit].numpy()
-    points = transform_points(motion.terrain_from_base, lowest.astype(np.float64))
-    points[:, 2] += rest_depth(robot, stiffness)
-    return points
+    return robot.points[backwards < limit].numpy().astype(np.float64)
 
 
 def lowest_support(robot: RobotModel, motion: MotionState, flipper_angles: np.ndarray, stiffness: float) -> float:

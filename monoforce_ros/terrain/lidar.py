@@ -38,6 +38,15 @@ _NEARBY = 0.5
 """Radius of the search for the ground of a cell [m]; slopes up to 45° are allowed within it."""
 
 
+_TALL = 0.5
+"""Height above the ground that carries the robot [m] from which something nearby is a wall: more than the shipped
+robots climb (1.45 wheel radii, of the Warthog 0.44 m). Lower things may be grass, between whose edges the robot would
+stand."""
+_BLIND = 2.0
+"""Distance from the robot within which a lidar on it may not see the foot of a wall [m]: one 1 m up, whose lowest ring
+points 25° down, sees ground from there on."""
+
+
 class TerrainError(ValueError):
     """The measurements do not suffice for a map."""
 
@@ -82,6 +91,9 @@ def terrain_from_cloud(
         np.minimum.at(known, (rows, columns), support[inside, 2])
         where[rows, columns] = True
         ground = fill_holes(known, where)
+        # A wall nearby casts a blind zone before it: interpolated, its height would begin below the robot.
+        if inside.any() and (tall := observed & _tall_nearby(heights, support[inside], grid)).any():
+            ground = np.where(where, ground, np.minimum(ground, fill_holes(known, where & ~tall)))
     return TerrainMap.from_height(
         torch.from_numpy(ground.astype(np.float32)),
         grid,
@@ -89,6 +101,17 @@ def terrain_from_cloud(
         observed=torch.from_numpy(observed),
         material=material,
     )
+
+
+def _tall_nearby(heights: np.ndarray, support: np.ndarray, grid: Grid) -> np.ndarray:
+    """Cells ``[rows, columns]`` near a robot that stands on support points, of walls, trunks and banks."""
+    x, y = np.meshgrid(grid.x, grid.y)
+    columns = np.column_stack([support[:, :2], np.ones(len(support))])
+    # Of the least slope through the points, if they lie on a line.
+    plane = np.linalg.lstsq(columns, support[:, 2], rcond=1e-3)[0]
+    level = plane[0] * x + plane[1] * y + plane[2]
+    middle = support[:, :2].mean(axis=0)
+    return (heights - level > _TALL) & (np.hypot(x - middle[0], y - middle[1]) < _BLIND)
 
 
 def cell_heights(points: np.ndarray, grid: Grid, settings: LidarSettings) -> tuple[np.ndarray, np.ndarray]:
