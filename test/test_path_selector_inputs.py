@@ -221,7 +221,7 @@ LISTENER = """
 import rclpy
 from geometry_msgs.msg import Twist
 rclpy.init()
-node = rclpy.create_node("dashboard")
+node = rclpy.create_node("{name}")
 node.create_subscription(Twist, "{topic}", lambda message: None, 1)
 rclpy.spin(node)
 """
@@ -232,7 +232,7 @@ def test_a_base_is_stopped_before_another_type_is_published(robot, ros_environme
     robot.listen(TwistStamped)
     robot.send_goal(50.0, 0.0)
     assert robot.live(10.0, until=lambda: robot.driven), robot.status()
-    code = LISTENER.format(topic=f"/{robot.prefix}/cmd_vel")
+    code = LISTENER.format(name="dashboard", topic=f"/{robot.prefix}/cmd_vel")
     listener = subprocess.Popen([sys.executable, "-c", code], env=ros_environment)
     try:
         assert robot.live(20.0, until=lambda: "no longer hears the commands" in robot.process.output)
@@ -426,20 +426,10 @@ def test_odometry_that_begins_anew_drops_the_goal(robot):
     assert not robot.commands
 
 
-ECHO = """
-import rclpy
-from geometry_msgs.msg import Twist
-rclpy.init()
-node = rclpy.create_node("{name}")
-node.create_subscription(Twist, "{topic}", lambda message: None, 1)
-rclpy.spin(node)
-"""
-
-
 @pytest.mark.parametrize("name", ["_ros2cli_1234", "dashboard"])
-def test_who_hears_the_commands_is_told_from_who_listens_for_another_type(robot, ros_environment, name):
+def test_only_nodes_that_expect_the_published_type_count_as_listeners(robot, ros_environment, name):
     """A base that expects TwistStamped, beside another listener that expects Twist from the start."""
-    code = ECHO.format(name=name, topic=f"/{robot.prefix}/cmd_vel")
+    code = LISTENER.format(name=name, topic=f"/{robot.prefix}/cmd_vel")
     listener = subprocess.Popen([sys.executable, "-c", code], env=ros_environment)
     try:
         count = robot.peer.node.count_subscribers

@@ -48,21 +48,12 @@ class TransformTree:
     def path(self, target: str, source: str) -> list[tuple[str, str]]:
         """The transforms, as (parent, child), that :meth:`find` composes; empty if there are none."""
         target, source = target.lstrip("/"), source.lstrip("/")
-        came_from: dict[str, tuple[str, bool]] = {}
-        frontier = [target]
-        while frontier and source not in came_from:
-            following = []
-            for frame in frontier:
-                for neighbour, (_, downwards) in list(self._neighbours.get(frame, {}).items()):
-                    if neighbour not in came_from and neighbour != target:
-                        came_from[neighbour] = frame, downwards
-                        following.append(neighbour)
-            frontier = following
-        edges, frame = [], source
-        while frame in came_from:
-            before, downwards = came_from[frame]
-            edges.append((before, frame) if downwards else (frame, before))
-            frame = before
+        found = self._searched(target, source)
+        edges = []
+        while source != target and source in found:
+            before, _, downwards = found[source]
+            edges.append((before, source) if downwards else (source, before))
+            source = before
         return edges[::-1]
 
     def descends(self, frame: str, ancestor: str) -> bool:
@@ -91,17 +82,24 @@ class TransformTree:
     def _reached(self, start: str, end: str = "", without: str = "") -> dict[str, np.ndarray]:
         """Pose in ``start`` of every frame connected with it, not through ``without``; ends early at ``end``."""
         reached = {start: np.eye(4)}
+        for frame, (before, matrix, downwards) in self._searched(start, end, without).items():
+            reached[frame] = reached[before] @ (matrix if downwards else np.linalg.inv(matrix))
+        return reached
+
+    def _searched(self, start: str, end: str, without: str = "") -> dict[str, tuple[str, np.ndarray, bool]]:
+        """Frames in the order in which they are reached, each with its neighbour towards ``start`` (see above)."""
+        found: dict[str, tuple[str, np.ndarray, bool]] = {}
         frontier = [start]
-        while frontier and end not in reached:
+        while frontier and end != start and end not in found:
             following = []
             for frame in frontier:
                 # Copied at once: another thread may add a frame.
                 for neighbour, (matrix, downwards) in list(self._neighbours.get(frame, {}).items()):
-                    if neighbour not in reached and neighbour != without:
-                        reached[neighbour] = reached[frame] @ (matrix if downwards else np.linalg.inv(matrix))
+                    if neighbour not in found and neighbour not in (start, without):
+                        found[neighbour] = frame, matrix, downwards
                         following.append(neighbour)
             frontier = following
-        return reached
+        return found
 
 
 @dataclass(frozen=True)

@@ -37,6 +37,8 @@ over several poses."""
 PATIENCE = 6.0
 """Time without motion as commanded [s] after which a goal is dropped: three windows. Bases that start slowly have moved
 by then; what stands for longer is stuck, switched off or lost, and must not drive on by itself once it is free."""
+_INTERVAL = 0.1
+"""Time between the poses at which it is judged whether commands are followed [s]: odometry may come at 200 Hz."""
 _FEWEST = 6
 """Fewest poses that show motion: with fewer, their noise is unknown."""
 
@@ -66,7 +68,7 @@ class ProgressCheck:
         self._samples: deque[tuple[float, float, float, float, float, float]] = deque()
         # Earlier commands: time [s], speed [m/s], yaw rate [rad/s].
         self._earlier: deque[tuple[float, float, float]] = deque()
-        self._followed = 0.0
+        self._followed = self._next = 0.0
 
     def clear(self) -> None:
         """Forget everything: the robot is not commanded to move."""
@@ -87,12 +89,15 @@ class ProgressCheck:
                 return
             self.clear()
         if not self._samples:
-            self._followed = time
+            self._followed = self._next = time
         self._samples.append((time, *command, float(position[0]), float(position[1]), heading))
         while time - self._samples[0][0] > WINDOW:
             self._earlier.append(self._samples.popleft()[:3])
         while self._earlier and time - self._earlier[0][0] > WINDOW + _LAGS[-1]:
             self._earlier.popleft()
+        if time < self._next:
+            return
+        self._next = time + _INTERVAL
         if self.moving or self._little_commanded:
             self._followed = time
 

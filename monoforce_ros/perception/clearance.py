@@ -51,7 +51,7 @@ def with_clear_start(terrain: TerrainMap, robot: RobotModel, state: State, *, ri
 
 
 def clear_of_robot(terrain: TerrainMap, robot: RobotModel, motion: MotionState) -> TerrainMap:
-    """A map of rigid ground, lowered where it reaches into a robot that stands on it."""
+    """A map of rigid ground, lowered where it reaches into a robot at rest."""
     still, rotation = torch.zeros(1, 3), torch.as_tensor(motion.terrain_from_base[:3, :3], dtype=torch.float32)
     return with_clear_start(terrain, robot, State(still, rotation[None], still, still), rigid=True)
 

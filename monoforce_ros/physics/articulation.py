@@ -6,7 +6,7 @@ the coordinates of a system that is solved together with the body's six velociti
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
@@ -29,8 +29,8 @@ SLOWEST = 1e-3
 
 
 @dataclass(frozen=True)
-class Articulation:
-    """What moves in the body; ``J`` joints, ``D`` drives, ``K`` of them with dynamics."""
+class Linkage:
+    """What moves in the body, of the robot alone; ``J`` joints, ``D`` drives, ``K`` of them with dynamics."""
 
     axes: Tensor
     """``[J, 3]``."""
@@ -52,6 +52,42 @@ class Articulation:
     """Index of each joint, then of each drive, among the coordinates; -1 without dynamics. ``J + D`` entries."""
     parameters: Tensor
     """Dynamics of each joint and drive, ``[J + D, 11]``, see :data:`PARAMETERS`."""
+    free: Tensor
+    """Whether a joint has dynamics, ``[J]`` bool."""
+    powered: Tensor
+    """Whether a drive has dynamics, ``[D]`` bool."""
+
+    @classmethod
+    def of_robot(cls, robot: RobotModel, drives: int) -> Linkage:
+        """That of a robot, in the precision of the rollout."""
+        joints, like, links = robot.joints, robot.points, robot.point_joints
+        motors = robot.motors or (None,) * drives
+        dynamics = [*(joint.dynamics for joint in joints), *motors]
+        coordinates, found = [], 0
+        for entry in dynamics:
+            coordinates.append(found if entry is not None else -1)
+            found += entry is not None
+        return cls(
+            axes=_table(like, [joint.axis for joint in joints]),
+            origins=_table(like, [joint.origin for joint in joints]),
+            places=_table(like, [joint.place for joint in joints]),
+            masses=like.new_tensor([joint.mass for joint in joints]),
+            rest=like.new_zeros(0) if robot.joint_angles is None else robot.joint_angles.to(like),
+            slides=tuple(joint.slides for joint in joints),
+            parents=tuple(joint.parent for joint in joints),
+            point_links=torch.zeros_like(robot.point_drives) if links is None else links + 1,
+            grip=torch.ones_like(robot.point_areas) if robot.point_grip is None else robot.point_grip.to(like),
+            coordinates=tuple(coordinates),
+            parameters=_parameters(like, dynamics),
+            free=torch.tensor([joint.dynamics is not None for joint in joints], device=like.device, dtype=torch.bool),
+            powered=torch.tensor([motor is not None for motor in motors], device=like.device),
+        )
+
+
+@dataclass(frozen=True)
+class Articulation(Linkage):
+    """A robot's linkage under controls."""
+
     target_angles: Tensor
     """``[B, T, J]`` [rad]."""
     target_rates: Tensor
@@ -105,8 +141,10 @@ class Articulation:
         batch, steps, drives = speeds.shape
         number = len(robot.joints)
         given = (robot.joints, robot.motors, robot.joint_angles, robot.point_joints, robot.point_grip, robot.points)
-        parts = _parts.get((*given, robot.point_drives, robot.point_areas), lambda: _Parts.of(robot, drives))
-        rest = parts.rest
+        linkage = _linkages.get(
+            (*given, robot.point_drives, robot.point_areas), lambda: Linkage.of_robot(robot, drives)
+        )
+        rest = linkage.rest
         targets = rest.expand(batch, steps, number) if controls.joint_angles is None else controls.joint_angles
         target_rates = torch.zeros_like(targets) if controls.joint_rates is None else controls.joint_rates
         targets, target_rates = targets.to(speeds), target_rates.to(speeds)
@@ -114,26 +152,16 @@ class Articulation:
         start = first if controls.start_angles is None else controls.start_angles.to(speeds)
         start_rates = torch.zeros_like(start) if controls.start_rates is None else controls.start_rates.to(speeds)
         built = cls(
-            axes=parts.axes,
-            origins=parts.origins,
-            places=parts.places,
-            masses=parts.masses,
-            rest=rest,
-            slides=parts.slides,
-            parents=parts.parents,
-            point_links=parts.point_links,
-            grip=parts.grip,
-            coordinates=parts.coordinates,
-            parameters=parts.parameters,
+            **{entry.name: getattr(linkage, entry.name) for entry in fields(linkage)},
             target_angles=targets,
             target_rates=target_rates,
-            angles=_history(targets, start, parts.free, target_rates, time_step),
-            rates=_history(target_rates, start_rates, parts.free),
+            angles=_history(targets, start, linkage.free, target_rates, time_step),
+            rates=_history(target_rates, start_rates, linkage.free),
             belts=speeds.new_zeros(batch, steps + 1, drives),
         )
         # Other drives turn as commanded from the start.
         rolling = built._rolling_speeds(robot, velocity, rates) if any(robot.motors) else built.belts[:, 0]
-        return replace(built, belts=_history(speeds, rolling, parts.powered))
+        return replace(built, belts=_history(speeds, rolling, linkage.powered))
 
     def _rolling_speeds(self, robot: RobotModel, velocity: Tensor, rates: Tensor) -> Tensor:
         """Surface speeds at which the drives roll at the start, ``[B, D]`` [m/s], from the motion in base axes."""
@@ -462,53 +490,7 @@ def _stacked(listed: list[Tensor], like: Tensor) -> Tensor:
     return torch.stack(listed, 1) if listed else like.new_zeros(like.shape[0], 0, 3)
 
 
-@dataclass(frozen=True)
-class _Parts:
-    """What a robot alone determines; fields as in :class:`Articulation`."""
-
-    axes: Tensor
-    origins: Tensor
-    places: Tensor
-    masses: Tensor
-    rest: Tensor
-    slides: tuple[bool, ...]
-    parents: tuple[int, ...]
-    point_links: Tensor
-    grip: Tensor
-    coordinates: tuple[int, ...]
-    parameters: Tensor
-    free: Tensor
-    """Whether a joint has dynamics, ``[J]`` bool."""
-    powered: Tensor
-    """Whether a drive has dynamics, ``[D]`` bool."""
-
-    @classmethod
-    def of(cls, robot: RobotModel, drives: int) -> _Parts:
-        joints, like, links = robot.joints, robot.points, robot.point_joints
-        motors = robot.motors or (None,) * drives
-        dynamics = [*(joint.dynamics for joint in joints), *motors]
-        coordinates, found = [], 0
-        for entry in dynamics:
-            coordinates.append(found if entry is not None else -1)
-            found += entry is not None
-        return cls(
-            axes=_table(like, [joint.axis for joint in joints]),
-            origins=_table(like, [joint.origin for joint in joints]),
-            places=_table(like, [joint.place for joint in joints]),
-            masses=like.new_tensor([joint.mass for joint in joints]),
-            rest=like.new_zeros(0) if robot.joint_angles is None else robot.joint_angles.to(like),
-            slides=tuple(joint.slides for joint in joints),
-            parents=tuple(joint.parent for joint in joints),
-            point_links=torch.zeros_like(robot.point_drives) if links is None else links + 1,
-            grip=torch.ones_like(robot.point_areas) if robot.point_grip is None else robot.point_grip.to(like),
-            coordinates=tuple(coordinates),
-            parameters=_parameters(like, dynamics),
-            free=torch.tensor([joint.dynamics is not None for joint in joints], device=like.device, dtype=torch.bool),
-            powered=torch.tensor([motor is not None for motor in motors], device=like.device),
-        )
-
-
-_parts: IdentityCache[_Parts] = IdentityCache()
+_linkages: IdentityCache[Linkage] = IdentityCache()
 
 
 def _table(like: Tensor, rows: list[tuple[float, float, float]]) -> Tensor:

@@ -104,7 +104,7 @@ def terrain_from_cloud(
 
 
 def _tall_nearby(heights: np.ndarray, support: np.ndarray, grid: Grid) -> np.ndarray:
-    """Cells ``[rows, columns]`` near a robot that stands on support points, of walls, trunks and banks."""
+    """Cells ``[rows, columns]`` near a robot at rest on support points, of walls, trunks and banks."""
     x, y = np.meshgrid(grid.x, grid.y)
     columns = np.column_stack([support[:, :2], np.ones(len(support))])
     # Of the least slope through the points, if they lie on a line.
