@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 import torch
 
+from monoforce_ros.effects import drive_speeds
+from monoforce_ros.perception import with_clear_start
 from monoforce_ros.physics import PhysicsOptions, State, rollout
 from monoforce_ros.physics.rest import rest_depth
 from monoforce_ros.planning import (
@@ -139,6 +141,76 @@ def test_a_wall_is_a_collision_and_the_path_past_it_is_not(husky):
     assert float(found.terms["collision"][2]) < 0.1 and bool(found.feasible[2]) and found.best == 2
     # The cost agrees with feasibility.
     assert float(found.cost[0]) > float(found.cost[2])
+
+
+@pytest.mark.parametrize("resolution", [0.05, 0.1])
+@pytest.mark.parametrize("name", ["husky", "tradr", "offroad_car"])
+def test_a_path_keeps_its_distance_from_an_obstacle_that_it_does_not_touch(name, resolution):
+    robot, grid = load_robot(name), Grid.square(12.8, resolution)
+    (low, high), side = robot.bounds, float(robot.bounds[1][1])
+    tall = float(high[2] - low[2]) + 0.3
+    twists = torch.tensor([0.5, 0.0]).expand(1, 200, 2)
+
+    def value(gap, height=tall, sign=1.0):
+        wall = np.where(sign * grid.y[:, None] > side + gap, height, 0.0) * np.ones(grid.columns)
+        terrain = TerrainMap.from_height(torch.from_numpy(wall).float(), grid)
+        start = State.at_rest(robot.ground_clearance)
+        result = rollout(terrain, robot, drive_speeds(robot, twists, 0.01), start, with_contact=True, force_every=6)
+        found = assess(result, terrain, robot, twists)
+        assert float(found.terms["collision"][0]) < 0.05
+        return float(found.terms["clearance"][0])
+
+    # Where a cell's edge lies is known to half a cell, and it is interpolated over one.
+    reach = 1.5 * resolution
+    for sign in (1.0, -1.0):
+        assert value(0.1 + reach, sign=sign) <= 1.0 and value(0.3 + reach, sign=sign) == 0.0
+        assert value(0.2 - resolution / 2, sign=sign) > 0.0
+    assert value(0.1 - resolution / 2, height=0.03) == 0.0, "what wheels climb is no obstacle"
+
+
+def test_a_robot_that_stands_beside_a_wall_may_leave_but_not_come_closer(husky):
+    side = float(husky.bounds[1][1])
+    wall = np.where(side + 0.02 < Y, 1.0, 0.0)
+    found, _ = assessed(husky, terrain_of(wall), [[0.0, 0.0], [0.5, 0.0], [0.5, -0.3], [0.5, 0.6]])
+    assert float(found.terms["clearance"][:3].min()) > 1.0 and "too close to an obstacle" in found.violations(3)
+    assert found.feasible.tolist() == [True, True, True, False]
+    # Away from the wall a path to it is infeasible before it touches.
+    away, _ = assessed(husky, terrain_of(np.where(side + 0.6 < Y, 1.0, 0.0)), [[0.5, 0.0], [0.4, 0.12], [0.5, 0.6]])
+    assert away.feasible.tolist() == [True, True, False] or away.feasible.tolist() == [True, False, False]
+
+
+@pytest.mark.parametrize("height", [0.2, 0.25, 0.5])
+@pytest.mark.parametrize("name", ["husky", "warthog", "tradr"])
+def test_a_robot_whose_wheels_stand_in_what_the_map_takes_for_ground_may_stand_and_leave(name, height):
+    robot = load_robot(name)
+    front = float(robot.bounds[1][0])
+    terrain = terrain_of(np.where(front - 0.15 < X, height, 0.0))
+    start = State.at_rest(robot.ground_clearance)
+    terrain = with_clear_start(terrain, robot, start)
+    twists = torch.tensor([[0.0, 0.0], [-0.4, 0.0], [0.8, 0.0]])[:, None].expand(3, 300, 2)
+    state = State.at_rest(robot.ground_clearance, batch=3)
+    result = rollout(terrain, robot, robot.drive_speeds(twists), state, with_contact=True, force_every=6)
+    found = assess(result, terrain, robot, twists)
+    assert found.feasible[:2].tolist() == [True, True], (found.violations(0), found.violations(1))
+    # Driving on costs more than leaving.
+    assert float(found.cost[2]) > float(found.cost[1])
+
+
+def test_the_clearance_is_differentiable_in_the_motion(husky):
+    beside = Y - float(husky.bounds[1][1])
+    wall = terrain_of(np.where(beside > 0.1, 0.3 + 0.2 * beside, 0.0))
+    start = State.at_rest(husky.ground_clearance)
+
+    def value(rate):
+        twists = torch.stack([torch.full((1, 200), 0.5), rate.expand(1, 200)], dim=-1)
+        result = rollout(wall, husky, drive_speeds(husky, twists, 0.01), start, with_contact=True)
+        return assess(result, wall, husky, twists).terms["clearance"].sum()
+
+    rate = torch.tensor(0.03, requires_grad=True)
+    (gradient,) = torch.autograd.grad(value(rate), rate)
+    with torch.no_grad():
+        difference = (value(torch.tensor(0.031)) - value(torch.tensor(0.029))) / 0.002
+    assert float(gradient) == pytest.approx(float(difference), rel=0.05) and abs(float(gradient)) > 1e-3
 
 
 def test_rough_ground_varies_the_load_and_slippery_ground_causes_slip(husky):

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from monoforce_ros.physics import Rollout
+from monoforce_ros.planning.clearance import LARGEST, closeness
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import TerrainMap
 
@@ -33,6 +34,7 @@ class CostWeights:
     effort: float = 0.3
     unobserved: float = 1.0
     collision: float = 3.0
+    clearance: float = 1.0
 
     def __post_init__(self):
         for name, value in asdict(self).items():
@@ -60,11 +62,17 @@ class Limits:
     """Share of the path over ground without measurements nearby, or off the map [-]."""
     collision: float = 0.25
     """Horizontal force of steep contacts over the robot's weight [-]."""
+    clearance: float = 0.1
+    """Smallest distance of the robot's outline from what it cannot climb [m]; below it a candidate is infeasible.
+
+    A cell of a map of 0.1 m: an obstacle's place is known to half a cell, and the odometry's and the rollout's over the
+    time between two predictions to a few centimetres."""
 
     def __post_init__(self):
         for name, value in asdict(self).items():
-            if not 1e-3 <= value <= 1e3:
-                raise ValueError(f"limit of {name}: got {value}, expected 0.001 to 1000")
+            largest = LARGEST if name == "clearance" else 1e3
+            if not 1e-3 <= value <= largest:
+                raise ValueError(f"limit of {name}: got {value}, expected 0.001 to {largest:g}")
 
 
 TERMS = tuple(entry.name for entry in fields(CostWeights))
@@ -76,7 +84,15 @@ def force_every(time_step: float) -> int:
 
 
 _FURTHER = 0.05
-"""Share of the limit by which a robot that leans beyond it may lean further for a moment, as it starts to move."""
+"""Share of the limit by which a robot that is beyond it may go further for a moment, as it starts to move."""
+
+_STANDING = 1e-3
+"""Largest command of a candidate that stands still [m/s, rad/s]."""
+_SETTLED = 0.6
+"""Time in which a body that starts inside the ground is pushed out of it [s]: of a Husky, a Warthog and a TRADR with
+their wheels or tracks in ground of 0.25 m, on one side or at the front, all but one came to rest within 0.5 s."""
+_CONTACT_TERMS = ("force_variation", "wheel_load", "collision")
+"""Terms of the forces that the map exerts on a robot that stands still, too."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +123,13 @@ class Assessment:
         if not bool(torch.isfinite(self.cost[index])):
             return "the rollout diverged"
         over = {name: float(value[index]) for name, value in self.terms.items() if not float(value[index]) <= 1.0}
-        return ", ".join(f"{name.replace('_', ' ')} {value:.1f} times its limit" for name, value in over.items())
+        words = [
+            "too close to an obstacle"
+            if name == "clearance"
+            else f"{name.replace('_', ' ')} {value:.1f} times its limit"
+            for name, value in over.items()
+        ]
+        return ", ".join(words)
 
 
 def assess(
@@ -141,25 +163,46 @@ def assess(
     rolls = torch.atan2(rollout.rotation[..., 2, 1], rollout.rotation[..., 2, 2]).abs()
     pitches = torch.asin(rollout.rotation[..., 2, 0].clamp(-1.0, 1.0)).abs()
     roll, pitch = (angles[:, 1:].amax(dim=1) for angles in (rolls, pitches))
-    load = _smoothed(contact.load.sum(dim=2), step)
     raw = {
         "roll": roll,
         "pitch": pitch,
-        "force_variation": load.std(dim=1) / weight,
-        "wheel_load": _load_loss(contact.sides, step),
+        **_contact_terms(rollout, step, weight),
         "slip": _slip(rollout, robot, twists),
         "effort": _effort(contact.traction, robot, twists[:, :: rollout.force_every]) / weight,
         "unobserved": _unobserved(rollout, terrain, robot),
-        "collision": _push(contact.push, step) / weight,
     }
-    terms = {name: torch.nan_to_num(raw[name] / getattr(limits, name), nan=torch.inf) for name in TERMS}
+    # A robot that leans beyond a limit, or stands too close, has to get away: what makes it no worse is feasible.
+    starts = {"roll": rolls[:, 0] / limits.roll, "pitch": pitches[:, 0] / limits.pitch}
+    standing = twists.abs().amax(dim=(1, 2)) < _STANDING
+    if bool(standing.any()):
+        own = {name: raw[name][standing][:1] / getattr(limits, name) for name in _CONTACT_TERMS}
+        if any(bool(value > 1.0) for value in own.values()):
+            # The robot does stand here. What the map does to it then is the map's error, such as grass taken for
+            # ground around the wheels, and no candidate's fault.
+            raw |= _contact_terms(rollout, step, weight, skipped=round(_SETTLED / step))
+            starts |= {name: raw[name][standing][:1] / getattr(limits, name) for name in _CONTACT_TERMS}
+    terms = {name: torch.nan_to_num(value / getattr(limits, name), nan=torch.inf) for name, value in raw.items()}
+    terms["clearance"], close, left = closeness(rollout, terrain, robot, limits.clearance)
+    # Who stands too close may turn before it leaves, and has left if it ends no closer.
+    starts["clearance"] = torch.where((close > 1.0) & (left <= close + _FURTHER), torch.inf, close)
     cost = sum(getattr(weights, name) * terms[name] for name in TERMS)
     cost = torch.where(rollout.valid, cost, torch.inf)
-    # A robot that leans beyond a limit already has to get away: what does not tilt it further is feasible.
-    leans = {"roll": rolls[:, 0] / limits.roll, "pitch": pitches[:, 0] / limits.pitch}
-    most = {name: (leans[name] + _FURTHER).clamp_min(1.0) if name in leans else 1.0 for name in TERMS}
+    most = {name: (starts[name] + _FURTHER).clamp_min(1.0) if name in starts else 1.0 for name in TERMS}
     feasible = torch.stack([value <= most[name] for name, value in terms.items()]).all(dim=0) & rollout.valid
     return Assessment(terms, cost, feasible)
+
+
+def _contact_terms(rollout: Rollout, step: float, weight: Tensor, skipped: int = 0) -> dict[str, Tensor]:
+    """Terms of the contact forces ``[N]``, without the first ``skipped`` ones."""
+    contact = rollout.contact
+    assert contact is not None
+    skipped = min(skipped, contact.load.shape[1] - 2)
+    load = _smoothed(contact.load[:, skipped:].sum(dim=2), step)
+    return {
+        "force_variation": load.std(dim=1) / weight,
+        "wheel_load": _load_loss(contact.sides[:, skipped:], step),
+        "collision": _push(contact.push[:, skipped:], step) / weight,
+    }
 
 
 def _smoothed(values: Tensor, step: float) -> Tensor:

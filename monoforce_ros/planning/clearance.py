@@ -1,0 +1,93 @@
+"""Clearance: how close a rollout comes to obstacles that the robot cannot climb, before it touches them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from monoforce_ros.physics import Rollout
+from monoforce_ros.robots import RobotModel
+from monoforce_ros.terrain import TerrainMap
+
+LARGEST = 1.0
+"""Largest limit [m]: maps are searched to three times as far."""
+_LEVELS = (1.5, 0.5, 0.25)
+"""Value of an obstacle within once, twice and three times the limit. The first is beyond 1, so that what stands closer
+is infeasible; the others make a wider path the cheaper one."""
+_RISE = 0.1
+"""Height over which an obstacle comes to count in full [m]: of the accuracy of a map's heights, and smooth."""
+
+
+def closeness(rollout: Rollout, terrain: TerrainMap, robot: RobotModel, limit: float) -> tuple[Tensor, ...]:
+    """How close the robot's outline comes to obstacles: 0 beyond three times ``limit``, above 1 within it.
+
+    Obstacles are what rises above the highest part of the wheels or tracks, or above the tips of raised flippers, in
+    the robot's own frame: the robot cannot climb it. A rollout feels them only when it touches them, yet neither the
+    map nor the motion is exact.
+
+    Args:
+        rollout: of ``N`` candidates.
+        terrain: the map of the rollout.
+        robot: the robot of the rollout.
+        limit: clearance below which a path is infeasible [m].
+
+    Returns:
+        the largest value after the start, the value at the start, and the one at the end, each ``[N]``. Differentiable
+        in the rollout.
+    """
+    height, grid = terrain.height.to(rollout.position), terrain.grid
+    raised = torch.stack([_raised(height, (1 + level) * limit / grid.resolution) for level in range(len(_LEVELS))])
+    outline = torch.from_numpy(_outline(robot, max(limit, grid.resolution))).to(rollout.position)
+    position = rollout.position[:, :: rollout.force_every]
+    rotation = rollout.rotation[:, :: rollout.force_every]
+    points = position[:, :, None] + torch.einsum("nsij,pj->nspi", rotation, outline)
+    count, steps, around, _ = points.shape
+    span = points.new_tensor([grid.columns - 1, grid.rows - 1]) * grid.resolution
+    place = 2.0 * (points[..., :2] - points.new_tensor(grid.origin)) / span - 1.0
+    # Beyond the edge the border values are continued, as in the rollout.
+    ground = functional.grid_sample(
+        raised[None], place.reshape(1, count * steps, around, 2), align_corners=True, padding_mode="border"
+    )[0].reshape(len(_LEVELS), count, steps, around)
+    share = ((ground - points[..., 2]) / _RISE).clamp(0.0, 1.0).nan_to_num(1.0)
+    value = (share * points.new_tensor(_LEVELS)[:, None, None, None]).amax(dim=(0, 3))
+    return value[:, 1:].amax(dim=1), value[:, 0], value[:, -1]
+
+
+def _raised(height: Tensor, cells: float) -> Tensor:
+    """The highest ground within a distance, given in cells, of each cell ``[rows, columns]``."""
+    reach = math.floor(cells)
+    if reach == 0:
+        return height
+    padded = functional.pad(height[None, None], (reach,) * 4, mode="replicate")[0, 0]
+    rows, columns = height.shape
+    highest = height
+    for row in range(-reach, reach + 1):
+        # A row of a disc is a window of its width.
+        half = math.floor(math.sqrt(max(cells**2 - row**2, 0.0)))
+        band = padded[reach + row : reach + row + rows, reach - half : reach + half + columns]
+        highest = torch.maximum(highest, functional.max_pool1d(band[:, None], 2 * half + 1, stride=1)[:, 0])
+    return highest
+
+
+def _outline(robot: RobotModel, spacing: float) -> np.ndarray:
+    """Points around the robot's bounds, at the height of what it cannot climb ``[P, 3]`` [m] (base frame)."""
+    low, high = (bound.double().cpu().numpy() for bound in robot.bounds)
+    driven = robot.points[robot.point_drives >= 0]
+    top = float((driven if len(driven) else robot.points)[:, 2].max())
+    top += max((_length(robot, index) for index in range(len(robot.flippers))), default=0.0)
+    ends = [np.linspace(low[axis], high[axis], 1 + math.ceil((high[axis] - low[axis]) / spacing)) for axis in (0, 1)]
+    sides = [[(x, y) for x in ends[0] for y in (low[1], high[1])], [(x, y) for x in (low[0], high[0]) for y in ends[1]]]
+    places = np.unique(np.array([*sides[0], *sides[1]]), axis=0)
+    return np.column_stack([places, np.full(len(places), top)])
+
+
+def _length(robot: RobotModel, index: int) -> float:
+    """Distance of a flipper's tip from its axle [m]."""
+    assert robot.point_flippers is not None
+    joint = np.asarray(robot.flippers[index].joint)
+    points = robot.points[robot.point_flippers == index].double().cpu().numpy()
+    return float(np.linalg.norm((points - joint)[:, [0, 2]], axis=1).max()) if len(points) else 0.0
