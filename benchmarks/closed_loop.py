@@ -132,7 +132,7 @@ def _start(name: str, folder: Path, *arguments: str) -> Executable:
 
 def trajectory_figure(rows: list[dict], sources: list[str]) -> Figure:
     """Trajectories of all runs, one panel per source; walls and grass of all seeds are superimposed."""
-    figure = Figure(figsize=(5.2 * len(sources), 4.0), layout="constrained", dpi=110)
+    figure = Figure(figsize=(5.2 * len(sources), 6.4), layout="constrained", dpi=110)
     panels = figure.subplots(1, len(sources), squeeze=False)
     for panel, source in zip(panels[0], sources, strict=True):
         selected = [row for row in rows if row["source"] == source]
@@ -149,7 +149,8 @@ def trajectory_figure(rows: list[dict], sources: list[str]) -> Figure:
             panel.plot(*row["trajectory"][-1], "o" if succeeded else "x", color=colour, ms=5)
         reached = sum(row["reached"] and not row["wall_touched"] for row in selected)
         panel.set(title=f"{source}: {reached} of {len(selected)} reach the goal", aspect="equal", xlim=(-0.8, 10.5))
-        panel.set(ylim=(-3.6, 3.6), xlabel="x [m]", ylabel="y [m]")
+        sideways = 0.6 + max(3.0, *(np.abs(np.array(row["trajectory"])[:, 1]).max() for row in selected))
+        panel.set(ylim=(-sideways, sideways), xlabel="x [m]", ylabel="y [m]")
     return figure
 
 
