@@ -37,6 +37,7 @@ def main() -> int:
     parser.add_argument(
         "--kind", choices=CASE_KINDS, nargs="+", default=["empty", "single"], help="kinds of drives (empty single)"
     )
+    parser.add_argument("--cases", nargs="+", default=[""], metavar="TEXT", help="only names with one of these")
     parser.add_argument(
         "--shares", type=float, nargs="+", default=[0.0, 0.1, 0.25, 0.5, 0.8, 1.25], help="values of drive_share"
     )
@@ -44,7 +45,12 @@ def main() -> int:
     options = parser.parse_args()
     torch.set_num_threads(1)
     rows = []
-    for case in tqdm([case for case in all_cases(options.set) if case.kind in options.kind], unit="drive"):
+    cases = [
+        case
+        for case in all_cases(options.set)
+        if case.kind in options.kind and any(text in case.name for text in options.cases)
+    ]
+    for case in tqdm(cases, unit="drive"):
         files = CaseFiles.of(case, options.work)
         nominal = options.work / "results" / options.label / "nominal" / case.platform_name / "platform.yaml"
         if not (files.truth.exists() and nominal.exists()):
