@@ -179,6 +179,17 @@ def test_a_robot_that_stands_beside_a_wall_may_leave_but_not_come_closer(husky):
     assert away.feasible.tolist() == [True, True, False] or away.feasible.tolist() == [True, False, False]
 
 
+def test_a_diverged_candidate_does_not_hide_the_wall_from_the_others(husky):
+    wall = terrain_of(np.where(float(husky.bounds[1][1]) + 0.05 < Y, 1.0, 0.0))
+    twists = torch.tensor([[0.5, 0.0], [0.5, 0.0]])[:, None].expand(2, 200, 2)
+    start = State.at_rest(husky.ground_clearance, batch=2)
+    result = rollout(wall, husky, husky.drive_speeds(twists), start, with_contact=True)
+    position = result.position.clone()
+    position[1, 50:] = torch.nan
+    found = assess(replace(result, position=position), wall, husky, twists)
+    assert float(found.terms["clearance"][0]) > 1.0
+
+
 @pytest.mark.parametrize("height", [0.2, 0.25, 0.5])
 @pytest.mark.parametrize("name", ["husky", "warthog", "tradr"])
 def test_a_robot_whose_wheels_stand_in_what_the_map_takes_for_ground_may_stand_and_leave(name, height):

@@ -18,6 +18,8 @@ LARGEST = 1.0
 _LEVELS = (1.5, 0.5, 0.25)
 """Value of an obstacle within once, twice and three times the limit. The first is beyond 1, so that what stands closer
 is infeasible; the others make a wider path the cheaper one."""
+_INTERVAL = 0.12
+"""Time between the poses that are examined [s]: at 1 m/s about a cell of a map."""
 _RISE = 0.1
 """Height over which an obstacle comes to count in full [m]: of the accuracy of a map's heights, and smooth."""
 
@@ -40,12 +42,17 @@ def closeness(rollout: Rollout, terrain: TerrainMap, robot: RobotModel, limit: f
         in the rollout.
     """
     height, grid = terrain.height.to(rollout.position), terrain.grid
-    raised = torch.stack([_raised(height, (1 + level) * limit / grid.resolution) for level in range(len(_LEVELS))])
+    every = max(1, math.floor(_INTERVAL / float(rollout.times[1] - rollout.times[0]) + 1e-6))
     outline = torch.from_numpy(_outline(robot, max(limit, grid.resolution))).to(rollout.position)
-    position = rollout.position[:, :: rollout.force_every]
-    rotation = rollout.rotation[:, :: rollout.force_every]
+    position, rotation = rollout.position[:, ::every], rollout.rotation[:, ::every]
     points = position[:, :, None] + torch.einsum("nsij,pj->nspi", rotation, outline)
     count, steps, around, _ = points.shape
+    # A diverged rollout has no height.
+    lowest = points.detach()[..., 2].nan_to_num(torch.inf).amin()
+    if not bool(height.amax() > lowest):
+        # Nothing on the map reaches that high.
+        return (points.new_zeros(count),) * 3
+    raised = torch.stack([_raised(height, (1 + level) * limit / grid.resolution) for level in range(len(_LEVELS))])
     span = points.new_tensor([grid.columns - 1, grid.rows - 1]) * grid.resolution
     place = 2.0 * (points[..., :2] - points.new_tensor(grid.origin)) / span - 1.0
     # Beyond the edge the border values are continued, as in the rollout.
@@ -59,7 +66,7 @@ def closeness(rollout: Rollout, terrain: TerrainMap, robot: RobotModel, limit: f
 
 def _raised(height: Tensor, cells: float) -> Tensor:
     """The highest ground within a distance, given in cells, of each cell ``[rows, columns]``."""
-    reach = math.floor(cells)
+    reach = math.floor(cells + 1e-6)
     if reach == 0:
         return height
     padded = functional.pad(height[None, None], (reach,) * 4, mode="replicate")[0, 0]
@@ -67,7 +74,7 @@ def _raised(height: Tensor, cells: float) -> Tensor:
     highest = height
     for row in range(-reach, reach + 1):
         # A row of a disc is a window of its width.
-        half = math.floor(math.sqrt(max(cells**2 - row**2, 0.0)))
+        half = math.floor(math.sqrt(max(cells**2 - row**2, 0.0)) + 1e-6)
         band = padded[reach + row : reach + row + rows, reach - half : reach + half + columns]
         highest = torch.maximum(highest, functional.max_pool1d(band[:, None], 2 * half + 1, stride=1)[:, 0])
     return highest
