@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from monoforce_ros.discrepancy.thresholds import Thresholds
-from monoforce_ros.discrepancy.trial import FitTest, Trial, excess_share
+from monoforce_ros.discrepancy.trial import FitTest, Trial, excess_share, expected_loss
 from monoforce_ros.discrepancy.verdict import Findings, Verdict, decide
 
 EFFECTS = (("drive_asymmetry", {"difference": 0.1}),)
@@ -66,3 +66,13 @@ def test_the_share_of_the_excess():
     # Nothing in excess: whatever an effect removes is all of it.
     assert excess_share(0.4, 0.3, 0.5) == 1.0
     assert Thresholds().most_share == 0.5
+
+
+def test_an_error_of_the_formula_excuses_no_more_than_the_loss_that_it_causes():
+    small = np.full((4, 2, 3), 2.0)
+    assert expected_loss(0.4, small, 0.15) == pytest.approx(0.4 + 0.5 * 0.3**2)
+    # Of ten windows one is thrown fifty times a healthy error: its square would stand for a rest of 3.2.
+    change = np.zeros((10, 2, 3))
+    change[0] = 50.0
+    assert expected_loss(0.4, change, 0.15) == pytest.approx(0.4 + 0.1 * (3.0 * 7.5 - 0.5 * 3.0**2))
+    assert expected_loss(0.4, change, 0.15) < 0.4 + 0.5 * np.mean((0.15 * change) ** 2)

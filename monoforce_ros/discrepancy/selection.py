@@ -42,6 +42,7 @@ from monoforce_ros.discrepancy.trial import (
     Outcome,
     Trial,
     excess_share,
+    expected_loss,
     folds_of,
     paired,
 )
@@ -307,7 +308,8 @@ class Search:
         healthy, spread = self.nominal, self.thresholds.drive_spread
         if healthy is not None and healthy.segments > 1:
             # An effect of the right kind leaves some of what it does: no formula is exact.
-            expected = healthy.loss + 0.5 * self.thresholds.model_error**2 * self.directions.mean_square(base, fixed)
+            change = self.directions.scaled(base) - self.directions.scaled(base[:fixed])
+            expected = expected_loss(healthy.loss, change, self.thresholds.model_error)
             above = np.log(max(trial.loss, 1e-9) / expected)
             size = float(student_distribution.sf(above / spread, self.thresholds.calibration_degrees))
             if above < spread:

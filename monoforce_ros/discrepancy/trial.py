@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from monoforce_ros.discrepancy.fit import robust
 from monoforce_ros.discrepancy.hypothesis import Effects
 from monoforce_ros.discrepancy.score_test import ScoreResult, block_numbers
 from monoforce_ros.discrepancy.thresholds import Thresholds
@@ -92,6 +93,20 @@ class Outcome:
 def excess_share(before: float, after: float, healthy: float) -> float:
     """Share of the loss above a healthy robot's that is gone afterwards, at most 1."""
     return min((before - after) / max(before - healthy, 1e-6), 1.0)
+
+
+def expected_loss(healthy: float, change: np.ndarray, model_error: float) -> float:
+    """Loss that is expected beside effects of the right kind: a healthy robot's, and that of their formula's error.
+
+    Judged by the robust loss as the residuals are: of windows that an effect changes by fifty times a healthy error, an
+    error's square would excuse nearly anything.
+
+    Args:
+        healthy: mean loss of the healthy robot.
+        change: what the effects change, scaled, ``[W, K, 3]``.
+        model_error: error of a formula as a share of what it changes.
+    """
+    return healthy + float(robust(model_error * change).mean())
 
 
 def folds_of(starts: np.ndarray) -> np.ndarray:
