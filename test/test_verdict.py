@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from monoforce_ros.discrepancy.score_test import ScoreResult
+from monoforce_ros.discrepancy.selection import Screened, admitted
 from monoforce_ros.discrepancy.thresholds import Thresholds
 from monoforce_ros.discrepancy.trial import FitTest, Trial, excess_share, expected_loss
 from monoforce_ros.discrepancy.verdict import Findings, Verdict, decide
@@ -76,3 +78,18 @@ def test_an_error_of_the_formula_excuses_no_more_than_the_loss_that_it_causes():
     change[0] = 50.0
     assert expected_loss(0.4, change, 0.15) == pytest.approx(0.4 + 0.1 * (3.0 * 7.5 - 0.5 * 3.0**2))
     assert expected_loss(0.4, change, 0.15) < 0.4 + 0.5 * np.mean((0.15 * change) ** 2)
+
+
+def test_once_something_is_missing_the_best_explanation_may_be_the_least_certain_one():
+    def candidate(name, loss, p, adjusted):
+        result = ScoreResult(name, np.ones(1), np.eye(1), 8.0, p, adjusted, 0.1)
+        return Screened(((name, {}),), loss, result)
+
+    friction = candidate("friction_scale", 0.4, 0.007, 0.09)
+    scrub = candidate("turning_scrub", 0.6, 0.2, 0.9)
+    delay = candidate("command_delay", 1.0, 0.001, 0.01)
+    worse = candidate("drive_gain", 1.3, 0.001, 0.01)
+    names = [entry.name for entry in admitted([friction, scrub, delay, worse], 1.2, 0.025)]
+    assert names == ["friction_scale", "command_delay"]
+    # Without one that is significant among all candidates nothing is missing.
+    assert admitted([friction, scrub], 1.2, 0.025) == [] and admitted([worse], 1.2, 0.025) == []

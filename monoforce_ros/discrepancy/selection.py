@@ -1,8 +1,8 @@
 """Selection: which effects explain a recording.
 
 Every effect is screened by a quick fit. Its influence on the residuals is then tested against the null distribution of
-the strongest of all candidates on this very recording (:mod:`score_test`). Of the significant ones the best is the one
-with the smallest held-out loss, by two-fold cross-validation over blocks. Effects are added one at a time while a
+the strongest of all candidates on this very recording (:mod:`score_test`). Where one is significant, the best of those
+that are significant by themselves is the one with the smallest held-out loss, by two-fold cross-validation over blocks. Effects are added one at a time while a
 further one is significant in the presence of the others; then each is tested again, and may be dropped or replaced.
 """
 
@@ -62,7 +62,7 @@ _ALTERNATIVES = 2
 
 
 @dataclass(frozen=True)
-class _Screened:
+class Screened:
     """A candidate after its quick fit."""
 
     effects: Effects
@@ -140,7 +140,7 @@ class Search:
         self.variance_ratio: float | None = None
         """Mean variance of the candidates' influence beyond what this recording and the robot file explain, as a share
         of that between segments."""
-        self._screenings: dict[tuple[tuple[object, ...], ...], tuple[float, list[_Screened]]] = {}
+        self._screenings: dict[tuple[tuple[object, ...], ...], tuple[float, list[Screened]]] = {}
         self._influences: dict[tuple[tuple[object, ...], ...], list[Direction]] = {}
         """Directions of the candidates that were screened last."""
 
@@ -357,7 +357,7 @@ class Search:
         """Number of leading effects that keep the values which another sensor measured."""
         return len(self.known) if effects[: len(self.known)] == self.known else 0
 
-    def _screened(self, base: Effects, number: str) -> tuple[float, list[_Screened]]:
+    def _screened(self, base: Effects, number: str) -> tuple[float, list[Screened]]:
         """Loss of ``base``, and a quick fit and test of every further effect, smallest loss first."""
         key = _key(base)
         if key in self._screenings:
@@ -385,7 +385,7 @@ class Search:
             if fit.effects != start:
                 directions[rank] = self.directions.influence(base, fit.effects[-1])
         tests = self._tested(base, residual, directions)
-        screened = [_Screened(fit.effects, float(fit.loss.mean()), test) for fit, test in zip(fits, tests, strict=True)]
+        screened = [Screened(fit.effects, float(fit.loss.mean()), test) for fit, test in zip(fits, tests, strict=True)]
         if base == self.known and self.nominal is not None and self.nominal.segments:
             ratios = [test.excess / self.nominal.between_segments(test.name)[0] for test in tests if test.p < 1.0]
             share = 1.0 / self.nominal.segments
@@ -413,9 +413,8 @@ class Search:
         """Trials with one more effect that is significant, smallest held-out loss first, and the scores of all."""
         base = self.refit(best.effects).effects if best.effects else ()
         before, screened = self._screened(base, f"{number}: ")
-        passed = [entry for entry in screened if entry.test.adjusted <= rate and entry.loss < before]
         judged = []
-        for entry in passed[:_JUDGED]:
+        for entry in admitted(screened, before, rate)[:_JUDGED]:
             self._progress(f"{number}: {entry.name}, judged")
             judged.append(self.judge(entry.effects))
         listed = []
@@ -516,6 +515,24 @@ class Search:
         if name in self._hints:
             starts.append(((name, {**dict(starts[0][0][1]), **dict(self._hints[name])}),))
         return starts
+
+
+def admitted(screened: Sequence[Screened], before: float, rate: float) -> list[Screened]:
+    """Candidates that are cross-validated, in their order.
+
+    That something is missing has to be shown among all candidates: one of them must be significant after adjustment.
+    Which it is, is then a choice between explanations: every effect that is significant by itself takes part in it, for
+    the best one may be the least certain (low friction varies most on the healthy robot, too).
+
+    Args:
+        screened: candidates after their quick fits.
+        before: loss without any of them.
+        rate: error rate of both steps.
+    """
+    better = [entry for entry in screened if entry.loss < before]
+    if not any(entry.test.adjusted <= rate for entry in better):
+        return []
+    return [entry for entry in better if entry.test.p <= rate]
 
 
 def _changed(effect: Effect, values: Mapping[str, float], known: Mapping[str, float]) -> dict[str, float]:
