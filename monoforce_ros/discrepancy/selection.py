@@ -2,8 +2,9 @@
 
 Every effect is screened by a quick fit. Its influence on the residuals is then tested against the null distribution of
 the strongest of all candidates on this very recording (:mod:`score_test`). Where one is significant, the best of those
-that are significant by themselves is the one with the smallest held-out loss, by two-fold cross-validation over blocks. Effects are added one at a time while a
-further one is significant in the presence of the others; then each is tested again, and may be dropped or replaced.
+that are significant by themselves is the one with the smallest held-out loss, by two-fold cross-validation over blocks.
+Effects are added one at a time while a further one is significant in the presence of the others; then each is tested
+again, and may be dropped or replaced.
 """
 
 from __future__ import annotations
@@ -73,6 +74,7 @@ class Screened:
 
     @property
     def name(self) -> str:
+        """Of the candidate."""
         return self.effects[-1][0]
 
 
