@@ -95,7 +95,7 @@ def test_every_candidate_has_its_path_and_its_costs(peer, predictor, heard):
     # On level ground everything can be driven; the terms add up to the cost by their weights.
     assert column["feasible"].all()
     weights = {"roll": 1.0, "pitch": 1.0, "force_variation": 0.5, "wheel_load": 1.0, "slip": 1.0, "effort": 0.0,
-               "unobserved": 1.0, "collision": 3.0, "clearance": 1.0}  # fmt: skip
+               "unobserved": 1.0, "collision": 3.0, "obstacle_clearance": 1.0}  # fmt: skip
     total = sum(weight * values[:, names.index(name)] for name, weight in weights.items())
     np.testing.assert_allclose(column["cost"], total, rtol=1e-4)
     markers = {m.ns: m for m in heard["/predicted/candidates"][-1].markers}

@@ -158,7 +158,7 @@ def test_a_path_keeps_its_distance_from_an_obstacle_that_it_does_not_touch(name,
         result = rollout(terrain, robot, drive_speeds(robot, twists, 0.01), start, with_contact=True, force_every=6)
         found = assess(result, terrain, robot, twists)
         assert float(found.terms["collision"][0]) < 0.05
-        return float(found.terms["clearance"][0])
+        return float(found.terms["obstacle_clearance"][0])
 
     # Where a cell's edge lies is known to half a cell, and it is interpolated over one.
     reach = 1.5 * resolution
@@ -172,7 +172,9 @@ def test_a_robot_that_stands_beside_a_wall_may_leave_but_not_come_closer(husky):
     side = float(husky.bounds[1][1])
     wall = np.where(side + 0.02 < Y, 1.0, 0.0)
     found, _ = assessed(husky, terrain_of(wall), [[0.0, 0.0], [0.5, 0.0], [0.5, -0.3], [0.5, 0.6]])
-    assert float(found.terms["clearance"][:3].min()) > 1.0 and "too close to an obstacle" in found.violations(3)
+    assert float(found.terms["obstacle_clearance"][:3].min()) > 1.0 and "too close to an obstacle" in found.violations(
+        3
+    )
     assert found.feasible.tolist() == [True, True, True, False]
     # Away from the wall a path to it is infeasible before it touches.
     away, _ = assessed(husky, terrain_of(np.where(side + 0.6 < Y, 1.0, 0.0)), [[0.5, 0.0], [0.4, 0.12], [0.5, 0.6]])
@@ -187,7 +189,7 @@ def test_a_diverged_candidate_does_not_hide_the_wall_from_the_others(husky):
     position = result.position.clone()
     position[1, 50:] = torch.nan
     found = assess(replace(result, position=position), wall, husky, twists)
-    assert float(found.terms["clearance"][0]) > 1.0
+    assert float(found.terms["obstacle_clearance"][0]) > 1.0
 
 
 @pytest.mark.parametrize("height", [0.2, 0.25, 0.5])
@@ -215,7 +217,7 @@ def test_the_clearance_is_differentiable_in_the_motion(husky):
     def value(rate):
         twists = torch.stack([torch.full((1, 200), 0.5), rate.expand(1, 200)], dim=-1)
         result = rollout(wall, husky, drive_speeds(husky, twists, 0.01), start, with_contact=True)
-        return assess(result, wall, husky, twists).terms["clearance"].sum()
+        return assess(result, wall, husky, twists).terms["obstacle_clearance"].sum()
 
     rate = torch.tensor(0.03, requires_grad=True)
     (gradient,) = torch.autograd.grad(value(rate), rate)

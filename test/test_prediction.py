@@ -103,7 +103,9 @@ def test_beside_a_wall_the_robot_stands_and_may_drive_away(wall, heading):
     judged = assess(rolled, terrain, robot, commanded)
     # Behind it the lidar of this test sees no ground within 1.4 m; and it does stand close to the wall.
     pressed = {name: float(values.max()) for name, values in judged.terms.items()}
-    assert max(value for name, value in pressed.items() if name not in {"unobserved", "clearance"}) < 1.0, pressed
+    assert max(value for name, value in pressed.items() if name not in {"unobserved", "obstacle_clearance"}) < 1.0, (
+        pressed
+    )
     assert assess(rolled, terrain, robot, commanded, limits=Limits(unobserved=10.0)).feasible.all()
     assert float(rolled.position[0].norm(dim=-1).max()) < 0.02
     assert terrain.height.max() > 0.5, "the wall itself stays"

@@ -34,7 +34,7 @@ class CostWeights:
     effort: float = 0.3
     unobserved: float = 1.0
     collision: float = 3.0
-    clearance: float = 1.0
+    obstacle_clearance: float = 1.0
 
     def __post_init__(self):
         for name, value in asdict(self).items():
@@ -62,7 +62,7 @@ class Limits:
     """Share of the path over ground without measurements nearby, or off the map [-]."""
     collision: float = 0.25
     """Horizontal force of steep contacts over the robot's weight [-]."""
-    clearance: float = 0.1
+    obstacle_clearance: float = 0.1
     """Smallest distance of the robot's outline from what it cannot climb [m]; below it a candidate is infeasible.
 
     A cell of a map of 0.1 m: an obstacle's place is known to half a cell, and the odometry's and the rollout's over the
@@ -70,7 +70,7 @@ class Limits:
 
     def __post_init__(self):
         for name, value in asdict(self).items():
-            largest = LARGEST if name == "clearance" else 1e3
+            largest = LARGEST if name == "obstacle_clearance" else 1e3
             if not 1e-3 <= value <= largest:
                 raise ValueError(f"limit of {name}: got {value}, expected 0.001 to {largest:g}")
 
@@ -125,7 +125,7 @@ class Assessment:
         over = {name: float(value[index]) for name, value in self.terms.items() if not float(value[index]) <= 1.0}
         words = [
             "too close to an obstacle"
-            if name == "clearance"
+            if name == "obstacle_clearance"
             else f"{name.replace('_', ' ')} {value:.1f} times its limit"
             for name, value in over.items()
         ]
@@ -182,9 +182,9 @@ def assess(
             raw |= _contact_terms(rollout, step, weight, skipped=round(_SETTLED / step))
             starts |= {name: raw[name][standing][:1] / getattr(limits, name) for name in _CONTACT_TERMS}
     terms = {name: torch.nan_to_num(value / getattr(limits, name), nan=torch.inf) for name, value in raw.items()}
-    terms["clearance"], close, left = closeness(rollout, terrain, robot, limits.clearance)
+    terms["obstacle_clearance"], close, left = closeness(rollout, terrain, robot, limits.obstacle_clearance)
     # Who stands too close may turn before it leaves, and has left if it ends no closer.
-    starts["clearance"] = torch.where((close > 1.0) & (left <= close + _FURTHER), torch.inf, close)
+    starts["obstacle_clearance"] = torch.where((close > 1.0) & (left <= close + _FURTHER), torch.inf, close)
     cost = sum(getattr(weights, name) * terms[name] for name in TERMS)
     cost = torch.where(rollout.valid, cost, torch.inf)
     most = {name: (starts[name] + _FURTHER).clamp_min(1.0) if name in starts else 1.0 for name in TERMS}
