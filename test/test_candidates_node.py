@@ -87,8 +87,10 @@ def test_every_candidate_has_its_path_and_its_costs(peer, predictor, heard):
     assert column["speed"][-1] == column["yaw_rate"][-1] == 0.0
     # The robot stands at (1, 2): arcs to the right end there, to the left there, and stopping ends where it is.
     assert column["y"][0] < 1.5 and column["y"][COUNT - 2] > 2.5 and column["heading"][0] < -0.5
-    # The current command, 0.5 m/s, holds for the first 0.2 s.
-    assert 0.05 < column["x"][-1] - 1.0 < 0.15 and abs(column["y"][-1] - 2.0) < 0.02
+    # The current command, 0.5 m/s, holds until the candidates start: after `candidate_delay`, 0.2 s, or as late as
+    # this computer publishes them.
+    assert 0.2 <= column["start"][0] <= 1.0 and (column["start"] == column["start"][0]).all()
+    assert abs(column["x"][-1] - 1.0 - 0.5 * column["start"][0]) < 0.05 and abs(column["y"][-1] - 2.0) < 0.02
     np.testing.assert_allclose(
         column["x_50"][COUNT // 2 - 1], 1.0 + 0.5 * (column["x"][COUNT // 2 - 1] - 1.0), atol=0.15
     )
@@ -146,9 +148,15 @@ def test_candidates_of_a_planner_are_compared_and_refined(peer, start):
         "-r", "predicted/candidate_costs:=requested_costs", "-r", "predicted/candidate_rollouts:=requested_rollouts",
     )  # fmt: skip
     process.wait_for("predicting 2 s ahead for husky")
-    costs, rollouts, spreads = [], [], []
+    costs, rollouts, spreads, starts = [], [], [], {}
     cloud = message_class("sensor_msgs/msg/PointCloud2")
-    peer.node.create_subscription(cloud, "/requested_costs", costs.append, QoSProfile(depth=10))
+
+    def on_costs(message) -> None:
+        costs.append(message)
+        names, values = table(message)
+        starts[stamp_in(message)] = float(values[0, names.index("start")])
+
+    peer.node.create_subscription(cloud, "/requested_costs", on_costs, QoSProfile(depth=10))
     peer.node.create_subscription(cloud, "/predicted/path_spread", spreads.append, QoSProfile(depth=10))
     if typed is not None:
         peer.node.create_subscription(typed, "/requested_rollouts", rollouts.append, QoSProfile(depth=10))
@@ -207,11 +215,16 @@ def test_candidates_of_a_planner_are_compared_and_refined(peer, start):
     commands = np.array(message.commands).reshape(count, samples, 2)
     np.testing.assert_allclose(states[:, 0, :3], [[1.0, 2.0, 0.3]] * 4, atol=1e-3)
     np.testing.assert_allclose(np.linalg.norm(states[..., 3:], axis=-1), 1.0, atol=1e-5)
-    # Samples are 0.1 s apart. The last command holds for the first two; candidates share the rest.
-    held = commands[0, 0]
-    np.testing.assert_allclose(commands[:, :2], np.broadcast_to(held, (count, 2, 2)), atol=1e-6)
+    # Samples are 0.1 s apart. The last command holds until the candidates start: after 0.2 s, or as late as they are
+    # published with `refine_seconds`, but with half the horizon left. They share the rest.
+    start_time = starts[stamp_in(message)]
+    assert 0.2 <= start_time <= 1.0
+    held, first = commands[0, 0], int(np.ceil(start_time / 0.1 - 1e-6))
+    middle = int(np.ceil((first + 20) / 2))
+    np.testing.assert_allclose(commands[:, :first], np.broadcast_to(held, (count, first, 2)), atol=1e-6)
     assert abs(held[0] - sequences[0, 0, 0]) > 0.01 or abs(held[1] - sequences[0, 0, 1]) > 0.01
-    np.testing.assert_allclose(commands[0, [2, 10, 12, 20]], sequences[0][[0, 0, 1, 1]], atol=1e-6)
+    shared = commands[0, [first, middle - 1, middle + 1, 20]]
+    np.testing.assert_allclose(shared, sequences[0][[0, 0, 1, 1]], atol=1e-6)
     # The robot's weight rests on its drives, in every candidate and at every time after the start.
     loads = np.array(message.loads).reshape(count, samples, len(message.drives))
     forces = np.array(message.forces).reshape(count, samples, 3)
@@ -219,7 +232,7 @@ def test_candidates_of_a_planner_are_compared_and_refined(peer, start):
     np.testing.assert_allclose(forces[2, 5:, 2], 50 * 9.81, rtol=0.05)
     np.testing.assert_allclose(loads[2, 5:].sum(axis=1), 50 * 9.81, rtol=0.05)
     velocities = np.array(message.velocities).reshape(count, samples, 6)
-    np.testing.assert_allclose(velocities[1, 10, 0], 0.4, atol=0.05)
+    np.testing.assert_allclose(velocities[1, middle - 1, 0], 0.4, atol=0.05)
     terms = np.array(message.terms).reshape(count, len(message.term_names))
     assert "roll" in message.term_names and np.isfinite(terms).all() and len(message.costs) == count
     assert message.best == int(np.argmin(np.where(message.feasible, message.costs, np.inf)))

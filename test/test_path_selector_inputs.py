@@ -47,6 +47,8 @@ class Robot:
         self.signs = np.ones(2)
         """Factors of forward speed and yaw rate with which the robot obeys."""
         self.travelled = 0.0
+        self.late, self.start = 0.0, None
+        """Age of the candidates as they arrive, and what they tell of their start [s]; None: nothing."""
 
     def listen(self, kind: type, quality: QoSProfile = BEST_EFFORT) -> None:
         """Become a base that listens to one type of command."""
@@ -84,7 +86,7 @@ class Robot:
                 )
                 self.odometry.publish(bytes(type_store().serialize_cdr(message, message.__msgtype__)))
             if candidates and step % 4 == 0:
-                self.candidates.publish(self._fan(stamp))
+                self.candidates.publish(self._fan(stamp - round(1e9 * self.late)))
             step += 1
             self.peer.spin(0.05)
             if until is not None and until():
@@ -96,6 +98,7 @@ class Robot:
         fields = {"x": self.place[0] + 2 * np.cos(angles), "y": self.place[1] + 2 * np.sin(angles), "z": np.zeros(3)}
         fields |= {"heading": angles, "speed": np.full(3, 0.5), "yaw_rate": np.array([0.4, 0.0, -0.4])}
         fields |= {"cost": np.zeros(3), "feasible": np.ones(3)}
+        fields |= {} if self.start is None else {"start": np.full(3, self.start)}
         for share in WAYPOINTS:
             along = share / 100
             fields |= {f"x_{share}": self.place[0] + along * (fields["x"] - self.place[0])}
@@ -196,6 +199,23 @@ def test_best_effort_odometry_is_received_and_a_moving_robot_drives(robot):
     robot.speed = 0.5
     assert robot.live(10.0, until=robot.says("driving to the goal")), robot.status()
     assert robot.status()[0] == OK
+
+
+def test_candidates_of_a_slow_predictor_are_driven_if_they_start_as_late_as_they_arrive(robot):
+    """They stop it otherwise, and what claims to start in an hour is late all the same."""
+    robot.listen(Twist)
+    robot.obeys = True
+    robot.live(1.0)
+    robot.send_goal(50.0, 0.0)
+    assert robot.live(10.0, until=lambda: robot.driven)
+    robot.late = 0.62
+    assert robot.live(10.0, until=robot.says("the limit is 0.6 s")), robot.status()
+    robot.start = 0.6
+    assert robot.live(10.0, until=robot.says("driving to the goal")), robot.status()
+    robot.live(1.0)
+    assert robot.driven
+    robot.late, robot.start = 2.5, 3600.0
+    assert robot.live(10.0, until=robot.says("the limit is 2.3 s")), robot.status()
 
 
 @pytest.mark.parametrize("robot", ["use_sim_time:=true"], indirect=True)

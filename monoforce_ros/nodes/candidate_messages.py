@@ -50,12 +50,13 @@ def candidate_markers(motion: MotionState, rollout: Rollout, assessment: Assessm
 
 
 def candidate_costs(
-    motion: MotionState, rollout: Rollout, commands: np.ndarray, assessment: Assessment, frame_id: str
+    motion: MotionState, rollout: Rollout, commands: np.ndarray, assessment: Assessment, frame_id: str, start: float
 ) -> bytes:
     """``sensor_msgs/PointCloud2``: a point at the end of each candidate, with command, cost and every term as fields.
 
     Of a robot that moves sideways ``lateral_speed`` is a field. ``x_25``, ``y_25`` and so on are positions after that
-    percentage of the horizon. The message type is standard; planners read it by field names, and RViz can colour it by
+    percentage of the horizon, ``start`` is the time after the stamp at which the candidates take effect [s]. The
+    message type is standard; planners read it by field names, and RViz can colour it by
     cost.
     """
     end = transform_points(motion.odometry_from_terrain, rollout.position[:, -1].double().cpu().numpy())
@@ -70,6 +71,7 @@ def candidate_costs(
         **({"lateral_speed": commands[:, 2]} if commands.shape[-1] > 2 else {}),
         "cost": assessment.cost.cpu().numpy(),
         "feasible": assessment.feasible.cpu().numpy().astype(np.float32),
+        "start": np.full(len(end), start),
     }
     for share in WAYPOINTS:
         step = round(share / 100 * (rollout.position.shape[1] - 1))

@@ -18,6 +18,7 @@ from monoforce_ros.core import CommandTrack
 from monoforce_ros.messages import decoding, message_class
 from monoforce_ros.nodes import candidate_messages as messages
 from monoforce_ros.nodes.health import ERROR, OK, WARN, Health
+from monoforce_ros.nodes.latency import Latency
 from monoforce_ros.physics import Rollout
 from monoforce_ros.planning import (
     TERMS,
@@ -64,6 +65,8 @@ class CandidateOutput:
             self._fan = fan_of_arcs(fan)
         self._requested: tuple[float, np.ndarray] | None = None
         self._round_seconds = 0.0
+        self.latency = Latency()
+        """Of the published candidates, against the odometry."""
         self.apply(settings)
         self._statistics: dict[str, str] = {}
         self._publishers = {
@@ -116,7 +119,9 @@ class CandidateOutput:
             return
         motion, settings = prediction.motion, self._settings
         # Candidates take effect after the delay; the last command holds until then.
-        delay = min(round(settings.candidate_delay / self._predictor.options.time_step), self._predictor.steps - 1)
+        time_step = self._predictor.options.time_step
+        seconds = max(settings.candidate_delay, min(self.latency.typical, 0.5 * settings.horizon))
+        delay = min(round(seconds / time_step), self._predictor.steps - 1)
         start, steps = self._predictor.history + delay, self._predictor.steps - delay
         stamps = self._predictor.command_stamps(prediction.stamp)[:start]
         before = commands.sample(stamps, timeout=settings.command_timeout)
@@ -138,7 +143,9 @@ class CandidateOutput:
                 angles = found.flippers
         data: dict[str, object] = {
             "candidates": messages.candidate_markers(motion, rollout, assessment, frame_id),
-            "candidate_costs": messages.candidate_costs(motion, rollout, twists[:, start], assessment, frame_id),
+            "candidate_costs": messages.candidate_costs(
+                motion, rollout, twists[:, start], assessment, frame_id, delay * time_step
+            ),
         }
         if assessment.best is not None:
             if angles is not None:
@@ -149,6 +156,7 @@ class CandidateOutput:
                 motion, rollout, self._predictor.robot, twists[:, self._predictor.history :, :2], assessment, frame_id,
                 settings.path_time_step,
             )  # fmt: skip
+        self._statistics["candidates start after [s]"] = f"{delay * time_step:.2f}"
         self._statistics["feasible candidates"] = f"{int(assessment.feasible.sum())} of {len(twists)}"
         if self._node.context.ok():
             for name, message in data.items():

@@ -52,6 +52,8 @@ _COARSEST = 0.05
 """Largest rounding of the candidates' positions [m]: half of the distance that counts as progress."""
 _PAUSE = 0.03
 """Time between the commands to stand at the end of the node [s]."""
+_LATEST_START = 2.0
+"""Largest `candidate_delay` of the predictor [s]; what claims to start later is late all the same."""
 _TWICE = 0.2
 """Time within which the same goal from the other subscription arrives [s]."""
 
@@ -64,6 +66,12 @@ class Candidates:
     """[ns]."""
     frame_id: str
     fields: dict[str, np.ndarray]
+
+    @property
+    def start(self) -> float:
+        """Time after the stamp at which they take effect [s]; 0 if they do not tell it."""
+        start = self.fields.get("start", np.zeros(0))
+        return float(np.clip(np.nan_to_num(start[0]), 0.0, _LATEST_START)) if len(start) else 0.0
 
 
 class Stop(Exception):  # noqa: N818  (no error: the robot has to stand)
@@ -412,8 +420,10 @@ class PathSelectorNode(Node):
             frames = f"candidates are in frame {candidates.frame_id!r}, odometry in {self._odometry_frame!r}"
             raise Stop(f"{frames}: give predictor and path_selector the same `odometry_topic`", "candidate frame")
         age = (motion.stamp - candidates.stamp) * NANOSECOND
-        if abs(age) > self.settings.timeout:
-            raise Stop(f"candidates are {age:.2f} s old, the limit is {self.settings.timeout:g} s", "late")
+        # A slow predictor's candidates hold the last command for longer before they start.
+        limit = max(self.settings.timeout, candidates.start + 0.5 * self.settings.timeout)
+        if age > limit or age < -self.settings.timeout:
+            raise Stop(f"candidates are {age:.2f} s old, the limit is {limit:g} s", "late")
         return candidates
 
     def _cost_to(self, target: np.ndarray) -> CostToGo | None:

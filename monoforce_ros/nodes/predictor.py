@@ -508,6 +508,7 @@ class PredictorNode(ManagedNode):
                 self.costmap.publish(job.prediction, job.frame_id)
             if self.candidates is not None:
                 self.candidates.publish(job.prediction, job.commands, job.frame_id)
+                self.candidates.latency.add((self.inputs.motion_stamp - job.prediction.stamp) * NANOSECOND)
             if self.ensemble is not None:
                 self.ensemble.publish(job.prediction, job.twists, job.frame_id)
         except Exception as error:  # no input may end the node
