@@ -7,7 +7,7 @@ records randomised worlds of the reporting seeds, evaluates every system on them
 vegetation drag, and writes the tables, their strata, a page with the worst predictions of each system, and a log: date,
 commit, digests of the checkpoints, and how often the reporting seeds were used. Recorded worlds are kept in the folder:
 an interrupted run continues where it stopped. Give a system one checkpoint per training seed; without --checkpoint the
-shipped encoder is tested.
+shipped encoder is tested with images, with a sweep, and with both.
 """
 
 from __future__ import annotations
@@ -76,14 +76,27 @@ REPORTING = SeedRange("reporting", 440_000, 10_000)
 BOUND = System("true_support", "true support height (bound)", "ground truth")
 LEARNED = {
     "shipped": ("shipped encoder, images → H_t", "images"),
+    "shipped_lidar": ("shipped encoder, lidar → H_t", "point cloud"),
+    "shipped_both": ("shipped encoder, both → H_t", "images, point cloud"),
     "lidar_hg": ("lidar → H_g [22]", "point cloud"),
     "lidar_ht": ("lidar → H_t", "point cloud"),
     "lss": ("images → H_g, LSS [9]", "images"),
     "monoforce": ("images → H_t, MonoForce", "images"),
+    "both": ("both → H_t", "images, point cloud"),
     "no_geometric": ("MonoForce without geometric loss", "images"),
     "no_terrain": ("MonoForce without terrain loss", "images"),
 }
 """Title and input of each learned system, by its name."""
+SHIPPED = tuple(name for name in LEARNED if name.startswith("shipped"))
+RATIOS = (
+    ("monoforce", "lss"), ("monoforce", "lidar"), ("monoforce", "no_geometric"), ("monoforce", "no_terrain"),
+    ("lidar_ht", "lidar_hg"), ("lidar_ht", "lidar"), ("both", "monoforce"), ("both", "lidar_ht"),
+    ("shipped", "lidar"), ("shipped", "flat"), ("shipped_lidar", "lidar"), ("shipped_both", "shipped"),
+    ("shipped_both", "shipped_lidar"), ("shipped_both", "lidar"), ("lidar", "true_support"),
+)  # fmt: skip
+"""Systems whose errors are compared."""
+TALL = ("0.4 to 0.8 m", "0.8 m or more")
+"""Strata of tall vegetation."""
 _RESAMPLES = 4000
 WORST = 3
 """Number of worst predictions that are shown of each system."""
@@ -290,21 +303,49 @@ def interval(results: Sequence[Result], measure: str) -> tuple[float, float, flo
 
     Worlds and training seeds are independent; windows of one world are not.
     """
+    values = _by_world_and_run(results, measure)
+    values = values[np.isfinite(values).all(axis=1)]
+    if not len(values):
+        return float("nan"), float("nan"), float("nan")
+    means = _resampled_means(values, np.random.default_rng(0))
+    low, high = np.quantile(means, (0.025, 0.975))
+    return float(values.mean()), float(low), float(high)
+
+
+def ratio(results: Sequence[Result], others: Sequence[Result], measure: str) -> tuple[float, float, float]:
+    """Ratio of two systems' means over the same worlds, with a 95 % interval by resampling worlds and training seeds.
+
+    A draw has the same worlds for both systems, and its own training seeds for each.
+    """
+    common = {result.world for result in results} & {result.world for result in others}
+    pair = [
+        _by_world_and_run([result for result in listed if result.world in common], measure)
+        for listed in (results, others)
+    ]
+    usable = np.logical_and.reduce([np.isfinite(values).all(axis=1) for values in pair])
+    first, second = (values[usable] for values in pair)
+    if not len(first):
+        return float("nan"), float("nan"), float("nan")
+    # Equal seeds draw equal worlds, which are drawn before training seeds.
+    ratios = _resampled_means(first, np.random.default_rng(0)) / _resampled_means(second, np.random.default_rng(0))
+    low, high = np.quantile(ratios, (0.025, 0.975))
+    return float(first.mean() / second.mean()), float(low), float(high)
+
+
+def _by_world_and_run(results: Sequence[Result], measure: str) -> np.ndarray:
+    """Errors ``[worlds, training seeds]``; NaN where there is none."""
     worlds = sorted({result.world for result in results})
     runs = sorted({result.checkpoint for result in results})
-    table = np.full((len(worlds), len(runs)), np.nan)
+    values = np.full((len(worlds), len(runs)), np.nan)
     for result in results:
-        table[worlds.index(result.world), runs.index(result.checkpoint)] = getattr(result, measure)
-    table = table[np.isfinite(table).all(axis=1)]
-    if not len(table):
-        return float("nan"), float("nan"), float("nan")
-    random = np.random.default_rng(0)
-    means = [
-        table[random.integers(0, len(table), len(table))][:, random.integers(0, len(runs), len(runs))].mean()
-        for _ in range(_RESAMPLES)
-    ]
-    low, high = np.quantile(means, (0.025, 0.975))
-    return float(table.mean()), float(low), float(high)
+        values[worlds.index(result.world), runs.index(result.checkpoint)] = getattr(result, measure)
+    return values
+
+
+def _resampled_means(values: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    worlds = random.integers(0, len(values), (_RESAMPLES, len(values)))
+    runs = random.integers(0, values.shape[1], (_RESAMPLES, values.shape[1]))
+    return values[worlds[:, :, None], runs[:, None, :]].mean(axis=(1, 2))
 
 
 def table(results: Sequence[Result]) -> str:
@@ -329,6 +370,29 @@ def table(results: Sequence[Result]) -> str:
             lines.append(f"| {titles[key].input} | {titles[key].title} | {seeds} | {cells[0]} | {cells[1]} |")
         lines.append("")
     return "\n".join(lines)
+
+
+def ratio_table(results: Sequence[Result], physics: str) -> str:
+    """Markdown table of the ratios of :data:`RATIOS` for which both systems were evaluated; empty without any."""
+    chosen = [result for result in results if result.physics == physics]
+    by_system: dict[str, list[Result]] = {}
+    for result in chosen:
+        by_system.setdefault(result.system, []).append(result)
+    lines = ["| ratio | Δx | ΔR | Δx, tall vegetation | ΔR, tall vegetation |", "|---|---|---|---|---|"]
+    for first, second in RATIOS:
+        if first not in by_system or second not in by_system:
+            continue
+        cells = []
+        for tall in (False, True):
+            own, others = (
+                [r for r in by_system[key] if not tall or r.strata.get("vegetation height") in TALL]
+                for key in (first, second)
+            )
+            for measure in ("position", "rotation"):
+                value, low, high = ratio(own, others, measure)
+                cells.append(f"{value:.2f} ({low:.2f} – {high:.2f})" if np.isfinite(value) else "–")
+        lines.append(f"| {first} / {second} | {' | '.join(cells)} |")
+    return "\n".join(lines) if len(lines) > 2 else ""
 
 
 def strata_table(results: Sequence[Result], physics: str) -> str:
@@ -391,13 +455,14 @@ def reporting_seeds(first: int, count: int) -> list[int]:
 
 
 def parse_checkpoints(listed: Sequence[str]) -> dict[str, list[Path]]:
-    """Checkpoints by system; without any, the shipped encoder.
+    """Checkpoints by system; without any, the shipped encoder with images, a sweep, and both.
 
     Raises:
         ValueError: an entry is no ``SYSTEM=FILE`` of a known system and an existing file.
     """
     found: dict[str, list[Path]] = {}
-    for text in listed or [f"shipped={ROOT / 'models' / 'terrain_encoder.safetensors'}"]:
+    shipped = ROOT / "models" / "terrain_encoder.safetensors"
+    for text in listed or [f"{name}={shipped}" for name in SHIPPED]:
         name, _, file = text.partition("=")
         if name not in LEARNED or not Path(file).is_file():
             raise ValueError(f"--checkpoint: got {text!r}, expected SYSTEM=FILE with one of {', '.join(LEARNED)}")
@@ -437,7 +502,11 @@ def main() -> int:
         print(f"terrain: no world could be evaluated: {next(iter(skipped.values()))}", file=sys.stderr)
         return 1
     text = table(results)
-    by_strata = "\n\n".join(f"Δx [m], physics: {name}\n\n{strata_table(results, name)}" for name in PHYSICS)
+    by_strata = "\n\n".join(
+        f"Ratios, physics: {name}\n\n{ratio_table(results, name)}\n\n"
+        f"Δx [m], physics: {name}\n\n{strata_table(results, name)}"
+        for name in PHYSICS
+    )
     entry: dict[str, object] = {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "commit": commit(),

@@ -45,6 +45,34 @@ def test_intervals_cover_worlds_and_training_seeds():
     assert terrain.interval([*disagreeing, result("lss", "0", 99, 5.0)], "position")[0] == pytest.approx(0.2)
 
 
+def test_ratios_compare_the_same_worlds():
+    """Worlds differ a lot, one system is always 20 % better: the interval of the ratio is narrow."""
+    first = [result("both", str(run), world, 0.8 * (1 + world)) for run in (0, 1) for world in range(12)]
+    second = [result("monoforce", "0", world, 1.0 + world) for world in range(12)]
+    assert terrain.ratio(first, second, "position") == pytest.approx((0.8, 0.8, 0.8))
+    # A world that only one of them could evaluate counts for neither; without a common one there is no ratio.
+    assert terrain.ratio([*first, result("both", "0", 50, 9.0)], second, "position")[0] == pytest.approx(0.8)
+    assert np.isnan(terrain.ratio(first, [result("monoforce", "0", 70, 1.0)], "position")[0])
+    strata = {"vegetation height": "0.8 m or more"}
+    tall = [
+        result(r.system, r.checkpoint, r.world, r.position * (0.5 if r.system == "both" else 1.0), strata=strata)
+        for r in (*first, *second)
+        if r.world > 5
+    ]
+    short = [r for r in (*first, *second) if r.world <= 5]
+    (row,) = [line for line in terrain.ratio_table([*tall, *short], "paper").splitlines() if "both" in line]
+    assert row.startswith("| both / monoforce | 0.5") and row.count("| 0.40 (0.40 – 0.40) ") == 2
+    assert terrain.ratio_table(second, "paper") == ""
+
+
+def test_an_encoder_gets_the_sensors_of_its_row():
+    """The shipped encoder takes either sensor or both."""
+    wanted = {"shipped": ("camera",), "shipped_lidar": ("lidar",), "shipped_both": ("camera", "lidar")}
+    systems = terrain.learned_systems(terrain.parse_checkpoints([]))
+    found = {system.key: terrain.terrain_source(system, load_robot("husky")).sensors for system in systems}
+    assert found == {f"{name}@0": sensors for name, sensors in wanted.items()}
+
+
 def test_the_log_counts_how_often_seeds_were_used(tmp_path):
     log = tmp_path / "terrain.log.jsonl"
     assert terrain.log_use(log, {"seeds": [1, 2]}) == 1
@@ -119,9 +147,9 @@ def test_physics_differ_by_the_drag_of_vegetation():
 
 
 def test_wrong_arguments_are_named(tmp_path):
-    with pytest.raises(ValueError, match="expected SYSTEM=FILE with one of shipped, lidar_hg"):
+    with pytest.raises(ValueError, match="expected SYSTEM=FILE with one of shipped, shipped_lidar"):
         terrain.parse_checkpoints(["best=x"])
-    assert list(terrain.parse_checkpoints([])) == ["shipped"]
+    assert list(terrain.parse_checkpoints([])) == ["shipped", "shipped_lidar", "shipped_both"]
     command = [sys.executable, "benchmarks/terrain.py", "--out", str(tmp_path), "--seed", "420000"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=250, check=False)
     assert done.returncode == 1 and "are for training" in done.stderr and "Traceback" not in done.stderr

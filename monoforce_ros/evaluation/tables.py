@@ -32,6 +32,8 @@ MINIMUM_POSES = 5
 _RESAMPLES = 4000
 _HALF_MAP = 6.4
 """Half the edge length of the encoder's map [m]."""
+_SENSORS = {"images": ("camera",), "point cloud": ("lidar",), "images, point cloud": ("camera", "lidar")}
+"""Of an encoder, by the input of a system."""
 DISTANCES = (0.0, 1.0, 2.5, _HALF_MAP)
 """Limits of the distances from the start by which errors are listed [m]."""
 
@@ -125,7 +127,7 @@ def terrain_source(system: System, robot: RobotModel) -> TerrainSource:
     if system.with_lidar:
         return choose_terrain_source("lidar_camera", robot, checkpoint=system.checkpoint)
     encoder = fused(load_encoder(system.checkpoint))
-    return EncoderTerrain(encoder, robot, ("lidar",) if system.input == "point cloud" else ("camera",))
+    return EncoderTerrain(encoder, robot, _SENSORS[system.input])
 
 
 def _sequence(name: str, evaluation: RecordingEvaluation, method: str, chosen: np.ndarray) -> SequenceErrors:
