@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from monoforce_ros.discrepancy.score_test import ScoreResult
-from monoforce_ros.discrepancy.selection import Screened, admitted
+from monoforce_ros.discrepancy.screening import Screened, admitted
 from monoforce_ros.discrepancy.thresholds import Thresholds
 from monoforce_ros.discrepancy.trial import FitTest, Trial, excess_share, expected_loss
 from monoforce_ros.discrepancy.verdict import Findings, Verdict, decide

@@ -77,7 +77,7 @@ def measured(case: Case, files: CaseFiles, nominal_file: Path, shares: Sequence[
         return None
     smallest = []
     for share in shares:
-        results = search.screened(replace(search.thresholds, drive_share=share))
+        results = search.screening.tested_as_if(search.known, replace(search.thresholds, drive_share=share))
         best = min(results, key=lambda result: result.adjusted)
         smallest.append((best.name, best.adjusted))
     return {

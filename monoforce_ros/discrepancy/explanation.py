@@ -8,12 +8,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from monoforce_ros.discrepancy.gap import residual_scale
-from monoforce_ros.discrepancy.hypothesis import Evidence, EvidenceWindows
+from monoforce_ros.discrepancy.hypothesis import Evidence, EvidenceWindows, Predictions
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.onset import Onset, find_onset
 from monoforce_ros.discrepancy.preflight import FEWEST_WINDOWS
 from monoforce_ros.discrepancy.selection import Search
-from monoforce_ros.discrepancy.sensor_findings import SensorFindings, refine_clock
+from monoforce_ros.discrepancy.sensor_findings import SensorFindings, refined_clock
 from monoforce_ros.discrepancy.thresholds import Thresholds
 from monoforce_ros.discrepancy.trial import Outcome, paired
 from monoforce_ros.discrepancy.verdict import Decision, Findings, decide
@@ -91,21 +91,21 @@ def explain(
     sensors = SensorFindings.of(evidence, robot, commissioned=nominal is not None)
 
     def searched(part: Windows) -> Search:
-        search = Search(
+        scale, known = residual_scale(part.uncertainty, part.data, nominal), sensors.known
+        if sensors.gyro is not None:
+            known = refined_clock(known, sensors.gyro, Predictions(robot, part.data), scale)
+        return Search(
             robot,
             part.data,
-            residual_scale(part.uncertainty, part.data, nominal),
+            scale,
             nominal=nominal,
-            known=sensors.known,
+            known=known,
             hints=sensors.hints,
             excluded=sensors.excluded,
             thresholds=thresholds,
             seed=settings.seed,
             progress=progress,
         )
-        if sensors.gyro is not None:
-            refine_clock(search, sensors.gyro)
-        return search
 
     search = searched(windows)
     outcome = search.run(settings.max_effects, exchange=exchange)

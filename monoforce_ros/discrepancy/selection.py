@@ -10,7 +10,7 @@ again, and may be dropped or replaced.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.stats import t as student_distribution
@@ -21,19 +21,16 @@ from monoforce_ros.discrepancy.estimates import EffectEstimate
 from monoforce_ros.discrepancy.fit import (
     Fit,
     estimate_effects,
-    first_values,
     fit_effects,
     flat,
-    jacobian,
     robust,
-    robust_weights,
     scales,
     without,
 )
 from monoforce_ros.discrepancy.hypothesis import Effects, EvidenceWindows, Predictions
 from monoforce_ros.discrepancy.learned import learned_terms
 from monoforce_ros.discrepancy.nominal import NominalModel
-from monoforce_ros.discrepancy.score_test import Direction, ScoreResult, block_numbers, score_tests
+from monoforce_ros.discrepancy.screening import Screening, admitted
 from monoforce_ros.discrepancy.thresholds import Thresholds
 from monoforce_ros.discrepancy.trial import (
     FOLDS,
@@ -47,35 +44,13 @@ from monoforce_ros.discrepancy.trial import (
     folds_of,
     paired,
 )
-from monoforce_ros.effects import CATALOGUE, Effect, identifiable_effects, separating_sensor
+from monoforce_ros.effects import CATALOGUE, separating_sensor
 from monoforce_ros.robots import RobotModel
 
 _JUDGED = 6
 """Significant effects that are cross-validated in one round, those with the smallest screening loss first."""
-_FITTED = 8
-"""Effects with one parameter that are fitted in one round, those that promise the smallest loss first. More than are
-judged afterwards; fewer than all of them only to save time."""
-_HOPELESS = 0.3
-"""p-value of an effect by itself at its best initial value above which it is not fitted: ten times the rate at which
-effects count as significant among all candidates. It only saves time."""
 _ALTERNATIVES = 2
 """Combinations that do not begin with the best single effect and are tried where that one leads to no good fit."""
-
-
-@dataclass(frozen=True)
-class Screened:
-    """A candidate after its quick fit."""
-
-    effects: Effects
-    """With the base's effects before it."""
-    loss: float
-    """On the subsampled windows."""
-    test: ScoreResult
-
-    @property
-    def name(self) -> str:
-        """Of the candidate."""
-        return self.effects[-1][0]
 
 
 class Search:
@@ -112,13 +87,12 @@ class Search:
         self.known = known
         self.predictions = Predictions(robot, data)
         self.directions = Directions(self.predictions, self.scale, nominal, thresholds)
-        self._seed, self._progress = seed, progress
+        self._progress = progress
+        self.screening = Screening(
+            robot, data, self.directions, hints=hints, excluded=excluded, thresholds=thresholds, seed=seed,
+            progress=progress,
+        )  # fmt: skip
         starts = data.starts
-        self._coarse = Predictions(robot, replace(data, starts=starts[::2]))
-        self._coarse_scale = self.scale[::2]
-        self._sparse = Predictions(robot, replace(data, starts=starts[::4]))
-        self._sparse_scale = self.scale[::4]
-        self._blocks = block_numbers(starts, thresholds.block)
         folds = folds_of(starts)
         # A window that reaches into the next block shares motion with windows of the held-out fold.
         ends = folds_of(np.r_[starts[0], starts + round(data.horizon * 1e9)])[1:]
@@ -136,15 +110,7 @@ class Search:
                 )
             )
         self._own = dict(robot.effects)
-        self._hints = dict(hints)
-        self._excluded = set(excluded)
         self._fits: dict[tuple[str, ...], Fit] = {}
-        self.variance_ratio: float | None = None
-        """Mean variance of the candidates' influence beyond what this recording and the robot file explain, as a share
-        of that between segments."""
-        self._screenings: dict[tuple[tuple[object, ...], ...], tuple[float, list[Screened]]] = {}
-        self._influences: dict[tuple[tuple[object, ...], ...], list[Direction]] = {}
-        """Directions of the candidates that were screened last."""
 
     def run(self, most_effects: int, *, exchange: bool = True) -> Outcome:
         """Add effects while a further one is significant, then test each in the presence of the others.
@@ -163,8 +129,9 @@ class Search:
                 # The motion contradicts the measurement of the other sensor.
                 self.known, start = (), nominal
         judged, tried = self._round(start, 1, self.thresholds.effect_rate)
+        ratio = self.screening.candidates(self.known, len(self.known), "1: ").variance_ratio(self.directions)
         if not judged:
-            return Outcome(nominal, start, self.fit_test(start, nominal), tuple(tried), self.variance_ratio)
+            return Outcome(nominal, start, self.fit_test(start, nominal), tuple(tried), ratio)
         best, listed = self._extended(self._preferred(judged), most_effects)
         tried += listed
         fit = self.fit_test(best, nominal)
@@ -180,7 +147,7 @@ class Search:
         exchanged, indistinguishable = self._exchanged(best) if exchange else (best, {})
         if exchanged is not best:
             best, fit = exchanged, self.fit_test(exchanged, nominal)
-        return Outcome(nominal, best, fit, tuple(tried), self.variance_ratio, indistinguishable)
+        return Outcome(nominal, best, fit, tuple(tried), ratio, indistinguishable)
 
     def _extended(self, best: Trial, most_effects: int) -> tuple[Trial, list[CandidateScore]]:
         """Add effects one at a time while a further one is significant."""
@@ -286,8 +253,7 @@ class Search:
         for i in range(len(fit.effects)):
             others = fit.effects[:i] + fit.effects[i + 1 :]
             free = self.fixed_count(others)
-            alone = fit_effects(self._coarse, [others], self._coarse_scale, iterations=4, free=free)
-            losses.append(float(alone.loss.mean()))
+            losses.append(self.screening.quick_fit(others, free, 4)[1])
         return sorted(range(len(losses)), key=lambda i: -losses[i])
 
     def fit_test(self, trial: Trial, nominal: Trial) -> FitTest:
@@ -303,7 +269,7 @@ class Search:
         fixed = self.fixed_count(base)
         directions = [*self.directions.of_formula(base, fixed), *self.directions.of_changes(base, fixed)]
         residual = self.directions.scaled(base)
-        tests = self._tested(base, residual, directions)
+        tests = self.screening.tested(base, fixed, residual, directions)
         least = self.thresholds.smallest_share * nominal.loss
         strongest = min((test for test in tests if test.gain > least), key=lambda test: test.adjusted, default=None)
         p, name = (1.0, "") if strongest is None else (strongest.adjusted, strongest.name)
@@ -326,103 +292,22 @@ class Search:
             explained = excess_share(nominal.loss, trial.loss, self.healthy_loss)
         return FitTest(p, name, tuple(tests), explained)
 
-    def screened(self, thresholds: Thresholds) -> list[ScoreResult]:
-        """Tests of all candidates alone, as if healthy drives varied as ``thresholds`` say."""
-        key = _key(self.known)
-        if key not in self._influences:
-            self._screenings.pop(key, None)
-            self._screened(self.known, "1: ")
-        directions = self._influences[key]
-        if self.nominal is not None:
-            varied = [self.nominal.variation_of(entry.name, thresholds.drive_share) for entry in directions]
-            directions = [
-                replace(entry, variation=variation, degrees=degrees)
-                for entry, (variation, degrees) in zip(directions, varied, strict=True)
-            ]
-        return self._tested(self.known, self.directions.scaled(self.known), directions)
-
-    def _tested(self, base: Effects, residual: np.ndarray, directions: Sequence[Direction]) -> list[ScoreResult]:
-        fixed = self.fixed_count(base)
-        free = sum(len(values) for _, values in base[fixed:])
-        fitted = None
-        if free:
-            skipped = sum(len(values) for _, values in base[:fixed])
-            rows = jacobian(self.predictions, base, residual, self.scale, skipped)
-            fitted = rows.reshape(free, *residual.shape)
-        weights = robust_weights(residual)
-        return score_tests(
-            residual, weights, self._blocks, directions, fitted=fitted, metric=self.directions.metric,
-            draws=self.thresholds.draws, seed=self._seed,
-        )  # fmt: skip
-
     def fixed_count(self, effects: Effects) -> int:
         """Number of leading effects that keep the values which another sensor measured."""
         return len(self.known) if effects[: len(self.known)] == self.known else 0
 
-    def _screened(self, base: Effects, number: str) -> tuple[float, list[Screened]]:
-        """Loss of ``base``, and a quick fit and test of every further effect, smallest loss first."""
-        key = _key(base)
-        if key in self._screenings:
-            return self._screenings[key]
-        before = float(robust(self._coarse.residuals([base])[0] / self._coarse_scale).mean())
-        residual = self._sparse.residuals([base])[0] / self._sparse_scale
-        names = {name for name, _ in base}
-        tried: list[tuple[float, Effect, Effects]] = []
-        for effect in identifiable_effects(self.robot):
-            if effect.name in names or effect.name in self._excluded:
-                continue
-            self._progress(f"{number}{effect.name}")
-            tried.append(self._tried(effect, base, residual))
-        tried.sort(key=lambda entry: entry[0])
-        residual = self.directions.scaled(base)
-        directions = [self.directions.influence(base, start[-1]) for _, _, start in tried]
-        tests = self._tested(base, residual, directions)
-        # Only what may be significant, and promises to reduce the loss, is fitted; others keep their initial values.
-        fits = []
-        for rank, (_, effect, start) in enumerate(tried):
-            promising = tests[rank].p <= _HOPELESS and (rank < _FITTED or len(effect.identified) > 1)
-            iterations = 2 if promising else 0
-            fit = fit_effects(self._coarse, [start], self._coarse_scale, iterations=iterations, free=len(base))
-            fits.append(fit)
-            if fit.effects != start:
-                directions[rank] = self.directions.influence(base, fit.effects[-1])
-        tests = self._tested(base, residual, directions)
-        screened = [Screened(fit.effects, float(fit.loss.mean()), test) for fit, test in zip(fits, tests, strict=True)]
-        if base == self.known and self.nominal is not None and self.nominal.segments:
-            ratios = [test.excess / self.nominal.between_segments(test.name)[0] for test in tests if test.p < 1.0]
-            share = 1.0 / self.nominal.segments
-            self.variance_ratio = float(np.mean(ratios)) - share if ratios else None
-        self._influences = {key: directions}
-        self._screenings[key] = (before, sorted(screened, key=lambda entry: entry.loss))
-        return self._screenings[key]
-
-    def _tried(self, effect: Effect, base: Effects, residual: np.ndarray) -> tuple[float, Effect, Effects]:
-        """Loss that an effect promises on some windows, and the best of its initial values.
-
-        The promised loss is the smallest at an initial value, or along the straight line from ``base`` to one.
-        """
-        starts = [base + start for start in self._starts(effect)]
-        scaled = np.nan_to_num(self._sparse.residuals(starts) / self._sparse_scale)
-        losses = robust(scaled).mean(axis=1)
-        weights = robust_weights(residual)
-        changes = scaled - residual
-        slopes = (weights * residual * changes).sum(axis=(1, 2, 3))
-        curvatures = np.maximum((weights * changes**2).sum(axis=(1, 2, 3)), 1e-12)
-        promised = robust(residual).mean() - 0.5 * slopes**2 / curvatures / residual.size
-        return float(min(promised.min(), losses.min())), effect, starts[int(np.argmin(losses))]
-
     def _round(self, best: Trial, number: int, rate: float) -> tuple[list[Trial], list[CandidateScore]]:
         """Trials with one more effect that is significant, smallest held-out loss first, and the scores of all."""
         base = self.refit(best.effects).effects if best.effects else ()
-        before, screened = self._screened(base, f"{number}: ")
+        found = self.screening.candidates(base, self.fixed_count(base), f"{number}: ")
         judged = []
-        for entry in admitted(screened, before, rate)[:_JUDGED]:
+        for entry in admitted(found.screened, found.before, rate)[:_JUDGED]:
             self._progress(f"{number}: {entry.name}, judged")
             judged.append(self.judge(entry.effects))
         listed = []
-        for entry in screened:
+        for entry in found.screened:
             trial = next((trial for trial in judged if trial.names[-1] == entry.name), None)
-            gain = before - entry.loss if trial is None else self._gain(best, trial)[0]
+            gain = found.before - entry.loss if trial is None else self._gain(best, trial)[0]
             listed.append(
                 CandidateScore(entry.name, number, float(gain), entry.test.adjusted, judged=trial is not None)
             )
@@ -461,7 +346,8 @@ class Search:
             base = self.refit(fewer.effects).effects
             residual = self.directions.scaled(base)
             effect = next(entry for entry in best.effects if entry[0] == name)
-            (test,) = self._tested(base, residual, [self.directions.influence(base, effect)])
+            influence = self.directions.influence(base, effect)
+            (test,) = self.screening.tested(base, self.fixed_count(base), residual, [influence])
             if test.p > self.thresholds.further_rate or not self._pays(fewer, best):
                 best = fewer
         return best
@@ -473,17 +359,16 @@ class Search:
             if name not in best.names:
                 continue
             base = tuple(entry for entry in self.refit(best.effects).effects if entry[0] != name)
-            before, screened = self._screened(base, f"{name} or ")
-            reached = float(
-                robust(self._coarse.residuals([self.refit(best.effects).effects])[0] / self._coarse_scale).mean()
-            )
-            near = [entry for entry in screened if entry.name != name and entry.loss < 0.5 * (before + reached)]
+            others = self.screening.candidates(base, self.fixed_count(base), f"{name} or ")
+            reached = self.screening.quick_loss(self.refit(best.effects).effects)
+            middle = 0.5 * (others.before + reached)
+            near = [entry for entry in others.screened if entry.name != name and entry.loss < middle]
             judged = sorted([*(self.judge(entry.effects) for entry in near[:_JUDGED]), best], key=lambda t: t.loss)
             if judged[0] is not best and self._gain(best, judged[0])[1] > 0:
                 best = judged[0]
             kept = best.names[-1] if name not in best.names else name
-            others = [trial for trial in judged if trial is not best]
-            indistinguishable[kept] = self._indistinguishable(best, others, kept)
+            instead = [trial for trial in judged if trial is not best]
+            indistinguishable[kept] = self._indistinguishable(best, instead, kept)
         return best, indistinguishable
 
     def _indistinguishable(self, best: Trial, judged: Sequence[Trial], effect: str) -> list[str]:
@@ -500,62 +385,11 @@ class Search:
                 continue
             base = self.refit(trial.effects).effects
             residual = self.directions.scaled(base)
-            (test,) = self._tested(
-                base, residual, [self.directions.direction(effect, np.nan_to_num(chosen - residual)[None])]
-            )
+            direction = self.directions.direction(effect, np.nan_to_num(chosen - residual)[None])
+            (test,) = self.screening.tested(base, self.fixed_count(base), residual, [direction])
             if test.p > self.thresholds.comparison_rate or separating_sensor(other, effect):
                 found.append(other)
         return found
-
-    def _starts(self, effect: Effect) -> list[Effects]:
-        name = effect.name
-        starts = first_values(effect)
-        if name in self._own and effect.stage != "measurement":
-            known = {key: float(value) for key, value in dict(self._own[name]).items()}
-            starts = [((name, {**known, **_changed(effect, values, known)}),) for ((_, values),) in starts]
-            starts.append(((name, {key: known.get(key, value) for key, value in starts[0][0][1].items()}),))
-        if name in self._hints:
-            starts.append(((name, {**dict(starts[0][0][1]), **dict(self._hints[name])}),))
-        return starts
-
-
-def admitted(screened: Sequence[Screened], before: float, rate: float) -> list[Screened]:
-    """Candidates that are cross-validated, in their order.
-
-    That something is missing has to be shown among all candidates: one of them must be significant after adjustment.
-    Which it is, is then a choice between explanations: every effect that is significant by itself takes part in it, for
-    the best one may be the least certain (low friction varies most on the healthy robot, too).
-
-    Args:
-        screened: candidates after their quick fits.
-        before: loss without any of them.
-        rate: error rate of both steps.
-    """
-    better = [entry for entry in screened if entry.loss < before]
-    if not any(entry.test.adjusted <= rate for entry in better):
-        return []
-    return [entry for entry in better if entry.test.p <= rate]
-
-
-def _changed(effect: Effect, values: Mapping[str, float], known: Mapping[str, float]) -> dict[str, float]:
-    """Initial values of a fit where the robot's file has ``known`` ones: as far from these as ``values`` from neutral.
-
-    A factor is multiplied, other parameters are added. Limits, whose neutral value is infinite, stay as they are.
-    """
-    parameters, changed = {parameter.name: parameter for parameter in effect.parameters}, {}
-    for key, value in values.items():
-        parameter = parameters[key]
-        if key not in known or not np.isfinite(parameter.neutral) or not np.isfinite(known[key]):
-            changed[key] = value
-            continue
-        moved = known[key] * value if parameter.neutral == 1.0 else known[key] + value - parameter.neutral
-        changed[key] = float(np.clip(moved, parameter.low, parameter.high))
-    return changed
-
-
-def _key(effects: Effects) -> tuple[tuple[object, ...], ...]:
-    """Names and values of effects, hashable."""
-    return tuple((name, *values.values()) for name, values in effects)
 
 
 def _parameter_count(trial: Trial) -> int:

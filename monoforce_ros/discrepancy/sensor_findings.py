@@ -10,8 +10,9 @@ import numpy as np
 from monoforce_ros.discrepancy.clocks import GyroFinding, compare_with_gyro
 from monoforce_ros.discrepancy.comparison import GapRow
 from monoforce_ros.discrepancy.estimates import EffectEstimate, ParameterEstimate
+from monoforce_ros.discrepancy.fit import robust
 from monoforce_ros.discrepancy.flippers import BLOCKED, FlipperFinding, compare_with_commands
-from monoforce_ros.discrepancy.hypothesis import Effects, Evidence
+from monoforce_ros.discrepancy.hypothesis import Effects, Evidence, Predictions
 from monoforce_ros.discrepancy.selection import Search
 from monoforce_ros.discrepancy.verdict import Decision, Verdict
 from monoforce_ros.discrepancy.wheels import WheelFinding, changed_drives, compare_with_wheels
@@ -81,15 +82,22 @@ def measured_effects(
     return measured if flippers is None else (*measured, flippers.effect)
 
 
-def refine_clock(search: Search, gyro: GyroFinding) -> None:
-    """Improve the gyro's estimate of the pose clock by the motion, now that the delay of the drives is known."""
-    if not search.known or search.known[0][0] != "pose_clock_offset":
-        return
+def refined_clock(known: Effects, gyro: GyroFinding, predictions: Predictions, scale: np.ndarray) -> Effects:
+    """The measured effects with the gyro's estimate of the pose clock improved by the motion.
+
+    The motion tells more now that the delay of the drives is known.
+
+    Args:
+        known: measured effects.
+        gyro: what the gyro says.
+        predictions: of the recording's windows.
+        scale: expected size of a residual, ``[W, K, 3]``.
+    """
+    if not known or known[0][0] != "pose_clock_offset":
+        return known
     offsets = gyro.offset + gyro.offset_half_width * np.linspace(-1.5, 1.5, 13)
-    tried: Sequence[Effects] = [
-        (("pose_clock_offset", {"offset": float(offset)}), *search.known[1:]) for offset in offsets
-    ]
-    search.known = min(tried, key=lambda effects: float(search.loss_of(effects).mean()))
+    tried: Sequence[Effects] = [(("pose_clock_offset", {"offset": float(offset)}), *known[1:]) for offset in offsets]
+    return min(tried, key=lambda effects: float(robust(predictions.residuals([effects])[0] / scale).mean()))
 
 
 def accepts_bias(decision: Decision, robot: RobotModel) -> bool:

@@ -1,0 +1,239 @@
+"""Screening: a quick fit and a test of every effect of the catalogue in addition to a base, on one recording."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from monoforce_ros.discrepancy.directions import Directions
+from monoforce_ros.discrepancy.fit import first_values, fit_effects, jacobian, robust, robust_weights
+from monoforce_ros.discrepancy.hypothesis import Effects, EvidenceWindows, Predictions
+from monoforce_ros.discrepancy.score_test import Direction, ScoreResult, block_numbers, score_tests
+from monoforce_ros.discrepancy.thresholds import Thresholds
+from monoforce_ros.effects import Effect, identifiable_effects
+from monoforce_ros.robots import RobotModel
+
+_FITTED = 8
+"""Effects with one parameter that are fitted in one round, those that promise the smallest loss first. More than are
+judged afterwards; fewer than all of them only to save time."""
+_HOPELESS = 0.3
+"""p-value of an effect by itself at its best initial value above which it is not fitted: ten times the rate at which
+effects count as significant among all candidates. It only saves time."""
+
+
+@dataclass(frozen=True)
+class Screened:
+    """A candidate after its quick fit."""
+
+    effects: Effects
+    """With the base's effects before it."""
+    loss: float
+    """On every second window."""
+    test: ScoreResult
+
+    @property
+    def name(self) -> str:
+        """Of the candidate."""
+        return self.effects[-1][0]
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """All candidates in addition to a base."""
+
+    before: float
+    """Loss of the base on every second window."""
+    screened: tuple[Screened, ...]
+    """Smallest loss first."""
+    influences: tuple[Direction, ...]
+    """Changes of the residuals by the candidates."""
+
+    def variance_ratio(self, directions: Directions) -> float | None:
+        """Mean variance of the candidates' influence beyond what this recording and the robot file explain, as a share
+        of that between segments of the commissioning recording; None where that is unknown."""
+        nominal = directions.nominal
+        if nominal is None or not nominal.segments:
+            return None
+        tests = [entry.test for entry in self.screened]
+        ratios = [test.excess / nominal.between_segments(test.name)[0] for test in tests if test.p < 1.0]
+        return float(np.mean(ratios)) - 1.0 / nominal.segments if ratios else None
+
+
+class Screening:
+    """Screens the effects that can be identified on a robot.
+
+    Args:
+        robot: robot with the effects of its file.
+        data: the recording's windows.
+        directions: of the same windows.
+        hints: values that another sensor suggests; fits start there, too.
+        excluded: effects that another sensor rules out.
+        thresholds: error rates.
+        seed: of the null distributions.
+        progress: called with a description of the next step.
+    """
+
+    def __init__(
+        self,
+        robot: RobotModel,
+        data: EvidenceWindows,
+        directions: Directions,
+        *,
+        hints: Effects = (),
+        excluded: Sequence[str] = (),
+        thresholds: Thresholds = Thresholds(),  # noqa: B008
+        seed: int = 0,
+        progress: Callable[[str], None] = lambda step: None,
+    ):
+        self._robot, self._directions, self._thresholds = robot, directions, thresholds
+        self._hints, self._excluded = dict(hints), set(excluded)
+        self._seed, self._progress = seed, progress
+        starts, scale = data.starts, directions.scale
+        self._coarse, self._coarse_scale = Predictions(robot, replace(data, starts=starts[::2])), scale[::2]
+        self._sparse, self._sparse_scale = Predictions(robot, replace(data, starts=starts[::4])), scale[::4]
+        self._blocks = block_numbers(starts, thresholds.block)
+        self._done: dict[tuple[tuple[object, ...], ...], Candidates] = {}
+
+    def quick_fit(self, effects: Effects, fixed: int, iterations: int) -> tuple[Effects, float]:
+        """Effects fitted to every second window, with the first ``fixed`` of them as they are, and their loss there."""
+        fit = fit_effects(self._coarse, [effects], self._coarse_scale, iterations=iterations, free=fixed)
+        return fit.effects, float(fit.loss.mean())
+
+    def quick_loss(self, effects: Effects) -> float:
+        """Loss on every second window."""
+        return float(robust(self._coarse.residuals([effects])[0] / self._coarse_scale).mean())
+
+    def tested(
+        self, base: Effects, fixed: int, residual: np.ndarray, directions: Sequence[Direction]
+    ) -> list[ScoreResult]:
+        """Tests of directions in addition to a base, of which the first ``fixed`` effects were measured.
+
+        Args:
+            base: effects in the model.
+            fixed: number of those whose values are not fitted.
+            residual: that ``base`` leaves, scaled, ``[W, K, 3]``.
+            directions: to be tested.
+        """
+        free = sum(len(values) for _, values in base[fixed:])
+        fitted = None
+        if free:
+            skipped = sum(len(values) for _, values in base[:fixed])
+            rows = jacobian(self._directions.predictions, base, residual, self._directions.scale, skipped)
+            fitted = rows.reshape(free, *residual.shape)
+        return score_tests(
+            residual, robust_weights(residual), self._blocks, directions, fitted=fitted,
+            metric=self._directions.metric, draws=self._thresholds.draws, seed=self._seed,
+        )  # fmt: skip
+
+    def tested_as_if(self, base: Effects, thresholds: Thresholds) -> list[ScoreResult]:
+        """Tests of all candidates in addition to measured effects, if healthy drives varied as ``thresholds`` say."""
+        influences = self.candidates(base, len(base), "1: ").influences
+        nominal = self._directions.nominal
+        if nominal is not None:
+            varied = [nominal.variation_of(entry.name, thresholds.drive_share) for entry in influences]
+            influences = tuple(
+                replace(entry, variation=variation, degrees=degrees)
+                for entry, (variation, degrees) in zip(influences, varied, strict=True)
+            )
+        return self.tested(base, len(base), self._directions.scaled(base), influences)
+
+    def candidates(self, base: Effects, fixed: int, number: str) -> Candidates:
+        """A quick fit and a test of every effect in addition to a base; kept, for it is asked for again.
+
+        Args:
+            base: effects in the model.
+            fixed: number of those whose values were measured.
+            number: of the round, for the progress.
+        """
+        key = tuple((name, *values.values()) for name, values in base)
+        if key not in self._done:
+            self._done[key] = self._screened(base, fixed, number)
+        return self._done[key]
+
+    def _screened(self, base: Effects, fixed: int, number: str) -> Candidates:
+        residual = self._sparse.residuals([base])[0] / self._sparse_scale
+        names = {name for name, _ in base}
+        tried: list[tuple[float, Effect, Effects]] = []
+        for effect in identifiable_effects(self._robot):
+            if effect.name in names or effect.name in self._excluded:
+                continue
+            self._progress(f"{number}{effect.name}")
+            tried.append(self._tried(effect, base, residual))
+        tried.sort(key=lambda entry: entry[0])
+        residual = self._directions.scaled(base)
+        influences = [self._directions.influence(base, start[-1]) for _, _, start in tried]
+        tests = self.tested(base, fixed, residual, influences)
+        # Only what may be significant, and promises to reduce the loss, is fitted; others keep their initial values.
+        fits = []
+        for rank, (_, effect, start) in enumerate(tried):
+            promising = tests[rank].p <= _HOPELESS and (rank < _FITTED or len(effect.identified) > 1)
+            fits.append(self.quick_fit(start, len(base), 2 if promising else 0))
+            if fits[-1][0] != start:
+                influences[rank] = self._directions.influence(base, fits[-1][0][-1])
+        tests = self.tested(base, fixed, residual, influences)
+        screened = [Screened(effects, loss, test) for (effects, loss), test in zip(fits, tests, strict=True)]
+        ordered = tuple(sorted(screened, key=lambda entry: entry.loss))
+        return Candidates(self.quick_loss(base), ordered, tuple(influences))
+
+    def _tried(self, effect: Effect, base: Effects, residual: np.ndarray) -> tuple[float, Effect, Effects]:
+        """Loss that an effect promises on every fourth window, and the best of its initial values.
+
+        The promised loss is the smallest at an initial value, or along the straight line from ``base`` to one.
+        """
+        starts = [base + start for start in self._starts(effect)]
+        scaled = np.nan_to_num(self._sparse.residuals(starts) / self._sparse_scale)
+        losses = robust(scaled).mean(axis=1)
+        weights = robust_weights(residual)
+        changes = scaled - residual
+        slopes = (weights * residual * changes).sum(axis=(1, 2, 3))
+        curvatures = np.maximum((weights * changes**2).sum(axis=(1, 2, 3)), 1e-12)
+        promised = robust(residual).mean() - 0.5 * slopes**2 / curvatures / residual.size
+        return float(min(promised.min(), losses.min())), effect, starts[int(np.argmin(losses))]
+
+    def _starts(self, effect: Effect) -> list[Effects]:
+        name = effect.name
+        own = dict(self._robot.effects)
+        starts = first_values(effect)
+        if name in own and effect.stage != "measurement":
+            known = {key: float(value) for key, value in dict(own[name]).items()}
+            starts = [((name, {**known, **_changed(effect, values, known)}),) for ((_, values),) in starts]
+            starts.append(((name, {key: known.get(key, value) for key, value in starts[0][0][1].items()}),))
+        if name in self._hints:
+            starts.append(((name, {**dict(starts[0][0][1]), **dict(self._hints[name])}),))
+        return starts
+
+
+def admitted(screened: Sequence[Screened], before: float, rate: float) -> list[Screened]:
+    """Candidates that are cross-validated, in their order.
+
+    That something is missing has to be shown among all candidates: one of them must be significant after adjustment.
+    Which it is, is then a choice between explanations: every effect that is significant by itself takes part in it, for
+    the best one may be the least certain (low friction varies most on the healthy robot, too).
+
+    Args:
+        screened: candidates after their quick fits.
+        before: loss without any of them.
+        rate: error rate of both steps.
+    """
+    better = [entry for entry in screened if entry.loss < before]
+    if not any(entry.test.adjusted <= rate for entry in better):
+        return []
+    return [entry for entry in better if entry.test.p <= rate]
+
+
+def _changed(effect: Effect, values: Mapping[str, float], known: Mapping[str, float]) -> dict[str, float]:
+    """Initial values of a fit where the robot's file has ``known`` ones: as far from these as ``values`` from neutral.
+
+    A factor is multiplied, other parameters are added. Limits, whose neutral value is infinite, stay as they are.
+    """
+    parameters, changed = {parameter.name: parameter for parameter in effect.parameters}, {}
+    for key, value in values.items():
+        parameter = parameters[key]
+        if key not in known or not np.isfinite(parameter.neutral) or not np.isfinite(known[key]):
+            changed[key] = value
+            continue
+        moved = known[key] * value if parameter.neutral == 1.0 else known[key] + value - parameter.neutral
+        changed[key] = float(np.clip(moved, parameter.low, parameter.high))
+    return changed
