@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import sys
 import time
-from dataclasses import dataclass
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
@@ -16,16 +15,19 @@ from sensor_msgs.msg import PointCloud2
 
 from monoforce_ros.core import NANOSECOND, FrameError, MotionState, RobotFrames, TransformHistory, pose_matrix
 from monoforce_ros.messages import decoding
+from monoforce_ros.nodes.candidate_input import CandidateInput
 from monoforce_ros.nodes.clocks import STEADY
 from monoforce_ros.nodes.command_output import CommandOutput
 from monoforce_ros.nodes.course import TRANSFORM_TIMEOUT, Course, CourseFrames
 from monoforce_ros.nodes.flipper_output import FlipperOutput
-from monoforce_ros.nodes.frames import TRANSFORMS_PATIENCE, TransformListener
+from monoforce_ros.nodes.frames import TransformListener
 from monoforce_ros.nodes.health import ERROR, OK, WARN, Health
+from monoforce_ros.nodes.odometry_input import OdometryInput
 from monoforce_ros.nodes.parameters import declare_parameters, settings_without_effect
 from monoforce_ros.nodes.process import run_schema_node
 from monoforce_ros.nodes.progress_check import PATIENCE, WINDOW, MeasuredVelocity, ProgressCheck
 from monoforce_ros.nodes.schema import read_schema, schema_path
+from monoforce_ros.nodes.stop import Refusal, Stop
 from monoforce_ros.nodes.subscriptions import AdaptiveSubscription
 from monoforce_ros.planning import (
     COMMAND_FIELDS,
@@ -48,42 +50,10 @@ _LONGER = 2.0
 """What a plan grows by at once [m] if it was planned anew around something."""
 _JUMP = 1.0
 """Distance by which odometry may jump without being another one [m]; and it may move at three times the speed."""
-_COARSEST = 0.05
-"""Largest rounding of the candidates' positions [m]: half of the distance that counts as progress."""
 _PAUSE = 0.03
 """Time between the commands to stand at the end of the node [s]."""
-_LATEST_START = 2.0
-"""Largest `candidate_delay` of the predictor [s]; what claims to start later is late all the same."""
 _TWICE = 0.2
 """Time within which the same goal from the other subscription arrives [s]."""
-
-
-@dataclass(frozen=True)
-class Candidates:
-    """The predictor's candidates."""
-
-    stamp: int
-    """[ns]."""
-    frame_id: str
-    fields: dict[str, np.ndarray]
-
-    @property
-    def start(self) -> float:
-        """Time after the stamp at which they take effect [s]; 0 if they do not tell it."""
-        start = self.fields.get("start", np.zeros(0))
-        return float(np.clip(np.nan_to_num(start[0]), 0.0, _LATEST_START)) if len(start) else 0.0
-
-
-class Stop(Exception):  # noqa: N818  (no error: the robot has to stand)
-    """The robot has to stop; the message says why, ``reason`` is a short key of it."""
-
-    def __init__(self, message: str, reason: str):
-        super().__init__(message)
-        self.reason = reason
-
-
-class Refusal(Exception):  # noqa: N818  (as Stop)
-    """The goal or plan cannot be driven to and is dropped; the message says why."""
 
 
 class PathSelectorNode(Node):
@@ -112,15 +82,9 @@ class PathSelectorNode(Node):
         self._course_frames = CourseFrames(self.transforms, history)
         self._course: Course | None = None
         self._received: Course | None = None
-        self._motion: MotionState | None = None
-        self._odometry_frame = self._base_name = ""
-        self._odometry_problem = ""
         self._started = time.monotonic()
-        self._first_odometry = 0.0
-        self._odometry_stamp: int | None = None
-        self._advanced = 0.0
-        self._arrivals: dict[str, float] = {}
-        self._candidates: Candidates | None = None
+        self._odometry = OdometryInput(self.frames, self.transforms, self.health, settings.timeout)
+        self._candidates = CandidateInput(self.health, settings.timeout)
         self._driving = False
         self._halting = 0
         """Commands to stand that are still to be sent."""
@@ -136,7 +100,7 @@ class PathSelectorNode(Node):
         self._inputs = {
             "odometry": self._subscribe(settings.odometry_topic, "nav_msgs/msg/Odometry", Odometry, self._on_odometry),
             "candidates": self._subscribe(
-                settings.candidate_cost_topic, "sensor_msgs/msg/PointCloud2", PointCloud2, self._on_candidates
+                settings.candidate_cost_topic, "sensor_msgs/msg/PointCloud2", PointCloud2, self._candidates.receive
             ),
             "occupancy": self._subscribe(
                 settings.occupancy_topic, "nav_msgs/msg/OccupancyGrid", OccupancyGrid, self._on_occupancy
@@ -201,45 +165,19 @@ class PathSelectorNode(Node):
             self._nearest = np.inf, time.monotonic()
         # At once, as the robot may be moving; what is missing now may be there at the next command.
         with contextlib.suppress(Stop, Refusal):
-            self._usable_motion()
+            self._odometry.usable("")
             self._in_odometry(course)
 
     def _on_odometry(self, message: Odometry) -> None:
-        self._arrivals["odometry"] = time.monotonic()
-        try:
-            state, frame_id, child = decoding.decode_odometry(message)
-            if not state.stamp:
-                raise decoding.MessageError("the stamps are zero: the state estimator does not set them")
-        except decoding.MessageError as error:
-            self._odometry_problem = str(error)
-            self.health.report("odometry", ERROR, str(error), reason="unusable")
+        before = self._odometry.motion
+        motion = self._odometry.motion if self._odometry.receive(message) else None
+        if motion is None:
             return
-        if state.stamp != self._odometry_stamp:
-            self._odometry_stamp, self._advanced = state.stamp, self._arrivals["odometry"]
-        self._first_odometry = self._first_odometry or self._arrivals["odometry"]
-        # The name of REP 105, as the predictor takes it.
-        frame_id = frame_id or "odom"
-        self._odometry_frame = frame_id
-        try:
-            offset = self.frames.odometry_child(child, self.transforms.tree)
-        except FrameError as error:
-            self._odometry_problem = self.transforms.explained(error)
-            # Transforms may be on their way.
-            if self.transforms.unavailable or time.monotonic() - self._first_odometry > TRANSFORMS_PATIENCE:
-                self.health.report("odometry", ERROR, self._odometry_problem, reason="frame")
-            return
-        self._odometry_problem = ""
-        before, self._motion = self._motion, state.of_base(offset)
-        self._drop_course_after_jump(before, self._motion)
-        self._base_name = self.frames.base_name(child, self.transforms.tree.frames)
-        on_robot = {child or self._base_name: offset, self._base_name: np.eye(4)}
-        self._course_frames.add_odometry(frame_id, self._motion, on_robot)
+        self._drop_course_after_jump(before, motion)
+        self._course_frames.add_odometry(self._odometry.frame, motion, self._odometry.on_robot)
         if self._driving:
-            motion = self._motion
-            seconds = motion.stamp * NANOSECOND
             speed, yaw_rate = self._last_command[:2]
-            self._progress.add(seconds, (speed, yaw_rate), motion.position[:2], motion.heading)
-        self.health.report("odometry", OK, "receiving odometry")
+            self._progress.add(motion.stamp * NANOSECOND, (speed, yaw_rate), motion.position[:2], motion.heading)
 
     def _drop_course_after_jump(self, before: MotionState | None, now: MotionState) -> None:
         """Forget the goal if the odometry goes on elsewhere: the place of a goal in its frame is unknown then."""
@@ -261,16 +199,6 @@ class PathSelectorNode(Node):
         self._course = None
         self.health.report(PART, ERROR, message, reason="refused")
 
-    def _on_candidates(self, message: PointCloud2) -> None:
-        try:
-            fields = decoding.decode_fields(message)
-        except decoding.MessageError as error:
-            self.health.report("candidates", ERROR, str(error), reason="unusable")
-            return
-        self._arrivals["candidates"] = time.monotonic()
-        self._candidates = Candidates(decoding.stamp_of(message), message.header.frame_id, fields)
-        self.health.report("candidates", OK, "receiving candidates")
-
     def _on_occupancy(self, message: OccupancyGrid) -> None:
         try:
             self._map, self._cost_to_go = decoding.decode_occupancy(message), None
@@ -282,8 +210,8 @@ class PathSelectorNode(Node):
 
     def _watch_inputs(self) -> None:
         now = time.monotonic()
-        for part in ("odometry", "candidates"):
-            silence = now - self._arrivals.get(part, self._started)
+        for part, arrival in (("odometry", self._odometry.arrival), ("candidates", self._candidates.arrival)):
+            silence = now - (self._started if arrival is None else arrival)
             if silence > self.settings.data_timeout:
                 cause = self._inputs[part].silence_cause
                 message = f"no messages for {silence:.1f} s ({cause})"
@@ -302,7 +230,7 @@ class PathSelectorNode(Node):
         else:
             return
         self._last_command = command or (0.0, 0.0)
-        self._commands.publish(self._last_command, self._base_name or self.settings.base_frame or _BASE_FRAME)
+        self._commands.publish(self._last_command, self._odometry.base_name or self.settings.base_frame or _BASE_FRAME)
         if command is not None:
             self._flippers.forward()
 
@@ -335,7 +263,7 @@ class PathSelectorNode(Node):
             Stop: there is no reliable command.
             Refusal: the course has no place in the odometry frame.
         """
-        motion = self._usable_motion()
+        motion = self._odometry.usable(self._inputs["odometry"].silence_cause)
         plan = self._in_odometry(course)[:, :2]
         position = motion.position[:2]
         target, remaining = plan_target(plan, position, self.settings.plan_lookahead)
@@ -345,45 +273,22 @@ class PathSelectorNode(Node):
             self._course = None
             self.health.report(PART, OK, f"the goal is reached: {distance:.2f} m away", reason="reached")
             return None
-        candidates = self._usable_candidates(motion)
+        cause = self._inputs["candidates"].silence_cause
+        candidates = self._candidates.usable(motion, self._odometry.frame, cause)
         if deaf := self._commands.deaf:
             raise Stop(f"{deaf}: is the base running, and is `command_topic` right?", "deaf")
         try:
             best = select_candidate(
-                candidates.fields, position, target, self.weights, self._cost_to(target), self._last_command
+                candidates, position, target, self.weights, self._cost_to(target), self._last_command
             )
         except ValueError as error:
             raise Stop(str(error), "fields") from error
         if best is None:
             raise Stop("no candidate is feasible", "infeasible")
-        command = tuple(float(candidates.fields[name][best]) for name in COMMAND_FIELDS if name in candidates.fields)
+        command = tuple(float(candidates[name][best]) for name in COMMAND_FIELDS if name in candidates)
         self._check_progress(course, remaining if len(plan) > 1 else distance)
         self._report_driving(course, distance, command)
         return command
-
-    def _usable_motion(self) -> MotionState:
-        """The newest motion of the base; raises ``Stop`` if it is missing, old or of an unknown frame."""
-        source = self._inputs["odometry"]
-        if self._odometry_problem:
-            raise Stop(self._odometry_problem, "odometry")
-        if self._motion is None:
-            raise Stop(f"no odometry: the position is unknown ({source.silence_cause})", "no odometry")
-        # Stamps cannot detect this: without odometry there are no new candidates either, so their age stays constant.
-        silence = time.monotonic() - self._arrivals["odometry"]
-        if silence > self.settings.timeout:
-            raise Stop(f"no odometry for {silence:.1f} s: the position is unknown ({source.silence_cause})", "silent")
-        # With such odometry candidates cannot grow old either.
-        frozen = time.monotonic() - self._advanced
-        if frozen > self.settings.timeout:
-            raise Stop(f"odometry has repeated the same stamp for {frozen:.1f} s: the position is unknown", "frozen")
-        if self._motion.rounding > _COARSEST:
-            far = f"{np.abs(self._motion.position).max() / 1e3:.0f} km from the origin of {self._odometry_frame!r}"
-            raise Stop(
-                f"odometry is {far}, where the 32-bit positions of candidates are {100 * self._motion.rounding:.0f} cm "
-                "apart: use an odometry frame that begins near the robot (REP 105)",
-                "far",
-            )
-        return self._motion
 
     def _in_odometry(self, course: Course) -> np.ndarray:
         """Points of the course ``[n, 3]`` in the odometry frame.
@@ -397,12 +302,12 @@ class PathSelectorNode(Node):
             self._course, points = self._course_frames.resolved(course, now)
         except FrameError as error:
             # Without odometry the frame that the transform leads to is unknown.
-            if now - max(course.received, self._first_odometry) < TRANSFORM_TIMEOUT:
+            if now - max(course.received, self._odometry.first_arrival) < TRANSFORM_TIMEOUT:
                 raise Stop(f"waiting for a transform: {error}", "frame") from error
             wait = f"not transformed within {TRANSFORM_TIMEOUT:g} s"
             raise Refusal(f"the {course.kind} is refused, {wait}: {error}; send it again") from error
         if self._course is not course:
-            end, frame = points[-1], self._odometry_frame
+            end, frame = points[-1], self._odometry.frame
             place = f"({end[0]:.2f}, {end[1]:.2f}) in {frame!r}"
             self.get_logger().info(
                 f"{course.frame_id!r} moves with the robot: the {course.kind} is kept at {place}",
@@ -410,28 +315,12 @@ class PathSelectorNode(Node):
             )
         return points
 
-    def _usable_candidates(self, motion: MotionState) -> Candidates:
-        """The newest candidates; raises ``Stop`` if they are missing, old or in another frame than the odometry."""
-        candidates = self._candidates
-        if candidates is None:
-            cause = self._inputs["candidates"].silence_cause
-            raise Stop(f"no candidates received: is the predictor running with `candidates`? ({cause})", "none")
-        if candidates.frame_id.lstrip("/") != self._odometry_frame.lstrip("/"):
-            frames = f"candidates are in frame {candidates.frame_id!r}, odometry in {self._odometry_frame!r}"
-            raise Stop(f"{frames}: give predictor and path_selector the same `odometry_topic`", "candidate frame")
-        age = (motion.stamp - candidates.stamp) * NANOSECOND
-        # A slow predictor's candidates hold the last command for longer before they start.
-        limit = max(self.settings.timeout, candidates.start + 0.5 * self.settings.timeout)
-        if age > limit or age < -self.settings.timeout:
-            raise Stop(f"candidates are {age:.2f} s old, the limit is {limit:g} s", "late")
-        return candidates
-
     def _cost_to(self, target: np.ndarray) -> CostToGo | None:
         """Path lengths around obstacles to a target; None without a map in the odometry frame."""
         if self._map is None:
             return None
-        if self._map_frame.lstrip("/") != self._odometry_frame.lstrip("/"):
-            message = f"not used: it is in frame {self._map_frame!r}, odometry in {self._odometry_frame!r}"
+        if self._map_frame.lstrip("/") != self._odometry.frame.lstrip("/"):
+            message = f"not used: it is in frame {self._map_frame!r}, odometry in {self._odometry.frame!r}"
             self.health.report("occupancy", WARN, message, reason="frame")
             return None
         found = self._cost_to_go
@@ -476,7 +365,7 @@ class PathSelectorNode(Node):
 
     def _silent_transform(self, course: Course) -> str:
         """Which transform from the course's frame is not sent any more, as when localisation has ended; or empty."""
-        name, silence = self.transforms.silence(course.frame_id, self._odometry_frame) if course.frame_id else ("", 0.0)
+        name, silence = self.transforms.silence(course.frame_id, self._odometry.frame) if course.frame_id else ("", 0.0)
         if silence <= self.settings.data_timeout:
             return ""
         return f"{name} has not been sent for {silence:.1f} s (is localisation running?)"
