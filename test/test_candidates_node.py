@@ -144,6 +144,7 @@ def test_candidates_of_a_planner_are_compared_and_refined(peer, start):
     typed = message_class("monoforce_msgs/msg/Candidates")
     process = start(
         "predictor", "--ros-args", "-r", "__node:=requested", "-p", "candidate_topic:=planned", "-p", "horizon:=2.0",
+        "-p", "candidate_delay:=0.8",
         "-p", "refine_seconds:=0.8", "-p", "rate:=1.0", "-p", "ensemble:=8",
         "-r", "predicted/candidate_costs:=requested_costs", "-r", "predicted/candidate_rollouts:=requested_rollouts",
     )  # fmt: skip
@@ -215,10 +216,10 @@ def test_candidates_of_a_planner_are_compared_and_refined(peer, start):
     commands = np.array(message.commands).reshape(count, samples, 2)
     np.testing.assert_allclose(states[:, 0, :3], [[1.0, 2.0, 0.3]] * 4, atol=1e-3)
     np.testing.assert_allclose(np.linalg.norm(states[..., 3:], axis=-1), 1.0, atol=1e-5)
-    # Samples are 0.1 s apart. The last command holds until the candidates start: after 0.2 s, or as late as they are
-    # published with `refine_seconds`, but with half the horizon left. They share the rest.
+    # Samples are 0.1 s apart. The last command holds until the candidates start, for longer than `command_timeout`:
+    # after `candidate_delay`, or as late as they are published, but with half the horizon left. They share the rest.
     start_time = starts[stamp_in(message)]
-    assert 0.2 <= start_time <= 1.0
+    assert 0.8 - 1e-6 <= start_time <= 1.0
     held, first = commands[0, 0], int(np.ceil(start_time / 0.1 - 1e-6))
     middle = int(np.ceil((first + 20) / 2))
     np.testing.assert_allclose(commands[:, :first], np.broadcast_to(held, (count, first, 2)), atol=1e-6)

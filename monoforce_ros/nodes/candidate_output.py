@@ -123,7 +123,8 @@ class CandidateOutput:
         seconds = max(settings.candidate_delay, min(self.latency.typical, 0.5 * settings.horizon))
         delay = min(round(seconds / time_step), self._predictor.steps - 1)
         start, steps = self._predictor.history + delay, self._predictor.steps - delay
-        stamps = self._predictor.command_stamps(prediction.stamp)[:start]
+        # Whoever drives goes on sending it: it does not expire while the candidates are computed.
+        stamps = np.minimum(self._predictor.command_stamps(prediction.stamp)[:start], prediction.stamp)
         before = commands.sample(stamps, timeout=settings.command_timeout)
         # A planner's sequences have no lateral speed.
         width = max(0, before.shape[-1] - sequences.shape[-1])
