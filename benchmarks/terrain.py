@@ -41,6 +41,8 @@ from monoforce_ros.evaluation.tables import (
     SequenceErrors,
     System,
     evaluate_sequence,
+    mean_over,
+    ratio_over,
     terrain_source,
 )
 from monoforce_ros.evaluation.view import PredictionView
@@ -97,7 +99,6 @@ RATIOS = (
 """Systems whose errors are compared."""
 TALL = ("0.4 to 0.8 m", "0.8 m or more")
 """Strata of tall vegetation."""
-_RESAMPLES = 4000
 WORST = 3
 """Number of worst predictions that are shown of each system."""
 _LIDAR = LidarSettings(rings=32, columns=360, rate=5.0)
@@ -303,13 +304,8 @@ def interval(results: Sequence[Result], measure: str) -> tuple[float, float, flo
 
     Worlds and training seeds are independent; windows of one world are not.
     """
-    values = _by_world_and_run(results, measure)
-    values = values[np.isfinite(values).all(axis=1)]
-    if not len(values):
-        return float("nan"), float("nan"), float("nan")
-    means = _resampled_means(values, np.random.default_rng(0))
-    low, high = np.quantile(means, (0.025, 0.975))
-    return float(values.mean()), float(low), float(high)
+    found = mean_over(_by_world_and_run(results, sorted({result.world for result in results}), measure))
+    return found.value, found.low, found.high
 
 
 def ratio(results: Sequence[Result], others: Sequence[Result], measure: str) -> tuple[float, float, float]:
@@ -317,35 +313,19 @@ def ratio(results: Sequence[Result], others: Sequence[Result], measure: str) -> 
 
     A draw has the same worlds for both systems, and its own training seeds for each.
     """
-    common = {result.world for result in results} & {result.world for result in others}
-    pair = [
-        _by_world_and_run([result for result in listed if result.world in common], measure)
-        for listed in (results, others)
-    ]
-    usable = np.logical_and.reduce([np.isfinite(values).all(axis=1) for values in pair])
-    first, second = (values[usable] for values in pair)
-    if not len(first):
-        return float("nan"), float("nan"), float("nan")
-    # Equal seeds draw equal worlds, which are drawn before training seeds.
-    ratios = _resampled_means(first, np.random.default_rng(0)) / _resampled_means(second, np.random.default_rng(0))
-    low, high = np.quantile(ratios, (0.025, 0.975))
-    return float(first.mean() / second.mean()), float(low), float(high)
+    common = sorted({result.world for result in results} & {result.world for result in others})
+    found = ratio_over(*(_by_world_and_run(listed, common, measure) for listed in (results, others)))
+    return found.value, found.low, found.high
 
 
-def _by_world_and_run(results: Sequence[Result], measure: str) -> np.ndarray:
+def _by_world_and_run(results: Sequence[Result], worlds: Sequence[int], measure: str) -> np.ndarray:
     """Errors ``[worlds, training seeds]``; NaN where there is none."""
-    worlds = sorted({result.world for result in results})
     runs = sorted({result.checkpoint for result in results})
     values = np.full((len(worlds), len(runs)), np.nan)
     for result in results:
-        values[worlds.index(result.world), runs.index(result.checkpoint)] = getattr(result, measure)
+        if result.world in worlds:
+            values[worlds.index(result.world), runs.index(result.checkpoint)] = getattr(result, measure)
     return values
-
-
-def _resampled_means(values: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    worlds = random.integers(0, len(values), (_RESAMPLES, len(values)))
-    runs = random.integers(0, values.shape[1], (_RESAMPLES, values.shape[1]))
-    return values[worlds[:, :, None], runs[:, None, :]].mean(axis=(1, 2))
 
 
 def table(results: Sequence[Result]) -> str:

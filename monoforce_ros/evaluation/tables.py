@@ -8,6 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from monoforce_ros.bags import Recording
 from monoforce_ros.encoder import fused, load_encoder
@@ -170,24 +171,48 @@ def _on_map(measured: Poses) -> np.ndarray:
     return (np.abs(along) < _HALF_MAP) & (np.abs(across) < _HALF_MAP)
 
 
-def mean_over(values: Sequence[float]) -> Mean:
-    """Mean over recordings with its bootstrap interval: recordings are independent, windows of one are not."""
-    array = np.array([value for value in values if np.isfinite(value)])
-    if not len(array):
-        return Mean(float("nan"), float("nan"), float("nan"))
-    means = array[_resampled(len(array))].mean(axis=1)
-    return Mean(float(array.mean()), *map(float, np.quantile(means, (0.025, 0.975))))
+def mean_over(values: ArrayLike) -> Mean:
+    """Mean with its bootstrap interval over recordings: they are independent, windows of one are not.
+
+    Args:
+        values: by recording ``[n]``, or by recording and training seed ``[n, seeds]``; seeds are resampled, too.
+            Recordings with a value that is not finite are left out.
+    """
+    rows = _by_recording(values)
+    rows = rows[np.isfinite(rows).all(axis=1)]
+    return _mean(float(rows.mean()), _resampled_means(rows)) if len(rows) else _mean(np.nan, np.full(1, np.nan))
 
 
-def ratio_over(values: Sequence[float], others: Sequence[float]) -> Mean:
-    """Ratio of two systems' means over the same recordings, with an interval by paired resampling."""
-    both = np.array([(a, b) for a, b in zip(values, others, strict=True) if np.isfinite(a) and np.isfinite(b)])
-    if not len(both):
-        return Mean(float("nan"), float("nan"), float("nan"))
-    means = both[_resampled(len(both))].mean(axis=1)
-    ratios = means[:, 0] / means[:, 1]
-    return Mean(float(both[:, 0].mean() / both[:, 1].mean()), *map(float, np.quantile(ratios, (0.025, 0.975))))
+def ratio_over(values: ArrayLike, others: ArrayLike) -> Mean:
+    """Ratio of two systems' means over the same recordings, with an interval by paired resampling.
+
+    A draw has the same recordings for both systems, and training seeds of its own for each.
+
+    Args:
+        values: as of :func:`mean_over`.
+        others: of the other system, for the same recordings.
+    """
+    first, second = _by_recording(values), _by_recording(others)
+    usable = np.isfinite(first).all(axis=1) & np.isfinite(second).all(axis=1)
+    first, second = first[usable], second[usable]
+    if not len(first):
+        return _mean(np.nan, np.full(1, np.nan))
+    return _mean(float(first.mean() / second.mean()), _resampled_means(first) / _resampled_means(second))
 
 
-def _resampled(count: int) -> np.ndarray:
-    return np.random.default_rng(0).integers(0, count, size=(_RESAMPLES, count))
+def _mean(value: float, resampled: np.ndarray) -> Mean:
+    return Mean(value, *map(float, np.quantile(resampled, (0.025, 0.975))))
+
+
+def _by_recording(values: ArrayLike) -> np.ndarray:
+    """``[n, seeds]``."""
+    array = np.asarray(values, float)
+    return array[:, None] if array.ndim == 1 else array
+
+
+def _resampled_means(rows: np.ndarray) -> np.ndarray:
+    """Means of resampled recordings and training seeds. Every call draws the same recordings of as many."""
+    random = np.random.default_rng(0)
+    recordings = random.integers(0, len(rows), (_RESAMPLES, len(rows)))
+    seeds = random.integers(0, rows.shape[1], (_RESAMPLES, rows.shape[1]))
+    return rows[recordings[:, :, None], seeds[:, None, :]].mean(axis=(1, 2))
