@@ -1,5 +1,7 @@
 """Bags: written atomically, read for either ROS, salvaged when damaged, else rejected with a clear error."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -267,3 +269,29 @@ def test_a_real_ros_1_bag_of_a_husky_is_read_without_conversion(real_data):
         message = next(m for m in bag.messages(["/husky_velocity_controller/odom"]))
         converted = deserialize_message(message.cdr(), Odometry)
         assert converted.child_frame_id == message.decode().child_frame_id
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_a_bag_is_opened_once_for_many_reads_and_anew_once_it_changed(tmp_path, storage, monkeypatch):
+    openings = []
+    enter = BagReader.__enter__
+    monkeypatch.setattr(BagReader, "__enter__", lambda self: openings.append(self.path) or enter(self))
+    path = write(tmp_path / "drive", storage)
+    recording = Recording.open(path)
+    frames = recording.images["/cam/image_raw"]
+    before = len(openings)
+    for index, frame in enumerate(frames):
+        assert (recording.image(frame) == index).all()
+    assert len(openings) == before + 1
+    # Two passes at once, and other threads, do not disturb each other.
+    pairs = zip(recording.images_of(frames), recording.images_of(frames[3:]), strict=False)
+    for index, ((_, first), (_, second)) in enumerate(pairs):
+        assert (first == index).all()
+        assert (second == index + 3).all()
+        assert (recording.image(frames[1]) == 1).all()
+    with ThreadPoolExecutor(3) as pool:
+        assert [int(image.flat[0]) for image in pool.map(recording.image, frames)] == list(range(len(frames)))
+    write(path, storage, count=3, overwrite=True)
+    with pytest.raises(BagError, match="the bag has changed"):
+        recording.image(frames[-1])
+    assert (Recording.open(path).image(frames[2]) == 2).all()

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags.builders import Message
 from monoforce_ros.bags.joint_record import JointRecord
+from monoforce_ros.bags.open_bags import opened
 from monoforce_ros.bags.reader import BagError, BagMessage, BagReader
 from monoforce_ros.core import (
     AngularVelocityTrack,
@@ -241,7 +242,7 @@ class Recording:
         by_reception = {frame.received: frame for frame in frames}
         if not by_reception:
             return
-        with BagReader(self.path) as bag:
+        with opened(self.path) as bag:
             for message in bag.messages([frames[0].topic], start=min(by_reception), stop=max(by_reception) + 1):
                 if message.received in by_reception:
                     try:
@@ -251,7 +252,7 @@ class Recording:
                     yield by_reception[message.received], decoded
 
     def _read(self, frame: Frame) -> Message:
-        with BagReader(self.path) as bag:
+        with opened(self.path) as bag:
             for message in bag.messages([frame.topic], start=frame.received, stop=frame.received + 1):
                 decoded = message.decode()
                 if decoding.stamp_of(decoded) == frame.stamp:
