@@ -5,9 +5,9 @@
 
 records randomised worlds of the reporting seeds, evaluates every system on them with the paper's physics alone and with
 vegetation drag, and writes the tables, their strata, a page with the worst predictions of each system, and a log: date,
-commit, digests of the checkpoints, and how often the reporting seeds were used. Recorded worlds are kept in the folder:
-an interrupted run continues where it stopped. Give a system one checkpoint per training seed; without --checkpoint the
-shipped encoder is tested with images, with a sweep, and with both.
+commit, digests of the checkpoints, and how often the reporting seeds were used. Recorded worlds and their results are
+kept in the folder: an interrupted run continues where it stopped. Give a system one checkpoint per training seed;
+without --checkpoint the shipped encoder is tested with images, with a sweep, and with both.
 """
 
 from __future__ import annotations
@@ -18,14 +18,18 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 import torch
 from scipy.ndimage import map_coordinates
+from terrain_tables import BOUND, LEARNED, SHIPPED, Result, ratio_table, strata_table, table
 from tqdm import tqdm
 
 from monoforce_ros.bags import BagError, Recording
@@ -41,8 +45,6 @@ from monoforce_ros.evaluation.tables import (
     SequenceErrors,
     System,
     evaluate_sequence,
-    mean_over,
-    ratio_over,
     terrain_source,
 )
 from monoforce_ros.evaluation.view import PredictionView
@@ -75,30 +77,6 @@ TRAINING = SeedRange("training", 420_000, 10_000)
 CHOOSING = SeedRange("choosing", 430_000, 10_000)
 REPORTING = SeedRange("reporting", 440_000, 10_000)
 
-BOUND = System("true_support", "true support height (bound)", "ground truth")
-LEARNED = {
-    "shipped": ("shipped encoder, images → H_t", "images"),
-    "shipped_lidar": ("shipped encoder, lidar → H_t", "point cloud"),
-    "shipped_both": ("shipped encoder, both → H_t", "images, point cloud"),
-    "lidar_hg": ("lidar → H_g [22]", "point cloud"),
-    "lidar_ht": ("lidar → H_t", "point cloud"),
-    "lss": ("images → H_g, LSS [9]", "images"),
-    "monoforce": ("images → H_t, MonoForce", "images"),
-    "both": ("both → H_t", "images, point cloud"),
-    "no_geometric": ("MonoForce without geometric loss", "images"),
-    "no_terrain": ("MonoForce without terrain loss", "images"),
-}
-"""Title and input of each learned system, by its name."""
-SHIPPED = tuple(name for name in LEARNED if name.startswith("shipped"))
-RATIOS = (
-    ("monoforce", "lss"), ("monoforce", "lidar"), ("monoforce", "no_geometric"), ("monoforce", "no_terrain"),
-    ("lidar_ht", "lidar_hg"), ("lidar_ht", "lidar"), ("both", "monoforce"), ("both", "lidar_ht"),
-    ("shipped", "lidar"), ("shipped", "flat"), ("shipped_lidar", "lidar"), ("shipped_both", "shipped"),
-    ("shipped_both", "shipped_lidar"), ("shipped_both", "lidar"), ("lidar", "true_support"),
-)  # fmt: skip
-"""Systems whose errors are compared."""
-TALL = ("0.4 to 0.8 m", "0.8 m or more")
-"""Strata of tall vegetation."""
 WORST = 3
 """Number of worst predictions that are shown of each system."""
 _LIDAR = LidarSettings(rings=32, columns=360, rate=5.0)
@@ -134,28 +112,6 @@ class TrueSupport:
 
         terrain = TerrainMap.from_height(sampled("support_height"), self.grid, material=self.material)
         return replace(terrain, geometric_height=sampled("visible_height"))
-
-
-@dataclass(frozen=True)
-class Result:
-    """Errors of a system with one of its checkpoints on one world."""
-
-    system: str
-    checkpoint: str
-    world: int
-    physics: str
-    position: float
-    """Δx [m]."""
-    rotation: float
-    """ΔR [deg]."""
-    windows: int
-    strata: dict[str, str]
-    worst: int = 0
-    """Start of the window with the largest position error [ns]; 0 without any."""
-    worst_position: float = float("nan")
-    """Its error [m]."""
-    by_distance: dict[str, float] = field(default_factory=dict)
-    """Δx [m] of poses by the distance from the start."""
 
 
 def strata(described: Mapping[str, object]) -> dict[str, str]:
@@ -197,14 +153,42 @@ def record_world(folder: Path, seed: int, settings: WorldSettings, duration: flo
     return out
 
 
+@dataclass(frozen=True)
+class Remembered:
+    """A terrain source whose maps are computed once: they are the same for every kind of physics."""
+
+    source: TerrainSource
+    maps: dict[int, TerrainMap] = field(default_factory=dict)
+    """By the stamp of the observation [ns]."""
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Of the source."""
+        return self.source.sensors
+
+    @property
+    def grid(self) -> Grid:
+        """Of the source."""
+        return self.source.grid
+
+    def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
+        """The source's map at the time of an observation."""
+        if observation.stamp not in self.maps:
+            self.maps[observation.stamp] = self.source.terrain(observation, motion)
+        return self.maps[observation.stamp]
+
+
 def evaluate_world(bag: Path, checkpoints: Mapping[str, Sequence[Path]], physics: Sequence[str]) -> list[Result]:
     """Errors of every system and checkpoint on one world, with each kind of physics."""
     described = json.loads(world_file(bag).read_text())
+    robot = load_robot(described["robot"])
     systems = [LIDAR, BOUND, *learned_systems(checkpoints), FLAT, CONSTANT]
+    sources: dict[str, TerrainSource] = {BOUND.key: Remembered(true_support(bag))}
+    for system in (LIDAR, *learned_systems(checkpoints)):
+        sources[system.key] = Remembered(terrain_source(system, robot))
     results = []
     for name in physics:
-        robot = with_physics(load_robot(described["robot"]), name)
-        errors: dict[str, SequenceErrors] = evaluate_sequence(bag, robot, systems, {BOUND.key: true_support(bag)})
+        errors: dict[str, SequenceErrors] = evaluate_sequence(bag, with_physics(robot, name), systems, sources)
         for system in systems:
             key, _, checkpoint = system.key.partition("@")
             found = errors[system.key]
@@ -215,6 +199,47 @@ def evaluate_world(bag: Path, checkpoints: Mapping[str, Sequence[Path]], physics
                 )
             )  # fmt: skip
     return results
+
+
+@dataclass(frozen=True)
+class WorldResults:
+    """What was found on one world."""
+
+    seed: int
+    checkpoints: dict[str, list[str]]
+    """Digests of the checkpoints of each system."""
+    commit: str
+    """Of the source that computed them."""
+    results: tuple[Result, ...] = ()
+    skipped: str = ""
+    """Why the world could not be evaluated."""
+
+    @classmethod
+    def load(cls, file: Path) -> WorldResults:
+        """Read results that were saved."""
+        stored = json.loads(file.read_text())
+        return cls(**stored | {"results": tuple(Result(**entry) for entry in stored["results"])})
+
+
+def world_results(seed: int, out: Path, checkpoints: Mapping[str, Sequence[Path]], duration: float) -> WorldResults:
+    """Record and evaluate a world, unless its results with the same checkpoints are in the folder."""
+    torch.set_num_threads(1)
+    file = out / "results" / f"{seed}.json"
+    digests = {name: [digest(path) for path in files] for name, files in checkpoints.items()}
+    if file.exists():
+        stored = WorldResults.load(file)
+        if stored.checkpoints == digests:
+            return stored
+    bag = record_world(out / "worlds", seed, WorldSettings(), duration)
+    found: list[Result] = []
+    skipped = ""
+    try:
+        found = evaluate_world(bag, checkpoints, tuple(PHYSICS))
+    except (BagError, EvaluationError) as error:
+        skipped = str(error)
+    done = WorldResults(seed, digests, commit(), tuple(found), skipped)
+    write_text(file, json.dumps(asdict(done), indent=1))
+    return done
 
 
 def learned_systems(checkpoints: Mapping[str, Sequence[Path]]) -> list[System]:
@@ -299,101 +324,6 @@ def with_physics(robot: RobotModel, name: str) -> RobotModel:
     return PHYSICS[name](robot)
 
 
-def interval(results: Sequence[Result], measure: str) -> tuple[float, float, float]:
-    """Mean over worlds and training seeds, with a 95 % interval by resampling both.
-
-    Worlds and training seeds are independent; windows of one world are not.
-    """
-    found = mean_over(_by_world_and_run(results, sorted({result.world for result in results}), measure))
-    return found.value, found.low, found.high
-
-
-def ratio(results: Sequence[Result], others: Sequence[Result], measure: str) -> tuple[float, float, float]:
-    """Ratio of two systems' means over the same worlds, with a 95 % interval by resampling worlds and training seeds.
-
-    A draw has the same worlds for both systems, and its own training seeds for each.
-    """
-    common = sorted({result.world for result in results} & {result.world for result in others})
-    found = ratio_over(*(_by_world_and_run(listed, common, measure) for listed in (results, others)))
-    return found.value, found.low, found.high
-
-
-def _by_world_and_run(results: Sequence[Result], worlds: Sequence[int], measure: str) -> np.ndarray:
-    """Errors ``[worlds, training seeds]``; NaN where there is none."""
-    runs = sorted({result.checkpoint for result in results})
-    values = np.full((len(worlds), len(runs)), np.nan)
-    for result in results:
-        if result.world in worlds:
-            values[worlds.index(result.world), runs.index(result.checkpoint)] = getattr(result, measure)
-    return values
-
-
-def table(results: Sequence[Result]) -> str:
-    """Markdown table of all systems, for each kind of physics."""
-    titles = {LIDAR.key: LIDAR, FLAT.key: FLAT, CONSTANT.key: CONSTANT, BOUND.key: BOUND} | {
-        key: System(key, *listed) for key, listed in LEARNED.items()
-    }
-    lines = []
-    for physics in dict.fromkeys(result.physics for result in results):
-        chosen = [result for result in results if result.physics == physics]
-        worlds = {result.world for result in chosen}
-        windows = sum(result.windows for result in chosen if result.system == LIDAR.key)
-        lines += [f"**Physics: {physics}**: {len(worlds)} worlds, {windows} windows of 5 s", ""]
-        lines += ["| input | terrain | training seeds | Δx [m] | ΔR [deg] |", "|---|---|---|---|---|"]
-        for key in dict.fromkeys(result.system for result in chosen):
-            own = [result for result in chosen if result.system == key]
-            seeds = len({result.checkpoint for result in own if result.checkpoint}) or "–"
-            cells = []
-            for measure, digits in (("position", 3), ("rotation", 2)):
-                mean, low, high = interval(own, measure)
-                cells.append(f"{mean:.{digits}f} ({low:.{digits}f} – {high:.{digits}f})")
-            lines.append(f"| {titles[key].input} | {titles[key].title} | {seeds} | {cells[0]} | {cells[1]} |")
-        lines.append("")
-    return "\n".join(lines)
-
-
-def ratio_table(results: Sequence[Result], physics: str) -> str:
-    """Markdown table of the ratios of :data:`RATIOS` for which both systems were evaluated; empty without any."""
-    chosen = [result for result in results if result.physics == physics]
-    by_system: dict[str, list[Result]] = {}
-    for result in chosen:
-        by_system.setdefault(result.system, []).append(result)
-    lines = ["| ratio | Δx | ΔR | Δx, tall vegetation | ΔR, tall vegetation |", "|---|---|---|---|---|"]
-    for first, second in RATIOS:
-        if first not in by_system or second not in by_system:
-            continue
-        cells = []
-        for tall in (False, True):
-            own, others = (
-                [r for r in by_system[key] if not tall or r.strata.get("vegetation height") in TALL]
-                for key in (first, second)
-            )
-            for measure in ("position", "rotation"):
-                value, low, high = ratio(own, others, measure)
-                cells.append(f"{value:.2f} ({low:.2f} – {high:.2f})" if np.isfinite(value) else "–")
-        lines.append(f"| {first} / {second} | {' | '.join(cells)} |")
-    return "\n".join(lines) if len(lines) > 2 else ""
-
-
-def strata_table(results: Sequence[Result], physics: str) -> str:
-    """Markdown table of Δx by stratum, with the number of worlds."""
-    chosen = [result for result in results if result.physics == physics]
-    systems = list(dict.fromkeys(result.system for result in chosen))
-    lines = [f"| criterion | stratum | worlds | {' | '.join(systems)} |", "|---" * (3 + len(systems)) + "|"]
-    for criterion in chosen[0].strata:
-        for stratum in sorted({result.strata[criterion] for result in chosen}):
-            own = [result for result in chosen if result.strata[criterion] == stratum]
-            cells = [f"{interval([r for r in own if r.system == key], 'position')[0]:.3f}" for key in systems]
-            count = len({result.world for result in own})
-            lines.append(f"| {criterion} | {stratum} | {count} | {' | '.join(cells)} |")
-    for distance in dict.fromkeys(name for result in chosen for name in result.by_distance):
-        own = [result for result in chosen if np.isfinite(result.by_distance.get(distance, np.nan))]
-        means = [np.mean([r.by_distance[distance] for r in own if r.system == key] or [np.nan]) for key in systems]
-        count = len({result.world for result in own})
-        lines.append(f"| distance | {distance} | {count} | {' | '.join(f'{mean:.3f}' for mean in means)} |")
-    return "\n".join(lines)
-
-
 def digest(path: Path) -> str:
     """SHA-256 of a file, its first 16 digits."""
     return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
@@ -458,11 +388,11 @@ def main() -> int:
     parser.add_argument("--worlds", type=int, help="number of worlds (40; with --quick 6)")
     parser.add_argument("--duration", type=float, help="of a recording [s] (40; with --quick 12)")
     parser.add_argument("--seed", type=int, default=REPORTING.first, help="first reporting seed (%(default)s)")
+    parser.add_argument("--jobs", type=int, default=2, help="worlds evaluated in parallel (%(default)s)")
     parser.add_argument("--checkpoint", action="append", default=[], metavar="SYSTEM=FILE",
                         help=f"repeat for other systems and training seeds; systems: {', '.join(LEARNED)}")  # fmt: skip
     parser.add_argument("--docs", type=Path, help="write the tables between the comments of this document")
     options = parser.parse_args()
-    torch.set_num_threads(1)
     try:
         seeds = reporting_seeds(options.seed, options.worlds or (6 if options.quick else 40))
         checkpoints = parse_checkpoints(options.checkpoint)
@@ -470,14 +400,12 @@ def main() -> int:
         print(f"terrain: {error}", file=sys.stderr)
         return 1
     duration = options.duration or (12.0 if options.quick else 40.0)
-    results: list[Result] = []
-    skipped: dict[int, str] = {}
-    for seed in tqdm(seeds, desc="worlds"):
-        bag = record_world(options.out / "worlds", seed, WorldSettings(), duration)
-        try:
-            results += evaluate_world(bag, checkpoints, tuple(PHYSICS))
-        except (BagError, EvaluationError) as error:
-            skipped[seed] = str(error)
+    one_world = partial(world_results, out=options.out, checkpoints=checkpoints, duration=duration)
+    # Spawned, because renderers and threads do not survive a fork.
+    with ProcessPoolExecutor(options.jobs, mp_context=get_context("spawn")) as pool:
+        worlds = list(tqdm(pool.map(one_world, seeds), total=len(seeds), desc="worlds"))
+    results = [result for world in worlds for result in world.results]
+    skipped = {world.seed: world.skipped for world in worlds if world.skipped}
     if not results:
         print(f"terrain: no world could be evaluated: {next(iter(skipped.values()))}", file=sys.stderr)
         return 1
@@ -490,6 +418,7 @@ def main() -> int:
     entry: dict[str, object] = {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "commit": commit(),
+        "evaluated_by": sorted({world.commit for world in worlds}),
         "seeds": seeds,
         "skipped": skipped,
         "duration_s": duration,

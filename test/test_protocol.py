@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import terrain
+import terrain_tables
 import wall
 from conftest import ROOT
 from scipy.spatial.transform import Rotation
@@ -18,7 +19,7 @@ from monoforce_ros.terrain import Grid, TerrainDefaults
 
 def result(system, checkpoint, world, position, **changed):
     values = {"physics": "paper", "rotation": 10 * position, "windows": 5, "strata": {"robot": "husky"}} | changed
-    return terrain.Result(system=system, checkpoint=checkpoint, world=world, position=position, **values)
+    return terrain_tables.Result(system=system, checkpoint=checkpoint, world=world, position=position, **values)
 
 
 def test_seeds_of_the_purposes_are_disjoint_and_reporting_refuses_the_others():
@@ -35,24 +36,24 @@ def test_seeds_of_the_purposes_are_disjoint_and_reporting_refuses_the_others():
 
 def test_intervals_cover_worlds_and_training_seeds():
     worlds = [result("lss", "0", world, 0.1 + 0.01 * world) for world in range(10)]
-    mean, low, high = terrain.interval(worlds, "position")
+    mean, low, high = terrain_tables.interval(worlds, "position")
     assert mean == pytest.approx(0.145) and low < 0.13 and high > 0.16
     # Training seeds that disagree widen the interval although worlds are the same.
     disagreeing = [result("lss", str(run), w, value) for run, value in ((0, 0.1), (1, 0.3)) for w in range(10)]
-    mean, low, high = terrain.interval(disagreeing, "position")
+    mean, low, high = terrain_tables.interval(disagreeing, "position")
     assert (mean, low, high) == (pytest.approx(0.2), pytest.approx(0.1), pytest.approx(0.3))
     # A world that one run could not evaluate counts for none.
-    assert terrain.interval([*disagreeing, result("lss", "0", 99, 5.0)], "position")[0] == pytest.approx(0.2)
+    assert terrain_tables.interval([*disagreeing, result("lss", "0", 99, 5.0)], "position")[0] == pytest.approx(0.2)
 
 
 def test_ratios_compare_the_same_worlds():
     """Worlds differ a lot, one system is always 20 % better: the interval of the ratio is narrow."""
     first = [result("both", str(run), world, 0.8 * (1 + world)) for run in (0, 1) for world in range(12)]
     second = [result("monoforce", "0", world, 1.0 + world) for world in range(12)]
-    assert terrain.ratio(first, second, "position") == pytest.approx((0.8, 0.8, 0.8))
+    assert terrain_tables.ratio(first, second, "position") == pytest.approx((0.8, 0.8, 0.8))
     # A world that only one of them could evaluate counts for neither; without a common one there is no ratio.
-    assert terrain.ratio([*first, result("both", "0", 50, 9.0)], second, "position")[0] == pytest.approx(0.8)
-    assert np.isnan(terrain.ratio(first, [result("monoforce", "0", 70, 1.0)], "position")[0])
+    assert terrain_tables.ratio([*first, result("both", "0", 50, 9.0)], second, "position")[0] == pytest.approx(0.8)
+    assert np.isnan(terrain_tables.ratio(first, [result("monoforce", "0", 70, 1.0)], "position")[0])
     strata = {"vegetation height": "0.8 m or more"}
     tall = [
         result(r.system, r.checkpoint, r.world, r.position * (0.5 if r.system == "both" else 1.0), strata=strata)
@@ -60,9 +61,9 @@ def test_ratios_compare_the_same_worlds():
         if r.world > 5
     ]
     short = [r for r in (*first, *second) if r.world <= 5]
-    (row,) = [line for line in terrain.ratio_table([*tall, *short], "paper").splitlines() if "both" in line]
+    (row,) = [line for line in terrain_tables.ratio_table([*tall, *short], "paper").splitlines() if "both" in line]
     assert row.startswith("| both / monoforce | 0.5") and row.count("| 0.40 (0.40 – 0.40) ") == 2
-    assert terrain.ratio_table(second, "paper") == ""
+    assert terrain_tables.ratio_table(second, "paper") == ""
 
 
 def test_an_encoder_gets_the_sensors_of_its_row():
@@ -85,15 +86,15 @@ def test_the_log_counts_how_often_seeds_were_used(tmp_path):
 def test_tables_have_a_row_for_every_system_and_stratum():
     rows = [result(key, "", world, 0.1, strata={"robot": name}) for key in ("lidar", "true_support", "flat")
             for world, name in enumerate(("husky", "marv", "marv"))]  # fmt: skip
-    text = terrain.table(rows)
+    text = terrain_tables.table(rows)
     assert "3 worlds, 15 windows" in text and "true support height (bound)" in text and "level ground" in text
-    assert "| robot | marv | 2 |" in terrain.strata_table(rows, "paper")
+    assert "| robot | marv | 2 |" in terrain_tables.strata_table(rows, "paper")
 
 
 def test_strata_by_distance_leave_out_worlds_without_such_poses():
     near, far = {"0 to 1 m": 0.1, "1 to 2.5 m": 0.3}, {"0 to 1 m": 0.2, "1 to 2.5 m": float("nan")}
     rows = [result("lidar", "", 0, 0.1, by_distance=near), result("lidar", "", 1, 0.1, by_distance=far)]
-    text = terrain.strata_table([*rows, result("lidar", "", 2, float("nan"), windows=0)], "paper")
+    text = terrain_tables.strata_table([*rows, result("lidar", "", 2, float("nan"), windows=0)], "paper")
     assert "| distance | 0 to 1 m | 2 | 0.150 |" in text and "| distance | 1 to 2.5 m | 1 | 0.300 |" in text
 
 

@@ -82,6 +82,7 @@ def evaluate_recording(
     horizons: Sequence[float] = (1.0, 2.0, 5.0),
     stride: float = 0.4,
     minimum_duration: float | None = None,
+    baselines: bool = True,
     quiet: bool = False,
 ) -> RecordingEvaluation:
     """Predict from many times of a recording and compare with the motion measured afterwards.
@@ -96,6 +97,7 @@ def evaluate_recording(
         horizons: times at which errors are summarised [s].
         stride: smallest time between the starts of windows [s].
         minimum_duration: odometry required after the start of a window [s]; by default the smallest horizon.
+        baselines: also roll out on level ground.
         quiet: show no progress bar.
 
     Raises:
@@ -116,15 +118,12 @@ def evaluate_recording(
     def roll_out_batch(batch: list[MotionState], maps: list[TerrainMap]) -> None:
         twists = np.stack([recording.commands.sample(predictor.command_stamps(m.stamp)) for m in batch])
         joints = recorded_joints(recording, predictor, [m.stamp for m in batch])
-        for method, batch_maps in (
-            (PHYSICS, maps),
-            (
-                FLAT_PHYSICS,
-                [flat.terrain(Observation(0, flipper_angles=_flippers_at(recording, m.stamp)), m) for m in batch],
-            ),
-        ):
-            if method == FLAT_PHYSICS and not sensors:
-                continue
+        compared = {PHYSICS: maps}
+        if sensors and baselines:
+            compared[FLAT_PHYSICS] = [
+                flat.terrain(Observation(0, flipper_angles=_flippers_at(recording, m.stamp)), m) for m in batch
+            ]
+        for method, batch_maps in compared.items():
             result = predictor.roll_out(TerrainMap.stack(batch_maps), batch, twists, joints=joints)
             index = np.rint(times / predictor.options.time_step).astype(int)
             for row, motion in enumerate(batch):

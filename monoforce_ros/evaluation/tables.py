@@ -108,7 +108,7 @@ def evaluate_sequence(
         topics = tuple(recording.images) if "camera" in source.sensors else ()
         evaluations[system.key] = evaluate_recording(
             recording, Predictor(robot, source, horizon=HORIZON), image_topics=topics,
-            horizons=(HORIZON,), stride=STRIDE, quiet=True, minimum_duration=1.0,
+            horizons=(HORIZON,), stride=STRIDE, quiet=True, minimum_duration=1.0, baselines=not evaluations,
         )  # fmt: skip
     common = set.intersection(*(set(e.stamps.tolist()) for e in evaluations.values()))
     first = next(iter(evaluations.values()))

@@ -1,0 +1,152 @@
+"""Tables of the protocol of docs/protocol.md: means, ratios and strata over worlds and training seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from monoforce_ros.evaluation.tables import CONSTANT, FLAT, LIDAR, System, mean_over, ratio_over
+
+BOUND = System("true_support", "true support height (bound)", "ground truth")
+LEARNED = {
+    "shipped": ("shipped encoder, images → H_t", "images"),
+    "shipped_lidar": ("shipped encoder, lidar → H_t", "point cloud"),
+    "shipped_both": ("shipped encoder, both → H_t", "images, point cloud"),
+    "lidar_hg": ("lidar → H_g [22]", "point cloud"),
+    "lidar_ht": ("lidar → H_t", "point cloud"),
+    "lss": ("images → H_g, LSS [9]", "images"),
+    "monoforce": ("images → H_t, MonoForce", "images"),
+    "both": ("both → H_t", "images, point cloud"),
+    "no_geometric": ("MonoForce without geometric loss", "images"),
+    "no_terrain": ("MonoForce without terrain loss", "images"),
+}
+"""Title and input of each learned system, by its name."""
+SHIPPED = tuple(name for name in LEARNED if name.startswith("shipped"))
+RATIOS = (
+    ("monoforce", "lss"), ("monoforce", "lidar"), ("monoforce", "no_geometric"), ("monoforce", "no_terrain"),
+    ("lidar_ht", "lidar_hg"), ("lidar_ht", "lidar"), ("both", "monoforce"), ("both", "lidar_ht"),
+    ("shipped", "lidar"), ("shipped", "flat"), ("shipped_lidar", "lidar"), ("shipped_both", "shipped"),
+    ("shipped_both", "shipped_lidar"), ("shipped_both", "lidar"), ("lidar", "true_support"),
+)  # fmt: skip
+"""Systems whose errors are compared."""
+TALL = ("0.4 to 0.8 m", "0.8 m or more")
+"""Strata of tall vegetation."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """Errors of a system with one of its checkpoints on one world."""
+
+    system: str
+    checkpoint: str
+    world: int
+    physics: str
+    position: float
+    """Δx [m]."""
+    rotation: float
+    """ΔR [deg]."""
+    windows: int
+    strata: dict[str, str]
+    worst: int = 0
+    """Start of the window with the largest position error [ns]; 0 without any."""
+    worst_position: float = float("nan")
+    """Its error [m]."""
+    by_distance: dict[str, float] = field(default_factory=dict)
+    """Δx [m] of poses by the distance from the start."""
+
+
+def interval(results: Sequence[Result], measure: str) -> tuple[float, float, float]:
+    """Mean over worlds and training seeds, with a 95 % interval by resampling both.
+
+    Worlds and training seeds are independent; windows of one world are not.
+    """
+    found = mean_over(_by_world_and_run(results, sorted({result.world for result in results}), measure))
+    return found.value, found.low, found.high
+
+
+def ratio(results: Sequence[Result], others: Sequence[Result], measure: str) -> tuple[float, float, float]:
+    """Ratio of two systems' means over the same worlds, with a 95 % interval by resampling worlds and training seeds.
+
+    A draw has the same worlds for both systems, and its own training seeds for each.
+    """
+    common = sorted({result.world for result in results} & {result.world for result in others})
+    found = ratio_over(*(_by_world_and_run(listed, common, measure) for listed in (results, others)))
+    return found.value, found.low, found.high
+
+
+def _by_world_and_run(results: Sequence[Result], worlds: Sequence[int], measure: str) -> np.ndarray:
+    """Errors ``[worlds, training seeds]``; NaN where there is none."""
+    runs = sorted({result.checkpoint for result in results})
+    values = np.full((len(worlds), len(runs)), np.nan)
+    for result in results:
+        if result.world in worlds:
+            values[worlds.index(result.world), runs.index(result.checkpoint)] = getattr(result, measure)
+    return values
+
+
+def table(results: Sequence[Result]) -> str:
+    """Markdown table of all systems, for each kind of physics."""
+    titles = {LIDAR.key: LIDAR, FLAT.key: FLAT, CONSTANT.key: CONSTANT, BOUND.key: BOUND} | {
+        key: System(key, *listed) for key, listed in LEARNED.items()
+    }
+    lines = []
+    for physics in dict.fromkeys(result.physics for result in results):
+        chosen = [result for result in results if result.physics == physics]
+        worlds = {result.world for result in chosen}
+        windows = sum(result.windows for result in chosen if result.system == LIDAR.key)
+        lines += [f"**Physics: {physics}**: {len(worlds)} worlds, {windows} windows of 5 s", ""]
+        lines += ["| input | terrain | training seeds | Δx [m] | ΔR [deg] |", "|---|---|---|---|---|"]
+        for key in dict.fromkeys(result.system for result in chosen):
+            own = [result for result in chosen if result.system == key]
+            seeds = len({result.checkpoint for result in own if result.checkpoint}) or "–"
+            cells = []
+            for measure, digits in (("position", 3), ("rotation", 2)):
+                mean, low, high = interval(own, measure)
+                cells.append(f"{mean:.{digits}f} ({low:.{digits}f} – {high:.{digits}f})")
+            lines.append(f"| {titles[key].input} | {titles[key].title} | {seeds} | {cells[0]} | {cells[1]} |")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def ratio_table(results: Sequence[Result], physics: str) -> str:
+    """Markdown table of the ratios of :data:`RATIOS` for which both systems were evaluated; empty without any."""
+    chosen = [result for result in results if result.physics == physics]
+    by_system: dict[str, list[Result]] = {}
+    for result in chosen:
+        by_system.setdefault(result.system, []).append(result)
+    lines = ["| ratio | Δx | ΔR | Δx, tall vegetation | ΔR, tall vegetation |", "|---|---|---|---|---|"]
+    for first, second in RATIOS:
+        if first not in by_system or second not in by_system:
+            continue
+        cells = []
+        for tall in (False, True):
+            own, others = (
+                [r for r in by_system[key] if not tall or r.strata.get("vegetation height") in TALL]
+                for key in (first, second)
+            )
+            for measure in ("position", "rotation"):
+                value, low, high = ratio(own, others, measure)
+                cells.append(f"{value:.2f} ({low:.2f} – {high:.2f})" if np.isfinite(value) else "–")
+        lines.append(f"| {first} / {second} | {' | '.join(cells)} |")
+    return "\n".join(lines) if len(lines) > 2 else ""
+
+
+def strata_table(results: Sequence[Result], physics: str) -> str:
+    """Markdown table of Δx by stratum, with the number of worlds."""
+    chosen = [result for result in results if result.physics == physics]
+    systems = list(dict.fromkeys(result.system for result in chosen))
+    lines = [f"| criterion | stratum | worlds | {' | '.join(systems)} |", "|---" * (3 + len(systems)) + "|"]
+    for criterion in chosen[0].strata:
+        for stratum in sorted({result.strata[criterion] for result in chosen}):
+            own = [result for result in chosen if result.strata[criterion] == stratum]
+            cells = [f"{interval([r for r in own if r.system == key], 'position')[0]:.3f}" for key in systems]
+            count = len({result.world for result in own})
+            lines.append(f"| {criterion} | {stratum} | {count} | {' | '.join(cells)} |")
+    for distance in dict.fromkeys(name for result in chosen for name in result.by_distance):
+        own = [result for result in chosen if np.isfinite(result.by_distance.get(distance, np.nan))]
+        means = [np.mean([r.by_distance[distance] for r in own if r.system == key] or [np.nan]) for key in systems]
+        count = len({result.world for result in own})
+        lines.append(f"| distance | {distance} | {count} | {' | '.join(f'{mean:.3f}' for mean in means)} |")
+    return "\n".join(lines)
