@@ -1,0 +1,59 @@
+#!/usr/bin/env bash
+# Trains the terrain sources that benchmarks/terrain.py compares, with three training seeds each, and writes the tables.
+#   scripts/train_systems.sh [STEPS]
+# Everything is kept in out/systems/; run it again to resume an interrupted run. docs/protocol.md describes it.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+steps=${1:-600}
+jobs=${JOBS:-2}
+out=out/systems
+mkdir -p "$out/log"
+
+# Seeds for training and for choosing (benchmarks/terrain.py): 64 and 8 worlds.
+training=$(seq 421000 421063)
+choosing=$(seq 430600 430607)
+record="scripts/run.sh synthesize --style varied --robot husky --camera 320x240 --camera-rate 2 --lidar 32x360 \
+  --lidar-rate 4 --duration 30 --quiet --force"
+for seed in $training $choosing; do
+  [ -f "$out/worlds/$seed.world.json" ] || echo "$seed"
+done | xargs -r -P "$jobs" -I SEED $record --seed SEED "$out/worlds/SEED"
+
+bags=$(printf "$out/worlds/%s " $training)
+held_out=$(printf "$out/worlds/%s " $choosing)
+common="$bags --held-out $held_out --robot husky --samples $out/samples"
+# Extract samples first, because parallel trainings would all do it.
+scripts/run.sh train $common --samples-only --jobs "$jobs" --out "$out/samples"
+
+# Same start, samples, steps, augmentation and weights; steps are restored by none of them.
+train="scripts/run.sh train $common --steps $steps --relative-bins 40 --no-edges --no-vegetation --precision bfloat16 \
+  --threads 1 --validate-every 200 --quiet"
+geometric="--losses geometric" all="--losses geometric terrain trajectory"
+options() { # system
+  case $1 in
+    lidar_hg) echo "--sensor lidar $geometric" ;;
+    lidar_ht) echo "--sensor lidar $all" ;;
+    lss) echo "--sensor camera $geometric" ;;
+    monoforce) echo "--sensor camera $all" ;;
+    both) echo "--sensor camera_lidar $all" ;;
+    no_geometric) echo "--sensor camera --losses terrain trajectory" ;;
+    no_terrain) echo "--sensor camera --losses geometric trajectory" ;;
+  esac
+}
+systems="lidar_hg lidar_ht lss monoforce both no_geometric no_terrain"
+seeds="1 2 3"
+for seed in $seeds; do
+  for system in $systems; do
+    [ -f "$out/encoders/$system.$seed/training.json" ] || echo "$(options "$system") --seed $seed --out $out/encoders/$system.$seed"
+  done
+done | xargs -r -P "$jobs" -I OPTIONS bash -c "$train OPTIONS >>$out/log/training.log 2>&1 || { tail -20 $out/log/training.log >&2; exit 255; }"
+
+checkpoints=""
+for system in $systems; do
+  for seed in $seeds; do
+    checkpoints+=" --checkpoint $system=$out/encoders/$system.$seed/encoder.safetensors"
+  done
+done
+for system in shipped shipped_lidar shipped_both; do
+  checkpoints+=" --checkpoint $system=models/terrain_encoder.safetensors"
+done
+scripts/run.sh python benchmarks/terrain.py --out "$out/tables" --jobs "$jobs" $checkpoints --docs docs/training.md
