@@ -8,6 +8,7 @@ import pytest
 import torch
 import yaml
 from conftest import ROOT
+from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.core import CommandTrack, MotionTrack
@@ -23,6 +24,7 @@ from monoforce_ros.effects.catalogue import (
 from monoforce_ros.effects.page import catalogue_page
 from monoforce_ros.effects.timing import contains, values_from, values_growing
 from monoforce_ros.physics import PhysicsOptions, State, rollout
+from monoforce_ros.physics.contact import held_slip
 from monoforce_ros.physics.problem import Problem
 from monoforce_ros.physics.rest import rest_depth
 from monoforce_ros.robots import RobotFileError, load_robot, robot_file
@@ -64,6 +66,7 @@ def test_neutral_values_change_nothing_bit_for_bit(husky, name, backend):
 
 STRONG = {
     "rolling_resistance": {"coefficient": 0.1},
+    "drive_compliance": {"speed_loss": 0.2},
     "vegetation_drag": {"coefficient": 3e4, "yield_speed": 0.4},
     "viscous_drag": {"coefficient": 40.0},
     "quadratic_drag": {"coefficient": 30.0},
@@ -449,6 +452,41 @@ def test_a_dead_drive_stands_still_and_a_slipping_one_loses_its_share(husky):
     plain = run(husky, (0.6, 0.0), 3.0).position[0, -1]
     assert float(lost[1]) < -0.05 and float(unequal[1]) < -0.05
     assert float(plain[0] - lost[0]) > 3.0 * float(plain[0] - unequal[0])
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_drives_lose_speed_in_proportion_to_their_traction(husky, backend):
+    """Rolling with 20 % of the weight costs 20 % of the speed that a wheel loses at a traction of its load."""
+    heavy = {"rolling_resistance": {"coefficient": 0.2}}
+    losses = []
+    for loss in (0.0, 0.1, 0.4):
+        robot = having(husky, **heavy, drive_compliance={"speed_loss": loss})
+        losses.append(1.0 - float(run(robot, (1.0, 0.0), 3.0, backend=backend).velocity[0, -1, 0]))
+    np.testing.assert_allclose(np.array(losses[1:]) - losses[0], [0.02, 0.08], rtol=0.2)
+    # A wheel that spins has all its friction, however soft its drive: it breaks away as hard.
+    slippery = {"friction_scale": {"factor": 0.1}}
+    starts = [
+        float(run(having(husky, **slippery, **soft), (1.0, 0.0), 0.3, backend=backend).velocity[0, -1, 0])
+        for soft in ({}, {"drive_compliance": {"speed_loss": 0.4}})
+    ]
+    assert starts[1] == pytest.approx(starts[0], rel=0.02)
+
+
+@pytest.mark.parametrize(("giving", "error"), [(0.01, 1e-4), (0.05, 1e-3), (0.2, 5e-3), (1.0, 0.025), (2.0, 1e-3)])
+def test_the_slip_that_a_soft_drive_leaves_solves_its_equation(giving, error):
+    grid = torch.meshgrid(torch.linspace(-1, 1, 41), torch.linspace(0, 1, 21), indexing="ij")
+    slip = torch.stack(grid).reshape(2, -1).double()
+    kept = held_slip(slip[None], torch.tensor(giving).double(), 0.02)[0]
+
+    def solved(along, across):
+        def excess(left):
+            return left + giving * left / math.sqrt(left**2 + across**2 + 0.02**2) - along
+
+        return brentq(excess, -1.1, 1.1)
+
+    exact = torch.tensor([solved(float(along), float(across)) for along, across in slip.T])
+    force, wanted = (left / torch.sqrt(left**2 + slip[1] ** 2 + 0.02**2) for left in (kept * slip[0], exact))
+    assert (force - wanted).abs().max() < error
 
 
 def test_the_supply_sags_with_the_speed_of_all_drives(husky):

@@ -198,6 +198,25 @@ def test_forces_drag_and_tilt_do_the_same_in_mujoco(husky, tmp_path):
     assert abs(data.qacc[5]) < 1e-6
 
 
+def test_drives_give_way_as_soft_servos_do_in_mujoco(husky, tmp_path):
+    """The gain that the export names: N r² / c for wheels of load N and radius r."""
+    loss, mass = 0.15, 54.0
+    gain = mass / 4 * 9.81 * 0.1651**2 / loss
+    robot = replace(husky, mass=torch.tensor(mass), centre_of_mass=torch.zeros(3))
+    compliance = estimate("drive_compliance", speed_loss=loss)
+    for force in (-160.0, 100.0):
+        pull = estimate("constant_force", x=force, y=0.0)
+        there, here = [], []
+        for servo_gain, effects in ((50 * gain, (pull,)), (gain, (pull, compliance))):
+            model, _ = model_with(tmp_path, husky, pull)
+            servos = [model.actuator(name).id for name, _, _ in WHEELS]
+            model.actuator_gainprm[servos, 0], model.actuator_biasprm[servos, 2] = servo_gain, -servo_gain
+            there.append(driven(model, 4.0, 0.8, 0.8)[-500:, 0].mean())
+            here.append(predicted(robot, effects, 4.0, 0.8, 0.8)[-100:, 0].mean())
+        assert here[1] - here[0] == pytest.approx(there[1] - there[0], rel=0.05)
+        assert abs(there[1] - there[0]) > 0.02
+
+
 def test_what_mujoco_cannot_express_is_said(husky, tmp_path):
     effects = (
         estimate("actuator_deadband", width=0.1),

@@ -29,6 +29,7 @@ _TIME_STEP = 0.002
 _GRAVITY = 9.81
 _NOT_IN_MUJOCO = {
     "actuator_deadband": "MuJoCo's actuators have no dead band: cut the commands before they reach the controls",
+    "drive_compliance": "set the gain of each wheel's servo to N r² / speed_loss, for a wheel of load N and radius r",
     "turning_scrub": "no element of a model: divide the difference of both sides' commands by the factor",
     "friction_anisotropy": "friction of a geometry is equal in both directions: use a contact pair",
     "rolling_resistance": "a resistance on the wheels' joints would be overcome by their servos",

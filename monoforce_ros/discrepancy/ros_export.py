@@ -15,12 +15,14 @@ _NOT_IN_DIFF_DRIVE = {
     "command_delay": "the controller cannot send a command earlier; give it to the planner (nav2)",
     "actuator_lag": "the controller has no model of the drives",
     "actuator_deadband": "the controller has no dead band; give it to the planner (nav2)",
+    "drive_compliance": "the motor drivers need an integral part",
     "payload": "the controller has no mass; tune the gains of the motor drivers",
 }
 _NOT_IN_NAV2 = {
     "actuator_lag": "MPPI's model follows velocities at once, within its acceleration limits",
     "drive_gain": "correct it in the base controller (diff_drive)",
     "drive_asymmetry": "correct it in the base controller (diff_drive)",
+    "drive_compliance": "the motor drivers need an integral part",
     "turning_scrub": "correct it in the base controller (diff_drive)",
     "payload": "MPPI's model has no mass",
 }

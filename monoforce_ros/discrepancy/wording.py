@@ -116,6 +116,9 @@ _FINDINGS: dict[str, Callable[[_Values], str]] = {
     ),
     "drive_gain": lambda v: f"The drives run {_change(v['gain'], 'slower', 'faster')} than commanded.",
     "drive_asymmetry": _asymmetry,
+    "drive_compliance": lambda v: (
+        f"The drives give way: a wheel that pulls with as much as its load runs {v['speed_loss']:.2f} m/s slower."
+    ),
     "turning_scrub": _scrub,
     "friction_scale": _friction,
     "friction_anisotropy": lambda v: f"Sideways, tyres grip {_change(v['factor'], 'less', 'more')} than lengthways.",
@@ -159,6 +162,7 @@ _REMEDIES = {
     "actuator_deadband": "look at the smallest output of the motor controller, and for friction in motor and gear",
     "drive_gain": "measure the wheels and compare with the radius that the base controller has",
     "drive_asymmetry": "compare tyre pressure, wear, chain and motor of both sides",
+    "drive_compliance": "give the motor controllers an integral part, or a larger gain",
     "turning_scrub": "set the wheel separation multiplier of the base controller (diagnose --export)",
     "friction_scale": "look at tyres and ground; drive slower in turns and when braking",
     "rolling_resistance": "look for soft ground, low tyre pressure, a dragging brake or a tight bearing",
@@ -186,6 +190,7 @@ _CAUSES = {
     "actuator_deadband": "small commands that the drives ignore",
     "drive_gain": "drives that run too slow or too fast",
     "drive_asymmetry": "sides of unequal speed",
+    "drive_compliance": "drives that give way under load",
     "turning_scrub": "turning less than the wheels ask for",
     "friction_scale": "slippery or grippy ground",
     "friction_anisotropy": "tyres that slip sideways",

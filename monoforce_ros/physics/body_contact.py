@@ -43,7 +43,7 @@ class BodyContact:
     drives: Tensor
     """Drive index of each point, ``[N]`` int64; -1 on the hull."""
     friction_factors: Tensor
-    """Longitudinal and lateral factor on the ground's friction, ``[B, 2]``."""
+    """Longitudinal and lateral factor on the ground's friction, and the drives' compliance [m/s], ``[B, 3]``."""
     ground_factors: Tensor
     """Divisor of the ground's stiffness and damping, and vegetation drag [N s/m⁴], ``[B, 2]``."""
     rolling_resistance: Tensor

@@ -23,6 +23,11 @@ within about 1 cm at a contact 5 cm wide and 10 cm high if the stiffness is 2e6 
 is 2e6 N/m³; on soil's own a robot of 50 kg would need 12 cm, more than a post is thick."""
 
 
+SMALLEST_SLIP = 1e-6
+"""Keeps a quotient finite without slip [m/s]."""
+HELD_ITERATIONS = 2
+"""Steps in which :func:`held_slip` is solved: forces are within 0.4 % of the limit of friction for a loss of 0.2 m/s,
+and within 2 % for 1 m/s."""
 FLAT_TREAD = 0.9
 """Cosine of the angle to the ground within which a belt's surface moves along it at the belt's full speed (26°): tyres
 and tracks lie flat in their contact. On the circle, a wheel that sinks by 8 mm would roll 1 % slower than its rim, and
@@ -38,6 +43,29 @@ def tread(belt: Tensor, along: Tensor) -> Tensor:
     """
     fastest = torch.sqrt((belt * belt).sum(1) + 1e-12)
     return ((belt * along).sum(1) / FLAT_TREAD).clamp(-fastest, fastest)
+
+
+def held_slip(slip: Tensor, giving: Tensor, regularisation: float) -> Tensor:
+    """Share of the longitudinal slip that is left when drives give way under their load, ``[B, N]``.
+
+    A speed controller without integral action loses speed in proportion to its torque. A drive that loses ``c`` when
+    it pulls with its wheel's load turns slower by ``c f / N``, so that ``s = s_0 - c μ s / sqrt(s² + s_y² + ε²)`` with
+    the regularised Coulomb law. Two steps of Newton's method, from the larger one of the solutions for small and for
+    large slip, both of which are too small.
+
+    Args:
+        slip: longitudinal and lateral slip at the commanded speed, ``[B, 2, N]`` [m/s].
+        giving: speed ``c μ`` that a drive loses at the limit of friction, ``[B, N]`` [m/s].
+        regularisation: slip ε at which friction is no longer proportional to slip [m/s].
+    """
+    along, across = slip[:, 0].abs(), slip[:, 1] * slip[:, 1] + regularisation**2
+    least = torch.sqrt(across)
+    share = torch.maximum(least / (least + giving), 1.0 - giving / (along + SMALLEST_SLIP))
+    for _ in range(HELD_ITERATIONS):
+        speed = torch.sqrt((share * along) ** 2 + across)
+        steepness = 1.0 + giving * across / (speed * speed * speed)
+        share = share - (share + giving * share / speed - 1.0) / steepness
+    return share
 
 
 def steepness(normal: Tensor) -> Tensor:
@@ -128,7 +156,8 @@ def contact(
         areas: area of each point, ``[N]`` [m²].
         masses: of the robots, ``[B]`` [kg].
         weights: share of the robot's weight m g per point, ``[B, N]`` or ``[N]`` [N] (``sigmoid`` only).
-        friction_factors: longitudinal and lateral factor on the ground's friction, ``[B, 2]``.
+        friction_factors: longitudinal and lateral factor on the ground's friction, and the drives' compliance, see
+            :func:`held_slip`, ``[B, 3]``.
         ground_factors: divisor of the ground's stiffness and damping [-], and force of vegetation per area, height and
             speed [N s/m⁴], ``[B, 2]``.
         rolling_resistance: force against rolling as a fraction of the load, ``[B]``.
@@ -169,10 +198,14 @@ def contact(
     pressing = touching_areas * (spring - damping * point_velocity[:, 0]).clamp_min(0.0)
     normal_gain = touching_areas * damping * (pressing > 0)
 
-    friction = ground.friction[:, None] * friction_factors[..., None]
+    friction = ground.friction[:, None] * friction_factors[:, :2, None]
     if grip is not None:
         held = torch.stack([grip, torch.ones_like(grip)])
         slip, friction = slip * held, friction * held
+    # The hull has no drive that could give way.
+    giving = friction_factors[:, 2, None] * friction[:, 0] * (1.0 - (outward * outward).sum(1))
+    kept = held_slip(slip, giving, options.slip_regularisation)
+    slip = torch.stack([kept * slip[:, 0], slip[:, 1]], dim=1)
     if soil is not None:
         slip_speed = torch.sqrt((slip * slip).sum(1) + options.slip_regularisation**2)
         soft_ground = soil.pressure(
@@ -186,7 +219,7 @@ def contact(
         load = (1.0 - soft) * load + yielding * soft_ground.load
         pressing = (1.0 - soft) * pressing + yielding * soft_ground.pressing
         normal_gain = (1.0 - soft) * normal_gain + yielding * soft_ground.gain
-        factors = friction_factors[..., None] if grip is None else friction_factors[..., None] * held
+        factors = friction_factors[:, :2, None] if grip is None else friction_factors[:, :2, None] * held
         tangential_gain = factors * (held_by / slip_speed)[:, None]
         tangential_force = -tangential_gain * slip
     elif options.tangential_force == "coulomb":
@@ -201,6 +234,7 @@ def contact(
     else:
         tangential_force = torch.zeros_like(slip)
         tangential_gain = tangential_force
+    tangential_gain = torch.stack([kept * tangential_gain[:, 0], tangential_gain[:, 1]], dim=1)
     # Rolling resistance and vegetation depend on the velocity of the body, not on slip.
     along, across = point_velocity[:, 1], point_velocity[:, 2]
     inverse_speed = torch.rsqrt(along * along + across * across + options.slip_regularisation**2)

@@ -52,7 +52,7 @@ class Problem:
     inertia: Tensor
     """About the centre of mass in base axes [kg m²], ``[B, 3, 3]``."""
     friction_factors: Tensor
-    """Longitudinal and lateral factor on the ground's friction, ``[B, 2]``."""
+    """Longitudinal and lateral factor on the ground's friction, and the drives' compliance [m/s], ``[B, 3]``."""
     gravity_tilt: Tensor
     """Tilt of gravity about x and y [rad], ``[B, 2]``."""
     resistance: Tensor
@@ -117,7 +117,7 @@ class Problem:
             drift = (rotation @ centre_rate[:, 0, :, None])[..., 0]
         resistance = (loads.rolling_resistance, loads.linear_drag, loads.quadratic_drag, loads.vegetation_yield)
         vegetation = (terrain.geometric_height - terrain.height).clamp_min(0.0)
-        factors = [robot.friction_longitudinal.expand(batch), robot.friction_lateral.expand(batch)]
+        factors = (robot.friction_longitudinal, robot.friction_lateral, loads.drive_compliance)
         problem = cls(
             terrain=terrain,
             centre=position + offset,
@@ -134,7 +134,7 @@ class Problem:
             mass=robot.mass.expand(batch),
             centre_of_mass=centre_of_mass,
             inertia=robot.inertia.expand(batch, 3, 3),
-            friction_factors=torch.stack(factors, dim=-1),
+            friction_factors=torch.stack([value.expand(batch) for value in factors], dim=-1),
             gravity_tilt=loads.gravity_tilt.expand(batch, 2),
             resistance=torch.stack([value.expand(batch) for value in resistance], dim=-1),
             vegetation=vegetation,

@@ -6,7 +6,14 @@ from typing import Any
 
 import warp as wp
 
-from monoforce_ros.physics.contact import LEAST_RIGID, RIGID_PER_MASS, RIGID_SLOPE, STEEPEST_SOIL
+from monoforce_ros.physics.contact import (
+    HELD_ITERATIONS,
+    LEAST_RIGID,
+    RIGID_PER_MASS,
+    RIGID_SLOPE,
+    SMALLEST_SLIP,
+    STEEPEST_SOIL,
+)
 from monoforce_ros.physics.soil_contact import FACING
 from monoforce_ros.physics.warp_kernels.soil import soil_pressure
 from monoforce_ros.physics.warp_kernels.structs import types
@@ -209,6 +216,20 @@ def contact_functions(double: bool, soft: bool) -> ContactFunctions:
             slip_across = velocity_across + wp.dot(belt, across)
             friction_along = grip * material[2] * factors[0]
             friction_across = material[2] * factors[1]
+            # Drives give way under their load; the hull has none.
+            kept = scalar(1.0)
+            if body.drives[i] >= 0:
+                giving = factors[2] * friction_along
+                sliding = wp.abs(slip_along)
+                square_across = slip_across * slip_across + options.slip_square
+                least = wp.sqrt(square_across)
+                kept = wp.max(least / (least + giving), scalar(1.0) - giving / (sliding + scalar(SMALLEST_SLIP)))
+                for _step in range(HELD_ITERATIONS):
+                    left_square = kept * kept * sliding * sliding + square_across
+                    left = wp.sqrt(left_square)
+                    steepness = scalar(1.0) + giving * square_across / (left_square * left)
+                    kept = kept - (kept + giving * kept / left - scalar(1.0)) / steepness
+            slip_along = kept * slip_along
             force_along = scalar(0.0)
             force_across = scalar(0.0)
             gain_along = scalar(0.0)
@@ -247,6 +268,7 @@ def contact_functions(double: bool, soft: bool) -> ContactFunctions:
                     force_across = friction_across * weight * (active_across - scalar(0.5))
                     gain_along = friction_along * weight * active_along * (scalar(1.0) - active_along)
                     gain_across = friction_across * weight * active_across * (scalar(1.0) - active_across)
+            gain_along = kept * gain_along
             touch.grip_force = vec2(force_along, force_across)
             touch.grip_gain = vec2(gain_along, gain_across)
             # Rolling resistance and vegetation depend on the velocity of the body, not on slip.
