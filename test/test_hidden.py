@@ -1,14 +1,18 @@
 """Injected faults: each changes the simulation as its name says, and the ground truth never gets into the bag."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.highlevel import AnyReader
 
-from monoforce_ros.effects import catalogue
+from monoforce_ros.effects import catalogue, controls
+from monoforce_ros.physics import State, rollout
+from monoforce_ros.robots import load_robot
 from monoforce_ros.synthetic import cli
 from monoforce_ros.synthetic.hidden import FAULTS, draw_hidden, parse_hidden, truth_file
 from monoforce_ros.synthetic.recording import RecordingSettings, record
@@ -17,6 +21,7 @@ from monoforce_ros.synthetic.simulation import Simulation
 from monoforce_ros.synthetic.terrain_shape import TerrainSettings
 from monoforce_ros.synthetic.vehicle import Vehicle
 from monoforce_ros.synthetic.world import TIME_STEP, build_model
+from monoforce_ros.terrain import Grid, TerrainMap
 
 FLAT = TerrainSettings(flat=True)
 RECORDED_ONLY = {"pose_clock_offset", "command_clock_offset", "sensor_yaw_offset", "sensor_lever_arm", "gyro_bias"}
@@ -109,6 +114,28 @@ def test_slippery_tyres_accelerate_slowly(husky, level):
 @pytest.mark.parametrize("hidden", ["viscous_drag:400", "quadratic_drag:600", "rolling_resistance:0.5"])
 def test_drag_slows_the_robot_as_far_as_stiff_servos_let_it(husky, level, hidden):
     assert steady(husky, level, (0.8, 0.0), hidden)[0] < steady(husky, level, (0.8, 0.0))[0] - 0.008
+
+
+def predicted(command, **effects):
+    """The same as ``steady`` by the rollout with effects of the catalogue."""
+    robot = replace(load_robot("husky"), effects=tuple(effects.items()))
+    twists = torch.tensor(command).expand(1, 400, 2)
+    terrain = TerrainMap.flat(Grid.square(20.0, 1.0))
+    moved = rollout(terrain, robot, controls(robot, twists, 0.01), State.at_rest(robot.ground_clearance))
+    ahead = (moved.rotation.transpose(-1, -2) @ moved.velocity[..., None])[0, -100:, :2, 0].mean(0)
+    return np.array([*ahead.numpy(), float(moved.angular_velocity[0, -100:, 2].mean())])
+
+
+@pytest.mark.parametrize(
+    ("command", "axis", "drag"), [((0.8, 0.0), 0, 400.0), ((0.5, 0.5), 2, 0.0), ((0.0, 0.8), 2, 0.0)]
+)
+def test_soft_drives_lose_the_speed_that_their_effect_says(husky, level, command, axis, drag):
+    """Ahead against a drag, and in turns, in which tyres scrub."""
+    pulled = (f"viscous_drag:{drag}",) if drag else ()
+    there = [steady(husky, level, command, *pulled, *soft)[axis] for soft in ((), ("drive_compliance:0.2",))]
+    held = {"viscous_drag": {"coefficient": drag}}
+    here = [predicted(command, **held, **soft)[axis] for soft in ({}, {"drive_compliance": {"speed_loss": 0.2}})]
+    assert here[0] - here[1] == pytest.approx(there[0] - there[1], rel=0.2)
 
 
 def test_a_force_and_a_tilted_gravity_push_in_their_direction(husky, level):

@@ -110,6 +110,21 @@ class DriveAsymmetry(Fault):
             spec.actuator(wheel.joint).gainprm[0] *= 1.0 - 0.5 * self.difference * np.sign(wheel.centre[1])
 
 
+class DriveCompliance(Fault):
+    """Soft servos: a wheel that pulls with as much as its load turns slower by this speed of its rim."""
+
+    speed_loss = Parameter(0.15, 0.03, 1.0)
+
+    @override
+    def modify_spec(self, spec: mujoco.MjSpec, robot: Vehicle) -> None:
+        load = robot.mass * 9.81 / len(robot.wheels)
+        for wheel in robot.driven:
+            servo = spec.actuator(wheel.joint)
+            gain = load * wheel.radius**2 / self.speed_loss
+            servo.gainprm[0] *= gain / -servo.biasprm[2]
+            servo.biasprm[2] = -gain
+
+
 class FrictionScale(Fault):
     """Tyres with another friction coefficient."""
 
