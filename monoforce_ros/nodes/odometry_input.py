@@ -8,13 +8,12 @@ from collections.abc import Mapping
 import numpy as np
 from nav_msgs.msg import Odometry
 
-from monoforce_ros.core import FrameError, MotionState, RobotFrames
-from monoforce_ros.messages import decoding
-from monoforce_ros.nodes.frames import TRANSFORMS_PATIENCE, TransformListener
-from monoforce_ros.nodes.health import ERROR, OK, Health
+from monoforce_ros.core import MotionState, RobotFrames
+from monoforce_ros.nodes.frames import TransformListener
+from monoforce_ros.nodes.health import OK, Health
+from monoforce_ros.nodes.odometry_reader import PART, OdometryReader
 from monoforce_ros.nodes.stop import Stop
 
-PART = "odometry"
 _COARSEST = 0.05
 """Largest rounding of the candidates' positions [m]: half of the distance that counts as progress."""
 
@@ -31,6 +30,7 @@ class OdometryInput:
 
     def __init__(self, frames: RobotFrames, transforms: TransformListener, health: Health, timeout: float):
         self._frames, self._transforms, self._health, self._timeout = frames, transforms, health, timeout
+        self._reader = OdometryReader(frames, transforms, health)
         self.motion: MotionState | None = None
         """Of the base."""
         self.frame = ""
@@ -41,40 +41,29 @@ class OdometryInput:
         """Poses of the base and of the frame that the odometry describes, in the base's frame ``[4, 4]``."""
         self.arrival: float | None = None
         """Steady time of the newest message [s]."""
-        self.first_arrival = 0.0
-        """Steady time of the first message with a stamp [s]; 0 before."""
-        self._problem = ""
         self._stamp: int | None = None
         self._advanced = 0.0
+
+    @property
+    def first_arrival(self) -> float:
+        """Steady time of the first message with a stamp [s]; 0 before."""
+        return self._reader.first_arrival
 
     def receive(self, message: Odometry) -> bool:
         """Take a message; returns whether it tells the motion of the base."""
         self.arrival = time.monotonic()
-        try:
-            state, frame_id, child = decoding.decode_odometry(message)
-            if not state.stamp:
-                raise decoding.MessageError("the stamps are zero: the state estimator does not set them")
-        except decoding.MessageError as error:
-            self._problem = str(error)
-            self._health.report(PART, ERROR, self._problem, reason="unusable")
+        received = self._reader.read(message)
+        if received is None:
             return False
-        if state.stamp != self._stamp:
-            self._stamp, self._advanced = state.stamp, self.arrival
-        self.first_arrival = self.first_arrival or self.arrival
+        if received.motion.stamp != self._stamp:
+            self._stamp, self._advanced = received.motion.stamp, self.arrival
         # The name of REP 105, as the predictor takes it.
-        self.frame = frame_id or "odom"
-        try:
-            offset = self._frames.odometry_child(child, self._transforms.tree)
-        except FrameError as error:
-            self._problem = self._transforms.explained(error)
-            # Transforms may be on their way.
-            if self._transforms.unavailable or time.monotonic() - self.first_arrival > TRANSFORMS_PATIENCE:
-                self._health.report(PART, ERROR, self._problem, reason="frame")
-            return False
-        self._problem = ""
-        self.motion = state.of_base(offset)
-        self.base_name = self._frames.base_name(child, self._transforms.tree.frames)
-        self.on_robot = {child or self.base_name: offset, self.base_name: np.eye(4)}
+        self.frame = received.frame_id or "odom"
+        self.motion = received.motion
+        self.base_name = self._frames.base_name(received.child_frame_id, self._transforms.tree.frames)
+        self.on_robot = {
+            received.child_frame_id or self.base_name: received.base_from_child, self.base_name: np.eye(4)
+        }  # fmt: skip
         self._health.report(PART, OK, "receiving odometry")
         return True
 
@@ -87,8 +76,8 @@ class OdometryInput:
         Raises:
             Stop: it is missing, old, of an unknown frame, or too far from the origin.
         """
-        if self._problem:
-            raise Stop(self._problem, "odometry")
+        if self._reader.problem:
+            raise Stop(self._reader.problem, "odometry")
         if self.motion is None or self.arrival is None:
             raise Stop(f"no odometry: the position is unknown ({cause})", "no odometry")
         # Stamps cannot detect this: without odometry there are no new candidates either, so their age stays constant.

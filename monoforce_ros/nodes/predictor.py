@@ -20,7 +20,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState, Poin
 from visualization_msgs.msg import MarkerArray
 
 from monoforce_ros.bags import camera_info_topics
-from monoforce_ros.core import NANOSECOND, CommandTrack, FrameError, RobotFrames, pose_matrix
+from monoforce_ros.core import NANOSECOND, CommandTrack, RobotFrames, pose_matrix
 from monoforce_ros.effects import corrected_commands, corrected_motion
 from monoforce_ros.messages import decoding
 from monoforce_ros.nodes import prediction_messages as encoders
@@ -29,12 +29,13 @@ from monoforce_ros.nodes.candidate_output import CandidateOutput
 from monoforce_ros.nodes.clocks import STEADY
 from monoforce_ros.nodes.costmap_output import CostmapOutput
 from monoforce_ros.nodes.ensemble_output import EnsembleOutput
-from monoforce_ros.nodes.frames import TRANSFORMS_PATIENCE, TransformListener
+from monoforce_ros.nodes.frames import TransformListener
 from monoforce_ros.nodes.health import ERROR, OK, STALE, WARN, Health
 from monoforce_ros.nodes.inputs import TIME_JUMP, Inputs, Received
 from monoforce_ros.nodes.joint_input import JointInput
 from monoforce_ros.nodes.managed import ManagedNode
 from monoforce_ros.nodes.monitor_output import MonitorOutput
+from monoforce_ros.nodes.odometry_reader import ZERO_STAMPS, OdometryReader
 from monoforce_ros.nodes.parameters import declare_parameters, follow_changes, settings_without_effect
 from monoforce_ros.nodes.process import run_schema_node
 from monoforce_ros.nodes.rate_limiter import RateLimiter
@@ -53,7 +54,6 @@ _LATE = 0.6
 """Age from which candidates are late [s]: the default `timeout` of path_selector, which stops the robot then."""
 _COARSE = 0.01
 """Distance of the 32-bit numbers of clouds at the robot [m] that is mentioned; 10 km from the origin it is 1 mm."""
-_ZERO_STAMPS = "the stamps are zero: the {} does not set them"
 
 
 @dataclass(frozen=True)
@@ -115,6 +115,7 @@ class PredictorNode(ManagedNode):
         self.transforms = TransformListener(self)
         if self.transforms.unavailable:
             self.get_logger().info(f"sensor poses are those of the robot file: {self.transforms.unavailable}")
+        self._odometry = OdometryReader(self.frames, self.transforms, self.health)
         self.decoder = SensorDecoder(self.frames, self.transforms.tree, self.health)
         self.inputs = Inputs(
             list(self.sensor_topics.values()),
@@ -135,7 +136,6 @@ class PredictorNode(ManagedNode):
         self._started = time.monotonic()
         self._predictions = 0
         self._last_prediction = self._started
-        self._first_odometry = 0.0
         self._durations: list[float] = []
         self.monitor = MonitorOutput(self, self.predictor, self.health)
         with_candidates = settings.candidates or settings.candidate_topic
@@ -284,25 +284,13 @@ class PredictorNode(ManagedNode):
 
     def _on_odometry(self, message: Odometry) -> None:
         self._arrivals["odometry"] = time.monotonic()
-        self._first_odometry = self._first_odometry or self._arrivals["odometry"]
-        try:
-            state, frame_id, child_frame_id = decoding.decode_odometry(message)
-        except decoding.MessageError as error:
-            self.health.report("odometry", ERROR, str(error), reason="unusable")
+        received = self._odometry.read(message)
+        if received is None:
             return
-        if not state.stamp:
-            self.health.report("odometry", ERROR, _ZERO_STAMPS.format("state estimator"), reason="zero stamp")
-            return
-        try:
-            pose = self.frames.odometry_child(child_frame_id, self.transforms.tree)
-        except FrameError as error:
-            # Transforms may be on their way.
-            if self.transforms.unavailable or time.monotonic() - self._first_odometry > TRANSFORMS_PATIENCE:
-                self.health.report("odometry", ERROR, self.transforms.explained(error), reason="frame")
-            return
+        state, frame_id = received.motion, received.frame_id
         if (before := self.inputs.frame_id) and frame_id != before:
             self._frame_changes.append(time.monotonic())
-        self.inputs.add_motion("odometry", state.of_base(pose), frame_id, child_frame_id)
+        self.inputs.add_motion("odometry", state, frame_id, received.child_frame_id)
         self._motion_arrival = time.monotonic()
         recent = [change for change in self._frame_changes if time.monotonic() - change < self.settings.data_timeout]
         if len(recent) > 1:
@@ -370,7 +358,7 @@ class PredictorNode(ManagedNode):
         self._arrivals[part] = time.monotonic()
         stamp = decoding.stamp_of(message)
         if stamp == 0:
-            self.health.report(part, ERROR, _ZERO_STAMPS.format("sensor driver"), reason="zero stamp")
+            self.health.report(part, ERROR, ZERO_STAMPS.format("sensor driver"), reason="zero stamp")
             return
         self.inputs.add_sensor(part, stamp, message)
 

@@ -1,0 +1,75 @@
+"""OdometryReader: what an odometry message says of the robot's base, or why it cannot be used."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from nav_msgs.msg import Odometry
+
+from monoforce_ros.core import FrameError, MotionState, RobotFrames
+from monoforce_ros.messages import decoding
+from monoforce_ros.nodes.frames import TRANSFORMS_PATIENCE, TransformListener
+from monoforce_ros.nodes.health import ERROR, Health
+
+PART = "odometry"
+"""Part of the node's health."""
+ZERO_STAMPS = "the stamps are zero: the {} does not set them"
+
+
+@dataclass(frozen=True)
+class BaseOdometry:
+    """One odometry message."""
+
+    motion: MotionState
+    """Of the base."""
+    frame_id: str
+    """Frame of the poses; empty if the message names none."""
+    child_frame_id: str
+    """Frame that the message describes."""
+    base_from_child: np.ndarray
+    """Pose ``[4, 4]`` of that frame in the base frame."""
+
+
+class OdometryReader:
+    """Reads odometry messages, and reports those that cannot be used.
+
+    Args:
+        frames: of the robot.
+        transforms: of ``/tf``.
+        health: gets the part ``odometry``.
+    """
+
+    def __init__(self, frames: RobotFrames, transforms: TransformListener, health: Health):
+        self._frames, self._transforms, self._health = frames, transforms, health
+        self.first_arrival = 0.0
+        """Steady time of the first message with a stamp [s]; 0 before."""
+        self.problem = ""
+        """Why the newest message cannot be used; empty if it can."""
+
+    def read(self, message: Odometry) -> BaseOdometry | None:
+        """What a message says; None if it cannot be used."""
+        try:
+            state, frame_id, child = decoding.decode_odometry(message)
+        except decoding.MessageError as error:
+            self._refuse(str(error), "unusable")
+            return None
+        if not state.stamp:
+            self._refuse(ZERO_STAMPS.format("state estimator"), "zero stamp")
+            return None
+        self.first_arrival = self.first_arrival or time.monotonic()
+        try:
+            offset = self._frames.odometry_child(child, self._transforms.tree)
+        except FrameError as error:
+            # Transforms may be on their way.
+            patient = not self._transforms.unavailable and time.monotonic() - self.first_arrival <= TRANSFORMS_PATIENCE
+            self._refuse(self._transforms.explained(error), "frame", silent=patient)
+            return None
+        self.problem = ""
+        return BaseOdometry(state.of_base(offset), frame_id, child, offset)
+
+    def _refuse(self, problem: str, reason: str, *, silent: bool = False) -> None:
+        self.problem = problem
+        if not silent:
+            self._health.report(PART, ERROR, problem, reason=reason)
