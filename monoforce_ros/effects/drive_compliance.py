@@ -35,5 +35,6 @@ class DriveCompliance(Effect):
 
     def setup(self, setup: Setup, values: Values) -> Setup:
         """The setup with this effect applied."""
-        loads = setup.loads
-        return replace(setup, loads=replace(loads, drive_compliance=loads.drive_compliance + values["speed_loss"]))
+        loads, loss = setup.loads, values["speed_loss"]
+        found = loss if loads.drive_compliance is None else loads.drive_compliance + loss
+        return replace(setup, loads=replace(loads, drive_compliance=found))

@@ -35,16 +35,17 @@ class Loads:
     """Force against motion per contact area, speed and height of the vegetation above the ground [N s/m⁴]."""
     vegetation_yield: Tensor
     """Speed at which the speed-independent bending force of vegetation equals its viscous drag [m/s]."""
-    drive_compliance: Tensor
-    """Surface speed that a drive loses when it pulls with as much as the load on its wheel [m/s]."""
     wrench: Tensor
     """Body-frame force [N] and torque [N m] per feature of ``FEATURES``, ``[6, F]`` or ``[B, 6, F]``."""
+    drive_compliance: Tensor | None = None
+    """Surface speed that a drive loses when it pulls with as much as the load on its wheel [m/s]; None: drives hold
+    their speed, which takes less computing than a loss of zero."""
 
     @classmethod
     def none(cls, like: Tensor) -> Loads:
         """No additional load, with the precision and device of ``like``."""
         zero = torch.zeros((), dtype=like.dtype, device=like.device)
-        return cls(zero.expand(2), zero, zero, zero, zero, zero, zero, zero.expand(6, len(FEATURES)))
+        return cls(zero.expand(2), zero, zero, zero, zero, zero, zero.expand(6, len(FEATURES)))
 
     def with_wrench(self, row: int, feature: str, weight: Tensor) -> Loads:
         """These loads with one more term of the body wrench.

@@ -43,7 +43,8 @@ class BodyContact:
     drives: Tensor
     """Drive index of each point, ``[N]`` int64; -1 on the hull."""
     friction_factors: Tensor
-    """Longitudinal and lateral factor on the ground's friction, and the drives' compliance [m/s], ``[B, 3]``."""
+    """Longitudinal and lateral factor on the ground's friction and, of drives that give way, their compliance [m/s],
+    ``[B, 2 or 3]``."""
     ground_factors: Tensor
     """Divisor of the ground's stiffness and damping, and vegetation drag [N s/m⁴], ``[B, 2]``."""
     rolling_resistance: Tensor

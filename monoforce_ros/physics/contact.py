@@ -156,8 +156,8 @@ def contact(
         areas: area of each point, ``[N]`` [m²].
         masses: of the robots, ``[B]`` [kg].
         weights: share of the robot's weight m g per point, ``[B, N]`` or ``[N]`` [N] (``sigmoid`` only).
-        friction_factors: longitudinal and lateral factor on the ground's friction, and the drives' compliance, see
-            :func:`held_slip`, ``[B, 3]``.
+        friction_factors: longitudinal and lateral factor on the ground's friction and, of drives that give way, their
+            compliance, see :func:`held_slip`, ``[B, 2 or 3]``.
         ground_factors: divisor of the ground's stiffness and damping [-], and force of vegetation per area, height and
             speed [N s/m⁴], ``[B, 2]``.
         rolling_resistance: force against rolling as a fraction of the load, ``[B]``.
@@ -202,10 +202,12 @@ def contact(
     if grip is not None:
         held = torch.stack([grip, torch.ones_like(grip)])
         slip, friction = slip * held, friction * held
-    # The hull has no drive that could give way.
-    giving = friction_factors[:, 2, None] * friction[:, 0] * (1.0 - (outward * outward).sum(1))
-    kept = held_slip(slip, giving, options.slip_regularisation)
-    slip = torch.stack([kept * slip[:, 0], slip[:, 1]], dim=1)
+    kept = None
+    if friction_factors.shape[1] == 3:
+        # The hull has no drive that could give way.
+        giving = friction_factors[:, 2, None] * friction[:, 0] * (1.0 - (outward * outward).sum(1))
+        kept = held_slip(slip, giving, options.slip_regularisation)
+        slip = torch.stack([kept * slip[:, 0], slip[:, 1]], dim=1)
     if soil is not None:
         slip_speed = torch.sqrt((slip * slip).sum(1) + options.slip_regularisation**2)
         soft_ground = soil.pressure(
@@ -234,7 +236,8 @@ def contact(
     else:
         tangential_force = torch.zeros_like(slip)
         tangential_gain = tangential_force
-    tangential_gain = torch.stack([kept * tangential_gain[:, 0], tangential_gain[:, 1]], dim=1)
+    if kept is not None:
+        tangential_gain = torch.stack([kept * tangential_gain[:, 0], tangential_gain[:, 1]], dim=1)
     # Rolling resistance and vegetation depend on the velocity of the body, not on slip.
     along, across = point_velocity[:, 1], point_velocity[:, 2]
     inverse_speed = torch.rsqrt(along * along + across * across + options.slip_regularisation**2)

@@ -52,7 +52,8 @@ class Problem:
     inertia: Tensor
     """About the centre of mass in base axes [kg m²], ``[B, 3, 3]``."""
     friction_factors: Tensor
-    """Longitudinal and lateral factor on the ground's friction, and the drives' compliance [m/s], ``[B, 3]``."""
+    """Longitudinal and lateral factor on the ground's friction and, of drives that give way, their compliance [m/s],
+    ``[B, 2 or 3]``."""
     gravity_tilt: Tensor
     """Tilt of gravity about x and y [rad], ``[B, 2]``."""
     resistance: Tensor
@@ -117,7 +118,9 @@ class Problem:
             drift = (rotation @ centre_rate[:, 0, :, None])[..., 0]
         resistance = (loads.rolling_resistance, loads.linear_drag, loads.quadratic_drag, loads.vegetation_yield)
         vegetation = (terrain.geometric_height - terrain.height).clamp_min(0.0)
-        factors = (robot.friction_longitudinal, robot.friction_lateral, loads.drive_compliance)
+        factors = [robot.friction_longitudinal, robot.friction_lateral]
+        if loads.drive_compliance is not None:
+            factors.append(loads.drive_compliance.to(dtype))
         problem = cls(
             terrain=terrain,
             centre=position + offset,

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 import warp as wp
 from torch import Tensor
+from torch.nn.functional import pad
 
 from monoforce_ros.physics import warp_joints
 from monoforce_ros.physics.clusters import point_clusters
@@ -51,6 +52,8 @@ def integrate(
     pages = max(len(height), len(material))
     height, material = height.expand(pages, -1, -1), material.expand(pages, -1, -1, -1)
     moving = problem.articulation
+    compliant = problem.friction_factors.shape[1] == 3
+    friction = problem.friction_factors if compliant else pad(problem.friction_factors, (0, 1))
     plain, ordered = _sampled_bodies(problem)
 
     def inputs(body: SampledBody) -> tuple[Tensor, ...]:
@@ -63,7 +66,7 @@ def integrate(
             problem.mass,
             problem.centre_of_mass,
             problem.inertia,
-            problem.friction_factors,
+            friction,
             problem.ground_factors,
             problem.gravity_tilt,
             problem.resistance,
@@ -72,12 +75,12 @@ def integrate(
         )
 
     start = (problem.centre, problem.rotation, problem.velocity, problem.angular_velocity)
-    fixed, listed = Fixed(options, terrain, ordered), inputs(ordered)
+    fixed, listed = Fixed(options, terrain, ordered, compliant), inputs(ordered)
     if moving is not None:
         motion = warp_joints.integrate(problem, moving, fixed, listed, start)
         if not problem.steps or not (with_forces or with_contact):
             return motion
-        fixed = Fixed(options, terrain, plain)
+        fixed = Fixed(options, terrain, plain, compliant)
         return warp_joints.with_forces(motion, problem, moving, fixed, inputs(plain), force_every)
     states: tuple[Tensor, ...] = _Integrate.apply(fixed, *listed, *start)
     centre, rotation, velocity, angular_velocity = states
@@ -88,7 +91,7 @@ def integrate(
     if with_contact and not with_forces and not with_gradient:
         sums = _launch_summary(fixed, force_every, contiguous(listed), contiguous(states))
         return replace(motion, contact=ContactSummary.split(sums, problem.drive_speeds.shape[2]))
-    fixed = Fixed(options, terrain, plain)
+    fixed = Fixed(options, terrain, plain, compliant)
     normal, tangential, forces = _Forces.apply(fixed, force_every, *inputs(plain), *states)
     return replace(motion, normal_forces=normal, tangential_forces=tangential, forces=forces)
 

@@ -97,7 +97,8 @@ class SampledBody:
 class Fixed:
     """Inputs of a launch without gradients."""
 
-    def __init__(self, options: PhysicsOptions, terrain: TerrainMap, body: SampledBody):
+    def __init__(self, options: PhysicsOptions, terrain: TerrainMap, body: SampledBody, compliant: bool):
+        self.compliant = compliant
         self.options = options
         self.grid = terrain.grid
         self.body = body
@@ -182,6 +183,7 @@ class Arguments:
         options.lookup = int(fixed.options.lookup == "bilinear")
         options.normal = int(fixed.options.normal_force == "normal")
         options.tangential = _TANGENTIAL[fixed.options.tangential_force]
+        options.compliant = int(fixed.compliant)
         moving = kinds.States()
         for name, array in self.states.items():
             setattr(moving, name, array)

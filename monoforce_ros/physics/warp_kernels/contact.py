@@ -218,17 +218,17 @@ def contact_functions(double: bool, soft: bool) -> ContactFunctions:
             friction_across = material[2] * factors[1]
             # Drives give way under their load; the hull has none.
             kept = scalar(1.0)
-            if body.drives[i] >= 0:
+            if options.compliant == 1 and body.drives[i] >= 0:
                 giving = factors[2] * friction_along
                 sliding = wp.abs(slip_along)
                 square_across = slip_across * slip_across + options.slip_square
                 least = wp.sqrt(square_across)
                 kept = wp.max(least / (least + giving), scalar(1.0) - giving / (sliding + scalar(SMALLEST_SLIP)))
                 for _step in range(HELD_ITERATIONS):
-                    left_square = kept * kept * sliding * sliding + square_across
-                    left = wp.sqrt(left_square)
-                    steepness = scalar(1.0) + giving * square_across / (left_square * left)
-                    kept = kept - (kept + giving * kept / left - scalar(1.0)) / steepness
+                    per_slip = scalar(1.0) / wp.sqrt(kept * kept * sliding * sliding + square_across)
+                    given = giving * per_slip
+                    steepness = scalar(1.0) + given * square_across * per_slip * per_slip
+                    kept = kept - (kept + given * kept - scalar(1.0)) / steepness
             slip_along = kept * slip_along
             force_along = scalar(0.0)
             force_across = scalar(0.0)

@@ -116,6 +116,7 @@ def types(double: bool) -> Types:
         lookup: int
         normal: int
         tangential: int
+        compliant: int  # 1 if drives give way
 
     @wp.struct
     class Touch:  # of one point with the ground
