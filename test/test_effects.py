@@ -472,7 +472,7 @@ def test_drives_lose_speed_in_proportion_to_their_traction(husky, backend):
     assert starts[1] == pytest.approx(starts[0], rel=0.02)
 
 
-@pytest.mark.parametrize(("giving", "error"), [(0.01, 1e-4), (0.05, 1e-3), (0.2, 5e-3), (1.0, 0.025), (2.0, 1e-3)])
+@pytest.mark.parametrize(("giving", "error"), [(0.01, 1e-4), (0.05, 2e-3), (0.2, 3e-3), (1.0, 0.02), (2.0, 1e-3)])
 def test_the_slip_that_a_soft_drive_leaves_solves_its_equation(giving, error):
     grid = torch.meshgrid(torch.linspace(-1, 1, 41), torch.linspace(0, 1, 21), indexing="ij")
     slip = torch.stack(grid).reshape(2, -1).double()

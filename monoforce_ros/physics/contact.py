@@ -25,9 +25,6 @@ is 2e6 N/m³; on soil's own a robot of 50 kg would need 12 cm, more than a post 
 
 SMALLEST_SLIP = 1e-6
 """Keeps a quotient finite without slip [m/s]."""
-HELD_ITERATIONS = 2
-"""Steps in which :func:`held_slip` is solved: forces are within 0.4 % of the limit of friction for a loss of 0.2 m/s,
-and within 2 % for 1 m/s."""
 FLAT_TREAD = 0.9
 """Cosine of the angle to the ground within which a belt's surface moves along it at the belt's full speed (26°): tyres
 and tracks lie flat in their contact. On the circle, a wheel that sinks by 8 mm would roll 1 % slower than its rim, and
@@ -50,8 +47,9 @@ def held_slip(slip: Tensor, giving: Tensor, regularisation: float) -> Tensor:
 
     A speed controller without integral action loses speed in proportion to its torque. A drive that loses ``c`` when
     it pulls with its wheel's load turns slower by ``c f / N``, so that ``s = s_0 - c μ s / sqrt(s² + s_y² + ε²)`` with
-    the regularised Coulomb law. Two steps of Newton's method, from the larger one of the solutions for small and for
-    large slip, both of which are too small.
+    the regularised Coulomb law. One step of Halley's method, from the larger one of the solutions for small and for
+    large slip, both of which are too small: forces are within 0.2 % of the limit of friction for a loss of 0.2 m/s,
+    and within 1.5 % for 1 m/s.
 
     Args:
         slip: longitudinal and lateral slip at the commanded speed, ``[B, 2, N]`` [m/s].
@@ -61,11 +59,13 @@ def held_slip(slip: Tensor, giving: Tensor, regularisation: float) -> Tensor:
     along, across = slip[:, 0].abs(), slip[:, 1] * slip[:, 1] + regularisation**2
     least = torch.sqrt(across)
     share = torch.maximum(least / (least + giving), 1.0 - giving / (along + SMALLEST_SLIP))
-    for _ in range(HELD_ITERATIONS):
-        speed = torch.sqrt((share * along) ** 2 + across)
-        steepness = 1.0 + giving * across / (speed * speed * speed)
-        share = share - (share + giving * share / speed - 1.0) / steepness
-    return share
+    per_slip = torch.rsqrt((share * along) ** 2 + across)
+    given = giving * per_slip
+    excess = share + given * share - 1.0
+    slope = 1.0 + given * across * per_slip * per_slip
+    # Half of the slope's own slope, negative.
+    bend = 1.5 * given * across * share * along * along * per_slip**4
+    return share - excess * slope / (slope * slope + excess * bend)
 
 
 def steepness(normal: Tensor) -> Tensor:

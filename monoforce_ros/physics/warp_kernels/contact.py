@@ -7,7 +7,6 @@ from typing import Any
 import warp as wp
 
 from monoforce_ros.physics.contact import (
-    HELD_ITERATIONS,
     LEAST_RIGID,
     RIGID_PER_MASS,
     RIGID_SLOPE,
@@ -224,11 +223,13 @@ def contact_functions(double: bool, soft: bool) -> ContactFunctions:
                 square_across = slip_across * slip_across + options.slip_square
                 least = wp.sqrt(square_across)
                 kept = wp.max(least / (least + giving), scalar(1.0) - giving / (sliding + scalar(SMALLEST_SLIP)))
-                for _step in range(HELD_ITERATIONS):
-                    per_slip = scalar(1.0) / wp.sqrt(kept * kept * sliding * sliding + square_across)
-                    given = giving * per_slip
-                    steepness = scalar(1.0) + given * square_across * per_slip * per_slip
-                    kept = kept - (kept + given * kept - scalar(1.0)) / steepness
+                per_slip = scalar(1.0) / wp.sqrt(kept * kept * sliding * sliding + square_across)
+                per_square = per_slip * per_slip
+                given = giving * per_slip
+                excess = kept + given * kept - scalar(1.0)
+                slope = scalar(1.0) + given * square_across * per_square
+                bend = scalar(1.5) * given * square_across * kept * sliding * sliding * per_square * per_square
+                kept = kept - excess * slope / (slope * slope + excess * bend)
             slip_along = kept * slip_along
             force_along = scalar(0.0)
             force_across = scalar(0.0)
