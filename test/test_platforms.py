@@ -312,9 +312,9 @@ def test_the_true_effect_explains_most_of_what_it_does_in_the_other_engine(tmp_p
     assert json.loads(json.dumps(row)) == row
     assert summary("single", [row]).startswith("single: 1 of 1 drives visible; share explained: 10 % quantile")
     # The more healthy drives vary, the less significant is the same drive.
-    row = null_rates.measured(case, CaseFiles.of(case, tmp_path), nominal, (0.0, 1.0, 1000.0))
+    row = null_rates.measured(case, CaseFiles.of(case, tmp_path), nominal, (0.0, 1.0, 1e5))
     (_, alone), (name, usual), (_, hopeless) = row["smallest"]
     assert name == "drive_loss" and alone <= usual <= 0.025 < hopeless
-    assert "of 1 drives with an effect below 0.025: 1 at 0, 1 at 1, 0 at 1000" in null_rates.summary(
-        "single", [row], (0.0, 1.0, 1000.0)
+    assert "of 1 drives with an effect below 0.025: 1 at 0, 1 at 1, 0 at 100000" in null_rates.summary(
+        "single", [row], (0.0, 1.0, 1e5)
     )
