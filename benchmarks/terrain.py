@@ -208,6 +208,8 @@ class WorldResults:
     seed: int
     checkpoints: dict[str, list[str]]
     """Digests of the checkpoints of each system."""
+    duration: float
+    """Of the recording [s]."""
     commit: str
     """Of the source that computed them."""
     results: tuple[Result, ...] = ()
@@ -228,7 +230,7 @@ def world_results(seed: int, out: Path, checkpoints: Mapping[str, Sequence[Path]
     digests = {name: [digest(path) for path in files] for name, files in checkpoints.items()}
     if file.exists():
         stored = WorldResults.load(file)
-        if stored.checkpoints == digests:
+        if (stored.checkpoints, stored.duration) == (digests, duration):
             return stored
     bag = record_world(out / "worlds", seed, WorldSettings(), duration)
     found: list[Result] = []
@@ -237,7 +239,7 @@ def world_results(seed: int, out: Path, checkpoints: Mapping[str, Sequence[Path]
         found = evaluate_world(bag, checkpoints, tuple(PHYSICS))
     except (BagError, EvaluationError) as error:
         skipped = str(error)
-    done = WorldResults(seed, digests, commit(), tuple(found), skipped)
+    done = WorldResults(seed, digests, duration, commit(), tuple(found), skipped)
     write_text(file, json.dumps(asdict(done), indent=1))
     return done
 

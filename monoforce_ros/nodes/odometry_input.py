@@ -33,8 +33,6 @@ class OdometryInput:
         self._reader = OdometryReader(frames, transforms, health)
         self.motion: MotionState | None = None
         """Of the base."""
-        self.frame = ""
-        """Frame of the odometry."""
         self.base_name = ""
         """Name of the base's frame."""
         self.on_robot: Mapping[str, np.ndarray] = {}
@@ -49,6 +47,11 @@ class OdometryInput:
         """Steady time of the first message with a stamp [s]; 0 before."""
         return self._reader.first_arrival
 
+    @property
+    def frame(self) -> str:
+        """Frame of the odometry; empty before the first message."""
+        return self._reader.frame
+
     def receive(self, message: Odometry) -> bool:
         """Take a message; returns whether it tells the motion of the base."""
         self.arrival = time.monotonic()
@@ -57,8 +60,6 @@ class OdometryInput:
             return False
         if received.motion.stamp != self._stamp:
             self._stamp, self._advanced = received.motion.stamp, self.arrival
-        # The name of REP 105, as the predictor takes it.
-        self.frame = received.frame_id or "odom"
         self.motion = received.motion
         self.base_name = self._frames.base_name(received.child_frame_id, self._transforms.tree.frames)
         self.on_robot = {

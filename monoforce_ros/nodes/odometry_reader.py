@@ -47,6 +47,8 @@ class OdometryReader:
         """Steady time of the first message with a stamp [s]; 0 before."""
         self.problem = ""
         """Why the newest message cannot be used; empty if it can."""
+        self.frame = ""
+        """Frame of the newest message with a stamp, that of REP 105 if it names none."""
 
     def read(self, message: Odometry) -> BaseOdometry | None:
         """What a message says; None if it cannot be used."""
@@ -59,6 +61,7 @@ class OdometryReader:
             self._refuse(ZERO_STAMPS.format("state estimator"), "zero stamp")
             return None
         self.first_arrival = self.first_arrival or time.monotonic()
+        self.frame = frame_id or "odom"
         try:
             offset = self._frames.odometry_child(child, self._transforms.tree)
         except FrameError as error:
