@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from monoforce_ros.bags import DETECTED, ReadOptions, Recording, smooth
+from monoforce_ros.discrepancy.command_changes import uncovered_doubt
 from monoforce_ros.discrepancy.comparison import GapRow, HeldOut, compare, gap_table
 from monoforce_ros.discrepancy.credibility import complaint
 from monoforce_ros.discrepancy.diagnosis import Diagnosis, DiagnosisSettings, diagnose
@@ -162,7 +163,8 @@ def diagnose_bag(
     large = residual_complaint(None if nominal is None else nominal.residual, evidence.smoothed, evidence.commands)
     # Named effects stay, with this doubt.
     steeper = steeper if diagnosis.effects else ""
-    doubts = [text for text in (ground.complaint, steeper, large) if text]
+    harder = "" if nominal is None else uncovered_doubt(evidence, settings.horizon, nominal.changes)
+    doubts = [text for text in (ground.complaint, steeper, harder, large) if text]
     if diagnosis.verdict == Verdict.NOT_IDENTIFIABLE:
         diagnosis = _with_wheels(diagnosis, evidence, model)
     robot_file = None

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from monoforce_ros.discrepancy.command_changes import covered_changes
 from monoforce_ros.discrepancy.directions import Directions
 from monoforce_ros.discrepancy.estimates import EffectEstimate
 from monoforce_ros.discrepancy.fit import (
@@ -109,7 +110,11 @@ def commission(
     residuals = _held_out_residuals(prepared, fits, merged.effects)
     progress(0.85, "variation between segments")
     nominal = _nominal(prepared, merged.effects, residuals)
-    nominal = replace(nominal, slope=max(slopes_of(evidence.smoothed).total for evidence in recordings))
+    nominal = replace(
+        nominal,
+        slope=max(slopes_of(evidence.smoothed).total for evidence in recordings),
+        changes=covered_changes([entry.data for entry in prepared]),
+    )
     progress(1.0, "done")
     return estimate_effects(merged, {}), nominal
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from monoforce_ros.discrepancy.command_changes import uncovered_residual
 from monoforce_ros.discrepancy.hypothesis import COMPONENTS, EvidenceWindows
 from monoforce_ros.discrepancy.moderation import VariancePrior
 from monoforce_ros.discrepancy.residual_model import TERMS, motion_terms
@@ -21,6 +22,7 @@ SEGMENT = 16.0
 of motion occur in each."""
 SMALLEST = np.array([0.01, 0.01, np.radians(0.3)])
 """Residuals below this are insignificant even on noise-free data [m, m, rad]."""
+_CHANGES = ("speed_m_s", "yaw_rate_rad_s")
 
 
 @dataclass(frozen=True)
@@ -43,12 +45,16 @@ class NominalModel:
     all windows."""
     slope: float | None = None
     """Root mean square slope of the ground on which the robot was commissioned [rad]; None if unknown."""
+    changes: np.ndarray | None = None
+    """Changes of speed [m/s] and of yaw rate [rad/s] that commissioning covered, ``[2]`` (:mod:`command_changes`);
+    None: all."""
 
     def residual_in(self, data: EvidenceWindows) -> np.ndarray:
         """RMS residual of the healthy robot in each window, ``[W, K, 3]`` [m, m, rad]."""
-        if self.terms is None:
-            return np.broadcast_to(self.residual, (len(data.starts), *self.residual.shape))
-        return np.sqrt(np.einsum("wkj,cj->wkc", motion_terms(data), self.terms))
+        residual = np.broadcast_to(self.residual, (len(data.starts), *self.residual.shape))
+        if self.terms is not None:
+            residual = np.sqrt(np.einsum("wkj,cj->wkc", motion_terms(data), self.terms))
+        return residual if self.changes is None else np.hypot(residual, uncovered_residual(data, self.changes))
 
     def scale_in(self, data: EvidenceWindows) -> np.ndarray:
         """Unit of ``variation`` in each window, ``[W, K, 3]`` [m, m, rad]."""
@@ -92,6 +98,9 @@ class NominalModel:
             "loss_spread": float(f"{self.loss_spread:.4g}"),
         } | ({} if self.terms is None else {"residual_terms": self._named_terms()}) | (
             {} if self.slope is None else {"slope_rad": float(f"{self.slope:.3g}")}
+        ) | (
+            {} if self.changes is None else
+            {"command_changes": {key: float(f"{value:.3g}") for key, value in zip(_CHANGES, self.changes, strict=True)}}
         )  # fmt: skip
 
     def _named_terms(self) -> dict[str, dict[str, float]]:
@@ -123,6 +132,8 @@ class NominalModel:
             terms = None
             if named is not None:
                 terms = np.array([[float(named[component][term]) for term in TERMS] for component in COMPONENTS])
+            covered = entry.get("command_changes")
+            changes = None if covered is None else np.array([float(covered[key]) for key in _CHANGES])
         except (KeyError, TypeError, ValueError) as error:
             raise RobotFileError(f"{robot_file(robot)}: commissioning: expected numbers, got {error!r}") from error
         values = [*variation.values(), *numbers]
@@ -141,7 +152,15 @@ class NominalModel:
                 f"{robot_file(robot)}: commissioning.residual_terms: expected finite numbers of 0 or more; commission "
                 "the robot again"
             )
-        return cls(residual, variation, segments, loss=numbers[0], loss_spread=numbers[1], terms=terms, slope=slope)
+        if changes is not None and not (np.isfinite(changes).all() and (changes >= 0).all()):
+            raise RobotFileError(
+                f"{robot_file(robot)}: commissioning.command_changes: expected finite numbers of 0 or more; commission "
+                "the robot again"
+            )
+        return cls(
+            residual, variation, segments, loss=numbers[0], loss_spread=numbers[1], terms=terms, slope=slope,
+            changes=changes,
+        )  # fmt: skip
 
 
 def _coefficients(name: str) -> int:
