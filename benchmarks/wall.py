@@ -12,7 +12,8 @@ only if the predicted friction is low.
 
 draws walls and posts of any texture and colour, 0.15 to 1.2 m high and 0.6 to 6 m away, and soft vegetation that looks
 like a wall, and reports precision, recall and the stopping position. The robot is commanded to drive straight ahead for
-eight seconds. Without --monoforce it tests the shipped encoder.
+eight seconds. Without --monoforce it tests the shipped encoder, or that of --encoder, with images, with a lidar sweep and
+with both.
 
 The table in docs/training.md uses seeds from 70000 on. The thresholds of encoder/edges.py and the average of encoders
 were tuned on seeds 80000 to 80031; seeds 93000 to 93031 are held out.
@@ -208,7 +209,12 @@ def run_any(options: argparse.Namespace, titles: dict[str, str]) -> None:
         if getattr(options, key)
     }
     if not sources:
-        sources["shipped encoder"] = EncoderTerrain(fused(load_encoder("", "camera")), robot)
+        name = "this encoder" if options.encoder else "shipped encoder"
+        encoder = fused(load_encoder(options.encoder, "camera"))
+        taken = encoder.config.sensor.split("_")
+        for title, sensors in (("images", ("camera",)), ("a sweep", ("lidar",)), ("both", ("camera", "lidar"))):
+            if all(sensor in taken for sensor in sensors):
+                sources[f"{name}, {title}"] = EncoderTerrain(encoder, robot, sensors)
     sources[titles["lidar"]] = LidarTerrain(robot, Grid.square(), TerrainDefaults())
     rows = []
     for title, source in sources.items():
@@ -241,6 +247,9 @@ def main() -> None:
     }  # fmt: skip
     for key in ("monoforce", "no_geometric", "lss"):
         parser.add_argument(f"--{key.replace('_', '-')}", type=Path, metavar="FILE.safetensors")
+    parser.add_argument(
+        "--encoder", default="", metavar="FILE", help="with --any-texture: another one than the shipped"
+    )
     parser.add_argument("--robot", default="husky", help="name or file (default: %(default)s)")
     parser.add_argument("--any-texture", action="store_true", help="walls, posts and vegetation of any texture")
     parser.add_argument("--quick", action="store_true", help="with --any-texture: 16 scenes instead of 80")

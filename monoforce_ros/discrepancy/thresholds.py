@@ -25,8 +25,8 @@ class Thresholds:
             (``benchmarks/platforms/null_rates.py``: root mean square about the commissioning drive).
         drive_share: variance of an effect's influence between healthy drives of one robot, as a share of that between
             segments of its commissioning drive: of 0, 0.1, 0.25, 0.5, 0.8 and 1.25 the smallest at which these drives
-            show an effect no more often than at ``effect_rate``: 6, 6, 6, 4, 3 and 3 of 50 (the same command), where
-            1.25 are stated, and 3 or more have a probability of 0.13.
+            show an effect no more often than at ``effect_rate``: 6, 5, 4, 1, 0 and 0 of 50 (the same command), where
+            1.25 are stated.
         calibration_degrees: degrees of freedom of these two: the number of platforms, for the two drives of each share
             a commissioning drive.
         model_error: error of an effect's formula as a share of what the effect changes, root mean square in any one
@@ -49,9 +49,9 @@ class Thresholds:
     confidence: float = 0.95
     draws: int = 400
     block: float = 4.0
-    drive_spread: float = 0.52
+    drive_spread: float = 0.35
     calibration_degrees: float = 25.0
-    drive_share: float = 0.8
+    drive_share: float = 0.5
     model_error: float = 0.15
     smallest_share: float = 0.05
     most_share: float = 0.5
