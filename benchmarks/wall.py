@@ -12,8 +12,8 @@ only if the predicted friction is low.
 
 draws walls and posts of any texture and colour, 0.15 to 1.2 m high and 0.6 to 6 m away, and soft vegetation that looks
 like a wall, and reports precision, recall and the stopping position. The robot is commanded to drive straight ahead for
-eight seconds. Without --monoforce it tests the shipped encoder, or that of --encoder, with images, with a lidar sweep and
-with both.
+eight seconds. Without --monoforce it tests the shipped encoder, or that of --encoder, with images, with a lidar sweep
+and with both.
 
 The table in docs/training.md uses seeds from 70000 on. The thresholds of encoder/edges.py and the average of encoders
 were tuned on seeds 80000 to 80031; seeds 93000 to 93031 are held out.

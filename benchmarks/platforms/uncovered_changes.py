@@ -2,7 +2,7 @@
 
     scripts/run.sh python benchmarks/platforms/uncovered_changes.py --work out/platforms --label LABEL
 
-For several values of the response time (``RESPONSE_TIME`` of ``discrepancy/command_changes.py``) it prints the spread of
+For several response times (``RESPONSE_TIME`` of ``discrepancy/command_changes.py``) it prints the spread of
 the logarithm of the loss ratio over the empty drives whose commands change harder than covered, and beside it that of
 the other empty drives. The value with the smallest spread is the one to choose.
 Needs recordings and commissioned platforms: run.py makes both.

@@ -2,7 +2,7 @@
 
 Limits of drives show in hard starts only: a motor with little torque follows a ramp and lags behind a step. A robot
 that was commissioned with gentle commands is not known to follow hard ones, whether it is healthy or not. Its motion
-there is uncertain by :data:`RESPONSE_TIME`, the time by which the response to such a change may differ from the model's.
+there is uncertain by :data:`RESPONSE_TIME`, the time by which it may respond earlier or later than the model.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _WORTH_SAYING = 0.5
 
 
 def largest_changes(data: EvidenceWindows) -> np.ndarray:
-    """Largest change of speed [m/s] and of yaw rate [rad/s] in 0.2 s, shortly before a window or since, ``[W, K, 2]``."""
+    """Largest changes of speed [m/s] and yaw rate [rad/s] in 0.2 s, shortly before a window or since, ``[W, K, 2]``."""
     commands = _commands(data)
     length = round(_WITHIN / _STEP)
     changes = np.zeros_like(commands)
@@ -46,9 +46,9 @@ def covered_changes(recordings: Sequence[EvidenceWindows]) -> np.ndarray:
 def uncovered_residual(data: EvidenceWindows, covered: np.ndarray) -> np.ndarray:
     """RMS residual of a healthy robot by changes harder than covered, ``[W, K, 3]`` [m, m, rad].
 
-    The robot is where it would be up to :data:`RESPONSE_TIME` earlier or later: along by the change of speed, in heading
-    by that of the yaw rate, and by the yaw rate itself where the speed changes. A heading error grows over the distance
-    into half of it across.
+    The robot is where it would be up to :data:`RESPONSE_TIME` earlier or later: along by the change of speed, in
+    heading by that of the yaw rate, and by the yaw rate itself where the speed changes. A heading error grows over the
+    distance into half of it across.
 
     Args:
         data: the windows.
