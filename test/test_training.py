@@ -161,10 +161,10 @@ def test_losses_are_means_over_measured_cells(recording):
     )
     elsewhere = off.geometric_height + torch.where(targets.observed, 0.0, 5.0)
     assert float(geometric_loss(replace(off, geometric_height=elsewhere), targets, batch.ground)) == float(whole)
-    loss = terrain_loss(maps_of(targets, decrease=torch.full_like(targets.supporting, 0.2)), targets)
+    loss = terrain_loss(maps_of(targets, decrease=torch.full_like(targets.supporting, 0.2)), targets, batch.ground)
     assert float(loss) == pytest.approx(0.2 - 0.025, abs=1e-4)
     nothing = replace(targets, contact_mask=torch.zeros_like(targets.contact_mask))
-    assert float(terrain_loss(maps_of(targets), nothing)) == 0.0
+    assert float(terrain_loss(maps_of(targets), nothing, batch.ground)) == 0.0
 
 
 def test_the_slope_loss_penalises_relative_height_errors(recording):

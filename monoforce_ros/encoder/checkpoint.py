@@ -69,8 +69,10 @@ def load_encoder(path: str | Path, sensor: str | None = None) -> Encoder:
         if file.stat().st_size > MAXIMUM_BYTES:
             raise CheckpointError(f"{file}: got {file.stat().st_size} bytes, expected at most {MAXIMUM_BYTES}")
     try:
-        # Files of the first format do not name it.
-        config = EncoderConfig(**({"format": 1} | json.loads(description.read_text(encoding="utf-8"))))
+        # Files of the first format do not name it, those of networks without scatter not their channels.
+        config = EncoderConfig(
+            **({"format": 1, "sweep_channels": 3} | json.loads(description.read_text(encoding="utf-8")))
+        )
     except (TypeError, ValueError) as error:
         raise CheckpointError(f"{description}: not an encoder configuration: {error}") from error
     if sensor is not None and sensor not in config.sensor.split("_"):

@@ -38,6 +38,9 @@ class EncoderConfig:
     relative_bins: int = 0
     """Number of bins of depth relative to level ground, as wide as those of depth, that add to them; 0 for none, as in
     the shipped encoder."""
+    sweep_channels: int = 5
+    """Features of a lidar sweep, see :func:`~monoforce_ros.encoder.sweep.sweep_features`: 5, or 3 (heights only) of
+    checkpoints that do not name it."""
     image_features: int = 32
     """Channels lifted into the map."""
     map_features: int = 24
@@ -74,6 +77,7 @@ class EncoderConfig:
             ("resolution", 0.01, 2.0),
             ("depth_bins", 2, 256),
             ("relative_bins", 0, 256),
+            ("sweep_channels", 3, 5),
             ("depth_minimum", 0.05, 20.0),
             ("depth_maximum", 0.5, 500.0),
             ("image_features", 1, 512),

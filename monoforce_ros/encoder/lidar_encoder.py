@@ -12,7 +12,7 @@ from torch import nn
 from monoforce_ros.encoder.birds_eye import BirdsEyeNetwork
 from monoforce_ros.encoder.config import EncoderConfig
 from monoforce_ros.encoder.heads import EncodedMaps, map_heads, maps_from_heads, terrain_maps
-from monoforce_ros.encoder.view import SUPPORT_CHANNELS, SWEEP_CHANNELS, CameraView, EncoderInput, encoder_input
+from monoforce_ros.encoder.view import SUPPORT_CHANNELS, CameraView, EncoderInput, encoder_input
 from monoforce_ros.terrain import TerrainMap
 
 
@@ -22,13 +22,14 @@ class LidarEncoder(nn.Module):
     def __init__(self, config: EncoderConfig):
         super().__init__()
         self.config = config
-        self.bird = BirdsEyeNetwork(SWEEP_CHANNELS + SUPPORT_CHANNELS, config.map_features)
+        self.bird = BirdsEyeNetwork(config.sweep_channels + SUPPORT_CHANNELS, config.map_features)
         self.heads = map_heads(config.map_features)
 
     @override
     def forward(self, batch: EncoderInput) -> EncodedMaps:
         """Predict maps from a batch with sweeps."""
-        outputs = self.heads(self.bird(torch.cat([batch.sweep, batch.support], dim=1))).float()
+        sweep = batch.sweep[:, : self.config.sweep_channels]
+        outputs = self.heads(self.bird(torch.cat([sweep, batch.support], dim=1))).float()
         hit = batch.sweep[:, 2]
         return maps_from_heads(outputs, batch, self.config, torch.ones_like(hit, dtype=torch.bool), hit)
 

@@ -16,7 +16,7 @@ from monoforce_ros.encoder.config import EncoderConfig
 from monoforce_ros.encoder.heads import EncodedMaps, map_heads, maps_from_heads, terrain_maps, with_edges
 from monoforce_ros.encoder.image_context import ImageContext, resized
 from monoforce_ros.encoder.lift import depth_values, lifted_points, map_cells, splat
-from monoforce_ros.encoder.view import SUPPORT_CHANNELS, SWEEP_CHANNELS, CameraView, EncoderInput, encoder_input
+from monoforce_ros.encoder.view import SUPPORT_CHANNELS, CameraView, EncoderInput, encoder_input
 from monoforce_ros.terrain import TerrainMap
 
 _GEOMETRY_CHANNELS = 5
@@ -61,7 +61,9 @@ class TerrainEncoder(nn.Module):
             nn.init.zeros_(self.relative.weight)
             assert self.relative.bias is not None
             nn.init.zeros_(self.relative.bias)
-        inputs = config.image_features + MOMENTS + SUPPORT_CHANNELS + (SWEEP_CHANNELS if config.takes_sweeps else 0)
+        inputs = (
+            config.image_features + MOMENTS + SUPPORT_CHANNELS + (config.sweep_channels if config.takes_sweeps else 0)
+        )
         self.bird = BirdsEyeNetwork(inputs, config.map_features)
         self.heads = map_heads(config.map_features)
         depths = torch.from_numpy(depth_values(config)).float()
@@ -115,7 +117,7 @@ class TerrainEncoder(nn.Module):
             covered, evidence, depth = torch.zeros(shape, dtype=torch.bool, device=device), None, None
         parts = [image_features, batch.support]
         if config.takes_sweeps:
-            parts.append(batch.sweep)
+            parts.append(batch.sweep[:, : config.sweep_channels])
         features = torch.cat([part.to(image_features.dtype) for part in parts], dim=1).to(self.lift.weight.dtype)
         if not features.is_cuda:
             features = features.contiguous(memory_format=torch.channels_last)

@@ -13,6 +13,7 @@ from torch import Tensor
 from monoforce_ros.core import CameraModel
 from monoforce_ros.encoder.config import EncoderConfig
 from monoforce_ros.encoder.lift import feature_rays
+from monoforce_ros.encoder.sweep import HEIGHT_CHANNELS, SWEEP_CHANNELS, cell_extremes, sweep_features
 from monoforce_ros.terrain import Grid
 
 _EMPTY = 127
@@ -24,8 +25,8 @@ _STEEPEST = 1.5
 """Limit of the plane's height relative to the robot's ground, as an input [m]."""
 
 
-SUPPORT_CHANNELS, SWEEP_CHANNELS = 4, 3
-"""Channels of :attr:`EncoderInput.support` and of :attr:`EncoderInput.sweep`."""
+SUPPORT_CHANNELS = 4
+"""Channels of :attr:`EncoderInput.support`."""
 
 
 @dataclass(frozen=True)
@@ -73,8 +74,8 @@ class EncoderInput:
     ground: Tensor
     """Height of the ground under the robot in its terrain frame ``[B]`` [m]."""
     sweep: Tensor
-    """Lowest and highest lidar hit of each cell relative to ``ground`` [m], and the hit mask, all 0 without a sweep;
-    ``[B, 3, rows, columns]``."""
+    """Features of the lidar sweep, see :func:`~monoforce_ros.encoder.sweep.sweep_features`, all 0 without one;
+    ``[B, 5, rows, columns]``."""
 
     @property
     def maps(self) -> int:
@@ -138,9 +139,11 @@ def assemble(
     """Input for one map from images at the network's size ``[height, width, 3]``, their rays ``[rows, columns, 3]``
     (NaN where there is no image) and origins ``[3]``; see :func:`encoder_input`."""
     ground, plane, near = support_plane(support, config.grid)
-    nothing = np.zeros((3, *plane.shape))
-    hits = nothing if sweep is None or not config.takes_sweeps else sweep_heights(sweep, ground, config)
-    traced = nothing if trace is None or not len(trace) else sweep_heights(trace, ground, config)
+    hits, traced = np.zeros((SWEEP_CHANNELS, *plane.shape)), np.zeros((HEIGHT_CHANNELS, *plane.shape))
+    if sweep is not None and config.takes_sweeps:
+        hits = sweep_features(sweep, ground, config)
+    if trace is not None and len(trace):
+        traced = cell_extremes(trace, ground, config)
     count = len(images)
     size = (count, config.image_height, config.image_width, 3)
     pixels = np.stack(images) if count else np.zeros(size, np.uint8)
@@ -160,21 +163,6 @@ def assemble(
         ground=torch.tensor([ground], dtype=torch.float32),
         sweep=torch.as_tensor(hits[None], dtype=torch.float32),
     )
-
-
-def sweep_heights(points: np.ndarray, ground: float, config: EncoderConfig) -> np.ndarray:
-    """Lowest and highest hit of each cell relative to ``ground`` [m], 0 without a hit, and the hit mask; ``[3, …]``."""
-    grid = config.grid
-    heights = points[:, 2] - ground
-    rows, columns, inside = grid.cells(points[:, :2])
-    inside &= (heights > config.lowest) & (heights < config.highest)
-    flat, heights = (rows * grid.columns + columns)[inside], heights[inside]
-    low, high = np.full(grid.rows * grid.columns, np.inf), np.full(grid.rows * grid.columns, -np.inf)
-    np.minimum.at(low, flat, heights)
-    np.maximum.at(high, flat, heights)
-    hit = np.isfinite(low)
-    stacked = np.stack([np.where(hit, low, 0.0), np.where(hit, high, 0.0), hit])
-    return stacked.reshape(3, grid.rows, grid.columns)
 
 
 def network_image(image: np.ndarray, config: EncoderConfig) -> np.ndarray:

@@ -80,9 +80,16 @@ def geometric_loss(
     return _huber(maps.geometric_height, measured, weight)
 
 
-def terrain_loss(maps: EncodedMaps, targets: Targets) -> Tensor:
-    """First part of equation 3 averaged over the contact mask, with a Huber instead of a squared loss."""
-    return _huber(maps.height, targets.supporting, targets.contact_mask * _view_weight(maps))
+def terrain_loss(
+    maps: EncodedMaps, targets: Targets, ground: Tensor, prominence: float = LossWeights.prominence
+) -> Tensor:
+    """First part of equation 3 averaged over the contact mask, with a Huber instead of a squared loss.
+
+    Prominent cells weigh more, as in :func:`geometric_loss`: whether they are firm or soft concerns few cells, and half
+    of their height is a cheap answer.
+    """
+    weight = targets.contact_mask * _view_weight(maps) * (1.0 + prominence * _prominence(targets, ground))
+    return _huber(maps.height, targets.supporting, weight)
 
 
 def slope_loss(maps: EncodedMaps, targets: Targets, resolution: float) -> Tensor:

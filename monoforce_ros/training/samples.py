@@ -18,6 +18,10 @@ from monoforce_ros.training.recording_samples import RecordingSamples, Segment
 MIRROR = np.diag([1.0, -1.0, 1.0])
 
 
+_LARGEST_NOISE = 0.03
+"""Standard deviation of the ranges of common lidars (data sheets of spinning ones: up to ±3 cm) [m]."""
+
+
 @dataclass(frozen=True)
 class Augmentation:
     """Data augmentation of a sample that stays consistent with the calibration.
@@ -48,6 +52,8 @@ class Augmentation:
     """Whether the images show nothing: their pixels are replaced by one colour or by noise."""
     sweep_share: float = 1.0
     """Share of the sweep's points that is kept; 0 for no sweep."""
+    sweep_noise: float = 0.0
+    """Standard deviation of ranges beyond that of the recording [m]: lidars differ."""
     sweep_seed: int = 0
     traced: bool = True
     """Whether the ground that the robot drove over is known."""
@@ -116,12 +122,15 @@ class Augmentation:
         return camera >= len(self.cameras) or self.cameras[camera] <= self.camera_share
 
     def thinned(self, points: np.ndarray, sensor: np.ndarray) -> np.ndarray:
-        """The kept points ``[n, 3]`` of a sweep that was measured from ``sensor`` ``[3]``: some rings, and some points
-        of each."""
+        """Kept points ``[n, 3]`` of a sweep measured from ``sensor`` ``[3]``, with noise: some rings, some points of
+        each."""
         if self.sweep_share >= 1.0 or not len(points):
             return points
         random = np.random.default_rng(self.sweep_seed)
         offset = points - sensor
+        distance = np.linalg.norm(offset, axis=1, keepdims=True)
+        noise = self.sweep_noise * random.standard_normal((len(points), 1))
+        points = points + offset / np.maximum(distance, 0.1) * noise
         elevation = np.degrees(np.arctan2(offset[:, 2], np.hypot(offset[:, 0], offset[:, 1])))
         # Lidars have rings 1 to 8 degrees apart, or points without such an order.
         spacing, phase = random.uniform(1.0, 8.0), random.uniform(0.0, 1.0)
@@ -145,6 +154,7 @@ def _drawn_sensors(random: np.random.Generator) -> dict[str, Any]:
         "camera_share": share if random.uniform() < 0.7 else min(share, random.uniform(0.2, 1.0)),
         "blank": bool(random.uniform() < 0.06),
         "sweep_share": 0.0 if kind == "images" else random.uniform(0.2, 1.0),
+        "sweep_noise": random.uniform(0.0, _LARGEST_NOISE),
         "sweep_seed": int(random.integers(2**31)),
         "traced": bool(random.uniform() < 0.5),
     }

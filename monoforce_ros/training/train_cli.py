@@ -14,6 +14,7 @@ from typing import override
 
 import numpy as np
 import torch
+from torch.nn import functional
 
 from monoforce_ros.bags import BagError, add_read_options, read_options
 from monoforce_ros.core import OptionParser, write_text
@@ -390,13 +391,19 @@ def _encoder(options: argparse.Namespace, config: EncoderConfig) -> Encoder:
         free = {"decreases", "edges", "geometric_spread_factor", "decrease_spread_factor"}
         if isinstance(encoder, TerrainEncoder) and not encoder.config.relative_bins:
             free.add("relative_bins")
+        if isinstance(encoder, TerrainEncoder):
+            free.add("sweep_channels")
         names = [n for n in expected if n not in free and expected[n] != found[n]]
         if names:
             differences = "; ".join(f"{name}: got {found[name]}, expected {expected[name]}" for name in names)
             raise CheckpointError(f"{options.start_from}: configuration differs from the options: {differences}")
         fresh = new_encoder(config)
-        # Bins of relative depth that the checkpoint lacks add nothing until they are trained.
-        fresh.load_state_dict(fresh.state_dict() | encoder.state_dict())
+        # Bins of relative depth and features of a sweep that the checkpoint lacks add nothing until they are trained.
+        weights = encoder.state_dict()
+        first = "bird.enter.0.weight"
+        lacking = fresh.state_dict()[first].shape[1] - weights[first].shape[1]
+        weights[first] = functional.pad(weights[first], (0, 0, 0, 0, 0, lacking))
+        fresh.load_state_dict(fresh.state_dict() | weights)
         return fresh
     encoder = new_encoder(config)
     if isinstance(encoder, TerrainEncoder) and options.backbone_weights == "imagenet":

@@ -141,7 +141,7 @@ class _Losses(nn.Module):
         if weights.geometric:
             losses["geometric"] = weights.geometric * geometric_loss(maps, targets, batch.ground, weights.prominence)
         if weights.terrain:
-            losses["terrain"] = weights.terrain * terrain_loss(maps, targets)
+            losses["terrain"] = weights.terrain * terrain_loss(maps, targets, batch.ground, weights.prominence)
             losses["slope"] = weights.slope * slope_loss(maps, targets, self.encoder.config.resolution)
         if weights.trajectory:
             losses["trajectory"] = weights.trajectory * trajectory_loss(
@@ -357,7 +357,9 @@ def validate(encoder: Encoder, recordings: Sequence[RecordingSamples], device: t
             measured = (targets.geometric - ground).clamp(LOWEST, HIGHEST) + ground
             geometric.append((maps.geometric_height - measured).abs()[targets.observed & maps.covered].cpu())
             supporting.append((maps.height - targets.supporting).abs()[targets.contact_mask & maps.covered].cpu())
-            losses.append(float(terrain_loss(maps, targets) + geometric_loss(maps, targets, batch.ground)))
+            losses.append(
+                float(terrain_loss(maps, targets, batch.ground) + geometric_loss(maps, targets, batch.ground))
+            )
 
     def median(parts: list[Tensor]) -> float:
         values = torch.cat(parts)

@@ -65,8 +65,8 @@ def read_state(file: Path, encoder: Encoder, optimiser: torch.optim.Optimizer, s
         raise TrainingError(f"{file}: damaged ({error}); delete {file.parent} to start over") from error
     expected, saved = json.loads(json.dumps(settings)), _renamed(description["settings"])
     different = [name for name, value in expected.items() if saved.get(name) != value]
-    # States of earlier releases do not name bins of relative depth.
-    if {"relative_bins": 0} | description["config"] != asdict(encoder.config):
+    # States of earlier releases do not name bins of relative depth, nor the channels of a sweep.
+    if {"relative_bins": 0, "sweep_channels": 3} | description["config"] != asdict(encoder.config):
         different.append("network configuration")
     if different:
         raise TrainingError(

@@ -1,0 +1,84 @@
+"""Sweep: lidar points as network input, by cell of the map."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from monoforce_ros.encoder.config import EncoderConfig
+from monoforce_ros.terrain import Grid
+
+HEIGHT_CHANNELS = 3
+"""Of :func:`cell_extremes`."""
+SWEEP_CHANNELS = 5
+"""Of :func:`sweep_features`."""
+_REACH = 0.25
+"""Half-width of the square around a cell whose points tell a surface from leaves [m]: as deep as a lidar sees into a
+hedge."""
+_UPPER = 0.1
+"""Height over the lowest point of the square from which a point counts [m]: the ground before a wall is none of it."""
+_SCATTER_UNIT = 0.1
+"""Unit of the scatter as an input [m]."""
+_FEWEST = 3
+"""Points that have a scatter."""
+
+
+def cell_extremes(points: np.ndarray, ground: float, config: EncoderConfig) -> np.ndarray:
+    """Lowest and highest point of each cell relative to ``ground`` [m], 0 without a point, and the mask of cells with
+    points; ``[3, rows, columns]``."""
+    grid = config.grid
+    flat, heights, _ = _placed(points, ground, config)
+    low, high = np.full(grid.rows * grid.columns, np.inf), np.full(grid.rows * grid.columns, -np.inf)
+    np.minimum.at(low, flat, heights)
+    np.maximum.at(high, flat, heights)
+    hit = np.isfinite(low)
+    stacked = np.stack([np.where(hit, low, 0.0), np.where(hit, high, 0.0), hit])
+    return stacked.reshape(HEIGHT_CHANNELS, grid.rows, grid.columns)
+
+
+def sweep_features(points: np.ndarray, ground: float, config: EncoderConfig) -> np.ndarray:
+    """Features of a sweep ``[5, rows, columns]``: :func:`cell_extremes`, scatter and number of the upper points nearby.
+
+    Leaves return a lidar's pulses from various depths, a wall from one plane, whatever they look like. The scatter is
+    the standard deviation of points along the horizontal direction in which they vary least: millimetres on walls,
+    posts and trunks, decimetres in vegetation (Lalonde et al., "Natural terrain classification using three-dimensional
+    ladar data for ground robot mobility", 2006, distinguish them so in three dimensions).
+
+    Args:
+        points: ``[n, 3]`` in the terrain frame [m].
+        ground: height of the ground under the robot [m].
+        config: configuration of the encoder.
+    """
+    grid = config.grid
+    extremes = cell_extremes(points, ground, config)
+    flat, heights, inside = _placed(points, ground, config)
+    hit_or_above = np.where(extremes[2] > 0, extremes[0], np.inf).astype(np.float32)
+    reach = max(1, round(_REACH / grid.resolution))
+    window = (2 * reach + 1, 2 * reach + 1)
+    lowest = cv2.erode(hit_or_above, np.ones(window, np.uint8), borderValue=np.inf).ravel()
+    upper = heights > lowest[flat] + _UPPER
+    flat = flat[upper]
+    # Relative to the map's centre, so that sums of squares keep their digits.
+    x, y = points[inside, :2][upper].T
+    sums = [_summed(flat, values, window, grid) for values in (np.ones_like(x), x, y, x * x, y * y, x * y)]
+    count = sums[0]
+    mean_x, mean_y, xx, yy, xy = (values / np.maximum(count, 1.0) for values in sums[1:])
+    xx, yy, xy = xx - mean_x**2, yy - mean_y**2, xy - mean_x * mean_y
+    least = 0.5 * (xx + yy) - np.hypot(0.5 * (xx - yy), xy)
+    scatter = np.where(count >= _FEWEST, np.sqrt(np.maximum(least, 0.0)), 0.0) / _SCATTER_UNIT
+    return np.concatenate([extremes, [scatter, np.log1p(count)]])
+
+
+def _placed(points: np.ndarray, ground: float, config: EncoderConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cells and heights of the points on the map, and the mask of these points."""
+    grid = config.grid
+    heights = points[:, 2] - ground
+    rows, columns, inside = grid.cells(points[:, :2])
+    inside &= (heights > config.lowest) & (heights < config.highest)
+    return (rows * grid.columns + columns)[inside], heights[inside], inside
+
+
+def _summed(flat: np.ndarray, values: np.ndarray, window: tuple[int, int], grid: Grid) -> np.ndarray:
+    """Sums over squares of cells, ``[rows, columns]``."""
+    cells = np.bincount(flat, values, grid.rows * grid.columns).reshape(grid.rows, grid.columns)
+    return cv2.boxFilter(cells, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
