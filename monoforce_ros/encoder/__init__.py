@@ -1,7 +1,15 @@
 """Terrain encoders: camera images → terrain map by lift-splat-shoot (paper III-A), and lidar sweep → dense map."""
 
 from monoforce_ros.encoder.backbone import WeightsError
-from monoforce_ros.encoder.checkpoint import CheckpointError, Encoder, averaged, load_encoder, new_encoder, save_encoder
+from monoforce_ros.encoder.checkpoint import (
+    CheckpointError,
+    Encoder,
+    averaged,
+    extended,
+    load_encoder,
+    new_encoder,
+    save_encoder,
+)
 from monoforce_ros.encoder.config import SENSORS, EncoderConfig
 from monoforce_ros.encoder.heads import EncodedMaps
 from monoforce_ros.encoder.inference import fused, multiplies_bfloat16, packed
@@ -24,6 +32,7 @@ __all__ = [
     "assemble",
     "averaged",
     "encoder_input",
+    "extended",
     "feature_rays",
     "fused",
     "letterbox",

@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
+from torch.nn import functional
 
 from monoforce_ros.core import atomic_path, share_directory, write_text
 from monoforce_ros.encoder.config import EncoderConfig
@@ -88,6 +89,21 @@ def load_encoder(path: str | Path, sensor: str | None = None) -> Encoder:
     if any(not value.isfinite().all() for value in weights.values() if value.is_floating_point()):
         raise CheckpointError(f"{path}: some weights are not finite; the training that wrote it diverged")
     return encoder.eval()
+
+
+def extended(encoder: Encoder, config: EncoderConfig) -> Encoder:
+    """An encoder of ``config`` with the weights of another one.
+
+    Bins of relative depth and features of a sweep that the other one lacks add nothing until they are trained; all else
+    in the configurations that determines weights must be equal.
+    """
+    fresh = new_encoder(config)
+    weights, own = encoder.state_dict(), fresh.state_dict()
+    first = "bird.enter.0.weight"
+    # The sweep's features are the last inputs.
+    weights[first] = functional.pad(weights[first], (0, 0, 0, 0, 0, own[first].shape[1] - weights[first].shape[1]))
+    fresh.load_state_dict(own | weights)
+    return fresh
 
 
 def averaged(paths: Sequence[str | Path], shares: Sequence[float]) -> Encoder:

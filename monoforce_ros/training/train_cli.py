@@ -14,7 +14,6 @@ from typing import override
 
 import numpy as np
 import torch
-from torch.nn import functional
 
 from monoforce_ros.bags import BagError, add_read_options, read_options
 from monoforce_ros.core import OptionParser, write_text
@@ -25,6 +24,7 @@ from monoforce_ros.encoder import (
     EncoderConfig,
     TerrainEncoder,
     WeightsError,
+    extended,
     load_encoder,
     new_encoder,
     save_encoder,
@@ -397,14 +397,7 @@ def _encoder(options: argparse.Namespace, config: EncoderConfig) -> Encoder:
         if names:
             differences = "; ".join(f"{name}: got {found[name]}, expected {expected[name]}" for name in names)
             raise CheckpointError(f"{options.start_from}: configuration differs from the options: {differences}")
-        fresh = new_encoder(config)
-        # Bins of relative depth and features of a sweep that the checkpoint lacks add nothing until they are trained.
-        weights = encoder.state_dict()
-        first = "bird.enter.0.weight"
-        lacking = fresh.state_dict()[first].shape[1] - weights[first].shape[1]
-        weights[first] = functional.pad(weights[first], (0, 0, 0, 0, 0, lacking))
-        fresh.load_state_dict(fresh.state_dict() | weights)
-        return fresh
+        return extended(encoder, config)
     encoder = new_encoder(config)
     if isinstance(encoder, TerrainEncoder) and options.backbone_weights == "imagenet":
         encoder.backbone.load_imagenet()

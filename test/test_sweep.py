@@ -1,0 +1,92 @@
+"""How lidar points scatter tells walls from leaves, whatever the lidar and the direction."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from monoforce_ros.encoder import EncoderConfig, extended, load_encoder, new_encoder, save_encoder
+from monoforce_ros.encoder.sweep import SWEEP_CHANNELS, cell_extremes, sweep_features
+
+CONFIG = EncoderConfig(sensor="lidar")
+
+
+def turned(points: np.ndarray, angle: float) -> np.ndarray:
+    cosine, sine = math.cos(angle), math.sin(angle)
+    return points @ np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+
+
+def ground_and(points: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """Points of level ground around the origin, and others."""
+    level = np.c_[random.uniform(-5.0, 5.0, (4000, 2)), random.normal(0.0, 0.01, 4000)]
+    return np.r_[level, points]
+
+
+def scatter_at(points: np.ndarray, place: np.ndarray) -> float:
+    """Median scatter [m] in cells within 0.2 m of a place."""
+    features = sweep_features(points, 0.0, CONFIG)
+    x, y = np.meshgrid(CONFIG.grid.x, CONFIG.grid.y)
+    near = np.hypot(x - place[0], y - place[1]) < 0.2
+    assert (features[4][near] > math.log(3.0)).any()
+    return 0.1 * float(np.median(features[3][near & (features[4] > math.log(3.0))]))
+
+
+@pytest.mark.parametrize("noise", [0.008, 0.03])
+@pytest.mark.parametrize("count", [12, 200])
+def test_walls_scatter_less_than_leaves(noise, count):
+    random = np.random.default_rng(3)
+    found = []
+    for angle in np.linspace(0.0, 2 * math.pi, 12):
+        sides, heights = random.uniform(-0.25, 0.25, count), random.uniform(0.15, 0.8, count)
+        wall = np.c_[3.0 + noise * random.standard_normal(count), sides, heights]
+        leaves = np.c_[3.0 + random.uniform(0.0, 0.5, count), sides, heights]
+        place = turned(np.array([[3.0, 0.0, 0.0]]), angle)[0]
+        found.append([scatter_at(ground_and(turned(p, angle), random), place) for p in (wall, leaves)])
+    firm, soft = np.array(found).T
+    # As much as the lidar's own noise, and decimetres; few points of leaves may happen to lie on a line.
+    assert firm.max() < 1.6 * noise
+    assert np.median(soft) > 0.06 and np.median(soft) > 2.0 * np.median(firm)
+
+
+def test_the_ground_before_a_wall_does_not_scatter():
+    random = np.random.default_rng(5)
+    points = ground_and(np.zeros((0, 3)), random)
+    features = sweep_features(points, 0.0, CONFIG)
+    assert not features[3:].any()
+    np.testing.assert_array_equal(features[:3], cell_extremes(points, 0.0, CONFIG))
+    assert features.shape == (SWEEP_CHANNELS, CONFIG.grid.rows, CONFIG.grid.columns)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 300), st.floats(-1e6, 1e6), st.integers(0, 2**32 - 1))
+def test_any_points_give_finite_features(count, offset, seed):
+    random = np.random.default_rng(seed)
+    points = random.uniform(-8.0, 8.0, (count, 3)) + np.array([0.0, 0.0, offset])
+    features = sweep_features(points, offset, CONFIG)
+    assert np.isfinite(features).all() and (features[3] >= 0.0).all() and features[3].max() < 6.0
+
+
+def test_checkpoints_without_scatter_predict_as_before_and_can_be_trained_further(tmp_path):
+    torch.manual_seed(1)
+    old = new_encoder(EncoderConfig(sensor="camera_lidar", sweep_channels=3, map_features=8))
+    with torch.no_grad():
+        for parameter in old.heads.parameters():
+            parameter.normal_(0.0, 0.1)
+    file = tmp_path / "old.safetensors"
+    save_encoder(old, file)
+    # Files of networks without scatter do not name the channels.
+    description = file.with_suffix(".json")
+    description.write_text(description.read_text().replace('"sweep_channels": 3,', ""))
+    assert load_encoder(file).config.sweep_channels == 3
+    wider = extended(load_encoder(file), EncoderConfig(sensor="camera_lidar", map_features=8))
+    assert wider.config.sweep_channels == SWEEP_CHANNELS
+    random = np.random.default_rng(2)
+    points = np.c_[random.uniform(-6.0, 6.0, (500, 2)), random.uniform(0.0, 1.0, 500)]
+    before, after = (encoder.eval().terrain([], sweep=points).height for encoder in (load_encoder(file), wider))
+    assert before.std() > 0.0
+    torch.testing.assert_close(before, after, rtol=0.0, atol=1e-6)
