@@ -57,7 +57,8 @@ def test_the_ground_before_a_wall_does_not_scatter():
     random = np.random.default_rng(5)
     points = ground_and(np.zeros((0, 3)), random)
     features = sweep_features(points, 0.0, CONFIG)
-    assert not features[3:].any()
+    assert not features[3:5].any()
+    assert (features[6] == features[2]).all() and (features[5] == features[1]).all()
     np.testing.assert_array_equal(features[:3], cell_extremes(points, 0.0, CONFIG))
     assert features.shape == (SWEEP_CHANNELS, CONFIG.grid.rows, CONFIG.grid.columns)
 
@@ -86,7 +87,21 @@ def test_checkpoints_without_scatter_predict_as_before_and_can_be_trained_furthe
     wider = extended(load_encoder(file), EncoderConfig(sensor="camera_lidar", map_features=8))
     assert wider.config.sweep_channels == SWEEP_CHANNELS
     random = np.random.default_rng(2)
-    points = np.c_[random.uniform(-6.0, 6.0, (500, 2)), random.uniform(0.0, 1.0, 500)]
-    before, after = (encoder.eval().terrain([], sweep=points).height for encoder in (load_encoder(file), wider))
+    support = np.array([[0.3, 0.3, 0.1], [0.3, -0.3, 0.0], [-0.3, 0.3, 0.1], [-0.3, -0.3, 0.0]])
+    trace = np.c_[random.uniform(-6.0, 6.0, (500, 2)), random.uniform(0.0, 1.0, 500)]
+    before, after = (e.eval().terrain([], support, trace=trace).height for e in (load_encoder(file), wider))
     assert before.std() > 0.0
     torch.testing.assert_close(before, after, rtol=0.0, atol=1e-6)
+
+
+def test_an_untrained_encoder_predicts_what_the_sweep_measured(tmp_path):
+    random = np.random.default_rng(4)
+    wall = np.c_[np.full(300, 3.0), random.uniform(-1.0, 1.0, 300), random.uniform(0.0, 0.8, 300)]
+    crown = np.c_[random.uniform(-3.5, -3.0, 200), random.uniform(-0.5, 0.5, 200), random.uniform(2.0, 2.5, 200)]
+    encoder = new_encoder(EncoderConfig(sensor="lidar", map_features=8)).eval()
+    found = encoder.terrain([], sweep=ground_and(np.r_[wall, crown], random))
+    height, grid = found.geometric_height.numpy(), found.grid
+    at = lambda x, y: height[int(np.argmin(abs(grid.y - y))), int(np.argmin(abs(grid.x - x)))]  # noqa: E731
+    # A step of one cell, and no wall below branches.
+    assert at(3.04, 0.04) > 0.6 and abs(at(2.84, 0.04)) < 0.05 and abs(at(3.24, 0.04)) < 0.05
+    assert abs(at(-3.24, 0.04)) < 0.05

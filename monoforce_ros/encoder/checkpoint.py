@@ -94,8 +94,9 @@ def load_encoder(path: str | Path, sensor: str | None = None) -> Encoder:
 def extended(encoder: Encoder, config: EncoderConfig) -> Encoder:
     """An encoder of ``config`` with the weights of another one.
 
-    Bins of relative depth and features of a sweep that the other one lacks add nothing until they are trained; all else
-    in the configurations that determines weights must be equal.
+    Bins of relative depth and features of a sweep that the other one lacks add nothing until they are trained. With
+    them heights correct what a sweep measured instead of the ground that carries the robot, which has to be trained,
+    too; without a sweep predictions stay as they were. All else that determines weights must be equal.
     """
     fresh = new_encoder(config)
     weights, own = encoder.state_dict(), fresh.state_dict()

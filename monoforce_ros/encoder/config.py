@@ -38,8 +38,8 @@ class EncoderConfig:
     relative_bins: int = 0
     """Number of bins of depth relative to level ground, as wide as those of depth, that add to them; 0 for none, as in
     the shipped encoder."""
-    sweep_channels: int = 5
-    """Features of a lidar sweep, see :func:`~monoforce_ros.encoder.sweep.sweep_features`: 5, or 3 (heights only) of
+    sweep_channels: int = 7
+    """Features of a lidar sweep, see :func:`~monoforce_ros.encoder.sweep.sweep_features`: 7, or 3 (heights only) of
     checkpoints that do not name it."""
     image_features: int = 32
     """Channels lifted into the map."""
@@ -77,7 +77,6 @@ class EncoderConfig:
             ("resolution", 0.01, 2.0),
             ("depth_bins", 2, 256),
             ("relative_bins", 0, 256),
-            ("sweep_channels", 3, 5),
             ("depth_minimum", 0.05, 20.0),
             ("depth_maximum", 0.5, 500.0),
             ("image_features", 1, 512),
@@ -88,6 +87,8 @@ class EncoderConfig:
             value = getattr(self, name)
             if not isinstance(value, int | float) or isinstance(value, bool) or not low <= value <= high:
                 raise ValueError(f"encoder {name}: got {value!r}, expected {low} to {high}")
+        if self.sweep_channels not in (3, 7):
+            raise ValueError(f"encoder sweep_channels: got {self.sweep_channels!r}, expected 3 or 7")
         for name in ("decreases", "edges"):
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"encoder {name}: got {getattr(self, name)!r}, expected true or false")

@@ -80,11 +80,11 @@ def maps_from_heads(
 ) -> EncodedMaps:
     """Heights, spreads and material from the outputs of the heads ``[B, 7, rows, columns]``, each within its bounds.
 
-    H_g is a correction to the ground that carries the robot (:attr:`EncoderInput.anchor`).
+    H_g is a correction to the ground that carries the robot, or to what a sweep measured (:meth:`EncoderInput.anchor`).
     """
     geometric, decrease, stiffness, damping, friction, geometric_spread, decrease_spread = outputs.unbind(1)
     return EncodedMaps(
-        geometric_height=geometric + batch.anchor + batch.ground[:, None, None],
+        geometric_height=geometric + batch.anchor(config) + batch.ground[:, None, None],
         decrease=functional.softplus(decrease, beta=_SOFTPLUS_BETA) if config.decreases else torch.zeros_like(decrease),
         stiffness=config.stiffness * torch.exp(stiffness.clamp(-4.0, 4.0)),
         damping=config.damping * torch.exp(damping.clamp(-4.0, 4.0)),

@@ -12,6 +12,7 @@ from torch import nn
 from monoforce_ros.encoder.birds_eye import BirdsEyeNetwork
 from monoforce_ros.encoder.config import EncoderConfig
 from monoforce_ros.encoder.heads import EncodedMaps, map_heads, maps_from_heads, terrain_maps
+from monoforce_ros.encoder.sweep import HIT
 from monoforce_ros.encoder.view import SUPPORT_CHANNELS, CameraView, EncoderInput, encoder_input
 from monoforce_ros.terrain import TerrainMap
 
@@ -30,7 +31,7 @@ class LidarEncoder(nn.Module):
         """Predict maps from a batch with sweeps."""
         sweep = batch.sweep[:, : self.config.sweep_channels]
         outputs = self.heads(self.bird(torch.cat([sweep, batch.support], dim=1))).float()
-        hit = batch.sweep[:, 2]
+        hit = batch.sweep[:, HIT]
         return maps_from_heads(outputs, batch, self.config, torch.ones_like(hit, dtype=torch.bool), hit)
 
     @torch.no_grad()

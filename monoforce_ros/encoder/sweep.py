@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import torch
+from torch import Tensor
 
 from monoforce_ros.encoder.config import EncoderConfig
-from monoforce_ros.terrain import Grid
+from monoforce_ros.terrain import Grid, LidarSettings, cell_heights
 
 HEIGHT_CHANNELS = 3
 """Of :func:`cell_extremes`."""
-SWEEP_CHANNELS = 5
+SWEEP_CHANNELS = 7
 """Of :func:`sweep_features`."""
+HIT, TOP, STANDING = 2, 5, 6
+"""Channels: the mask of cells with points; the height on which :func:`measured_surface` builds, and its mask."""
 _REACH = 0.25
 """Half-width of the square around a cell whose points tell a surface from leaves [m]: as deep as a lidar sees into a
 hedge."""
@@ -37,7 +41,8 @@ def cell_extremes(points: np.ndarray, ground: float, config: EncoderConfig) -> n
 
 
 def sweep_features(points: np.ndarray, ground: float, config: EncoderConfig) -> np.ndarray:
-    """Features of a sweep ``[5, rows, columns]``: :func:`cell_extremes`, scatter and number of the upper points nearby.
+    """Features of a sweep ``[7, rows, columns]``: :func:`cell_extremes`, scatter and number of the upper points nearby,
+    and the height of what stands on the ground with its mask.
 
     Leaves return a lidar's pulses from various depths, a wall from one plane, whatever they look like. The scatter is
     the standard deviation of points along the horizontal direction in which they vary least: millimetres on walls,
@@ -66,7 +71,24 @@ def sweep_features(points: np.ndarray, ground: float, config: EncoderConfig) -> 
     xx, yy, xy = xx - mean_x**2, yy - mean_y**2, xy - mean_x * mean_y
     least = 0.5 * (xx + yy) - np.hypot(0.5 * (xx - yy), xy)
     scatter = np.where(count >= _FEWEST, np.sqrt(np.maximum(least, 0.0)), 0.0) / _SCATTER_UNIT
-    return np.concatenate([extremes, [scatter, np.log1p(count)]])
+    # Not the highest point: a robot passes under branches.
+    raised = points - np.array([0.0, 0.0, ground])
+    limits = LidarSettings(lowest=config.lowest, highest=config.highest, quantile=1.0)
+    top, standing = cell_heights(raised, grid, limits)
+    return np.concatenate([extremes, [scatter, np.log1p(count), top, standing]])
+
+
+def measured_surface(sweep: Tensor, anchor: Tensor, channels: int) -> Tensor:
+    """The surface that heights correct ``[B, rows, columns]`` [m]: what a sweep measured, and ``anchor`` elsewhere.
+
+    A network that predicted measured heights anew would blur the steps of walls and posts into slopes.
+
+    Args:
+        sweep: features of sweeps ``[B, 7, rows, columns]``.
+        anchor: the ground that carries the robot ``[B, rows, columns]`` [m].
+        channels: number of the features that the network was trained with; 3 for those that build on ``anchor`` alone.
+    """
+    return anchor if channels <= HEIGHT_CHANNELS else torch.where(sweep[:, STANDING] > 0, sweep[:, TOP], anchor)
 
 
 def _placed(points: np.ndarray, ground: float, config: EncoderConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -16,6 +16,7 @@ from monoforce_ros.encoder.config import EncoderConfig
 from monoforce_ros.encoder.heads import EncodedMaps, map_heads, maps_from_heads, terrain_maps, with_edges
 from monoforce_ros.encoder.image_context import ImageContext, resized
 from monoforce_ros.encoder.lift import depth_values, lifted_points, map_cells, splat
+from monoforce_ros.encoder.sweep import HIT
 from monoforce_ros.encoder.view import SUPPORT_CHANNELS, CameraView, EncoderInput, encoder_input
 from monoforce_ros.terrain import TerrainMap
 
@@ -122,7 +123,7 @@ class TerrainEncoder(nn.Module):
         if not features.is_cuda:
             features = features.contiguous(memory_format=torch.channels_last)
         outputs = self.heads(self.bird(features).to(self.heads.weight.dtype)).float()
-        hit = batch.sweep[:, 2]
+        hit = batch.sweep[:, HIT]
         evidence = hit if evidence is None else evidence + hit
         maps = maps_from_heads(outputs, batch, config, covered | (hit > 0), evidence, depth)
         return with_edges(maps, config) if config.edges and not self.training else maps

@@ -3,7 +3,7 @@
 from monoforce_ros.terrain.accumulation import accumulate
 from monoforce_ros.terrain.files import TerrainFileError, load_terrain, save_terrain
 from monoforce_ros.terrain.grid import Grid
-from monoforce_ros.terrain.lidar import LidarSettings, TerrainError, fill_holes, terrain_from_cloud
+from monoforce_ros.terrain.lidar import LidarSettings, TerrainError, cell_heights, fill_holes, terrain_from_cloud
 from monoforce_ros.terrain.terrain_map import CHANNELS, TerrainDefaults, TerrainMap
 
 __all__ = [
@@ -15,6 +15,7 @@ __all__ = [
     "TerrainFileError",
     "TerrainMap",
     "accumulate",
+    "cell_heights",
     "fill_holes",
     "load_terrain",
     "save_terrain",
