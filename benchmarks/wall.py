@@ -34,7 +34,7 @@ from tqdm import tqdm
 from monoforce_ros.core import MotionState, write_text
 from monoforce_ros.encoder import fused, load_encoder
 from monoforce_ros.messages import decoding
-from monoforce_ros.perception import EncoderTerrain, LidarTerrain, Observation, TerrainSource
+from monoforce_ros.perception import EncoderTerrain, LidarTerrain, Observation, TerrainSource, choose_terrain_source
 from monoforce_ros.prediction import Prediction, Predictor
 from monoforce_ros.reporting import write_between
 from monoforce_ros.robots import RobotModel, load_robot
@@ -215,6 +215,9 @@ def run_any(options: argparse.Namespace, titles: dict[str, str]) -> None:
         for title, sensors in (("images", ("camera",)), ("a sweep", ("lidar",)), ("both", ("camera", "lidar"))):
             if all(sensor in taken for sensor in sensors):
                 sources[f"{name}, {title}"] = EncoderTerrain(encoder, robot, sensors)
+        sources[f"lidar lowered by {name} (lidar_camera)"] = choose_terrain_source(
+            "lidar_camera", robot, checkpoint=options.encoder
+        )
     sources[titles["lidar"]] = LidarTerrain(robot, Grid.square(), TerrainDefaults())
     rows = []
     for title, source in sources.items():

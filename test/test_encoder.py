@@ -232,9 +232,12 @@ def test_untrained_material_is_that_of_the_configuration(sensor):
     config = replace(SMALL, sensor=sensor, friction=0.6, stiffness=1e6, damping=3e4)
     random = np.random.default_rng(1)
     seen = [view(random.integers(0, 255, (96, 128, 3), np.uint8))] if "camera" in sensor else []
-    terrain = new_encoder(config).terrain(seen, sweep=random.normal(size=(500, 3)) if "lidar" in sensor else None)
-    # Heights are those of the ground that carries the robot.
-    assert float(terrain.geometric_height.abs().max()) == 0.0 and float(terrain.height.abs().max()) < 0.03
+    sweep = np.concatenate([random.uniform(-1.0, 1.0, (500, 2)), np.full((500, 1), 0.2)], axis=1)
+    terrain = new_encoder(config).terrain(seen, sweep=sweep if "lidar" in sensor else None)
+    # Heights are those of the ground that carries the robot, and those that a sweep measured.
+    heights = {0.0, 0.2} if "lidar" in sensor else {0.0}
+    assert {round(float(height), 1) for height in terrain.geometric_height.unique()} == heights
+    assert float((terrain.geometric_height - terrain.height).max()) < 0.03
     for name in ("friction", "stiffness", "damping"):
         values = getattr(terrain, name)
         torch.testing.assert_close(values, torch.full_like(values, getattr(config, name)))

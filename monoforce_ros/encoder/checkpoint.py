@@ -94,12 +94,14 @@ def load_encoder(path: str | Path, sensor: str | None = None) -> Encoder:
 def extended(encoder: Encoder, config: EncoderConfig) -> Encoder:
     """An encoder of ``config`` with the weights of another one.
 
-    Bins of relative depth and features of a sweep that the other one lacks add nothing until they are trained. With
-    them heights correct what a sweep measured instead of the ground that carries the robot, which has to be trained,
-    too; without a sweep predictions stay as they were. All else that determines weights must be equal.
+    Bins of relative depth and features of a sweep that the other one lacks add nothing until they are trained. But
+    heights that a sweep measured are believed from the start where the other one predicted all heights anew: that has
+    to be trained. Without a sweep predictions stay as they were. All else that determines weights must be equal.
     """
     fresh = new_encoder(config)
     weights, own = encoder.state_dict(), fresh.state_dict()
+    for name in ("heads.weight", "heads.bias"):
+        weights[name] = torch.cat([weights[name], own[name][len(weights[name]) :]])
     first = "bird.enter.0.weight"
     # The sweep's features are the last inputs.
     weights[first] = functional.pad(weights[first], (0, 0, 0, 0, 0, own[first].shape[1] - weights[first].shape[1]))

@@ -112,6 +112,11 @@ class EncoderConfig:
         return self.sensor != "camera"
 
     @property
+    def believes(self) -> bool:
+        """Whether an output says how far heights that a sweep measured are believed."""
+        return self.takes_sweeps and self.sweep_channels > 3
+
+    @property
     def feature_rows(self) -> int:
         """Of the lifted feature map."""
         return self.image_height // FEATURE_STRIDE

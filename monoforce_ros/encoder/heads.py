@@ -11,10 +11,12 @@ from torch.nn import functional
 
 from monoforce_ros.encoder.config import EncoderConfig
 from monoforce_ros.encoder.edges import restore_edges
+from monoforce_ros.encoder.sweep import STANDING, TOP
 from monoforce_ros.encoder.view import EncoderInput
 from monoforce_ros.terrain import TerrainMap
 
 _HEADS = 7
+"""And one more for how far measured heights are believed, where a sweep is an input."""
 _SOFTPLUS_BETA = 5.0
 """Sharpness β of the softplus that keeps H_d ≥ 0 [1/m]. Its gradient vanishes far below 0: a sharper bend starts there,
 or firm ground pushes the whole map there before grass is distinguished from it."""
@@ -23,6 +25,8 @@ _FIRM = -0.4
 _INITIAL_SPREAD = 0.1
 _SMALLEST_SPREAD, _LARGEST_SPREAD = 0.01, 3.0
 """Scales of the Laplace distribution of a height [m]: untrained, and limits."""
+_BELIEVED = 3.0
+"""Initial output of the head for belief in measured heights, before the logistic function: 95 %."""
 _OBSERVED = 0.05
 """Least summed depth probability of an observed cell."""
 
@@ -55,18 +59,20 @@ class EncodedMaps:
         return self.geometric_height - self.decrease
 
 
-def map_heads(features: int) -> nn.Conv2d:
-    """Untrained heads for H_g, H_d, stiffness, damping, friction and the spreads of H_g and H_d.
+def map_heads(config: EncoderConfig) -> nn.Conv2d:
+    """Untrained heads for H_g, H_d, stiffness, damping, friction, the spreads of H_g and H_d, and belief.
 
-    All weights start at zero, which encodes the ground that carries the robot with the configuration's material;
-    without a loss they stay there.
+    All weights start at zero, which encodes the ground that carries the robot (and the surface that a sweep measured)
+    with the configuration's material; without a loss they stay there.
     """
-    heads = nn.Conv2d(features, _HEADS, kernel_size=1)
+    heads = nn.Conv2d(config.map_features, _HEADS + config.believes, kernel_size=1)
     assert heads.bias is not None
     with torch.no_grad():
         heads.weight.zero_()
         heads.bias.zero_()
         heads.bias[1] = _FIRM
+        if config.believes:
+            heads.bias[_HEADS] = _BELIEVED
     return heads
 
 
@@ -80,11 +86,17 @@ def maps_from_heads(
 ) -> EncodedMaps:
     """Heights, spreads and material from the outputs of the heads ``[B, 7, rows, columns]``, each within its bounds.
 
-    H_g is a correction to the ground that carries the robot, or to what a sweep measured (:meth:`EncoderInput.anchor`).
+    H_g is a correction to the ground that carries the robot. Where a sweep measured something, an eighth output says how
+    far that is believed instead: a network that predicted all heights anew would blur the steps of walls and posts into
+    slopes; one that believed everything would take single leaves for posts.
     """
-    geometric, decrease, stiffness, damping, friction, geometric_spread, decrease_spread = outputs.unbind(1)
+    geometric, decrease, stiffness, damping, friction, geometric_spread, decrease_spread = outputs[:, :_HEADS].unbind(1)
+    anchor = batch.anchor
+    if config.believes:
+        believed = torch.sigmoid(outputs[:, _HEADS]) * batch.sweep[:, STANDING]
+        anchor = torch.lerp(anchor, batch.sweep[:, TOP], believed)
     return EncodedMaps(
-        geometric_height=geometric + batch.anchor(config) + batch.ground[:, None, None],
+        geometric_height=geometric + anchor + batch.ground[:, None, None],
         decrease=functional.softplus(decrease, beta=_SOFTPLUS_BETA) if config.decreases else torch.zeros_like(decrease),
         stiffness=config.stiffness * torch.exp(stiffness.clamp(-4.0, 4.0)),
         damping=config.damping * torch.exp(damping.clamp(-4.0, 4.0)),

@@ -24,7 +24,7 @@ class LidarEncoder(nn.Module):
         super().__init__()
         self.config = config
         self.bird = BirdsEyeNetwork(config.sweep_channels + SUPPORT_CHANNELS, config.map_features)
-        self.heads = map_heads(config.map_features)
+        self.heads = map_heads(config)
 
     @override
     def forward(self, batch: EncoderInput) -> EncodedMaps:

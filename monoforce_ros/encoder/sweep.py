@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import torch
-from torch import Tensor
 
 from monoforce_ros.encoder.config import EncoderConfig
 from monoforce_ros.terrain import Grid, LidarSettings, cell_heights
@@ -15,7 +13,7 @@ HEIGHT_CHANNELS = 3
 SWEEP_CHANNELS = 7
 """Of :func:`sweep_features`."""
 HIT, TOP, STANDING = 2, 5, 6
-"""Channels: the mask of cells with points; the height on which :func:`measured_surface` builds, and its mask."""
+"""Channels: the mask of cells with points; the height of what stands on the ground, and its mask."""
 _REACH = 0.25
 """Half-width of the square around a cell whose points tell a surface from leaves [m]: as deep as a lidar sees into a
 hedge."""
@@ -76,19 +74,6 @@ def sweep_features(points: np.ndarray, ground: float, config: EncoderConfig) -> 
     limits = LidarSettings(lowest=config.lowest, highest=config.highest, quantile=1.0)
     top, standing = cell_heights(raised, grid, limits)
     return np.concatenate([extremes, [scatter, np.log1p(count), top, standing]])
-
-
-def measured_surface(sweep: Tensor, anchor: Tensor, channels: int) -> Tensor:
-    """The surface that heights correct ``[B, rows, columns]`` [m]: what a sweep measured, and ``anchor`` elsewhere.
-
-    A network that predicted measured heights anew would blur the steps of walls and posts into slopes.
-
-    Args:
-        sweep: features of sweeps ``[B, 7, rows, columns]``.
-        anchor: the ground that carries the robot ``[B, rows, columns]`` [m].
-        channels: number of the features that the network was trained with; 3 for those that build on ``anchor`` alone.
-    """
-    return anchor if channels <= HEIGHT_CHANNELS else torch.where(sweep[:, STANDING] > 0, sweep[:, TOP], anchor)
 
 
 def _placed(points: np.ndarray, ground: float, config: EncoderConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -66,7 +66,7 @@ class TerrainEncoder(nn.Module):
             config.image_features + MOMENTS + SUPPORT_CHANNELS + (config.sweep_channels if config.takes_sweeps else 0)
         )
         self.bird = BirdsEyeNetwork(inputs, config.map_features)
-        self.heads = map_heads(config.map_features)
+        self.heads = map_heads(config)
         depths = torch.from_numpy(depth_values(config)).float()
         self.register_buffer("depths", depths, persistent=False)
         self.backbone_frozen = self.images_frozen = False

@@ -13,7 +13,7 @@ from torch import Tensor
 from monoforce_ros.core import CameraModel
 from monoforce_ros.encoder.config import EncoderConfig
 from monoforce_ros.encoder.lift import feature_rays
-from monoforce_ros.encoder.sweep import HEIGHT_CHANNELS, SWEEP_CHANNELS, cell_extremes, measured_surface, sweep_features
+from monoforce_ros.encoder.sweep import HEIGHT_CHANNELS, SWEEP_CHANNELS, cell_extremes, sweep_features
 from monoforce_ros.terrain import Grid
 
 _EMPTY = 127
@@ -82,11 +82,11 @@ class EncoderInput:
         """Number of maps."""
         return len(self.ground)
 
-    def anchor(self, config: EncoderConfig) -> Tensor:
-        """Surface that predicted heights correct, relative to ``ground`` [m] ``[B, rows, columns]``: what the sweep
-        measured; elsewhere the ground that carries the robot, the plane under the wheels and level ground further away.
-        """
-        return measured_surface(self.sweep, self.support[:, 0], config.sweep_channels if config.takes_sweeps else 0)
+    @property
+    def anchor(self) -> Tensor:
+        """Ground that carries the robot, which predicted heights correct, relative to ``ground`` [m]
+        ``[B, rows, columns]``: the plane under the wheels, and level ground further away."""
+        return self.support[:, 0]
 
     def to(self, device: torch.device | str) -> EncoderInput:
         """The same on another device."""
