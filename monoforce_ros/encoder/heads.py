@@ -86,9 +86,9 @@ def maps_from_heads(
 ) -> EncodedMaps:
     """Heights, spreads and material from the outputs of the heads ``[B, 7, rows, columns]``, each within its bounds.
 
-    H_g is a correction to the ground that carries the robot. Where a sweep measured something, an eighth output says how
-    far that is believed instead: a network that predicted all heights anew would blur the steps of walls and posts into
-    slopes; one that believed everything would take single leaves for posts.
+    H_g is a correction to the ground that carries the robot. Where a sweep measured something, an eighth output says
+    how far that is believed instead: a network that predicted all heights anew would blur the steps of walls and posts
+    into slopes; one that believed everything would take single leaves for posts.
     """
     geometric, decrease, stiffness, damping, friction, geometric_spread, decrease_spread = outputs[:, :_HEADS].unbind(1)
     anchor = batch.anchor
