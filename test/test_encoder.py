@@ -237,7 +237,7 @@ def test_untrained_material_is_that_of_the_configuration(sensor):
     # Heights are those of the ground that carries the robot, and those that a sweep measured.
     heights = {0.0, 0.2} if "lidar" in sensor else {0.0}
     assert {round(float(height), 1) for height in terrain.geometric_height.unique()} == heights
-    assert float((terrain.geometric_height - terrain.height).max()) < 0.03
+    assert float((terrain.geometric_height - terrain.height).max()) < 0.04
     for name in ("friction", "stiffness", "damping"):
         values = getattr(terrain, name)
         torch.testing.assert_close(values, torch.full_like(values, getattr(config, name)))

@@ -105,8 +105,12 @@ def test_an_untrained_encoder_predicts_what_the_sweep_measured(tmp_path):
     # A step of one cell, and no wall below branches.
     assert at(3.04, 0.04) > 0.6 and abs(at(2.84, 0.04)) < 0.05 and abs(at(3.24, 0.04)) < 0.05
     assert abs(at(-3.24, 0.04)) < 0.05
-    # What is not believed does not count.
+    # What does not carry lowers H_t alone, and what is not believed does not count.
     with torch.no_grad():
         encoder.heads.bias[-1] = -20.0
+    found = encoder.terrain([], sweep=ground_and(np.r_[wall, crown], random))
+    assert float(found.geometric_height.max()) > 0.6 and float(found.height.max()) < 0.05
+    with torch.no_grad():
+        encoder.heads.bias[-2] = -20.0
     found = encoder.terrain([], sweep=ground_and(np.r_[wall, crown], random))
     assert float(found.geometric_height.abs().max()) < 1e-6

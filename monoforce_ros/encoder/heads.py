@@ -15,8 +15,8 @@ from monoforce_ros.encoder.sweep import STANDING, TOP
 from monoforce_ros.encoder.view import EncoderInput
 from monoforce_ros.terrain import TerrainMap
 
-_HEADS = 7
-"""And one more for how far measured heights are believed, where a sweep is an input."""
+_HEADS, _SWEEP_HEADS = 7, 2
+"""And those for how far heights that a sweep measured are believed, and how far they carry."""
 _SOFTPLUS_BETA = 5.0
 """Sharpness β of the softplus that keeps H_d ≥ 0 [1/m]. Its gradient vanishes far below 0: a sharper bend starts there,
 or firm ground pushes the whole map there before grass is distinguished from it."""
@@ -26,7 +26,7 @@ _INITIAL_SPREAD = 0.1
 _SMALLEST_SPREAD, _LARGEST_SPREAD = 0.01, 3.0
 """Scales of the Laplace distribution of a height [m]: untrained, and limits."""
 _BELIEVED = 3.0
-"""Initial output of the head for belief in measured heights, before the logistic function: 95 %."""
+"""Initial output of the heads for measured heights, before the logistic function: 95 %."""
 _OBSERVED = 0.05
 """Least summed depth probability of an observed cell."""
 
@@ -60,19 +60,19 @@ class EncodedMaps:
 
 
 def map_heads(config: EncoderConfig) -> nn.Conv2d:
-    """Untrained heads for H_g, H_d, stiffness, damping, friction, the spreads of H_g and H_d, and belief.
+    """Untrained heads for H_g, H_d, stiffness, damping, friction, the spreads of H_g and H_d, and measured heights.
 
     All weights start at zero, which encodes the ground that carries the robot (and the surface that a sweep measured)
     with the configuration's material; without a loss they stay there.
     """
-    heads = nn.Conv2d(config.map_features, _HEADS + config.believes, kernel_size=1)
+    heads = nn.Conv2d(config.map_features, _HEADS + _SWEEP_HEADS * config.believes, kernel_size=1)
     assert heads.bias is not None
     with torch.no_grad():
         heads.weight.zero_()
         heads.bias.zero_()
         heads.bias[1] = _FIRM
         if config.believes:
-            heads.bias[_HEADS] = _BELIEVED
+            heads.bias[_HEADS:] = _BELIEVED
     return heads
 
 
@@ -87,17 +87,19 @@ def maps_from_heads(
     """Heights, spreads and material from the outputs of the heads ``[B, 7, rows, columns]``, each within its bounds.
 
     H_g is a correction to the ground that carries the robot. Where a sweep measured something, an eighth output says
-    how far that is believed instead: a network that predicted all heights anew would blur the steps of walls and posts
-    into slopes; one that believed everything would take single leaves for posts.
+    how far that is believed instead, and a ninth how far what rises there carries: a network that predicted all heights
+    anew would blur the steps of walls and posts into slopes, and a smooth H_d below single leaves would leave spikes in
+    H_t.
     """
     geometric, decrease, stiffness, damping, friction, geometric_spread, decrease_spread = outputs[:, :_HEADS].unbind(1)
-    anchor = batch.anchor
+    below = functional.softplus(decrease, beta=_SOFTPLUS_BETA)
     if config.believes:
-        believed = torch.sigmoid(outputs[:, _HEADS]) * batch.sweep[:, STANDING]
-        anchor = torch.lerp(anchor, batch.sweep[:, TOP], believed)
+        believed, carries = torch.sigmoid(outputs[:, _HEADS:]).unbind(1)
+        rise = believed * batch.sweep[:, STANDING] * (batch.sweep[:, TOP] - batch.anchor)
+        geometric, below = geometric + rise, below + (1.0 - carries) * rise.clamp_min(0.0)
     return EncodedMaps(
-        geometric_height=geometric + anchor + batch.ground[:, None, None],
-        decrease=functional.softplus(decrease, beta=_SOFTPLUS_BETA) if config.decreases else torch.zeros_like(decrease),
+        geometric_height=geometric + batch.anchor + batch.ground[:, None, None],
+        decrease=below if config.decreases else torch.zeros_like(below),
         stiffness=config.stiffness * torch.exp(stiffness.clamp(-4.0, 4.0)),
         damping=config.damping * torch.exp(damping.clamp(-4.0, 4.0)),
         friction=config.friction * torch.exp(friction.clamp(-3.0, 1.0)),
