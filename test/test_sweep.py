@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from monoforce_ros.encoder import EncoderConfig, extended, load_encoder, new_encoder, save_encoder
 from monoforce_ros.encoder.sweep import SWEEP_CHANNELS, cell_extremes, sweep_features
+from monoforce_ros.terrain import LidarSettings, cell_heights
 
 CONFIG = EncoderConfig(sensor="lidar")
 
@@ -114,3 +115,15 @@ def test_an_untrained_encoder_predicts_what_the_sweep_measured(tmp_path):
         encoder.heads.bias[-2] = -20.0
     found = encoder.terrain([], sweep=ground_and(np.r_[wall, crown], random))
     assert float(found.geometric_height.abs().max()) < 1e-6
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2000), st.floats(0.2, 3.0), st.integers(0, 2**32 - 1))
+def test_the_height_of_what_stands_is_that_of_the_lidar_map(count, spread, seed):
+    random = np.random.default_rng(seed)
+    points = np.c_[random.uniform(-2.0, 2.0, (count, 2)), random.normal(0.0, spread, count)]
+    features = sweep_features(points, 0.3, CONFIG)
+    limits = LidarSettings(lowest=CONFIG.lowest, highest=CONFIG.highest, quantile=1.0)
+    top, standing = cell_heights(points - np.array([0.0, 0.0, 0.3]), CONFIG.grid, limits)
+    np.testing.assert_array_equal(features[6] > 0, standing)
+    np.testing.assert_allclose(features[5], top, atol=1e-9)

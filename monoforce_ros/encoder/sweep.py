@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from monoforce_ros.encoder.config import EncoderConfig
-from monoforce_ros.terrain import Grid, LidarSettings, cell_heights
+from monoforce_ros.terrain import Grid, LidarSettings, cell_heights, stands_on_ground
 
 HEIGHT_CHANNELS = 3
 """Of :func:`cell_extremes`."""
@@ -28,14 +28,7 @@ _FEWEST = 3
 def cell_extremes(points: np.ndarray, ground: float, config: EncoderConfig) -> np.ndarray:
     """Lowest and highest point of each cell relative to ``ground`` [m], 0 without a point, and the mask of cells with
     points; ``[3, rows, columns]``."""
-    grid = config.grid
-    flat, heights, _ = _placed(points, ground, config)
-    low, high = np.full(grid.rows * grid.columns, np.inf), np.full(grid.rows * grid.columns, -np.inf)
-    np.minimum.at(low, flat, heights)
-    np.maximum.at(high, flat, heights)
-    hit = np.isfinite(low)
-    stacked = np.stack([np.where(hit, low, 0.0), np.where(hit, high, 0.0), hit])
-    return stacked.reshape(HEIGHT_CHANNELS, grid.rows, grid.columns)
+    return _extremes(*_placed(points, ground, config), config.grid)
 
 
 def sweep_features(points: np.ndarray, ground: float, config: EncoderConfig) -> np.ndarray:
@@ -53,36 +46,59 @@ def sweep_features(points: np.ndarray, ground: float, config: EncoderConfig) -> 
         config: configuration of the encoder.
     """
     grid = config.grid
-    extremes = cell_extremes(points, ground, config)
-    flat, heights, inside = _placed(points, ground, config)
-    hit_or_above = np.where(extremes[2] > 0, extremes[0], np.inf).astype(np.float32)
+    placed, flat = _placed(points, ground, config)
+    extremes = _extremes(placed, flat, grid)
+    lowest = np.where(extremes[HIT] > 0, extremes[0], np.inf).astype(np.float32)
     reach = max(1, round(_REACH / grid.resolution))
     window = (2 * reach + 1, 2 * reach + 1)
-    lowest = cv2.erode(hit_or_above, np.ones(window, np.uint8), borderValue=np.inf).ravel()
-    upper = heights > lowest[flat] + _UPPER
-    flat = flat[upper]
+    floor = cv2.erode(lowest, np.ones(window, np.uint8), borderValue=np.inf).ravel()
+    upper = placed[:, 2] > floor[flat] + _UPPER
     # Relative to the map's centre, so that sums of squares keep their digits.
-    x, y = points[inside, :2][upper].T
-    sums = [_summed(flat, values, window, grid) for values in (np.ones_like(x), x, y, x * x, y * y, x * y)]
+    x, y, _ = placed[upper].T
+    sums = [_summed(flat[upper], values, window, grid) for values in (np.ones_like(x), x, y, x * x, y * y, x * y)]
     count = sums[0]
     mean_x, mean_y, xx, yy, xy = (values / np.maximum(count, 1.0) for values in sums[1:])
     xx, yy, xy = xx - mean_x**2, yy - mean_y**2, xy - mean_x * mean_y
     least = 0.5 * (xx + yy) - np.hypot(0.5 * (xx - yy), xy)
     scatter = np.where(count >= _FEWEST, np.sqrt(np.maximum(least, 0.0)), 0.0) / _SCATTER_UNIT
-    # Not the highest point: a robot passes under branches.
-    raised = points - np.array([0.0, 0.0, ground])
-    limits = LidarSettings(lowest=config.lowest, highest=config.highest, quantile=1.0)
-    top, standing = cell_heights(raised, grid, limits)
+    top, standing = _standing(placed, flat, extremes, config)
     return np.concatenate([extremes, [scatter, np.log1p(count), top, standing]])
 
 
-def _placed(points: np.ndarray, ground: float, config: EncoderConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Cells and heights of the points on the map, and the mask of these points."""
+def _standing(
+    placed: np.ndarray, flat: np.ndarray, extremes: np.ndarray, config: EncoderConfig
+) -> tuple[np.ndarray, np.ndarray]:
+    """Height of what stands on the ground in each cell [m], and the mask of cells with it.
+
+    Not the highest point, because a robot passes under branches; but only cells as tall as its headroom have to be
+    sorted for gaps.
+    """
+    grid, limits = config.grid, LidarSettings(lowest=config.lowest, highest=config.highest, quantile=1.0)
+    low, high, hit = extremes
+    standing = np.zeros(low.shape, bool)
+    cells = np.flatnonzero(hit)
+    standing.ravel()[cells] = stands_on_ground(low.ravel()[cells].astype(np.float32), cells, grid, limits)
+    tall = standing & (high - low > limits.headroom)
+    top, found = cell_heights(placed[tall.ravel()[flat]], grid, limits)
+    return np.where(tall & found, top, high) * standing, standing
+
+
+def _placed(points: np.ndarray, ground: float, config: EncoderConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Points on the map, relative to ``ground``, and their cells."""
     grid = config.grid
-    heights = points[:, 2] - ground
-    rows, columns, inside = grid.cells(points[:, :2])
-    inside &= (heights > config.lowest) & (heights < config.highest)
-    return (rows * grid.columns + columns)[inside], heights[inside], inside
+    raised = np.asarray(points, float) - np.array([0.0, 0.0, ground])
+    rows, columns, inside = grid.cells(raised[:, :2])
+    inside &= (raised[:, 2] > config.lowest) & (raised[:, 2] < config.highest)
+    return raised[inside], (rows * grid.columns + columns)[inside]
+
+
+def _extremes(placed: np.ndarray, flat: np.ndarray, grid: Grid) -> np.ndarray:
+    low, high = np.full(grid.rows * grid.columns, np.inf), np.full(grid.rows * grid.columns, -np.inf)
+    np.minimum.at(low, flat, placed[:, 2])
+    np.maximum.at(high, flat, placed[:, 2])
+    hit = np.isfinite(low)
+    stacked = np.stack([np.where(hit, low, 0.0), np.where(hit, high, 0.0), hit])
+    return stacked.reshape(HEIGHT_CHANNELS, grid.rows, grid.columns)
 
 
 def _summed(flat: np.ndarray, values: np.ndarray, window: tuple[int, int], grid: Grid) -> np.ndarray:

@@ -3,7 +3,14 @@
 from monoforce_ros.terrain.accumulation import accumulate
 from monoforce_ros.terrain.files import TerrainFileError, load_terrain, save_terrain
 from monoforce_ros.terrain.grid import Grid
-from monoforce_ros.terrain.lidar import LidarSettings, TerrainError, cell_heights, fill_holes, terrain_from_cloud
+from monoforce_ros.terrain.lidar import (
+    LidarSettings,
+    TerrainError,
+    cell_heights,
+    fill_holes,
+    stands_on_ground,
+    terrain_from_cloud,
+)
 from monoforce_ros.terrain.terrain_map import CHANNELS, TerrainDefaults, TerrainMap
 
 __all__ = [
@@ -19,5 +26,6 @@ __all__ = [
     "fill_holes",
     "load_terrain",
     "save_terrain",
+    "stands_on_ground",
     "terrain_from_cloud",
 ]

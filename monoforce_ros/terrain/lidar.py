@@ -133,7 +133,7 @@ def cell_heights(points: np.ndarray, grid: Grid, settings: LidarSettings) -> tup
     ground = gaps == gaps[np.flatnonzero(first)][cell]
     flat, z, cell = flat[ground], z[ground], cell[ground]
     starts = np.flatnonzero(np.r_[True, cell[1:] != cell[:-1]])
-    standing = _stands_on_ground(z[starts], flat[starts], grid, settings)
+    standing = stands_on_ground(z[starts], flat[starts], grid, settings)
     counts = np.diff(np.r_[starts, len(cell)])
     position = starts + (counts - 1) * settings.quantile
     below = np.floor(position).astype(np.int64)
@@ -144,7 +144,7 @@ def cell_heights(points: np.ndarray, grid: Grid, settings: LidarSettings) -> tup
     return heights, observed
 
 
-def _stands_on_ground(lowest: np.ndarray, cells: np.ndarray, grid: Grid, settings: LidarSettings) -> np.ndarray:
+def stands_on_ground(lowest: np.ndarray, cells: np.ndarray, grid: Grid, settings: LidarSettings) -> np.ndarray:
     """Which cells' lowest returns belong to the ground or to objects on it, rather than to an overhanging crown.
 
     A crown without returns from the ground below it lies far above the lowest return nearby; objects on the ground have
