@@ -9,6 +9,7 @@ from pathlib import Path
 import null_rates
 import numpy as np
 import pytest
+import uncovered_changes
 from benchmark_case import SETS, Case, all_cases
 from benchmark_score import closed_share, covered, found_all, scores
 from case_recording import CaseFiles, displacement, hidden_job, record_platform, record_together
@@ -311,6 +312,10 @@ def test_the_true_effect_explains_most_of_what_it_does_in_the_other_engine(tmp_p
     assert row["explained"] > 0.7 and row["error"] < 0.5
     assert json.loads(json.dumps(row)) == row
     assert summary("single", [row]).startswith("single: 1 of 1 drives visible; share explained: 10 % quantile")
+    # The slower healthy drives may respond to harder commands, the less of an error is left.
+    row = uncovered_changes.measured(case, CaseFiles.of(case, tmp_path), nominal, (0.0, 0.06, 1.0))
+    ratios = row["loss_ratios"]
+    assert ratios[0] >= ratios[1] >= ratios[2] > 0.0 and (row["harder"] <= 0.0 or ratios[2] < ratios[0])
     # The more healthy drives vary, the less significant is the same drive.
     row = null_rates.measured(case, CaseFiles.of(case, tmp_path), nominal, (0.0, 1.0, 1e5))
     (_, alone), (name, usual), (_, hopeless) = row["smallest"]
