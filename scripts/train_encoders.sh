@@ -15,17 +15,20 @@ run() { scripts/run.sh "$@"; }
 
 if [ "$target" = checkpoint ]; then
   # Images and sweeps of randomised worlds with the simulator's surfaces as targets: first rough country, then also level
-  # sites with more walls, and with the late stages of the backbone. Walls cover few cells and weigh more.
+  # sites with more walls, and with the late stages of the backbone, then the map alone. Walls cover few cells and weigh
+  # more.
   shipped() { # name, worlds, steps, options
     local out=out/encoders/$1 count=$2 steps=$3
     shift 3
     [ -f "$out/training.json" ] && return
     run train --worlds "$count" --samples "$worlds/randomised" --out "$out" --steps "$steps" --sensor camera_lidar \
-      --no-edges --losses geometric terrain --no-vegetation --geometric 2 --prominence 5 --precision bfloat16 --threads 1 "$@"
+      --relative-bins 40 --no-edges --losses geometric terrain --no-vegetation --geometric 2 --prominence 5 --precision bfloat16 --threads 1 "$@"
   }
   shipped country 200 2200 --world-styles varied --validate-every 550
-  shipped shipped 256 1400 --start-from out/encoders/country/encoder.safetensors --rate 0.0012 --train-backbone late \
+  shipped sites 256 1400 --start-from out/encoders/country/encoder.safetensors --rate 0.0012 --train-backbone late \
     --seed 2 --validate-every 350
+  shipped shipped 256 700 --start-from out/encoders/sites/encoder.safetensors --rate 0.0012 --train-backbone map \
+    --seed 4 --validate-every 350
   for ending in safetensors json; do
     cp "out/encoders/shipped/encoder.$ending" "models/.terrain_encoder.$ending"
     mv "models/.terrain_encoder.$ending" "models/terrain_encoder.$ending"
