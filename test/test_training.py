@@ -17,10 +17,12 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from monoforce_ros.core import CameraModel
-from monoforce_ros.encoder import EncodedMaps, EncoderConfig, load_encoder, new_encoder
+from monoforce_ros.encoder import CheckpointError, EncodedMaps, EncoderConfig, load_encoder, new_encoder
+from monoforce_ros.encoder.checkpoint import shipped_checkpoint
 from monoforce_ros.encoder.lift import feature_rays
 from monoforce_ros.physics import PhysicsOptions
 from monoforce_ros.robots import load_robot
+from monoforce_ros.training import train_cli
 from monoforce_ros.training.losses import (
     LossWeights,
     depth_loss,
@@ -496,3 +498,18 @@ def test_unusable_input_is_reported_in_one_line(executables, tmp_path, demo_bag)
     shutil.copytree(demo_bag, other)
     unknown = run(executables, other, "--out", tmp_path / "o", "--images", "/no", *OPTIONS, check=False)
     assert unknown.returncode == 1 and "no images with a CameraInfo" in unknown.stderr
+
+
+def test_fine_tuning_takes_the_sensors_and_bins_of_its_start():
+    arguments = ["bag", "--start-from", str(shipped_checkpoint())]
+    options = build_parser().parse_args(arguments)
+    shipped = load_encoder("")
+    config = train_cli._config(options)
+    assert (config.sensor, config.relative_bins) == (shipped.config.sensor, shipped.config.relative_bins)
+    assert shipped.config.sensor == "camera_lidar" and shipped.config.relative_bins > 0
+    start = train_cli._encoder(options, config).state_dict()
+    assert all(torch.equal(start[name], value) for name, value in shipped.state_dict().items())
+    assert train_cli._config(build_parser().parse_args(["bag"])).sensor == "camera"
+    options = build_parser().parse_args([*arguments, "--sensor", "camera"])
+    with pytest.raises(CheckpointError, match="sensor: got camera_lidar, expected camera"):
+        train_cli._encoder(options, train_cli._config(options))

@@ -131,8 +131,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--samples", type=Path, metavar="DIR", help="folder for the samples extracted from the bags "
                         "(default: OUT/samples)")  # fmt: skip
     parser.add_argument("--samples-only", action="store_true", help="extract the samples and stop")
-    parser.add_argument("--sensor", choices=SENSORS, default="camera", help="input of the encoder: images; a lidar "
-                        "sweep to densify; or both, either of which may be absent (default: %(default)s)")  # fmt: skip
+    parser.add_argument("--sensor", choices=SENSORS, help="input of the encoder: images; a lidar sweep to densify; or "
+                        "both, either of which may be absent (default: that of --start-from, or camera)")  # fmt: skip
     parser.add_argument("--images", nargs="+", default=[], metavar="TOPIC", help="image topics (default: all with a "
                         "CameraInfo)")  # fmt: skip
     add_read_options(parser)
@@ -161,8 +161,8 @@ def build_parser() -> argparse.ArgumentParser:
                         "%(default)s)")  # fmt: skip
     parser.add_argument("--resolution", type=float, default=EncoderConfig.resolution, metavar="M", help="size of a "
                         "cell (default: %(default)s)")  # fmt: skip
-    parser.add_argument("--relative-bins", type=int, default=EncoderConfig.relative_bins, metavar="N", help="bins of "
-                        "depth relative to level ground, 0 for none (default: %(default)s)")  # fmt: skip
+    parser.add_argument("--relative-bins", type=int, metavar="N", help="bins of depth relative to level ground "
+                        "(default: those of --start-from, or none)")  # fmt: skip
     parser.add_argument("--edges", action=argparse.BooleanOptionalAction, help="restore steps that uncertainty blurs "
                         "into slopes, cameras only (default: unless the geometric loss is the only one)")  # fmt: skip
     parser.add_argument("--adapt", action="store_true", help="adapt the shipped encoder (or --start-from) to this "
@@ -408,13 +408,14 @@ def _config(options: argparse.Namespace) -> EncoderConfig:
     width, _, height = options.size.partition("x")
     if not (width.isdecimal() and height.isdecimal()):
         raise ValueError(f"--size: got {options.size!r}, expected two whole numbers as in 320x240")
+    start = EncoderConfig() if options.start_from is None else load_encoder(options.start_from).config
     return EncoderConfig(
-        sensor=options.sensor,
+        sensor=start.sensor if options.sensor is None else options.sensor,
         image_width=int(width),
         image_height=int(height),
         map_size=options.map_size,
         resolution=options.resolution,
-        relative_bins=options.relative_bins,
+        relative_bins=start.relative_bins if options.relative_bins is None else options.relative_bins,
         decreases=options.losses != ["geometric"],
         edges=options.losses != ["geometric"] if options.edges is None else options.edges,
     )
