@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from monoforce_ros.encoder import EncoderConfig, extended, load_encoder, new_encoder, save_encoder
-from monoforce_ros.encoder.sweep import SWEEP_CHANNELS, cell_extremes, sweep_features
+from monoforce_ros.encoder.config import SWEEP_CHANNELS
+from monoforce_ros.encoder.sweep import cell_extremes, sweep_features
 from monoforce_ros.terrain import LidarSettings, cell_heights
 
 CONFIG = EncoderConfig(sensor="lidar")

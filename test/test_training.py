@@ -504,12 +504,12 @@ def test_fine_tuning_takes_the_sensors_and_bins_of_its_start():
     arguments = ["bag", "--start-from", str(shipped_checkpoint())]
     options = build_parser().parse_args(arguments)
     shipped = load_encoder("")
-    config = train_cli._config(options)
+    config = train_cli._config(options, shipped)
     assert (config.sensor, config.relative_bins) == (shipped.config.sensor, shipped.config.relative_bins)
     assert shipped.config.sensor == "camera_lidar" and shipped.config.relative_bins > 0
-    start = train_cli._encoder(options, config).state_dict()
+    start = train_cli._encoder(options, config, shipped).state_dict()
     assert all(torch.equal(start[name], value) for name, value in shipped.state_dict().items())
-    assert train_cli._config(build_parser().parse_args(["bag"])).sensor == "camera"
+    assert train_cli._config(build_parser().parse_args(["bag"]), None).sensor == "camera"
     options = build_parser().parse_args([*arguments, "--sensor", "camera"])
     with pytest.raises(CheckpointError, match="sensor: got camera_lidar, expected camera"):
-        train_cli._encoder(options, train_cli._config(options))
+        train_cli._encoder(options, train_cli._config(options, shipped), shipped)

@@ -19,11 +19,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
-from benchmark_case import CASE_KINDS, SETS, Case, all_cases
+from benchmark_case import CASE_KINDS, Case
 from case_recording import CaseFiles
+from case_rows import add_case_arguments, measured_rows
 from case_search import search_of
-from tqdm import tqdm
 
 from monoforce_ros.core import write_text
 from monoforce_ros.discrepancy.thresholds import Thresholds
@@ -31,36 +30,18 @@ from monoforce_ros.discrepancy.thresholds import Thresholds
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--work", type=Path, default=Path("out/platforms"), help="folder of run.py (out/platforms)")
-    parser.add_argument("--label", required=True, help="results of run.py whose commissioned platforms are used")
-    parser.add_argument("--set", choices=sorted(SETS), default="choosing", help="set of seeds (choosing)")
+    add_case_arguments(parser)
     parser.add_argument(
         "--kind", choices=CASE_KINDS, nargs="+", default=["empty", "single"], help="kinds of drives (empty single)"
     )
-    parser.add_argument("--cases", nargs="+", default=[""], metavar="TEXT", help="only names with one of these")
     parser.add_argument(
         "--shares", type=float, nargs="+", default=[0.0, 0.1, 0.25, 0.5, 0.8, 1.25], help="values of drive_share"
     )
-    parser.add_argument("--json", type=Path, help="write the rows to this file")
     options = parser.parse_args()
-    torch.set_num_threads(1)
-    rows = []
-    cases = [
-        case
-        for case in all_cases(options.set)
-        if case.kind in options.kind and any(text in case.name for text in options.cases)
-    ]
-    for case in tqdm(cases, unit="drive"):
-        files = CaseFiles.of(case, options.work)
-        nominal = options.work / "results" / options.label / "nominal" / case.platform_name / "platform.yaml"
-        if not (files.truth.exists() and nominal.exists()):
-            continue
-        row = measured(case, files, nominal, options.shares)
-        if row is not None:
-            rows.append(row)
-            tqdm.write(row_line(row))
+    rows = measured_rows(
+        options, options.kind, lambda case, files, nominal: measured(case, files, nominal, options.shares), row_line
+    )
     if not rows:
-        print(f"no drive of these kinds is recorded and commissioned in {options.work}: run run.py", file=sys.stderr)
         return 1
     for kind in options.kind:
         print(summary(kind, [row for row in rows if row["kind"] == kind], options.shares))

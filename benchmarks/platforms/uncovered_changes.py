@@ -17,11 +17,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
-from benchmark_case import SETS, Case, all_cases
+from benchmark_case import Case
 from case_recording import CaseFiles
+from case_rows import add_case_arguments, measured_rows
 from case_search import search_of
-from tqdm import tqdm
 
 from monoforce_ros.core import write_text
 from monoforce_ros.discrepancy import command_changes
@@ -33,32 +32,15 @@ _HARDER = 0.3
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--work", type=Path, default=Path("out/platforms"), help="folder of run.py (out/platforms)")
-    parser.add_argument("--label", required=True, help="results of run.py whose commissioned platforms are used")
-    parser.add_argument("--set", choices=sorted(SETS), default="choosing", help="set of seeds (choosing)")
-    parser.add_argument("--cases", nargs="+", default=[""], metavar="TEXT", help="only names with one of these")
+    add_case_arguments(parser)
     parser.add_argument(
         "--times", type=float, nargs="+", default=[0.0, 0.04, 0.05, 0.06, 0.08, 0.1], help="response times [s]"
     )
-    parser.add_argument("--json", type=Path, help="write the rows to this file")
     options = parser.parse_args()
-    torch.set_num_threads(1)
-    rows = []
-    cases = [
-        case
-        for case in all_cases(options.set)
-        if case.kind == "empty" and any(text in case.name for text in options.cases)
-    ]
-    for case in tqdm(cases, unit="drive"):
-        files = CaseFiles.of(case, options.work)
-        nominal = options.work / "results" / options.label / "nominal" / case.platform_name / "platform.yaml"
-        row = measured(case, files, nominal, options.times) if files.truth.exists() and nominal.exists() else None
-        if row is not None:
-            rows.append(row)
-            ratios = ", ".join(f"{ratio:.2f}" for ratio in row["loss_ratios"])
-            tqdm.write(f"{case.name:32s} {row['harder']:4.2f} harder, loss of healthy: {ratios}")
+    rows = measured_rows(
+        options, ("empty",), lambda case, files, nominal: measured(case, files, nominal, options.times), row_line
+    )
     if not rows:
-        print(f"no empty drive is recorded and commissioned in {options.work}: run run.py", file=sys.stderr)
         return 1
     for harder in (True, False):
         chosen = [row for row in rows if (row["harder"] > _HARDER) == harder]
@@ -74,6 +56,12 @@ def main() -> int:
     if options.json:
         write_text(options.json, json.dumps(rows, indent=1) + "\n")
     return 0
+
+
+def row_line(row: dict) -> str:
+    """One line about a drive."""
+    ratios = ", ".join(f"{ratio:.2f}" for ratio in row["loss_ratios"])
+    return f"{row['case']:32s} {row['harder']:4.2f} harder, loss of healthy: {ratios}"
 
 
 def measured(case: Case, files: CaseFiles, nominal_file: Path, times: Sequence[float]) -> dict | None:

@@ -12,17 +12,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from monoforce_ros.discrepancy.hypothesis import Evidence, EvidenceWindows, window_starts
+from monoforce_ros.discrepancy.residual_model import BEFORE, STEP, window_commands
 
 RESPONSE_TIME = 0.06
 """Of healthy robots whose commands change harder than in their commissioning drive [s], root mean square. Of 0.04 to
 0.1 s that with the smallest spread of the loss between 16 such drives of the choosing set, 0.30 in its logarithm, where
 it is 0.38 on the other 34 drives, and 0.73 without it (``benchmarks/platforms/uncovered_changes.py``)."""
 _WITHIN = 0.2
-"""Time in which commands change [s]: shorter than most drives need, so that a ramp is told from a step."""
-_STEP = 0.05
-"""Of the commands [s]."""
-_BEFORE = 0.5
-"""Changes so long before a window still move the robot in it [s]: typical dead times and lags."""
+"""Time in which commands change [s]: shorter than most drives need, so that a ramp differs from a step."""
 _COVERED = 0.95
 """Quantile of the changes in the windows of a commissioning drive up to which they are covered."""
 _WORTH_SAYING = 0.5
@@ -31,11 +28,7 @@ _WORTH_SAYING = 0.5
 
 def largest_changes(data: EvidenceWindows) -> np.ndarray:
     """Largest changes of speed [m/s] and yaw rate [rad/s] in 0.2 s, shortly before a window or since, ``[W, K, 2]``."""
-    commands = _commands(data)
-    length = round(_WITHIN / _STEP)
-    changes = np.zeros_like(commands)
-    changes[:, length:] = np.abs(commands[:, length:] - commands[:, :-length])
-    return np.maximum.accumulate(changes, axis=1)[:, _columns(data)]
+    return _largest(window_commands(data))[:, _columns(data)]
 
 
 def covered_changes(recordings: Sequence[EvidenceWindows]) -> np.ndarray:
@@ -54,13 +47,14 @@ def uncovered_residual(data: EvidenceWindows, covered: np.ndarray) -> np.ndarray
         data: the windows.
         covered: result of :func:`covered_changes`.
     """
-    changes, columns = largest_changes(data), _columns(data)
+    commands, columns = window_commands(data), _columns(data)
+    changes = _largest(commands)[:, columns]
     beyond = np.maximum(changes - covered, 0.0)
     share = beyond[..., 0] / np.maximum(changes[..., 0], 1e-9)
-    commands = np.abs(_commands(data))
-    rate = np.maximum.accumulate(commands[..., 1], axis=1)[:, columns]
-    first = round(_BEFORE / _STEP)
-    distance = np.cumsum(commands[:, first:, 0] * _STEP, axis=1)[:, columns - first]
+    speed, rate = np.moveaxis(np.abs(commands), -1, 0)
+    rate = np.maximum.accumulate(rate, axis=1)[:, columns]
+    first = round(BEFORE / STEP)
+    distance = np.cumsum(speed[:, first:] * STEP, axis=1)[:, columns - first]
     along = RESPONSE_TIME * beyond[..., 0]
     heading = RESPONSE_TIME * np.hypot(beyond[..., 1], rate * share)
     return np.stack([along, 0.5 * distance * heading, heading], axis=-1)
@@ -92,13 +86,14 @@ def uncovered_doubt(evidence: Evidence, horizon: float, covered: np.ndarray | No
     )
 
 
-def _commands(data: EvidenceWindows) -> np.ndarray:
-    """Speed and yaw rate from shortly before the windows to their ends, ``[W, T, 2]``."""
-    before, steps = round(_BEFORE / _STEP), round(float(data.samples[-1]) / _STEP)
-    grid = np.rint(np.arange(-before, steps + 1) * _STEP * 1e9).astype(np.int64)
-    return data.commands.sample(data.starts[:, None] + grid)[..., :2]
+def _largest(commands: np.ndarray) -> np.ndarray:
+    """Largest changes in 0.2 s so far, ``[W, T, 2]``."""
+    length = round(_WITHIN / STEP)
+    changes = np.zeros_like(commands)
+    changes[:, length:] = np.abs(commands[:, length:] - commands[:, :-length])
+    return np.maximum.accumulate(changes, axis=1)
 
 
 def _columns(data: EvidenceWindows) -> np.ndarray:
     """Columns of the commands at the times of the samples, ``[K]``."""
-    return np.rint((data.samples + _BEFORE) / _STEP).astype(int)
+    return np.rint((data.samples + BEFORE) / STEP).astype(int)

@@ -18,9 +18,9 @@ from monoforce_ros.discrepancy.hypothesis import EvidenceWindows
 TERMS = ("time", "distance", "turn", "sideways", "speed_change", "yaw_rate_change")
 """Commanded motion whose squares add up to the variance: elapsed time [s], distance [m], turn [rad], integral of the
 sideways acceleration [m/s], and changes of speed [m/s] and of yaw rate [rad/s]."""
-_STEP = 0.05
+STEP = 0.05
 """Of the commands [s]."""
-_BEFORE = 0.5
+BEFORE = 0.5
 """Changes of the command so long before a window still move the robot in it [s]: typical dead times and lags."""
 _LARGEST = 3.0
 """Residuals beyond so many standard deviations count as if they were that large."""
@@ -29,16 +29,22 @@ _PRIOR_WINDOWS = 1.0
 """Weight of the prior, in windows."""
 
 
+def window_commands(data: EvidenceWindows) -> np.ndarray:
+    """Speed [m/s] and yaw rate [rad/s] every :data:`STEP` from :data:`BEFORE` windows to their ends, ``[W, T, 2]``."""
+    before, steps = round(BEFORE / STEP), round(float(data.samples[-1]) / STEP)
+    grid = np.rint(np.arange(-before, steps + 1) * STEP * 1e9).astype(np.int64)
+    return data.commands.sample(data.starts[:, None] + grid)[..., :2]
+
+
 def motion_terms(data: EvidenceWindows) -> np.ndarray:
     """Squares of the terms since the start of each window, ``[W, K, len(TERMS)]``."""
-    before, steps = round(_BEFORE / _STEP), round(float(data.samples[-1]) / _STEP)
-    grid = np.rint(np.arange(-before, steps + 1) * _STEP * 1e9).astype(np.int64)
-    speed, rate = np.moveaxis(data.commands.sample(data.starts[:, None] + grid)[..., :2], -1, 0)
-    driven = [np.abs(values[:, before + 1 :]) * _STEP for values in (speed, rate, speed * rate)]
+    before, steps = round(BEFORE / STEP), round(float(data.samples[-1]) / STEP)
+    speed, rate = np.moveaxis(window_commands(data), -1, 0)
+    driven = [np.abs(values[:, before + 1 :]) * STEP for values in (speed, rate, speed * rate)]
     changes = [np.abs(np.diff(values, axis=1)) for values in (speed, rate)]
     totals = [np.cumsum(values, axis=1) for values in driven]
     totals += [np.cumsum(values, axis=1)[:, before:] for values in changes]
-    at = np.clip(np.rint(data.samples / _STEP).astype(int) - 1, 0, steps - 1)
+    at = np.clip(np.rint(data.samples / STEP).astype(int) - 1, 0, steps - 1)
     elapsed = np.broadcast_to(data.samples, (len(data.starts), len(data.samples)))
     return np.stack([elapsed, *(values[:, at] for values in totals)], axis=-1) ** 2
 

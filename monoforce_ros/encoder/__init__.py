@@ -10,7 +10,7 @@ from monoforce_ros.encoder.checkpoint import (
     new_encoder,
     save_encoder,
 )
-from monoforce_ros.encoder.config import SENSORS, EncoderConfig
+from monoforce_ros.encoder.config import HEIGHT_CHANNELS, SENSORS, EncoderConfig
 from monoforce_ros.encoder.heads import EncodedMaps
 from monoforce_ros.encoder.inference import fused, multiplies_bfloat16, packed
 from monoforce_ros.encoder.lidar_encoder import LidarEncoder
@@ -19,6 +19,7 @@ from monoforce_ros.encoder.terrain_encoder import TerrainEncoder
 from monoforce_ros.encoder.view import CameraView, EncoderInput, assemble, encoder_input, network_image
 
 __all__ = [
+    "HEIGHT_CHANNELS",
     "SENSORS",
     "CameraView",
     "CheckpointError",

@@ -13,7 +13,7 @@ from safetensors.torch import load_file, save_file
 from torch.nn import functional
 
 from monoforce_ros.core import atomic_path, share_directory, write_text
-from monoforce_ros.encoder.config import EncoderConfig
+from monoforce_ros.encoder.config import HEIGHT_CHANNELS, EncoderConfig
 from monoforce_ros.encoder.lidar_encoder import LidarEncoder
 from monoforce_ros.encoder.terrain_encoder import TerrainEncoder
 
@@ -72,7 +72,7 @@ def load_encoder(path: str | Path, sensor: str | None = None) -> Encoder:
     try:
         # Files of the first format do not name it, those of networks without scatter not their channels.
         config = EncoderConfig(
-            **({"format": 1, "sweep_channels": 3} | json.loads(description.read_text(encoding="utf-8")))
+            **({"format": 1, "sweep_channels": HEIGHT_CHANNELS} | json.loads(description.read_text(encoding="utf-8")))
         )
     except (TypeError, ValueError) as error:
         raise CheckpointError(f"{description}: not an encoder configuration: {error}") from error

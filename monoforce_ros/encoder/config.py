@@ -11,6 +11,8 @@ FORMAT = 2
 """Version of the network's inputs and outputs; checkpoints of other versions cannot be used."""
 BACKBONES = ("efficientnet_lite0",)
 
+HEIGHT_CHANNELS, SWEEP_CHANNELS = 3, 7
+"""Features of a lidar sweep: its heights, and all (:mod:`sweep`)."""
 FEATURE_STRIDE = 8
 """Stride of the lifted features in pixels of the resized image."""
 
@@ -38,7 +40,7 @@ class EncoderConfig:
     relative_bins: int = 0
     """Number of bins of depth relative to level ground, as wide as those of depth, that add to them; 0 for none, as in
     the shipped encoder."""
-    sweep_channels: int = 7
+    sweep_channels: int = SWEEP_CHANNELS
     """Features of a lidar sweep, see :func:`~monoforce_ros.encoder.sweep.sweep_features`: 7, or 3 (heights only) of
     checkpoints that do not name it."""
     image_features: int = 32
@@ -87,8 +89,10 @@ class EncoderConfig:
             value = getattr(self, name)
             if not isinstance(value, int | float) or isinstance(value, bool) or not low <= value <= high:
                 raise ValueError(f"encoder {name}: got {value!r}, expected {low} to {high}")
-        if self.sweep_channels not in (3, 7):
-            raise ValueError(f"encoder sweep_channels: got {self.sweep_channels!r}, expected 3 or 7")
+        if self.sweep_channels not in (HEIGHT_CHANNELS, SWEEP_CHANNELS):
+            raise ValueError(
+                f"encoder sweep_channels: got {self.sweep_channels!r}, expected {HEIGHT_CHANNELS} or {SWEEP_CHANNELS}"
+            )
         for name in ("decreases", "edges"):
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"encoder {name}: got {getattr(self, name)!r}, expected true or false")
@@ -114,7 +118,7 @@ class EncoderConfig:
     @property
     def believes(self) -> bool:
         """Whether an output says how far heights that a sweep measured are believed."""
-        return self.takes_sweeps and self.sweep_channels > 3
+        return self.takes_sweeps and self.sweep_channels > HEIGHT_CHANNELS
 
     @property
     def feature_rows(self) -> int:

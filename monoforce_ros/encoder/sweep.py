@@ -5,13 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from monoforce_ros.encoder.config import EncoderConfig
+from monoforce_ros.encoder.config import HEIGHT_CHANNELS, EncoderConfig
 from monoforce_ros.terrain import Grid, LidarSettings, cell_heights, stands_on_ground
 
-HEIGHT_CHANNELS = 3
-"""Of :func:`cell_extremes`."""
-SWEEP_CHANNELS = 7
-"""Of :func:`sweep_features`."""
 HIT, TOP, STANDING = 2, 5, 6
 """Channels: the mask of cells with points; the height of what stands on the ground, and its mask."""
 _REACH = 0.25

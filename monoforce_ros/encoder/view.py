@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from monoforce_ros.core import CameraModel
-from monoforce_ros.encoder.config import EncoderConfig
+from monoforce_ros.encoder.config import HEIGHT_CHANNELS, SWEEP_CHANNELS, EncoderConfig
 from monoforce_ros.encoder.lift import feature_rays
-from monoforce_ros.encoder.sweep import HEIGHT_CHANNELS, SWEEP_CHANNELS, cell_extremes, sweep_features
+from monoforce_ros.encoder.sweep import cell_extremes, sweep_features
 from monoforce_ros.terrain import Grid
 
 _EMPTY = 127

@@ -233,7 +233,8 @@ def _train(options: argparse.Namespace, process: Process) -> None:
     # Results of a seed depend on the number of threads.
     if options.threads:
         torch.set_num_threads(options.threads)
-    config, settings = _config(options), _settings(options)
+    start = None if options.start_from is None else load_encoder(options.start_from)
+    config, settings = _config(options, start), _settings(options)
     robot = load_robot(options.robot)
     held_out = list(options.held_out)
     bags = [bag for bag in options.bags if bag not in held_out]
@@ -262,7 +263,7 @@ def _train(options: argparse.Namespace, process: Process) -> None:
             )
     robot = _with_vegetation(robot, training, config, settings, options, process)
     torch.manual_seed(settings.seed)
-    encoder = _encoder(options, config)
+    encoder = _encoder(options, config, start)
     if options.depth_steps and process.first and not state_file(options.out).is_file():
         _train_depth(encoder, training, options)
     if options.depth_steps and process.count > 1:
@@ -384,38 +385,35 @@ def _with_vegetation(
     return load_robot(file)
 
 
-def _encoder(options: argparse.Namespace, config: EncoderConfig) -> Encoder:
-    if options.start_from is not None:
-        encoder = load_encoder(options.start_from)
-        found, expected = asdict(encoder.config), asdict(config)
+def _encoder(options: argparse.Namespace, config: EncoderConfig, start: Encoder | None) -> Encoder:
+    if start is not None:
+        found, expected = asdict(start.config), asdict(config)
         free = {"decreases", "edges", "geometric_spread_factor", "decrease_spread_factor"}
-        if isinstance(encoder, TerrainEncoder) and not encoder.config.relative_bins:
-            free.add("relative_bins")
-        if isinstance(encoder, TerrainEncoder):
-            free.add("sweep_channels")
+        if isinstance(start, TerrainEncoder):
+            free |= {"sweep_channels"} | (set() if start.config.relative_bins else {"relative_bins"})
         names = [n for n in expected if n not in free and expected[n] != found[n]]
         if names:
             differences = "; ".join(f"{name}: got {found[name]}, expected {expected[name]}" for name in names)
             raise CheckpointError(f"{options.start_from}: configuration differs from the options: {differences}")
-        return extended(encoder, config)
+        return extended(start, config)
     encoder = new_encoder(config)
     if isinstance(encoder, TerrainEncoder) and options.backbone_weights == "imagenet":
         encoder.backbone.load_imagenet()
     return encoder
 
 
-def _config(options: argparse.Namespace) -> EncoderConfig:
+def _config(options: argparse.Namespace, start: Encoder | None) -> EncoderConfig:
     width, _, height = options.size.partition("x")
     if not (width.isdecimal() and height.isdecimal()):
         raise ValueError(f"--size: got {options.size!r}, expected two whole numbers as in 320x240")
-    start = EncoderConfig() if options.start_from is None else load_encoder(options.start_from).config
+    given = EncoderConfig() if start is None else start.config
     return EncoderConfig(
-        sensor=start.sensor if options.sensor is None else options.sensor,
+        sensor=given.sensor if options.sensor is None else options.sensor,
         image_width=int(width),
         image_height=int(height),
         map_size=options.map_size,
         resolution=options.resolution,
-        relative_bins=start.relative_bins if options.relative_bins is None else options.relative_bins,
+        relative_bins=given.relative_bins if options.relative_bins is None else options.relative_bins,
         decreases=options.losses != ["geometric"],
         edges=options.losses != ["geometric"] if options.edges is None else options.edges,
     )

@@ -12,7 +12,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from monoforce_ros.core import atomic_path
-from monoforce_ros.encoder import Encoder
+from monoforce_ros.encoder import HEIGHT_CHANNELS, Encoder
 
 
 class TrainingError(RuntimeError):
@@ -66,7 +66,7 @@ def read_state(file: Path, encoder: Encoder, optimiser: torch.optim.Optimizer, s
     expected, saved = json.loads(json.dumps(settings)), _renamed(description["settings"])
     different = [name for name, value in expected.items() if saved.get(name) != value]
     # States of earlier releases do not name bins of relative depth, nor the channels of a sweep.
-    if {"relative_bins": 0, "sweep_channels": 3} | description["config"] != asdict(encoder.config):
+    if {"relative_bins": 0, "sweep_channels": HEIGHT_CHANNELS} | description["config"] != asdict(encoder.config):
         different.append("network configuration")
     if different:
         raise TrainingError(
