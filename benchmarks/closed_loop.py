@@ -4,8 +4,8 @@
                                                     [--docs FILE] [--png FILE]
 
 The three processes communicate through ROS in real time. A run succeeds if the robot comes within half a metre of the
-goal within the time limit without touching the wall. `lidar` treats grass as solid ground, `camera` runs the terrain
-encoder, and `lidar_camera` lowers the lidar's heights by the encoder's predicted compliance.
+goal within the time limit without touching the wall. `lidar_interpolation` treats grass as solid ground; the other
+sources run the terrain encoder on the sweep, the images, or both.
 
 Settings of the encoder and the selector were tuned on courses with seeds 80000 to 80031. Reported results use held-out
 seeds from 91000 on (the default); `--docs` rejects the tuning seeds.
@@ -28,6 +28,7 @@ from rclpy.qos import QoSProfile
 from ros_peer import Executable, Peer
 
 from monoforce_ros.core import write_text
+from monoforce_ros.perception import SOURCES
 from monoforce_ros.reporting import write_between
 from monoforce_ros.robots import load_robot
 from monoforce_ros.synthetic import WALL_THICKNESS, CourseSettings
@@ -37,6 +38,8 @@ CHOICE_SEEDS = range(80_000, 80_032)
 """Seeds of courses for tuning the encoder and the selector; never report results on them."""
 REPORT_SEED = 91_000
 """First seed of courses for reported results; do not tune on this or later seeds."""
+DRIVEN = tuple(source for source in SOURCES if source != "flat")
+"""Terrain sources that see the wall."""
 TOLERANCE = 0.5
 """Distance to the goal at which it counts as reached [m]."""
 GOAL_BEHIND_GRASS = 2.0
@@ -165,8 +168,8 @@ def main() -> None:
         help=f"first seed (%(default)s); {CHOICE_SEEDS[0]} to {CHOICE_SEEDS[-1]} are for tuning, seeds from "
         f"{REPORT_SEED} on for reporting",
     )
-    parser.add_argument("--source", nargs="+", choices=("lidar", "camera", "lidar_camera"),
-                        default=["lidar", "camera", "lidar_camera"], help="terrain sources (default: all)")  # fmt: skip
+    parser.add_argument("--source", nargs="+", choices=DRIVEN, default=list(DRIVEN),
+                        help="terrain sources (default: all)")  # fmt: skip
     parser.add_argument("--robot", default="husky", help="robot name or file (%(default)s)")
     parser.add_argument("--checkpoint", default="", help="terrain encoder weights (default: the shipped ones)")
     parser.add_argument("--seconds", type=float, default=75.0, help="time limit of each run (%(default)s)")

@@ -26,13 +26,24 @@ LEARNED = {
 SHIPPED = tuple(name for name in LEARNED if name.startswith("shipped"))
 RATIOS = (
     ("monoforce", "lss"), ("monoforce", "lidar"), ("monoforce", "no_geometric"), ("monoforce", "no_terrain"),
-    ("lidar_ht", "lidar_hg"), ("lidar_ht", "lidar"), ("both", "monoforce"), ("both", "lidar_ht"),
+    ("lss", "lidar"), ("lidar_hg", "lidar"), ("lidar_ht", "lidar_hg"), ("lidar_ht", "lidar"),
+    ("both", "monoforce"), ("both", "lidar_ht"),
     ("shipped", "lidar"), ("shipped", "flat"), ("shipped_lidar", "lidar"), ("shipped_both", "shipped"),
     ("shipped_both", "shipped_lidar"), ("shipped_both", "lidar"), ("lidar", "true_support"),
 )  # fmt: skip
 """Systems whose errors are compared."""
+RIGID = ("below 0.05 m",)
+"""Strata without vegetation, as the paper's Table I."""
 TALL = ("0.4 to 0.8 m", "0.8 m or more")
-"""Strata of tall vegetation."""
+"""Strata of tall vegetation, as its Table II."""
+PAPER = {
+    "lidar": ((0.14, 4.06), (0.13, 4.74)),
+    "lidar_hg": ((0.20, 4.63), (0.13, 4.32)),
+    "lss": ((0.12, 4.59), (0.11, 5.80)),
+    "monoforce": ((0.13, 4.53), (0.07, 2.62)),
+    "no_geometric": (None, (0.09, 2.56)),
+}
+"""Δx [m] and ΔR [deg] of the paper: on RELLIS-3D (Table I), which is rigid, and on RobinGas (Tables II and III)."""
 
 
 @dataclass(frozen=True)
@@ -111,26 +122,42 @@ def table(results: Sequence[Result]) -> str:
 
 
 def ratio_table(results: Sequence[Result], physics: str) -> str:
-    """Markdown table of the ratios of :data:`RATIOS` for which both systems were evaluated; empty without any."""
+    """Markdown table of the ratios of :data:`RATIOS` for which both systems were evaluated; empty without any.
+
+    Those of the paper stand beside the worlds that are like its own: without vegetation, and with tall vegetation.
+    """
     chosen = [result for result in results if result.physics == physics]
     by_system: dict[str, list[Result]] = {}
     for result in chosen:
         by_system.setdefault(result.system, []).append(result)
-    lines = ["| ratio | Δx | ΔR | Δx, tall vegetation | ΔR, tall vegetation |", "|---|---|---|---|---|"]
+    lines = [
+        "| ratio | Δx | ΔR | rigid: Δx | ΔR | paper's Table I | tall vegetation: Δx | ΔR | paper's Tables II, III |",
+        "|---" * 9 + "|",
+    ]
     for first, second in RATIOS:
         if first not in by_system or second not in by_system:
             continue
         cells = []
-        for tall in (False, True):
+        for table_number, strata in enumerate((None, RIGID, TALL), start=-1):
             own, others = (
-                [r for r in by_system[key] if not tall or r.strata.get("vegetation height") in TALL]
+                [r for r in by_system[key] if strata is None or r.strata.get("vegetation height") in strata]
                 for key in (first, second)
             )
             for measure in ("position", "rotation"):
                 value, low, high = ratio(own, others, measure)
                 cells.append(f"{value:.2f} ({low:.2f} – {high:.2f})" if np.isfinite(value) else "–")
+            if strata is not None:
+                cells.append(_paper_ratio(first, second, table_number))
         lines.append(f"| {first} / {second} | {' | '.join(cells)} |")
     return "\n".join(lines) if len(lines) > 2 else ""
+
+
+def _paper_ratio(first: str, second: str, table_number: int) -> str:
+    """Ratios of Δx and ΔR in the paper; ``table_number`` 0 for Table I, 1 for Tables II and III."""
+    own, others = (PAPER.get(name, (None, None))[table_number] for name in (first, second))
+    if own is None or others is None:
+        return "–"
+    return ", ".join(f"{mine / other:.2f}" for mine, other in zip(own, others, strict=True))
 
 
 def strata_table(results: Sequence[Result], physics: str) -> str:

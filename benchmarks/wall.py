@@ -8,12 +8,13 @@ encoder predicts the same motion from one image. Randomly selected scenes have n
 predict a crash. Each prediction is repeated with uniform friction, because a wall blurred into a slope stops the robot
 only if the predicted friction is low.
 
-    scripts/run.sh python benchmarks/wall.py --any-texture [--quick] [--monoforce FILE ...] [--seed N] [--json FILE]
+    scripts/run.sh python benchmarks/wall.py --any-texture [--quick] [--checkpoint SYSTEM=FILE ...] [--seed N]
+        [--json FILE] [--docs FILE]
 
 draws walls and posts of any texture and colour, 0.15 to 1.2 m high and 0.6 to 6 m away, and soft vegetation that looks
 like a wall, and reports precision, recall and the stopping position. The robot is commanded to drive straight ahead for
-eight seconds. Without --monoforce it tests the shipped encoder, or that of --encoder, with images, with a lidar sweep
-and with both.
+eight seconds. Systems are those of benchmarks/terrain.py, each with one checkpoint per training seed, whose scenes are
+counted together; without any, the shipped encoder is tested with images, with a lidar sweep and with both.
 
 The table in docs/training.md uses seeds from 70000 on. The thresholds of encoder/edges.py and the average of encoders
 were tuned on seeds 80000 to 80031; seeds 93000 to 93031 are held out.
@@ -23,18 +24,22 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from matplotlib.figure import Figure
+from terrain import parse_checkpoints
+from terrain_tables import LEARNED
 from tqdm import tqdm
 
 from monoforce_ros.core import MotionState, write_text
 from monoforce_ros.encoder import fused, load_encoder
+from monoforce_ros.evaluation.tables import System, terrain_source
 from monoforce_ros.messages import decoding
-from monoforce_ros.perception import EncoderTerrain, LidarTerrain, Observation, TerrainSource, choose_terrain_source
+from monoforce_ros.perception import EncoderTerrain, LidarTerrain, Observation, TerrainSource
 from monoforce_ros.prediction import Prediction, Predictor
 from monoforce_ros.reporting import write_between
 from monoforce_ros.robots import RobotModel, load_robot
@@ -197,33 +202,31 @@ def any_row(title: str, scenes: list[AnyScene], driven: np.ndarray) -> dict:
     return row
 
 
+def _driven_with(
+    sources: Sequence[TerrainSource], robot: RobotModel, scenes: list[AnyScene], title: str
+) -> tuple[list[AnyScene], np.ndarray]:
+    """The scenes, once for each source, and the distances predicted with it [m]."""
+    driven = [
+        predicted(Predictor(robot, source, horizon=ANY_HORIZON), scene, ANY_SPEED)[0]
+        for source in sources
+        for scene in tqdm(scenes, desc=title, leave=False)
+    ]
+    return list(scenes) * len(sources), np.array(driven)
+
+
 def run_any(options: argparse.Namespace, titles: dict[str, str]) -> None:
     """Evaluate terrain sources on obstacles of any texture."""
     robot = load_robot(options.robot)
     counts = QUICK_SCENES if options.quick else ANY_SCENES
     jobs = [(kind, options.seed + 1000 * index + i) for index, kind in enumerate(counts) for i in range(counts[kind])]
     scenes = [any_scene(*job) for job in tqdm(jobs, desc="scenes")]
-    sources: dict[str, TerrainSource] = {
-        titles[key]: EncoderTerrain(fused(load_encoder(getattr(options, key))), robot)
-        for key in ("monoforce", "no_geometric", "lss")
-        if getattr(options, key)
-    }
-    if not sources:
-        name = "this encoder" if options.encoder else "shipped encoder"
-        encoder = fused(load_encoder(options.encoder, "camera"))
-        taken = encoder.config.sensor.split("_")
-        for title, sensors in (("images", ("camera",)), ("a sweep", ("lidar",)), ("both", ("camera", "lidar"))):
-            if all(sensor in taken for sensor in sensors):
-                sources[f"{name}, {title}"] = EncoderTerrain(encoder, robot, sensors)
-        sources[f"lidar lowered by {name} (lidar_camera)"] = choose_terrain_source(
-            "lidar_camera", robot, checkpoint=options.encoder
-        )
-    sources[titles["lidar"]] = LidarTerrain(robot, Grid.square(), TerrainDefaults())
     rows = []
-    for title, source in sources.items():
-        predictor = Predictor(robot, source, horizon=ANY_HORIZON)
-        driven = np.array([predicted(predictor, scene, ANY_SPEED)[0] for scene in scenes])
-        rows.append(any_row(title, scenes, driven))
+    for name, files in parse_checkpoints(options.checkpoint).items():
+        systems = [System(name, *LEARNED[name], file) for file in files]
+        sources = [terrain_source(system, robot) for system in systems]
+        rows.append(any_row(systems[0].title, *_driven_with(sources, robot, scenes, systems[0].title)))
+    interpolation = [LidarTerrain(robot, Grid.square(), TerrainDefaults())]
+    rows.append(any_row(titles["lidar"], *_driven_with(interpolation, robot, scenes, titles["lidar"])))
     lines = ["| terrain | precision | recall | walls | posts | soft vegetation | stop error (median) |"]
     lines += ["|---|---|---|---|---|---|---|"]
     for row in rows:
@@ -250,9 +253,8 @@ def main() -> None:
     }  # fmt: skip
     for key in ("monoforce", "no_geometric", "lss"):
         parser.add_argument(f"--{key.replace('_', '-')}", type=Path, metavar="FILE.safetensors")
-    parser.add_argument(
-        "--encoder", default="", metavar="FILE", help="with --any-texture: another one than the shipped"
-    )
+    parser.add_argument("--checkpoint", action="append", default=[], metavar="SYSTEM=FILE", help="with --any-texture: "
+                        f"repeat for other systems and training seeds; systems: {', '.join(LEARNED)}")  # fmt: skip
     parser.add_argument("--robot", default="husky", help="name or file (default: %(default)s)")
     parser.add_argument("--any-texture", action="store_true", help="walls, posts and vegetation of any texture")
     parser.add_argument("--quick", action="store_true", help="with --any-texture: 16 scenes instead of 80")
@@ -265,7 +267,10 @@ def main() -> None:
     if options.seed is None:
         options.seed = ANY_SEED if options.any_texture else 70000
     if options.any_texture:
-        run_any(options, titles)
+        try:
+            run_any(options, titles)
+        except ValueError as error:
+            parser.error(str(error))
         return
     robot = load_robot(options.robot)
     sources = {

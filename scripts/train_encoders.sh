@@ -15,8 +15,8 @@ run() { scripts/run.sh "$@"; }
 
 if [ "$target" = checkpoint ]; then
   # Images and sweeps of randomised worlds with the simulator's surfaces as targets: first rough country, then also level
-  # sites with more walls, and with the late stages of the backbone, then the map alone. Walls cover few cells and weigh
-  # more.
+  # sites with more walls, and with the late stages of the backbone, then the map alone, last with more sweeps. Walls
+  # cover few cells and weigh more.
   shipped() { # name, worlds, steps, options
     local out=out/encoders/$1 count=$2 steps=$3
     shift 3
@@ -27,8 +27,10 @@ if [ "$target" = checkpoint ]; then
   shipped country 200 2200 --world-styles varied --validate-every 550
   shipped sites 256 1400 --start-from out/encoders/country/encoder.safetensors --rate 0.0012 --train-backbone late \
     --seed 2 --validate-every 350
-  shipped shipped 256 700 --start-from out/encoders/sites/encoder.safetensors --rate 0.0012 --train-backbone map \
-    --seed 4 --validate-every 350
+  shipped map 256 1700 --start-from out/encoders/sites/encoder.safetensors --rate 0.0015 --train-backbone map \
+    --seed 5 --validate-every 425
+  shipped shipped 256 1000 --start-from out/encoders/map/encoder.safetensors --rate 0.0015 --train-backbone map \
+    --sensor-shares 0.25 0.4 0.35 --seed 6 --validate-every 500
   for ending in safetensors json; do
     cp "out/encoders/shipped/encoder.$ending" "models/.terrain_encoder.$ending"
     mv "models/.terrain_encoder.$ending" "models/terrain_encoder.$ending"

@@ -57,3 +57,4 @@ for system in shipped shipped_lidar shipped_both; do
   checkpoints+=" --checkpoint $system=models/terrain_encoder.safetensors"
 done
 scripts/run.sh python benchmarks/terrain.py --out "$out/tables" --jobs "$jobs" $checkpoints --docs docs/training.md
+scripts/run.sh python benchmarks/wall.py --any-texture $checkpoints --json "$out/tables/wall.json" --docs docs/protocol.md

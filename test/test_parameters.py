@@ -135,8 +135,10 @@ def test_parameters_that_have_no_effect_are_said(declared):
         said("checkpoint:=/a.safetensors", "terrain_source:=lidar_camera", "ensemble:=8", "ensemble_scale:=2.0") == []
     )
     assert said("candidate_topic:=/planner", "candidate_delay:=0.2", "limit_roll:=0.3") == []
-    assert said("checkpoint:=/a.safetensors") == [
-        "checkpoint has no effect: it needs terrain_source camera or lidar_camera, and terrain_source is lidar"
+    assert said("checkpoint:=/a.safetensors") == []
+    assert said("camera_retention_time:=1.0") == [
+        "camera_retention_time has no effect: it needs terrain_source camera or lidar_camera, and terrain_source is "
+        "lidar"
     ]
     assert said("refine_seconds:=0.1", "ensemble_scale:=2.0", "candidates:=0") == [
         "refine_seconds has no effect: it needs candidates or candidate_topic, and candidates is off, "

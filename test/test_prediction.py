@@ -69,7 +69,7 @@ def test_a_wall_just_ahead_does_not_reach_into_the_robot():
     """A lidar sees no ground near the robot; heights interpolated from the wall would push the robot away."""
     robot = load_robot("husky")
     still = MotionState(0, np.zeros(3), Rotation.from_euler("z", 0.7).as_matrix(), np.zeros(3), np.zeros(3))
-    predictor = Predictor(robot, choose_terrain_source("lidar", robot), horizon=1.0)
+    predictor = Predictor(robot, choose_terrain_source("lidar_interpolation", robot), horizon=1.0)
     seen = predictor.source.terrain(Observation(0, sweep(0.62)), still)
     terrain = clear_of_robot(seen, robot, still)
     twists = np.zeros((1, len(predictor.command_stamps(0)), 2))
@@ -92,7 +92,7 @@ def test_beside_a_wall_the_robot_stands_and_may_drive_away(wall, heading):
     robot = load_robot("husky")
     turn = Rotation.from_euler("z", heading).as_matrix()
     still = MotionState(0, np.zeros(3), turn, np.zeros(3), np.zeros(3))
-    predictor = Predictor(robot, choose_terrain_source("lidar", robot), horizon=3.0)
+    predictor = Predictor(robot, choose_terrain_source("lidar_interpolation", robot), horizon=3.0)
     terrain = predictor.source.terrain(Observation(0, (sweep(wall) @ turn).astype(np.float32)), still)
     twists = np.zeros((2, len(predictor.command_stamps(0)), 2))
     twists[1, :, 0] = -0.4
@@ -115,7 +115,7 @@ def test_before_low_things_heights_are_interpolated():
     """Grass, too, is seen from above only: a robot in it must not stand between walls."""
     robot = load_robot("husky")
     still = MotionState(0, np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3))
-    source = choose_terrain_source("lidar", robot)
+    source = choose_terrain_source("lidar_interpolation", robot)
     grass = sweep(9.0)
     grass[:, 2] += 0.35
     terrain = source.terrain(Observation(0, grass.astype(np.float32)), still)

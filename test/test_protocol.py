@@ -64,6 +64,10 @@ def test_ratios_compare_the_same_worlds():
     (row,) = [line for line in terrain_tables.ratio_table([*tall, *short], "paper").splitlines() if "both" in line]
     assert row.startswith("| both / monoforce | 0.5") and row.count("| 0.40 (0.40 – 0.40) ") == 2
     assert terrain_tables.ratio_table(second, "paper") == ""
+    # The paper's own ratios, which it gives in tables of errors, stand beside.
+    both_known = [result(name, "0", world, 0.1, strata=strata) for name in ("monoforce", "lss") for world in (1, 2)]
+    (row,) = [line for line in terrain_tables.ratio_table(both_known, "paper").splitlines() if "lss" in line]
+    assert row.split(" | ")[5] == "1.08, 0.99" and row.endswith("| 0.64, 0.45 |")
 
 
 def test_an_encoder_gets_the_sensors_of_its_row():

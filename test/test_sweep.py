@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from hypothesis import strategies as st
 from monoforce_ros.encoder import EncoderConfig, extended, load_encoder, new_encoder, save_encoder
 from monoforce_ros.encoder.config import SWEEP_CHANNELS
 from monoforce_ros.encoder.sweep import cell_extremes, sweep_features
-from monoforce_ros.terrain import LidarSettings, cell_heights
+from monoforce_ros.terrain import LidarSettings, cell_heights, terrain_from_cloud
 
 CONFIG = EncoderConfig(sensor="lidar")
 
@@ -23,9 +24,9 @@ def turned(points: np.ndarray, angle: float) -> np.ndarray:
     return points @ np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
 
 
-def ground_and(points: np.ndarray, random: np.random.Generator) -> np.ndarray:
+def ground_and(points: np.ndarray, random: np.random.Generator, count: int = 4000) -> np.ndarray:
     """Points of level ground around the origin, and others."""
-    level = np.c_[random.uniform(-5.0, 5.0, (4000, 2)), random.normal(0.0, 0.01, 4000)]
+    level = np.c_[random.uniform(-5.0, 5.0, (count, 2)), random.normal(0.0, 0.01, count)]
     return np.r_[level, points]
 
 
@@ -60,7 +61,8 @@ def test_the_ground_before_a_wall_does_not_scatter():
     points = ground_and(np.zeros((0, 3)), random)
     features = sweep_features(points, 0.0, CONFIG)
     assert not features[3:5].any()
-    assert (features[6] == features[2]).all() and (features[5] == features[1]).all()
+    assert (features[6] == features[2]).all()
+    assert (features[5] >= features[0]).all() and (features[5] <= features[1]).all()
     np.testing.assert_array_equal(features[:3], cell_extremes(points, 0.0, CONFIG))
     assert features.shape == (SWEEP_CHANNELS, CONFIG.grid.rows, CONFIG.grid.columns)
 
@@ -100,8 +102,10 @@ def test_an_untrained_encoder_predicts_what_the_sweep_measured(tmp_path):
     random = np.random.default_rng(4)
     wall = np.c_[np.full(300, 3.0), random.uniform(-1.0, 1.0, 300), random.uniform(0.0, 0.8, 300)]
     crown = np.c_[random.uniform(-3.5, -3.0, 200), random.uniform(-0.5, 0.5, 200), random.uniform(2.0, 2.5, 200)]
+    # Points in all cells: nothing is interpolated.
+    points = ground_and(np.r_[wall, crown], random, 100_000)
     encoder = new_encoder(EncoderConfig(sensor="lidar", map_features=8)).eval()
-    found = encoder.terrain([], sweep=ground_and(np.r_[wall, crown], random))
+    found = encoder.terrain([], sweep=points)
     height, grid = found.geometric_height.numpy(), found.grid
     at = lambda x, y: height[int(np.argmin(abs(grid.y - y))), int(np.argmin(abs(grid.x - x)))]  # noqa: E731
     # A step of one cell, and no wall below branches.
@@ -109,22 +113,70 @@ def test_an_untrained_encoder_predicts_what_the_sweep_measured(tmp_path):
     assert abs(at(-3.24, 0.04)) < 0.05
     # What does not carry lowers H_t alone, and what is not believed does not count.
     with torch.no_grad():
-        encoder.heads.bias[-1] = -20.0
-    found = encoder.terrain([], sweep=ground_and(np.r_[wall, crown], random))
+        encoder.heads.bias[8] = -20.0
+    found = encoder.terrain([], sweep=points)
     assert float(found.geometric_height.max()) > 0.6 and float(found.height.max()) < 0.05
     with torch.no_grad():
-        encoder.heads.bias[-2] = -20.0
-    found = encoder.terrain([], sweep=ground_and(np.r_[wall, crown], random))
+        encoder.heads.bias[[7, 9]] = -20.0
+    found = encoder.terrain([], sweep=points)
     assert float(found.geometric_height.abs().max()) < 1e-6
 
 
+def test_an_untrained_encoder_interpolates_between_rings_as_the_lidar_map_does():
+    random = np.random.default_rng(6)
+    directions, distances = random.uniform(0.0, 2 * math.pi, 3000), random.choice([2.0, 3.0, 4.5, 6.0], 3000)
+    points = np.c_[distances * np.cos(directions), distances * np.sin(directions), np.zeros(3000)]
+    points[:, 2] = 0.2 + 0.15 * points[:, 0]
+    support = np.array([[0.4, 0.3, 0.26], [0.4, -0.3, 0.26], [-0.4, 0.3, 0.14], [-0.4, -0.3, 0.14]])
+    encoder = new_encoder(EncoderConfig(sensor="lidar", map_features=8)).eval()
+    interpolated = terrain_from_cloud(points, encoder.config.grid, support=support)
+    between = ~interpolated.observed
+
+    def mean_error() -> float:
+        found = encoder.terrain([], support, sweep=points)
+        return float((found.geometric_height - interpolated.height)[between].abs().mean())
+
+    # An output of 95 % is the only difference.
+    assert mean_error() < 0.03
+    with torch.no_grad():
+        encoder.heads.bias[9] = -20.0
+    assert mean_error() > 0.1
+    # Without a sweep, the output has no effect.
+    with torch.no_grad():
+        encoder.heads.bias[9] = 20.0
+    assert float(encoder.terrain([], support, sweep=np.zeros((0, 3))).geometric_height[0, 0]) == pytest.approx(0.2)
+
+
+def test_encoders_without_the_interpolation_can_be_trained_further_with_it():
+    torch.manual_seed(2)
+    old = new_encoder(EncoderConfig(sensor="lidar", sweep_channels=7, map_features=8))
+    with torch.no_grad():
+        for parameter in old.heads.parameters():
+            parameter.normal_(0.0, 0.1)
+    wider = extended(old, EncoderConfig(sensor="lidar", map_features=8)).eval()
+    points = ground_and(np.zeros((0, 3)), np.random.default_rng(7))
+    with torch.no_grad():
+        wider.heads.bias[9] = -20.0
+    before, after = (e.eval().terrain([], sweep=points) for e in (old, wider))
+    unseen = ~before.observed
+    assert before.height[unseen].std() > 0.0
+    torch.testing.assert_close(before.height[unseen], after.height[unseen], rtol=0.0, atol=1e-5)
+    # Measured heights are believed rather than corrected.
+    assert float(after.geometric_height[before.observed].abs().mean()) < 0.7 * float(
+        before.geometric_height[before.observed].abs().mean()
+    )
+
+
 @settings(max_examples=30, deadline=None)
-@given(st.integers(0, 2000), st.floats(0.2, 3.0), st.integers(0, 2**32 - 1))
+@given(st.integers(0, 2000), st.floats(0.02, 3.0), st.integers(0, 2**32 - 1))
 def test_the_height_of_what_stands_is_that_of_the_lidar_map(count, spread, seed):
     random = np.random.default_rng(seed)
     points = np.c_[random.uniform(-2.0, 2.0, (count, 2)), random.normal(0.0, spread, count)]
     features = sweep_features(points, 0.3, CONFIG)
-    limits = LidarSettings(lowest=CONFIG.lowest, highest=CONFIG.highest, quantile=1.0)
-    top, standing = cell_heights(points - np.array([0.0, 0.0, 0.3]), CONFIG.grid, limits)
+    limits = LidarSettings(lowest=CONFIG.lowest, highest=CONFIG.highest)
+    relative = points - np.array([0.0, 0.0, 0.3])
+    usual, standing = cell_heights(relative, CONFIG.grid, limits)
+    highest, _ = cell_heights(relative, CONFIG.grid, replace(limits, quantile=1.0))
+    rises = features[1] - features[0] > 0.1
     np.testing.assert_array_equal(features[6] > 0, standing)
-    np.testing.assert_allclose(features[5], top, atol=1e-9)
+    np.testing.assert_allclose(features[5], np.where(rises, highest, usual), atol=1e-9)

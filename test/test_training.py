@@ -500,6 +500,18 @@ def test_unusable_input_is_reported_in_one_line(executables, tmp_path, demo_bag)
     assert unknown.returncode == 1 and "no images with a CameraInfo" in unknown.stderr
 
 
+def test_shares_of_sensors_decide_what_a_sample_lacks():
+    random = np.random.default_rng(3)
+    swept = [Augmentation.draw(random, (0.0, 0.0, 1.0)) for _ in range(20)]
+    assert not any(drawn.shows(camera) for drawn in swept for camera in range(6))
+    assert all(drawn.sweep_share > 0.0 for drawn in swept)
+    seeing = [Augmentation.draw(random, (2.0, 0.0, 0.0)) for _ in range(20)]
+    assert all(any(drawn.shows(camera) for camera in range(6)) for drawn in seeing)
+    assert not any(drawn.sweep_share for drawn in seeing)
+    with pytest.raises(ValueError, match="sensor_shares: got"):
+        TrainingSettings(sensor_shares=(0.0, 0.0, 0.0))
+
+
 def test_fine_tuning_takes_the_sensors_and_bins_of_its_start():
     arguments = ["bag", "--start-from", str(shipped_checkpoint())]
     options = build_parser().parse_args(arguments)

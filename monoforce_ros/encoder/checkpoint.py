@@ -103,8 +103,11 @@ def extended(encoder: Encoder, config: EncoderConfig) -> Encoder:
     for name in ("heads.weight", "heads.bias"):
         weights[name] = torch.cat([weights[name], own[name][len(weights[name]) :]])
     first = "bird.enter.0.weight"
-    # The sweep's features are the last inputs.
-    weights[first] = functional.pad(weights[first], (0, 0, 0, 0, 0, own[first].shape[1] - weights[first].shape[1]))
+    # The sweep's features are the last inputs, or the first ones if there are no images.
+    old = weights[first].shape[1] if config.takes_images else encoder.config.sweep_channels
+    before, after = weights[first][:, :old], weights[first][:, old:]
+    added = own[first].shape[1] - weights[first].shape[1]
+    weights[first] = torch.cat([functional.pad(before, (0, 0, 0, 0, 0, added)), after], dim=1)
     fresh.load_state_dict(own | weights)
     return fresh
 

@@ -11,8 +11,9 @@ FORMAT = 2
 """Version of the network's inputs and outputs; checkpoints of other versions cannot be used."""
 BACKBONES = ("efficientnet_lite0",)
 
-HEIGHT_CHANNELS, SWEEP_CHANNELS = 3, 7
-"""Features of a lidar sweep: its heights, and all (:mod:`sweep`)."""
+HEIGHT_CHANNELS, SCATTER_CHANNELS, SWEEP_CHANNELS = 3, 7, 8
+"""Features of a lidar sweep: its heights; with scatter and what stands on the ground; with the interpolation, which are
+all (:mod:`sweep`)."""
 FEATURE_STRIDE = 8
 """Stride of the lifted features in pixels of the resized image."""
 
@@ -41,8 +42,8 @@ class EncoderConfig:
     """Number of bins of depth relative to level ground, as wide as those of depth, that add to them; 0 for none, as in
     the shipped encoder."""
     sweep_channels: int = SWEEP_CHANNELS
-    """Features of a lidar sweep, see :func:`~monoforce_ros.encoder.sweep.sweep_features`: 7, or 3 (heights only) of
-    checkpoints that do not name it."""
+    """Features of a lidar sweep, see :func:`~monoforce_ros.encoder.sweep.sweep_features`: 8, 7 (without interpolation),
+    or 3 (heights only) of checkpoints that do not name it."""
     image_features: int = 32
     """Channels lifted into the map."""
     map_features: int = 24
@@ -89,9 +90,10 @@ class EncoderConfig:
             value = getattr(self, name)
             if not isinstance(value, int | float) or isinstance(value, bool) or not low <= value <= high:
                 raise ValueError(f"encoder {name}: got {value!r}, expected {low} to {high}")
-        if self.sweep_channels not in (HEIGHT_CHANNELS, SWEEP_CHANNELS):
+        if self.sweep_channels not in (HEIGHT_CHANNELS, SCATTER_CHANNELS, SWEEP_CHANNELS):
             raise ValueError(
-                f"encoder sweep_channels: got {self.sweep_channels!r}, expected {HEIGHT_CHANNELS} or {SWEEP_CHANNELS}"
+                f"encoder sweep_channels: got {self.sweep_channels!r}, expected {HEIGHT_CHANNELS}, "
+                f"{SCATTER_CHANNELS} or {SWEEP_CHANNELS}"
             )
         for name in ("decreases", "edges"):
             if not isinstance(getattr(self, name), bool):
@@ -119,6 +121,11 @@ class EncoderConfig:
     def believes(self) -> bool:
         """Whether an output says how far heights that a sweep measured are believed."""
         return self.takes_sweeps and self.sweep_channels > HEIGHT_CHANNELS
+
+    @property
+    def interpolates(self) -> bool:
+        """Whether another one says how far heights interpolated between them are believed."""
+        return self.takes_sweeps and self.sweep_channels > SCATTER_CHANNELS
 
     @property
     def feature_rows(self) -> int:

@@ -11,12 +11,13 @@ from torch.nn import functional
 
 from monoforce_ros.encoder.config import EncoderConfig
 from monoforce_ros.encoder.edges import restore_edges
-from monoforce_ros.encoder.sweep import STANDING, TOP
+from monoforce_ros.encoder.sweep import BETWEEN, STANDING, TOP
 from monoforce_ros.encoder.view import EncoderInput
 from monoforce_ros.terrain import TerrainMap
 
 _HEADS, _SWEEP_HEADS = 7, 2
-"""And those for how far heights that a sweep measured are believed, and how far they carry."""
+"""And those for how far heights that a sweep measured are believed, and how far they carry; another one for heights
+interpolated between them."""
 _SOFTPLUS_BETA = 5.0
 """Sharpness β of the softplus that keeps H_d ≥ 0 [1/m]. Its gradient vanishes far below 0: a sharper bend starts there,
 or firm ground pushes the whole map there before grass is distinguished from it."""
@@ -65,7 +66,7 @@ def map_heads(config: EncoderConfig) -> nn.Conv2d:
     All weights start at zero, which encodes the ground that carries the robot (and the surface that a sweep measured)
     with the configuration's material; without a loss they stay there.
     """
-    heads = nn.Conv2d(config.map_features, _HEADS + _SWEEP_HEADS * config.believes, kernel_size=1)
+    heads = nn.Conv2d(config.map_features, _HEADS + _SWEEP_HEADS * config.believes + config.interpolates, kernel_size=1)
     assert heads.bias is not None
     with torch.no_grad():
         heads.weight.zero_()
@@ -84,18 +85,25 @@ def maps_from_heads(
     evidence: Tensor,
     depth: Tensor | None = None,
 ) -> EncodedMaps:
-    """Heights, spreads and material from the outputs of the heads ``[B, 7, rows, columns]``, each within its bounds.
+    """Heights, spreads and material from outputs of the heads ``[B, 7..10, rows, columns]``, each within its bounds.
 
     H_g is a correction to the ground that carries the robot. Where a sweep measured something, an eighth output says
     how far that is believed instead, and a ninth how far what rises there carries: a network that predicted all heights
     anew would blur the steps of walls and posts into slopes, and a smooth H_d below single leaves would leave spikes in
-    H_t.
+    H_t. Between such cells, a tenth output says how far the interpolation is believed.
     """
     geometric, decrease, stiffness, damping, friction, geometric_spread, decrease_spread = outputs[:, :_HEADS].unbind(1)
     below = functional.softplus(decrease, beta=_SOFTPLUS_BETA)
     if config.believes:
-        believed, carries = torch.sigmoid(outputs[:, _HEADS:]).unbind(1)
-        rise = believed * batch.sweep[:, STANDING] * (batch.sweep[:, TOP] - batch.anchor)
+        believed, carries, *others = torch.sigmoid(outputs[:, _HEADS:]).unbind(1)
+        standing = batch.sweep[:, STANDING]
+        rise = believed * standing * (batch.sweep[:, TOP] - batch.anchor)
+        if config.interpolates:
+            # Without a sweep there is nothing between.
+            between = others[0] * (standing.amax(dim=(1, 2), keepdim=True) - standing)
+            rise = rise + between * (batch.sweep[:, BETWEEN] - batch.anchor)
+            # What is believed is not corrected: pictures or points of another world would spoil what was measured.
+            geometric = geometric * (1.0 - believed * standing - between)
         geometric, below = geometric + rise, below + (1.0 - carries) * rise.clamp_min(0.0)
     return EncodedMaps(
         geometric_height=geometric + batch.anchor + batch.ground[:, None, None],

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 
 from monoforce_ros.encoder.config import HEIGHT_CHANNELS, EncoderConfig
-from monoforce_ros.terrain import Grid, LidarSettings, cell_heights, stands_on_ground
+from monoforce_ros.terrain import Grid, LidarSettings, cell_heights, interpolated_ground
 
-HIT, TOP, STANDING = 2, 5, 6
-"""Channels: the mask of cells with points; the height of what stands on the ground, and its mask."""
+HIT, TOP, STANDING, BETWEEN = 2, 5, 6, 7
+"""Channels: the mask of cells with points; the height of what stands on the ground, and its mask; this height
+interpolated over the whole map."""
 _REACH = 0.25
 """Half-width of the square around a cell whose points tell a surface from leaves [m]: as deep as a lidar sees into a
 hedge."""
@@ -27,9 +30,11 @@ def cell_extremes(points: np.ndarray, ground: float, config: EncoderConfig) -> n
     return _extremes(*_placed(points, ground, config), config.grid)
 
 
-def sweep_features(points: np.ndarray, ground: float, config: EncoderConfig) -> np.ndarray:
-    """Features of a sweep ``[7, rows, columns]``: :func:`cell_extremes`, scatter and number of the upper points nearby,
-    and the height of what stands on the ground with its mask.
+def sweep_features(
+    points: np.ndarray, ground: float, config: EncoderConfig, support: np.ndarray | None = None
+) -> np.ndarray:
+    """Features of a sweep ``[8, rows, columns]``: :func:`cell_extremes`, scatter and number of the upper points nearby,
+    the height of what stands on the ground with its mask, and this height interpolated through the wheels' contacts.
 
     Leaves return a lidar's pulses from various depths, a wall from one plane, whatever they look like. The scatter is
     the standard deviation of points along the horizontal direction in which they vary least: millimetres on walls,
@@ -40,6 +45,7 @@ def sweep_features(points: np.ndarray, ground: float, config: EncoderConfig) -> 
         points: ``[n, 3]`` in the terrain frame [m].
         ground: height of the ground under the robot [m].
         config: configuration of the encoder.
+        support: contact points of the wheels ``[m, 3]`` in the terrain frame [m].
     """
     grid = config.grid
     placed, flat = _placed(points, ground, config)
@@ -58,7 +64,11 @@ def sweep_features(points: np.ndarray, ground: float, config: EncoderConfig) -> 
     least = 0.5 * (xx + yy) - np.hypot(0.5 * (xx - yy), xy)
     scatter = np.where(count >= _FEWEST, np.sqrt(np.maximum(least, 0.0)), 0.0) / _SCATTER_UNIT
     top, standing = _standing(placed, flat, extremes, config)
-    return np.concatenate([extremes, [scatter, np.log1p(count), top, standing]])
+    between = np.zeros_like(top)
+    if standing.any():
+        contacts = np.zeros((0, 3)) if support is None else support - np.array([0.0, 0.0, ground])
+        between = interpolated_ground(top, standing, contacts, grid)
+    return np.concatenate([extremes, [scatter, np.log1p(count), top, standing, between]])
 
 
 def _standing(
@@ -66,17 +76,16 @@ def _standing(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Height of what stands on the ground in each cell [m], and the mask of cells with it.
 
-    Not the highest point, because a robot passes under branches; but only cells as tall as its headroom have to be
-    sorted for gaps.
+    On the ground the height is that of the lidar map, whose quantile noise affects less than the highest point; of what
+    rises from it, the highest point, but below gaps: a robot passes under branches.
     """
-    grid, limits = config.grid, LidarSettings(lowest=config.lowest, highest=config.highest, quantile=1.0)
-    low, high, hit = extremes
-    standing = np.zeros(low.shape, bool)
-    cells = np.flatnonzero(hit)
-    standing.ravel()[cells] = stands_on_ground(low.ravel()[cells].astype(np.float32), cells, grid, limits)
-    tall = standing & (high - low > limits.headroom)
-    top, found = cell_heights(placed[tall.ravel()[flat]], grid, limits)
-    return np.where(tall & found, top, high) * standing, standing
+    grid = config.grid
+    quantile = LidarSettings(lowest=config.lowest, highest=config.highest)
+    usual, standing = cell_heights(placed, grid, quantile)
+    low, high, _ = extremes
+    rises = standing & (high - low > _UPPER)
+    highest, found = cell_heights(placed[rises.ravel()[flat]], grid, replace(quantile, quantile=1.0))
+    return np.where(rises & found, highest, usual), standing
 
 
 def _placed(points: np.ndarray, ground: float, config: EncoderConfig) -> tuple[np.ndarray, np.ndarray]:

@@ -75,7 +75,7 @@ class EncoderInput:
     """Height of the ground under the robot in its terrain frame ``[B]`` [m]."""
     sweep: Tensor
     """Features of the lidar sweep, see :func:`~monoforce_ros.encoder.sweep.sweep_features`, all 0 without one;
-    ``[B, 7, rows, columns]``."""
+    ``[B, 8, rows, columns]``."""
 
     @property
     def maps(self) -> int:
@@ -141,7 +141,7 @@ def assemble(
     ground, plane, near = support_plane(support, config.grid)
     hits, traced = np.zeros((SWEEP_CHANNELS, *plane.shape)), np.zeros((HEIGHT_CHANNELS, *plane.shape))
     if sweep is not None and config.takes_sweeps:
-        hits = sweep_features(sweep, ground, config)
+        hits = sweep_features(sweep, ground, config, support)
     if trace is not None and len(trace):
         traced = cell_extremes(trace, ground, config)
     count = len(images)

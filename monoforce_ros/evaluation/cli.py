@@ -53,7 +53,7 @@ class _FormerOption(argparse.Action):
         setattr(namespace, self.dest, values)
 
 
-_OF_CAMERAS = ("checkpoint", "retention_time", "images")
+_OF_CAMERAS = ("retention_time", "images")
 
 
 def _parser() -> OptionParser:
@@ -130,11 +130,13 @@ def main(arguments: list[str] | None = None) -> int:
     if not 0 <= options.retention_time <= 600:
         parser.error(f"--retention-time: got {options.retention_time}, expected 0 to 600 s")
     if options.check:
-        unused = ("terrain", *_OF_CAMERAS, "friction", "soil", "horizons", "stride")
+        unused = ("terrain", "checkpoint", *_OF_CAMERAS, "friction", "soil", "horizons", "stride")
         parser.refuse_without_effect(options, unused, "with --check")
     elif options.terrain not in CAMERA_SOURCES:
         sources = " or ".join(CAMERA_SOURCES)
         parser.refuse_without_effect(options, _OF_CAMERAS, f"with --terrain {options.terrain}: it needs {sources}")
+        if options.terrain != "lidar":
+            parser.refuse_without_effect(options, ("checkpoint",), f"with --terrain {options.terrain}: no encoder")
     try:
         if options.check:
             bag = options.bag or share_directory() / "bags" / "demo"

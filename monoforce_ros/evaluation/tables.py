@@ -124,7 +124,7 @@ def evaluate_sequence(
 def terrain_source(system: System, robot: RobotModel) -> TerrainSource:
     """The terrain source of a system."""
     if system.checkpoint is None:
-        return choose_terrain_source("lidar", robot)
+        return choose_terrain_source("lidar_interpolation", robot)
     if system.with_lidar:
         return choose_terrain_source("lidar_camera", robot, checkpoint=system.checkpoint)
     encoder = fused(load_encoder(system.checkpoint))

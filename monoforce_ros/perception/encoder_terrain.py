@@ -14,7 +14,7 @@ from monoforce_ros.perception.ground_alignment import align_to_ground, support_p
 from monoforce_ros.perception.observation import Observation
 from monoforce_ros.perception.trace import DrivenGround
 from monoforce_ros.robots import RobotModel
-from monoforce_ros.terrain import Grid, TerrainMap
+from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap
 
 
 @contextmanager
@@ -46,6 +46,7 @@ class EncoderTerrain:
         robot: the robot on the ground.
         sensors: sensors used, of ``camera`` and ``lidar``; of two sensors either may be absent from an observation.
         threads: CPU threads of the encoder; see :func:`encoder_threads`.
+        material: material of the ground in place of the predicted one.
 
     Raises:
         ValueError: the encoder does not take one of the sensors.
@@ -58,13 +59,14 @@ class EncoderTerrain:
         sensors: tuple[str, ...] = ("camera",),
         *,
         threads: int | None = None,
+        material: TerrainDefaults | None = None,
     ):
         config = encoder.config
         unused = [name for name in sensors if name not in config.sensor.split("_")]
         if unused or not sensors:
             raise ValueError(f"terrain from {' and '.join(sensors) or 'no sensor'}: the encoder takes {config.sensor}")
         self.encoder, self.robot, self.sensors = encoder, robot, sensors
-        self._threads = threads
+        self._threads, self._material = threads, material
         self._driven = DrivenGround()
         self.start_error = 0.0
         """Median difference between the last map and the ground under the wheels, before they were aligned [m]."""
@@ -87,7 +89,8 @@ class EncoderTerrain:
         with encoder_threads(self._threads):
             found = self.encoder.terrain(views, support, sweep=sweep, trace=trace)
         self.start_error = _error_under(found, support)
-        return align_to_ground(found, support)
+        aligned = align_to_ground(found, support)
+        return aligned if self._material is None else aligned.with_material(self._material)
 
 
 def _error_under(terrain: TerrainMap, support: np.ndarray) -> float:

@@ -15,7 +15,7 @@ from monoforce_ros.perception.trust import TrustedTerrain
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import Grid, TerrainDefaults
 
-SOURCES = ("lidar", "camera", "lidar_camera", "flat")
+SOURCES = ("lidar", "lidar_interpolation", "camera", "lidar_camera", "flat")
 """Names of the terrain sources."""
 CAMERA_SOURCES = ("camera", "lidar_camera")
 """Those that use images."""
@@ -39,14 +39,15 @@ def choose_terrain_source(
     Args:
         kind: its name.
         robot: the robot on the ground.
-        grid: cells of the maps; sources with an encoder use the encoder's.
+        grid: cells of the maps; sources with cameras use the encoder's. The source ``lidar`` interpolates on any other
+            grid than the encoder's, and where the encoder takes no sweeps.
         material: material of ground for which the source does not predict it.
         checkpoint: checkpoint of the encoder; empty for the shipped one.
         device: device of the encoder.
         precision: precision of the encoder, see :func:`monoforce_ros.encoder.fused`.
         threads: CPU threads of the encoder; by default PyTorch's current number.
-        fallback: whether sources with an encoder fall back (to level ground, or to the lidar alone) while the encoder
-            is worse than level ground; see :class:`monoforce_ros.perception.TrustedTerrain`.
+        fallback: whether sources with an encoder fall back (to level ground, or to interpolation of the lidar) while
+            the encoder is worse than level ground; see :class:`monoforce_ros.perception.TrustedTerrain`.
         retention_time: how long terrain seen by cameras is kept after it leaves the images [s]; 0 disables it.
 
     Raises:
@@ -55,23 +56,24 @@ def choose_terrain_source(
     """
     if kind not in SOURCES:
         raise ValueError(f"terrain source: got {kind!r}, expected one of {SOURCES}")
-    grid = grid or Grid.square()
     if kind == "flat":
-        return FlatTerrain(robot, grid, material)
-    if kind == "lidar":
-        return LidarTerrain(robot, grid, material)
-    encoder = load_encoder(checkpoint, "camera")
-    # An encoder of both predicts H_d from both.
-    sensors = ("lidar", "camera") if kind == "lidar_camera" and encoder.config.takes_sweeps else ("camera",)
+        return FlatTerrain(robot, grid or Grid.square(), material)
+    if kind == "lidar_interpolation":
+        return LidarTerrain(robot, grid or Grid.square(), material)
+    encoder = load_encoder(checkpoint, None if kind == "lidar" else "camera")
+    sensors = tuple(name for name in kind.split("_") if name == "camera" or encoder.config.takes_sweeps)
+    if not sensors or (kind == "lidar" and grid not in (None, encoder.config.grid)):
+        return LidarTerrain(robot, grid or encoder.config.grid, material)
     # Packed weights and half precision save time on the CPU only.
     encoder = packed(fused(encoder, precision)) if device == "cpu" else fused(encoder).to(device)
-    own = EncoderTerrain(encoder, robot, sensors, threads=threads)
+    # Shape says little of material.
+    own = EncoderTerrain(encoder, robot, sensors, threads=threads, material=material if kind == "lidar" else None)
     learned: TerrainSource = own
-    if retention_time:
+    if retention_time and "camera" in sensors:
         learned = TemporalMemory(learned, robot, stiffness=encoder.config.stiffness, retention_time=retention_time)
     level, lidar = FlatTerrain(robot, learned.grid, material), LidarTerrain(robot, learned.grid, material)
-    if kind == "lidar_camera":
+    if kind == "lidar_camera" and "lidar" not in sensors:
         learned = LidarCameraTerrain(lidar, learned)
     if fallback:
-        learned = TrustedTerrain(learned, own, (lidar, level) if kind == "lidar_camera" else (level,))
+        learned = TrustedTerrain(learned, own, (level,) if kind == "camera" else (lidar, level))
     return learned

@@ -63,7 +63,7 @@ class TrustReport:
         if not self.start_error <= START_TOLERANCE:
             return (
                 f"the encoder's ground under the wheels is off by {100 * self.start_error:.0f} cm, expected at most"
-                f" {100 * START_TOLERANCE:.0f} cm: check the cameras' poses, or adapt the encoder (train --adapt BAG)"
+                f" {100 * START_TOLERANCE:.0f} cm: check the sensors' poses, or adapt the encoder (train --adapt BAG)"
             )
         if not np.isfinite(self.error):
             return "nothing compared yet: until the robot reaches ground that was predicted, the fallback is used"

@@ -8,6 +8,7 @@ from monoforce_ros.terrain.lidar import (
     TerrainError,
     cell_heights,
     fill_holes,
+    interpolated_ground,
     stands_on_ground,
     terrain_from_cloud,
 )
@@ -24,6 +25,7 @@ __all__ = [
     "accumulate",
     "cell_heights",
     "fill_holes",
+    "interpolated_ground",
     "load_terrain",
     "save_terrain",
     "stands_on_ground",

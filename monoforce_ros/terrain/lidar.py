@@ -82,18 +82,7 @@ def terrain_from_cloud(
             f"expected at least {settings.minimum_cells}: is the lidar's frame right, is it covered?"
         )
     visible = fill_holes(heights, observed)
-    ground = visible
-    if support is not None and len(support):
-        rows, columns, inside = grid.cells(support[:, :2])
-        known, where = heights.copy(), observed.copy()
-        rows, columns = rows[inside], columns[inside]
-        known[rows, columns] = np.inf
-        np.minimum.at(known, (rows, columns), support[inside, 2])
-        where[rows, columns] = True
-        ground = fill_holes(known, where)
-        # A wall nearby casts a blind zone before it: interpolated, its height would begin below the robot.
-        if inside.any() and (tall := observed & _tall_nearby(heights, support[inside], grid)).any():
-            ground = np.where(where, ground, np.minimum(ground, fill_holes(known, where & ~tall)))
+    ground = visible if support is None else interpolated_ground(heights, observed, support, grid)
     return TerrainMap.from_height(
         torch.from_numpy(ground.astype(np.float32)),
         grid,
@@ -101,6 +90,30 @@ def terrain_from_cloud(
         observed=torch.from_numpy(observed),
         material=material,
     )
+
+
+def interpolated_ground(heights: np.ndarray, observed: np.ndarray, support: np.ndarray, grid: Grid) -> np.ndarray:
+    """Ground between cells whose heights are known, through the robot's contact points.
+
+    Args:
+        heights: height of each cell ``[rows, columns]`` [m].
+        observed: cells whose height is known.
+        support: ground contact points ``[m, 3]`` [m] of the robot, whose cells take their height; may be empty.
+        grid: cells of the map.
+    """
+    rows, columns, inside = grid.cells(support[:, :2])
+    if not inside.any():
+        return fill_holes(heights, observed)
+    known, where = heights.copy(), observed.copy()
+    rows, columns = rows[inside], columns[inside]
+    known[rows, columns] = np.inf
+    np.minimum.at(known, (rows, columns), support[inside, 2])
+    where[rows, columns] = True
+    ground = fill_holes(known, where)
+    # A wall nearby casts a blind zone before it: interpolated, its height would begin below the robot.
+    if (tall := observed & _tall_nearby(heights, support[inside], grid)).any():
+        ground = np.where(where, ground, np.minimum(ground, fill_holes(known, where & ~tall)))
+    return ground
 
 
 def _tall_nearby(heights: np.ndarray, support: np.ndarray, grid: Grid) -> np.ndarray:

@@ -116,6 +116,19 @@ class TerrainMap:
         grid = grid or Grid.square()
         return cls.from_height(torch.full((grid.rows, grid.columns), height, dtype=dtype), grid, material=material)
 
+    def with_material(self, material: TerrainDefaults) -> TerrainMap:
+        """The same surfaces of one material."""
+
+        def constant(value: float) -> Tensor:
+            return torch.full_like(self.height, value, requires_grad=False)
+
+        return replace(
+            self,
+            stiffness=constant(material.stiffness),
+            damping=constant(material.damping),
+            friction=constant(material.friction),
+        )
+
     @classmethod
     def stack(cls, maps: Sequence[TerrainMap]) -> TerrainMap:
         """A batch ``[B, rows, columns]`` of maps on the same grid."""

@@ -59,14 +59,15 @@ class Augmentation:
     """Whether the ground that the robot drove over is known."""
 
     @classmethod
-    def draw(cls, random: np.random.Generator, *, drop_sensors: bool = False) -> Augmentation:
+    def draw(cls, random: np.random.Generator, sensor_shares: Sequence[float] | None = None) -> Augmentation:
         """A random augmentation.
 
         Args:
             random: source of random numbers.
-            drop_sensors: whether to leave out cameras, sweeps, or parts of them, for encoders of both.
+            sensor_shares: shares of samples with images alone, with both and with a sweep alone, for encoders of both;
+                by default nothing is left out.
         """
-        sensors = _drawn_sensors(random) if drop_sensors else {}
+        sensors = {} if sensor_shares is None else _drawn_sensors(random, sensor_shares)
         brightness = random.uniform(0.7, 1.35)
         return cls(
             mirrored=bool(random.integers(2)),
@@ -145,9 +146,9 @@ class Augmentation:
         return self == Augmentation()
 
 
-def _drawn_sensors(random: np.random.Generator) -> dict[str, Any]:
-    """Sensors of one sample: images in six of seven, sweeps in four of nine, never neither."""
-    kind = random.choice(["images", "both", "sweep"], p=[0.55, 0.3, 0.15])
+def _drawn_sensors(random: np.random.Generator, shares: Sequence[float]) -> dict[str, Any]:
+    """Sensors of one sample, never none."""
+    kind = random.choice(["images", "both", "sweep"], p=np.array(shares) / sum(shares))
     share = {"images": 1.0, "both": 1.0, "sweep": -1.0}[str(kind)]
     return {
         "cameras": tuple(random.uniform(size=6)),

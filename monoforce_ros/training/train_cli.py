@@ -181,6 +181,9 @@ def build_parser() -> argparse.ArgumentParser:
                         help="(default: %(default)s)")  # fmt: skip
     parser.add_argument("--save-every", type=int, default=TrainingSettings.save_every, metavar="STEPS",
                         help="(default: %(default)s)")  # fmt: skip
+    parser.add_argument("--sensor-shares", type=float, nargs=3, default=TrainingSettings.sensor_shares,
+                        metavar=("IMAGES", "BOTH", "SWEEP"), help="with --sensor camera_lidar: shares of samples with "
+                        "images alone, both and a sweep alone (default: %(default)s)")  # fmt: skip
     parser.add_argument("--precision", choices=("auto", "float32", "bfloat16"), default="auto", help="(default: "
                         "bfloat16 on CUDA)")  # fmt: skip
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="(default: CUDA if "
@@ -427,6 +430,7 @@ def _settings(options: argparse.Namespace) -> TrainingSettings:
         steps=options.steps, batch=options.batch, rate=options.rate,
         weights=LossWeights(**weights, prominence=options.prominence), seed=options.seed,
         augment=not options.no_augmentation, backbone=options.train_backbone,
+        sensor_shares=tuple(options.sensor_shares),
         validate_every=options.validate_every, save_every=options.save_every, precision=options.precision,
     )  # fmt: skip
 

@@ -66,6 +66,8 @@ class TrainingSettings:
     """Whether to augment samples (mirror, rotate, crop, change colours)."""
     backbone: str = "none"
     """Part of the backbone that is trained, of :data:`BACKBONE_PARTS`: its ImageNet weights hold for photographs."""
+    sensor_shares: tuple[float, float, float] = (0.55, 0.3, 0.15)
+    """Shares of samples with images alone, with both and with a sweep alone, for encoders of both."""
     validate_every: int = 250
     save_every: int = 50
     precision: str = "auto"
@@ -80,6 +82,9 @@ class TrainingSettings:
                 raise ValueError(f"training {name}: got {getattr(self, name)}, expected {low:g} to {high:g}")
         if self.backbone not in BACKBONE_PARTS:
             raise ValueError(f"training backbone: got {self.backbone!r}, expected one of {', '.join(BACKBONE_PARTS)}")
+        shares = self.sensor_shares
+        if len(shares) != 3 or not all(0.0 <= share < float("inf") for share in shares) or not sum(shares) > 0.0:
+            raise ValueError(f"training sensor_shares: got {shares}, expected three numbers from 0 on, not all 0")
         if self.precision not in ("auto", "float32", "bfloat16"):
             raise ValueError(f"training precision: got {self.precision!r}, expected auto, float32 or bfloat16")
 
@@ -281,10 +286,8 @@ class Trainer:
         order = np.random.default_rng([settings.seed, 7, epoch]).permutation(len(self.index))
         first += process.rank * settings.batch
         chosen = np.take(order, range(first, first + settings.batch), mode="wrap")
-        drop = self.encoder.config.sensor == "camera_lidar"
-        drawn = [
-            Augmentation.draw(random, drop_sensors=drop) if settings.augment else Augmentation() for _ in range(total)
-        ]
+        shares = settings.sensor_shares if self.encoder.config.sensor == "camera_lidar" else None
+        drawn = [Augmentation.draw(random, shares) if settings.augment else Augmentation() for _ in range(total)]
         augmentations = drawn[process.rank * settings.batch :]
         samples = [
             sample(self.recordings[self.index[i][0]], self.index[i][1], self.encoder.config, augmentation)

@@ -90,8 +90,9 @@ RENAMED_WEIGHTS = {"standing": "prominence", "standing_decrease": "prominent_dec
 
 
 def _renamed(settings: dict) -> dict:
-    """Saved settings of an earlier release under their names of today."""
+    """Saved settings of an earlier release under their names of today, and those that it did not have."""
     settings = {"augment" if name == "vary" else name: value for name, value in settings.items()}
+    settings = {"sensor_shares": [0.55, 0.3, 0.15]} | settings
     weights = settings.get("weights")
     if isinstance(weights, dict):
         settings["weights"] = {RENAMED_WEIGHTS.get(name, name): value for name, value in weights.items()}

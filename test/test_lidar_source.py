@@ -1,0 +1,107 @@
+"""The source ``lidar``: the encoder on sweeps, interpolation where it cannot or may not be used."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from monoforce_ros.bags import Recording
+from monoforce_ros.core import MotionState
+from monoforce_ros.encoder import EncoderConfig, new_encoder, save_encoder
+from monoforce_ros.evaluation import evaluate_recording, observe
+from monoforce_ros.evaluation.tables import PHYSICS
+from monoforce_ros.perception import (
+    EncoderTerrain,
+    LidarTerrain,
+    Observation,
+    TrustedTerrain,
+    choose_terrain_source,
+)
+from monoforce_ros.prediction import Predictor
+from monoforce_ros.robots import load_robot
+from monoforce_ros.terrain import Grid, TerrainDefaults
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+STILL = MotionState(0, np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3))
+
+
+@pytest.fixture(scope="module")
+def husky():
+    return load_robot("husky")
+
+
+@pytest.fixture(scope="module")
+def recording(demo_bag):
+    return Recording.open(demo_bag).in_base_frame("base_link")
+
+
+def errors(recording, source, robot):
+    """Mean position error after 5 s [m]."""
+    found = evaluate_recording(
+        recording, Predictor(robot, source, horizon=5.0), horizons=(5.0,), stride=1.0, quiet=True, minimum_duration=1.0
+    )
+    return found.summary(PHYSICS)[5.0][0].mean
+
+
+def test_in_tall_grass_paths_are_far_better_than_on_interpolated_heights(recording, husky):
+    learned, interpolated = (
+        errors(recording, choose_terrain_source(kind, husky), husky) for kind in ("lidar", "lidar_interpolation")
+    )
+    assert learned < 0.5 * interpolated
+
+
+def test_interpolation_is_used_until_the_wheels_have_confirmed_the_encoder(recording, husky):
+    trusted, plain = (choose_terrain_source(kind, husky, fallback=True) for kind in ("lidar", "lidar_interpolation"))
+    assert isinstance(trusted, TrustedTerrain) and isinstance(plain, LidarTerrain)
+    shares = []
+    for frame in recording.clouds[::5]:
+        observation, motion = observe(recording, husky, frame.stamp, ("lidar",)), recording.motion.at(frame.stamp)
+        terrain, interpolated = (source.terrain(observation, motion) for source in (trusted, plain))
+        shares.append(trusted.report.share)
+        if not shares[-1]:
+            torch.testing.assert_close(terrain.height, interpolated.height)
+    assert shares[0] == 0.0
+    assert shares[-1] > 0.3
+
+
+def test_other_grids_and_encoders_without_sweeps_are_interpolated(tmp_path, husky):
+    wide = choose_terrain_source("lidar", husky, grid=Grid.square(20.0, 0.2))
+    assert isinstance(wide, LidarTerrain) and wide.grid == Grid.square(20.0, 0.2)
+    file = tmp_path / "images.safetensors"
+    save_encoder(new_encoder(EncoderConfig(map_features=8)), file)
+    assert isinstance(choose_terrain_source("lidar", husky, checkpoint=file), LidarTerrain)
+    assert isinstance(choose_terrain_source("lidar", husky, grid=Grid.square()), EncoderTerrain)
+
+
+def test_material_is_the_given_one(husky):
+    material = TerrainDefaults(stiffness=1e6, damping=3e4, friction=0.55)
+    random = np.random.default_rng(0)
+    cloud = np.c_[random.uniform(-6.0, 6.0, (8000, 2)), np.full(8000, -0.13)].astype(np.float32)
+    terrain = choose_terrain_source("lidar", husky, material=material).terrain(Observation(0, cloud), STILL)
+    for name in ("stiffness", "damping", "friction"):
+        assert (getattr(terrain, name) == getattr(material, name)).all()
+    # Level ground is level ground.
+    near = np.hypot(*np.meshgrid(terrain.grid.x, terrain.grid.y)) < 4.0
+    assert float(terrain.height[torch.from_numpy(near)].std()) < 0.03
+
+
+def test_both_sensors_make_one_map_and_either_may_be_missing(recording, husky):
+    source = choose_terrain_source("lidar_camera", husky)
+    assert isinstance(source, EncoderTerrain) and set(source.sensors) == {"lidar", "camera"}
+    stamp = recording.clouds[len(recording.clouds) // 2].stamp
+    observation = observe(recording, husky, stamp, ("lidar", "camera"), tuple(recording.images))
+    motion = recording.motion.at(stamp)
+    assert observation.images and observation.cloud is not None
+    both = source.terrain(observation, motion)
+    without_images = source.terrain(replace(observation, images={}), motion)
+    without_cloud = source.terrain(replace(observation, cloud=None), motion)
+    swept = choose_terrain_source("lidar", husky).terrain(observation, motion)
+    assert float((both.height - without_images.height).abs().max()) > 0.01
+    assert float((both.height - without_cloud.height).abs().max()) > 0.05
+    # The trace that each source remembers differs by the maps made before: none here.
+    torch.testing.assert_close(without_images.geometric_height, swept.geometric_height, rtol=0.0, atol=0.02)
+    with pytest.raises(ValueError, match="a point cloud or an image"):
+        source.terrain(replace(observation, images={}, cloud=None), motion)
