@@ -22,7 +22,7 @@ from monoforce_ros.perception import (
 )
 from monoforce_ros.prediction import Predictor
 from monoforce_ros.robots import load_robot
-from monoforce_ros.terrain import Grid, TerrainDefaults
+from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainError
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 STILL = MotionState(0, np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3))
@@ -105,3 +105,16 @@ def test_both_sensors_make_one_map_and_either_may_be_missing(recording, husky):
     torch.testing.assert_close(without_images.geometric_height, swept.geometric_height, rtol=0.0, atol=0.02)
     with pytest.raises(ValueError, match="a point cloud or an image"):
         source.terrain(replace(observation, images={}, cloud=None), motion)
+
+
+def test_a_covered_lidar_is_an_error_alone_and_none_beside_cameras(recording, husky):
+    stamp = recording.clouds[0].stamp
+    observation = observe(recording, husky, stamp, ("lidar", "camera"), tuple(recording.images))
+    motion = recording.motion.at(stamp)
+    covered = replace(observation, cloud=np.zeros((5, 3), np.float32) + np.array([1.0, 0.0, 0.0], np.float32))
+    for fallback in (False, True):
+        with pytest.raises(TerrainError, match="5 returns hit 1 cells"):
+            choose_terrain_source("lidar", husky, fallback=fallback).terrain(covered, motion)
+    found = choose_terrain_source("lidar_camera", husky, fallback=True).terrain(covered, motion)
+    level = choose_terrain_source("flat", husky).terrain(covered, motion)
+    torch.testing.assert_close(found.height, level.height)

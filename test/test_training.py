@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import cv2
 import numpy as np
@@ -40,6 +40,7 @@ from monoforce_ros.training.sample_extraction import SampleSettings, extract_sam
 from monoforce_ros.training.samples import MIRROR, Augmentation, Targets, sample
 from monoforce_ros.training.train_cli import build_parser
 from monoforce_ros.training.trainer import Process, Trainer, TrainingSettings, validate
+from monoforce_ros.training.training_state import TrainingError, read_state, save_state
 
 TINY = EncoderConfig(image_width=128, image_height=96, map_size=6.4, resolution=0.2)
 OPTIONS = ["--size", "128x96", "--map-size", "6.4", "--resolution", "0.2", "--batch", "4", "--device", "cpu",
@@ -498,6 +499,21 @@ def test_unusable_input_is_reported_in_one_line(executables, tmp_path, demo_bag)
     shutil.copytree(demo_bag, other)
     unknown = run(executables, other, "--out", tmp_path / "o", "--images", "/no", *OPTIONS, check=False)
     assert unknown.returncode == 1 and "no images with a CameraInfo" in unknown.stderr
+
+
+@pytest.mark.parametrize("sensor", ["camera", "lidar"])
+def test_trainings_with_images_alone_resume_whatever_a_sweep_would_show(tmp_path, sensor):
+    config = EncoderConfig(sensor=sensor, map_features=8)
+    encoder = new_encoder(config)
+    optimiser = torch.optim.SGD(encoder.parameters(), 1e-3)
+    file = tmp_path / "state.safetensors"
+    saved = {"settings": {}, "step": 3, "config": asdict(config) | {"sweep_channels": 7}}
+    save_state(file, encoder, optimiser, saved)
+    if sensor == "camera":
+        assert read_state(file, encoder, optimiser, {})["step"] == 3
+    else:
+        with pytest.raises(TrainingError, match="saved with different network configuration"):
+            read_state(file, encoder, optimiser, {})
 
 
 def test_shares_of_sensors_decide_what_a_sample_lacks():

@@ -219,8 +219,8 @@ class PredictorNode(ManagedNode):
         )
         if settings.terrain_source == "lidar" and isinstance(source, LidarTerrain):
             self.get_logger().warning(
-                "terrain_source lidar interpolates the point cloud: the encoder takes no sweeps, or has no map of "
-                f"{settings.map_size:g} m with cells of {settings.map_resolution:g} m; or ask for lidar_interpolation"
+                "terrain_source lidar interpolates the point cloud, because the encoder takes no sweeps, or has no map "
+                f"of {settings.map_size:g} m with cells of {settings.map_resolution:g} m"
             )
         return source
 

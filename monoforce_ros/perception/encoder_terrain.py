@@ -14,7 +14,7 @@ from monoforce_ros.perception.ground_alignment import align_to_ground, support_p
 from monoforce_ros.perception.observation import Observation
 from monoforce_ros.perception.trace import DrivenGround
 from monoforce_ros.robots import RobotModel
-from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap
+from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap, require_cells
 
 
 @contextmanager
@@ -77,13 +77,21 @@ class EncoderTerrain:
         return self.encoder.config.grid
 
     def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
-        """Predicted map; raises ``ValueError`` if all sensors, a calibration or a camera pose are missing."""
+        """Predicted map; raises ``ValueError`` if all sensors, a calibration or a camera pose are missing.
+
+        Without images it raises ``TerrainError`` if too few points lie on the map, of which an encoder would make level
+        ground.
+        """
         views = _views(observation, motion) if "camera" in self.sensors else []
         sweep = _sweep(observation, motion, self.robot) if "lidar" in self.sensors else None
         if not views and sweep is None:
             wanted = {"camera": "an image", "lidar": "a point cloud"}
             names = " or ".join(wanted[name] for name in self.sensors)
             raise ValueError(f"the terrain encoder needs {names}, and the observation has none")
+        if not views and sweep is not None:
+            rows, columns, inside = self.grid.cells(sweep[:, :2])
+            cells = np.unique((rows * self.grid.columns + columns)[inside])
+            require_cells(len(cells), len(sweep), self.grid)
         support = support_points(self.robot, motion, self.encoder.config.stiffness)
         trace = self._driven.update(motion, support)
         with encoder_threads(self._threads):

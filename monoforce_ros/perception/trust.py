@@ -17,7 +17,7 @@ from monoforce_ros.perception.encoder_terrain import EncoderTerrain
 from monoforce_ros.perception.ground_alignment import support_points
 from monoforce_ros.perception.observation import Observation, TerrainSource
 from monoforce_ros.perception.trace import continues
-from monoforce_ros.terrain import Grid, TerrainMap
+from monoforce_ros.terrain import Grid, TerrainError, TerrainMap
 
 BLOCK = 0.5
 """Distance travelled in one block of comparisons [m], about a robot's length: errors within it are not independent."""
@@ -278,9 +278,7 @@ class TrustedTerrain:
     def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
         """The encoder's map or the fallback's; raises the source's errors."""
         predicted = self._source.terrain(observation, motion)
-        measured = {"lidar": observation.cloud is not None, "camera": bool(observation.images)}
-        fallback = next(f for f in self._fallbacks if all(measured[sensor] for sensor in f.sensors))
-        other = fallback.terrain(observation, motion)
+        other = self._fallback(observation, motion)
         support = support_points(self._encoder.robot, motion, self._encoder.encoder.config.stiffness)
         cameras = {}
         for name, pose in observation.base_from_cameras.items():
@@ -288,6 +286,17 @@ class TrustedTerrain:
             cameras[name] = float(np.arctan2(axis[1], axis[0]))
         self.report = self._trust.update(motion, support, predicted, cameras, self._encoder.start_error, other)
         return blended(other, predicted, self.report.share)
+
+    def _fallback(self, observation: Observation, motion: MotionState) -> TerrainMap:
+        """Map of the first fallback whose sensors have measured enough; the last one's error if there is none."""
+        measured = {"lidar": observation.cloud is not None, "camera": bool(observation.images)}
+        usable = [f for f in self._fallbacks if all(measured[sensor] for sensor in f.sensors)]
+        for fallback in usable[:-1]:
+            try:
+                return fallback.terrain(observation, motion)
+            except TerrainError:
+                continue
+        return usable[-1].terrain(observation, motion)
 
 
 def blended(fallback: TerrainMap, predicted: TerrainMap, share: float) -> TerrainMap:

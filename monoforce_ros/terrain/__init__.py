@@ -9,6 +9,7 @@ from monoforce_ros.terrain.lidar import (
     cell_heights,
     fill_holes,
     interpolated_ground,
+    require_cells,
     stands_on_ground,
     terrain_from_cloud,
 )
@@ -27,6 +28,7 @@ __all__ = [
     "fill_holes",
     "interpolated_ground",
     "load_terrain",
+    "require_cells",
     "save_terrain",
     "stands_on_ground",
     "terrain_from_cloud",

@@ -76,11 +76,7 @@ def terrain_from_cloud(
         TerrainError: too few cells have returns.
     """
     heights, observed = cell_heights(points, grid, settings)
-    if observed.sum() < settings.minimum_cells:
-        raise TerrainError(
-            f"the cloud's {len(points)} returns hit {int(observed.sum())} cells of the {grid.extent[1]:.1f} m map, "
-            f"expected at least {settings.minimum_cells}: is the lidar's frame right, is it covered?"
-        )
+    require_cells(int(observed.sum()), len(points), grid, settings)
     visible = fill_holes(heights, observed)
     ground = visible if support is None else interpolated_ground(heights, observed, support, grid)
     return TerrainMap.from_height(
@@ -90,6 +86,15 @@ def terrain_from_cloud(
         observed=torch.from_numpy(observed),
         material=material,
     )
+
+
+def require_cells(count: int, returns: int, grid: Grid, settings: LidarSettings = LidarSettings()) -> None:
+    """Raise ``TerrainError`` if ``returns`` of a lidar hit too few cells of a map."""
+    if count < settings.minimum_cells:
+        raise TerrainError(
+            f"the cloud's {returns} returns hit {count} cells of the {grid.extent[1]:.1f} m map, "
+            f"expected at least {settings.minimum_cells}: is the lidar's frame right, is it covered?"
+        )
 
 
 def interpolated_ground(heights: np.ndarray, observed: np.ndarray, support: np.ndarray, grid: Grid) -> np.ndarray:

@@ -66,7 +66,10 @@ def read_state(file: Path, encoder: Encoder, optimiser: torch.optim.Optimizer, s
     expected, saved = json.loads(json.dumps(settings)), _renamed(description["settings"])
     different = [name for name, value in expected.items() if saved.get(name) != value]
     # States of earlier releases do not name bins of relative depth, nor the channels of a sweep.
-    if {"relative_bins": 0, "sweep_channels": HEIGHT_CHANNELS} | description["config"] != asdict(encoder.config):
+    config = {"relative_bins": 0, "sweep_channels": HEIGHT_CHANNELS} | description["config"]
+    if not encoder.config.takes_sweeps:
+        config["sweep_channels"] = encoder.config.sweep_channels
+    if config != asdict(encoder.config):
         different.append("network configuration")
     if different:
         raise TrainingError(
