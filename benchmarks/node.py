@@ -52,8 +52,8 @@ class Case:
 
 
 CASES = (
-    Case("lidar", "lidar", clouds=True),
-    Case("lidar_candidates", "lidar, 64 candidates", clouds=True, parameters=("candidates:=64",)),
+    Case("lidar", "lidar, interpolated", clouds=True),
+    Case("lidar_candidates", "lidar, interpolated, 64 candidates", clouds=True, parameters=("candidates:=64",)),
     Case("camera", "1 camera 640 × 480", cameras=1),
     Case("camera_candidates", "1 camera, 64 candidates", cameras=1, parameters=("candidates:=64",)),
     Case("camera_all", "1 camera, 64 candidates, ensemble of 24", cameras=1,
@@ -179,7 +179,7 @@ class Predictor(Executable):
     """The installed predictor with the parameters of a case."""
 
     def __init__(self, case: Case, folder: Path, frames: list[str]):
-        source = "camera" if case.cameras else "lidar"
+        source = "camera" if case.cameras else "lidar_interpolation"
         parameters = [f"terrain_source:={source}", f"robot:={four_camera_robot(folder)}", *case.parameters]
         if frames:
             parameters.append(f"image_topics:=[{','.join(f'{frame}/image_raw' for frame in frames)}]")

@@ -1,6 +1,6 @@
 """Coverage of the predicted 90 % band at 1, 2 and 5 s: share of measured positions inside the band.
 
-    scripts/run.sh python benchmarks/uncertainty.py BAG... [--terrain lidar|camera|flat] [--json FILE]
+    scripts/run.sh python benchmarks/uncertainty.py BAG... [--terrain NAME] [--json FILE]
 
 Predictions start every second and use the recorded commands. A calibrated band contains 90 % of the outcomes. The
 benchmark also prints the factor that calibrates it on these recordings (`ensemble_scale` of the predictor).
@@ -63,7 +63,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("bags", nargs="+", type=Path)
     parser.add_argument("--robot", default="husky", help="robot name or file (%(default)s)")
-    parser.add_argument("--terrain", choices=SOURCES, default="lidar", help="terrain source (%(default)s)")
+    parser.add_argument(
+        "--terrain", choices=SOURCES, default="lidar_interpolation", help="terrain source (%(default)s)"
+    )
     parser.add_argument("--checkpoint", default="", help="checkpoint of the terrain encoder (default: the shipped one)")
     parser.add_argument("--members", type=int, default=EnsembleSettings.members, help="ensemble size (%(default)s)")
     parser.add_argument(

@@ -224,7 +224,8 @@ def run_any(options: argparse.Namespace, titles: dict[str, str]) -> None:
     for name, files in parse_checkpoints(options.checkpoint).items():
         systems = [System(name, *LEARNED[name], file) for file in files]
         sources = [terrain_source(system, robot) for system in systems]
-        rows.append(any_row(systems[0].title, *_driven_with(sources, robot, scenes, systems[0].title)))
+        title = systems[0].title + (f", {len(files)} training seeds" if len(files) > 1 else "")
+        rows.append(any_row(title, *_driven_with(sources, robot, scenes, title)))
     interpolation = [LidarTerrain(robot, Grid.square(), TerrainDefaults())]
     rows.append(any_row(titles["lidar"], *_driven_with(interpolation, robot, scenes, titles["lidar"])))
     lines = ["| terrain | precision | recall | walls | posts | soft vegetation | stop error (median) |"]
@@ -266,6 +267,8 @@ def main() -> None:
     torch.set_num_threads(2)
     if options.seed is None:
         options.seed = ANY_SEED if options.any_texture else 70000
+    if options.any_texture and (options.monoforce or options.no_geometric or options.lss):
+        parser.error("--any-texture takes --checkpoint SYSTEM=FILE, not --monoforce, --no-geometric or --lss")
     if options.any_texture:
         try:
             run_any(options, titles)

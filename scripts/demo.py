@@ -22,7 +22,7 @@ from monoforce_ros.evaluation import figures
 from monoforce_ros.evaluation.cli import main as evaluate
 from monoforce_ros.evaluation.view import PredictionView
 from monoforce_ros.messages import stamp_of
-from monoforce_ros.perception import choose_terrain_source
+from monoforce_ros.perception import SOURCES, choose_terrain_source
 from monoforce_ros.prediction import Predictor
 from monoforce_ros.reporting import figure_png
 from monoforce_ros.robots import load_robot
@@ -130,7 +130,7 @@ def main() -> None:
     parser.add_argument("--robot", default="husky", help="robot name or file (%(default)s)")
     parser.add_argument(
         "--terrain",
-        choices=("camera", "lidar", "flat"),
+        choices=SOURCES,
         default="camera",
         help="terrain source (%(default)s)",
     )

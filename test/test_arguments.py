@@ -275,8 +275,8 @@ def test_a_gpu_that_is_not_there_is_said_in_one_line(executables, ros_environmen
     ("words", "message"),
     [
         (
-            ["evaluate", "bag", "--checkpoint", "/a.safetensors"],
-            "--checkpoint has no effect with --terrain lidar: it needs",
+            ["evaluate", "bag", "--terrain", "lidar_interpolation", "--checkpoint", "/a.safetensors"],
+            "--checkpoint has no effect with --terrain lidar_interpolation: no encoder",
         ),
         (["evaluate", "bag", "--terrain", "flat", "--images", "/front"], "--images has no effect with --terrain flat"),
         (["evaluate", "bag", "--check", "--images", "/typo"], "--images has no effect with --check"),

@@ -115,6 +115,29 @@ def test_a_covered_lidar_is_an_error_alone_and_none_beside_cameras(recording, hu
     for fallback in (False, True):
         with pytest.raises(TerrainError, match="5 returns hit 1 cells"):
             choose_terrain_source("lidar", husky, fallback=fallback).terrain(covered, motion)
+    # Nor do points that lie far from the ground say anything of it: the lidar's pose is wrong.
+    above = replace(observation, cloud=observation.cloud + np.array([0.0, 0.0, 9.0], np.float32))
+    with pytest.raises(TerrainError, match="hit 0 cells"):
+        choose_terrain_source("lidar", husky).terrain(above, motion)
     found = choose_terrain_source("lidar_camera", husky, fallback=True).terrain(covered, motion)
     level = choose_terrain_source("flat", husky).terrain(covered, motion)
     torch.testing.assert_close(found.height, level.height)
+    # Five points do not spoil what the cameras show.
+    seen, without = (
+        choose_terrain_source("lidar_camera", husky).terrain(data, motion)
+        for data in (covered, replace(observation, cloud=None))
+    )
+    torch.testing.assert_close(seen.height, without.height)
+    assert float(seen.height.std()) > 0.01
+
+
+def test_with_both_sensors_rigid_ground_has_the_given_material(recording, husky):
+    stamp = recording.clouds[len(recording.clouds) // 2].stamp
+    observation = observe(recording, husky, stamp, ("lidar", "camera"), tuple(recording.images))
+    material = TerrainDefaults(stiffness=1e6, damping=3e4, friction=0.55)
+    found = choose_terrain_source("lidar_camera", husky, material=material).terrain(
+        observation, recording.motion.at(stamp)
+    )
+    depth = found.geometric_height - found.height
+    assert (found.friction[depth < 0.02] == 0.55).all() and int((depth < 0.02).sum()) > 1000
+    assert (found.friction[depth > 0.06] != 0.55).any()

@@ -22,7 +22,8 @@ Encoder = TerrainEncoder | LidarEncoder
 MAXIMUM_BYTES = 2_000_000_000
 _HOW_TO_GET_ONE = (
     "a checkpoint is a file NAME.safetensors with NAME.json in the same folder, as written by training; "
-    "set `checkpoint` to its path, leave it empty for the shipped encoder, or use the terrain source `lidar`"
+    "set `checkpoint` to its path, leave it empty for the shipped encoder, or use the terrain source "
+    "`lidar_interpolation`"
 )
 
 

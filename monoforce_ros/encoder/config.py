@@ -39,8 +39,7 @@ class EncoderConfig:
     depth_bins: int = 48
     """Range [m] and number of depth bins, evenly spaced in the logarithm of depth."""
     relative_bins: int = 0
-    """Number of bins of depth relative to level ground, as wide as those of depth, that add to them; 0 for none, as in
-    the shipped encoder."""
+    """Number of bins of depth relative to level ground, as wide as those of depth, that add to them; 0 for none."""
     sweep_channels: int = SWEEP_CHANNELS
     """Features of a lidar sweep, see :func:`~monoforce_ros.encoder.sweep.sweep_features`: 8, 7 (without interpolation),
     or 3 (heights only) of checkpoints that do not name it."""

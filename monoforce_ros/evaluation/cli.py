@@ -71,7 +71,7 @@ def _parser() -> OptionParser:
     parser.add_argument(
         "--checkpoint",
         default="",
-        help="terrain encoder weights, for camera terrain sources (default: the shipped ones)",
+        help="terrain encoder weights (default: the shipped ones)",
     )
     parser.add_argument(
         "--retention-time",
@@ -176,6 +176,7 @@ def run(options: argparse.Namespace) -> None:
         material=material,
         checkpoint=options.checkpoint,
         retention_time=options.retention_time,
+        warn=lambda message: print(f"warning: {message}", file=sys.stderr),
     )
     predictor = Predictor(
         robot, source, horizon=max(options.horizons), options=PhysicsOptions(soil=read_soil(options.soil))

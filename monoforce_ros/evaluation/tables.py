@@ -48,7 +48,7 @@ class System:
     input: str
     checkpoint: Path | None = None
     with_lidar: bool = False
-    """Combine the lidar's heights with the compliance that the encoder predicts, instead of using its heights."""
+    """Combine the lidar's heights with the compliance that an encoder of images predicts, instead of its heights."""
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ from monoforce_ros.nodes.rate_limiter import RateLimiter
 from monoforce_ros.nodes.schema import read_schema, schema_path
 from monoforce_ros.nodes.sensor_decoder import LIDAR, SensorDecoder
 from monoforce_ros.nodes.subscriptions import AdaptiveSubscription, command_types
-from monoforce_ros.perception import LidarTerrain, TerrainSource, TrustReport, choose_terrain_source
+from monoforce_ros.perception import TerrainSource, TrustReport, choose_terrain_source
 from monoforce_ros.physics import PhysicsOptions, read_soil
 from monoforce_ros.prediction import FORCE_INTERVAL, Prediction, Predictor
 from monoforce_ros.robots import load_robot
@@ -205,7 +205,7 @@ class PredictorNode(ManagedNode):
                 "driver, or use device:=auto"
             )
         cuda = settings.device == "cuda" or (settings.device == "auto" and torch.cuda.is_available())
-        source = choose_terrain_source(
+        return choose_terrain_source(
             settings.terrain_source,
             self.robot,
             grid=Grid.square(settings.map_size, settings.map_resolution),
@@ -216,13 +216,8 @@ class PredictorNode(ManagedNode):
             threads=min(settings.encoder_threads, os.cpu_count() or 1),
             retention_time=settings.camera_retention_time,
             fallback=settings.camera_fallback,
+            warn=self.get_logger().warning,
         )
-        if settings.terrain_source == "lidar" and isinstance(source, LidarTerrain):
-            self.get_logger().warning(
-                "terrain_source lidar interpolates the point cloud, because the encoder takes no sweeps, or has no map "
-                f"of {settings.map_size:g} m with cells of {settings.map_resolution:g} m"
-            )
-        return source
 
     def _sensor_topics(self) -> dict[str, str]:
         """Part name → resolved topic of every sensor that the terrain source uses."""

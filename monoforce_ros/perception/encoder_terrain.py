@@ -9,12 +9,13 @@ import numpy as np
 import torch
 
 from monoforce_ros.core import MotionState, transform_points
-from monoforce_ros.encoder import CameraView, Encoder
+from monoforce_ros.encoder import CameraView, Encoder, EncoderConfig
+from monoforce_ros.perception.fusion import material_by_compliance
 from monoforce_ros.perception.ground_alignment import align_to_ground, support_points
 from monoforce_ros.perception.observation import Observation
 from monoforce_ros.perception.trace import DrivenGround
 from monoforce_ros.robots import RobotModel
-from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap, require_cells
+from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainError, TerrainMap, require_cells
 
 
 @contextmanager
@@ -46,7 +47,8 @@ class EncoderTerrain:
         robot: the robot on the ground.
         sensors: sensors used, of ``camera`` and ``lidar``; of two sensors either may be absent from an observation.
         threads: CPU threads of the encoder; see :func:`encoder_threads`.
-        material: material of the ground in place of the predicted one.
+        material: material of rigid ground, of which shape says little; images tell that of what is soft. By default it
+            is predicted everywhere.
 
     Raises:
         ValueError: the encoder does not take one of the sensors.
@@ -67,6 +69,8 @@ class EncoderTerrain:
             raise ValueError(f"terrain from {' and '.join(sensors) or 'no sensor'}: the encoder takes {config.sensor}")
         self.encoder, self.robot, self.sensors = encoder, robot, sensors
         self._threads, self._material = threads, material
+        self.stiffness = config.stiffness if material is None else material.stiffness
+        """Of the ground that carries the robot [N/m³]."""
         self._driven = DrivenGround()
         self.start_error = 0.0
         """Median difference between the last map and the ground under the wheels, before they were aligned [m]."""
@@ -79,8 +83,8 @@ class EncoderTerrain:
     def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
         """Predicted map; raises ``ValueError`` if all sensors, a calibration or a camera pose are missing.
 
-        Without images it raises ``TerrainError`` if too few points lie on the map, of which an encoder would make level
-        ground.
+        Without images it raises ``TerrainError`` if too few points lie on the map: an encoder would interpolate between
+        them. Beside images such a sweep is left out.
         """
         views = _views(observation, motion) if "camera" in self.sensors else []
         sweep = _sweep(observation, motion, self.robot) if "lidar" in self.sensors else None
@@ -88,17 +92,31 @@ class EncoderTerrain:
             wanted = {"camera": "an image", "lidar": "a point cloud"}
             names = " or ".join(wanted[name] for name in self.sensors)
             raise ValueError(f"the terrain encoder needs {names}, and the observation has none")
-        if not views and sweep is not None:
-            rows, columns, inside = self.grid.cells(sweep[:, :2])
-            cells = np.unique((rows * self.grid.columns + columns)[inside])
-            require_cells(len(cells), len(sweep), self.grid)
-        support = support_points(self.robot, motion, self.encoder.config.stiffness)
+        support = support_points(self.robot, motion, self.stiffness)
+        if sweep is not None:
+            try:
+                _require_ground(sweep, float(support[:, 2].mean()), self.encoder.config)
+            except TerrainError:
+                if not views:
+                    raise
+                sweep = None
         trace = self._driven.update(motion, support)
         with encoder_threads(self._threads):
             found = self.encoder.terrain(views, support, sweep=sweep, trace=trace)
         self.start_error = _error_under(found, support)
         aligned = align_to_ground(found, support)
-        return aligned if self._material is None else aligned.with_material(self._material)
+        if self._material is None:
+            return aligned
+        rigid = aligned.with_material(self._material)
+        return material_by_compliance(rigid, aligned) if views else rigid
+
+
+def _require_ground(sweep: np.ndarray, ground: float, config: EncoderConfig) -> None:
+    """Raise ``TerrainError`` if too few points ``[n, 3]`` lie between the heights that the encoder takes."""
+    rows, columns, inside = config.grid.cells(sweep[:, :2])
+    inside &= (sweep[:, 2] - ground > config.lowest) & (sweep[:, 2] - ground < config.highest)
+    cells = np.unique((rows * config.grid.columns + columns)[inside])
+    require_cells(len(cells), len(sweep), config.grid)
 
 
 def _error_under(terrain: TerrainMap, support: np.ndarray) -> float:

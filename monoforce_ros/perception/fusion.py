@@ -6,12 +6,13 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
+from torch import Tensor
 
 from monoforce_ros.core import MotionState
 from monoforce_ros.perception.clearance import clear_of_robot
 from monoforce_ros.perception.lidar import LidarTerrain
 from monoforce_ros.perception.observation import Observation, TerrainSource
-from monoforce_ros.terrain import Grid, TerrainMap
+from monoforce_ros.terrain import Grid, TerrainError, TerrainMap
 
 _RIGID_BELOW, _COMPLIANT_FROM = 0.02, 0.06
 """Compliance (H_g − H_t of the encoder) up to which a surface counts as rigid, and from which on as compliant [m]."""
@@ -30,26 +31,38 @@ def apply_compliance(lidar: TerrainMap, camera: TerrainMap) -> TerrainMap:
         lidar: map from a lidar.
         camera: map from an encoder, on the same grid.
     """
-    compliance = (camera.geometric_height - camera.height).clamp_min(0.0)
-    share = ((compliance - _RIGID_BELOW) / (_COMPLIANT_FROM - _RIGID_BELOW)).clamp(0.0, 1.0)
+    compliance, share = _compliance(camera)
     # A surface far above the predicted one is another object, which the encoder has not recognised.
     above = (lidar.height - camera.height).clamp_min(0.0)
     height = lidar.height - share * torch.minimum(above, compliance + _HEIGHT_TOLERANCE)
-    return replace(
-        camera,
-        height=height,
-        geometric_height=height + share * compliance,
-        stiffness=torch.lerp(lidar.stiffness, camera.stiffness, share),
-        damping=torch.lerp(lidar.damping, camera.damping, share),
-        friction=torch.lerp(lidar.friction, camera.friction, share),
-        observed=lidar.observed | camera.observed,
+    surfaces = replace(
+        material_by_compliance(lidar, camera), height=height, geometric_height=height + share * compliance
     )
+    return replace(surfaces, observed=lidar.observed | camera.observed)
+
+
+def material_by_compliance(rigid: TerrainMap, predicted: TerrainMap) -> TerrainMap:
+    """A predicted map with the material of another one where it is rigid, and its own where it is compliant (H_d)."""
+    _, share = _compliance(predicted)
+    return replace(
+        predicted,
+        stiffness=torch.lerp(rigid.stiffness, predicted.stiffness, share),
+        damping=torch.lerp(rigid.damping, predicted.damping, share),
+        friction=torch.lerp(rigid.friction, predicted.friction, share),
+    )
+
+
+def _compliance(terrain: TerrainMap) -> tuple[Tensor, Tensor]:
+    """H_d [m], and how far a cell counts as compliant, 0 to 1."""
+    compliance = (terrain.geometric_height - terrain.height).clamp_min(0.0)
+    return compliance, ((compliance - _RIGID_BELOW) / (_COMPLIANT_FROM - _RIGID_BELOW)).clamp(0.0, 1.0)
 
 
 @dataclass(frozen=True)
 class LidarCameraTerrain:
-    """Lidar heights, lowered by the compliance that the encoder predicts (H_d); both on the encoder's grid.
+    """Lidar heights, lowered by the compliance that an encoder of images predicts (H_d); both on the encoder's grid.
 
+    For encoders that take no sweeps; others make one map of both sensors.
     A lidar locates walls accurately but measures the top of grass; an encoder recognises grass, but its heights are
     less accurate.
     """
@@ -70,6 +83,11 @@ class LidarCameraTerrain:
             return self.camera.terrain(observation, motion)
         if not observation.images:
             return self.lidar.terrain(observation, motion)
-        fused = apply_compliance(self.lidar.terrain(observation, motion), self.camera.terrain(observation, motion))
+        seen = self.camera.terrain(observation, motion)
+        try:
+            measured = self.lidar.terrain(observation, motion)
+        except TerrainError:
+            return seen
+        fused = apply_compliance(measured, seen)
         # What is still high is rigid.
         return clear_of_robot(fused, self.lidar.robot, motion)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 from monoforce_ros.encoder import fused, load_encoder, packed
@@ -33,6 +34,7 @@ def choose_terrain_source(
     threads: int | None = None,
     retention_time: float = 0.0,
     fallback: bool = False,
+    warn: Callable[[str], None] = lambda message: None,
 ) -> TerrainSource:
     """A terrain source by its name, one of :data:`SOURCES`.
 
@@ -49,6 +51,7 @@ def choose_terrain_source(
         fallback: whether sources with an encoder fall back (to level ground, or to interpolation of the lidar) while
             the encoder is worse than level ground; see :class:`monoforce_ros.perception.TrustedTerrain`.
         retention_time: how long terrain seen by cameras is kept after it leaves the images [s]; 0 disables it.
+        warn: told why the source ``lidar`` only interpolates.
 
     Raises:
         ValueError: there is no such source or precision.
@@ -62,12 +65,15 @@ def choose_terrain_source(
         return LidarTerrain(robot, grid or Grid.square(), material)
     encoder = load_encoder(checkpoint, None if kind == "lidar" else "camera")
     sensors = tuple(name for name in kind.split("_") if name == "camera" or encoder.config.takes_sweeps)
-    if not sensors or (kind == "lidar" and grid not in (None, encoder.config.grid)):
-        return LidarTerrain(robot, grid or encoder.config.grid, material)
+    own_grid = encoder.config.grid
+    if kind == "lidar" and (not sensors or grid not in (None, own_grid)):
+        wanted = f"a map of {own_grid.columns * own_grid.resolution:g} m with cells of {own_grid.resolution:g} m"
+        reason = f"its encoder makes {wanted} only" if sensors else f"the encoder {checkpoint} takes no sweeps"
+        warn(f"terrain source lidar interpolates the point cloud like lidar_interpolation: {reason}")
+        return LidarTerrain(robot, grid or own_grid, material)
     # Packed weights and half precision save time on the CPU only.
     encoder = packed(fused(encoder, precision)) if device == "cpu" else fused(encoder).to(device)
-    # Shape says little of material.
-    own = EncoderTerrain(encoder, robot, sensors, threads=threads, material=material if kind == "lidar" else None)
+    own = EncoderTerrain(encoder, robot, sensors, threads=threads, material=material if "lidar" in sensors else None)
     learned: TerrainSource = own
     if retention_time and "camera" in sensors:
         learned = TemporalMemory(learned, robot, stiffness=encoder.config.stiffness, retention_time=retention_time)
@@ -75,5 +81,7 @@ def choose_terrain_source(
     if kind == "lidar_camera" and "lidar" not in sensors:
         learned = LidarCameraTerrain(lidar, learned)
     if fallback:
-        learned = TrustedTerrain(learned, own, (level,) if kind == "camera" else (lidar, level))
+        fallbacks: list[TerrainSource] = [] if kind == "camera" else [lidar]
+        fallbacks += [] if kind == "lidar" else [level]
+        learned = TrustedTerrain(learned, own, fallbacks)
     return learned

@@ -56,6 +56,8 @@ class TrustReport:
     """Camera that looked at the places with the largest mean error; empty before any comparison."""
     by_distance: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Mean error of prediction and of level ground [m], by the distance from which a place was predicted."""
+    remedy: str = "adapt the encoder to this robot (train --adapt BAG)"
+    """What to do if the encoder is not trusted."""
 
     @property
     def explanation(self) -> str:
@@ -63,7 +65,7 @@ class TrustReport:
         if not self.start_error <= START_TOLERANCE:
             return (
                 f"the encoder's ground under the wheels is off by {100 * self.start_error:.0f} cm, expected at most"
-                f" {100 * START_TOLERANCE:.0f} cm: check the sensors' poses, or adapt the encoder (train --adapt BAG)"
+                f" {100 * START_TOLERANCE:.0f} cm: check the sensors' poses, or {self.remedy}"
             )
         if not np.isfinite(self.error):
             return "nothing compared yet: until the robot reaches ground that was predicted, the fallback is used"
@@ -74,7 +76,7 @@ class TrustReport:
         if self.trusted:
             return f"{compared}; {100 * self.share:.0f} % of what it adds to the fallback's heights are used"
         camera = f", worst from {self.worst_camera}" if self.worst_camera else ""
-        return f"{compared}{camera}: adapt the encoder to this robot (train --adapt BAG)"
+        return f"{compared}{camera}: {self.remedy}"
 
 
 @dataclass(frozen=True)
@@ -256,7 +258,8 @@ class TrustedTerrain:
     Args:
         source: source of the encoder's maps, with or without temporal memory.
         encoder: the encoder's own source within it.
-        fallbacks: sources of the maps where the encoder is not trusted; the first one whose sensors have measured.
+        fallbacks: sources of the maps where the encoder is not trusted; the first one whose sensors have measured
+            enough.
     """
 
     def __init__(self, source: TerrainSource, encoder: EncoderTerrain, fallbacks: Sequence[TerrainSource]):
@@ -279,13 +282,16 @@ class TrustedTerrain:
         """The encoder's map or the fallback's; raises the source's errors."""
         predicted = self._source.terrain(observation, motion)
         other = self._fallback(observation, motion)
-        support = support_points(self._encoder.robot, motion, self._encoder.encoder.config.stiffness)
+        support = support_points(self._encoder.robot, motion, self._encoder.stiffness)
         cameras = {}
         for name, pose in observation.base_from_cameras.items():
             axis = (motion.terrain_from_base @ pose)[:3, 2]
             cameras[name] = float(np.arctan2(axis[1], axis[0]))
-        self.report = self._trust.update(motion, support, predicted, cameras, self._encoder.start_error, other)
-        return blended(other, predicted, self.report.share)
+        report = self._trust.update(motion, support, predicted, cameras, self._encoder.start_error, other)
+        # Adaptation needs images.
+        without = replace(report, remedy="use terrain_source lidar_interpolation")
+        self.report = report if "camera" in self.sensors else without
+        return blended(other, predicted, report.share)
 
     def _fallback(self, observation: Observation, motion: MotionState) -> TerrainMap:
         """Map of the first fallback whose sensors have measured enough; the last one's error if there is none."""

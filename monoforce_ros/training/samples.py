@@ -147,7 +147,7 @@ class Augmentation:
 
 
 def _drawn_sensors(random: np.random.Generator, shares: Sequence[float]) -> dict[str, Any]:
-    """Sensors of one sample, never none."""
+    """Sensors of one sample; of images alone, some cameras or rarely all are left out."""
     kind = random.choice(["images", "both", "sweep"], p=np.array(shares) / sum(shares))
     share = {"images": 1.0, "both": 1.0, "sweep": -1.0}[str(kind)]
     return {

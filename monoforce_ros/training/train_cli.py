@@ -207,6 +207,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if not options.bags and not options.worlds:
         parser.error("got no bags and no --worlds; expected one of them at least")
+    sensor = options.sensor or ("camera_lidar" if options.start_from else "camera")
+    if options.adapt or options.no_augmentation or sensor != "camera_lidar":
+        parser.refuse_without_effect(options, ("sensor_shares",), "without augmentation of images and sweeps")
     if options.samples_only and options.samples is None:
         parser.error("--samples-only: expected a folder with --samples")
     if options.out is None and not options.samples_only:
@@ -391,9 +394,9 @@ def _with_vegetation(
 def _encoder(options: argparse.Namespace, config: EncoderConfig, start: Encoder | None) -> Encoder:
     if start is not None:
         found, expected = asdict(start.config), asdict(config)
-        free = {"decreases", "edges", "geometric_spread_factor", "decrease_spread_factor"}
-        if isinstance(start, TerrainEncoder):
-            free |= {"sweep_channels"} | (set() if start.config.relative_bins else {"relative_bins"})
+        free = {"decreases", "edges", "geometric_spread_factor", "decrease_spread_factor", "sweep_channels"}
+        if isinstance(start, TerrainEncoder) and not start.config.relative_bins:
+            free |= {"relative_bins"}
         names = [n for n in expected if n not in free and expected[n] != found[n]]
         if names:
             differences = "; ".join(f"{name}: got {found[name]}, expected {expected[name]}" for name in names)
