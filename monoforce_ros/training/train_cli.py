@@ -103,7 +103,7 @@ class _RenamedOption(argparse.Action):
         setattr(namespace, self.dest, self.const if self.nargs == 0 else values)
 
 
-def build_parser() -> argparse.ArgumentParser:
+def build_parser() -> OptionParser:
     """The parser of the command line."""
     parser = OptionParser(
         prog="train",
