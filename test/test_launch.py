@@ -88,7 +88,10 @@ def test_tf_moves_into_the_namespace_on_request():
     [
         ({"candidates": "abc"}, "candidates: got 'abc', expected an integer 0 … 512"),
         ({"candidates": "5000"}, "candidates: got 5000, expected an integer 0 … 512"),
-        ({"terrain_source": "sonar"}, "terrain_source: got 'sonar', expected one of lidar, lidar_interpolation, camera"),
+        (
+            {"terrain_source": "sonar"},
+            "terrain_source: got 'sonar', expected one of lidar, lidar_interpolation, camera",
+        ),
         ({"path_selector": "maybe"}, "path_selector: got 'maybe', expected true or false"),
         ({"use_sim_time": "1"}, "use_sim_time: got 1, expected true or false"),
         ({"namespace": "1st robot"}, "namespace: got '1st robot', expected letters"),
