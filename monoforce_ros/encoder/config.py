@@ -12,8 +12,8 @@ FORMAT = 2
 BACKBONES = ("efficientnet_lite0",)
 
 HEIGHT_CHANNELS, SCATTER_CHANNELS, SWEEP_CHANNELS = 3, 7, 8
-"""Features of a lidar sweep: its heights; with scatter and what stands on the ground; with the interpolation, which are
-all (:mod:`sweep`)."""
+"""Features of a lidar sweep: its heights; with scatter and the height of ground and objects; with the interpolation,
+which are all (:mod:`sweep`)."""
 FEATURE_STRIDE = 8
 """Stride of the lifted features in pixels of the resized image."""
 

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 
 from monoforce_ros.encoder.config import HEIGHT_CHANNELS, EncoderConfig
-from monoforce_ros.terrain import Grid, LidarSettings, cell_heights, interpolated_ground
+from monoforce_ros.terrain import Grid, LidarSettings, cell_quantiles, interpolated_ground
 
 HIT, TOP, STANDING, BETWEEN = 2, 5, 6, 7
-"""Channels: the mask of cells with points; the height of what stands on the ground, and its mask; this height
+"""Channels: the mask of cells with points; the height of the ground and of objects on it, and its mask; this height
 interpolated over the whole map."""
 _REACH = 0.25
 """Half-width of the square around a cell whose points tell a surface from leaves [m]: as deep as a lidar sees into a
@@ -34,7 +32,7 @@ def sweep_features(
     points: np.ndarray, ground: float, config: EncoderConfig, support: np.ndarray | None = None
 ) -> np.ndarray:
     """Features of a sweep ``[8, rows, columns]``: :func:`cell_extremes`, scatter and number of the upper points nearby,
-    the height of what stands on the ground with its mask, and this height interpolated through the wheels' contacts.
+    the height of the ground and of objects on it with its mask, and this height interpolated through the contacts.
 
     Leaves return a lidar's pulses from various depths, a wall from one plane, whatever they look like. The scatter is
     the standard deviation of points along the horizontal direction in which they vary least: millimetres on walls,
@@ -63,7 +61,7 @@ def sweep_features(
     xx, yy, xy = xx - mean_x**2, yy - mean_y**2, xy - mean_x * mean_y
     least = 0.5 * (xx + yy) - np.hypot(0.5 * (xx - yy), xy)
     scatter = np.where(count >= _FEWEST, np.sqrt(np.maximum(least, 0.0)), 0.0) / _SCATTER_UNIT
-    top, standing = _standing(placed, flat, extremes, config)
+    top, standing = _standing(placed, extremes, config)
     between = np.zeros_like(top)
     if standing.any():
         contacts = np.zeros((0, 3)) if support is None else support - np.array([0.0, 0.0, ground])
@@ -71,21 +69,16 @@ def sweep_features(
     return np.concatenate([extremes, [scatter, np.log1p(count), top, standing, between]])
 
 
-def _standing(
-    placed: np.ndarray, flat: np.ndarray, extremes: np.ndarray, config: EncoderConfig
-) -> tuple[np.ndarray, np.ndarray]:
+def _standing(placed: np.ndarray, extremes: np.ndarray, config: EncoderConfig) -> tuple[np.ndarray, np.ndarray]:
     """Height of what stands on the ground in each cell [m], and the mask of cells with it.
 
     On the ground the height is that of the lidar map, whose quantile noise affects less than the highest point; of what
     rises from it, the highest point, but below gaps: a robot passes under branches.
     """
-    grid = config.grid
-    quantile = LidarSettings(lowest=config.lowest, highest=config.highest)
-    usual, standing = cell_heights(placed, grid, quantile)
+    limits = LidarSettings(lowest=config.lowest, highest=config.highest)
+    (usual, highest), standing = cell_quantiles(placed, config.grid, limits, (limits.quantile, 1.0))
     low, high, _ = extremes
-    rises = standing & (high - low > _UPPER)
-    highest, found = cell_heights(placed[rises.ravel()[flat]], grid, replace(quantile, quantile=1.0))
-    return np.where(rises & found, highest, usual), standing
+    return np.where(high - low > _UPPER, highest, usual), standing
 
 
 def _placed(points: np.ndarray, ground: float, config: EncoderConfig) -> tuple[np.ndarray, np.ndarray]:

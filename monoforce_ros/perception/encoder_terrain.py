@@ -15,7 +15,7 @@ from monoforce_ros.perception.ground_alignment import align_to_ground, support_p
 from monoforce_ros.perception.observation import Observation
 from monoforce_ros.perception.trace import DrivenGround
 from monoforce_ros.robots import RobotModel
-from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainError, TerrainMap, require_cells
+from monoforce_ros.terrain import Grid, LidarSettings, TerrainDefaults, TerrainMap, require_cells
 
 
 @contextmanager
@@ -94,11 +94,10 @@ class EncoderTerrain:
             raise ValueError(f"the terrain encoder needs {names}, and the observation has none")
         support = support_points(self.robot, motion, self.stiffness)
         if sweep is not None:
-            try:
-                _require_ground(sweep, float(support[:, 2].mean()), self.encoder.config)
-            except TerrainError:
-                if not views:
-                    raise
+            cells = _measured_cells(sweep, float(support[:, 2].mean()), self.encoder.config)
+            if not views:
+                require_cells(cells, len(sweep), self.grid)
+            elif cells < LidarSettings().minimum_cells:
                 sweep = None
         trace = self._driven.update(motion, support)
         with encoder_threads(self._threads):
@@ -111,12 +110,13 @@ class EncoderTerrain:
         return material_by_compliance(rigid, aligned) if views else rigid
 
 
-def _require_ground(sweep: np.ndarray, ground: float, config: EncoderConfig) -> None:
-    """Raise ``TerrainError`` if too few points ``[n, 3]`` lie between the heights that the encoder takes."""
+def _measured_cells(sweep: np.ndarray, ground: float, config: EncoderConfig) -> int:
+    """Number of cells with points ``[n, 3]`` between the heights that the encoder takes."""
     rows, columns, inside = config.grid.cells(sweep[:, :2])
     inside &= (sweep[:, 2] - ground > config.lowest) & (sweep[:, 2] - ground < config.highest)
-    cells = np.unique((rows * config.grid.columns + columns)[inside])
-    require_cells(len(cells), len(sweep), config.grid)
+    hit = np.zeros((config.grid.rows, config.grid.columns), bool)
+    hit[rows[inside], columns[inside]] = True
+    return int(hit.sum())
 
 
 def _error_under(terrain: TerrainMap, support: np.ndarray) -> float:

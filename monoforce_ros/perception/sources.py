@@ -51,7 +51,7 @@ def choose_terrain_source(
         fallback: whether sources with an encoder fall back (to level ground, or to interpolation of the lidar) while
             the encoder is worse than level ground; see :class:`monoforce_ros.perception.TrustedTerrain`.
         retention_time: how long terrain seen by cameras is kept after it leaves the images [s]; 0 disables it.
-        warn: told why the source ``lidar`` only interpolates.
+        warn: called with the reason if the source ``lidar`` only interpolates.
 
     Raises:
         ValueError: there is no such source or precision.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -134,14 +135,24 @@ def _tall_nearby(heights: np.ndarray, support: np.ndarray, grid: Grid) -> np.nda
 
 def cell_heights(points: np.ndarray, grid: Grid, settings: LidarSettings) -> tuple[np.ndarray, np.ndarray]:
     """Height of each cell with returns, ``[rows, columns]`` [m], and the mask of these cells."""
+    heights, observed = cell_quantiles(points, grid, settings, (settings.quantile,))
+    return heights[0], observed
+
+
+def cell_quantiles(
+    points: np.ndarray, grid: Grid, settings: LidarSettings, quantiles: Sequence[float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Quantiles of the heights of each cell's returns, ``[quantiles, rows, columns]`` [m], and the mask of cells with
+    returns; those above a gap, which the robot passes under, do not count."""
     z = points[:, 2]
     rows, columns, inside = grid.cells(points[:, :2])
     inside &= (z > settings.lowest) & (z < settings.highest)
     flat, z = (rows * grid.columns + columns)[inside], z[inside]
-    heights = np.zeros((grid.rows, grid.columns))
+    heights = np.zeros((len(quantiles), grid.rows * grid.columns))
     observed = np.zeros((grid.rows, grid.columns), bool)
+    shape = (len(quantiles), grid.rows, grid.columns)
     if not len(z):
-        return heights, observed
+        return heights.reshape(shape), observed
     order = np.lexsort((z, flat))
     flat, z = flat[order], z[order]
     first = np.r_[True, flat[1:] != flat[:-1]]
@@ -153,13 +164,14 @@ def cell_heights(points: np.ndarray, grid: Grid, settings: LidarSettings) -> tup
     starts = np.flatnonzero(np.r_[True, cell[1:] != cell[:-1]])
     standing = stands_on_ground(z[starts], flat[starts], grid, settings)
     counts = np.diff(np.r_[starts, len(cell)])
-    position = starts + (counts - 1) * settings.quantile
-    below = np.floor(position).astype(np.int64)
-    above = np.minimum(below + 1, starts + counts - 1)
-    values = z[below] + (position - below) * (z[above] - z[below])
-    heights.ravel()[flat[starts][standing]] = values[standing]
+    for row, quantile in zip(heights, quantiles, strict=True):
+        position = starts + (counts - 1) * quantile
+        below = np.floor(position).astype(np.int64)
+        above = np.minimum(below + 1, starts + counts - 1)
+        values = z[below] + (position - below) * (z[above] - z[below])
+        row[flat[starts][standing]] = values[standing]
     observed.ravel()[flat[starts][standing]] = True
-    return heights, observed
+    return heights.reshape(shape), observed
 
 
 def stands_on_ground(lowest: np.ndarray, cells: np.ndarray, grid: Grid, settings: LidarSettings) -> np.ndarray:
