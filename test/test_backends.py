@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from monoforce_ros.physics import PhysicsOptions, State, rollout
+from monoforce_ros.physics.warp_launch import chunks
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainMap
 
@@ -64,6 +65,21 @@ def test_single_precision_follows_double_precision():
     assert quick.position.dtype == torch.float32
     assert float((exact.position - quick.position).norm(dim=-1).median()) < 1e-4
     assert float((exact.position - quick.position).norm(dim=-1).max()) < 0.01
+
+
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+@pytest.mark.parametrize("backward", [True, False])
+@pytest.mark.parametrize(
+    ("first", "count", "steps"), [(0, 1, 500), (3, 29, 500), (0, 2100, 500), (0, 9, 10**7), (0, 4, 0)]
+)
+def test_launches_take_each_trajectory_of_a_share_once(device, backward, first, count, steps):
+    parts = chunks((first, count), steps, torch.device(device), backward=backward)
+    assert [i for start, width in parts for i in range(start, start + width)] == list(range(first, first + count))
+
+
+def test_a_gpu_gets_a_batch_at_once_also_backwards():
+    # In parts of eight, 32 trajectories took four times as long as eight on an H100.
+    assert chunks((0, 512), 500, torch.device("cuda"), backward=True) == [(0, 512)]
 
 
 def test_a_batch_split_over_threads_has_the_gradient_of_its_parts():

@@ -20,12 +20,12 @@ from monoforce_ros.physics.problem import Motion, Problem
 from monoforce_ros.physics.soil import SOIL_PARAMETERS
 from monoforce_ros.physics.warp_kernels import forces_kernel, integrate_kernel, summarise_kernel
 from monoforce_ros.physics.warp_launch import (
-    CHUNK,
     INPUTS,
     Arguments,
     Fixed,
     SampledBody,
     adjoint,
+    chunks,
     contiguous,
     in_parallel,
     precision,
@@ -187,10 +187,8 @@ def _launch(
     fixed.ceilings(inputs[0])
 
     def work(part: tuple[int, int]) -> list[Tensor]:
-        first, count = part
         arguments = Arguments(fixed, inputs, states, gradients=backward, state_gradients=state_gradients)
-        for chunk in range(first, first + count, CHUNK if backward else count):
-            width = min(CHUNK, first + count - chunk) if backward else count
+        for chunk, width in chunks(part, steps, inputs[0].device, backward=backward):
             # The adjoint reads the sums of every step. Storing them for a few trajectories at a time requires a second
             # forward launch, but saves most of the memory.
             slots = max(1, steps) if backward else 1

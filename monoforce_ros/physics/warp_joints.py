@@ -23,12 +23,12 @@ from monoforce_ros.physics.warp_kernels import (
     joint_functions,
 )
 from monoforce_ros.physics.warp_launch import (
-    CHUNK,
     CPU_THREADS,
     INPUTS,
     Arguments,
     Fixed,
     adjoint,
+    chunks,
     contiguous,
     in_parallel,
     precision,
@@ -354,10 +354,8 @@ def _launch(
     fixed.ceilings(inputs[0])
 
     def work(part: tuple[int, int]) -> list[Tensor]:
-        first, count = part
         arguments = _Arguments(fixed, joints, inputs, states, gradients=backward, state_gradients=state_gradients)
-        for chunk in range(first, first + count, CHUNK if backward else count):
-            width = min(CHUNK, first + count - chunk) if backward else count
+        for chunk, width in chunks(part, steps, inputs[0].device, backward=backward):
             # As without joints, the adjoint reads what the steps left in the scratch arrays.
             if backward:
                 scratch = _Scratch(joints, kinds, inputs[0], width, max(1, steps), gradients=True)

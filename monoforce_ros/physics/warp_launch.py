@@ -22,8 +22,11 @@ CPU_THREADS = 2
 SMALLEST_SHARE = 4
 """Smallest number of trajectories per thread; splitting smaller batches takes longer."""
 
-CHUNK = 8
-"""Number of trajectories whose per-step sums are in memory at once in the backward pass."""
+CPU_CHUNK = 8
+"""Number of trajectories whose per-step values are in memory at once in the backward pass on the CPU."""
+CUDA_STEPS = 500_000
+"""The same on CUDA, times the number of steps: about 100 MB of sums in float32. A GPU computes a thousand trajectories
+at the same time, each as slowly as one alone."""
 
 _TANGENTIAL = {"none": NO_FRICTION, "coulomb": COULOMB, "sigmoid": SIGMOID}
 _threads: ThreadPoolExecutor | None = None
@@ -230,6 +233,16 @@ def shares(batch: int, device: torch.device) -> list[tuple[int, int]]:
     workers = 1 if device.type == "cuda" else max(1, min(CPU_THREADS, batch // SMALLEST_SHARE))
     edges = [round(batch * k / workers) for k in range(workers + 1)]
     return [(low, high - low) for low, high in itertools.pairwise(edges)]
+
+
+def chunks(part: tuple[int, int], steps: int, device: torch.device, *, backward: bool) -> list[tuple[int, int]]:
+    """Index of the first trajectory and number of trajectories of each launch of one share of a batch.
+
+    The forward pass takes all at once; the backward pass keeps the values of all steps, and takes as many as fit.
+    """
+    first, count = part
+    most = (CPU_CHUNK if device.type == "cpu" else max(1, CUDA_STEPS // max(1, steps))) if backward else count
+    return [(start, min(most, first + count - start)) for start in range(first, first + count, max(1, most))]
 
 
 def in_parallel[Result](work: Callable[[tuple[int, int]], Result], shares: list[tuple[int, int]]) -> list[Result]:
