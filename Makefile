@@ -7,7 +7,7 @@
 #                 real drives (an hour), write the tables of docs/discrepancy.md
 # make diagnosis-quick  measure diagnose on six drawn platforms (about 15 minutes), write nothing to the documents
 # make checkpoint train the shipped terrain encoder on randomised worlds, from nothing (two hours)
-# make tables     compare terrain sources on worlds that no training saw, as the paper's tables do (two hours)
+# make tables     compare terrain sources on worlds that no training saw, as the paper's tables do (six hours)
 SHELL := /bin/bash
 .PHONY: demo test test-lowest interfaces bench diagnosis diagnosis-quick engines checkpoint tables lint environment build graphics lock clean help
 
@@ -84,5 +84,8 @@ diagnosis: build graphics engines
 	@if [ -d "$(DRIVES)" ]; then scripts/run.sh python benchmarks/warthog_reports.py "$(DRIVES)" \
 	  --json out/warthog.json --docs docs/discrepancy.md; else echo "[diagnosis] no real drives at $(DRIVES)"; fi
 
-checkpoint tables: build graphics
-	@scripts/train_encoders.sh $@
+checkpoint: build graphics
+	@scripts/train_checkpoint.sh
+
+tables: build graphics
+	@scripts/train_systems.sh

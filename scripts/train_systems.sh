@@ -26,7 +26,7 @@ scripts/run.sh train $common --samples-only --jobs "$jobs" --out "$out/samples"
 
 # Same start, samples, steps, augmentation and weights; steps are restored by none of them.
 train="scripts/run.sh train $common --steps $steps --relative-bins 40 --no-edges --no-vegetation --precision bfloat16 \
-  --threads 1 --validate-every 200 --quiet"
+  --threads 1 --validate-every "$steps" --quiet"
 geometric="--losses geometric" all="--losses geometric terrain trajectory"
 options() { # system
   case $1 in
@@ -57,4 +57,5 @@ for system in shipped shipped_lidar shipped_both; do
   checkpoints+=" --checkpoint $system=models/terrain_encoder.safetensors"
 done
 scripts/run.sh python benchmarks/terrain.py --out "$out/tables" --jobs "$jobs" $checkpoints --docs docs/training.md
-scripts/run.sh python benchmarks/wall.py --any-texture $checkpoints --json "$out/tables/wall.json" --docs docs/protocol.md
+scripts/run.sh python benchmarks/wall.py $checkpoints --json "$out/tables/wall.json" --png docs/wall.png \
+  --docs docs/protocol.md

@@ -15,7 +15,6 @@ from monoforce_ros.encoder import (
     CheckpointError,
     EncoderConfig,
     TerrainEncoder,
-    averaged,
     fused,
     load_encoder,
     new_encoder,
@@ -348,25 +347,3 @@ def test_unusable_checkpoints_are_refused(tmp_path):
     save_encoder(broken, path)
     with pytest.raises(CheckpointError, match="not finite"):
         load_encoder(path)
-
-
-def test_encoders_are_averaged_by_their_shares(tmp_path):
-    torch.manual_seed(0)
-    paths = [tmp_path / f"{name}.safetensors" for name in "ab"]
-    encoders = [TerrainEncoder(SMALL) for _ in paths]
-    for encoder, path in zip(encoders, paths, strict=True):
-        save_encoder(encoder, path)
-    mean = averaged(paths, [2.0, 1.0]).state_dict()
-    first, second = (encoder.state_dict() for encoder in encoders)
-    moved = 0
-    for name, value in mean.items():
-        if value.is_floating_point():
-            torch.testing.assert_close(value, (2.0 * first[name] + second[name]) / 3.0)
-            moved += int(not torch.equal(first[name], second[name]))
-    assert moved > 10
-    for shares in ([1.0], [1.0, 0.0], [1.0, float("nan")]):
-        with pytest.raises(ValueError, match="expected a number above 0 for each"):
-            averaged(paths, shares)
-    save_encoder(TerrainEncoder(replace(SMALL, map_features=SMALL.map_features + 8)), paths[1])
-    with pytest.raises(CheckpointError, match="its network differs from that of"):
-        averaged(paths, [1.0, 1.0])

@@ -163,10 +163,10 @@ def test_wrong_arguments_are_named(tmp_path):
 def test_precision_and_recall_of_stops():
     def scene(kind, driven):
         ahead = SimpleNamespace(kind=kind)
-        return wall.AnyScene(ahead, None, None, driven)
+        return wall.Scene(ahead, None, None, driven)
 
     scenes = [scene("wall", 2.0), scene("wall", 6.3), scene("post", 3.0), scene("vegetation", 6.3)]
-    row = wall.any_row("x", scenes, np.array([1.8, 6.4, 6.4, 3.0]))
+    row = wall.counted("x", scenes, np.array([1.8, 6.4, 6.4, 3.0]))
     assert (row["stops"], row["predicted"], row["found"]) == (2, 2, 1)
     assert row["precision"] == row["recall"] == 0.5
     assert row["stop_error_m"] == pytest.approx(-0.2)

@@ -4,7 +4,6 @@ from monoforce_ros.encoder.backbone import WeightsError
 from monoforce_ros.encoder.checkpoint import (
     CheckpointError,
     Encoder,
-    averaged,
     extended,
     load_encoder,
     new_encoder,
@@ -31,7 +30,6 @@ __all__ = [
     "TerrainEncoder",
     "WeightsError",
     "assemble",
-    "averaged",
     "encoder_input",
     "extended",
     "feature_rays",

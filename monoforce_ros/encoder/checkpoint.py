@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -111,32 +110,3 @@ def extended(encoder: Encoder, config: EncoderConfig) -> Encoder:
     weights[first] = torch.cat([functional.pad(before, (0, 0, 0, 0, 0, added)), after], dim=1)
     fresh.load_state_dict(own | weights)
     return fresh
-
-
-def averaged(paths: Sequence[str | Path], shares: Sequence[float]) -> Encoder:
-    """Weighted mean of the weights of encoders fine-tuned from the same checkpoint.
-
-    Such encoders lie in one basin of the loss, and their mean is often better than each of them (Wortsman et al.,
-    "Model soups", ICML 2022). The mean of independently trained encoders is useless.
-
-    Args:
-        paths: paths of the checkpoints.
-        shares: weight of each in the mean, above 0; they are normalised to a sum of 1.
-
-    Raises:
-        CheckpointError: a checkpoint cannot be read, or the networks differ.
-        ValueError: the number of shares differs from that of the checkpoints, or a share is not a number above 0.
-    """
-    if len(paths) != len(shares) or not paths or not all(0.0 < share < float("inf") for share in shares):
-        raise ValueError(f"shares of {len(paths)} encoders: got {list(shares)}, expected a number above 0 for each")
-    encoders = [load_encoder(path) for path in paths]
-    for path, encoder in zip(paths, encoders, strict=True):
-        if encoder.config != encoders[0].config:
-            raise CheckpointError(f"{path}: its network differs from that of {paths[0]}, so they cannot be averaged")
-    mean = new_encoder(encoders[0].config)
-    states = [encoder.state_dict() for encoder in encoders]
-    with torch.no_grad():
-        for name, value in mean.state_dict().items():
-            total = sum(share * state[name].double() for share, state in zip(shares, states, strict=True))
-            value.copy_(total / sum(shares))
-    return mean.eval()
