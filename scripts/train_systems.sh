@@ -20,7 +20,7 @@ done | xargs -r -P "$jobs" -I SEED $record --seed SEED "$out/worlds/SEED"
 
 bags=$(printf "$out/worlds/%s " $training)
 held_out=$(printf "$out/worlds/%s " $choosing)
-common="$bags --held-out $held_out --robot husky --samples $out/samples"
+common="$bags --held-out $held_out --robot husky --samples $out/samples --fit-iterations 40"
 # Extract samples first, because parallel trainings would all do it.
 scripts/run.sh train $common --samples-only --jobs "$jobs" --out "$out/samples"
 

@@ -139,6 +139,9 @@ def build_parser() -> OptionParser:
     add_read_options(parser)
     parser.add_argument("--period", type=float, default=SampleSettings.period, metavar="S", help="interval between "
                         "samples (default: %(default)s)")  # fmt: skip
+    parser.add_argument("--fit-iterations", type=int, default=SampleSettings.iterations, metavar="N", help="gradient "
+                        "steps of each terrain fit (paper III-F); 0: the supporting terrain as the wheels traced it "
+                        "(default: %(default)s)")  # fmt: skip
     parser.add_argument("--steps", type=int, default=TrainingSettings.steps, help="(default: %(default)s)")
     parser.add_argument("--batch", type=int, default=TrainingSettings.batch, help="samples per step and process "
                         "(default: %(default)s)")  # fmt: skip
@@ -461,7 +464,7 @@ def _samples(
 ) -> list[RecordingSamples]:
     """Samples of each usable bag, extracted in parallel; with a progress bar if there is a title."""
     recordings = []
-    settings = SampleSettings(period=options.period, reading=read_options(options))
+    settings = SampleSettings(period=options.period, iterations=options.fit_iterations, reading=read_options(options))
     folder = options.samples or options.out / "samples"
     bar = progress(bags, label=title, unit="bag", quiet=options.quiet or not title or not bags)
     with ProcessPoolExecutor(
