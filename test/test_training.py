@@ -396,6 +396,29 @@ def trained(executables, demo_bag, sample_folder, tmp_path_factory):
     return out
 
 
+def test_batches_prepared_in_advance_do_not_change_the_training(recording, husky, tmp_path, one_thread):
+    def weights(loaders: int, stop: int | None = None):
+        settings = TrainingSettings(steps=6, warm_up=2, save_every=3, weights=LossWeights(trajectory=0.0))
+        torch.manual_seed(0)
+        folder = tmp_path / f"{loaders} {stop}"
+        trainer = Trainer(new_encoder(TINY), husky, [recording], [], folder, settings, Process("cpu"), loaders=loaders)
+
+        def report(step: int, losses: dict[str, float]) -> None:
+            if step == stop:
+                raise KeyboardInterrupt
+
+        if stop is not None:
+            with pytest.raises(KeyboardInterrupt):
+                trainer.run(report)
+            assert trainer.resume() and trainer.step == 3
+        trainer.run()
+        return trainer.encoder.state_dict()
+
+    expected = weights(1)
+    for found in (weights(4), weights(9), weights(4, stop=5)):
+        assert all(torch.equal(found[name], value) for name, value in expected.items())
+
+
 def test_training_improves_on_the_ground_that_carries_the_robot(recording, husky, tmp_path, one_thread):
     settings = TrainingSettings(steps=30, warm_up=3, rate=3e-3, augment=False, weights=LossWeights(trajectory=0.0))
     torch.manual_seed(0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
@@ -182,6 +183,8 @@ class Trainer:
         out: folder for ``encoder.safetensors``, ``training.json``, ``state/`` and logs.
         settings: settings of the training.
         process: this process and its device.
+        loaders: batches prepared at the same time, beside a step; by default one on the CPU, which the step needs
+            itself, and for a GPU one for each core up to eight.
     """
 
     def __init__(
@@ -193,8 +196,11 @@ class Trainer:
         out: Path,
         settings: TrainingSettings,
         process: Process,
+        *,
+        loaders: int | None = None,
     ):
         self.out, self.settings, self.process = out, settings, process
+        self.loaders = loaders or (1 if process.device.type == "cpu" else min(8, os.cpu_count() or 1))
         self.encoder = encoder.to(process.device).to(memory_format=torch.channels_last)
         self.recordings, self.held_out = list(recordings), list(held_out)
         self.index = [(r, i) for r, recording in enumerate(self.recordings) for i in range(len(recording))]
@@ -231,12 +237,13 @@ class Trainer:
         settings = self.settings
         not_finite = 0
         self.encoder.train()
-        with ThreadPoolExecutor(1) as pool:
-            prepared = pool.submit(self._batch, self.step)
+        with ThreadPoolExecutor(self.loaders) as pool:
+            first = range(self.step, min(self.step + self.loaders, settings.steps))
+            prepared = deque(pool.submit(self._batch, step) for step in first)
             while self.step < settings.steps:
-                batch, targets = prepared.result()
-                if self.step + 1 < settings.steps:
-                    prepared = pool.submit(self._batch, self.step + 1)
+                batch, targets = prepared.popleft().result()
+                if self.step + self.loaders < settings.steps:
+                    prepared.append(pool.submit(self._batch, self.step + self.loaders))
                 losses = self._descend(batch.to(self.process.device), targets.to(self.process.device))
                 self.step += 1
                 not_finite = 0 if np.isfinite(losses["total"]) else not_finite + 1
