@@ -23,6 +23,7 @@ from monoforce_ros.encoder.lift import feature_rays
 from monoforce_ros.physics import PhysicsOptions
 from monoforce_ros.robots import load_robot
 from monoforce_ros.training import train_cli
+from monoforce_ros.training.judgement import BOTH, CAMERAS, SWEEP
 from monoforce_ros.training.losses import (
     LossWeights,
     depth_loss,
@@ -39,7 +40,7 @@ from monoforce_ros.training.recording_samples import SamplesError, read_samples
 from monoforce_ros.training.sample_extraction import SampleSettings, extract_samples
 from monoforce_ros.training.samples import MIRROR, Augmentation, Targets, sample
 from monoforce_ros.training.train_cli import build_parser
-from monoforce_ros.training.trainer import Process, Trainer, TrainingSettings, validate
+from monoforce_ros.training.trainer import Process, Trainer, TrainingSettings, _sensors, validate
 from monoforce_ros.training.training_state import TrainingError, read_state, save_state
 
 TINY = EncoderConfig(image_width=128, image_height=96, map_size=6.4, resolution=0.2)
@@ -417,6 +418,20 @@ def test_batches_prepared_in_advance_do_not_change_the_training(recording, husky
     expected = weights(1)
     for found in (weights(4), weights(9), weights(4, stop=5)):
         assert all(torch.equal(found[name], value) for name, value in expected.items())
+
+
+def test_validation_sees_the_sensors_in_the_shares_of_the_training():
+    found = [_sensors(i, (0.25, 0.4, 0.35)) for i in range(100)]
+    assert [found.count(kind) for kind in (CAMERAS, BOTH, SWEEP)] == pytest.approx([25, 40, 35], abs=2)
+    assert {_sensors(i, (1.0, 0.0, 0.0)) for i in range(50)} == {CAMERAS}
+
+
+def test_an_encoder_of_both_is_validated_with_a_sweep_alone(recording):
+    encoder = new_encoder(replace(TINY, sensor="camera_lidar"))
+    seen = []
+    encoder.register_forward_hook(lambda module, inputs, maps: seen.append(inputs[0]))
+    validate(encoder, [recording], torch.device("cpu"), (0.0, 0.0, 1.0))
+    assert all(len(batch.images) == 0 and float(batch.sweep.abs().max()) > 0.0 for batch in seen)
 
 
 def test_training_improves_on_the_ground_that_carries_the_robot(recording, husky, tmp_path, one_thread):

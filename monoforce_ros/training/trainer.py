@@ -26,6 +26,7 @@ from monoforce_ros.encoder import (
 )
 from monoforce_ros.physics import PhysicsOptions
 from monoforce_ros.robots import RobotModel
+from monoforce_ros.training.judgement import BOTH, CAMERAS, SWEEP
 from monoforce_ros.training.losses import (
     HIGHEST,
     LOWEST,
@@ -88,6 +89,9 @@ class TrainingSettings:
             raise ValueError(f"training sensor_shares: got {shares}, expected three numbers from 0 on, not all 0")
         if self.precision not in ("auto", "float32", "bfloat16"):
             raise ValueError(f"training precision: got {self.precision!r}, expected auto, float32 or bfloat16")
+
+
+_GOLDEN_RATIO = (5**0.5 - 1) / 2
 
 
 @dataclass(frozen=True)
@@ -309,7 +313,7 @@ class Trainer:
         if not self.held_out:
             save_encoder(self.encoder, self.out / "encoder.safetensors")
             return
-        found = validate(self.encoder, self.held_out, self.process.device)
+        found = validate(self.encoder, self.held_out, self.process.device, self.settings.sensor_shares)
         self.history.append((self.step, found))
         if found.loss < self.best:
             self.best = found.loss
@@ -351,15 +355,31 @@ def state_file(out: Path) -> Path:
 
 
 @torch.no_grad()
-def validate(encoder: Encoder, recordings: Sequence[RecordingSamples], device: torch.device) -> Validation:
-    """Evaluate an encoder on whole recordings, without augmentation; an encoder of images and sweeps by its images."""
+def validate(
+    encoder: Encoder,
+    recordings: Sequence[RecordingSamples],
+    device: torch.device,
+    sensor_shares: Sequence[float] = (1.0, 0.0, 0.0),
+) -> Validation:
+    """Evaluate an encoder on whole recordings, without augmentation.
+
+    Args:
+        encoder: the encoder.
+        recordings: recordings that it was not trained on.
+        device: its device.
+        sensor_shares: shares of samples with images alone, with both and with a sweep alone, for encoders of both.
+    """
     encoder.eval()
-    augmentation = Augmentation(sweep_share=0.0) if encoder.config.sensor == "camera_lidar" else Augmentation()
+    mixed = encoder.config.sensor == "camera_lidar"
     geometric, supporting, losses = [], [], []
     for recording in recordings:
         for start in range(0, len(recording), 8):
             indices = range(start, min(start + 8, len(recording)))
-            samples = [sample(recording, i, encoder.config, augmentation, chunks=1) for i in indices]
+            given = [_sensors(i, sensor_shares) if mixed else Augmentation() for i in indices]
+            samples = [
+                sample(recording, i, encoder.config, augmentation, chunks=1)
+                for i, augmentation in zip(indices, given, strict=True)
+            ]
             batch = EncoderInput.stack([s[0] for s in samples]).to(device)
             targets = Targets.stack([s[1] for s in samples]).to(device)
             maps: EncodedMaps = encoder(batch)
@@ -376,6 +396,12 @@ def validate(encoder: Encoder, recordings: Sequence[RecordingSamples], device: t
         return float(values.median()) if len(values) else float("nan")
 
     return Validation(median(geometric), median(supporting), float(np.mean(losses)))
+
+
+def _sensors(index: int, shares: Sequence[float]) -> Augmentation:
+    """Sensors of a sample by its index, the same in each validation; any run of samples has about the given shares."""
+    part = (index + 0.5) * _GOLDEN_RATIO % 1.0 * sum(shares)
+    return CAMERAS if part < shares[0] else BOTH if part < shares[0] + shares[1] else SWEEP
 
 
 def describe(config: EncoderConfig, settings: TrainingSettings, recordings: Sequence[RecordingSamples]) -> dict:
