@@ -23,6 +23,7 @@ from monoforce_ros.encoder import (
 )
 from monoforce_ros.encoder.backbone import Backbone, WeightsError
 from monoforce_ros.encoder.checkpoint import shipped_checkpoint
+from monoforce_ros.encoder.heads import terrain_maps
 from monoforce_ros.encoder.lift import depth_values, feature_rays, lifted_points, map_cells, splat
 from monoforce_ros.encoder.view import EncoderInput, encoder_input, network_image, support_plane
 
@@ -347,3 +348,17 @@ def test_unusable_checkpoints_are_refused(tmp_path):
     save_encoder(broken, path)
     with pytest.raises(CheckpointError, match="not finite"):
         load_encoder(path)
+
+
+def test_a_decrease_below_the_bend_of_its_loss_is_no_layer():
+    encoder = new_encoder(SMALL)
+    batch = EncoderInput.stack([encoder_input([view()], None, SMALL)])
+    with torch.no_grad():
+        maps = encoder(batch)
+    shape = maps.decrease.shape
+    decrease = torch.linspace(0.0, 0.4, shape[-1]).expand(shape)
+    terrain = terrain_maps(replace(maps, decrease=decrease), SMALL)[0]
+    predicted = terrain.geometric_height - terrain.height
+    hedged = decrease[0] <= 0.05
+    assert hedged.any() and float(predicted[hedged].abs().max()) == 0.0
+    assert torch.allclose(predicted[~hedged], decrease[0][~hedged], atol=1e-6)

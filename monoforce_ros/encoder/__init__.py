@@ -10,7 +10,7 @@ from monoforce_ros.encoder.checkpoint import (
     save_encoder,
 )
 from monoforce_ros.encoder.config import HEIGHT_CHANNELS, SENSORS, EncoderConfig
-from monoforce_ros.encoder.heads import EncodedMaps
+from monoforce_ros.encoder.heads import SMALLEST_DECREASE, EncodedMaps
 from monoforce_ros.encoder.inference import fused, multiplies_bfloat16, packed
 from monoforce_ros.encoder.lidar_encoder import LidarEncoder
 from monoforce_ros.encoder.lift import feature_rays, letterbox
@@ -20,6 +20,7 @@ from monoforce_ros.encoder.view import CameraView, EncoderInput, assemble, encod
 __all__ = [
     "HEIGHT_CHANNELS",
     "SENSORS",
+    "SMALLEST_DECREASE",
     "CameraView",
     "CheckpointError",
     "EncodedMaps",

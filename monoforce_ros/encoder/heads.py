@@ -15,6 +15,9 @@ from monoforce_ros.encoder.sweep import BETWEEN, STANDING, TOP
 from monoforce_ros.encoder.view import EncoderInput
 from monoforce_ros.terrain import TerrainMap
 
+SMALLEST_DECREASE = 0.05
+"""Smallest H_d that is used [m], and where the training's loss of heights turns from squared to linear: below, an
+unsure network predicts a little vegetation everywhere at hardly any cost."""
 _HEADS, _SWEEP_HEADS = 7, 2
 """And those for how far heights that a sweep measured are believed, and how far they carry; another one for heights
 interpolated between them."""
@@ -131,7 +134,12 @@ def with_edges(maps: EncodedMaps, config: EncoderConfig) -> EncodedMaps:
 
 
 def terrain_maps(maps: EncodedMaps, config: EncoderConfig) -> list[TerrainMap]:
-    """The predictions of a batch as terrain maps on the CPU."""
+    """The predictions of a batch as terrain maps on the CPU.
+
+    An H_d below :data:`SMALLEST_DECREASE` is no layer but a hedge, and left out.
+    """
+    layer = torch.where(maps.decrease > SMALLEST_DECREASE, maps.decrease, 0.0)
+    maps = replace(maps, decrease=layer)
     values = {
         name: getattr(maps, name).detach().cpu()
         for name in (

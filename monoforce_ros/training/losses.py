@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from monoforce_ros.effects import controls
-from monoforce_ros.encoder import EncodedMaps, EncoderConfig
+from monoforce_ros.encoder import SMALLEST_DECREASE, EncodedMaps, EncoderConfig
 from monoforce_ros.physics import PhysicsOptions, State, rollout
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import TerrainMap
@@ -20,7 +20,7 @@ from monoforce_ros.training.trajectory_residual import robust_loss, trajectory_r
 
 HIGHEST, LOWEST = 1.0, -1.5
 """Heights relative to the ground under the robot are clamped to this range [m]: a tree is a wall (paper, figure 6)."""
-_HUBER_DELTA = 0.05
+_HUBER_DELTA = SMALLEST_DECREASE
 """Height errors beyond this count linearly, so that a few walls and trees do not outweigh the ground [m]."""
 _PROMINENT_HEIGHT, _NEIGHBOURHOOD = 0.3, 12
 """Height over the neighbourhood's mean of a fully prominent cell [m]; half-width of the neighbourhood [cells]."""
