@@ -29,7 +29,7 @@ from typing import ClassVar
 import numpy as np
 import torch
 from scipy.ndimage import map_coordinates
-from terrain_tables import BOUND, LEARNED, SHIPPED, Result, ratio_table, strata_table, table
+from terrain_tables import BOUND, DEEP, LEARNED, SHIPPED, Result, ratio_table, strata_table, table
 from tqdm import tqdm
 
 from monoforce_ros.bags import BagError, Recording
@@ -48,7 +48,8 @@ from monoforce_ros.evaluation.tables import (
     terrain_source,
 )
 from monoforce_ros.evaluation.view import PredictionView
-from monoforce_ros.perception import FlatTerrain, Observation, TerrainSource
+from monoforce_ros.perception import FlatTerrain, Observation, TerrainSource, support_points
+from monoforce_ros.perception.ground_alignment import align_to_ground
 from monoforce_ros.prediction import Predictor
 from monoforce_ros.reporting import figure_png, page, picture_card, write_between
 from monoforce_ros.robots import RobotModel, load_robot
@@ -77,6 +78,8 @@ TRAINING = SeedRange("training", 420_000, 10_000)
 CHOOSING = SeedRange("choosing", 430_000, 10_000)
 REPORTING = SeedRange("reporting", 440_000, 10_000)
 
+STRIDE = 2.0
+"""Time between the starts of windows [s]: of 5 s each, they overlap by 60 %."""
 WORST = 3
 """Number of worst predictions that are shown of each system."""
 _LIDAR = LidarSettings(rings=32, columns=360, rate=5.0)
@@ -86,14 +89,16 @@ DRAG_ROBOT = ROOT / "models" / "husky_in_grass.yaml"
 
 @dataclass(frozen=True)
 class TrueSupport:
-    """The ground that carries the robot, from a world's labels: no encoder can do better with this physics.
+    """The ground that carries the robot, from a world's labels: what heights alone can achieve with this physics.
 
     Attributes:
+        robot: the robot on it.
         labels: of :func:`monoforce_ros.synthetic.labels.world_labels`.
         grid: of the maps.
         material: of the ground, as other sources without material use it.
     """
 
+    robot: RobotModel
     labels: Mapping[str, np.ndarray]
     grid: Grid
     material: TerrainDefaults
@@ -111,7 +116,9 @@ class TrueSupport:
             return torch.as_tensor(values - transform[2, 3], dtype=torch.float32)
 
         terrain = TerrainMap.from_height(sampled("support_height"), self.grid, material=self.material)
-        return replace(terrain, geometric_height=sampled("visible_height"))
+        terrain = replace(terrain, geometric_height=sampled("visible_height"))
+        # Like every other source: the robot rests as deep in the ground as its weight presses it.
+        return align_to_ground(terrain, support_points(self.robot, motion, self.material.stiffness))
 
 
 def strata(described: Mapping[str, object]) -> dict[str, str]:
@@ -183,22 +190,47 @@ def evaluate_world(bag: Path, checkpoints: Mapping[str, Sequence[Path]], physics
     described = json.loads(world_file(bag).read_text())
     robot = load_robot(described["robot"])
     systems = [LIDAR, BOUND, *learned_systems(checkpoints), FLAT, CONSTANT]
-    sources: dict[str, TerrainSource] = {BOUND.key: Remembered(true_support(bag))}
+    sources: dict[str, TerrainSource] = {BOUND.key: Remembered(true_support(bag, robot))}
     for system in (LIDAR, *learned_systems(checkpoints)):
         sources[system.key] = Remembered(terrain_source(system, robot))
     results = []
     for name in physics:
-        errors: dict[str, SequenceErrors] = evaluate_sequence(bag, with_physics(robot, name), systems, sources)
+        errors: dict[str, SequenceErrors] = evaluate_sequence(
+            bag, with_physics(robot, name), systems, sources, stride=STRIDE
+        )
+        vegetation, overgrown = driven_vegetation(bag, robot, errors[LIDAR.key].stamps)
         for system in systems:
             key, _, checkpoint = system.key.partition("@")
             found = errors[system.key]
             results.append(
                 Result(
                     key, checkpoint, int(described["seed"]), name, found.position, found.rotation, found.windows,
-                    strata(described), found.worst, found.worst_position, found.by_distance,
+                    strata(described), found.worst, found.worst_position, found.by_distance, list(found.positions),
+                    list(found.rotations), vegetation, overgrown,
                 )
             )  # fmt: skip
     return results
+
+
+def driven_vegetation(bag: Path, robot: RobotModel, stamps: Sequence[int]) -> tuple[list[float], list[float]]:
+    """Greatest depth of soft vegetation under the robot during each window, and the share of its path in deep one.
+
+    Windows start at ``stamps`` [ns]. The depth at a pose is the greatest under the robot's centre and 0.3 m to each
+    side of it.
+    """
+    motion = Recording.open(bag, robot=robot).in_base_frame(robot.base_frame).motion
+    with np.load(labels_file(bag)) as stored:
+        depth = stored["visible_height"] - stored["support_height"]
+        origin, resolution = stored["origin"], float(stored["resolution"])
+    around = np.array([[0.0, 0.0], [0.3, 0.0], [-0.3, 0.0], [0.0, 0.3], [0.0, -0.3]])
+    greatest, share = [], []
+    for stamp in stamps:
+        later = (motion.stamps >= stamp) & (motion.stamps <= stamp + HORIZON * 1e9)
+        cells = (motion.positions[later, None, :2] + around - origin) / resolution
+        under = map_coordinates(depth, [cells[..., 1], cells[..., 0]], order=1, mode="nearest").max(axis=1)
+        greatest.append(float(under.max()))
+        share.append(float((under >= DEEP).mean()))
+    return greatest, share
 
 
 @dataclass(frozen=True)
@@ -253,11 +285,11 @@ def learned_systems(checkpoints: Mapping[str, Sequence[Path]]) -> list[System]:
     ]
 
 
-def true_support(bag: Path) -> TrueSupport:
+def true_support(bag: Path, robot: RobotModel) -> TrueSupport:
     """The ground of a recorded world."""
     with np.load(labels_file(bag)) as stored:
         labels = {name: stored[name] for name in ("support_height", "visible_height", "origin", "resolution")}
-    return TrueSupport(labels, Grid.square(), TerrainDefaults())
+    return TrueSupport(robot, labels, Grid.square(), TerrainDefaults())
 
 
 def worst_cases(results: Sequence[Result], physics: str, count: int = WORST) -> dict[str, list[Result]]:
@@ -283,7 +315,7 @@ def gallery(worlds: Path, results: Sequence[Result], checkpoints: Mapping[str, S
             recording = Recording.open(bag, robot=robot).in_base_frame(robot.base_frame)
             system = learned.get(f"{key}@{result.checkpoint}", {LIDAR.key: LIDAR, FLAT.key: FLAT}.get(key, BOUND))
             if system is BOUND:
-                source: TerrainSource = true_support(bag)
+                source: TerrainSource = true_support(bag, robot)
             elif system is FLAT:
                 source = FlatTerrain(robot, Grid.square(), TerrainDefaults())
             else:

@@ -23,6 +23,8 @@ LEARNED = {
     "no_terrain": ("MonoForce without terrain loss", "images"),
 }
 """Title and input of each learned system, by its name."""
+DEEP = 0.2
+"""Depth of soft vegetation that counts as tall where the robot drives through it [m]."""
 SHIPPED = tuple(name for name in LEARNED if name.startswith("shipped"))
 RATIOS = (
     ("monoforce", "lss"), ("monoforce", "lidar"), ("monoforce", "no_geometric"), ("monoforce", "no_terrain"),
@@ -66,6 +68,14 @@ class Result:
     """Its error [m]."""
     by_distance: dict[str, float] = field(default_factory=dict)
     """Δx [m] of poses by the distance from the start."""
+    positions: list[float] = field(default_factory=list)
+    """Δx of each window [m]; NaN where the prediction diverged."""
+    rotations: list[float] = field(default_factory=list)
+    """ΔR of each window [deg]."""
+    vegetation: list[float] = field(default_factory=list)
+    """Greatest depth of soft vegetation under the driven path of each window [m]."""
+    overgrown: list[float] = field(default_factory=list)
+    """Share of each window's path with at least :data:`DEEP` of it."""
 
 
 def interval(results: Sequence[Result], measure: str) -> tuple[float, float, float]:

@@ -13,6 +13,8 @@ import wall
 from conftest import ROOT
 from scipy.spatial.transform import Rotation
 
+from monoforce_ros.core import MotionState
+from monoforce_ros.perception import support_points
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainDefaults
 
@@ -133,16 +135,25 @@ def test_the_bound_reads_true_heights_in_the_terrain_frame():
         "visible_height": (0.1 * (0.1 * columns - 10.0) + 0.3).astype(np.float32),
         "origin": np.array([-10.0, -10.0]), "resolution": np.array(0.1),
     }  # fmt: skip
-    source = terrain.TrueSupport(labels, Grid.square(), TerrainDefaults())
-    transform = np.eye(4)
-    transform[:3, :3] = Rotation.from_euler("z", 90, degrees=True).as_matrix()
-    transform[:3, 3] = [2.0, 1.0, 0.5]
-    found = source.terrain(None, SimpleNamespace(odometry_from_terrain=transform))
-    # Two metres to the right of a robot that faces along y are at x = 4 m, where the ground is at 0.4 m.
-    row, column = np.argmin(np.abs(np.asarray(found.grid.y) + 2.0)), np.argmin(np.abs(np.asarray(found.grid.x)))
-    expected = 0.1 * (2.0 - float(np.asarray(found.grid.y)[row])) - 0.5
+    robot = load_robot("husky")
+    source = terrain.TrueSupport(robot, labels, Grid.square(), TerrainDefaults())
+    turned = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    motion = MotionState(0, np.array([2.0, 1.0, 0.5]), turned, np.zeros(3), np.zeros(3))
+    found = source.terrain(None, motion)
+    # Five metres to the right of a robot that faces along y are at x = 7 m, where the ground is at 0.7 m.
+    row, column = np.argmin(np.abs(np.asarray(found.grid.y) + 5.0)), np.argmin(np.abs(np.asarray(found.grid.x)))
+    expected = 0.1 * (2.0 - float(np.asarray(found.grid.y)[row])) - motion.odometry_from_terrain[2, 3]
     assert float(found.height[row, column]) == pytest.approx(expected, abs=1e-3)
     assert float(found.geometric_height[row, column]) == pytest.approx(expected + 0.3, abs=1e-3)
+    # Under the robot it passes through the ground on which its wheels stand, as every other source's does.
+    support = support_points(robot, motion, TerrainDefaults().stiffness)
+    rows, columns, _ = found.grid.cells(support[:, :2])
+    under = found.height.numpy()[rows, columns]
+    assert (
+        np.median(np.abs(under - support[:, 2]))
+        < 0.01
+        < abs(support[:, 2].mean() - (0.2 - motion.odometry_from_terrain[2, 3]))
+    )
 
 
 def test_physics_differ_by_the_drag_of_vegetation():

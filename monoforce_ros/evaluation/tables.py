@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from monoforce_ros.bags import Recording
-from monoforce_ros.encoder import fused, load_encoder
+from monoforce_ros.encoder import fused, load_encoder, packed
 from monoforce_ros.evaluation.metrics import Poses, position_errors, rotation_errors
 from monoforce_ros.evaluation.recording_evaluation import (
     CONSTANT_VELOCITY,
@@ -23,6 +23,7 @@ from monoforce_ros.evaluation.recording_evaluation import (
 from monoforce_ros.perception import EncoderTerrain, TerrainSource, choose_terrain_source
 from monoforce_ros.prediction import Predictor
 from monoforce_ros.robots import RobotModel
+from monoforce_ros.terrain import TerrainDefaults
 
 HORIZON = 5.0
 """Length of a window [s]."""
@@ -67,6 +68,12 @@ class SequenceErrors:
     """Its error [m]."""
     by_distance: dict[str, float] = field(default_factory=dict)
     """Mean position error [m] of poses by how far the robot has come from the start, see :data:`DISTANCES`."""
+    stamps: tuple[int, ...] = ()
+    """Start of each window [ns], the same for all systems."""
+    positions: tuple[float, ...] = ()
+    """Δx of each window [m]; NaN where the prediction diverged, which the means leave out."""
+    rotations: tuple[float, ...] = ()
+    """ΔR of each window [deg]."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +91,12 @@ CONSTANT = System("constant", "constant velocity", "odometry")
 
 
 def evaluate_sequence(
-    bag: Path, robot: RobotModel, systems: Sequence[System], sources: Mapping[str, TerrainSource] | None = None
+    bag: Path,
+    robot: RobotModel,
+    systems: Sequence[System],
+    sources: Mapping[str, TerrainSource] | None = None,
+    *,
+    stride: float = STRIDE,
 ) -> dict[str, SequenceErrors]:
     """Errors of each system on one recording, over the same windows.
 
@@ -95,6 +107,7 @@ def evaluate_sequence(
         robot: its robot.
         systems: what to compare.
         sources: terrain sources of systems that have neither a checkpoint nor a name of their own, by key.
+        stride: time between the starts of windows [s].
 
     Raises:
         BagError, CheckpointError, EvaluationError: the bag or a checkpoint cannot be used.
@@ -108,7 +121,7 @@ def evaluate_sequence(
         topics = tuple(recording.images) if "camera" in source.sensors else ()
         evaluations[system.key] = evaluate_recording(
             recording, Predictor(robot, source, horizon=HORIZON), image_topics=topics,
-            horizons=(HORIZON,), stride=STRIDE, quiet=True, minimum_duration=1.0, baselines=not evaluations,
+            horizons=(HORIZON,), stride=stride, quiet=True, minimum_duration=1.0, baselines=not evaluations,
         )  # fmt: skip
     common = set.intersection(*(set(e.stamps.tolist()) for e in evaluations.values()))
     first = next(iter(evaluations.values()))
@@ -127,8 +140,10 @@ def terrain_source(system: System, robot: RobotModel) -> TerrainSource:
         return choose_terrain_source("lidar_interpolation", robot)
     if system.with_lidar:
         return choose_terrain_source("lidar_camera", robot, checkpoint=system.checkpoint)
-    encoder = fused(load_encoder(system.checkpoint))
-    return EncoderTerrain(encoder, robot, _SENSORS[system.input])
+    encoder = packed(fused(load_encoder(system.checkpoint)))
+    sensors = _SENSORS[system.input]
+    # As the node does: shape says little about the material of rigid ground.
+    return EncoderTerrain(encoder, robot, sensors, material=TerrainDefaults() if "lidar" in sensors else None)
 
 
 def _sequence(name: str, evaluation: RecordingEvaluation, method: str, chosen: np.ndarray) -> SequenceErrors:
@@ -137,7 +152,6 @@ def _sequence(name: str, evaluation: RecordingEvaluation, method: str, chosen: n
     predicted = Poses(predicted.positions[chosen], predicted.rotations[chosen])
     usable = np.logical_and.accumulate(_on_map(measured), axis=1)
     position, rotation = position_errors(predicted, measured), rotation_errors(predicted, measured)
-    usable &= np.isfinite(position) & np.isfinite(rotation)
     usable[:, 0] = False
     counted = usable.sum(axis=1) >= MINIMUM_POSES
 
@@ -151,13 +165,18 @@ def _sequence(name: str, evaluation: RecordingEvaluation, method: str, chosen: n
     by_distance = {}
     for low, high in pairwise(DISTANCES):
         chosen_poses = usable & counted[:, None] & (away >= low) & (away < high)
-        by_distance[f"{low:g} to {high:g} m"] = float(position[chosen_poses].mean()) if chosen_poses.any() else np.nan
+        values = position[chosen_poses & np.isfinite(position)]
+        by_distance[f"{low:g} to {high:g} m"] = float(values.mean()) if len(values) else np.nan
     moved, turned = of_windows(position), of_windows(rotation)
-    worst = int(moved.argmax())
+    finite = np.isfinite(moved) & np.isfinite(turned)
+    if not finite.any():
+        return SequenceErrors(name, float("nan"), float("nan"), 0)
+    worst = int(np.where(finite, moved, -1.0).argmax())
+    stamps = evaluation.stamps[chosen][counted]
     return SequenceErrors(
-        name, float(moved.mean()), float(turned.mean()), int(counted.sum()),
-        worst=int(evaluation.stamps[chosen][counted][worst]), worst_position=float(moved[worst]),
-        by_distance=by_distance,
+        name, float(moved[finite].mean()), float(turned[finite].mean()), int(finite.sum()),
+        worst=int(stamps[worst]), worst_position=float(moved[worst]), by_distance=by_distance,
+        stamps=tuple(stamps.tolist()), positions=tuple(moved.tolist()), rotations=tuple(turned.tolist()),
     )  # fmt: skip
 
 
