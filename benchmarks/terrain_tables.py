@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -34,10 +34,6 @@ RATIOS = (
     ("shipped_both", "shipped_lidar"), ("shipped_both", "lidar"), ("lidar", "true_support"),
 )  # fmt: skip
 """Systems whose errors are compared."""
-RIGID = ("below 0.05 m",)
-"""Strata without vegetation, as the paper's Table I."""
-TALL = ("0.4 to 0.8 m", "0.8 m or more")
-"""Strata of tall vegetation, as its Table II."""
 PAPER = {
     "lidar": ((0.14, 4.06), (0.13, 4.74)),
     "lidar_hg": ((0.20, 4.63), (0.13, 4.32)),
@@ -78,8 +74,65 @@ class Result:
     """Share of each window's path with at least :data:`DEEP` of it."""
 
 
+def _rigid(result: Result) -> np.ndarray:
+    """Windows without vegetation under the path, as the paper's Table I."""
+    return np.asarray(result.vegetation) < 0.05
+
+
+def _tall(result: Result) -> np.ndarray:
+    """Windows of which the robot drives a quarter through deep vegetation, as its Tables II and III."""
+    return np.asarray(result.overgrown) >= 0.25
+
+
+def _between(result: Result) -> np.ndarray:
+    return ~(_rigid(result) | _tall(result))
+
+
+GROUNDS: dict[str, Callable[[Result], np.ndarray]] = {
+    "rigid": _rigid, "some vegetation": _between, "tall vegetation": _tall,
+}  # fmt: skip
+"""Windows by the vegetation under the driven path."""
+
+
+def in_common(results: Sequence[Result]) -> list[Result]:
+    """The results without windows in which a prediction of any system diverged."""
+    usable: dict[tuple[int, str], np.ndarray] = {}
+    for result in results:
+        if result.positions:
+            finite = np.isfinite(result.positions) & np.isfinite(result.rotations)
+            key = (result.world, result.physics)
+            usable[key] = usable.get(key, np.ones(len(finite), bool)) & finite
+    return over_windows(results, lambda result: usable.get((result.world, result.physics), np.zeros(0, bool)))
+
+
+def over_windows(results: Sequence[Result], chosen: Callable[[Result], np.ndarray]) -> list[Result]:
+    """Results over some of their windows; those without any of these are left out."""
+    found = []
+    for result in results:
+        keep = np.flatnonzero(chosen(result))
+        if not len(keep):
+            continue
+        listed = {
+            name: [getattr(result, name)[i] for i in keep]
+            for name in ("positions", "rotations", "vegetation", "overgrown")
+        }
+        means = {"position": np.mean(listed["positions"]), "rotation": np.mean(listed["rotations"])}
+        found.append(replace(result, windows=len(keep), **{n: float(v) for n, v in means.items()}, **listed))
+    return found
+
+
+def diverged(results: Sequence[Result]) -> dict[str, int]:
+    """Number of predictions of each system that diverged."""
+    found: dict[str, int] = {}
+    for result in results:
+        count = int(np.sum(~np.isfinite(result.positions)))
+        if count:
+            found[result.system] = found.get(result.system, 0) + count
+    return found
+
+
 def interval(results: Sequence[Result], measure: str) -> tuple[float, float, float]:
-    """Mean over worlds and training seeds, with a 95 % interval by resampling both.
+    """Mean over worlds and training seeds, with a 95 % interval: see :func:`monoforce_ros.evaluation.tables.mean_over`.
 
     Worlds and training seeds are independent; windows of one world are not.
     """
@@ -88,9 +141,8 @@ def interval(results: Sequence[Result], measure: str) -> tuple[float, float, flo
 
 
 def ratio(results: Sequence[Result], others: Sequence[Result], measure: str) -> tuple[float, float, float]:
-    """Ratio of two systems' means over the same worlds, with a 95 % interval by resampling worlds and training seeds.
-
-    A draw has the same worlds for both systems, and its own training seeds for each.
+    """Ratio of two systems' means over the same worlds, with a 95 % interval: see
+    :func:`monoforce_ros.evaluation.tables.ratio_over`.
     """
     common = sorted({result.world for result in results} & {result.world for result in others})
     found = ratio_over(*(_by_world_and_run(listed, common, measure) for listed in (results, others)))
@@ -117,7 +169,7 @@ def table(results: Sequence[Result]) -> str:
         chosen = [result for result in results if result.physics == physics]
         worlds = {result.world for result in chosen}
         windows = sum(result.windows for result in chosen if result.system == LIDAR.key)
-        lines += [f"**Physics: {physics}**: {len(worlds)} worlds, {windows} windows of 5 s", ""]
+        lines += [f"**Physics: {physics}**: {len(worlds)} worlds, {windows} windows of up to 5 s", ""]
         lines += ["| input | terrain | training seeds | Δx [m] | ΔR [deg] |", "|---|---|---|---|---|"]
         for key in dict.fromkeys(result.system for result in chosen):
             own = [result for result in chosen if result.system == key]
@@ -134,29 +186,37 @@ def table(results: Sequence[Result]) -> str:
 def ratio_table(results: Sequence[Result], physics: str) -> str:
     """Markdown table of the ratios of :data:`RATIOS` for which both systems were evaluated; empty without any.
 
-    Those of the paper stand beside the worlds that are like its own: without vegetation, and with tall vegetation.
+    Those of the paper stand beside the windows that are like its own: without vegetation, and in tall vegetation.
     """
-    chosen = [result for result in results if result.physics == physics]
     by_system: dict[str, list[Result]] = {}
-    for result in chosen:
-        by_system.setdefault(result.system, []).append(result)
+    for result in results:
+        if result.physics == physics:
+            by_system.setdefault(result.system, []).append(result)
+    if not by_system:
+        return ""
+    first_of = {result.world: result for result in next(iter(by_system.values()))}
+    counts = {}
+    for name in ("rigid", "tall vegetation"):
+        own = over_windows(list(first_of.values()), GROUNDS[name])
+        counts[name] = f"{sum(result.windows for result in own)} windows of {len(own)} worlds"
     lines = [
-        "| ratio | Δx | ΔR | rigid: Δx | ΔR | paper's Table I | tall vegetation: Δx | ΔR | paper's Tables II, III |",
+        f"| ratio | Δx | ΔR | rigid ({counts['rigid']}): Δx | ΔR | paper's Table I | tall vegetation "
+        f"({counts['tall vegetation']}): Δx | ΔR | paper's Tables II, III |",
         "|---" * 9 + "|",
     ]
     for first, second in RATIOS:
         if first not in by_system or second not in by_system:
             continue
         cells = []
-        for table_number, strata in enumerate((None, RIGID, TALL), start=-1):
+        for table_number, ground in enumerate((None, "rigid", "tall vegetation"), start=-1):
             own, others = (
-                [r for r in by_system[key] if strata is None or r.strata.get("vegetation height") in strata]
+                by_system[key] if ground is None else over_windows(by_system[key], GROUNDS[ground])
                 for key in (first, second)
             )
             for measure in ("position", "rotation"):
                 value, low, high = ratio(own, others, measure)
                 cells.append(f"{value:.2f} ({low:.2f} – {high:.2f})" if np.isfinite(value) else "–")
-            if strata is not None:
+            if ground is not None:
                 cells.append(_paper_ratio(first, second, table_number))
         lines.append(f"| {first} / {second} | {' | '.join(cells)} |")
     return "\n".join(lines) if len(lines) > 2 else ""
@@ -181,6 +241,10 @@ def strata_table(results: Sequence[Result], physics: str) -> str:
             cells = [f"{interval([r for r in own if r.system == key], 'position')[0]:.3f}" for key in systems]
             count = len({result.world for result in own})
             lines.append(f"| {criterion} | {stratum} | {count} | {' | '.join(cells)} |")
+    for ground, among in GROUNDS.items():
+        own = over_windows(chosen, among)
+        cells = [f"{interval([r for r in own if r.system == key], 'position')[0]:.3f}" for key in systems]
+        lines.append(f"| under the path | {ground} | {len({r.world for r in own})} | {' | '.join(cells)} |")
     for distance in dict.fromkeys(name for result in chosen for name in result.by_distance):
         own = [result for result in chosen if np.isfinite(result.by_distance.get(distance, np.nan))]
         means = [np.mean([r.by_distance[distance] for r in own if r.system == key] or [np.nan]) for key in systems]

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -20,7 +21,18 @@ from monoforce_ros.terrain import Grid, TerrainDefaults
 
 
 def result(system, checkpoint, world, position, **changed):
-    values = {"physics": "paper", "rotation": 10 * position, "windows": 5, "strata": {"robot": "husky"}} | changed
+    depth = changed.pop("depth", 0.0)
+    windows = {
+        "positions": [position] * 5, "rotations": [10 * position] * 5, "vegetation": [depth] * 5,
+        "overgrown": [float(depth > 0.2)] * 5,
+    }  # fmt: skip
+    values = {
+        "physics": "paper",
+        "rotation": 10 * position,
+        "windows": 5,
+        "strata": {"robot": "husky"},
+        **windows,
+    } | changed
     return terrain_tables.Result(system=system, checkpoint=checkpoint, world=world, position=position, **values)
 
 
@@ -43,7 +55,7 @@ def test_intervals_cover_worlds_and_training_seeds():
     # Training seeds that disagree widen the interval although worlds are the same.
     disagreeing = [result("lss", str(run), w, value) for run, value in ((0, 0.1), (1, 0.3)) for w in range(10)]
     mean, low, high = terrain_tables.interval(disagreeing, "position")
-    assert (mean, low, high) == (pytest.approx(0.2), pytest.approx(0.1), pytest.approx(0.3))
+    assert mean == pytest.approx(0.2) and low < 0.1 and high > 0.3
     # A world that one run could not evaluate counts for none.
     assert terrain_tables.interval([*disagreeing, result("lss", "0", 99, 5.0)], "position")[0] == pytest.approx(0.2)
 
@@ -56,9 +68,8 @@ def test_ratios_compare_the_same_worlds():
     # A world that only one of them could evaluate counts for neither; without a common one there is no ratio.
     assert terrain_tables.ratio([*first, result("both", "0", 50, 9.0)], second, "position")[0] == pytest.approx(0.8)
     assert np.isnan(terrain_tables.ratio(first, [result("monoforce", "0", 70, 1.0)], "position")[0])
-    strata = {"vegetation height": "0.8 m or more"}
     tall = [
-        result(r.system, r.checkpoint, r.world, r.position * (0.5 if r.system == "both" else 1.0), strata=strata)
+        result(r.system, r.checkpoint, r.world, r.position * (0.5 if r.system == "both" else 1.0), depth=0.5)
         for r in (*first, *second)
         if r.world > 5
     ]
@@ -67,9 +78,30 @@ def test_ratios_compare_the_same_worlds():
     assert row.startswith("| both / monoforce | 0.5") and row.count("| 0.40 (0.40 – 0.40) ") == 2
     assert terrain_tables.ratio_table(second, "paper") == ""
     # The paper's own ratios, which it gives in tables of errors, stand beside.
-    both_known = [result(name, "0", world, 0.1, strata=strata) for name in ("monoforce", "lss") for world in (1, 2)]
+    both_known = [result(name, "0", world, 0.1, depth=0.5) for name in ("monoforce", "lss") for world in (1, 2)]
     (row,) = [line for line in terrain_tables.ratio_table(both_known, "paper").splitlines() if "lss" in line]
     assert row.split(" | ")[5] == "1.08, 0.99" and row.endswith("| 0.64, 0.45 |")
+
+
+def test_windows_in_which_a_prediction_diverged_count_for_no_system():
+    rows = [result("lss", "0", 1, 0.2), result("lidar", "", 1, 0.1), result("lidar", "", 2, 0.3)]
+    rows[0] = replace(rows[0], positions=[0.2, float("nan"), 0.2, 0.2, 0.2])
+    rows[1] = replace(rows[1], positions=[0.1, 9.9, 0.1, 0.1, 0.1])
+    assert terrain_tables.diverged(rows) == {"lss": 1}
+    found = terrain_tables.in_common(rows)
+    assert [r.windows for r in found] == [4, 4, 5]
+    assert [r.position for r in found] == pytest.approx([0.2, 0.1, 0.3])
+
+
+def test_grounds_go_by_what_the_robot_drives_through():
+    row = replace(
+        result("lidar", "", 1, 0.1), positions=[1.0, 2.0, 3.0], rotations=[1.0, 2.0, 3.0],
+        vegetation=[0.01, 0.6, 0.6], overgrown=[0.0, 0.1, 0.5],
+    )  # fmt: skip
+    found = {
+        name: terrain_tables.over_windows([row], among)[0].position for name, among in terrain_tables.GROUNDS.items()
+    }
+    assert found == {"rigid": 1.0, "some vegetation": 2.0, "tall vegetation": 3.0}
 
 
 def test_an_encoder_gets_the_sensors_of_its_row():

@@ -110,3 +110,25 @@ def test_errors_are_reported_in_one_line(executables, demo_bag, tmp_path):
     assert run().returncode == 2
     wrong = run("--rigid", demo_bag, "--lss", tmp_path / "no.safetensors")
     assert wrong.returncode == 1 and "no.safetensors does not exist" in wrong.stderr
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.1, 0.2])
+def test_intervals_of_ratios_hold_the_truth_with_three_training_seeds(spread):
+    """Worlds and training seeds differ by random factors; 95 % of intervals are to hold the ratio of 0.8."""
+    random = np.random.default_rng(5)
+    held = []
+    for _ in range(120):
+        worlds = random.lognormal(0.0, 0.6, (40, 1))
+        first, second = (
+            ratio * worlds * random.lognormal(0.0, 0.15, (40, 3)) * random.lognormal(0.0, spread, (1, 3))
+            for ratio in (0.8, 1.0)
+        )
+        found = ratio_over(first, second)
+        held.append(found.low <= 0.8 <= found.high)
+    assert np.mean(held) > 0.9
+
+
+def test_a_ratio_does_not_depend_on_the_order_of_training_seeds():
+    values = np.array([[1.0, 2.0, 3.0]] * 8) * np.linspace(1, 2, 8)[:, None]
+    found, permuted = ratio_over(values, values), ratio_over(values, values[:, [2, 0, 1]])
+    assert found == permuted and found.low < 0.6 and found.high > 1.6

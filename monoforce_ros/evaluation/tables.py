@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.stats import t as student_t
 
 from monoforce_ros.bags import Recording
 from monoforce_ros.encoder import fused, load_encoder, packed
@@ -191,21 +192,26 @@ def _on_map(measured: Poses) -> np.ndarray:
 
 
 def mean_over(values: ArrayLike) -> Mean:
-    """Mean with its bootstrap interval over recordings: they are independent, windows of one are not.
+    """Mean with its interval over recordings and training seeds.
+
+    Recordings are resampled: they are independent, windows of one are not. Training seeds are too few for that: the
+    spread of their means, with the quantile of Student's t distribution, widens the interval.
 
     Args:
-        values: by recording ``[n]``, or by recording and training seed ``[n, seeds]``; seeds are resampled, too.
-            Recordings with a value that is not finite are left out.
+        values: by recording ``[n]``, or by recording and training seed ``[n, seeds]``. Recordings with a value that is
+            not finite are left out.
     """
     rows = _by_recording(values)
     rows = rows[np.isfinite(rows).all(axis=1)]
-    return _mean(float(rows.mean()), _resampled_means(rows)) if len(rows) else _mean(np.nan, np.full(1, np.nan))
+    if not len(rows):
+        return Mean(np.nan, np.nan, np.nan)
+    return _widened(float(rows.mean()), _resampled_means(rows), [rows])
 
 
 def ratio_over(values: ArrayLike, others: ArrayLike) -> Mean:
     """Ratio of two systems' means over the same recordings, with an interval by paired resampling.
 
-    A draw has the same recordings for both systems, and training seeds of its own for each.
+    A draw has the same recordings for both systems. Training seeds of both widen the interval as in :func:`mean_over`.
 
     Args:
         values: as of :func:`mean_over`.
@@ -215,12 +221,22 @@ def ratio_over(values: ArrayLike, others: ArrayLike) -> Mean:
     usable = np.isfinite(first).all(axis=1) & np.isfinite(second).all(axis=1)
     first, second = first[usable], second[usable]
     if not len(first):
-        return _mean(np.nan, np.full(1, np.nan))
-    return _mean(float(first.mean() / second.mean()), _resampled_means(first) / _resampled_means(second))
+        return Mean(np.nan, np.nan, np.nan)
+    resampled = _resampled_means(first) / _resampled_means(second)
+    return _widened(float(first.mean() / second.mean()), resampled, [first, second])
 
 
-def _mean(value: float, resampled: np.ndarray) -> Mean:
-    return Mean(value, *map(float, np.quantile(resampled, (0.025, 0.975))))
+def _widened(value: float, resampled: np.ndarray, systems: Sequence[np.ndarray]) -> Mean:
+    """95 % interval from resampled recordings and from the means ``[n, seeds]`` of each system's training seeds."""
+    low, high = (float(q) for q in np.quantile(resampled, (0.025, 0.975)))
+    freedom = sum(rows.shape[1] - 1 for rows in systems)
+    if not freedom or not value > 0.0:
+        return Mean(value, low, high)
+    # Of logarithms: errors differ by factors.
+    variance = sum(np.log(rows.mean(axis=0)).var(ddof=1) / rows.shape[1] for rows in systems if rows.shape[1] > 1)
+    by_seed = float(student_t.ppf(0.975, freedom) * np.sqrt(variance))
+    down, up = np.log(value / low), np.log(high / value)
+    return Mean(value, value * float(np.exp(-np.hypot(down, by_seed))), value * float(np.exp(np.hypot(up, by_seed))))
 
 
 def _by_recording(values: ArrayLike) -> np.ndarray:
@@ -230,8 +246,6 @@ def _by_recording(values: ArrayLike) -> np.ndarray:
 
 
 def _resampled_means(rows: np.ndarray) -> np.ndarray:
-    """Means of resampled recordings and training seeds. Every call draws the same recordings of as many."""
-    random = np.random.default_rng(0)
-    recordings = random.integers(0, len(rows), (_RESAMPLES, len(rows)))
-    seeds = random.integers(0, rows.shape[1], (_RESAMPLES, rows.shape[1]))
-    return rows[recordings[:, :, None], seeds[:, None, :]].mean(axis=(1, 2))
+    """Means over training seeds and resampled recordings. Every call draws the same recordings of as many."""
+    recordings = np.random.default_rng(0).integers(0, len(rows), (_RESAMPLES, len(rows)))
+    return rows.mean(axis=1)[recordings].mean(axis=1)
