@@ -133,6 +133,8 @@ def test_the_fallback_replaces_the_maps_of_a_harmful_encoder(robot):
         # The encoder goes wrong far away: its ground under the wheels stays right.
         with torch.no_grad():
             encoder.heads.bias[0] = 0.1 if x > 1.0 else 0.0
+            # It no longer believes what is measured, or interpolated between.
+            encoder.heads.bias[[7, 9]] = -3.0 if x > 1.0 else 3.0
         maps.append(trusted.terrain(Observation(int(1e9 * x), cloud=cloud), at(x)))
     assert trusted.report is not None and not trusted.report.trusted
     flat = FlatTerrain(robot, config.grid, material).terrain(Observation(0), at(0.0))
@@ -140,6 +142,7 @@ def test_the_fallback_replaces_the_maps_of_a_harmful_encoder(robot):
     # Right again: the encoder is used again.
     with torch.no_grad():
         encoder.heads.bias[:2] = torch.tensor([0.0, -3.0])
+        encoder.heads.bias[[7, 9]] = 3.0
     for x in np.arange(8.0, 24.0, 0.1):
         trusted.terrain(Observation(int(1e9 * x), cloud=cloud), at(x))
     assert trusted.report.trusted
