@@ -57,5 +57,5 @@ for system in shipped shipped_lidar shipped_both; do
   checkpoints+=" --checkpoint $system=models/terrain_encoder.safetensors"
 done
 scripts/run.sh python benchmarks/terrain.py --out "$out/tables" --jobs "$jobs" $checkpoints --docs docs/training.md
-scripts/run.sh python benchmarks/wall.py $checkpoints --json "$out/tables/wall.json" --png docs/wall.png \
+scripts/run.sh python benchmarks/wall.py $checkpoints --json "$out/tables/wall.json" --png "$out/tables/wall.png" \
   --docs docs/protocol.md
