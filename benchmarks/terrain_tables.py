@@ -188,38 +188,33 @@ def ratio_table(results: Sequence[Result], physics: str) -> str:
 
     Those of the paper stand beside the windows that are like its own: without vegetation, and in tall vegetation.
     """
-    by_system: dict[str, list[Result]] = {}
-    for result in results:
-        if result.physics == physics:
-            by_system.setdefault(result.system, []).append(result)
-    if not by_system:
-        return ""
-    first_of = {result.world: result for result in next(iter(by_system.values()))}
-    counts = {}
-    for name in ("rigid", "tall vegetation"):
-        own = over_windows(list(first_of.values()), GROUNDS[name])
-        counts[name] = f"{sum(result.windows for result in own)} windows of {len(own)} worlds"
+    chosen = [result for result in results if result.physics == physics]
+    rigid, tall = (over_windows(chosen, GROUNDS[name]) for name in ("rigid", "tall vegetation"))
     lines = [
-        f"| ratio | Δx | ΔR | rigid ({counts['rigid']}): Δx | ΔR | paper's Table I | tall vegetation "
-        f"({counts['tall vegetation']}): Δx | ΔR | paper's Tables II, III |",
+        f"| ratio | Δx | ΔR | rigid ({_extent(rigid)}): Δx | ΔR | paper's Table I | tall vegetation "
+        f"({_extent(tall)}): Δx | ΔR | paper's Tables II, III |",
         "|---" * 9 + "|",
     ]
+    known = {result.system for result in chosen}
     for first, second in RATIOS:
-        if first not in by_system or second not in by_system:
+        if first not in known or second not in known:
             continue
         cells = []
-        for table_number, ground in enumerate((None, "rigid", "tall vegetation"), start=-1):
-            own, others = (
-                by_system[key] if ground is None else over_windows(by_system[key], GROUNDS[ground])
-                for key in (first, second)
-            )
+        for table_number, among in enumerate((chosen, rigid, tall), start=-1):
+            own, others = ([result for result in among if result.system == key] for key in (first, second))
             for measure in ("position", "rotation"):
                 value, low, high = ratio(own, others, measure)
                 cells.append(f"{value:.2f} ({low:.2f} – {high:.2f})" if np.isfinite(value) else "–")
-            if ground is not None:
+            if table_number >= 0:
                 cells.append(_paper_ratio(first, second, table_number))
         lines.append(f"| {first} / {second} | {' | '.join(cells)} |")
     return "\n".join(lines) if len(lines) > 2 else ""
+
+
+def _extent(results: Sequence[Result]) -> str:
+    """Number of windows and worlds, which every system has in common."""
+    windows = {result.world: result.windows for result in results}
+    return f"{sum(windows.values())} windows of {len(windows)} worlds"
 
 
 def _paper_ratio(first: str, second: str, table_number: int) -> str:

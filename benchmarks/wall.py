@@ -28,7 +28,7 @@ from tqdm import tqdm
 from monoforce_ros.core import MotionState, write_text
 from monoforce_ros.evaluation.tables import LIDAR, System, terrain_source
 from monoforce_ros.messages import decoding
-from monoforce_ros.perception import Observation, TerrainSource
+from monoforce_ros.perception import Observation
 from monoforce_ros.prediction import Prediction, Predictor
 from monoforce_ros.reporting import write_between
 from monoforce_ros.robots import RobotModel, load_robot
@@ -79,12 +79,11 @@ def observed(world: LiveWorld, robot: RobotModel) -> tuple[Observation, MotionSt
     return observation, state
 
 
-def predicted(source: TerrainSource, robot: RobotModel, found: Scene) -> Prediction:
-    """The prediction of a scene's motion."""
-    predictor = Predictor(robot, source, horizon=HORIZON)
+def predicted(predictor: Predictor, observation: Observation, start: MotionState) -> Prediction:
+    """The prediction of driving straight ahead from what was observed."""
     twists = np.zeros((predictor.history + predictor.steps, 2))
     twists[predictor.history :, 0] = SPEED
-    return predictor.predict(found.observation, found.start, twists)
+    return predictor.predict(observation, start, twists)
 
 
 def distance(prediction: Prediction) -> float:
@@ -113,19 +112,25 @@ def draw(found: Scene, predictions: dict[str, Prediction]) -> Figure:
     return figure
 
 
+def simulated(settings: LiveSettings, duration: float) -> tuple[Observation, MotionState, float]:
+    """What is seen of a world, the robot's state, and how far it drives [m] when told to drive straight ahead."""
+    world = LiveWorld(settings)
+    try:
+        observation, state = observed(world, load_robot("husky"))
+        world.simulation.drive(SPEED, 0.0)
+        world.advance(world.time + duration)
+        end, _, _ = decoding.decode_odometry(world.odometry(10**9))
+    finally:
+        world.close()
+    return observation, state, float(np.linalg.norm(end.position[:2] - state.position[:2]))
+
+
 def scene(kind: str, seed: int) -> Scene:
     """Simulate one scene of a kind of :data:`monoforce_ros.synthetic.AHEAD_KINDS`."""
     robot = load_robot("husky")
     ahead = draw_wall_ahead(kind, seed, float(robot.points[:, 0].max()))
-    world = LiveWorld(LiveSettings(seed=seed, scenery=ahead.scenery, camera=CameraSettings()))
-    try:
-        observation, state = observed(world, robot)
-        world.simulation.drive(SPEED, 0.0)
-        world.advance(world.time + HORIZON)
-        end, _, _ = decoding.decode_odometry(world.odometry(10**9))
-    finally:
-        world.close()
-    return Scene(ahead, observation, state, float(np.linalg.norm(end.position[:2] - state.position[:2])))
+    settings = LiveSettings(seed=seed, scenery=ahead.scenery, camera=CameraSettings())
+    return Scene(ahead, *simulated(settings, HORIZON))
 
 
 def counted(title: str, scenes: list[Scene], driven: np.ndarray) -> dict:
@@ -183,15 +188,16 @@ def main() -> None:
     pictured = min(scenes, key=lambda s: (not s.stops, abs(s.ahead.distance - 2.5)))
     rows, drawn = [], {}
     for own in (*systems, [LIDAR]):
-        sources = [terrain_source(system, robot) for system in own]
+        predictors = [Predictor(robot, terrain_source(system, robot), horizon=HORIZON) for system in own]
         title = own[0].title + (f", {len(own)} training seeds" if len(own) > 1 else "")
         driven = [
-            distance(predicted(source, robot, found))
-            for source in sources
+            distance(predicted(predictor, found.observation, found.start))
+            for predictor in predictors
             for found in tqdm(scenes, desc=title, leave=False)
         ]
-        rows.append(counted(title, scenes * len(sources), np.array(driven)))
-        drawn[own[0].title] = predicted(sources[0], robot, pictured)
+        rows.append(counted(title, scenes * len(predictors), np.array(driven)))
+        if options.png:
+            drawn[own[0].title] = predicted(predictors[0], pictured.observation, pictured.start)
     text = table(rows)
     print(text)
     if options.json:

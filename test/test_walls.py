@@ -6,20 +6,18 @@ it must not predict crashes where there is no wall.
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 import wall
 
-from monoforce_ros.messages import decoding
 from monoforce_ros.perception import choose_terrain_source
 from monoforce_ros.prediction import Predictor
 from monoforce_ros.robots import load_robot
-from monoforce_ros.synthetic import CameraSettings, CourseSettings, LiveSettings, LiveWorld
+from monoforce_ros.synthetic import CameraSettings, CourseSettings, LiveSettings
 from monoforce_ros.synthetic.random_streams import random_stream
 
-SPEED, HORIZON = 0.8, 5.0
-THRESHOLD = 0.7 * SPEED * HORIZON
+HORIZON = 5.0
+THRESHOLD = 0.7 * wall.SPEED * HORIZON
 """A robot that covers less than this of the commanded distance has crashed [m]."""
 
 
@@ -30,22 +28,14 @@ def simulated(seed: int):
     course = replace(
         CourseSettings.draw(seed), wall=distance, grass=None, wall_width=4.0, roughness=float(random.uniform(0.1, 0.5))
     )
-    world = LiveWorld(LiveSettings(seed=seed, course=course, camera=CameraSettings()))
-    try:
-        observation, state = wall.observed(world, load_robot("husky"))
-        world.simulation.drive(SPEED, 0.0)
-        world.advance(world.time + HORIZON)
-        end, _, _ = decoding.decode_odometry(world.odometry(10**9))
-    finally:
-        world.close()
-    return observation, state, distance is not None, float(np.linalg.norm(end.position[:2] - state.position[:2]))
+    settings = LiveSettings(seed=seed, course=course, camera=CameraSettings())
+    observation, state, driven = wall.simulated(settings, HORIZON)
+    return observation, state, distance is not None, driven
 
 
 def predicted(predictor: Predictor, observation, state) -> float:
     """Distance that is predicted [m]; heights must be finite."""
-    twists = np.zeros((predictor.history + predictor.steps, 2))
-    twists[predictor.history :, 0] = SPEED
-    prediction = predictor.predict(observation, state, twists)
+    prediction = wall.predicted(predictor, observation, state)
     assert torch.isfinite(prediction.terrain.height).all()
     return wall.distance(prediction)
 
