@@ -34,8 +34,9 @@ options() { # system
     lidar_ht) echo "--sensor lidar $all" ;;
     lss) echo "--sensor camera $geometric" ;;
     monoforce) echo "--sensor camera $all" ;;
-    both) echo "--sensor camera_lidar $all" ;;
-    no_geometric) echo "--sensor camera --losses terrain trajectory" ;;
+    both) echo "--sensor camera_lidar --all-sensors $all" ;;
+    # Without all that the lidar teaches; without all that the driven ground teaches.
+    no_geometric) echo "--sensor camera --losses terrain trajectory --no-depth" ;;
     no_terrain) echo "--sensor camera --losses geometric trajectory" ;;
   esac
 }

@@ -566,6 +566,17 @@ def test_shares_of_sensors_decide_what_a_sample_lacks():
         TrainingSettings(sensor_shares=(0.0, 0.0, 0.0))
 
 
+def test_with_all_sensors_no_sample_lacks_any():
+    options = build_parser().parse_args(["bag", "--sensor", "camera_lidar", "--all-sensors", "--no-depth"])
+    settings = train_cli._settings(options)
+    assert settings.sensor_shares is None and settings.weights.depth == 0.0
+    random = np.random.default_rng(3)
+    for drawn in (Augmentation.draw(random, settings.sensor_shares) for _ in range(50)):
+        assert all(drawn.shows(camera) for camera in range(6)) and not drawn.blank
+        assert drawn.sweep_share == 1.0 and drawn.traced
+    assert train_cli._settings(build_parser().parse_args(["bag"])).weights.depth > 0.0
+
+
 def test_fine_tuning_takes_the_sensors_and_bins_of_its_start():
     arguments = ["bag", "--start-from", str(shipped_checkpoint())]
     options = build_parser().parse_args(arguments)

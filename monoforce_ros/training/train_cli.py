@@ -150,6 +150,8 @@ def build_parser() -> OptionParser:
     parser.add_argument("--losses", nargs="+", default=["geometric", "terrain", "trajectory"],
                         choices=("geometric", "terrain", "trajectory"),
                         help="losses to minimise (default: all; `geometric` alone is LSS)")  # fmt: skip
+    parser.add_argument("--no-depth", action="store_true", help="do not train the depth along pixels with the lidar's "
+                        "points")  # fmt: skip
     parser.add_argument("--geometric", type=float, default=LossWeights.geometric, metavar="WEIGHT", help="weight of "
                         "the geometric loss (default: %(default)s)")  # fmt: skip
     parser.add_argument("--prominence", type=float, default=LossWeights.prominence, metavar="WEIGHT", help="additional "
@@ -188,6 +190,9 @@ def build_parser() -> OptionParser:
     parser.add_argument("--sensor-shares", type=float, nargs=3, default=TrainingSettings.sensor_shares,
                         metavar=("IMAGES", "BOTH", "SWEEP"), help="with --sensor camera_lidar: shares of samples with "
                         "images alone, both and a sweep alone (default: %(default)s)")  # fmt: skip
+    parser.add_argument("--all-sensors", action="store_true", help="with --sensor camera_lidar: leave out no sensor, "
+                        "camera or ring of any sample. To compare with encoders of one sensor; such an encoder does "
+                        "not expect that a sensor fails")  # fmt: skip
     parser.add_argument("--precision", choices=("auto", "float32", "bfloat16"), default="auto", help="(default: "
                         "bfloat16 on CUDA)")  # fmt: skip
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="(default: CUDA if "
@@ -213,7 +218,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error("got no bags and no --worlds; expected one of them at least")
     sensor = options.sensor or ("camera_lidar" if options.start_from else "camera")
     if options.adapt or options.no_augmentation or sensor != "camera_lidar":
-        parser.refuse_without_effect(options, ("sensor_shares",), "without augmentation of images and sweeps")
+        parser.refuse_without_effect(
+            options, ("sensor_shares", "all_sensors"), "without augmentation of images and sweeps"
+        )
+    elif options.all_sensors:
+        parser.refuse_without_effect(options, ("sensor_shares",), "with --all-sensors")
     if options.samples_only and options.samples is None:
         parser.error("--samples-only: expected a folder with --samples")
     if options.out is None and not options.samples_only:
@@ -437,9 +446,10 @@ def _settings(options: argparse.Namespace) -> TrainingSettings:
                ("geometric", "terrain", "trajectory")}  # fmt: skip
     return TrainingSettings(
         steps=options.steps, batch=options.batch, rate=options.rate,
-        weights=LossWeights(**weights, prominence=options.prominence), seed=options.seed,
+        weights=LossWeights(**weights, prominence=options.prominence, **({"depth": 0.0} if options.no_depth else {})),
+        seed=options.seed,
         augment=not options.no_augmentation, backbone=options.train_backbone,
-        sensor_shares=tuple(options.sensor_shares),
+        sensor_shares=None if options.all_sensors else tuple(options.sensor_shares),
         validate_every=options.validate_every, save_every=options.save_every, precision=options.precision,
     )  # fmt: skip
 

@@ -68,8 +68,9 @@ class TrainingSettings:
     """Whether to augment samples (mirror, rotate, crop, change colours)."""
     backbone: str = "none"
     """Part of the backbone that is trained, of :data:`BACKBONE_PARTS`: its ImageNet weights hold for photographs."""
-    sensor_shares: tuple[float, float, float] = (0.55, 0.3, 0.15)
-    """Shares of samples with images alone, with both and with a sweep alone, for encoders of both."""
+    sensor_shares: tuple[float, float, float] | None = (0.55, 0.3, 0.15)
+    """For encoders of both: shares of samples with images alone, with both and with a sweep alone, of which cameras,
+    rings and the driven ground are left out at random, too. None: every sample has everything."""
     validate_every: int = 250
     save_every: int = 50
     precision: str = "auto"
@@ -85,7 +86,9 @@ class TrainingSettings:
         if self.backbone not in BACKBONE_PARTS:
             raise ValueError(f"training backbone: got {self.backbone!r}, expected one of {', '.join(BACKBONE_PARTS)}")
         shares = self.sensor_shares
-        if len(shares) != 3 or not all(0.0 <= share < float("inf") for share in shares) or not sum(shares) > 0.0:
+        if shares is not None and (
+            len(shares) != 3 or not all(0.0 <= share < float("inf") for share in shares) or not sum(shares) > 0.0
+        ):
             raise ValueError(f"training sensor_shares: got {shares}, expected three numbers from 0 on, not all 0")
         if self.precision not in ("auto", "float32", "bfloat16"):
             raise ValueError(f"training precision: got {self.precision!r}, expected auto, float32 or bfloat16")
@@ -359,7 +362,7 @@ def validate(
     encoder: Encoder,
     recordings: Sequence[RecordingSamples],
     device: torch.device,
-    sensor_shares: Sequence[float] = (1.0, 0.0, 0.0),
+    sensor_shares: Sequence[float] | None = (1.0, 0.0, 0.0),
 ) -> Validation:
     """Evaluate an encoder on whole recordings, without augmentation.
 
@@ -367,15 +370,16 @@ def validate(
         encoder: the encoder.
         recordings: recordings that it was not trained on.
         device: its device.
-        sensor_shares: shares of samples with images alone, with both and with a sweep alone, for encoders of both.
+        sensor_shares: shares of samples with images alone, with both and with a sweep alone, for encoders of both;
+            None: all samples have both.
     """
     encoder.eval()
-    mixed = encoder.config.sensor == "camera_lidar"
+    mixed = encoder.config.sensor == "camera_lidar" and sensor_shares is not None
     geometric, supporting, losses = [], [], []
     for recording in recordings:
         for start in range(0, len(recording), 8):
             indices = range(start, min(start + 8, len(recording)))
-            given = [_sensors(i, sensor_shares) if mixed else Augmentation() for i in indices]
+            given = [_sensors(i, sensor_shares) if mixed else BOTH for i in indices]
             samples = [
                 sample(recording, i, encoder.config, augmentation, chunks=1)
                 for i, augmentation in zip(indices, given, strict=True)
