@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from monoforce_ros.encoder import EncoderConfig, new_encoder, save_encoder
+from monoforce_ros.bags import Recording
+from monoforce_ros.encoder import EncoderConfig, load_encoder, new_encoder, save_encoder
 from monoforce_ros.evaluation.metrics import Poses
-from monoforce_ros.evaluation.recording_evaluation import PHYSICS, RecordingEvaluation
+from monoforce_ros.evaluation.recording_evaluation import PHYSICS, RecordingEvaluation, evaluate_recording, predict_at
 from monoforce_ros.evaluation.tables import FLAT, LIDAR, _sequence, evaluate_sequence, mean_over, ratio_over
+from monoforce_ros.perception import EncoderTerrain
+from monoforce_ros.prediction import Predictor
 from monoforce_ros.robots import load_robot
 
 
@@ -65,6 +68,31 @@ def checkpoints(tmp_path_factory):
             encoder.heads.weight.normal_(0.0, 0.02)
         save_encoder(encoder, folder / f"{sensor}.safetensors")
     return folder
+
+
+def test_the_map_of_one_window_does_not_depend_on_the_windows_before(demo_bag):
+    robot = load_robot("husky")
+    recording = Recording.open(demo_bag, robot=robot).in_base_frame(robot.base_frame)
+    source = EncoderTerrain(load_encoder(""), robot)
+    maps = {}
+
+    class Remembering:
+        sensors, grid = source.sensors, source.grid
+
+        def terrain(self, observation, motion):
+            maps[observation.stamp] = source.terrain(observation, motion)
+            return maps[observation.stamp]
+
+    predictor = Predictor(robot, Remembering(), horizon=2.0)
+    topics = tuple(recording.images)
+    found = evaluate_recording(recording, predictor, image_topics=topics, horizons=(2.0,), stride=2.0, quiet=True)
+    last = int(found.stamps[-1])
+    # A source that saw none of them knows the ground driven over, too.
+    fresh = Predictor(robot, EncoderTerrain(load_encoder(""), robot), horizon=2.0)
+    alone = predict_at(recording, fresh, last, topics)
+    assert len(maps) >= 3 and torch.allclose(alone.terrain.height, maps[last].height, atol=1e-5)
+    assert np.allclose(alone.positions()[:: round(0.1 / fresh.options.time_step)],
+                       found.predicted[PHYSICS].positions[-1], atol=1e-4)  # fmt: skip
 
 
 def test_the_executable_writes_json_markdown_and_html(executables, demo_bag, checkpoints, tmp_path):

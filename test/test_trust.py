@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from monoforce_ros.core import MotionState
+from monoforce_ros.core import MotionState, MotionTrack
 from monoforce_ros.encoder import EncoderConfig, new_encoder
 from monoforce_ros.perception import (
     DrivenGround,
@@ -149,18 +149,44 @@ def test_the_fallback_replaces_the_maps_of_a_harmful_encoder(robot):
 
 
 def test_driven_ground_moves_with_the_robot_and_ends_after_six_metres(robot):
-    driven = DrivenGround()
+    driven = DrivenGround(robot, 2e6)
     for i, angle in enumerate(np.linspace(0.0, 1.0, 101)):
         turn = Rotation.from_euler("z", angle).as_matrix()
         position = np.array([10.0 * np.sin(angle), 10.0 * (1 - np.cos(angle)), 0.2 * angle])
         motion = MotionState(int(1e8 * i), position, turn, np.array([1.0, 0, 0]), np.array([0, 0, 0.1]))
-        points = driven.update(motion, support_points(robot, motion, 2e6))
+        points = driven.update(motion)
     distance = np.hypot(points[:, 0], points[:, 1])
     assert 5.0 < distance.max() < 6.8 and points[distance < 1.0].shape[0] > 0
     # The path rose by 2 cm per metre.
     away = points[distance > 5.0]
     assert np.median(away[:, 2]) == pytest.approx(-0.13 - 0.02 * np.median(np.hypot(away[:, 0], away[:, 1])), abs=0.03)
-    assert not len(driven.update(at(500.0, stamp=int(2e10)), np.zeros((4, 3))))
+    assert not len(driven.update(at(500.0, stamp=int(2e10))))
+
+
+def test_driven_ground_follows_the_track_between_two_maps_and_never_looks_ahead(robot):
+    along = np.arange(0.0, 8.0, 0.02)
+    track = MotionTrack(
+        (along * 1e9).astype(np.int64), np.stack([along, 0 * along, 0.1 * along], axis=1),
+        np.tile([0.0, 0.0, 0.0, 1.0], (len(along), 1)), np.tile([1.0, 0.0, 0.1], (len(along), 1)),
+        np.zeros((len(along), 3)),
+    )  # fmt: skip
+
+    def driven_by(stamps: list[float]) -> np.ndarray:
+        driven = DrivenGround(robot, 2e6)
+        for stamp in stamps:
+            points = driven.update(track.at(int(stamp * 1e9)), track)
+        return points
+
+    once = driven_by([4.01])
+    # Asked before or not, and of later times, too.
+    assert np.array_equal(once, driven_by([1.0, 3.333, 4.01])) and np.array_equal(once, driven_by([7.0, 4.01]))
+    middle = np.array([points.mean(axis=0) for points in once.reshape(-1, len(support_points(robot, at(0.0), 2e6)), 3)])
+    assert np.allclose(np.diff(middle[:, 0]), 0.1, atol=0.021) and middle[0, 0] == pytest.approx(-4.01, abs=0.05)
+    assert -0.15 < middle[-1, 0] < -0.05
+    # Without a track it knows where it was asked alone.
+    sparse = DrivenGround(robot, 2e6)
+    sparse.update(track.at(0))
+    assert len(sparse.update(track.at(int(4.01e9)))) < len(once) / 10
 
 
 def test_an_encoder_without_a_sensor_says_so(robot):

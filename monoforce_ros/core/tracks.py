@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -142,6 +143,12 @@ class MotionTrack:
             linear_velocity=blend(self.linear_velocities),
             angular_velocity=blend(self.angular_velocities),
         )
+
+    def states(self, after: int, until: int) -> Iterator[MotionState]:
+        """Measured states with stamps after ``after`` and up to ``until`` [ns]."""
+        first, last = np.searchsorted(self.stamps, [after, until], side="right")
+        for index in range(int(first), int(last)):
+            yield self._state(index, int(self.stamps[index]))
 
     def of_base(self, base_from_child: np.ndarray, base_frame: str) -> MotionTrack:
         """The motion of the base, if this is the motion of a frame with pose ``[4, 4]`` in the base frame.

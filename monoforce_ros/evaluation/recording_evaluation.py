@@ -238,7 +238,7 @@ def observe(
         cameras[topic] = recording.cameras[topic]
         pose = recording.sensor_pose(cameras[topic].frame_id, robot.base_frame, robot.sensors)
         poses[topic] = _base_motion(recording, frame.stamp, stamp) @ pose
-    return Observation(stamp, cloud, images, cameras, poses, _flippers_at(recording, stamp))
+    return Observation(stamp, cloud, images, cameras, poses, _flippers_at(recording, stamp), recording.motion)
 
 
 def _flippers_at(recording: Recording, stamp: int) -> np.ndarray | None:

@@ -80,7 +80,7 @@ class SensorDecoder:
             self._health.report(part, OK, f"receiving {kind}", **{_AGE: f"{age:.3f}"})
         if not received.keys() <= {"odometry"} and cloud is None and not images:
             return None
-        return Observation(stamp, cloud, images, cameras, poses)
+        return Observation(stamp, cloud, images, cameras, poses, track=track)
 
     def _sensor_pose(self, entry: Received, track: MotionTrack, maximum_gap: float) -> np.ndarray:
         def odometry_from_base() -> np.ndarray:

@@ -71,7 +71,7 @@ class EncoderTerrain:
         self._threads, self._material = threads, material
         self.stiffness = config.stiffness if material is None else material.stiffness
         """Of the ground that carries the robot [N/m³]."""
-        self._driven = DrivenGround()
+        self._driven = DrivenGround(robot, self.stiffness)
         self.start_error = 0.0
         """Median difference between the last map and the ground under the wheels, before they were aligned [m]."""
 
@@ -99,7 +99,7 @@ class EncoderTerrain:
                 require_cells(cells, len(sweep), self.grid)
             elif cells < LidarSettings().minimum_cells:
                 sweep = None
-        trace = self._driven.update(motion, support)
+        trace = self._driven.update(motion, observation.track)
         with encoder_threads(self._threads):
             found = self.encoder.terrain(views, support, sweep=sweep, trace=trace)
         self.start_error = _error_under(found, support)

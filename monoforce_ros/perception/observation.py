@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from monoforce_ros.core import CameraModel, MotionState
+from monoforce_ros.core import CameraModel, MotionState, MotionTrack
 from monoforce_ros.terrain import Grid, TerrainMap
 
 
@@ -27,6 +27,9 @@ class Observation:
     """Pose ``[4, 4]`` of each camera in the base frame."""
     flipper_angles: np.ndarray | None = None
     """Measured angles of the robot's flippers ``[F]`` [rad], NaN where unknown; None: as in its file."""
+    track: MotionTrack | None = None
+    """Measured motion of the base, from which sources know the ground that the robot drove over; they do not look at
+    what comes after ``stamp``. None: they know it where they were asked for a map."""
 
 
 class TerrainSource(Protocol):

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from monoforce_ros.core import NANOSECOND, MotionState, transform_points
+from monoforce_ros.core import NANOSECOND, MotionState, MotionTrack, transform_points
+from monoforce_ros.perception.ground_alignment import support_points
 from monoforce_ros.robots import RobotModel
 
 TRACE_LENGTH = 6.0
@@ -39,37 +40,51 @@ class DrivenGround:
     It starts over where odometry jumps or time goes back.
 
     Args:
+        robot: its wheels or tracks.
+        stiffness: of the ground that carries it [N/m³].
         length: length of the path that is kept [m].
         step: distance after which the ground under the wheels is added [m].
     """
 
-    def __init__(self, length: float = TRACE_LENGTH, step: float = 0.1):
+    def __init__(self, robot: RobotModel, stiffness: float, *, length: float = TRACE_LENGTH, step: float = 0.1):
+        self._robot, self._stiffness = robot, stiffness
         self._length, self._step = length, step
         self._places: list[tuple[np.ndarray, np.ndarray]] = []
         """Position of the robot and the points under its wheels, in the odometry frame."""
         self._previous: MotionState | None = None
 
-    def update(self, motion: MotionState, support: np.ndarray) -> np.ndarray:
-        """Add the ground under a robot, and return the ground that it drove over before.
+    def update(self, motion: MotionState, track: MotionTrack | None = None) -> np.ndarray:
+        """Add where the robot has been, and return the ground that it drove over before.
 
         Args:
-            motion: the robot's motion.
-            support: points under its wheels ``[m, 3]`` in its terrain frame [m].
+            motion: the robot's motion now.
+            track: measured motion; what lies between the last call and now is added. By default only where the robot
+                is at the time of each call is known.
 
         Returns:
             ``[k, 3]`` in the terrain frame [m], without the ground under the robot now.
         """
-        if self._previous is None or not continues(motion, self._previous):
-            self._places = []
-        self._previous = motion
-        if not self._places or np.linalg.norm(motion.position - self._places[-1][0]) >= self._step:
-            self._places.append((motion.position, transform_points(motion.odometry_from_terrain, support)))
-            kept = round(self._length / self._step)
-            self._places = self._places[-kept:]
-        earlier = [points for _, points in self._places[:-1]]
+        last = self._previous
+        if last is not None and last.stamp > motion.stamp:
+            last = None
+        # Of a track only measured states count: what is known of a time does not depend on when it was asked for.
+        for state in [motion] if track is None else track.states(-1 if last is None else last.stamp, motion.stamp):
+            if last is None or not continues(state, last):
+                self._places = []
+            last = state
+            if not self._places or np.linalg.norm(state.position - self._places[-1][0]) >= self._step:
+                support = support_points(self._robot, state, self._stiffness)
+                self._places.append((state.position, transform_points(state.odometry_from_terrain, support)))
+        self._previous = last
+        kept = round(self._length / self._step)
+        self._places = self._places[-kept:]
+        earlier = list(self._places)
+        if earlier and np.linalg.norm(motion.position - earlier[-1][0]) < self._step:
+            earlier.pop()
         if not earlier:
             return np.zeros((0, 3))
-        return transform_points(np.linalg.inv(motion.odometry_from_terrain), np.concatenate(earlier))
+        points = np.concatenate([points for _, points in earlier])
+        return transform_points(np.linalg.inv(motion.odometry_from_terrain), points)
 
 
 _JUMP = 1.0
