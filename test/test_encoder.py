@@ -350,15 +350,25 @@ def test_unusable_checkpoints_are_refused(tmp_path):
         load_encoder(path)
 
 
-def test_a_decrease_below_the_bend_of_its_loss_is_no_layer():
-    encoder = new_encoder(SMALL)
-    batch = EncoderInput.stack([encoder_input([view()], None, SMALL)])
+def layer_of(decrease: torch.Tensor) -> torch.Tensor:
+    """H_d ``[rows, columns]`` that a map has if the heads predict one."""
     with torch.no_grad():
-        maps = encoder(batch)
-    shape = maps.decrease.shape
-    decrease = torch.linspace(0.0, 0.4, shape[-1]).expand(shape)
-    terrain = terrain_maps(replace(maps, decrease=decrease), SMALL)[0]
-    predicted = terrain.geometric_height - terrain.height
-    hedged = decrease[0] <= 0.05
+        maps = new_encoder(SMALL)(EncoderInput.stack([encoder_input([view()], None, SMALL)]))
+    terrain = terrain_maps(replace(maps, decrease=decrease.expand(maps.decrease.shape)), SMALL)[0]
+    return terrain.geometric_height - terrain.height
+
+
+def test_a_decrease_below_the_bend_of_its_loss_is_no_layer():
+    decrease = torch.linspace(0.0, 0.4, SMALL.grid.columns).expand(SMALL.grid.rows, -1)
+    predicted = layer_of(decrease)
+    hedged = decrease <= 0.05
     assert hedged.any() and float(predicted[hedged].abs().max()) == 0.0
-    assert torch.allclose(predicted[~hedged], decrease[0][~hedged], atol=1e-6)
+    assert torch.allclose(predicted[~hedged], decrease[~hedged], atol=1e-6)
+
+
+def test_a_decrease_that_hovers_about_the_limit_makes_no_ground_of_steps():
+    # Hedges of alternately 3 and 6 cm, and vegetation of 2 to 18 cm whose thin places are vegetation, too.
+    checkered = torch.from_numpy(np.indices((SMALL.grid.rows, SMALL.grid.columns)).sum(axis=0) % 2)
+    assert float(layer_of(0.03 + 0.03 * checkered).abs().max()) == 0.0
+    thin = 0.02 + 0.16 * checkered
+    assert torch.allclose(layer_of(thin), thin.float(), atol=1e-6)
