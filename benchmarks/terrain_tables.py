@@ -16,6 +16,7 @@ LEARNED = {
     "shipped_both": ("shipped encoder, both → H_t", "images, point cloud"),
     "lidar_hg": ("lidar → H_g [22]", "point cloud"),
     "lidar_ht": ("lidar → H_t", "point cloud"),
+    "lidar_ht_traced": ("lidar → H_t, H_t* traced instead of fitted", "point cloud"),
     "lss": ("images → H_g, LSS [9]", "images"),
     "monoforce": ("images → H_t, MonoForce", "images"),
     "both": ("both → H_t", "images, point cloud"),
@@ -29,7 +30,7 @@ SHIPPED = tuple(name for name in LEARNED if name.startswith("shipped"))
 RATIOS = (
     ("monoforce", "lss"), ("monoforce", "lidar"), ("monoforce", "no_geometric"), ("monoforce", "no_terrain"),
     ("lss", "lidar"), ("lidar_hg", "lidar"), ("lidar_ht", "lidar_hg"), ("lidar_ht", "lidar"),
-    ("both", "monoforce"), ("both", "lidar_ht"),
+    ("lidar_ht_traced", "lidar_ht"), ("both", "monoforce"), ("both", "lidar_ht"),
     ("shipped", "lidar"), ("shipped", "flat"), ("shipped_lidar", "lidar"), ("shipped_both", "shipped"),
     ("shipped_both", "shipped_lidar"), ("shipped_both", "lidar"), ("lidar", "true_support"),
 )  # fmt: skip

@@ -22,9 +22,12 @@ done | xargs -r -P "$jobs" -I SEED $record --seed SEED "$out/worlds/SEED"
 
 bags=$(printf "$out/worlds/%s " $training)
 held_out=$(printf "$out/worlds/%s " $choosing)
-common="$bags --held-out $held_out --robot husky --samples $out/samples --fit-iterations 40"
-# Extract samples first, because parallel trainings would all do it.
-scripts/run.sh train $common --samples-only --jobs "$jobs" --out "$out/samples"
+common="$bags --held-out $held_out --robot husky --samples $out/samples"
+# Extract samples first, because parallel trainings would all do it: H_t* fitted, and as the wheels traced it.
+fitted="--fit-iterations 40" traced="--fit-iterations 0"
+for targets in "$fitted" "$traced"; do
+  scripts/run.sh train $common $targets --samples-only --jobs "$jobs" --out "$out/samples"
+done
 
 # Same start, samples, steps, augmentation and weights; steps are restored by none of them.
 train="scripts/run.sh train $common --steps $steps --relative-bins 40 --no-edges --no-vegetation --precision bfloat16 \
@@ -32,17 +35,18 @@ train="scripts/run.sh train $common --steps $steps --relative-bins 40 --no-edges
 geometric="--losses geometric" all="--losses geometric terrain trajectory"
 options() { # system
   case $1 in
-    lidar_hg) echo "--sensor lidar $geometric" ;;
-    lidar_ht) echo "--sensor lidar $all" ;;
-    lss) echo "--sensor camera $geometric" ;;
-    monoforce) echo "--sensor camera $all" ;;
-    both) echo "--sensor camera_lidar --all-sensors $all" ;;
+    lidar_hg) echo "--sensor lidar $geometric $fitted" ;;
+    lidar_ht) echo "--sensor lidar $all $fitted" ;;
+    lidar_ht_traced) echo "--sensor lidar $all $traced" ;;
+    lss) echo "--sensor camera $geometric $fitted" ;;
+    monoforce) echo "--sensor camera $all $fitted" ;;
+    both) echo "--sensor camera_lidar --all-sensors $all $fitted" ;;
     # Without all that the lidar teaches; without all that the driven ground teaches.
-    no_geometric) echo "--sensor camera --losses terrain trajectory --no-depth" ;;
-    no_terrain) echo "--sensor camera --losses geometric trajectory" ;;
+    no_geometric) echo "--sensor camera --losses terrain trajectory --no-depth $fitted" ;;
+    no_terrain) echo "--sensor camera --losses geometric trajectory $fitted" ;;
   esac
 }
-systems="lidar_hg lidar_ht lss monoforce both no_geometric no_terrain"
+systems="lidar_hg lidar_ht lidar_ht_traced lss monoforce both no_geometric no_terrain"
 seeds="1 2 3"
 for training_seed in $seeds; do
   for system in $systems; do

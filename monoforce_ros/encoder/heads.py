@@ -20,8 +20,8 @@ SMALLEST_DECREASE = 0.05
 unsure network predicts a little vegetation everywhere at hardly any cost."""
 _LAYER_REACH = 0.1
 """Half-width of the square whose mean H_d decides that [m], a wheel's width: cell by cell, what hovers about the limit
-would become a ground of steps and holes. On 24 worlds for choosing paths are as good as cell by cell, and 2 % worse with
-half a metre (docs/training.md)."""
+would become a ground of steps and holes. On 24 worlds for choosing paths are as good as cell by cell, and 2 % worse
+with half a metre (docs/training.md)."""
 _HEADS, _SWEEP_HEADS = 7, 2
 """And those for how far heights that a sweep measured are believed, and how far they carry; another one for heights
 interpolated between them."""

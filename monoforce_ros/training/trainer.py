@@ -374,12 +374,12 @@ def validate(
             None: all samples have both.
     """
     encoder.eval()
-    mixed = encoder.config.sensor == "camera_lidar" and sensor_shares is not None
+    shares = sensor_shares if encoder.config.sensor == "camera_lidar" else None
     geometric, supporting, losses = [], [], []
     for recording in recordings:
         for start in range(0, len(recording), 8):
             indices = range(start, min(start + 8, len(recording)))
-            given = [_sensors(i, sensor_shares) if mixed else BOTH for i in indices]
+            given = [BOTH if shares is None else _sensors(i, shares) for i in indices]
             samples = [
                 sample(recording, i, encoder.config, augmentation, chunks=1)
                 for i, augmentation in zip(indices, given, strict=True)
