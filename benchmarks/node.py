@@ -45,6 +45,8 @@ class Case:
 
     name: str
     title: str
+    source: str
+    """``terrain_source`` of the predictor."""
     cameras: int = 0
     clouds: bool = False
     rate: float = 10.0
@@ -52,14 +54,16 @@ class Case:
 
 
 CASES = (
-    Case("lidar", "lidar, interpolated", clouds=True),
-    Case("lidar_candidates", "lidar, interpolated, 64 candidates", clouds=True, parameters=("candidates:=64",)),
-    Case("camera", "1 camera 640 × 480", cameras=1),
-    Case("camera_candidates", "1 camera, 64 candidates", cameras=1, parameters=("candidates:=64",)),
-    Case("camera_all", "1 camera, 64 candidates, ensemble of 24", cameras=1,
+    Case("lidar", "lidar", "lidar", clouds=True),
+    Case("lidar_candidates", "lidar, 64 candidates", "lidar", clouds=True, parameters=("candidates:=64",)),
+    Case("interpolation", "lidar, interpolated", "lidar_interpolation", clouds=True),
+    Case("camera", "1 camera 640 × 480", "camera", cameras=1),
+    Case("camera_candidates", "1 camera, 64 candidates", "camera", cameras=1, parameters=("candidates:=64",)),
+    Case("camera_all", "1 camera, 64 candidates, ensemble of 24", "camera", cameras=1,
          parameters=("candidates:=64", "ensemble:=24")),
-    Case("four_cameras", "4 cameras 640 × 480", cameras=4),
-    Case("overload", "1 camera at 100 Hz", cameras=1, rate=100.0),
+    Case("lidar_camera", "lidar and 1 camera", "lidar_camera", cameras=1, clouds=True),
+    Case("four_cameras", "4 cameras 640 × 480", "camera", cameras=4),
+    Case("overload", "1 camera at 100 Hz", "camera", cameras=1, rate=100.0),
 )  # fmt: skip
 
 
@@ -179,8 +183,7 @@ class Predictor(Executable):
     """The installed predictor with the parameters of a case."""
 
     def __init__(self, case: Case, folder: Path, frames: list[str]):
-        source = "camera" if case.cameras else "lidar_interpolation"
-        parameters = [f"terrain_source:={source}", f"robot:={four_camera_robot(folder)}", *case.parameters]
+        parameters = [f"terrain_source:={case.source}", f"robot:={four_camera_robot(folder)}", *case.parameters]
         if frames:
             parameters.append(f"image_topics:=[{','.join(f'{frame}/image_raw' for frame in frames)}]")
         arguments = ["--ros-args", *(word for p in parameters for word in ("-p", p))]
@@ -327,7 +330,7 @@ def main() -> None:
     cases = [case for case in CASES if not options.only or case.name in options.only]
     with tempfile.TemporaryDirectory() as folder:
         if options.endurance:
-            source = cases[0] if options.only else CASES[2]
+            source = cases[0] if options.only else next(case for case in CASES if case.name == "camera")
             case = replace(source, name="endurance", parameters=("candidates:=8", "ensemble:=8"))
             found = endure(case, options.endurance, Path(folder))
             result = {"endurance": found}
