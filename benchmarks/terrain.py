@@ -26,14 +26,16 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import ClassVar
 
+import cv2
 import numpy as np
 import torch
 from scipy.ndimage import map_coordinates
+from scipy.spatial.transform import Rotation
 from terrain_tables import BOUND, DEEP, LEARNED, SHIPPED, Result, diverged, in_common, ratio_table, strata_table, table
 from tqdm import tqdm
 
 from monoforce_ros.bags import BagError, Recording
-from monoforce_ros.core import MotionState, write_text
+from monoforce_ros.core import MotionState, atomic_path, write_text
 from monoforce_ros.evaluation import EvaluationError
 from monoforce_ros.evaluation.figures import CameraPicture, prediction_figure
 from monoforce_ros.evaluation.recording_evaluation import predict_at
@@ -83,6 +85,8 @@ STRIDE = 2.0
 WORST = 3
 """Number of worst predictions that are shown of each system."""
 _LIDAR = LidarSettings(rings=32, columns=360, rate=5.0)
+PUBLISHED_LOG = ROOT / "docs" / "terrain_tables.log.jsonl"
+"""Uses of reporting seeds whose tables were published."""
 # The robots' own physics differ: drag was fitted for the Husky only.
 DRAG_ROBOT = ROOT / "models" / "husky_in_grass.yaml"
 
@@ -127,23 +131,32 @@ def strata(described: Mapping[str, object]) -> dict[str, str]:
     def bands(name: str, limits: Sequence[float], unit: str) -> str:
         value = described[name]
         assert isinstance(value, int | float)
-        edges = [f"{limit:g}" for limit in limits]
-        for index, limit in enumerate(limits):
-            if value < limit:
-                return f"below {edges[0]} {unit}" if index == 0 else f"{edges[index - 1]} to {edges[index]} {unit}"
-        return f"{edges[-1]} {unit} or more"
+        return _band(value, limits, unit)
 
-    views = described["field_of_view_deg"]
+    views, heights, lenses = (described[name] for name in ("field_of_view_deg", "camera_height", "distortion_model"))
     assert isinstance(views, list)
+    assert isinstance(heights, list)
+    assert isinstance(lenses, list)
     return {
         "vegetation height": bands("vegetation_height", (0.05, 0.4, 0.8), "m"),
         "slope": bands("slope_deg", (4.0, 8.0), "°"),
         "light": str(described["sky"]),
         "ground misleads": "yes" if described["misleading_ground"] else "no",
         "cameras": str(described["cameras"]),
+        "camera height": "none" if not heights else _band(float(np.mean(heights)), (0.5, 1.0), "m"),
+        "lens": "none" if not lenses else "fisheye" if "equidistant" in lenses else "pinhole",
         "field of view": "none" if not views else ("below 75°" if max(views) < 75.0 else "75° or more"),
         "robot": str(described["robot"]),
     }
+
+
+def _band(value: float, limits: Sequence[float], unit: str) -> str:
+    """Name of the band between ascending limits that a value lies in."""
+    edges = [f"{limit:g}" for limit in limits]
+    for index, limit in enumerate(limits):
+        if value < limit:
+            return f"below {edges[0]} {unit}" if index == 0 else f"{edges[index - 1]} to {edges[index]} {unit}"
+    return f"{edges[-1]} {unit} or more"
 
 
 def record_world(folder: Path, seed: int, settings: WorldSettings, duration: float) -> Path:
@@ -185,6 +198,34 @@ class Remembered:
         return self.maps[observation.stamp]
 
 
+@dataclass(frozen=True)
+class DefaultMaterial:
+    """A terrain source of whose maps the heights alone are used: systems that are compared differ in nothing else."""
+
+    source: TerrainSource
+    material: TerrainDefaults = field(default_factory=TerrainDefaults)
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Of the source."""
+        return self.source.sensors
+
+    @property
+    def grid(self) -> Grid:
+        """Of the source."""
+        return self.source.grid
+
+    def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
+        """The source's map with the default material."""
+        return self.source.terrain(observation, motion).with_material(self.material)
+
+
+def judged_source(system: System, robot: RobotModel) -> TerrainSource:
+    """The terrain source of a system as it is judged: the shipped encoder as in the node, the others' heights alone."""
+    source = terrain_source(system, robot)
+    return source if system.key.partition("@")[0] in SHIPPED else DefaultMaterial(source)
+
+
 def evaluate_world(bag: Path, checkpoints: Mapping[str, Sequence[Path]], physics: Sequence[str]) -> list[Result]:
     """Errors of every system and checkpoint on one world, with each kind of physics."""
     described = json.loads(world_file(bag).read_text())
@@ -192,7 +233,7 @@ def evaluate_world(bag: Path, checkpoints: Mapping[str, Sequence[Path]], physics
     systems = [LIDAR, BOUND, *learned_systems(checkpoints), FLAT, CONSTANT]
     sources: dict[str, TerrainSource] = {BOUND.key: Remembered(true_support(bag, robot))}
     for system in (LIDAR, *learned_systems(checkpoints)):
-        sources[system.key] = Remembered(terrain_source(system, robot))
+        sources[system.key] = Remembered(judged_source(system, robot))
     found_by: dict[str, dict[str, SequenceErrors]] = {
         name: evaluate_sequence(bag, with_physics(robot, name), systems, sources, stride=STRIDE) for name in physics
     }
@@ -216,21 +257,30 @@ def evaluate_world(bag: Path, checkpoints: Mapping[str, Sequence[Path]], physics
 def driven_vegetation(bag: Path, robot: RobotModel, stamps: Sequence[int]) -> tuple[list[float], list[float]]:
     """Greatest depth of soft vegetation under the robot during each window, and the share of its path in deep one.
 
-    Windows start at ``stamps`` [ns]. The depth at a pose is the greatest under the robot's centre and 0.3 m to each
-    side of it.
+    Windows start at ``stamps`` [ns]. The greatest depth is that anywhere under the robot; in deep vegetation is a pose
+    of which half the ground under the robot has it.
     """
     motion = Recording.open(bag, robot=robot).in_base_frame(robot.base_frame).motion
     with np.load(labels_file(bag)) as stored:
-        depth = stored["visible_height"] - stored["support_height"]
+        # Snow and mud are deep, too, but no vegetation.
+        depth = np.minimum(stored["visible_height"] - stored["support_height"], stored["vegetation_height"])
         origin, resolution = stored["origin"], float(stored["resolution"])
-    around = np.array([[0.0, 0.0], [0.3, 0.0], [-0.3, 0.0], [0.0, 0.3], [0.0, -0.3]])
+    corners = robot.points[:, :2].double().numpy()
+    count = np.ceil(np.ptp(corners, axis=0) / resolution).astype(int) + 1
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    sides = (np.linspace(low[axis], high[axis], count[axis]) for axis in (0, 1))
+    under_robot = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
+    headings = Rotation.from_quat(motion.quaternions).as_euler("zyx")[:, 0]
     greatest, share = [], []
     for stamp in stamps:
         later = (motion.stamps >= stamp) & (motion.stamps <= stamp + HORIZON * 1e9)
-        cells = (motion.positions[later, None, :2] + around - origin) / resolution
-        under = map_coordinates(depth, [cells[..., 1], cells[..., 0]], order=1, mode="nearest").max(axis=1)
+        along = np.stack([np.cos(headings[later]), np.sin(headings[later])], axis=-1)[:, None]
+        across = np.stack([-along[..., 1], along[..., 0]], axis=-1)
+        places = motion.positions[later, None, :2] + under_robot[:, :1] * along + under_robot[:, 1:] * across
+        cells = (places - origin) / resolution
+        under = map_coordinates(depth, [cells[..., 1], cells[..., 0]], order=1, mode="nearest")
         greatest.append(float(under.max()))
-        share.append(float((under >= DEEP).mean()))
+        share.append(float((np.median(under, axis=1) >= DEEP).mean()))
     return greatest, share
 
 
@@ -304,9 +354,21 @@ def worst_cases(results: Sequence[Result], physics: str, count: int = WORST) -> 
     return {system: own for system, own in found.items() if own}
 
 
-def gallery(worlds: Path, results: Sequence[Result], checkpoints: Mapping[str, Sequence[Path]], physics: str) -> str:
-    """A page with the worst predictions of each system: the camera's view, and the map with both paths."""
-    cards = []
+@dataclass(frozen=True)
+class WorstCase:
+    """One of a system's worst predictions as a picture: the camera's view, and the map with both paths."""
+
+    rank: int
+    png: bytes
+    heading: str
+    caption: str
+
+
+def draw_worst_cases(
+    worlds: Path, results: Sequence[Result], checkpoints: Mapping[str, Sequence[Path]], physics: str
+) -> list[WorstCase]:
+    """Pictures of the worst predictions of each system."""
+    drawn = []
     learned = {system.key: system for system in learned_systems(checkpoints)}
     cases = worst_cases(results, physics)
     for key, own in tqdm(cases.items(), desc="worst cases"):
@@ -320,7 +382,7 @@ def gallery(worlds: Path, results: Sequence[Result], checkpoints: Mapping[str, S
             elif system is FLAT:
                 source = FlatTerrain(robot, Grid.square(), TerrainDefaults())
             else:
-                source = terrain_source(system, robot)
+                source = judged_source(system, robot)
             topics = tuple(recording.images) if "camera" in source.sensors else ()
             prediction = predict_at(recording, Predictor(robot, source, horizon=HORIZON), result.worst, topics)
             later = recording.motion.stamps - result.worst
@@ -332,19 +394,43 @@ def gallery(worlds: Path, results: Sequence[Result], checkpoints: Mapping[str, S
             )
             seconds = (result.worst - recording.motion.stamps[0]) * 1e-9
             about = ", ".join(f"{name}: {value}" for name, value in result.strata.items())
-            cards.append(
-                picture_card(
-                    figure_png(figure),
-                    alt=f"{system.title}, world {result.world}",
-                    heading=f"{system.title}: number {rank}, mean error {result.worst_position:.2f} m",
-                    caption=f"World {result.world}, {seconds:.0f} s into the recording. {about}.",
-                )
-            )
+            heading = f"{system.title}: number {rank}, mean error {result.worst_position:.2f} m"
+            caption = f"World {result.world}, {seconds:.0f} s into the recording. {about}."
+            drawn.append(WorstCase(rank, figure_png(figure), heading, caption))
+    return drawn
+
+
+def gallery(cases: Sequence[WorstCase], physics: str) -> str:
+    """A page with the worst predictions of each system."""
+    cards = [picture_card(case.png, alt=case.heading, heading=case.heading, caption=case.caption) for case in cases]
     lead = (
         f"The {WORST} worlds in which each system's worst prediction is farthest off, physics: {physics}. Orange: "
         "predicted path. Dashed: measured path."
     )
     return page("Worst predictions of each terrain source", "".join(cards), lead=lead)
+
+
+def contact_sheet(cases: Sequence[WorstCase], columns: int = 2, width: int = 640) -> np.ndarray:
+    """The worst prediction of each system under its name, side by side ``[h, w, 3]`` uint8 BGR."""
+    tiles = []
+    for case in cases:
+        if case.rank > 1:
+            continue
+        image = cv2.imdecode(np.frombuffer(case.png, np.uint8), cv2.IMREAD_COLOR)
+        assert image is not None
+        height = round(width * image.shape[0] / image.shape[1])
+        tile = np.full((height + 24, width, 3), 255, np.uint8)
+        tile[24:] = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+        # OpenCV's fonts have no arrows and no subscripts.
+        title = case.heading.replace("→", "to").replace(": number 1, mean error", ":")
+        cv2.putText(tile, title, (8, 17), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
+        tiles.append(tile)
+    highest = max(len(tile) for tile in tiles)
+    tiles += [np.full((1, width, 3), 255, np.uint8)] * (-len(tiles) % columns)
+    padded = [
+        cv2.copyMakeBorder(t, 0, highest - len(t), 0, 0, cv2.BORDER_CONSTANT, value=(255, 255, 255)) for t in tiles
+    ]
+    return np.vstack([np.hstack(padded[i : i + columns]) for i in range(0, len(padded), columns)])
 
 
 PHYSICS: dict[str, Callable[[RobotModel], RobotModel]] = {
@@ -364,13 +450,18 @@ def digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
 
 
-def log_use(log: Path, entry: dict[str, object]) -> int:
-    """Append an entry; returns how often its reporting seeds have been used, this time included."""
-    earlier = [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
+def log_use(logs: Sequence[Path], entry: dict[str, object]) -> int:
+    """Append an entry to the first of several logs; returns how often its seeds were used in all of them."""
+
+    def entries(log: Path) -> list[dict]:
+        return [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
+
     seeds = set(entry["seeds"])  # type: ignore[call-overload]
-    used = 1 + sum(bool(seeds & set(other["seeds"])) for other in earlier)
-    listed = [*earlier, entry | {"times_used": used}]
-    write_text(log, "".join(json.dumps(line) + "\n" for line in listed))
+    # A use may be in several logs.
+    dates = {other["date"] for log in logs for other in entries(log) if seeds & set(other["seeds"])}
+    used = len(dates | {entry["date"]})
+    listed = [*entries(logs[0]), entry | {"times_used": used}]
+    write_text(logs[0], "".join(json.dumps(line) + "\n" for line in listed))
     return used
 
 
@@ -428,6 +519,7 @@ def main() -> int:
     parser.add_argument("--checkpoint", action="append", default=[], metavar="SYSTEM=FILE",
                         help=f"repeat for other systems and training seeds; systems: {', '.join(LEARNED)}")  # fmt: skip
     parser.add_argument("--docs", type=Path, help="write the tables between the comments of this document")
+    parser.add_argument("--sheet", type=Path, metavar="FILE.jpg", help="also draw the worst case of each system here")
     options = parser.parse_args()
     try:
         count = options.worlds or (6 if options.quick else 40)
@@ -470,18 +562,22 @@ def main() -> int:
         "duration_s": duration,
         "checkpoints": {name: [digest(file) for file in files] for name, files in checkpoints.items()},
     }
-    used = log_use(options.out / "terrain.log.jsonl", entry)
+    log = options.out / "terrain.log.jsonl"
+    used = log_use([log, PUBLISHED_LOG], entry)
     write_text(options.out / "terrain.md", f"{text}\n{by_strata}\n")
     write_text(options.out / "terrain.json", json.dumps([asdict(result) for result in results], indent=1))
-    shown = gallery(options.out / "worlds", results, checkpoints, next(iter(PHYSICS)))
-    write_text(options.out / "worst_cases.html", shown)
+    physics = next(iter(PHYSICS))
+    cases = draw_worst_cases(options.out / "worlds", results, checkpoints, physics)
+    write_text(options.out / "worst_cases.html", gallery(cases, physics))
+    sheet = cv2.imencode(".jpg", contact_sheet(cases), [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
+    for file in filter(None, [options.out / "worst_cases.jpg", options.sheet]):
+        with atomic_path(file) as unfinished:
+            unfinished.write_bytes(sheet)
     if options.docs is not None:
         write_between(options.docs, "terrain", f"{text}\n{by_strata}")
+        log_use([PUBLISHED_LOG, log], entry | {"docs": options.docs.name})
     print(text)
-    print(
-        f"{options.out / 'terrain.md'}, {options.out / 'worst_cases.html'}; these seeds were used {used} time(s), see "
-        f"{options.out / 'terrain.log.jsonl'}"
-    )
+    print(f"{options.out / 'terrain.md'}, {options.out / 'worst_cases.html'}; seeds used {used} time(s), see {log}")
     return 0
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -23,7 +23,7 @@ from typing import ClassVar
 import numpy as np
 import torch
 from scipy.ndimage import map_coordinates
-from terrain import REPORTING, TrueSupport
+from terrain import CHOOSING, TrueSupport
 from tqdm import tqdm
 
 from monoforce_ros.bags import BagError, Recording, smooth
@@ -43,10 +43,16 @@ from monoforce_ros.training import FitSettings, TerrainFit, fit_terrain
 METHODS = {
     "traced": FitSettings(iterations=0),
     "fitted": FitSettings(),
-    "fitted with friction": FitSettings(friction=True),
+    "fitted, with friction": FitSettings(friction=True),
+    "traced, friction fitted": FitSettings(heights=False, friction=True),
+    "traced, friction and stiffness fitted": FitSettings(heights=False, friction=True, stiffness=True),
 }
 ODOMETRY = {"perfect": OdometrySettings(), "localisation": OdometrySettings.slam()}
 BOUND = "true ground"
+SLIPPERY = 0.6
+"""Friction relative to ordinary ground below which the driven ground is slippery on average: wet grass and worse."""
+SOFT = 0.02
+"""Mean depth of mud, sand or snow above which it is soft [m]."""
 _MEASURES = (("height", 1e3, 1), ("slope", 1.0, 2), ("position", 1.0, 3), ("rotation", 1.0, 2))
 """Name, factor and digits of each column of the table."""
 _SLOPE_BASELINE = 0.6
@@ -69,6 +75,8 @@ class Row:
     """Mean of the map's friction on touched cells."""
     true_friction: float = float("nan")
     """Of the simulator's, as a factor on ordinary ground."""
+    softness: float = float("nan")
+    """Mean depth of the layer of mud, sand or snow on touched cells [m]."""
     position: float = float("nan")
     """Δx of predicted paths [m]."""
     rotation: float = float("nan")
@@ -97,7 +105,7 @@ class FittedGround:
             return torch.as_tensor(found, dtype=torch.float32)
 
         terrain = TerrainMap.from_height(sampled(source.height) - placed[2, 3], self.grid)
-        return replace(terrain, friction=sampled(source.friction))
+        return replace(terrain, friction=sampled(source.friction), stiffness=sampled(source.stiffness))
 
 
 class TrueGround(TrueSupport):
@@ -119,7 +127,10 @@ def truth(name: str, bag: Path, fit: TerrainFit) -> np.ndarray:
 def map_errors(bag: Path, fit: TerrainFit) -> dict[str, float]:
     """Errors of a map on touched cells."""
     touched, grid = fit.contact_mask, fit.terrain.grid
-    error = fit.terrain.height.numpy() + fit.odometry_from_terrain[2, 3] - truth("support_height", bag, fit)
+    support, visible, plants = (
+        truth(name, bag, fit) for name in ("support_height", "visible_height", "vegetation_height")
+    )
+    error = fit.terrain.height.numpy() + fit.odometry_from_terrain[2, 3] - support
     apart = round(_SLOPE_BASELINE / grid.resolution)
     slopes = []
     for axis in (0, 1):
@@ -134,6 +145,7 @@ def map_errors(bag: Path, fit: TerrainFit) -> dict[str, float]:
         "slope": float(np.degrees(np.arctan(np.median(np.concatenate(slopes)) / (apart * grid.resolution)))),
         "friction": float(fit.terrain.friction.numpy()[touched].mean()),
         "true_friction": float(truth("friction", bag, fit)[touched].mean()),
+        "softness": float((visible - plants - support)[touched].clip(0.0).mean()),
     }
 
 
@@ -179,7 +191,7 @@ def world_rows(seed: int, out: Path, duration: float) -> list[Row]:
     grid, material = Grid.square(), TerrainDefaults()
     known: dict[str, TerrainSource] = {
         **sources,
-        BOUND: TrueGround(labels, grid, material),
+        BOUND: TrueGround(robot, labels, grid, material),
         FLAT.title: FlatTerrain(robot, grid, material),
     }
     systems = [System(key, key, "") for key in known]
@@ -224,10 +236,33 @@ def table(rows: Sequence[Row]) -> str:
             ratio = f"{found.value:.2f} ({found.low:.2f} – {found.high:.2f})"
         lines.append(f"| {odometry} | {method} | {' | '.join(cells)} | {ratio} |")
     for odometry in ODOMETRY:
-        own = by[odometry, "fitted with friction"]
+        own = by[odometry, "traced, friction fitted"]
         pairs = np.array([[row.friction, row.true_friction] for row in own])
         correlation = np.corrcoef(np.log(pairs.T))[0, 1] if len(pairs) > 2 else np.nan
         lines += ["", f"Correlation of fitted with true friction over worlds, odometry {odometry}: {correlation:.2f}."]
+    return "\n".join(lines) + "\n\n" + by_ground(rows)
+
+
+def by_ground(rows: Sequence[Row]) -> str:
+    """Markdown table of Δx relative to tracing by the ground driven over, with the odometry of a localisation."""
+    kinds: dict[str, Callable[[Row], bool]] = {
+        "all": lambda row: True,
+        "slippery": lambda row: row.true_friction < SLIPPERY,
+        "soft": lambda row: row.softness > SOFT,
+        "neither": lambda row: row.true_friction >= SLIPPERY and row.softness <= SOFT,
+    }
+    chosen = [row for row in rows if row.odometry == "localisation"]
+    methods = [method for method in METHODS if method != "traced"]
+    lines = [f"| ground driven over | worlds | Δx traced [m] | {' | '.join(f'{m} / traced' for m in methods)} |",
+             "|---" * (3 + len(methods)) + "|"]  # fmt: skip
+    for name, among in kinds.items():
+        own = {m: [r.position for r in chosen if r.method == m and among(r)] for m in METHODS}
+        if not own["traced"]:
+            continue
+        found = [ratio_over(own[method], own["traced"]) for method in methods]
+        cells = [f"{ratio.value:.2f} ({ratio.low:.2f} – {ratio.high:.2f})" for ratio in found]
+        traced = mean_over(own["traced"]).value
+        lines.append(f"| {name} | {len(own['traced'])} | {traced:.3f} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
@@ -237,7 +272,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="worlds and results")
     parser.add_argument("--worlds", type=int, default=24, help="number of worlds (%(default)s)")
     parser.add_argument("--duration", type=float, default=30.0, help="of a recording [s] (%(default)s)")
-    parser.add_argument("--seed", type=int, default=REPORTING.first + 5000, help="first seed (%(default)s)")
+    parser.add_argument("--seed", type=int, default=CHOOSING.first + 5000, help="first seed, by default of those for "
+                        "choosing: the default of `train` was chosen by this (%(default)s)")  # fmt: skip
     parser.add_argument("--jobs", type=int, default=2, help="worlds in parallel (%(default)s)")
     parser.add_argument("--json", type=Path, help="write the results to this file")
     parser.add_argument("--docs", type=Path, help="write the table between the comments of this document")

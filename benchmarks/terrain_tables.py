@@ -24,6 +24,8 @@ LEARNED = {
     "no_terrain": ("MonoForce without terrain loss", "images"),
 }
 """Title and input of each learned system, by its name."""
+FEWEST_WORLDS = 5
+"""Strata with fewer worlds say more of these than of the stratum."""
 DEEP = 0.2
 """Depth of soft vegetation that counts as tall where the robot drives through it [m]."""
 SHIPPED = tuple(name for name in LEARNED if name.startswith("shipped"))
@@ -171,7 +173,10 @@ def table(results: Sequence[Result]) -> str:
         worlds = {result.world for result in chosen}
         windows = sum(result.windows for result in chosen if result.system == LIDAR.key)
         lines += [f"**Physics: {physics}**: {len(worlds)} worlds, {windows} windows of up to 5 s", ""]
-        lines += ["| input | terrain | training seeds | Δx [m] | ΔR [deg] |", "|---|---|---|---|---|"]
+        lines += [
+            "| input | terrain | training seeds | Δx [m] | ΔR [deg] | paper, Table I | paper, Tables II, III |",
+            "|---" * 7 + "|",
+        ]
         for key in dict.fromkeys(result.system for result in chosen):
             own = [result for result in chosen if result.system == key]
             seeds = len({result.checkpoint for result in own if result.checkpoint}) or "–"
@@ -179,7 +184,9 @@ def table(results: Sequence[Result]) -> str:
             for measure, digits in (("position", 3), ("rotation", 2)):
                 mean, low, high = interval(own, measure)
                 cells.append(f"{mean:.{digits}f} ({low:.{digits}f} – {high:.{digits}f})")
-            lines.append(f"| {titles[key].input} | {titles[key].title} | {seeds} | {cells[0]} | {cells[1]} |")
+            cells += ["–" if listed is None else f"{listed[0]:.2f} m, {listed[1]:.2f}°"
+                      for listed in PAPER.get(key, (None, None))]  # fmt: skip
+            lines.append(f"| {titles[key].input} | {titles[key].title} | {seeds} | {' | '.join(cells)} |")
         lines.append("")
     return "\n".join(lines)
 
@@ -227,7 +234,7 @@ def _paper_ratio(first: str, second: str, table_number: int) -> str:
 
 
 def strata_table(results: Sequence[Result], physics: str) -> str:
-    """Markdown table of Δx by stratum, with the number of worlds."""
+    """Markdown table of Δx by stratum of at least :data:`FEWEST_WORLDS` worlds, with their number."""
     chosen = [result for result in results if result.physics == physics]
     systems = list(dict.fromkeys(result.system for result in chosen))
     lines = [f"| criterion | stratum | worlds | {' | '.join(systems)} |", "|---" * (3 + len(systems)) + "|"]
@@ -236,7 +243,8 @@ def strata_table(results: Sequence[Result], physics: str) -> str:
             own = [result for result in chosen if result.strata[criterion] == stratum]
             cells = [f"{interval([r for r in own if r.system == key], 'position')[0]:.3f}" for key in systems]
             count = len({result.world for result in own})
-            lines.append(f"| {criterion} | {stratum} | {count} | {' | '.join(cells)} |")
+            if count >= FEWEST_WORLDS:
+                lines.append(f"| {criterion} | {stratum} | {count} | {' | '.join(cells)} |")
     for ground, among in GROUNDS.items():
         own = over_windows(chosen, among)
         cells = [f"{interval([r for r in own if r.system == key], 'position')[0]:.3f}" for key in systems]

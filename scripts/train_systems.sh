@@ -64,6 +64,7 @@ done
 for system in shipped shipped_lidar shipped_both; do
   checkpoints+=" --checkpoint $system=models/terrain_encoder.safetensors"
 done
-scripts/run.sh python benchmarks/terrain.py --out "$out/tables" --seed "$seed" --jobs "$jobs" $checkpoints --docs docs/training.md
+scripts/run.sh python benchmarks/terrain.py --out "$out/tables" --seed "$seed" --jobs "$jobs" $checkpoints --docs docs/training.md \
+  --sheet docs/worst_cases.jpg
 scripts/run.sh python benchmarks/wall.py $checkpoints --json "$out/tables/wall.json" --png "$out/tables/wall.png" \
   --docs docs/protocol.md

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import terrain
 import terrain_tables
+import torch
 import wall
 from conftest import ROOT
 from scipy.spatial.transform import Rotation
@@ -104,6 +105,53 @@ def test_grounds_go_by_what_the_robot_drives_through():
     assert found == {"rigid": 1.0, "some vegetation": 2.0, "tall vegetation": 3.0}
 
 
+def test_compared_systems_differ_in_heights_alone():
+    robot = load_robot("husky")
+    shipped = terrain.parse_checkpoints([])["shipped_lidar"]
+    systems = [*terrain.learned_systems({"lidar_ht": shipped, "shipped_lidar": shipped}), terrain.LIDAR]
+    found = {system.key: terrain.judged_source(system, robot) for system in systems}
+    assert isinstance(found["lidar_ht@0"], terrain.DefaultMaterial) and found["lidar_ht@0"].sensors == ("lidar",)
+    assert not isinstance(found["shipped_lidar@0"], terrain.DefaultMaterial)
+
+    class Slippery:
+        sensors, grid = (), Grid.square()
+
+        def terrain(self, observation, motion):
+            return terrain.TerrainMap.from_height(
+                0.1 * torch.ones(self.grid.rows, self.grid.columns), self.grid, material=TerrainDefaults(friction=0.1)
+            )
+
+    judged = terrain.DefaultMaterial(Slippery()).terrain(None, None)
+    assert float(judged.friction.min()) == pytest.approx(TerrainDefaults().friction)
+    assert float(judged.height.min()) == pytest.approx(0.1)
+
+
+def test_vegetation_counts_anywhere_under_the_robot(tmp_path, monkeypatch):
+    """A tuft beside the centre is under the wheels; a path through grass is overgrown where half of it is."""
+    robot = load_robot("husky")
+    stamps = (np.arange(61) * 1e8).astype(np.int64)
+    track = SimpleNamespace(stamps=stamps, positions=np.stack([0.2 * np.arange(61), *np.zeros((2, 61))], axis=1),
+                            quaternions=np.tile([0.0, 0.0, 0.0, 1.0], (61, 1)))  # fmt: skip
+    opened = SimpleNamespace(in_base_frame=lambda frame: SimpleNamespace(motion=track))
+    monkeypatch.setattr(terrain.Recording, "open", lambda *args, **kwargs: opened)
+    height = np.zeros((81, 241), np.float32)
+    height[36:38, 80] = 0.3  # 0.3 to 0.4 m to the right, 6 m ahead
+    height[:, 120:] = 0.5
+    np.savez(terrain.labels_file(tmp_path / "bag"), visible_height=height, support_height=np.zeros_like(height),
+             vegetation_height=height, origin=np.array([-2.0, -4.0]), resolution=np.array(0.1))  # fmt: skip
+    greatest, share = terrain.driven_vegetation(tmp_path / "bag", robot, [0])
+    assert greatest[0] == pytest.approx(0.5) and share[0] == pytest.approx(1 / 51, abs=0.03)
+    height[:, 120:] = 0.0
+    np.savez(terrain.labels_file(tmp_path / "bag"), visible_height=height, support_height=np.zeros_like(height),
+             vegetation_height=height, origin=np.array([-2.0, -4.0]), resolution=np.array(0.1))  # fmt: skip
+    assert terrain.driven_vegetation(tmp_path / "bag", robot, [0]) == ([pytest.approx(0.3, abs=0.01)], [0.0])
+    # Deep mud is no vegetation.
+    np.savez(terrain.labels_file(tmp_path / "bag"), visible_height=height + 0.3, support_height=np.zeros_like(height),
+             vegetation_height=np.zeros_like(height), origin=np.array([-2.0, -4.0]),
+             resolution=np.array(0.1))  # fmt: skip
+    assert terrain.driven_vegetation(tmp_path / "bag", robot, [0]) == ([0.0], [0.0])
+
+
 def test_an_encoder_gets_the_sensors_of_its_row():
     """The shipped encoder takes either sensor or both."""
     wanted = {"shipped": ("camera",), "shipped_lidar": ("lidar",), "shipped_both": ("camera", "lidar")}
@@ -114,19 +162,28 @@ def test_an_encoder_gets_the_sensors_of_its_row():
 
 def test_the_log_counts_how_often_seeds_were_used(tmp_path):
     log = tmp_path / "terrain.log.jsonl"
-    assert terrain.log_use(log, {"seeds": [1, 2]}) == 1
-    assert terrain.log_use(log, {"seeds": [3]}) == 1
-    assert terrain.log_use(log, {"seeds": [2, 3]}) == 3
+    published = tmp_path / "published.log.jsonl"
+    assert terrain.log_use([log, published], {"date": "a", "seeds": [1, 2]}) == 1
+    assert terrain.log_use([log, published], {"date": "b", "seeds": [3]}) == 1
+    assert terrain.log_use([log, published], {"date": "c", "seeds": [2, 3]}) == 3
+    # The same use in the log of published tables counts once; a new folder does not start over.
+    assert terrain.log_use([published, log], {"date": "c", "seeds": [2, 3]}) == 3
+    assert terrain.log_use([tmp_path / "other", published], {"date": "d", "seeds": [3]}) == 2
     lines = [json.loads(line) for line in log.read_text().splitlines()]
     assert [line["times_used"] for line in lines] == [1, 1, 3]
 
 
 def test_tables_have_a_row_for_every_system_and_stratum():
     rows = [result(key, "", world, 0.1, strata={"robot": name}) for key in ("lidar", "true_support", "flat")
-            for world, name in enumerate(("husky", "marv", "marv"))]  # fmt: skip
+            for world, name in enumerate(("husky", *["marv"] * 5))]  # fmt: skip
     text = terrain_tables.table(rows)
-    assert "3 worlds, 15 windows" in text and "true support height (bound)" in text and "level ground" in text
-    assert "| robot | marv | 2 |" in terrain_tables.strata_table(rows, "paper")
+    assert "6 worlds, 30 windows" in text and "true support height (bound)" in text and "level ground" in text
+    (row,) = [line for line in text.splitlines() if "lidar interpolation" in line]
+    assert row.endswith("| 0.14 m, 4.06° | 0.13 m, 4.74° |")
+    strata = terrain_tables.strata_table(rows, "paper")
+    assert "| robot | marv | 5 |" in strata
+    # One world says nothing of its robot.
+    assert "| robot | husky |" not in strata
 
 
 def test_strata_by_distance_leave_out_worlds_without_such_poses():
@@ -153,9 +210,13 @@ def test_the_worst_predictions_of_each_system_are_of_different_worlds():
 def test_worlds_are_sorted_into_strata():
     described = {
         "vegetation_height": 0.5, "slope_deg": 9.0, "sky": "dusk", "misleading_ground": True, "cameras": 2,
-        "field_of_view_deg": [60.0, 120.0], "robot": "marv",
+        "field_of_view_deg": [60.0, 120.0], "robot": "marv", "camera_height": [0.4, 1.0],
+        "distortion_model": ["plumb_bob", "equidistant"],
     }  # fmt: skip
     found = terrain.strata(described)
+    assert found["camera height"] == "0.5 to 1 m" and found["lens"] == "fisheye"
+    bare = described | {"field_of_view_deg": [], "camera_height": [], "distortion_model": []}
+    assert {terrain.strata(bare)[name] for name in ("camera height", "lens", "field of view")} == {"none"}
     assert found["vegetation height"] == "0.4 to 0.8 m" and found["slope"] == "8 ° or more"
     assert found["field of view"] == "75° or more" and found["ground misleads"] == "yes"
 
@@ -203,14 +264,18 @@ def test_wrong_arguments_are_named(tmp_path):
     assert done.returncode == 1 and "are for training" in done.stderr and "Traceback" not in done.stderr
 
 
-def test_precision_and_recall_of_stops():
+def test_a_stop_is_found_where_it_is_predicted_near_its_place():
     def scene(kind, driven):
-        ahead = SimpleNamespace(kind=kind)
-        return wall.Scene(ahead, None, None, driven)
+        return wall.Scene(SimpleNamespace(kind=kind), None, None, driven)
 
     scenes = [scene("wall", 2.0), scene("wall", 6.3), scene("post", 3.0), scene("vegetation", 6.3)]
-    row = wall.counted("x", scenes, np.array([1.8, 6.4, 6.4, 3.0]))
-    assert (row["stops"], row["predicted"], row["found"]) == (2, 2, 1)
-    assert row["precision"] == row["recall"] == 0.5
+    row = wall.counted("x", scenes, np.array([[1.8, 6.4, 6.4, 3.0]]))
+    assert (row["stops"], row["precision"][0], row["recall"][0]) == (2, 0.5, 0.5)
     assert row["stop_error_m"] == pytest.approx(-0.2)
-    assert row["vegetation"] == [1, 0, 1] and row["wall"] == [1, 1, 2]
+    assert row["vegetation"] == [0.0, 1.0, 0, 1] and row["wall"] == [1.0, 1.0, 1, 2]
+    # Of two training seeds the other stops 3 m behind the wall: no wall was found, but a stop was predicted.
+    row = wall.counted("x", scenes, np.array([[1.8, 6.4, 6.4, 3.0], [5.0, 6.4, 6.4, 6.4]]))
+    assert row["recall"][0] == 0.25 and row["recall_anywhere"][0] == 0.5 and row["precision"][0] == pytest.approx(1 / 3)
+    assert row["recall"][1] < 0.25 < row["recall"][2]
+    assert "| x | 0.33 (" in wall.table([row]) and "| 0.5 of 1 found |" in wall.table([row])
+    assert wall.counted("x", scenes, np.full((1, 4), 6.4))["precision"] is None

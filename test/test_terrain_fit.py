@@ -18,7 +18,15 @@ from monoforce_ros.robots import load_robot
 from monoforce_ros.synthetic.labels import GroundClass, labels_file
 from monoforce_ros.synthetic.odometry import OdometrySettings
 from monoforce_ros.synthetic.recording import RecordingSettings, record
-from monoforce_ros.terrain import Grid, TerrainFileError, TerrainMap, accumulate, load_terrain, save_terrain
+from monoforce_ros.terrain import (
+    Grid,
+    TerrainDefaults,
+    TerrainFileError,
+    TerrainMap,
+    accumulate,
+    load_terrain,
+    save_terrain,
+)
 from monoforce_ros.terrain.accumulation import count_neighbours
 from monoforce_ros.training import FitSettings, fit_terrain
 from monoforce_ros.training.fit_cli import FitFigures, existing_figures
@@ -128,6 +136,25 @@ def test_friction_is_fitted_where_the_robot_slips(husky):
     friction = fitted.terrain.friction.numpy()[fitted.contact_mask]
     assert np.median(friction) == pytest.approx(0.28, abs=0.1)
     assert fitted.losses.min() < plain.losses.min()
+    # What tracing cannot tell alone: heights stay as the wheels traced them.
+    given = FitSettings(heights=False, friction=True)
+    traced = fit_terrain(motion, commands, husky, start=start, length=4.5, settings=FitSettings(iterations=0))
+    material = fit_terrain(motion, commands, husky, start=start, length=4.5, settings=given)
+    assert torch.equal(material.terrain.height, traced.terrain.height)
+    assert np.median(material.terrain.friction.numpy()[material.contact_mask]) == pytest.approx(0.28, abs=0.1)
+    assert material.losses[-1] < material.losses[0] and not len(traced.losses)
+
+
+def test_stiffness_is_fitted_where_the_robot_sways(husky):
+    grid = Grid.square(12.8, 0.1)
+    rough = torch.from_numpy((0.05 * np.sin(3.0 * np.tile(grid.x, (grid.rows, 1)))).astype(np.float32))
+    soft = TerrainMap.from_height(rough, grid, material=TerrainDefaults(stiffness=2e5))
+    motion, commands = recorded(husky, soft, (0.8, 0.1), 5.0, 0.1)
+    given = FitSettings(heights=False, stiffness=True)
+    fit = fit_terrain(motion, commands, husky, start=int(motion.stamps[0]), length=4.5, settings=given)
+    initial = TerrainDefaults().stiffness
+    assert np.median(fit.terrain.stiffness.numpy()[fit.contact_mask]) < 0.6 * initial
+    assert fit.losses[-1] < fit.losses[0]
 
 
 def test_sweeps_are_accumulated_at_their_poses_without_dust():

@@ -21,10 +21,12 @@ from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap, fill_holes
 from monoforce_ros.training.trajectory_residual import robust_loss, trajectory_residual
 
 _SAMPLE_TIME = 0.1
-_HORIZONTAL_SCALE, _VERTICAL_SCALE, _TILT_SCALE = 0.15, 0.01, np.radians(0.7)
-"""Scales of pose residuals [m, m, rad]; horizontally wider because slip decides there."""
-_FRICTION_TRUST = 0.3
-"""Weight of the square of local changes in the logarithm of friction."""
+_HORIZONTAL_SCALE, _VERTICAL_SCALE, _TILT_SCALE, _HEADING_SCALE = 0.15, 0.01, np.radians(0.7), np.radians(4.0)
+"""Scales of pose residuals [m, m, rad, rad]; wider horizontally and in heading because slip decides there."""
+_MATERIAL_TRUST = 0.3
+"""Weight of the square of local changes in the logarithm of friction and of stiffness."""
+_FACTORS = {"friction": (0.1, 3.0), "stiffness": (0.01, 10.0)}
+"""Range of fitted material relative to the initial one."""
 _BLEND = 0.6
 """Distance from the wheel tracks beyond which the visible terrain replaces the traced one [m]."""
 
@@ -48,10 +50,14 @@ class FitSettings:
     trust: float = 0.3
     """Weight of the squared height change: trust in the traced surface, since motion also depends on effects other than
     the terrain's shape, such as slip."""
+    heights: bool = True
+    """Whether to fit heights; otherwise they stay as the wheels traced them."""
     friction: bool = False
-    """Whether to fit friction too."""
+    """Whether to fit friction too, with the heading, which shows slip."""
+    stiffness: bool = False
+    """Whether to fit the stiffness of the ground too."""
     friction_step: float = 0.03
-    """Initial step in the logarithm of friction."""
+    """Initial step in the logarithm of friction and of stiffness."""
 
     def __post_init__(self):
         for name, low, high in (
@@ -73,7 +79,7 @@ class TerrainFit:
     """Fitted terrain and its error in predicting the motion."""
 
     terrain: TerrainMap
-    """``height`` is H_t*, ``geometric_height`` is H_g* (H_t* without a visible terrain), ``friction`` as fitted."""
+    """``height`` is H_t*, ``geometric_height`` is H_g* (H_t* without a visible terrain); material as fitted."""
     contact_mask: np.ndarray
     """Cells that wheels or tracks touched, ``[rows, columns]`` bool: where H_t* is known."""
     odometry_from_terrain: np.ndarray
@@ -121,7 +127,7 @@ def fit_terrain(
     progress: Callable[[], None] = lambda: None,
     joints: JointRecord | None = None,
 ) -> TerrainFit:
-    """Fit heights, and optionally friction, to a driven trajectory.
+    """Fit heights, and optionally friction and stiffness, to a driven trajectory.
 
     The map is initialised with the surface traced by the undersides of the wheels, blended into the visible terrain
     elsewhere. Chunks of the trajectory are rolled out in one batch from measured states, and gradient descent reduces
@@ -215,21 +221,21 @@ class _Chunks:
         )
         return result.position[:, self.index], result.rotation[:, self.index]
 
-    def loss(self, terrain: TerrainMap, backend: str) -> Tensor:
+    def loss(self, terrain: TerrainMap, backend: str, *, with_heading: bool) -> Tensor:
         """Huber loss of scaled residuals between predicted and measured poses; robust to slip."""
         positions, rotations = self.roll_out(terrain, backend)
         translation, rotation = trajectory_residual(
             positions[:, 1:], rotations[:, 1:], self.positions[:, 1:], self.rotations[:, 1:]
         )
-        # Heading is left out: it hardly depends on heights.
-        scaled = torch.cat(
-            [
-                translation[..., :2] / _HORIZONTAL_SCALE,
-                translation[..., 2:] / _VERTICAL_SCALE,
-                rotation[..., :2] / _TILT_SCALE,
-            ],
-            dim=-1,
-        )
+        parts = [
+            translation[..., :2] / _HORIZONTAL_SCALE,
+            translation[..., 2:] / _VERTICAL_SCALE,
+            rotation[..., :2] / _TILT_SCALE,
+        ]
+        if with_heading:
+            # It hardly depends on heights.
+            parts.append(rotation[..., 2:] / _HEADING_SCALE)
+        scaled = torch.cat(parts, dim=-1)
         per_sample = robust_loss(scaled, 3.0)
         finite = torch.isfinite(per_sample)
         return torch.where(finite, per_sample, 0.0).sum() / finite.sum().clamp_min(1)
@@ -245,32 +251,42 @@ def _descend(
 ) -> tuple[TerrainMap, list[float]]:
     near = torch.from_numpy((distance_transform_edt(~contact_mask) * settings.resolution < _BLEND).astype(np.float32))
     change = torch.zeros_like(terrain.height, requires_grad=True)
-    groups = [{"params": [change], "lr": settings.step}]
-    # Friction has a global factor, and local changes where the motion requires them.
-    logarithm, local = torch.zeros((), requires_grad=True), torch.zeros_like(terrain.height, requires_grad=True)
-    if settings.friction:
-        groups.append({"params": [logarithm, local], "lr": settings.friction_step})
+    groups = [{"params": [change], "lr": settings.step}] if settings.heights else []
+    # Material has a global factor, and local changes where the motion requires them.
+    fitted = [name for name in ("friction", "stiffness") if getattr(settings, name)]
+    logarithms = {name: torch.zeros((), requires_grad=True) for name in fitted}
+    locals_ = {name: torch.zeros_like(terrain.height, requires_grad=True) for name in fitted}
+    if fitted:
+        groups.append({"params": [*logarithms.values(), *locals_.values()], "lr": settings.friction_step})
+    if not groups or not settings.iterations:
+        return terrain, []
     optimiser = torch.optim.Adam(groups, betas=(0.8, 0.98))
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, max(1, settings.iterations), 0.1 * settings.step)
     kernel, wide = _kernel(1.2), _kernel(4.0)
+    resting = rest_depth(chunks.robot, float(terrain.stiffness.mean()))
 
     def current() -> TerrainMap:
-        height = terrain.height + near * _blurred(change, kernel)
-        if not settings.friction:
-            return replace(terrain, height=height)
-        factor = torch.exp(logarithm + near * _blurred(local, wide)).clamp(0.1, 3.0)
-        return replace(terrain, height=height, friction=terrain.friction * factor)
+        height = terrain.height + near * _blurred(change, kernel) if settings.heights else terrain.height
+        material = {
+            name: getattr(terrain, name)
+            * torch.exp(logarithms[name] + near * _blurred(locals_[name], wide)).clamp(*_FACTORS[name])
+            for name in fitted
+        }
+        if settings.stiffness:
+            # Where the wheels were is what was traced: on softer ground they stand deeper below its surface.
+            height = height + resting * (terrain.stiffness / material["stiffness"] - 1.0)
+        return replace(terrain, height=height, **material)
 
     losses: list[float] = []
     best, least = current(), np.inf
     for _ in range(settings.iterations):
         optimiser.zero_grad()
         candidate = current()
-        data = chunks.loss(candidate, backend)
-        added = candidate.height - terrain.height
+        data = chunks.loss(candidate, backend, with_heading=settings.friction)
+        added = near * _blurred(change, kernel)
         curvature = functional.conv2d(added[None, None] / _VERTICAL_SCALE, _LAPLACE)[0, 0]
         prior = settings.smoothness * (curvature**2).sum() + settings.trust * ((added / _VERTICAL_SCALE) ** 2).sum()
-        prior = prior + _FRICTION_TRUST * (local**2).sum()
+        prior = prior + _MATERIAL_TRUST * sum((local**2).sum() for local in locals_.values())
         loss = data + prior / max(1.0, float(near.sum()))
         loss.backward()
         losses.append(float(loss.detach()))
@@ -299,7 +315,10 @@ def _blurred(values: Tensor, kernel: Tensor) -> Tensor:
 
 
 def _detached(terrain: TerrainMap) -> TerrainMap:
-    return replace(terrain, height=terrain.height.detach(), friction=terrain.friction.detach())
+    return replace(
+        terrain, height=terrain.height.detach(), friction=terrain.friction.detach(),
+        stiffness=terrain.stiffness.detach(),
+    )  # fmt: skip
 
 
 def _within(motion: MotionTrack, start: int, length: float) -> MotionTrack:

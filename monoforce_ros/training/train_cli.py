@@ -44,7 +44,7 @@ from monoforce_ros.training.adaptation import (
 )
 from monoforce_ros.training.depth_training import DepthSettings, DepthTrainer, depth_errors
 from monoforce_ros.training.image_features import image_features
-from monoforce_ros.training.judgement import CAMERAS, SWEEP, calibrated
+from monoforce_ros.training.judgement import BOTH, CAMERAS, SWEEP, calibrated
 from monoforce_ros.training.losses import LossWeights
 from monoforce_ros.training.recording_samples import RecordingSamples, SamplesError, read_samples
 from monoforce_ros.training.sample_extraction import SampleSettings, extract_samples
@@ -301,7 +301,7 @@ def _train(options: argparse.Namespace, process: Process) -> None:
         trainer.run(log)
     if process.first and validation:
         best = load_encoder(options.out / "encoder.safetensors")
-        sensors = CAMERAS if config.takes_images else SWEEP
+        sensors = BOTH if options.all_sensors else CAMERAS if config.takes_images else SWEEP
         save_encoder(calibrated(best, validation, sensors), options.out / "encoder.safetensors")
     if process.first:
         _write_summary(options.out, trainer, describe(config, settings, training))
