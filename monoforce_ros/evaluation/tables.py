@@ -229,12 +229,16 @@ def ratio_over(values: ArrayLike, others: ArrayLike) -> Mean:
 def _widened(value: float, resampled: np.ndarray, systems: Sequence[np.ndarray]) -> Mean:
     """95 % interval from resampled recordings and from the means ``[n, seeds]`` of each system's training seeds."""
     low, high = (float(q) for q in np.quantile(resampled, (0.025, 0.975)))
-    freedom = sum(rows.shape[1] - 1 for rows in systems)
-    if not freedom or not value > 0.0:
+    trained = [rows for rows in systems if rows.shape[1] > 1]
+    if not trained or not value > 0.0:
         return Mean(value, low, high)
     # Of logarithms: errors differ by factors.
-    variance = sum(np.log(rows.mean(axis=0)).var(ddof=1) / rows.shape[1] for rows in systems if rows.shape[1] > 1)
-    by_seed = float(student_t.ppf(0.975, freedom) * np.sqrt(variance))
+    variances = np.array([np.log(rows.mean(axis=0)).var(ddof=1) / rows.shape[1] for rows in trained])
+    if not variances.any():
+        return Mean(value, low, high)
+    # Welch and Satterthwaite: seeds of one system may differ far more than those of the other.
+    freedom = variances.sum() ** 2 / sum(v**2 / (rows.shape[1] - 1) for v, rows in zip(variances, trained, strict=True))
+    by_seed = float(student_t.ppf(0.975, freedom) * np.sqrt(variances.sum()))
     down, up = np.log(value / low), np.log(high / value)
     return Mean(value, value * float(np.exp(-np.hypot(down, by_seed))), value * float(np.exp(np.hypot(up, by_seed))))
 
