@@ -94,7 +94,10 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--iterations", type=int, default=FitSettings.iterations, help="gradient steps "
                         "(default: %(default)s)")  # fmt: skip
     parser.add_argument("--no-lidar", action="store_true", help="fit to the motion only")
+    parser.add_argument("--traced", action="store_true", help="leave heights as the wheels traced them, and fit "
+                        "material only")  # fmt: skip
     parser.add_argument("--friction", action="store_true", help="fit friction too")
+    parser.add_argument("--stiffness", action="store_true", help="fit the stiffness of the ground too")
     parser.add_argument("--position-noise", type=float, metavar="M", help="standard deviation of the "
                         "odometry's position (default: estimated)")  # fmt: skip
     parser.add_argument("--rotation-noise", type=float, metavar="DEG", help="standard deviation of the "
@@ -114,7 +117,10 @@ def main(arguments: list[str] | None = None) -> int:
     # For many small operations one thread is faster than several, and robust to other load.
     torch.set_num_threads(1)
     try:
-        settings = FitSettings(chunk=options.chunk, iterations=options.iterations, friction=options.friction)
+        settings = FitSettings(
+            chunk=options.chunk, iterations=options.iterations, heights=not options.traced, friction=options.friction,
+            stiffness=options.stiffness,
+        )  # fmt: skip
         robot = load_robot(options.robot)
         done = [_fit_bag(bag, robot, settings, options) for bag in options.bags]
     except (BagError, RobotFileError, ValueError, OSError) as error:
