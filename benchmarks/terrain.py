@@ -354,6 +354,27 @@ def worst_cases(results: Sequence[Result], physics: str, count: int = WORST) -> 
     return {system: own for system, own in found.items() if own}
 
 
+def own_failures(results: Sequence[Result], physics: str) -> dict[str, list[Result]]:
+    """The worst window of each system in the world where it exceeds that of the true heights by the most.
+
+    Where all are far off by the same, friction is to blame or the physics, and no terrain.
+    """
+    bound = {r.world: r.worst_position for r in results if r.physics == physics and r.system == BOUND.key and r.worst}
+    found: dict[str, Result] = {}
+
+    def excess(result: Result) -> float:
+        return result.worst_position - bound[result.world]
+
+    for result in results:
+        if result.physics != physics or not result.worst or result.world not in bound:
+            continue
+        if result.system in (BOUND.key, CONSTANT.key):
+            continue
+        if result.system not in found or excess(result) > excess(found[result.system]):
+            found[result.system] = result
+    return {system: [result] for system, result in found.items()}
+
+
 @dataclass(frozen=True)
 class WorstCase:
     """One of a system's worst predictions as a picture: the camera's view, and the map with both paths."""
@@ -364,13 +385,12 @@ class WorstCase:
     caption: str
 
 
-def draw_worst_cases(
-    worlds: Path, results: Sequence[Result], checkpoints: Mapping[str, Sequence[Path]], physics: str
+def draw_cases(
+    worlds: Path, cases: Mapping[str, Sequence[Result]], checkpoints: Mapping[str, Sequence[Path]], physics: str
 ) -> list[WorstCase]:
-    """Pictures of the worst predictions of each system."""
+    """Pictures of the worst windows of results of each system."""
     drawn = []
     learned = {system.key: system for system in learned_systems(checkpoints)}
-    cases = worst_cases(results, physics)
     for key, own in tqdm(cases.items(), desc="worst cases"):
         for rank, result in enumerate(own, start=1):
             bag = worlds / f"{result.world}"
@@ -411,11 +431,9 @@ def gallery(cases: Sequence[WorstCase], physics: str) -> str:
 
 
 def contact_sheet(cases: Sequence[WorstCase], columns: int = 2, width: int = 640) -> np.ndarray:
-    """The worst prediction of each system under its name, side by side ``[h, w, 3]`` uint8 BGR."""
+    """Pictures under the names of their systems, side by side ``[h, w, 3]`` uint8 BGR."""
     tiles = []
     for case in cases:
-        if case.rank > 1:
-            continue
         image = cv2.imdecode(np.frombuffer(case.png, np.uint8), cv2.IMREAD_COLOR)
         assert image is not None
         height = round(width * image.shape[0] / image.shape[1])
@@ -519,7 +537,7 @@ def main() -> int:
     parser.add_argument("--checkpoint", action="append", default=[], metavar="SYSTEM=FILE",
                         help=f"repeat for other systems and training seeds; systems: {', '.join(LEARNED)}")  # fmt: skip
     parser.add_argument("--docs", type=Path, help="write the tables between the comments of this document")
-    parser.add_argument("--sheet", type=Path, metavar="FILE.jpg", help="also draw the worst case of each system here")
+    parser.add_argument("--sheet", type=Path, metavar="FILE.jpg", help="also draw each system's failures here")
     options = parser.parse_args()
     try:
         count = options.worlds or (6 if options.quick else 40)
@@ -567,9 +585,11 @@ def main() -> int:
     write_text(options.out / "terrain.md", f"{text}\n{by_strata}\n")
     write_text(options.out / "terrain.json", json.dumps([asdict(result) for result in results], indent=1))
     physics = next(iter(PHYSICS))
-    cases = draw_worst_cases(options.out / "worlds", results, checkpoints, physics)
+    worlds_folder = options.out / "worlds"
+    cases = draw_cases(worlds_folder, worst_cases(results, physics), checkpoints, physics)
     write_text(options.out / "worst_cases.html", gallery(cases, physics))
-    sheet = cv2.imencode(".jpg", contact_sheet(cases), [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
+    failures_drawn = draw_cases(worlds_folder, own_failures(results, physics), checkpoints, physics)
+    sheet = cv2.imencode(".jpg", contact_sheet(failures_drawn), [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
     for file in filter(None, [options.out / "worst_cases.jpg", options.sheet]):
         with atomic_path(file) as unfinished:
             unfinished.write_bytes(sheet)

@@ -39,11 +39,11 @@ def recording(demo_bag):
 
 
 def errors(recording, source, robot):
-    """Mean position error after 5 s [m]."""
+    """Median position error after 5 s [m]: of six windows, one that is stuck on a tuft decides the mean."""
     found = evaluate_recording(
         recording, Predictor(robot, source, horizon=5.0), horizons=(5.0,), stride=1.0, quiet=True, minimum_duration=1.0
     )
-    return found.summary(PHYSICS)[5.0][0].mean
+    return found.summary(PHYSICS)[5.0][0].median
 
 
 def test_in_tall_grass_paths_are_far_better_than_on_interpolated_heights(recording, husky):

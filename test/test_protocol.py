@@ -207,6 +207,14 @@ def test_the_worst_predictions_of_each_system_are_of_different_worlds():
     assert found["lidar"][0].worst_position == 0.9
 
 
+def test_a_failure_is_where_true_heights_do_better():
+    rows = [result(key, "", world, 0.1, worst=1, worst_position=error)
+            for key, errors in (("true_support", (2.0, 0.1)), ("lidar", (2.1, 0.9)))
+            for world, error in enumerate(errors)]  # fmt: skip
+    (only,) = terrain.own_failures(rows, "paper").values()
+    assert [(case.system, case.world) for case in only] == [("lidar", 1)]
+
+
 def test_worlds_are_sorted_into_strata():
     described = {
         "vegetation_height": 0.5, "slope_deg": 9.0, "sky": "dusk", "misleading_ground": True, "cameras": 2,
