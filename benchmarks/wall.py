@@ -110,11 +110,13 @@ def draw(found: Scene, predictions: dict[str, Prediction]) -> Figure:
         grid, height = prediction.terrain.grid, prediction.terrain.height.numpy()
         row = int(np.argmin(np.abs(np.asarray(grid.y))))
         ahead = np.asarray(grid.x) > -0.5
-        right.plot(np.asarray(grid.x)[ahead], height[row, ahead], color=f"C{index}", label=title)
-        right.plot(*prediction.rollout.position[0].numpy()[-1, [0, 2]], "o", color=f"C{index}", markersize=9)
+        # There are ten colours.
+        style, marker = (("-", "o"), ("--", "s"))[index // 10 % 2]
+        right.plot(np.asarray(grid.x)[ahead], height[row, ahead], style, color=f"C{index % 10}", label=title)
+        right.plot(*prediction.rollout.position[0].numpy()[-1, [0, 2]], marker, color=f"C{index % 10}", markersize=9)
     right.plot(found.driven, 0.0, "kx", markersize=10, label=f"simulated robot after {HORIZON:.0f} s")
     right.set(xlabel="ahead [m]", ylabel="supporting height H_t [m]", xlim=(-0.5, 6.4))
-    right.set_title(f"predicted terrain; dots: predicted robot after {HORIZON:.0f} s")
+    right.set_title(f"predicted terrain; markers: predicted robot after {HORIZON:.0f} s")
     right.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 
