@@ -133,10 +133,12 @@ def strata(described: Mapping[str, object]) -> dict[str, str]:
         assert isinstance(value, int | float)
         return _band(value, limits, unit)
 
-    views, heights, lenses = (described[name] for name in ("field_of_view_deg", "camera_height", "distortion_model"))
-    assert isinstance(views, list)
-    assert isinstance(heights, list)
-    assert isinstance(lenses, list)
+    def of_cameras(name: str) -> list:
+        values = described[name]
+        assert isinstance(values, list)
+        return values
+
+    views, heights, lenses = map(of_cameras, ("field_of_view_deg", "camera_height", "distortion_model"))
     return {
         "vegetation height": bands("vegetation_height", (0.05, 0.4, 0.8), "m"),
         "slope": bands("slope_deg", (4.0, 8.0), "°"),
@@ -174,12 +176,10 @@ def record_world(folder: Path, seed: int, settings: WorldSettings, duration: flo
 
 
 @dataclass(frozen=True)
-class Remembered:
-    """A terrain source whose maps are computed once: they are the same for every kind of physics."""
+class _Wrapped:
+    """A terrain source around another one."""
 
     source: TerrainSource
-    maps: dict[int, TerrainMap] = field(default_factory=dict)
-    """By the stamp of the observation [ns]."""
 
     @property
     def sensors(self) -> tuple[str, ...]:
@@ -190,6 +190,14 @@ class Remembered:
     def grid(self) -> Grid:
         """Of the source."""
         return self.source.grid
+
+
+@dataclass(frozen=True)
+class Remembered(_Wrapped):
+    """A terrain source whose maps are computed once: they are the same for every kind of physics."""
+
+    maps: dict[int, TerrainMap] = field(default_factory=dict)
+    """By the stamp of the observation [ns]."""
 
     def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
         """The source's map at the time of an observation."""
@@ -199,21 +207,10 @@ class Remembered:
 
 
 @dataclass(frozen=True)
-class DefaultMaterial:
+class DefaultMaterial(_Wrapped):
     """A terrain source of whose maps the heights alone are used: systems that are compared differ in nothing else."""
 
-    source: TerrainSource
     material: TerrainDefaults = field(default_factory=TerrainDefaults)
-
-    @property
-    def sensors(self) -> tuple[str, ...]:
-        """Of the source."""
-        return self.source.sensors
-
-    @property
-    def grid(self) -> Grid:
-        """Of the source."""
-        return self.source.grid
 
     def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
         """The source's map with the default material."""
@@ -359,27 +356,19 @@ def own_failures(results: Sequence[Result], physics: str) -> dict[str, list[Resu
 
     Where all are far off by the same, friction is to blame or the physics, and no terrain.
     """
-    bound = {r.world: r.worst_position for r in results if r.physics == physics and r.system == BOUND.key and r.worst}
-    found: dict[str, Result] = {}
-
-    def excess(result: Result) -> float:
-        return result.worst_position - bound[result.world]
-
-    for result in results:
-        if result.physics != physics or not result.worst or result.world not in bound:
-            continue
-        if result.system in (BOUND.key, CONSTANT.key):
-            continue
-        if result.system not in found or excess(result) > excess(found[result.system]):
-            found[result.system] = result
-    return {system: [result] for system, result in found.items()}
+    usable = [r for r in results if r.physics == physics and r.worst]
+    bound = {r.world: r.worst_position for r in usable if r.system == BOUND.key}
+    found: dict[str, list[Result]] = {}
+    for result in sorted((r for r in usable if r.world in bound), key=lambda r: bound[r.world] - r.worst_position):
+        if result.system not in (BOUND.key, CONSTANT.key):
+            found.setdefault(result.system, [result])
+    return found
 
 
 @dataclass(frozen=True)
 class WorstCase:
     """One of a system's worst predictions as a picture: the camera's view, and the map with both paths."""
 
-    rank: int
     png: bytes
     heading: str
     caption: str
@@ -416,7 +405,7 @@ def draw_cases(
             about = ", ".join(f"{name}: {value}" for name, value in result.strata.items())
             heading = f"{system.title}: number {rank}, mean error {result.worst_position:.2f} m"
             caption = f"World {result.world}, {seconds:.0f} s into the recording. {about}."
-            drawn.append(WorstCase(rank, figure_png(figure), heading, caption))
+            drawn.append(WorstCase(figure_png(figure), heading, caption))
     return drawn
 
 
@@ -481,6 +470,16 @@ def log_use(logs: Sequence[Path], entry: dict[str, object]) -> int:
     listed = [*entries(logs[0]), entry | {"times_used": used}]
     write_text(logs[0], "".join(json.dumps(line) + "\n" for line in listed))
     return used
+
+
+def described_use(seeds: Sequence[int], checkpoints: Mapping[str, Sequence[Path]]) -> dict[str, object]:
+    """What a log says of every use of seeds."""
+    return {
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "commit": commit(),
+        "seeds": list(seeds),
+        "checkpoints": {name: [digest(file) for file in files] for name, files in checkpoints.items()},
+    }
 
 
 def commit() -> str:
@@ -571,14 +570,10 @@ def main() -> int:
         f"Δx [m], physics: {name}\n\n{strata_table(results, name)}"
         for name in PHYSICS
     )
-    entry: dict[str, object] = {
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "commit": commit(),
+    entry = described_use(seeds, checkpoints) | {
         "evaluated_by": sorted({world.commit for world in worlds}),
-        "seeds": seeds,
         "skipped": skipped,
         "duration_s": duration,
-        "checkpoints": {name: [digest(file) for file in files] for name, files in checkpoints.items()},
     }
     log = options.out / "terrain.log.jsonl"
     used = log_use([log, PUBLISHED_LOG], entry)

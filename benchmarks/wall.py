@@ -17,13 +17,12 @@ import argparse
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 import torch
 from matplotlib.figure import Figure
-from terrain import CHOOSING, ROOT, commit, digest, judged_source, log_use, parse_checkpoints, reporting_seeds
+from terrain import CHOOSING, ROOT, described_use, judged_source, log_use, parse_checkpoints, reporting_seeds
 from terrain_tables import LEARNED
 from tqdm import tqdm
 
@@ -242,11 +241,7 @@ def main() -> None:
             drawn[own[0].title] = predicted(predictors[0], pictured.observation, pictured.start)
     text = table(rows)
     print(text)
-    entry: dict[str, object] = {
-        "date": datetime.now(UTC).isoformat(timespec="seconds"), "commit": commit(), "robot": options.robot,
-        "seeds": [seed for _, seed in jobs],
-        "checkpoints": {name: [digest(file) for file in files] for name, files in checkpoints.items()},
-    }  # fmt: skip
+    entry = described_use([seed for _, seed in jobs], checkpoints) | {"robot": options.robot}
     if options.json:
         logs = [options.json.with_name("wall.log.jsonl"), PUBLISHED_LOG]
         print(f"{logs[0]}: seeds used {log_use(logs, entry)} time(s)")

@@ -66,5 +66,5 @@ for system in shipped shipped_lidar shipped_both; do
 done
 scripts/run.sh python benchmarks/terrain.py --out "$out/tables" --seed "$seed" --jobs "$jobs" $checkpoints --docs docs/training.md \
   --sheet docs/worst_cases.jpg
-scripts/run.sh python benchmarks/wall.py $checkpoints --json "$out/tables/wall.json" --png "$out/tables/wall.png" \
+scripts/run.sh python benchmarks/wall.py $checkpoints --seed $((seed + 6000)) --json "$out/tables/wall.json" --png docs/wall.png \
   --docs docs/protocol.md

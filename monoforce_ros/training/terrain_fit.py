@@ -265,8 +265,10 @@ def _descend(
     kernel, wide = _kernel(1.2), _kernel(4.0)
     resting = rest_depth(chunks.robot, float(terrain.stiffness.mean()))
 
-    def current() -> TerrainMap:
-        height = terrain.height + near * _blurred(change, kernel) if settings.heights else terrain.height
+    def current() -> tuple[TerrainMap, Tensor]:
+        """The map, and what was added to its heights."""
+        added = near * _blurred(change, kernel)
+        height = terrain.height + added
         material = {
             name: getattr(terrain, name)
             * torch.exp(logarithms[name] + near * _blurred(locals_[name], wide)).clamp(*_FACTORS[name])
@@ -275,15 +277,14 @@ def _descend(
         if settings.stiffness:
             # Where the wheels were is what was traced: on softer ground they stand deeper below its surface.
             height = height + resting * (terrain.stiffness / material["stiffness"] - 1.0)
-        return replace(terrain, height=height, **material)
+        return replace(terrain, height=height, **material), added
 
     losses: list[float] = []
-    best, least = current(), np.inf
+    best, least = terrain, np.inf
     for _ in range(settings.iterations):
         optimiser.zero_grad()
-        candidate = current()
+        candidate, added = current()
         data = chunks.loss(candidate, backend, with_heading=settings.friction)
-        added = near * _blurred(change, kernel)
         curvature = functional.conv2d(added[None, None] / _VERTICAL_SCALE, _LAPLACE)[0, 0]
         prior = settings.smoothness * (curvature**2).sum() + settings.trust * ((added / _VERTICAL_SCALE) ** 2).sum()
         prior = prior + _MATERIAL_TRUST * sum((local**2).sum() for local in locals_.values())

@@ -446,9 +446,10 @@ def _settings(options: argparse.Namespace) -> TrainingSettings:
                ("geometric", "terrain", "trajectory")}  # fmt: skip
     return TrainingSettings(
         steps=options.steps, batch=options.batch, rate=options.rate,
-        weights=LossWeights(**weights, prominence=options.prominence, **({"depth": 0.0} if options.no_depth else {})),
-        seed=options.seed,
-        augment=not options.no_augmentation, backbone=options.train_backbone,
+        weights=LossWeights(
+            **weights, prominence=options.prominence, depth=0.0 if options.no_depth else LossWeights.depth
+        ),
+        seed=options.seed, augment=not options.no_augmentation, backbone=options.train_backbone,
         sensor_shares=None if options.all_sensors else tuple(options.sensor_shares),
         validate_every=options.validate_every, save_every=options.save_every, precision=options.precision,
     )  # fmt: skip
