@@ -33,7 +33,7 @@ def baseline_errors(
     """Residuals ``[W, 3]`` at the last sample of each window, for each baseline trained on the other folds."""
     predictions = Predictions(robot, data)
     before = predictions.residuals([()])[0][:, -1]
-    folds = folds_of(data.starts)
+    folds = folds_of(data.starts, 2)
     results = {name: before.copy() for name in ("refit", "network", "sindy")}
     features = _features(data)
     for fold in np.unique(folds):

@@ -63,7 +63,7 @@ class Healthy:
         starts, _ = comparable_starts(evidence, self.robot, settings)
         noisy = noisy_motions(evidence.smoothed, settings.seed)
         windows = windows_of(evidence, self.robot, starts, np.array(settings.samples), noisy)
-        found = explain(evidence, self.robot, windows, self.nominal, settings, exchange=False)
+        found = explain(evidence, self.robot, windows, self.nominal, settings, repeated=True)
         trial = found.decision.trial
         estimates = () if trial is None else found.search.estimates(found.search.refit(trial.effects))
         return found, {estimate.name: estimate.parameters for estimate in estimates}

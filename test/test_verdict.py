@@ -85,11 +85,14 @@ def test_once_something_is_missing_the_best_explanation_may_be_the_least_certain
         result = ScoreResult(name, np.ones(1), np.eye(1), 8.0, p, adjusted, 0.1)
         return Screened(((name, {}),), loss, result)
 
+    # A drag that fast stretches alone show explains most, with a large p-value of its own.
+    drag = candidate("viscous_drag", 0.3, 0.2, 0.9)
     friction = candidate("friction_scale", 0.4, 0.007, 0.09)
-    scrub = candidate("turning_scrub", 0.6, 0.2, 0.9)
     delay = candidate("command_delay", 1.0, 0.001, 0.01)
     worse = candidate("drive_gain", 1.3, 0.001, 0.01)
-    names = [entry.name for entry in admitted([friction, scrub, delay, worse], 1.2, 0.025)]
-    assert names == ["friction_scale", "command_delay"]
+    names = [entry.name for entry in admitted([drag, friction, delay, worse], 1.2, 0.025)]
+    assert names == ["viscous_drag", "friction_scale", "command_delay"]
     # Without one that is significant among all candidates nothing is missing.
-    assert admitted([friction, scrub], 1.2, 0.025) == [] and admitted([worse], 1.2, 0.025) == []
+    assert admitted([drag, friction], 1.2, 0.025) == [] and admitted([worse], 1.2, 0.025) == []
+    # Unless the residuals are too large for a healthy robot.
+    assert admitted([drag, worse], 1.2, 0.025, incomplete=True) == [drag]

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from monoforce_ros.bags import Recording
 from monoforce_ros.core import CommandTrack, MotionTrack, WheelTrack
 from monoforce_ros.discrepancy.wheel_motion import undriven_stretches, wheels_without_motion
-from monoforce_ros.discrepancy.wheels import compare_with_wheels
-from monoforce_ros.effects import drive_speeds
+from monoforce_ros.discrepancy.wheels import changed_drives, compare_with_wheels
+from monoforce_ros.effects import CATALOGUE, drive_speeds, effect_values
 from monoforce_ros.physics import State, rollout
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainMap
@@ -98,6 +98,37 @@ def test_noise_alone_shows_no_effect(husky):
         found = compare_with_wheels(commands, wheels_of(commands, husky, (), noise=0.6, seed=seed), husky)
         named += [name for name, _ in found.effects]
     assert len(named) <= 1, named
+
+
+def test_a_limit_below_those_of_the_catalogue_stays_within_them(husky):
+    """Values of the wheels are initial values of fits, which accept nothing else."""
+    commands = drawn_commands(60.0, 12)
+    commands = CommandTrack(commands.stamps, commands.twists * [1.0, 0.3])
+    half = 0.5 * float((husky.drive_offsets.max() - husky.drive_offsets.min()).abs())
+    speed, rate = commands.twists[::2, 0], np.clip(commands.twists[::2, 1], -0.02, 0.02)
+    speeds = np.stack([speed - half * rate, speed + half * rate], axis=1) / husky.wheel_radius
+    found = compare_with_wheels(commands, WheelTrack(commands.stamps[::2], speeds), husky)
+    (limit,) = [values["limit"] for name, values in found.effects if name == "yaw_rate_limit"]
+    low = next(p.low for p in CATALOGUE["yaw_rate_limit"].parameters)
+    assert low <= limit < 0.1
+    hints, _ = changed_drives(found, husky)
+    for name, values in hints:
+        assert effect_values(name, values)
+
+
+def test_only_what_the_wheels_contradict_is_ruled_out(husky):
+    commands = drawn_commands(60.0, 11)
+    clear = compare_with_wheels(commands, wheels_of(commands, husky, (), noise=0.05), husky)
+    assert {"actuator_deadband", "command_delay", "actuator_lag", "drive_loss"} <= set(clear.ruled_out)
+    # A dead band beside a limit is not part of the wheels' model: they cannot tell that there is none.
+    both = (("actuator_deadband", {"width": 0.05}), ("actuator_saturation", {"limit": 0.6}))
+    hidden = compare_with_wheels(commands, wheels_of(commands, husky, both, noise=0.3), husky)
+    assert "actuator_deadband" not in {name for name, _ in hidden.effects}
+    assert "actuator_deadband" not in hidden.ruled_out
+    assert "actuator_deadband" not in changed_drives(hidden, husky)[1]
+    # Nor in noise that is larger than it.
+    noisy = compare_with_wheels(commands, wheels_of(commands, husky, both[:1], noise=4.0), husky)
+    assert noisy is None or "actuator_deadband" not in noisy.ruled_out
 
 
 def test_a_long_recording_keeps_its_evidence_and_says_what_was_used(husky):

@@ -14,7 +14,13 @@ import numpy as np
 from monoforce_ros.bags import SmoothedMotion
 from monoforce_ros.core import MotionTrack
 from monoforce_ros.discrepancy.gap import find_regimes, noise_residuals, relative_motion
-from monoforce_ros.discrepancy.hypothesis import Effects, EvidenceWindows, Predictions, window_starts
+from monoforce_ros.discrepancy.hypothesis import (
+    Effects,
+    EvidenceWindows,
+    Predictions,
+    residuals_by_part,
+    window_starts,
+)
 from monoforce_ros.discrepancy.trial import BLOCK, blocks_of
 from monoforce_ros.robots import RobotModel
 
@@ -48,10 +54,9 @@ class HeldOut:
         into = ((starts - self.first) % round(self.block * 1e9)) * 1e-9
         return starts[into + horizon <= self.block + 0.5]
 
-    def residuals(self, predictions: Predictions) -> np.ndarray:
+    def residuals(self, robot: RobotModel, windows: EvidenceWindows) -> np.ndarray:
         """Residuals ``[W, K, 3]`` of each window with the effects of its part."""
-        part = self.part_of(predictions.data.starts)
-        return predictions.residuals(list(self.effects))[part, np.arange(len(part))]
+        return residuals_by_part(robot, windows, self.part_of(windows.starts), self.effects)
 
 
 @dataclass(frozen=True)
@@ -147,7 +152,7 @@ def compare(
         floor = noise_residuals(data.motion, noisy, windows)
         predictions = Predictions(robot, windows)
         before = predictions.residuals([()])[0][:, 0]
-        after = None if held_out is None else held_out.residuals(predictions)[:, 0]
+        after = None if held_out is None else held_out.residuals(robot, windows)[:, 0]
         results.append(Comparison(windows.horizon, windows.starts, before, after, floor[:, 0], windows))
     return results
 
@@ -232,7 +237,7 @@ def measured_paths(
     measured = relative_motion(windows.motion, windows)
     predictions = Predictions(robot, windows)
     before = predictions.residuals([()])[0]
-    after = None if held_out is None else held_out.residuals(predictions)
+    after = None if held_out is None else held_out.residuals(robot, windows)
     order = np.argsort(np.hypot(before[:, -1, 0], before[:, -1, 1]))
     picked = order[np.unique(np.linspace(0.5 * len(order), len(order) - 1, count).astype(int))]
     return [

@@ -74,7 +74,7 @@ def explain(
     settings: DiagnosisSettings,
     progress: Callable[[str], None] = lambda step: None,
     *,
-    exchange: bool = True,
+    repeated: bool = False,
 ) -> Explanation:
     """Find the effects that explain the windows of a recording.
 
@@ -85,7 +85,8 @@ def explain(
         nominal: what commissioning learned; None for a robot that was never commissioned.
         settings: settings of the diagnosis.
         progress: called with each step.
-        exchange: see :meth:`Search.run`.
+        repeated: the windows are a part of those that were explained already: they begin after an onset, and what could
+            stand in an effect's place is known.
     """
     thresholds = settings.thresholds
     sensors = SensorFindings.of(evidence, robot, commissioned=nominal is not None)
@@ -108,21 +109,22 @@ def explain(
         )
 
     search = searched(windows)
-    outcome = search.run(settings.max_effects, exchange=exchange)
+    outcome = search.run(settings.max_effects, exchange=not repeated)
     onset = None
-    if not outcome.fit.passed(thresholds):
+    if not repeated and not outcome.fit.passed(thresholds):
         starts = windows.data.starts
-        trial = outcome.best
+        trials = [outcome.best]
         second = starts >= np.median(starts)
-        if not trial.effects and second.sum() >= FEWEST_WINDOWS:
-            # An effect that begins late may be too weak over the whole recording.
-            trial = search.judge(searched(windows[second]).run(1).best.effects)
-        onset = find_onset(search, trial)
+        if second.sum() >= FEWEST_WINDOWS:
+            # An effect that begins late may be too weak over the whole recording, or another one stand in for it.
+            trials.append(search.judge(searched(windows[second]).run(1, exchange=False).best.effects))
+        onsets = [found for found in (find_onset(search, trial) for trial in trials) if found is not None]
+        onset = min(onsets, key=lambda found: found.loss, default=None)
         late = starts >= (starts[0] if onset is None else onset.stamp)
         if onset is not None and late.sum() >= FEWEST_WINDOWS:
             windows = windows[late]
             search = searched(windows)
-            outcome = search.run(settings.max_effects, exchange=exchange)
+            outcome = search.run(settings.max_effects)
         else:
             onset = None
     findings = Findings(

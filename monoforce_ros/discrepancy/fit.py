@@ -36,6 +36,8 @@ class Fit:
     """Of the scaled residuals by each parameter that was fitted, in units of its typical size, ``[P, W, K, 3]``."""
     blocks: int = 0
     """Number of blocks from whose scores the covariance follows."""
+    residual: np.ndarray | None = None
+    """Scaled residuals with the fitted values, ``[W, K, 3]``."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -166,6 +168,7 @@ def fit_effects(
         covariance,
         derivatives,
         len(np.unique(block_numbers(predictions.data.starts, _BLOCK))),
+        residual,
     )
 
 

@@ -125,6 +125,29 @@ def sample_motion(motion: MotionTrack, stamps: np.ndarray) -> tuple[np.ndarray, 
     return blend(motion.positions), rotations, blend(motion.linear_velocities), blend(motion.angular_velocities)
 
 
+def residuals_by_part(
+    robot: RobotModel, data: EvidenceWindows, parts: np.ndarray, effects: Sequence[Effects]
+) -> np.ndarray:
+    """Predicted minus measured, ``[W, K, 3 (COMPONENTS)]``, each window with the effects of its part.
+
+    Args:
+        robot: robot with the effects of its file.
+        data: the windows.
+        parts: number of the part of each, ``[W]``.
+        effects: by part.
+    """
+    residuals = np.zeros((len(data.starts), len(data.samples), len(COMPONENTS)))
+    alike: dict[tuple[object, ...], list[int]] = {}
+    for part in np.unique(parts):
+        key = tuple((name, *values.items()) for name, values in effects[part])
+        alike.setdefault(key, []).append(int(part))
+    for numbers in alike.values():
+        here = np.isin(parts, numbers)
+        windows = Predictions(robot, replace(data, starts=data.starts[here]))
+        residuals[here] = windows.residuals([effects[numbers[0]]])[0]
+    return residuals
+
+
 def corrected_evidence(evidence: Evidence, robot: RobotModel) -> Evidence:
     """The evidence corrected for the sensor and clock errors in a robot's file."""
     effects = tuple((name, {key: float(value) for key, value in values.items()}) for name, values in robot.effects)

@@ -25,6 +25,8 @@ class Onset:
     """Since the first window [s]."""
     gain: float
     """Reduction of the mean loss against the same effects over the whole recording."""
+    loss: float
+    """Mean loss of the recording."""
 
     @property
     def remark(self) -> str:
@@ -65,4 +67,4 @@ def find_onset(search: Search, trial: Trial) -> Onset | None:
     least = search.thresholds.smallest_share * float(before.mean())
     if low <= 0 or nominal_low <= 0 or min(gain, nominal_gain) < least:
         return None
-    return Onset(int(begin + round(edge * 1e9)), edge, gain)
+    return Onset(int(begin + round(edge * 1e9)), edge, gain, float(combined.mean()))

@@ -167,8 +167,7 @@ def repeat(
 def _found(
     evidence: Evidence, robot: RobotModel, windows: Windows, nominal: NominalModel | None, settings: DiagnosisSettings
 ) -> Repeated:
-    # What could stand in an effect's place is known from the whole recording.
-    found = explain(evidence, robot, windows, nominal, settings, exchange=False)
+    found = explain(evidence, robot, windows, nominal, settings, repeated=True)
     trial = found.decision.trial
     listed = trial or found.decision.parts
     return Repeated(

@@ -49,6 +49,8 @@ class Candidates:
     """Smallest loss first."""
     influences: tuple[Direction, ...]
     """Changes of the residuals by the candidates."""
+    incomplete: bool = False
+    """Whether those were fitted, too, that are not significant by themselves."""
 
     def variance_ratio(self, directions: Directions) -> float | None:
         """Mean variance of the candidates' influence beyond what this recording and the robot file explain, as a share
@@ -139,20 +141,23 @@ class Screening:
             )
         return self.tested(base, len(base), self._directions.scaled(base), influences)
 
-    def candidates(self, base: Effects, fixed: int, number: str) -> Candidates:
+    def candidates(self, base: Effects, fixed: int, number: str, *, incomplete: bool = False) -> Candidates:
         """A quick fit and a test of every effect in addition to a base; kept, for it is asked for again.
 
         Args:
             base: effects in the model.
             fixed: number of those whose values were measured.
             number: of the round, for the progress.
+            incomplete: whether it is known that something is missing: then effects are fitted that are not significant
+                by themselves, too.
         """
         key = tuple((name, *values.values()) for name, values in base)
-        if key not in self._done:
-            self._done[key] = self._screened(base, fixed, number)
-        return self._done[key]
+        known = self._done.get(key)
+        if known is None or (incomplete and not known.incomplete):
+            self._done[key] = known = self._screened(base, fixed, number, incomplete)
+        return known
 
-    def _screened(self, base: Effects, fixed: int, number: str) -> Candidates:
+    def _screened(self, base: Effects, fixed: int, number: str, incomplete: bool) -> Candidates:
         residual = self._sparse.residuals([base])[0] / self._sparse_scale
         names = {name for name, _ in base}
         tried: list[tuple[float, Effect, Effects]] = []
@@ -163,19 +168,23 @@ class Screening:
             tried.append(self._tried(effect, base, residual))
         tried.sort(key=lambda entry: entry[0])
         residual = self._directions.scaled(base)
-        influences = [self._directions.influence(base, start[-1]) for _, _, start in tried]
-        tests = self.tested(base, fixed, residual, influences)
+        possible = np.ones(len(tried), bool)
+        if not incomplete:
+            influences = [self._directions.influence(base, start[-1]) for _, _, start in tried]
+            possible = np.array([test.p <= _HOPELESS for test in self.tested(base, fixed, residual, influences)])
         # Only what may be significant, and promises to reduce the loss, is fitted; others keep their initial values.
         fits = []
         for rank, (_, effect, start) in enumerate(tried):
-            promising = tests[rank].p <= _HOPELESS and (rank < _FITTED or len(effect.identified) > 1)
+            promising = possible[rank] and (rank < _FITTED or len(effect.identified) > 1)
             fits.append(self.quick_fit(start, len(base), 2 if promising else 0))
-            if fits[-1][0] != start:
-                influences[rank] = self._directions.influence(base, fits[-1][0][-1])
+        influences = [
+            influences[rank] if not incomplete and fit == start else self._directions.influence(base, fit[-1])
+            for rank, ((_, _, start), (fit, _)) in enumerate(zip(tried, fits, strict=True))
+        ]
         tests = self.tested(base, fixed, residual, influences)
         screened = [Screened(effects, loss, test) for (effects, loss), test in zip(fits, tests, strict=True)]
         ordered = tuple(sorted(screened, key=lambda entry: entry.loss))
-        return Candidates(self.quick_loss(base), ordered, tuple(influences))
+        return Candidates(self.quick_loss(base), ordered, tuple(influences), incomplete)
 
     def _tried(self, effect: Effect, base: Effects, residual: np.ndarray) -> tuple[float, Effect, Effects]:
         """Loss that an effect promises on every fourth window, and the best of its initial values.
@@ -205,22 +214,21 @@ class Screening:
         return starts
 
 
-def admitted(screened: Sequence[Screened], before: float, rate: float) -> list[Screened]:
+def admitted(screened: Sequence[Screened], before: float, rate: float, *, incomplete: bool = False) -> list[Screened]:
     """Candidates that are cross-validated, in their order.
 
-    That something is missing has to be shown among all candidates: one of them must be significant after adjustment.
-    Which it is, is then a choice between explanations: every effect that is significant by itself takes part in it, for
-    the best one may be the least certain (low friction varies most on the healthy robot, too).
+    That something is missing has to be shown: by one of all candidates that is significant after adjustment, or by the
+    size of what is left. Which it is, is then a choice between explanations, by what each predicts. The best one may be
+    the least certain: fast driving alone shows a drag, and low friction varies most on the healthy robot, too.
 
     Args:
         screened: candidates after their quick fits.
         before: loss without any of them.
-        rate: error rate of both steps.
+        rate: error rate.
+        incomplete: whether it is known that something is missing.
     """
     better = [entry for entry in screened if entry.loss < before]
-    if not any(entry.test.adjusted <= rate for entry in better):
-        return []
-    return [entry for entry in better if entry.test.p <= rate]
+    return better if incomplete or any(entry.test.adjusted <= rate for entry in better) else []
 
 
 def _changed(effect: Effect, values: Mapping[str, float], known: Mapping[str, float]) -> dict[str, float]:

@@ -10,7 +10,7 @@ again, and may be dropped or replaced.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import t as student_distribution
@@ -27,8 +27,9 @@ from monoforce_ros.discrepancy.fit import (
     scales,
     without,
 )
-from monoforce_ros.discrepancy.hypothesis import Effects, EvidenceWindows, Predictions
+from monoforce_ros.discrepancy.hypothesis import Effects, EvidenceWindows, Predictions, residuals_by_part
 from monoforce_ros.discrepancy.learned import learned_terms
+from monoforce_ros.discrepancy.left_out import values_without_parts
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.screening import Screening, admitted
 from monoforce_ros.discrepancy.thresholds import Thresholds
@@ -47,10 +48,26 @@ from monoforce_ros.discrepancy.trial import (
 from monoforce_ros.effects import CATALOGUE, separating_sensor
 from monoforce_ros.robots import RobotModel
 
-_JUDGED = 6
-"""Significant effects that are cross-validated in one round, those with the smallest screening loss first."""
-_ALTERNATIVES = 2
+_JUDGED = 4
+"""Effects that are cross-validated in one round, those with the smallest screening loss first."""
+_PROMISING = 0.5
+"""Share of the best gain on held-out windows that an effect must promise on those of its quick fit to be judged. It
+only saves time: effects that promise half as much hardly predict more."""
+_HOPELESS = 0.5
+"""Effects that explain less than this share of what an explanation must explain (``most_share``) are neither exchanged
+nor replaced by combinations with another beginning: it only saves time on what is unknown anyway."""
+_ALTERNATIVES = 1
 """Combinations that do not begin with the best single effect and are tried where that one leads to no good fit."""
+
+
+@dataclass(frozen=True)
+class _Size:
+    """The size of residuals beside those of a healthy robot."""
+
+    above: float
+    """Logarithm of the ratio of the losses."""
+    p: float
+    """p-value of a healthy drive as large."""
 
 
 class Search:
@@ -93,24 +110,10 @@ class Search:
             progress=progress,
         )  # fmt: skip
         starts = data.starts
-        folds = folds_of(starts)
-        # A window that reaches into the next block shares motion with windows of the held-out fold.
-        ends = folds_of(np.r_[starts[0], starts + round(data.horizon * 1e9)])[1:]
-        self._split = []
-        for held_out in range(FOLDS):
-            fitted = (folds != held_out) & (ends != held_out)
-            if fitted.sum() < 4:
-                fitted = folds != held_out
-            self._split.append(
-                (
-                    Predictions(robot, replace(data, starts=starts[fitted])),
-                    self.scale[fitted],
-                    Predictions(robot, replace(data, starts=starts[folds == held_out])),
-                    folds == held_out,
-                )
-            )
+        self._folds = folds_of(starts)
+        self._ends = folds_of(np.r_[starts[0], starts + round(data.horizon * 1e9)])[1:]
         self._own = dict(robot.effects)
-        self._fits: dict[tuple[str, ...], Fit] = {}
+        self._fits: dict[tuple[tuple[str, ...], ...], Fit] = {}
 
     def run(self, most_effects: int, *, exchange: bool = True) -> Outcome:
         """Add effects while a further one is significant, then test each in the presence of the others.
@@ -139,12 +142,15 @@ class Search:
             # The effect that explains most alone need not be part of the best combination.
             if fit.passed(self.thresholds) or most_effects < 2:
                 break
+            if fit.explained < _HOPELESS * self.thresholds.most_share:
+                break
             extended, listed = self._extended(other, most_effects)
             tried += listed
             gain, low = self._gain(best, extended)
             if low > 0 and gain > self.thresholds.smallest_share * nominal.loss:
                 best, fit = extended, self.fit_test(extended, nominal)
-        exchanged, indistinguishable = self._exchanged(best) if exchange else (best, {})
+        hopeless = fit.explained < _HOPELESS * self.thresholds.most_share
+        exchanged, indistinguishable = self._exchanged(best) if exchange and not hopeless else (best, {})
         if exchanged is not best:
             best, fit = exchanged, self.fit_test(exchanged, nominal)
         return Outcome(nominal, best, fit, tuple(tried), ratio, indistinguishable)
@@ -184,25 +190,32 @@ class Search:
         """Robust loss of each window, ``[W]``."""
         return robust(self.predictions.residuals([effects])[0] / self.scale)
 
-    def judge(self, effects: Effects, iterations: int = 4) -> Trial:
-        """Cross-validate: fit without each fold, and judge on it."""
-        held_out_loss = np.zeros(len(self.data.starts))
-        parts, losses = [], []
-        for fitted, scale, judged, where in self._split:
-            fit = fit_effects(fitted, [effects], scale, iterations=iterations, free=self.fixed_count(effects))
-            held_out_loss[where] = robust(judged.residuals([fit.effects])[0] / self.scale[where])
-            parts.append(fit.effects)
-            losses.append(float(fit.loss.mean()) + float(held_out_loss[where].mean()))
-        return Trial(parts[int(np.argmin(losses))], tuple(parts), held_out_loss)
+    def judge(self, effects: Effects) -> Trial:
+        """Cross-validate: judge each fold with the values that the effects have without it."""
+        fit = self.refit(effects)
+        unchanged = np.concatenate([self._without(name, values) for name, values in fit.effects] or [np.zeros(0)])
+        parts = values_without_parts(fit, self._folds, self._ends, FOLDS, unchanged)
+        residuals = residuals_by_part(self.robot, self.data, self._folds, parts)
+        return Trial(fit.effects, parts, robust(residuals / self.scale))
+
+    def _without(self, name: str, values: Mapping[str, float]) -> np.ndarray:
+        """Values of an effect's parameters on the nominal robot."""
+        in_file = {} if CATALOGUE[name].stage == "measurement" else dict(self._own.get(name, {}))
+        known = {parameter.name: parameter.neutral for parameter in CATALOGUE[name].parameters}
+        return np.array([float(in_file.get(key, known[key])) for key in values])
 
     def refit(self, effects: Effects) -> Fit:
-        """Fit to the whole recording."""
-        names = tuple(name for name, _ in effects)
-        if names not in self._fits:
-            self._fits[names] = fit_effects(
-                self.predictions, [effects], self.scale, iterations=6, free=self.fixed_count(effects)
-            )
-        return self._fits[names]
+        """Fit to the whole recording; kept, and fitted anew from values that explain it better."""
+        key = tuple((name, *values) for name, values in effects)
+        known = self._fits.get(key)
+        if known is not None and (
+            known.effects == effects or float(self.loss_of(effects).mean()) >= float(known.loss.mean())
+        ):
+            return known
+        self._fits[key] = fit_effects(
+            self.predictions, [effects], self.scale, iterations=4, free=self.fixed_count(effects)
+        )
+        return self._fits[key]
 
     def healthy_variances(self, fit: Fit) -> np.ndarray:
         """Variance of each parameter of a fit if its effect varies as much as on the healthy robot, ``[P]``."""
@@ -273,24 +286,32 @@ class Search:
         least = self.thresholds.smallest_share * nominal.loss
         strongest = min((test for test in tests if test.gain > least), key=lambda test: test.adjusted, default=None)
         p, name = (1.0, "") if strongest is None else (strongest.adjusted, strongest.name)
-        healthy, spread = self.nominal, self.thresholds.drive_spread
-        if healthy is not None and healthy.segments > 1:
-            # An effect of the right kind leaves some of what it does: no formula is exact.
-            change = self.directions.scaled(base) - self.directions.scaled(base[:fixed])
-            expected = expected_loss(healthy.loss, change, self.thresholds.model_error)
-            above = np.log(max(trial.loss, 1e-9) / expected)
-            size = float(student_distribution.sf(above / spread, self.thresholds.calibration_degrees))
-            if above < spread:
+        size = self._size(trial)
+        if self.nominal is not None and size is not None:
+            if size.above < self.thresholds.drive_spread:
                 # What is about as small as on the healthy robot is nothing that is missing.
                 p, name = 1.0, ""
-            if trial.loss - healthy.loss > least and size < p:
-                p, name = size, "residuals that are too large"
+            if trial.loss - self.healthy_loss > least and size.p < p:
+                p, name = size.p, "residuals that are too large"
             # Two tests: the smaller p-value of two has twice the rate.
             p = min(1.0, 2.0 * p)
         explained = 1.0
         if self.nominal is not None and self.nominal.segments > 0 and trial.effects:
             explained = excess_share(nominal.loss, trial.loss, self.healthy_loss)
         return FitTest(p, name, tuple(tests), explained)
+
+    def _size(self, trial: Trial) -> _Size | None:
+        """How much larger a trial's residuals are than a healthy robot's; None where these are unknown."""
+        healthy = self.nominal
+        if healthy is None or healthy.segments < 2:
+            return None
+        base = self.refit(trial.effects).effects if trial.effects else ()
+        # An effect of the right kind leaves some of what it does: no formula is exact.
+        change = self.directions.scaled(base) - self.directions.scaled(base[: self.fixed_count(base)])
+        expected = expected_loss(healthy.loss, change, self.thresholds.model_error)
+        above = float(np.log(max(trial.loss, 1e-9) / expected))
+        degrees = self.thresholds.calibration_degrees
+        return _Size(above, float(student_distribution.sf(above / self.thresholds.drive_spread, degrees)))
 
     def fixed_count(self, effects: Effects) -> int:
         """Number of leading effects that keep the values which another sensor measured."""
@@ -299,9 +320,15 @@ class Search:
     def _round(self, best: Trial, number: int, rate: float) -> tuple[list[Trial], list[CandidateScore]]:
         """Trials with one more effect that is significant, smallest held-out loss first, and the scores of all."""
         base = self.refit(best.effects).effects if best.effects else ()
-        found = self.screening.candidates(base, self.fixed_count(base), f"{number}: ")
-        judged = []
-        for entry in admitted(found.screened, found.before, rate)[:_JUDGED]:
+        # Two tests of the nominal model: the size of its residuals, and their directions. Beside effects that were
+        # found the size only shows that these are not exact.
+        size = self._size(best) if number == 1 else None
+        incomplete = size is not None and 2.0 * size.p <= self.thresholds.fit_rate
+        found = self.screening.candidates(base, self.fixed_count(base), f"{number}: ", incomplete=incomplete)
+        judged: list[Trial] = []
+        for entry in admitted(found.screened, found.before, rate, incomplete=incomplete)[:_JUDGED]:
+            if judged and found.before - entry.loss < _PROMISING * (best.loss - min(trial.loss for trial in judged)):
+                break
             self._progress(f"{number}: {entry.name}, judged")
             judged.append(self.judge(entry.effects))
         listed = []

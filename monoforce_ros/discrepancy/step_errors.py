@@ -52,7 +52,7 @@ def compare_after_steps(evidence: Evidence, robot: RobotModel, effects: Effects)
             after[folds == fold] = _distance(predictions(at[folds == fold]), fit.effects)
         return before, after
 
-    return compare_on_steps(motion, evidence.commands, starts, folds_of(starts), errors)
+    return compare_on_steps(motion, evidence.commands, starts, folds_of(starts, 2), errors)
 
 
 def _distance(predictions: Predictions, effects: Effects) -> np.ndarray:

@@ -52,6 +52,6 @@ class Thresholds:
     drive_spread: float = 0.35
     calibration_degrees: float = 25.0
     drive_share: float = 0.5
-    model_error: float = 0.15
+    model_error: float = 0.3
     smallest_share: float = 0.05
     most_share: float = 0.5

@@ -14,7 +14,9 @@ from monoforce_ros.discrepancy.thresholds import Thresholds
 
 HEALTHY_LOSS = 0.5
 """Robust loss of residuals as large as their scale: half the square of a standard deviation."""
-FOLDS = 2
+FOLDS = 8
+"""Parts that are held out in turn: each block of a recording of a minute. Half of a recording shows an effect in half
+as many manoeuvres, and its values scatter twice as much."""
 BLOCK = 8.0
 """Length of the blocks that are held out together [s]: longer than a window."""
 
@@ -24,9 +26,9 @@ class Trial:
     """Effects that were fitted and judged by their held-out loss."""
 
     effects: Effects
-    """With the values of the fold whose fit has the smaller loss."""
+    """With the values fitted to the whole recording."""
     parts: tuple[Effects, ...]
-    """Effects fitted with each fold left out."""
+    """Effects with the values that they have without each fold."""
     held_out_loss: np.ndarray
     """Loss of each window with the effects fitted without its fold, ``[W]``."""
 
@@ -109,9 +111,9 @@ def expected_loss(healthy: float, change: np.ndarray, model_error: float) -> flo
     return healthy + float(robust(model_error * change).mean())
 
 
-def folds_of(starts: np.ndarray) -> np.ndarray:
-    """Fold of each window: alternating blocks."""
-    return ((starts - starts[0]) // round(BLOCK * 1e9)).astype(int) % FOLDS
+def folds_of(starts: np.ndarray, count: int = FOLDS) -> np.ndarray:
+    """Fold of each window: its block, in turn."""
+    return ((starts - starts[0]) // round(BLOCK * 1e9)).astype(int) % count
 
 
 def blocks_of(starts: np.ndarray) -> np.ndarray:

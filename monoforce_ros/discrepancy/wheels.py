@@ -56,6 +56,8 @@ class WheelFinding:
     """Blocks of the recording that were used."""
     all_blocks: int = 0
     """Blocks of the recording in which the robot was driven by commands."""
+    ruled_out: tuple[str, ...] = ()
+    """Further effects whose confidence interval holds no value that would count."""
 
     def summary(self) -> str:
         """One sentence for reports."""
@@ -116,6 +118,7 @@ def compare_with_wheels(commands: CommandTrack, wheels: WheelTrack | None, robot
         ratio,
         used_blocks=len(blocks),
         all_blocks=len(found),
+        ruled_out=tuple(_ruled_out(best.names, values, blocks)),
     )
 
 
@@ -124,7 +127,7 @@ def changed_drives(wheels: WheelFinding, robot: RobotModel) -> tuple[Effects, tu
 
     Returns:
         the effects whose value differs from the file's by more than its confidence interval, with the values of the
-        wheels; and the names of the other effects that wheels show, which did not change.
+        wheels; and the names of those that did not change.
     """
     in_file, shown = dict(robot.effects), dict(wheels.effects)
     half_widths = dict(zip(shown, wheels.half_widths, strict=True))
@@ -137,6 +140,9 @@ def changed_drives(wheels: WheelFinding, robot: RobotModel) -> tuple[Effects, tu
         value = float(shown[effect.name][response.parameter]) if effect.name in shown else neutral
         # Of an effect that the wheels do not show the half-width is unknown: the largest one stands for it.
         half_width = half_widths.get(effect.name, max(wheels.half_widths, default=0.0))
+        if effect.name not in shown and expected == neutral and effect.name not in wheels.ruled_out:
+            # The wheels neither show it nor rule it out.
+            continue
         if value == expected or abs(value - expected) <= half_width:
             unchanged.append(effect.name)
         elif np.isfinite(value):
@@ -352,6 +358,33 @@ def _weak(model: _Model, blocks: _Blocks) -> list[str]:
     ]
 
 
+def _ruled_out(names: tuple[str, ...], values: np.ndarray, blocks: _Blocks) -> Iterator[str]:
+    """Effects that a model does not hold, and that would count only at values which the wheels contradict.
+
+    That a selection leaves an effect out does not show that it is absent: noise may hide it, or another effect stand in
+    for it. Each is therefore fitted beside the others, and its confidence interval looked at.
+    """
+    for effect in wheel_effects():
+        if effect.name in names:
+            continue
+        together = tuple(e.name for e in wheel_effects() if e.name in names or e.name == effect.name)
+        known = _Model(names, values, np.zeros(0))
+        fitted = _fit(together, blocks, _starts(together, blocks.fastest, known))
+        place = together.index(effect.name)
+        value, half_width = float(fitted[place]), float(_half_widths(fitted, together, blocks)[place])
+        ends = (value - half_width, value + half_width)
+        if np.isfinite(ends).all() and not any(_response(effect.name).counts(end, blocks.fastest) for end in ends):
+            yield effect.name
+
+
+def _bounds(name: str, fastest: Fastest) -> tuple[float, float]:
+    """Bounds of a fit: values that the catalogue allows, for they become initial values of other fits."""
+    response = _response(name)
+    parameter = next(p for p in CATALOGUE[name].parameters if p.name == response.parameter)
+    low, high = (float(np.clip(end, parameter.low, parameter.high)) for end in response.bounds(fastest))
+    return low, max(high, low + 1e-3)
+
+
 def _response(name: str) -> WheelResponse:
     response = CATALOGUE[name].wheel_response
     assert response is not None, name
@@ -395,7 +428,7 @@ def _fit(names: tuple[str, ...], blocks: _Blocks, starts: Sequence[np.ndarray]) 
     if not names:
         return np.zeros(0)
     fastest = blocks.fastest
-    bounds = np.array([_response(name).bounds(fastest) for name in names])
+    bounds = np.array([_bounds(name, fastest) for name in names])
     inside = [np.clip(start, bounds[:, 0] + 1e-6, bounds[:, 1] - 1e-6) for start in starts]
     start = min(inside, key=lambda values: _block_losses(values, names, blocks, fastest.speed).sum())
     return least_squares(
@@ -410,8 +443,10 @@ def _half_widths(values: np.ndarray, names: tuple[str, ...], blocks: _Blocks) ->
     derivatives = []
     for i, value in enumerate(values):
         step = max(0.01 * abs(value), 1e-3)
-        shifted = [_residuals(values + sign * step * np.eye(len(values))[i], names, blocks) for sign in (1, -1)]
-        derivatives.append((shifted[0] - shifted[1]) / (2 * step))
+        # A dead time of less than none is not defined.
+        ends = np.clip((value - step, value + step), *_bounds(names[i], blocks.fastest))
+        shifted = [_residuals(values + (end - value) * np.eye(len(values))[i], names, blocks) for end in ends]
+        derivatives.append((shifted[1] - shifted[0]) / (ends[1] - ends[0]))
     jacobian = np.array(derivatives)
     top = blocks.fastest.speed
     weight = 1.0 / np.sqrt(1.0 + (base / (0.05 * top)) ** 2)

@@ -1,0 +1,110 @@
+"""Left out: values without a part of a recording follow from one step of the fit, and equal those of a new fit."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from monoforce_ros.core import CommandTrack, MotionTrack
+from monoforce_ros.discrepancy.fit import fit_effects, flat, robust
+from monoforce_ros.discrepancy.hypothesis import EvidenceWindows, Predictions, residuals_by_part, window_starts
+from monoforce_ros.discrepancy.left_out import values_without_parts
+from monoforce_ros.discrepancy.selection import Search
+from monoforce_ros.discrepancy.trial import FOLDS, folds_of
+from monoforce_ros.effects import drive_speeds
+from monoforce_ros.physics import State, rollout
+from monoforce_ros.robots import load_robot
+from monoforce_ros.terrain import Grid, TerrainMap
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+SAMPLES = np.array([0.5, 1.0, 1.5, 2.0])
+SCALE = np.tile([0.02, 0.02, 0.01], (4, 1))
+
+
+def _recording(effects, *, fast_from=0.0, noise=0.004):
+    """64 s of a Husky with effects, with noise on its poses; it drives fast only after ``fast_from`` [s]."""
+    husky = load_robot("husky")
+    random = np.random.default_rng(3)
+    steps = 6400
+    commanded = np.repeat(random.uniform([0.1, -0.8], [0.9, 0.8], (43, 2)), 150, axis=0)[:steps]
+    commanded[: round(fast_from / 0.01), 0] *= 0.15
+    robot = replace(husky, effects=effects)
+    speeds = drive_speeds(robot, torch.as_tensor(commanded[None], dtype=torch.float32), 0.01)
+    level = TerrainMap.flat(Grid.square(2.0, 1.0))
+    result = rollout(level, robot, speeds, State.at_rest(0.13), with_forces=False)
+    rotations = Rotation.from_matrix(result.rotation[0, ::5].double().numpy())
+    positions = result.position[0, ::5].double().numpy()
+    motion = MotionTrack(
+        stamps=np.arange(len(rotations), dtype=np.int64) * 50_000_000,
+        positions=positions + noise * random.standard_normal(positions.shape),
+        quaternions=rotations.as_quat(),
+        linear_velocities=rotations.inv().apply(result.velocity[0, ::5].double().numpy()),
+        angular_velocities=rotations.inv().apply(result.angular_velocity[0, ::5].double().numpy()),
+    )
+    commands = CommandTrack(np.arange(steps, dtype=np.int64) * 10_000_000, commanded)
+    return EvidenceWindows(motion, commands, window_starts(motion, [slice(0, len(motion))], 2.0, 1.0), 2.0, SAMPLES)
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [
+        (("drive_gain", {"gain": 0.85}),),
+        (("viscous_drag", {"coefficient": 200.0}), ("drive_asymmetry", {"difference": 0.1})),
+        (("command_delay", {"delay": 0.2}),),
+    ],
+)
+def test_one_step_equals_a_new_fit_without_the_part(effects):
+    data = _recording(effects)
+    husky = load_robot("husky")
+    folds = folds_of(data.starts)
+    ends = folds_of(np.r_[data.starts[0], data.starts + 2_000_000_000])[1:]
+    fit = fit_effects(Predictions(husky, data), [effects], SCALE)
+    found = values_without_parts(fit, folds, ends, FOLDS, np.full(len(flat(effects)), np.nan))
+    moved = []
+    for part in range(FOLDS):
+        kept = (folds != part) & (ends != part)
+        again = fit_effects(Predictions(husky, replace(data, starts=data.starts[kept])), [fit.effects], SCALE)
+        half_width = np.sqrt(np.diag(fit.covariance))
+        assert np.abs(flat(found[part]) - flat(again.effects)) == pytest.approx(0.0, abs=1.0 * half_width.max())
+        moved.append(np.abs(flat(found[part]) - flat(fit.effects)) / half_width)
+    # The parts matter: the values without them differ from each other.
+    assert 0.01 < np.max(moved) < 5.0
+
+
+def test_what_one_part_alone_shows_is_not_known_without_it():
+    data = _recording((("quadratic_drag", {"coefficient": 250.0}),), fast_from=56.0)
+    search = Search(load_robot("husky"), data, SCALE)
+    trial = search.judge((("quadratic_drag", {"coefficient": 200.0}),))
+    values = [effects[0][1]["coefficient"] for effects in trial.parts]
+    last = folds_of(data.starts)[-1]
+    others = np.delete(values, last)
+    # The part that holds the fast drive moves the value by far more than any other.
+    assert abs(values[last] - np.median(others)) > 5.0 * np.ptp(others)
+
+
+def test_each_window_is_judged_with_the_values_without_its_part():
+    data = _recording((("drive_gain", {"gain": 0.8}),))
+    husky = load_robot("husky")
+    parts = folds_of(data.starts)
+    effects = tuple((("drive_gain", {"gain": 0.7 + 0.05 * part}),) for part in range(FOLDS))
+    found = residuals_by_part(husky, data, parts, effects)
+    everywhere = Predictions(husky, data).residuals(list(effects))
+    assert found == pytest.approx(everywhere[parts, np.arange(len(parts))], abs=1e-6)
+    trial = Search(husky, data, SCALE).judge((("drive_gain", {"gain": 0.8}),))
+    assert trial.held_out_loss == pytest.approx(
+        robust(residuals_by_part(husky, data, parts, trial.parts) / SCALE), abs=1e-6
+    )
+
+
+def test_a_fit_is_kept_by_the_parameters_that_it_holds_and_improved_from_better_values():
+    data = _recording((("drive_gain", {"gain": 0.8}),))
+    search = Search(load_robot("husky"), data, SCALE)
+    one = search.refit((("learned_term", {"force_x:vx": -10.0}),))
+    two = search.refit((("learned_term", {"force_x:vx": -10.0, "torque_z:wz": -5.0}),))
+    assert len(flat(one.effects)) == 1 and len(flat(two.effects)) == 2
+    poor = search.refit((("sensor_yaw_offset", {"angle": 3.0}),))
+    better = search.refit((("sensor_yaw_offset", {"angle": 0.0}),))
+    assert better.loss.mean() <= poor.loss.mean()
