@@ -30,15 +30,14 @@ class Thresholds:
         calibration_degrees: degrees of freedom of these two: the number of platforms, for the two drives of each share
             a commissioning drive.
         model_error: error of an effect's formula as a share of what the effect changes, root mean square in any one
-            direction: no formula holds exactly on another engine or robot. Set by judgement: rolling resistance and
-            friction of the own simulator keep their names with it. ``benchmarks/platforms/true_effects.py`` prints
-            what all that the true effect leaves is beside what it changes, on other engines: 0.31 in the median of
-            the 27 drives of the choosing set on which a single effect is visible.
+            direction: no formula holds exactly on another engine or robot. All that the true effect leaves, beside what
+            it changes, is 0.34 (root mean square) on the 20 singles and pairs of the MuJoCo platforms 1022 to 1038 for
+            choosing on which it is visible (``benchmarks/platforms/true_effects.py``); a little less is assumed.
         smallest_share: smallest share of a loss that an effect must remove (of the loss without it, but at least the
             healthy robot's), or a rest must make up (of the nominal model's), to be reported: the loss is quadratic,
             so a twentieth of it is an error of less than a quarter (√0.05) of the error that was there.
         most_share: smallest share of the excess loss, that above a healthy robot's, which effects must explain to be
-            the explanation: most of it, by definition. What explains less is reported as a known part. On those 27
+            the explanation: most of it, by definition. What explains less is reported as a known part. On 27 such
             drives the true effect explains 0.79 in the median, and less than half on five (the same command).
     """
 
