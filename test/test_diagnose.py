@@ -270,7 +270,7 @@ def test_without_a_discrepancy_nothing_is_added(husky):
     ("injected", "verdict", "reason"),
     [
         (("drive_gain", {"gain": 0.8}), Verdict.NO_IMPROVEMENT, "do not decrease beyond chance"),
-        (("learned_term", {"torque_z:vx|vx|": 150.0}), Verdict.UNKNOWN_EFFECT, "the formula is not added"),
+        (("learned_term", {"force_y:vx|vx|": 200.0}), Verdict.UNKNOWN_EFFECT, "the formula is not added"),
     ],
 )
 def test_what_does_not_improve_held_out_windows_is_not_added(husky, monkeypatch, injected, verdict, reason):

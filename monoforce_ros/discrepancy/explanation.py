@@ -115,7 +115,8 @@ def explain(
         starts = windows.data.starts
         trials = [outcome.best]
         second = starts >= np.median(starts)
-        if second.sum() >= FEWEST_WINDOWS:
+        unexplained = not outcome.best.effects or outcome.fit.explained < thresholds.most_share
+        if unexplained and second.sum() >= FEWEST_WINDOWS:
             # An effect that begins late may be too weak over the whole recording, or another one stand in for it.
             trials.append(search.judge(searched(windows[second]).run(1, exchange=False).best.effects))
         onsets = [found for found in (find_onset(search, trial) for trial in trials) if found is not None]

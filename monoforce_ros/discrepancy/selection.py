@@ -48,7 +48,7 @@ from monoforce_ros.discrepancy.trial import (
 from monoforce_ros.effects import CATALOGUE, separating_sensor
 from monoforce_ros.robots import RobotModel
 
-_JUDGED = 4
+_JUDGED = 6
 """Effects that are cross-validated in one round, those with the smallest screening loss first."""
 _PROMISING = 0.5
 """Share of the best gain on held-out windows that an effect must promise on those of its quick fit to be judged. It
@@ -205,7 +205,7 @@ class Search:
         return np.array([float(in_file.get(key, known[key])) for key in values])
 
     def refit(self, effects: Effects) -> Fit:
-        """Fit to the whole recording; kept, and fitted anew from values that explain it better."""
+        """Fit to the whole recording; kept, and repeated from values that explain it better."""
         key = tuple((name, *values) for name, values in effects)
         known = self._fits.get(key)
         if known is not None and (
@@ -213,7 +213,7 @@ class Search:
         ):
             return known
         self._fits[key] = fit_effects(
-            self.predictions, [effects], self.scale, iterations=4, free=self.fixed_count(effects)
+            self.predictions, [effects], self.scale, iterations=6, free=self.fixed_count(effects)
         )
         return self._fits[key]
 
@@ -325,8 +325,12 @@ class Search:
         size = self._size(best) if number == 1 else None
         incomplete = size is not None and 2.0 * size.p <= self.thresholds.fit_rate
         found = self.screening.candidates(base, self.fixed_count(base), f"{number}: ", incomplete=incomplete)
+        entries = admitted(found.screened, found.before, rate, incomplete=incomplete)
+        if self.nominal is None or self.nominal.segments < 2:
+            # Nothing tells whether an effect explains enough: it must be significant by itself.
+            entries = [entry for entry in entries if entry.test.p <= rate]
         judged: list[Trial] = []
-        for entry in admitted(found.screened, found.before, rate, incomplete=incomplete)[:_JUDGED]:
+        for entry in entries[:_JUDGED]:
             if judged and found.before - entry.loss < _PROMISING * (best.loss - min(trial.loss for trial in judged)):
                 break
             self._progress(f"{number}: {entry.name}, judged")
