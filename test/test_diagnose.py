@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from recorded_rollout import recorded
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import Recording, SmoothedMotion, builders, smooth
@@ -77,15 +78,7 @@ def simulated_recording(husky, effects, seconds=24.0):
     speeds = drive_speeds(robot, torch.as_tensor(commanded[None], dtype=torch.float32), 0.01)
     terrain = TerrainMap.flat(Grid.square(2.0, 1.0))
     result = rollout(terrain, robot, speeds, State.at_rest(0.13), with_forces=False)
-    rotations = Rotation.from_matrix(result.rotation[0, ::5].double().numpy())
-    stamps = (10**9 + np.arange(len(rotations)) * 50_000_000).astype(np.int64)
-    motion = MotionTrack(
-        stamps=stamps,
-        positions=result.position[0, ::5].double().numpy(),
-        quaternions=rotations.as_quat(),
-        linear_velocities=rotations.inv().apply(result.velocity[0, ::5].double().numpy()),
-        angular_velocities=rotations.inv().apply(result.angular_velocity[0, ::5].double().numpy()),
-    )
+    motion = recorded(result, 10**9)
     commands = CommandTrack(10**9 + np.arange(steps) * 10_000_000, commanded)
     return recorded_motion(motion, robot), recorded_commands(commands, robot)
 
@@ -270,7 +263,7 @@ def test_without_a_discrepancy_nothing_is_added(husky):
     ("injected", "verdict", "reason"),
     [
         (("drive_gain", {"gain": 0.8}), Verdict.NO_IMPROVEMENT, "do not decrease beyond chance"),
-        (("learned_term", {"force_y:vx|vx|": 200.0}), Verdict.UNKNOWN_EFFECT, "the formula is not added"),
+        (("learned_term", {"torque_z:vx|vx|": 400.0}), Verdict.UNKNOWN_EFFECT, "the formula is not added"),
     ],
 )
 def test_what_does_not_improve_held_out_windows_is_not_added(husky, monkeypatch, injected, verdict, reason):

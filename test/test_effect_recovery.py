@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
+from recorded_rollout import recorded
 
-from monoforce_ros.core import CommandTrack, MotionTrack
+from monoforce_ros.core import CommandTrack
 from monoforce_ros.discrepancy.fit import first_values, fit_effects
 from monoforce_ros.discrepancy.hypothesis import EvidenceWindows, Predictions, window_starts
 from monoforce_ros.discrepancy.selection import Search
@@ -36,14 +36,7 @@ def driven(robot, terrain=None):
     speeds = drive_speeds(robot, torch.as_tensor(commanded[None], dtype=torch.float32), 0.01)
     ground = TerrainMap.flat(Grid.square(2.0, 1.0)) if terrain is None else terrain
     result = rollout(ground, robot, speeds, State.at_rest(0.14), with_forces=False)
-    rotations = Rotation.from_matrix(result.rotation[0, ::5].double().numpy())
-    motion = MotionTrack(
-        (10**9 + np.arange(len(rotations)) * 50_000_000).astype(np.int64),
-        result.position[0, ::5].double().numpy(),
-        rotations.as_quat(),
-        rotations.inv().apply(result.velocity[0, ::5].double().numpy()),
-        rotations.inv().apply(result.angular_velocity[0, ::5].double().numpy()),
-    )
+    motion = recorded(result, 10**9)
     commands = CommandTrack(10**9 + np.arange(len(commanded)) * 10_000_000, commanded)
     starts = window_starts(motion, [slice(0, len(motion))], 2.0, 1.0)
     return EvidenceWindows(motion, commands, starts, 2.0, SAMPLES, terrain, None if terrain is None else np.eye(4))

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
+from recorded_rollout import recorded
 
-from monoforce_ros.core import CommandTrack, MotionTrack
+from monoforce_ros.core import CommandTrack
 from monoforce_ros.discrepancy.fit import fit_effects, flat, robust
 from monoforce_ros.discrepancy.hypothesis import EvidenceWindows, Predictions, residuals_by_part, window_starts
 from monoforce_ros.discrepancy.left_out import values_without_parts
@@ -35,15 +35,8 @@ def _recording(effects, *, fast_from=0.0, noise=0.004):
     speeds = drive_speeds(robot, torch.as_tensor(commanded[None], dtype=torch.float32), 0.01)
     level = TerrainMap.flat(Grid.square(2.0, 1.0))
     result = rollout(level, robot, speeds, State.at_rest(0.13), with_forces=False)
-    rotations = Rotation.from_matrix(result.rotation[0, ::5].double().numpy())
-    positions = result.position[0, ::5].double().numpy()
-    motion = MotionTrack(
-        stamps=np.arange(len(rotations), dtype=np.int64) * 50_000_000,
-        positions=positions + noise * random.standard_normal(positions.shape),
-        quaternions=rotations.as_quat(),
-        linear_velocities=rotations.inv().apply(result.velocity[0, ::5].double().numpy()),
-        angular_velocities=rotations.inv().apply(result.angular_velocity[0, ::5].double().numpy()),
-    )
+    motion = recorded(result)
+    motion = replace(motion, positions=motion.positions + noise * random.standard_normal(motion.positions.shape))
     commands = CommandTrack(np.arange(steps, dtype=np.int64) * 10_000_000, commanded)
     return EvidenceWindows(motion, commands, window_starts(motion, [slice(0, len(motion))], 2.0, 1.0), 2.0, SAMPLES)
 
@@ -59,8 +52,8 @@ def _recording(effects, *, fast_from=0.0, noise=0.004):
 def test_one_step_equals_a_new_fit_without_the_part(effects):
     data = _recording(effects)
     husky = load_robot("husky")
-    folds = folds_of(data.starts)
-    ends = folds_of(np.r_[data.starts[0], data.starts + 2_000_000_000])[1:]
+    folds = folds_of(data.starts, FOLDS)
+    ends = folds_of(np.r_[data.starts[0], data.starts + 2_000_000_000], FOLDS)[1:]
     fit = fit_effects(Predictions(husky, data), [effects], SCALE)
     found = values_without_parts(fit, folds, ends, FOLDS, np.full(len(flat(effects)), np.nan))
     moved = []
@@ -79,7 +72,7 @@ def test_what_one_part_alone_shows_is_not_known_without_it():
     search = Search(load_robot("husky"), data, SCALE)
     trial = search.judge((("quadratic_drag", {"coefficient": 200.0}),))
     values = [effects[0][1]["coefficient"] for effects in trial.parts]
-    last = folds_of(data.starts)[-1]
+    last = folds_of(data.starts, FOLDS)[-1]
     others = np.delete(values, last)
     # The part that holds the fast drive moves the value by far more than any other.
     assert abs(values[last] - np.median(others)) > 5.0 * np.ptp(others)
@@ -88,7 +81,7 @@ def test_what_one_part_alone_shows_is_not_known_without_it():
 def test_each_window_is_judged_with_the_values_without_its_part():
     data = _recording((("drive_gain", {"gain": 0.8}),))
     husky = load_robot("husky")
-    parts = folds_of(data.starts)
+    parts = folds_of(data.starts, FOLDS)
     effects = tuple((("drive_gain", {"gain": 0.7 + 0.05 * part}),) for part in range(FOLDS))
     found = residuals_by_part(husky, data, parts, effects)
     everywhere = Predictions(husky, data).residuals(list(effects))

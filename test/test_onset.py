@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
+from recorded_rollout import recorded
 
-from monoforce_ros.core import CommandTrack, MotionTrack, WheelTrack
+from monoforce_ros.core import CommandTrack, WheelTrack
 from monoforce_ros.discrepancy.hypothesis import EvidenceWindows, window_starts
 from monoforce_ros.discrepancy.onset import find_onset
 from monoforce_ros.discrepancy.selection import Search
@@ -31,14 +31,7 @@ def _recording(begins: float) -> EvidenceWindows:
     acting = torch.arange(steps)[None, :, None] * 0.01 >= begins
     level = TerrainMap.flat(Grid.square(2.0, 1.0))
     result = rollout(level, husky, torch.where(acting, 0.75 * speeds, speeds), State.at_rest(0.13), with_forces=False)
-    rotations = Rotation.from_matrix(result.rotation[0, ::5].double().numpy())
-    motion = MotionTrack(
-        stamps=np.arange(len(rotations), dtype=np.int64) * 50_000_000,
-        positions=result.position[0, ::5].double().numpy(),
-        quaternions=rotations.as_quat(),
-        linear_velocities=rotations.inv().apply(result.velocity[0, ::5].double().numpy()),
-        angular_velocities=rotations.inv().apply(result.angular_velocity[0, ::5].double().numpy()),
-    )
+    motion = recorded(result)
     commands = CommandTrack(np.arange(steps, dtype=np.int64) * 10_000_000, commanded)
     starts = window_starts(motion, [slice(0, len(motion))], 2.0, 1.0)
     return EvidenceWindows(motion, commands, starts, 2.0, SAMPLES)

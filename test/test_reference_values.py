@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 import torch
 from conftest import ROOT
+from recorded_rollout import recorded
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import SmoothedMotion
-from monoforce_ros.core import CameraModel, CommandTrack, MotionTrack
+from monoforce_ros.core import CameraModel, CommandTrack
 from monoforce_ros.discrepancy import DiagnosisSettings, Evidence, diagnose
 from monoforce_ros.effects.catalogue import drive_speeds, recorded_commands, recorded_motion
 from monoforce_ros.encoder import CameraView, load_encoder
@@ -116,14 +117,7 @@ def diagnosis() -> dict:
     speeds = drive_speeds(robot, torch.as_tensor(twists[None], dtype=torch.float32), 0.01)
     flat = TerrainMap.flat(Grid.square(2.0, 1.0))
     result = rollout(flat, robot, speeds, State.at_rest(0.13), with_forces=False)
-    rotations = Rotation.from_matrix(result.rotation[0, ::5].double().numpy())
-    motion = MotionTrack(
-        stamps=(10**9 + np.arange(len(rotations)) * 50_000_000).astype(np.int64),
-        positions=result.position[0, ::5].double().numpy(),
-        quaternions=rotations.as_quat(),
-        linear_velocities=rotations.inv().apply(result.velocity[0, ::5].double().numpy()),
-        angular_velocities=rotations.inv().apply(result.angular_velocity[0, ::5].double().numpy()),
-    )
+    motion = recorded(result, 10**9)
     commands = CommandTrack(10**9 + np.arange(len(twists)) * 10_000_000, twists)
     motion, commands = recorded_motion(motion, robot), recorded_commands(commands, robot)
     smoothed = SmoothedMotion(motion, 0.003, 0.002, (slice(0, len(motion)),))

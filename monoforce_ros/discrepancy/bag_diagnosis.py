@@ -16,7 +16,7 @@ from monoforce_ros.discrepancy.credibility import complaint
 from monoforce_ros.discrepancy.diagnosis import Diagnosis, DiagnosisSettings, diagnose
 from monoforce_ros.discrepancy.gap import noisy_motions
 from monoforce_ros.discrepancy.ground import Ground, beyond_commissioning, choose_ground
-from monoforce_ros.discrepancy.hypothesis import Effects, Evidence, corrected_evidence, window_starts
+from monoforce_ros.discrepancy.hypothesis import Effects, Evidence, corrected_evidence, own_values, window_starts
 from monoforce_ros.discrepancy.motion_check import motion_faults
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.nominal_residual import residual_complaint
@@ -170,7 +170,7 @@ def diagnose_bag(
     robot_file = None
     # On ground that no map shows slopes pass for effects: nothing of that belongs into a robot file.
     credible = bool(diagnosis.effects) and not ground.unknown
-    if credible and all(not complaint(effect, _in_file(model, effect.name)) for effect in diagnosis.effects):
+    if credible and all(not complaint(effect, own_values(model, effect.name)) for effect in diagnosis.effects):
         effects = [effect_entry(effect) for effect in diagnosis.effects]
         robot_file = write_robot(robot, found_file, effects, [bag], data)
     elif found_file.exists():
@@ -226,12 +226,6 @@ def without_blame_for_ground(diagnosis: Diagnosis, unexplained: str, *, named: b
         noise_floor=diagnosis.noise_floor,
         commissioned=diagnosis.commissioned,
     )
-
-
-def _in_file(robot: RobotModel, name: str) -> dict[str, float]:
-    """Values of an effect in the robot's file; those of sensors and clocks are neutral for what adds to them."""
-    values = {} if CATALOGUE[name].stage == "measurement" else dict(robot.effects).get(name, {})
-    return {key: float(value) for key, value in values.items()}
 
 
 def _with_wheels(diagnosis: Diagnosis, evidence: Evidence, robot: RobotModel) -> Diagnosis:

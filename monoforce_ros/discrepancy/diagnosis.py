@@ -216,7 +216,7 @@ def diagnose(
         fitted=fitted,
         remarks=decision.remarks,
         losses=decision.losses,
-        commissioned=nominal is not None and nominal.segments > 0,
+        commissioned=search.commissioned,
         details=Details(data, before, floor, tuple(compared), paths),
     )
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from monoforce_ros.discrepancy.fit import without
-from monoforce_ros.discrepancy.hypothesis import Effects, Predictions
+from monoforce_ros.discrepancy.hypothesis import Effects, Predictions, own_values
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.score_test import Direction
 from monoforce_ros.discrepancy.thresholds import Thresholds
@@ -38,7 +38,6 @@ class Directions:
         self.predictions, self.scale, self.nominal = predictions, scale, nominal
         self.metric = 1.0 if nominal is None else scale / nominal.scale_in(predictions.data)
         self._thresholds = thresholds
-        self._own = dict(predictions.robot.effects)
         self._rolled: dict[tuple[tuple[object, ...], ...], np.ndarray] = {}
 
     def scaled(self, effects: Effects) -> np.ndarray:
@@ -72,9 +71,7 @@ class Directions:
         """
         name, values = effect
         known = {parameter.name: parameter for parameter in CATALOGUE[name].parameters}
-        # The recording is corrected for measurement effects of the file: what is found adds to them.
-        in_file = {} if CATALOGUE[name].stage == "measurement" else dict(self._own.get(name, {}))
-        own = {key: float(value) for key, value in in_file.items()}
+        own = own_values(self.predictions.robot, name)
         hypotheses: list[Effects] = []
         if len(values) == 1:
             hypotheses.append((*base, effect))

@@ -131,7 +131,7 @@ def explain(
     findings = Findings(
         outcome.nominal, outcome.best, outcome.fit,
         healthy_loss=search.healthy_loss,
-        commissioned=nominal is not None and nominal.segments > 0,
+        commissioned=search.commissioned,
         known=search.known,
     )  # fmt: skip
     if not findings.fit.passed(thresholds):

@@ -148,6 +148,12 @@ def residuals_by_part(
     return residuals
 
 
+def own_values(robot: RobotModel, name: str) -> dict[str, float]:
+    """Values of an effect in the robot's file; none of sensors and clocks, for which the recording was corrected."""
+    values = {} if CATALOGUE[name].stage == "measurement" else dict(robot.effects).get(name, {})
+    return {key: float(value) for key, value in values.items()}
+
+
 def corrected_evidence(evidence: Evidence, robot: RobotModel) -> Evidence:
     """The evidence corrected for the sensor and clock errors in a robot's file."""
     effects = tuple((name, {key: float(value) for key, value in values.items()}) for name, values in robot.effects)

@@ -27,7 +27,13 @@ from monoforce_ros.discrepancy.fit import (
     scales,
     without,
 )
-from monoforce_ros.discrepancy.hypothesis import Effects, EvidenceWindows, Predictions, residuals_by_part
+from monoforce_ros.discrepancy.hypothesis import (
+    Effects,
+    EvidenceWindows,
+    Predictions,
+    own_values,
+    residuals_by_part,
+)
 from monoforce_ros.discrepancy.learned import learned_terms
 from monoforce_ros.discrepancy.left_out import values_without_parts
 from monoforce_ros.discrepancy.nominal import NominalModel
@@ -53,7 +59,7 @@ _JUDGED = 6
 _PROMISING = 0.5
 """Share of the best gain on held-out windows that an effect must promise on those of its quick fit to be judged. It
 only saves time: effects that promise half as much hardly predict more."""
-_HOPELESS = 0.5
+_SMALL_SHARE = 0.5
 """Effects that explain less than this share of what an explanation must explain (``most_share``) are neither exchanged
 nor replaced by combinations with another beginning: it only saves time on what is unknown anyway."""
 _ALTERNATIVES = 1
@@ -110,9 +116,8 @@ class Search:
             progress=progress,
         )  # fmt: skip
         starts = data.starts
-        self._folds = folds_of(starts)
-        self._ends = folds_of(np.r_[starts[0], starts + round(data.horizon * 1e9)])[1:]
-        self._own = dict(robot.effects)
+        self._folds = folds_of(starts, FOLDS)
+        self._ends = folds_of(np.r_[starts[0], starts + round(data.horizon * 1e9)], FOLDS)[1:]
         self._fits: dict[tuple[tuple[str, ...], ...], Fit] = {}
 
     def run(self, most_effects: int, *, exchange: bool = True) -> Outcome:
@@ -142,14 +147,14 @@ class Search:
             # The effect that explains most alone need not be part of the best combination.
             if fit.passed(self.thresholds) or most_effects < 2:
                 break
-            if fit.explained < _HOPELESS * self.thresholds.most_share:
+            if fit.explained < _SMALL_SHARE * self.thresholds.most_share:
                 break
             extended, listed = self._extended(other, most_effects)
             tried += listed
             gain, low = self._gain(best, extended)
             if low > 0 and gain > self.thresholds.smallest_share * nominal.loss:
                 best, fit = extended, self.fit_test(extended, nominal)
-        hopeless = fit.explained < _HOPELESS * self.thresholds.most_share
+        hopeless = fit.explained < _SMALL_SHARE * self.thresholds.most_share
         exchanged, indistinguishable = self._exchanged(best) if exchange and not hopeless else (best, {})
         if exchanged is not best:
             best, fit = exchanged, self.fit_test(exchanged, nominal)
@@ -182,6 +187,11 @@ class Search:
         return best
 
     @property
+    def commissioned(self) -> bool:
+        """Whether the residuals of the healthy robot are known."""
+        return self.nominal is not None and self.nominal.segments > 0
+
+    @property
     def healthy_loss(self) -> float:
         """Mean loss of the healthy robot."""
         return HEALTHY_LOSS if self.nominal is None else self.nominal.loss
@@ -200,9 +210,9 @@ class Search:
 
     def _without(self, name: str, values: Mapping[str, float]) -> np.ndarray:
         """Values of an effect's parameters on the nominal robot."""
-        in_file = {} if CATALOGUE[name].stage == "measurement" else dict(self._own.get(name, {}))
-        known = {parameter.name: parameter.neutral for parameter in CATALOGUE[name].parameters}
-        return np.array([float(in_file.get(key, known[key])) for key in values])
+        neutral = {parameter.name: parameter.neutral for parameter in CATALOGUE[name].parameters}
+        own = {**neutral, **own_values(self.robot, name)}
+        return np.array([own[key] for key in values])
 
     def refit(self, effects: Effects) -> Fit:
         """Fit to the whole recording; kept, and repeated from values that explain it better."""
@@ -255,8 +265,7 @@ class Search:
     def _credible(self, trial: Trial) -> bool:
         """Whether the effect that was added last is a measurement."""
         estimate = self.estimates(self.refit(trial.effects))[-1]
-        in_file = {} if CATALOGUE[estimate.name].stage == "measurement" else dict(self._own.get(estimate.name, {}))
-        return not complaint(estimate, {key: float(value) for key, value in in_file.items()})
+        return not complaint(estimate, own_values(self.robot, estimate.name))
 
     def ranked(self, fit: Fit) -> list[int]:
         """Indices of a fit's effects, ranked by leave-one-out loss: the loss of the others, fitted again without it."""
@@ -287,7 +296,7 @@ class Search:
         strongest = min((test for test in tests if test.gain > least), key=lambda test: test.adjusted, default=None)
         p, name = (1.0, "") if strongest is None else (strongest.adjusted, strongest.name)
         size = self._size(trial)
-        if self.nominal is not None and size is not None:
+        if size is not None:
             if size.above < self.thresholds.drive_spread:
                 # What is about as small as on the healthy robot is nothing that is missing.
                 p, name = 1.0, ""
@@ -296,7 +305,7 @@ class Search:
             # Two tests: the smaller p-value of two has twice the rate.
             p = min(1.0, 2.0 * p)
         explained = 1.0
-        if self.nominal is not None and self.nominal.segments > 0 and trial.effects:
+        if self.commissioned and trial.effects:
             explained = excess_share(nominal.loss, trial.loss, self.healthy_loss)
         return FitTest(p, name, tuple(tests), explained)
 
@@ -326,7 +335,7 @@ class Search:
         incomplete = size is not None and 2.0 * size.p <= self.thresholds.fit_rate
         found = self.screening.candidates(base, self.fixed_count(base), f"{number}: ", incomplete=incomplete)
         entries = admitted(found.screened, found.before, rate, incomplete=incomplete)
-        if self.nominal is None or self.nominal.segments < 2:
+        if not self.commissioned:
             # Nothing tells whether an effect explains enough: it must be significant by itself.
             entries = [entry for entry in entries if entry.test.p <= rate]
         judged: list[Trial] = []
@@ -352,10 +361,9 @@ class Search:
         then be beyond chance. Else it need only be large enough, for effects that few blocks show gain in few of them.
         """
         gain, low = self._gain(before, after)
-        commissioned = self.nominal is not None and self.nominal.segments > 0
         # Where residuals are far below what counts as healthy, any share of them is nothing.
         least = self.thresholds.smallest_share * max(before.loss, self.healthy_loss)
-        return gain > least and (commissioned or low > 0)
+        return gain > least and (self.commissioned or low > 0)
 
     def _gain(self, before: Trial, after: Trial) -> tuple[float, float]:
         rate = self.thresholds.comparison_rate

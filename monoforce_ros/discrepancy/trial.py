@@ -111,8 +111,8 @@ def expected_loss(healthy: float, change: np.ndarray, model_error: float) -> flo
     return healthy + float(robust(model_error * change).mean())
 
 
-def folds_of(starts: np.ndarray, count: int = FOLDS) -> np.ndarray:
-    """Fold of each window: its block, in turn."""
+def folds_of(starts: np.ndarray, count: int) -> np.ndarray:
+    """Fold of each window, of ``count``: blocks take turns."""
     return ((starts - starts[0]) // round(BLOCK * 1e9)).astype(int) % count
 
 

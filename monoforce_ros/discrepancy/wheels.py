@@ -319,7 +319,7 @@ class _Selection:
         for name in self._order:
             excluded = any(other in _response(name).excludes or name in _response(other).excludes for other in names)
             if name not in names and not excluded:
-                yield tuple(other for other in self._order if other in names or other == name)
+                yield _in_order((*names, name))
 
     def _exchanged(self, best: _Model) -> _Model:
         """The best model with one effect replaced by another, or ``best``; a first effect may stand in for a later."""
@@ -367,7 +367,7 @@ def _ruled_out(names: tuple[str, ...], values: np.ndarray, blocks: _Blocks) -> I
     for effect in wheel_effects():
         if effect.name in names:
             continue
-        together = tuple(e.name for e in wheel_effects() if e.name in names or e.name == effect.name)
+        together = _in_order((*names, effect.name))
         known = _Model(names, values, np.zeros(0))
         fitted = _fit(together, blocks, _starts(together, blocks.fastest, known))
         place = together.index(effect.name)
@@ -383,6 +383,11 @@ def _bounds(name: str, fastest: Fastest) -> tuple[float, float]:
     parameter = next(p for p in CATALOGUE[name].parameters if p.name == response.parameter)
     low, high = (float(np.clip(end, parameter.low, parameter.high)) for end in response.bounds(fastest))
     return low, max(high, low + 1e-3)
+
+
+def _in_order(names: Sequence[str]) -> tuple[str, ...]:
+    """Names of effects in the order in which they act on a command."""
+    return tuple(effect.name for effect in wheel_effects() if effect.name in names)
 
 
 def _response(name: str) -> WheelResponse:
