@@ -54,6 +54,17 @@ def test_the_share_is_not_asked_of_a_robot_whose_healthy_error_nobody_knows():
     assert decide(found(2.2, commissioned=False)).verdict is Verdict.EFFECT_FOUND
 
 
+def test_a_formula_that_explains_most_of_what_a_name_leaves_contradicts_it():
+    weak = found(2.2, commissioned=False)
+    better = replace(weak, formula=trial(0.5, (("learned_term", {"torque_z:vx": 200.0}),)), formula_gain=(1.7, 0.9))
+    decision = decide(better)
+    assert decision.verdict is Verdict.UNKNOWN_EFFECT and decision.trial is better.formula
+    # By chance, or only a little: the name stays.
+    assert decide(replace(better, formula_gain=(1.7, -0.1))).verdict is Verdict.EFFECT_FOUND
+    little = trial(1.5, (("learned_term", {"torque_z:vx": 200.0}),))
+    assert decide(replace(better, formula=little, formula_gain=(0.7, 0.2))).verdict is Verdict.EFFECT_FOUND
+
+
 def test_without_effects_nothing_is_missing():
     nominal = trial(0.9)
     findings = Findings(nominal, nominal, FitTest(0.5, ""), healthy_loss=0.5, commissioned=True)

@@ -16,7 +16,7 @@ from monoforce_ros.discrepancy.selection import Search
 from monoforce_ros.discrepancy.sensor_findings import SensorFindings, refined_clock
 from monoforce_ros.discrepancy.thresholds import Thresholds
 from monoforce_ros.discrepancy.trial import Outcome, paired
-from monoforce_ros.discrepancy.verdict import Decision, Findings, decide
+from monoforce_ros.discrepancy.verdict import Decision, Findings, decide, leaves_most
 from monoforce_ros.robots import RobotModel
 
 
@@ -134,7 +134,8 @@ def explain(
         commissioned=search.commissioned,
         known=search.known,
     )  # fmt: skip
-    if not findings.fit.passed(thresholds):
+    doubtful = bool(outcome.best.effects) and not findings.commissioned and leaves_most(findings, thresholds)
+    if doubtful or not findings.fit.passed(thresholds):
         starts = windows.data.starts
         learned = search.learn(outcome.best.effects)
         if len(outcome.best.effects) > len(search.known):

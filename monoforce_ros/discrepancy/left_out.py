@@ -2,8 +2,10 @@
 
 Fitting anew without each of many parts costs as many fits. A part moves the values little, so that one Gauss-Newton
 step from the fit to the whole recording suffices (the infinitesimal jackknife with the exact curvature of what remains;
-Rad and Maleki 2020, "approximate leave-one-out"). What a part alone shows cannot be known without it: a weak prior then
-draws the values to where they would be without the effect.
+Rad and Maleki 2020, "approximate leave-one-out"). The step undoes the pull of the part that is left out, not the whole
+remaining gradient: where a fit ended before its minimum, or at a bound, that one does not vanish, and would carry all
+parts the same way far beyond where the fit is linear. What a part alone shows cannot be known without it: a weak prior
+then draws the values to where they would be without the effect.
 """
 
 from __future__ import annotations
@@ -48,7 +50,7 @@ def values_without_parts(
             found.append(fit.effects)
             continue
         step = np.linalg.solve(
-            curvature[kept].sum(axis=0) + _PRIOR * whole, gradient[kept].sum(axis=0) + _PRIOR * whole @ away
+            curvature[kept].sum(axis=0) + _PRIOR * whole, _PRIOR * whole @ away - gradient[~kept].sum(axis=0)
         )
         moved = values.copy()
         moved[fixed:] -= typical * step

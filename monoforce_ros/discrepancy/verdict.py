@@ -90,15 +90,23 @@ class Decision:
 def fits(findings: Findings, thresholds: Thresholds) -> bool:
     """Whether what the best effects leave looks like the healthy robot.
 
-    Of a robot that was never commissioned nobody knows how large its errors should be. Its effects keep their names if
-    they explain most of the loss, and a formula in addition to them does not explain most of the rest.
+    Of a robot that was never commissioned nobody knows how large its errors should be. Its effects keep their names
+    unless a formula in addition to them explains most of what they leave: large errors, as of a robot that spins, hide
+    what is missing from a test. Where the test does find more, they must also explain most of the loss.
     """
-    if findings.fit.passed(thresholds):
-        return True
+    passed = findings.fit.passed(thresholds)
     if findings.commissioned or not findings.best.effects:
-        return False
-    most = findings.best.loss < 0.5 * findings.nominal.loss
-    return most and (findings.formula_gain[1] <= 0 or findings.formula_gain[0] < 0.5 * findings.best.loss)
+        return passed
+    if findings.formula is not None and findings.formula_gain[1] > 0:
+        rest = 1.0 - findings.formula.loss / findings.best.loss
+        if rest >= thresholds.most_share:
+            return False
+    return passed or not leaves_most(findings, thresholds)
+
+
+def leaves_most(findings: Findings, thresholds: Thresholds) -> bool:
+    """Whether the best effects leave most of the nominal model's loss."""
+    return findings.best.loss > (1.0 - thresholds.most_share) * findings.nominal.loss
 
 
 def decide(findings: Findings, thresholds: Thresholds = Thresholds()) -> Decision:  # noqa: B008
