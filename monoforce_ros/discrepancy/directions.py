@@ -9,6 +9,7 @@ import numpy as np
 
 from monoforce_ros.discrepancy.fit import without
 from monoforce_ros.discrepancy.hypothesis import Effects, Predictions, own_values
+from monoforce_ros.discrepancy.learned import LEARNED, FormulaTerms
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.score_test import Direction
 from monoforce_ros.discrepancy.thresholds import Thresholds
@@ -16,10 +17,10 @@ from monoforce_ros.effects import CATALOGUE
 
 _SMALLEST_SECANT = 0.1
 """Smallest distance from neutral, in typical sizes, at which the influence of one of several parameters is taken."""
-_FORMULA_STEP = 0.02
-"""Of a term of a formula, as a share of the robot's weight."""
 _KEPT = 8
 """Residuals of this many hypotheses are kept."""
+_KEPT_TERMS = 2
+"""Those of all terms, in addition to this many bases: what was found, and nothing."""
 
 
 class Directions:
@@ -39,10 +40,11 @@ class Directions:
         self.metric = 1.0 if nominal is None else scale / nominal.scale_in(predictions.data)
         self._thresholds = thresholds
         self._rolled: dict[tuple[tuple[object, ...], ...], np.ndarray] = {}
+        self._terms: dict[tuple[tuple[object, ...], ...], FormulaTerms] = {}
 
     def scaled(self, effects: Effects) -> np.ndarray:
         """Scaled residuals, ``[W, K, 3]``; the last ones are kept."""
-        key = tuple((name, *values.values()) for name, values in effects)
+        key = _key(effects)
         if key not in self._rolled:
             if len(self._rolled) >= _KEPT:
                 self._rolled.pop(next(iter(self._rolled)))
@@ -87,19 +89,22 @@ class Directions:
         changed_rows = self.predictions.residuals(hypotheses) / self.scale
         return self.direction(name, np.nan_to_num(changed_rows - self.scaled(base)))
 
+    def formula_terms(self, base: Effects) -> FormulaTerms:
+        """What every term of a formula does in addition to a base; kept, for a formula is fitted from it, too."""
+        key = _key(base)
+        if key not in self._terms:
+            if len(self._terms) >= _KEPT_TERMS:
+                self._terms.pop(next(iter(self._terms)))
+            self._terms[key] = FormulaTerms.of(self.predictions, base, self.scale)
+        return self._terms[key]
+
     def of_formula(self, base: Effects, fixed: int = 0) -> list[Direction]:
         """Change of the residuals by each term of a formula in addition to a base, ``fixed`` of which were measured."""
-        learned = CATALOGUE["learned_term"]
-        keys = [parameter.name for parameter in learned.parameters]
-        step = _FORMULA_STEP * 9.81 * float(self.predictions.robot.mass.mean())
-        neutral = dict.fromkeys(keys, 0.0)
-        trials: list[Effects] = [(*base, (learned.name, neutral))]
-        trials += [(*base, (learned.name, {**neutral, key: step})) for key in keys]
-        rolled = self.predictions.residuals(trials) / self.scale
+        terms = self.formula_terms(base)
         error = self.mean_square(base, fixed, self.metric)
         return [
-            self.direction(f"{learned.name} {key}", (row - rolled[0])[None], error)
-            for key, row in zip(keys, rolled[1:], strict=True)
+            self.direction(f"{LEARNED} {key}", (row - terms.without)[None], error)
+            for key, row in zip(terms.keys, terms.with_each, strict=True)
         ]
 
     def of_changes(self, base: Effects, fixed: int = 0) -> list[Direction]:
@@ -128,3 +133,7 @@ class Directions:
             return 0.0
         change = self.scaled(base) - self.scaled(base[:fixed])
         return float(np.mean((np.nan_to_num(change) * metric) ** 2))
+
+
+def _key(effects: Effects) -> tuple[tuple[object, ...], ...]:
+    return tuple((name, *values.values()) for name, values in effects)

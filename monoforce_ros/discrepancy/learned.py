@@ -7,6 +7,7 @@ terms are then fitted through the rollout.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,23 +20,45 @@ _STEP = 0.02
 """Step of the finite differences, as a share of the robot's weight."""
 
 
-def learned_terms(predictions: Predictions, base: Effects, scale: np.ndarray, most: int) -> list[Effects]:
+@dataclass(frozen=True)
+class FormulaTerms:
+    """What each term of a formula does to a recording's residuals."""
+
+    keys: tuple[str, ...]
+    """Of the terms."""
+    step: float
+    """Coefficient of each [N or N m]."""
+    without: np.ndarray
+    """Scaled residuals without any of them, ``[W, K, 3]``."""
+    with_each: np.ndarray
+    """Scaled residuals with one of them at a time, ``[F, W, K, 3]``."""
+
+    @classmethod
+    def of(cls, predictions: Predictions, base: Effects, scale: np.ndarray) -> FormulaTerms:
+        """Every term in addition to a base; ``scale`` is the expected size of a residual, ``[W, K, 3]``."""
+        keys = tuple(parameter.name for parameter in CATALOGUE[LEARNED].parameters)
+        step = _STEP * 9.81 * float(predictions.robot.mass.mean())
+        neutral = dict.fromkeys(keys, 0.0)
+        trials: list[Effects] = [(*base, (LEARNED, neutral))]
+        trials += [(*base, (LEARNED, {**neutral, key: step})) for key in keys]
+        rolled = predictions.residuals(trials) / scale
+        return cls(keys, step, rolled[0], rolled[1:])
+
+
+def learned_terms(base: Effects, terms: FormulaTerms, most: int) -> list[Effects]:
     """Sums of one to ``most`` terms, each with the further term that explains most of the remaining residuals.
 
     Args:
-        predictions: predictions for the recording's windows.
         base: effects that act in addition.
-        scale: expected size of a residual, ``[K, 3]``.
+        terms: what each does in addition to them.
         most: largest number of terms.
     """
-    keys = [parameter.name for parameter in CATALOGUE[LEARNED].parameters]
-    step = _STEP * 9.81 * float(predictions.robot.mass.mean())
-    trials = [(*base, (LEARNED, dict.fromkeys(keys, 0.0)))]
-    trials += [(*base, (LEARNED, {**dict.fromkeys(keys, 0.0), key: step})) for key in keys]
-    rolled = np.nan_to_num(predictions.residuals(trials) / scale, nan=1e3)
-    weight = np.sqrt(np.minimum(1.0, OUTLIER / np.maximum(np.abs(rolled[0]), 1e-9))).ravel()
-    wanted = -weight * rolled[0].ravel()
-    columns = weight * (rolled[1:] - rolled[0]).reshape(len(keys), -1)
+    keys, step = terms.keys, terms.step
+    without = np.nan_to_num(terms.without, nan=1e3)
+    changes = np.nan_to_num(terms.with_each, nan=1e3) - without
+    weight = np.sqrt(np.minimum(1.0, OUTLIER / np.maximum(np.abs(without), 1e-9))).ravel()
+    wanted = -weight * without.ravel()
+    columns = weight * changes.reshape(len(keys), -1)
     lengths = np.linalg.norm(columns, axis=1)
     # A feature that hardly occurs in the recording would get an arbitrarily large weight.
     lengths = np.maximum(lengths, 0.1 * lengths.max())
@@ -50,8 +73,8 @@ def learned_terms(predictions: Predictions, base: Effects, scale: np.ndarray, mo
         rows = columns[chosen]
         values = np.linalg.solve(rows @ rows.T + ridge**2 * np.eye(len(chosen)), rows @ wanted)
         remaining = wanted - values @ rows
-        terms = {keys[index]: float(step * value) for index, value in zip(chosen, values, strict=True)}
-        effects = (*base, (LEARNED, terms))
+        sum_of = {keys[index]: float(step * value) for index, value in zip(chosen, values, strict=True)}
+        effects: Effects = (*base, (LEARNED, sum_of))
         found.append(with_values(effects, flat(effects)))
     return found
 

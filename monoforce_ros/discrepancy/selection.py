@@ -176,14 +176,15 @@ class Search:
 
         A further term must reduce the held-out loss beyond chance.
         """
-        trials = []
-        for number, effects in enumerate(learned_terms(self.predictions, base or self.known, self.scale, most)):
+        start = self.refit(base).effects if base else self.known
+        best: Trial | None = None
+        for number, effects in enumerate(learned_terms(start, self.directions.formula_terms(start), most)):
             self._progress(f"fitting a formula with {number + 1} terms")
-            trials.append(self.judge(effects))
-        best = trials[0]
-        for trial in trials[1:]:
-            if self._gain(best, trial)[1] > 0:
-                best = trial
+            trial = self.judge(effects)
+            if best is not None and self._gain(best, trial)[1] <= 0:
+                break
+            best = trial
+        assert best is not None
         return best
 
     @property
