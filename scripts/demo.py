@@ -92,6 +92,20 @@ def published(out: Path) -> dict[int, dict[str, object]]:
     return {stamp: found for stamp, found in sorted(by_stamp.items()) if len(found) == len(OUTPUTS)}
 
 
+def terrain_status(out: Path, stamp: int) -> str:
+    """What the predictor said of its terrain when it published the prediction of a stamp, or nothing."""
+    said = ""
+    with BagReader(out / "outputs") as bag:
+        for message in bag.messages(["/diagnostics", "/predicted/path"]):
+            decoded = message.decode()
+            if message.topic == "/predicted/path":
+                if stamp_of(decoded) >= stamp and said:
+                    break
+                continue
+            said = next((status.message for status in decoded.status if status.name.endswith("terrain")), said)
+    return said
+
+
 def draw(bag: Path, out: Path, robot_name: str, moment: float) -> int:
     """Draw the published prediction nearest to ``moment`` [s] of the bag; returns the number of predictions."""
     robot = load_robot(robot_name)
@@ -116,6 +130,7 @@ def draw(bag: Path, out: Path, robot_name: str, moment: float) -> int:
         under_recorded_commands=rolled.position[0].double().numpy(),
         picture=figures.CameraPicture.nearest(recording, robot, stamp),
         measured=recording.motion.positions[(later >= 0) & (later <= 5e9)],
+        title=f"terrain: {status}" if (status := terrain_status(out, stamp)) else "",
     )
     (out / "prediction.png").write_bytes(figure_png(figure))
     gaps = np.diff([s * 1e-9 for s in predictions])

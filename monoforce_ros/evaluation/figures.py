@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from dataclasses import dataclass
 
 import matplotlib
@@ -89,7 +90,7 @@ def prediction_figure(
         measured: measured positions ``[n, 3]`` in the odometry frame [m].
         under_recorded_commands: positions ``[n, 3]`` in the terrain frame [m] that are predicted under the commands
             recorded afterwards; ``view`` is then a prediction under the command at its start.
-        title: a line above the figure.
+        title: text above the figure.
     """
     colour_range = _colour_range(view)
     figure = Figure(figsize=(15.5 if picture else 8.0, 6.4), layout="constrained", dpi=110)
@@ -108,7 +109,7 @@ def prediction_figure(
         axes[0].set_title("camera: predicted ground, path and contact forces")
     _draw_map(axes[-1], view, robot, measured, under_recorded_commands, colour_range)
     if title:
-        figure.suptitle(title, x=0.01, ha="left", fontsize=13, fontweight="bold")
+        figure.suptitle(textwrap.fill(title, 140 if picture else 72), x=0.01, ha="left", fontsize=13, fontweight="bold")
     return figure
 
 
