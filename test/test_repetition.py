@@ -107,7 +107,7 @@ def test_an_effect_that_others_replace_half_of_the_time_belongs_to_a_class_with_
     assert judged.found_again == (1, 2) and judged.indistinguishable == ("payload",)
 
 
-def test_an_effect_beside_another_that_no_repetition_finds_is_not_added(husky):
+def test_an_effect_beside_another_that_is_found_again_in_fewer_than_half_of_the_repetitions_is_not_added(husky):
     motion, commands = simulated_recording(husky, (("command_delay", {"delay": 0.3}),), seconds=40.0)
     evidence, windows = windows_of(motion, commands)
     found = explain(evidence, husky, windows, None, SETTINGS)
@@ -122,8 +122,16 @@ def test_an_effect_beside_another_that_no_repetition_finds_is_not_added(husky):
 
     delay, payload = Repeated(named=(name,)), Repeated(named=(name, "payload"))
     assert names(delay, payload, None)[0] == (name, "payload")
-    kept, remarks = names(delay, delay, None)
-    assert kept == (name,) and "no repetition without a part of the recording finds it: payload" in remarks
+    for repeated in ((delay, delay, None), (delay, delay, payload)):
+        kept, remarks = names(*repeated)
+        assert kept == (name,) and "not added: payload found again in fewer than half of the searches" in remarks
+    # One that takes its place each time is the same finding under another name.
+    instead = Repeated(named=(name, "constant_force"))
+    assert names(instead, instead, payload)[0] == (name, "payload")
+    # Where each repetition finds something else, the recording does not say what is wrong.
+    others = (Repeated(named=("drive_gain",)), Repeated(named=("drive_loss",)), Repeated(named=("turning_scrub",)))
+    nothing = Repetition(0, others).confirmed(found, decision, SETTINGS.thresholds)
+    assert nothing.verdict == Verdict.UNKNOWN_EFFECT and nothing.trial is None and nothing.parts is both
     # The only effect is kept: its doubt stands on the first screen.
     alone = replace(decision, trial=found.decision.trial)
     assert Repetition(0, (Repeated(), Repeated())).confirmed(found, alone, SETTINGS.thresholds) is alone

@@ -8,7 +8,7 @@ each time does not hang on a single manoeuvre.
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from multiprocessing import forkserver
@@ -65,53 +65,78 @@ class Repetition:
         return HeldOut(tuple(() if r is None else r.effects for r in self.repeated), self.first, LENGTH)
 
     def confirmed(self, explanation: Explanation, decision: Decision, thresholds: Thresholds) -> Decision:
-        """The decision without the effects beside others that no repetition finds (stability selection, Meinshausen and
-        Bühlmann 2010).
+        """The decision without the effects beside others that fewer than half of the repetitions find (stability
+        selection, Meinshausen and Bühlmann 2010), where another single one that takes their place is the same finding.
 
-        The rest is judged anew: without them it may leave what does not look like the healthy robot.
+        The rest is judged anew: without them it may leave what does not look like the healthy robot. Where none of
+        several effects is found again, the recording does not say what is wrong.
         """
         trial, search = decision.trial, explanation.search
-        if trial is None or decision.verdict != Verdict.EFFECT_FOUND:
+        if trial is None or decision.verdict != Verdict.EFFECT_FOUND or len(trial.names) < 2:
             return decision
-        found = {name for entry in self.repeated if entry is not None for name in entry.named}
-        alike = explanation.outcome.indistinguishable
-        known = dict(search.known)
-        missing = [n for n in trial.names if n not in known and not {n, *alike.get(n, ())} & found]
+        alike, known = explanation.outcome.indistinguishable, dict(search.known)
+        missing = [
+            name for name in trial.names if name not in known and not self._support(name, alike, trial.names).often
+        ]
+        if not missing:
+            return decision
+        remark = f"{' and '.join(missing)} found again in fewer than half of the searches without a part of the recording"
         kept = tuple(entry for entry in trial.effects if entry[0] not in missing)
-        if not missing or not kept:
-            return decision
+        if not kept:
+            remarks = (*decision.remarks, remark)
+            return replace(decision, verdict=Verdict.UNKNOWN_EFFECT, trial=None, parts=trial, remarks=remarks)
         best = search.judge(kept)
         findings = explanation.findings
         findings = replace(findings, best=best, fit=search.fit_test(best, findings.nominal), formula=None)
         again = decide(findings, thresholds)
-        remark = f"not added, for no repetition without a part of the recording finds it: {' and '.join(missing)}"
         losses = replace(again.losses, variance_ratio=decision.losses.variance_ratio)
-        return replace(again, remarks=(*again.remarks, remark), losses=losses)
+        return replace(again, remarks=(*again.remarks, f"not added: {remark}"), losses=losses)
 
     def judged(self, effects: Sequence[EffectEstimate]) -> tuple[EffectEstimate, ...]:
         """The effects of the whole recording, each with how often it was found again.
 
         Where a single other effect is found in its place half of the time, the recording does not tell the two apart.
         """
-        done = [entry for entry in self.repeated if entry is not None]
-        names = {effect.name for effect in effects}
+        names = [effect.name for effect in effects]
+        alike = {effect.name: effect.indistinguishable for effect in effects}
         result = []
         for effect in effects:
             if effect.name == LEARNED:
                 result.append(effect)
                 continue
-            same = {effect.name, *effect.indistinguishable}
-            missed = [r for r in done if not same & set(r.named)]
-            instead = [extra[0] for r in missed if len(extra := [n for n in r.named if n not in names]) == 1]
-            others = [name for name in dict.fromkeys(instead) if 2 * instead.count(name) >= len(done)]
+            support = self._support(effect.name, alike, names)
             result.append(
                 replace(
                     effect,
-                    indistinguishable=(*effect.indistinguishable, *others),
-                    found_again=(len(done) - len(missed), len(done)),
+                    indistinguishable=(*effect.indistinguishable, *support.instead),
+                    found_again=(support.found, support.repetitions),
                 )
             )
         return tuple(result)
+
+    def _support(self, name: str, alike: Mapping[str, Sequence[str]], names: Sequence[str]) -> _Support:
+        """How often an effect, or one that is indistinguishable from it, is found again beside the others."""
+        done = [entry for entry in self.repeated if entry is not None]
+        same = {name, *alike.get(name, ())}
+        missed = [r for r in done if not same & set(r.named)]
+        instead = [extra[0] for r in missed if len(extra := [n for n in r.named if n not in names]) == 1]
+        often = tuple(other for other in dict.fromkeys(instead) if 2 * instead.count(other) >= len(done))
+        return _Support(len(done) - len(missed), len(done), often)
+
+
+@dataclass(frozen=True)
+class _Support:
+    """How often an effect is found again."""
+
+    found: int
+    repetitions: int
+    instead: tuple[str, ...]
+    """Other effects that take its place in at least half of the repetitions."""
+
+    @property
+    def often(self) -> bool:
+        """Whether it, or another one in its place, is found in at least half of them."""
+        return bool(self.instead) or 2 * self.found >= self.repetitions
 
 
 def prepare_processes() -> None:
