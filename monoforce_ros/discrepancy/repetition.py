@@ -66,7 +66,7 @@ class Repetition:
 
     def confirmed(self, explanation: Explanation, decision: Decision, thresholds: Thresholds) -> Decision:
         """The decision without the effects beside others that fewer than half of the repetitions find (stability
-        selection, Meinshausen and Bühlmann 2010), where another single one that takes their place is the same finding.
+        selection, Meinshausen and Bühlmann 2010), where another one that takes their place is the same finding.
 
         The rest is judged anew: without them it may leave what does not look like the healthy robot. Where none of
         several effects is found again, the recording does not say what is wrong.
@@ -80,7 +80,8 @@ class Repetition:
         ]
         if not missing:
             return decision
-        remark = f"{' and '.join(missing)} found again in fewer than half of the searches without a part of the recording"
+        dropped = " and ".join(missing)
+        remark = f"{dropped} found again in fewer than half of the searches without a part of the recording"
         kept = tuple(entry for entry in trial.effects if entry[0] not in missing)
         if not kept:
             remarks = (*decision.remarks, remark)
@@ -95,7 +96,7 @@ class Repetition:
     def judged(self, effects: Sequence[EffectEstimate]) -> tuple[EffectEstimate, ...]:
         """The effects of the whole recording, each with how often it was found again.
 
-        Where a single other effect is found in its place half of the time, the recording does not tell the two apart.
+        Where another effect is found in its place half of the time, the recording does not tell the two apart.
         """
         names = [effect.name for effect in effects]
         alike = {effect.name: effect.indistinguishable for effect in effects}
@@ -119,7 +120,7 @@ class Repetition:
         done = [entry for entry in self.repeated if entry is not None]
         same = {name, *alike.get(name, ())}
         missed = [r for r in done if not same & set(r.named)]
-        instead = [extra[0] for r in missed if len(extra := [n for n in r.named if n not in names]) == 1]
+        instead = [other for r in missed for other in r.named if other not in names]
         often = tuple(other for other in dict.fromkeys(instead) if 2 * instead.count(other) >= len(done))
         return _Support(len(done) - len(missed), len(done), often)
 
