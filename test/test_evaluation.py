@@ -13,12 +13,15 @@ from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import BagWriter, Recording, builders
 from monoforce_ros.core import MotionState
-from monoforce_ros.evaluation import observe
+from monoforce_ros.evaluation import evaluate_recording, observe
 from monoforce_ros.evaluation.cli import main
 from monoforce_ros.evaluation.figures import prediction_figure
 from monoforce_ros.evaluation.metrics import Poses, bootstrap_interval, position_errors, rotation_errors, summarise
 from monoforce_ros.evaluation.recording_evaluation import MAXIMUM_SPREAD, constant_velocity
+from monoforce_ros.evaluation.report import summary_table
 from monoforce_ros.evaluation.view import LARGEST_DRAWN_FORCE, PredictionView
+from monoforce_ros.perception import choose_terrain_source
+from monoforce_ros.prediction import Predictor
 from monoforce_ros.reporting import card, definition_list, folded_list, page, write_between
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainMap
@@ -95,7 +98,9 @@ def report(executables, demo_bag, tmp_path_factory):
 
 def test_the_report_compares_with_the_baseline_at_every_horizon(report):
     _, content, printed = report
-    assert set(content["methods"]) == {"physics", "physics, flat ground", "constant velocity, flat ground"}
+    assert list(content["methods"]) == [
+        "physics", "physics, confirmed terrain", "physics, flat ground", "constant velocity, flat ground"
+    ]  # fmt: skip
     for rows in content["methods"].values():
         assert set(rows) == {"1", "2", "5"}
         assert rows["1"]["position_error_m"]["windows"] >= 10
@@ -124,6 +129,24 @@ def test_physics_beats_constant_velocity_on_the_demo_recording(report):
     for horizon in ("2", "5"):
         physics = methods["physics"][horizon]["position_error_m"]["mean"]
         assert physics < methods["constant velocity, flat ground"][horizon]["position_error_m"]["mean"]
+
+
+def test_terrain_that_the_ground_contradicts_is_not_counted_as_confirmed(demo_bag):
+    husky = load_robot("husky")
+    recording = Recording.open(demo_bag).in_base_frame(husky.base_frame)
+
+    def errors(source):
+        found = evaluate_recording(
+            recording, Predictor(husky, source, horizon=2.0), image_topics=tuple(recording.images), horizons=(1.0, 2.0),
+            stride=0.6, quiet=True,
+        )  # fmt: skip
+        return {method: rows[2.0][0].mean for method, rows in summary_table(found).items()}
+
+    alone = errors(choose_terrain_source("camera", husky))
+    trusted = errors(choose_terrain_source("camera", husky, fallback=True))
+    # The encoder's own terrain is judged as without a fallback, and beside it what the node publishes.
+    assert trusted.pop("physics, confirmed terrain") == pytest.approx(trusted["physics, flat ground"], rel=0.05)
+    assert trusted == pytest.approx(alone)
 
 
 def test_the_page_is_self_contained(report):

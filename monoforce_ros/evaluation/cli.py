@@ -29,7 +29,7 @@ from monoforce_ros.evaluation.recording_evaluation import (
 from monoforce_ros.evaluation.report import Picture, terminal_table, write_reports
 from monoforce_ros.evaluation.view import PredictionView
 from monoforce_ros.messages import MessageError
-from monoforce_ros.perception import CAMERA_SOURCES, SOURCES, choose_terrain_source
+from monoforce_ros.perception import CAMERA_SOURCES, SOURCES, TrustedTerrain, choose_terrain_source
 from monoforce_ros.physics import SOILS, PhysicsOptions, SoilError, read_soil
 from monoforce_ros.prediction import Predictor
 from monoforce_ros.reporting import figure_png
@@ -176,6 +176,7 @@ def run(options: argparse.Namespace) -> None:
         material=material,
         checkpoint=options.checkpoint,
         retention_time=options.retention_time,
+        fallback=True,
         warn=lambda message: print(f"warning: {message}", file=sys.stderr),
     )
     predictor = Predictor(
@@ -204,6 +205,9 @@ def run(options: argparse.Namespace) -> None:
             figure_png(figures.recording_figure(evaluation, recording.motion.positions)),
         ),
     ]
+    if isinstance(source, TrustedTerrain):
+        # The examples show the encoder's own terrain; they are not in the order of time that trust needs.
+        predictor.source = source.source
     folder.mkdir(parents=True, exist_ok=True)
     for name, number in _example_windows(evaluation):
         stamp = int(evaluation.stamps[number])

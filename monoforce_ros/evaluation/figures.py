@@ -16,11 +16,23 @@ from matplotlib.patheffects import withStroke
 from monoforce_ros.bags import BagError, Recording, nearest_frame
 from monoforce_ros.core import CameraModel, transform_points
 from monoforce_ros.evaluation.overlay import SURFACE_COLOURS, draw_prediction
-from monoforce_ros.evaluation.recording_evaluation import CONSTANT_VELOCITY, FLAT_PHYSICS, PHYSICS, RecordingEvaluation
+from monoforce_ros.evaluation.recording_evaluation import (
+    CONFIRMED_PHYSICS,
+    CONSTANT_VELOCITY,
+    FLAT_PHYSICS,
+    PHYSICS,
+    RecordingEvaluation,
+)
 from monoforce_ros.evaluation.view import PredictionView
 from monoforce_ros.robots import RobotModel
 
-COLOURS = {PHYSICS: "#0b84a5", FLAT_PHYSICS: "#9b59b6", CONSTANT_VELOCITY: "#e08214", "measured": "#1a1a1a"}
+COLOURS = {
+    PHYSICS: "#0b84a5",
+    CONFIRMED_PHYSICS: "#2e8b57",
+    FLAT_PHYSICS: "#9b59b6",
+    CONSTANT_VELOCITY: "#e08214",
+    "measured": "#1a1a1a",
+}
 _PATH = "#ffb020"
 _RECORDED_COMMANDS = "#5ad1ff"
 _FORCE = "#e8285a"

@@ -13,7 +13,7 @@ from monoforce_ros.core import MotionState, StaleDataError, transform_points
 from monoforce_ros.effects import corrected_commands, corrected_motion
 from monoforce_ros.evaluation.metrics import Poses, Summary, position_errors, rotation_errors, summarise
 from monoforce_ros.messages import MessageError
-from monoforce_ros.perception import FlatTerrain, Observation
+from monoforce_ros.perception import FlatTerrain, Observation, TrustedTerrain
 from monoforce_ros.prediction import JointMotion, Prediction, Predictor
 from monoforce_ros.reporting import progress
 from monoforce_ros.robots import RobotModel
@@ -23,6 +23,8 @@ SAMPLE_TIME = 0.1
 """Time between the poses that are compared [s]."""
 PHYSICS, FLAT_PHYSICS, CONSTANT_VELOCITY = "physics", "physics, flat ground", "constant velocity, flat ground"
 """Names of the methods in reports: the prediction, and two baselines."""
+CONFIRMED_PHYSICS = "physics, confirmed terrain"
+"""The prediction on an encoder's terrain as far as the ground has confirmed it, as ``predictor`` publishes it."""
 BATCH = 16
 """Number of windows that are rolled out together."""
 MAXIMUM_SPREAD = 0.1
@@ -92,7 +94,8 @@ def evaluate_recording(
 
     Args:
         recording: the recording.
-        predictor: robot, terrain source and horizon; the horizon must be at least the largest of ``horizons``.
+        predictor: robot, terrain source and horizon; the horizon must be at least the largest of ``horizons``. With a
+            source that falls back, the encoder's own terrain and the confirmed one are compared side by side.
         image_topics: cameras of a camera terrain source; windows start at images of the first one.
         horizons: times at which errors are summarised [s].
         stride: smallest time between the starts of windows [s].
@@ -111,14 +114,18 @@ def evaluate_recording(
     remarks: list[str] = []
     motions: list[MotionState] = []
     terrains: list[TerrainMap] = []
-    collected: dict[str, list[Poses]] = {PHYSICS: [], FLAT_PHYSICS: [], CONSTANT_VELOCITY: []}
+    collected: dict[str, list[Poses]] = {
+        PHYSICS: [], CONFIRMED_PHYSICS: [], FLAT_PHYSICS: [], CONSTANT_VELOCITY: []
+    }  # fmt: skip
     inside: list[np.ndarray] = []
     flat = FlatTerrain(predictor.robot, predictor.source.grid, TerrainDefaults())
 
-    def roll_out_batch(batch: list[MotionState], maps: list[TerrainMap]) -> None:
+    def roll_out_batch(batch: list[MotionState], maps: list[TerrainMap], confirmed: list[TerrainMap]) -> None:
         twists = np.stack([recording.commands.sample(predictor.command_stamps(m.stamp)) for m in batch])
         joints = recorded_joints(recording, predictor, [m.stamp for m in batch])
         compared = {PHYSICS: maps}
+        if confirmed:
+            compared[CONFIRMED_PHYSICS] = confirmed
         if sensors and baselines:
             compared[FLAT_PHYSICS] = [
                 flat.terrain(Observation(0, flipper_angles=_flippers_at(recording, m.stamp)), m) for m in batch
@@ -136,22 +143,27 @@ def evaluate_recording(
 
     pending: list[MotionState] = []
     pending_maps: list[TerrainMap] = []
+    pending_confirmed: list[TerrainMap] = []
     for stamp in progress(stamps, label="predicting", unit="window", quiet=quiet):
         try:
             motion = recording.motion.at(int(stamp), maximum_gap=MAXIMUM_GAP)
             observation = observe(recording, predictor.robot, int(stamp), sensors, image_topics)
-            pending_maps.append(predictor.source.terrain(observation, motion))
+            found = predictor.source.terrain(observation, motion)
         except (StaleDataError, MessageError, ValueError) as error:
             remarks.append(f"window at {(stamp - recording.motion.stamps[0]) * 1e-9:.1f} s skipped: {error}")
             continue
+        if isinstance(predictor.source, TrustedTerrain) and predictor.source.predicted is not None:
+            pending_confirmed.append(found)
+            found = predictor.source.predicted
         pending.append(motion)
-        terrains.append(pending_maps[-1])
+        pending_maps.append(found)
+        terrains.append(found)
         motions.append(motion)
         if len(pending) == BATCH:
-            roll_out_batch(pending, pending_maps)
-            pending, pending_maps = [], []
+            roll_out_batch(pending, pending_maps, pending_confirmed)
+            pending, pending_maps, pending_confirmed = [], [], []
     if pending:
-        roll_out_batch(pending, pending_maps)
+        roll_out_batch(pending, pending_maps, pending_confirmed)
     if not motions:
         raise EvaluationError(
             f"{recording.path}: every prediction failed: {remarks[0] if remarks else 'no sensor data'}"

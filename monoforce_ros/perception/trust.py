@@ -263,24 +263,28 @@ class TrustedTerrain:
     """
 
     def __init__(self, source: TerrainSource, encoder: EncoderTerrain, fallbacks: Sequence[TerrainSource]):
-        self._source, self._encoder, self._fallbacks = source, encoder, tuple(fallbacks)
+        self.source = source
+        """Source of the encoder's maps."""
+        self._encoder, self._fallbacks = encoder, tuple(fallbacks)
         self._trust = TerrainTrust(source.grid)
         self.report: TrustReport | None = None
         """Result of the last comparison; None before the first map."""
+        self.predicted: TerrainMap | None = None
+        """The encoder's last map, before any of it was replaced by the fallback's."""
 
     @property
     def sensors(self) -> tuple[str, ...]:
         """Sensors of the source."""
-        return self._source.sensors
+        return self.source.sensors
 
     @property
     def grid(self) -> Grid:
         """Grid of the source."""
-        return self._source.grid
+        return self.source.grid
 
     def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
         """The encoder's map or the fallback's; raises the source's errors."""
-        predicted = self._source.terrain(observation, motion)
+        self.predicted = predicted = self.source.terrain(observation, motion)
         other = self._fallback(observation, motion)
         support = support_points(self._encoder.robot, motion, self._encoder.stiffness)
         cameras = {}
