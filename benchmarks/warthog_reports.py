@@ -2,7 +2,7 @@
 
     scripts/run.sh python benchmarks/warthog_reports.py FOLDER [--json FILE] [--docs docs/discrepancy.md]
 
-Each recording is converted to a bag and diagnosed with the shipped Warthog file on level ground; the
+Each recording is converted to a bag and diagnosed with the shipped Warthog file on the ground that is found in it; the
 recording of another day on asphalt is held out for the first. Each ground gets a robot file with its effects.
 """
 

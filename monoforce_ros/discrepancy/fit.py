@@ -237,6 +237,7 @@ def estimate_effects(
     *,
     healthy_variances: np.ndarray | None = None,
     segments: int = 0,
+    formula_variances: np.ndarray | None = None,
     confidence: float = 0.95,
 ) -> tuple[EffectEstimate, ...]:
     """Fitted effects with confidence intervals.
@@ -247,11 +248,13 @@ def estimate_effects(
         healthy_variances: variance of each parameter on the healthy robot, ``[P]``: the model's own error, which no
             residual of this recording shows.
         segments: number of healthy segments from which they were estimated.
+        formula_variances: variance of each parameter because no formula of an effect is exact, ``[P]``.
         confidence: of the intervals.
     """
     sampling = np.maximum(np.diag(fit.covariance), 0.0)
     healthy = np.zeros_like(sampling) if healthy_variances is None else healthy_variances
-    total = sampling + healthy
+    formula = np.zeros_like(sampling) if formula_variances is None else formula_variances
+    total = sampling + healthy + formula
     # Welch and Satterthwaite: degrees of freedom of a sum of estimated variances.
     parts = sampling**2 / max(fit.blocks - len(sampling), 1) + healthy**2 / max(segments, 1)
     degrees = np.where(parts > 0, total**2 / np.maximum(parts, 1e-300), np.inf)

@@ -251,15 +251,34 @@ class Search:
             variances[place] = np.diag(spread) * typical[place] ** 2
         return variances
 
+    def formula_variances(self, fit: Fit) -> np.ndarray:
+        """Variance of each parameter of a fit because its effect's formula is not exact, ``[P]``.
+
+        It is proportional to the square of what the effect is, beyond what the robot's file says: the distance of all
+        its parameters of the same unit from their values without it.
+        """
+        variances = []
+        for name, values in fit.effects:
+            units = [
+                {parameter.name: parameter.unit for parameter in CATALOGUE[name].parameters}[key] for key in values
+            ]
+            away = np.array(list(values.values()), float) - self._without(name, values)
+            # A limit has no distance from its absence: its size is its own value.
+            away = np.where(np.isfinite(away), away, list(values.values()))
+            squares = [sum(away[i] ** 2 for i, other in enumerate(units) if other == unit) for unit in units]
+            variances += [self.thresholds.formula_error**2 * square for square in squares]
+        return np.array(variances)
+
     def estimates(
         self, fit: Fit, indistinguishable: Mapping[str, Sequence[str]] | None = None
     ) -> tuple[EffectEstimate, ...]:
-        """Fitted effects with intervals that hold the healthy robot's variation too."""
+        """Fitted effects with intervals that hold the healthy robot's variation and the formulas' errors, too."""
         return estimate_effects(
             fit,
             indistinguishable or {},
             healthy_variances=self.healthy_variances(fit),
             segments=0 if self.nominal is None else self.nominal.segments,
+            formula_variances=self.formula_variances(fit),
             confidence=self.thresholds.confidence,
         )
 

@@ -1,0 +1,95 @@
+"""How far values of effects are from the truth, beyond their intervals, where the effects are hidden in another engine.
+
+    scripts/run.sh python benchmarks/platforms/interval_error.py --results out/platforms/results/LABEL [LABEL ...]
+
+Prints which share of the 95 % intervals would hold the truth if values had a further error, proportional to the size of
+their effects: it calibrates ``formula_error`` of ``discrepancy/thresholds.py``. Needs results of run.py for choosing;
+of a case with several results the last counts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from monoforce_ros.core import write_text
+from monoforce_ros.discrepancy.thresholds import Thresholds
+from monoforce_ros.effects import CATALOGUE
+
+SHARES = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3)
+"""Errors as shares of the size of an effect."""
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--results", type=Path, nargs="+", required=True, help="folders of results of run.py")
+    parser.add_argument(
+        "--included", type=float, default=Thresholds().formula_error,
+        help="formula_error of the code that was judged: it is taken out of its intervals (%(default)s)",
+    )  # fmt: skip
+    parser.add_argument("--json", type=Path, help="write the values to this file")
+    options = parser.parse_args()
+    cases = {
+        file.name: json.loads(file.read_text())
+        for folder in options.results
+        for file in sorted((folder / "cases").glob("*.json"))
+    }
+    rows = [row for case in cases.values() for row in values_of(case, options.included)]
+    if not rows:
+        print(f"no effect with a known value was named in {options.results}: run run.py", file=sys.stderr)
+        return 1
+    for row in rows:
+        print("{case:60s} {parameter:34s} {truth:10.4g} {value:10.4g} ± {half_width:.2g}".format(**row))
+    print(f"\n{len(rows)} values; share of intervals with the truth, if their formulas' error is")
+    for share in SHARES:
+        print(f"  {share:5.2f} of the effect: {100 * coverage(rows, share):.0f} %")
+    if options.json:
+        write_text(options.json, json.dumps(rows, indent=1) + "\n")
+    return 0
+
+
+def values_of(case: dict, included: float) -> list[dict]:
+    """Values that were named rightly, with half widths of their intervals without the error that is included."""
+    rows = []
+    for hidden in case.get("hidden", []):
+        for effect in case.get("effects", []):
+            if effect["name"] != hidden["name"]:
+                continue
+            for key in hidden["estimated"]:
+                if key not in effect["parameters"]:
+                    continue
+                found, size = effect["parameters"][key], size_of(effect, key)
+                half_width = 0.5 * (found["high"] - found["low"])
+                rows.append(
+                    {
+                        "case": case["case"],
+                        "parameter": f"{effect['name']} {key}",
+                        "truth": hidden["values"][key],
+                        "value": found["value"],
+                        "half_width": float(np.sqrt(max(half_width**2 - (2.0 * included * size) ** 2, 0.0))),
+                        "size": size,
+                    }
+                )
+    return rows
+
+
+def size_of(effect: dict, key: str) -> float:
+    """Distance of an effect's parameters of the same unit from no effect; the value itself where that is infinite."""
+    known = {parameter.name: parameter for parameter in CATALOGUE[effect["name"]].parameters}
+    same = [name for name in effect["parameters"] if known[name].unit == known[key].unit]
+    away = [effect["parameters"][name]["value"] - known[name].neutral for name in same]
+    return float(np.linalg.norm(away)) if np.all(np.isfinite(away)) else abs(effect["parameters"][key]["value"])
+
+
+def coverage(rows: list[dict], share: float) -> float:
+    """Share of the intervals that hold the truth with a further error of a share of each effect's size."""
+    inside = [abs(r["truth"] - r["value"]) <= np.hypot(r["half_width"], 2.0 * share * r["size"]) for r in rows]
+    return float(np.mean(inside))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
