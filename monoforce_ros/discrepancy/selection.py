@@ -181,9 +181,8 @@ class Search:
         for number, effects in enumerate(learned_terms(start, self.directions.formula_terms(start), most)):
             self._progress(f"fitting a formula with {number + 1} terms")
             trial = self.judge(effects)
-            if best is not None and self._gain(best, trial)[1] <= 0:
-                break
-            best = trial
+            if best is None or self._gain(best, trial)[1] > 0:
+                best = trial
         assert best is not None
         return best
 
