@@ -59,6 +59,7 @@ def test_a_formula_that_explains_most_of_what_a_name_leaves_contradicts_it():
     better = replace(weak, formula=trial(0.5, (("learned_term", {"torque_z:vx": 200.0}),)), formula_gain=(1.7, 0.9))
     decision = decide(better)
     assert decision.verdict is Verdict.UNKNOWN_EFFECT and decision.trial is better.formula
+    assert "a formula explains most of what is left" in decision.remarks
     # By chance, or only a little: the name stays.
     assert decide(replace(better, formula_gain=(1.7, -0.1))).verdict is Verdict.EFFECT_FOUND
     little = trial(1.5, (("learned_term", {"torque_z:vx": 200.0}),))

@@ -17,8 +17,9 @@ from pathlib import Path
 import numpy as np
 
 from monoforce_ros.core import write_text
+from monoforce_ros.discrepancy.estimates import effect_sizes
+from monoforce_ros.discrepancy.fit import neutral_values
 from monoforce_ros.discrepancy.thresholds import Thresholds
-from monoforce_ros.effects import CATALOGUE
 
 SHARES = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3)
 """Errors as shares of the size of an effect."""
@@ -59,10 +60,12 @@ def values_of(case: dict, included: float) -> list[dict]:
         for effect in case.get("effects", []):
             if effect["name"] != hidden["name"]:
                 continue
-            for key in hidden["estimated"]:
-                if key not in effect["parameters"]:
+            values = {key: found["value"] for key, found in effect["parameters"].items()}
+            sizes = effect_sizes(effect["name"], values, neutral_values(((effect["name"], values),)))
+            for key, size in zip(values, sizes, strict=True):
+                if key not in hidden["estimated"]:
                     continue
-                found, size = effect["parameters"][key], size_of(effect, key)
+                found = effect["parameters"][key]
                 half_width = 0.5 * (found["high"] - found["low"])
                 rows.append(
                     {
@@ -71,18 +74,10 @@ def values_of(case: dict, included: float) -> list[dict]:
                         "truth": hidden["values"][key],
                         "value": found["value"],
                         "half_width": float(np.sqrt(max(half_width**2 - (2.0 * included * size) ** 2, 0.0))),
-                        "size": size,
+                        "size": float(size),
                     }
                 )
     return rows
-
-
-def size_of(effect: dict, key: str) -> float:
-    """Distance of an effect's parameters of the same unit from no effect; the value itself where that is infinite."""
-    known = {parameter.name: parameter for parameter in CATALOGUE[effect["name"]].parameters}
-    same = [name for name in effect["parameters"] if known[name].unit == known[key].unit]
-    away = [effect["parameters"][name]["value"] - known[name].neutral for name in same]
-    return float(np.linalg.norm(away)) if np.all(np.isfinite(away)) else abs(effect["parameters"][key]["value"])
 
 
 def coverage(rows: list[dict], share: float) -> float:

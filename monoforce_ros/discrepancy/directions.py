@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from monoforce_ros.discrepancy.fit import without
-from monoforce_ros.discrepancy.hypothesis import Effects, Predictions, own_values
+from monoforce_ros.discrepancy.hypothesis import Effects, Predictions, own_values, values_key
 from monoforce_ros.discrepancy.learned import LEARNED, FormulaTerms
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.score_test import Direction
@@ -44,7 +44,7 @@ class Directions:
 
     def scaled(self, effects: Effects) -> np.ndarray:
         """Scaled residuals, ``[W, K, 3]``; the last ones are kept."""
-        key = _key(effects)
+        key = values_key(effects)
         if key not in self._rolled:
             if len(self._rolled) >= _KEPT:
                 self._rolled.pop(next(iter(self._rolled)))
@@ -91,7 +91,7 @@ class Directions:
 
     def formula_terms(self, base: Effects) -> FormulaTerms:
         """What every term of a formula does in addition to a base; kept, for a formula is fitted from it, too."""
-        key = _key(base)
+        key = values_key(base)
         if key not in self._terms:
             if len(self._terms) >= _KEPT_TERMS:
                 self._terms.pop(next(iter(self._terms)))
@@ -133,7 +133,3 @@ class Directions:
             return 0.0
         change = self.scaled(base) - self.scaled(base[:fixed])
         return float(np.mean((np.nan_to_num(change) * metric) ** 2))
-
-
-def _key(effects: Effects) -> tuple[tuple[object, ...], ...]:
-    return tuple((name, *values.values()) for name, values in effects)

@@ -5,6 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+import numpy as np
+
+from monoforce_ros.effects import CATALOGUE
+
 
 @dataclass(frozen=True)
 class ParameterEstimate:
@@ -35,3 +39,16 @@ class EffectEstimate:
     found_again: tuple[int, int] | None = None
     """In how many of how many repetitions, each without another part of the recording, it or one of these others is
     found; None for a recording too short for that, and for a formula."""
+
+
+def effect_sizes(name: str, values: Mapping[str, float], without: np.ndarray) -> np.ndarray:
+    """Size of an effect in the unit of each of its parameters, ``[P]``.
+
+    It is the distance of all parameters of that unit from their values without the effect. A limit has no distance from
+    its absence: its size is its own value.
+    """
+    units = {parameter.name: parameter.unit for parameter in CATALOGUE[name].parameters}
+    unit = np.array([units[key] for key in values])
+    found = np.array(list(values.values()), float)
+    away = np.where(np.isfinite(without), found - without, found)
+    return np.array([np.linalg.norm(away[unit == same]) for same in unit])

@@ -148,6 +148,11 @@ def residuals_by_part(
     return residuals
 
 
+def values_key(effects: Effects) -> tuple[tuple[object, ...], ...]:
+    """Names and values of effects as a key."""
+    return tuple((name, *values.values()) for name, values in effects)
+
+
 def own_values(robot: RobotModel, name: str) -> dict[str, float]:
     """Values of an effect in the robot's file; none of sensors and clocks, for which the recording was corrected."""
     values = {} if CATALOGUE[name].stage == "measurement" else dict(robot.effects).get(name, {})

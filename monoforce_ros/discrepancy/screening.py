@@ -9,7 +9,7 @@ import numpy as np
 
 from monoforce_ros.discrepancy.directions import Directions
 from monoforce_ros.discrepancy.fit import first_values, fit_effects, jacobian, robust, robust_weights
-from monoforce_ros.discrepancy.hypothesis import Effects, EvidenceWindows, Predictions
+from monoforce_ros.discrepancy.hypothesis import Effects, EvidenceWindows, Predictions, values_key
 from monoforce_ros.discrepancy.score_test import Direction, ScoreResult, block_numbers, score_tests
 from monoforce_ros.discrepancy.thresholds import Thresholds
 from monoforce_ros.effects import Effect, identifiable_effects
@@ -151,7 +151,7 @@ class Screening:
             incomplete: whether it is known that something is missing: then effects are fitted that are not significant
                 by themselves, too.
         """
-        key = tuple((name, *values.values()) for name, values in base)
+        key = values_key(base)
         known = self._done.get(key)
         if known is None or (incomplete and not known.incomplete):
             self._done[key] = known = self._screened(base, fixed, number, incomplete)

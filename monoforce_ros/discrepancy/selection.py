@@ -17,12 +17,13 @@ from scipy.stats import t as student_distribution
 
 from monoforce_ros.discrepancy.credibility import complaint
 from monoforce_ros.discrepancy.directions import Directions
-from monoforce_ros.discrepancy.estimates import EffectEstimate
+from monoforce_ros.discrepancy.estimates import EffectEstimate, effect_sizes
 from monoforce_ros.discrepancy.fit import (
     Fit,
     estimate_effects,
     fit_effects,
     flat,
+    neutral_values,
     robust,
     scales,
     without,
@@ -177,13 +178,14 @@ class Search:
         A further term must reduce the held-out loss beyond chance.
         """
         start = self.refit(base).effects if base else self.known
-        best: Trial | None = None
+        trials = []
         for number, effects in enumerate(learned_terms(start, self.directions.formula_terms(start), most)):
             self._progress(f"fitting a formula with {number + 1} terms")
-            trial = self.judge(effects)
-            if best is None or self._gain(best, trial)[1] > 0:
+            trials.append(self.judge(effects))
+        best = trials[0]
+        for trial in trials[1:]:
+            if self._gain(best, trial)[1] > 0:
                 best = trial
-        assert best is not None
         return best
 
     @property
@@ -210,9 +212,8 @@ class Search:
 
     def _without(self, name: str, values: Mapping[str, float]) -> np.ndarray:
         """Values of an effect's parameters on the nominal robot."""
-        neutral = {parameter.name: parameter.neutral for parameter in CATALOGUE[name].parameters}
-        own = {**neutral, **own_values(self.robot, name)}
-        return np.array([own[key] for key in values])
+        own, neutral = own_values(self.robot, name), neutral_values(((name, values),))
+        return np.array([own.get(key, value) for key, value in zip(values, neutral, strict=True)])
 
     def refit(self, effects: Effects) -> Fit:
         """Fit to the whole recording; kept, and repeated from values that explain it better."""
@@ -253,20 +254,10 @@ class Search:
     def formula_variances(self, fit: Fit) -> np.ndarray:
         """Variance of each parameter of a fit because its effect's formula is not exact, ``[P]``.
 
-        It is proportional to the square of what the effect is, beyond what the robot's file says: the distance of all
-        its parameters of the same unit from their values without it.
+        It grows with the square of the effect's size, beyond what the robot's file says.
         """
-        variances = []
-        for name, values in fit.effects:
-            units = [
-                {parameter.name: parameter.unit for parameter in CATALOGUE[name].parameters}[key] for key in values
-            ]
-            away = np.array(list(values.values()), float) - self._without(name, values)
-            # A limit has no distance from its absence: its size is its own value.
-            away = np.where(np.isfinite(away), away, list(values.values()))
-            squares = [sum(away[i] ** 2 for i, other in enumerate(units) if other == unit) for unit in units]
-            variances += [self.thresholds.formula_error**2 * square for square in squares]
-        return np.array(variances)
+        found = [effect_sizes(name, values, self._without(name, values)) for name, values in fit.effects]
+        return (self.thresholds.formula_error * np.concatenate([*found, np.zeros(0)])) ** 2
 
     def estimates(
         self, fit: Fit, indistinguishable: Mapping[str, Sequence[str]] | None = None

@@ -97,11 +97,14 @@ def fits(findings: Findings, thresholds: Thresholds) -> bool:
     passed = findings.fit.passed(thresholds)
     if findings.commissioned or not findings.best.effects:
         return passed
-    if findings.formula is not None and findings.formula_gain[1] > 0:
-        rest = 1.0 - findings.formula.loss / findings.best.loss
-        if rest >= thresholds.most_share:
-            return False
-    return passed or not leaves_most(findings, thresholds)
+    return not _contradicted(findings, thresholds) and (passed or not leaves_most(findings, thresholds))
+
+
+def _contradicted(findings: Findings, thresholds: Thresholds) -> bool:
+    """Whether a formula in addition to the best effects explains most of what they leave."""
+    if findings.formula is None or findings.formula_gain[1] <= 0:
+        return False
+    return findings.formula.loss <= (1.0 - thresholds.most_share) * findings.best.loss
 
 
 def leaves_most(findings: Findings, thresholds: Thresholds) -> bool:
@@ -125,6 +128,8 @@ def decide(findings: Findings, thresholds: Thresholds = Thresholds()) -> Decisio
             )
         return Decision(Verdict.EFFECT_FOUND, best, remarks, losses)
     reason = "what is left exceeds a healthy robot's error by more than what is explained"
+    if not findings.commissioned:
+        reason = "a formula explains most of what is left"
     if findings.fit.p <= thresholds.fit_rate:
         reason = f"what is left does not look like the healthy robot: {findings.fit.strongest}"
     remarks = (reason,)

@@ -120,12 +120,10 @@ def evaluate_recording(
     inside: list[np.ndarray] = []
     flat = FlatTerrain(predictor.robot, predictor.source.grid, TerrainDefaults())
 
-    def roll_out_batch(batch: list[MotionState], maps: list[TerrainMap], confirmed: list[TerrainMap]) -> None:
+    def roll_out_batch(batch: list[MotionState], maps: dict[str, list[TerrainMap]]) -> None:
         twists = np.stack([recording.commands.sample(predictor.command_stamps(m.stamp)) for m in batch])
         joints = recorded_joints(recording, predictor, [m.stamp for m in batch])
-        compared = {PHYSICS: maps}
-        if confirmed:
-            compared[CONFIRMED_PHYSICS] = confirmed
+        compared = {method: batch_maps for method, batch_maps in maps.items() if batch_maps}
         if sensors and baselines:
             compared[FLAT_PHYSICS] = [
                 flat.terrain(Observation(0, flipper_angles=_flippers_at(recording, m.stamp)), m) for m in batch
@@ -142,8 +140,7 @@ def evaluate_recording(
                     inside.append(result.inside[row].numpy()[index])
 
     pending: list[MotionState] = []
-    pending_maps: list[TerrainMap] = []
-    pending_confirmed: list[TerrainMap] = []
+    pending_maps: dict[str, list[TerrainMap]] = {PHYSICS: [], CONFIRMED_PHYSICS: []}
     for stamp in progress(stamps, label="predicting", unit="window", quiet=quiet):
         try:
             motion = recording.motion.at(int(stamp), maximum_gap=MAXIMUM_GAP)
@@ -153,17 +150,17 @@ def evaluate_recording(
             remarks.append(f"window at {(stamp - recording.motion.stamps[0]) * 1e-9:.1f} s skipped: {error}")
             continue
         if isinstance(predictor.source, TrustedTerrain) and predictor.source.predicted is not None:
-            pending_confirmed.append(found)
+            pending_maps[CONFIRMED_PHYSICS].append(found)
             found = predictor.source.predicted
         pending.append(motion)
-        pending_maps.append(found)
+        pending_maps[PHYSICS].append(found)
         terrains.append(found)
         motions.append(motion)
         if len(pending) == BATCH:
-            roll_out_batch(pending, pending_maps, pending_confirmed)
-            pending, pending_maps, pending_confirmed = [], [], []
+            roll_out_batch(pending, pending_maps)
+            pending, pending_maps = [], {PHYSICS: [], CONFIRMED_PHYSICS: []}
     if pending:
-        roll_out_batch(pending, pending_maps, pending_confirmed)
+        roll_out_batch(pending, pending_maps)
     if not motions:
         raise EvaluationError(
             f"{recording.path}: every prediction failed: {remarks[0] if remarks else 'no sensor data'}"
