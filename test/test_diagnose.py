@@ -5,7 +5,6 @@ import shutil
 import subprocess
 from dataclasses import replace
 
-import mujoco
 import numpy as np
 import pytest
 import torch
@@ -560,9 +559,6 @@ def pulled_robot(tmp_path_factory):
     return out
 
 
-@pytest.mark.xfail(
-    mujoco.__version__.startswith("3.10."), reason="named a speed limit in a recording of MuJoCo 3.10", strict=True
-)
 def test_an_out_of_catalogue_effect_is_reported_as_unknown(pulled_robot, late_robot, tmp_path, executables,
                                                             ros_environment):  # fmt: skip
     out = tmp_path / "reports"
