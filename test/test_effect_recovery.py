@@ -49,6 +49,7 @@ def driven(robot, terrain=None):
         ("acceleration_limit", {"limit": 0.7}, 0.05),
         ("yaw_acceleration_limit", {"limit": 0.9}, 0.05),
         ("drive_loss", {"loss": -0.25}, 0.05),
+        ("drive_droop", {"loss": 0.15, "recovery": 2.0}, 0.12),
         ("supply_sag", {"sag": 0.3}, 0.08),
         ("rotation_centre", {"x": 0.06}, 0.1),
         ("drive_compliance", {"speed_loss": 0.15}, 0.1),

@@ -117,6 +117,7 @@ ALL_STAGES = {
     "yaw_rate_limit": {"limit": 0.11},
     "drive_loss": {"loss": -0.3},
     "supply_sag": {"sag": 0.25},
+    "drive_droop": {"loss": 0.06, "recovery": 0.8},
     "acceleration_limit": {"limit": 0.13},
     "yaw_acceleration_limit": {"limit": 0.21},
 }
@@ -167,6 +168,34 @@ def test_command_effects_have_their_closed_forms(husky):
     band = steps(having(husky, actuator_deadband={"width": 0.1}), [-0.5, -0.05, 0.0, 0.08, 0.5])
     np.testing.assert_allclose(band, [-0.4, 0, 0, 0, 0.4])
     np.testing.assert_allclose(steps(having(husky, drive_gain={"gain": 0.9}), [0.5]), [0.45])
+
+
+def test_drives_give_way_to_the_scrub_of_a_turn_until_integral_action_restores_them(husky):
+    fast = dataclasses.replace(husky, maximum_speed=9.0, maximum_yaw_rate=9.0)
+    robot = having(fast, drive_droop={"loss": 0.2, "recovery": 1.5})
+    width = float(husky.drive_offsets.max() - husky.drive_offsets.min())
+    time = np.arange(600) * 0.01
+    step = np.where((time >= 1.0)[:, None], [0.5, 2.0 / width], [0.5, 0.0])
+    step[time >= 4.0, 1] = 1.0 / width
+    forward, yaw_rate = twist_of(robot, step).T
+    np.testing.assert_allclose(forward, 0.5, atol=1e-12)
+    # At first the whole loss, of which the integral part takes back what it can; a slower turn to the same side keeps
+    # its load, and follows at once.
+    lost = np.where(time < 1.0, 0.0, 2.0 * 0.2 * np.exp(-(time - 1.0) / 1.5)) / width
+    np.testing.assert_allclose(yaw_rate, step[:, 1] - lost, atol=1e-9)
+    # A turn that asks for less than the friction waits: the integral part grows by d / T until it overcomes it.
+    slow = np.where(time[:, None] >= 1.0, [0.0, 2.0 * 0.1 / width], 0.0)
+    yaw_rate = twist_of(robot, slow)[:, 1]
+    begins = 1.0 + 1.5 * (0.2 / 0.1) * (1.0 - 0.1 / 0.2)
+    assert np.abs(yaw_rate[time < begins - 0.05]).max() < 1e-9 < yaw_rate[time > begins + 0.05].min()
+    assert yaw_rate[-1] == pytest.approx(2.0 * 0.1 / width * (1.0 - np.exp(-(5.99 - begins) / 1.5)), rel=0.02)
+    # The wheels show the same.
+    response = CATALOGUE["drive_droop"].wheel_response
+    sides = np.stack([step[:, 0] - 0.5 * width * step[:, 1], step[:, 0] + 0.5 * width * step[:, 1]])
+    shown = response.speeds(sides[None], 0.2, 1.5, 0.01)[0]
+    np.testing.assert_allclose((shown[1] - shown[0]) / width, step[:, 1] - lost, atol=1e-9)
+    # A robot with steered wheels has no scrub.
+    assert not CATALOGUE["drive_droop"].applies_to(load_robot("rally_car")) and CATALOGUE["drive_droop"].applies_to(husky)
 
 
 def twist_of(robot, commands):

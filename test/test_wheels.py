@@ -61,6 +61,8 @@ HUSKY_BASE = (
         (("supply_sag", {"sag": 0.4}),),
         (("drive_loss", {"loss": 0.4}),),
         (("drive_loss", {"loss": -1.0}),),
+        (("drive_droop", {"loss": 0.2, "recovery": 1.5}),),
+        (("actuator_lag", {"time_constant": 0.2}), ("drive_droop", {"loss": 0.15, "recovery": 1.0})),
         (("command_delay", {"delay": 0.3}), ("actuator_lag", {"time_constant": 0.2})),
     ],
 )
@@ -68,10 +70,11 @@ def test_effects_of_the_drives_are_recovered_from_wheel_speeds(husky, effects):
     commands = drawn_commands(90.0, 5)
     found = compare_with_wheels(commands, wheels_of(commands, husky, effects), husky)
     assert {name for name, _ in found.effects} == {name for name, _ in effects}
-    for (name, values), half_width in zip(found.effects, found.half_widths, strict=True):
-        (key, value), (_, injected) = *values.items(), *dict(effects)[name].items()
-        assert value == pytest.approx(injected, rel=0.06, abs=0.015), key
-        assert 0.0 < half_width < 0.1
+    for (name, values), half_widths in zip(found.effects, found.half_widths, strict=True):
+        for key, injected in dict(effects)[name].items():
+            # Integral action is shown by what it did before a block, too, of which little is known.
+            assert values[key] == pytest.approx(injected, rel=0.12 if key == "recovery" else 0.06, abs=0.015), key
+            assert 0.0 < half_widths[key] < 0.1 * max(1.0, injected)
 
 
 def test_a_dead_time_is_found_though_it_is_a_small_share_of_the_error():

@@ -21,6 +21,7 @@ from monoforce_ros.discrepancy.motion_check import motion_faults
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.nominal_residual import residual_complaint
 from monoforce_ros.discrepancy.report import effect_entry, write_diagnosis
+from monoforce_ros.discrepancy.separate_stretches import laid_apart
 from monoforce_ros.discrepancy.step_errors import compare_after_steps
 from monoforce_ros.discrepancy.terrain_evidence import supporting_terrain, traced_terrain
 from monoforce_ros.discrepancy.verdict import Verdict
@@ -94,6 +95,9 @@ def read_with_ground(
     if ground.source not in ("lidar", "traced"):
         terrain_map, pose = load_terrain(Path(ground.source))
         return replace(evidence, terrain=terrain_map, odometry_from_terrain=pose), recording, ground
+    if ground.apart:
+        smoothed = laid_apart(smoothed, _MARGIN)
+        evidence = replace(evidence, smoothed=smoothed)
     motion = smoothed.motion
     low, high = motion.positions.min(axis=0)[:2] - _MARGIN, motion.positions.max(axis=0)[:2] + _MARGIN
     columns, rows = np.ceil((high - low) / 0.1).astype(int) + 1
@@ -159,17 +163,26 @@ def diagnose_bag(
     steeper = beyond_commissioning(ground.slope, None if nominal is None else nominal.slope)
     # A robot that was commissioned on such slopes is known there, without a map, too.
     known = nominal is not None and nominal.slope is not None and not steeper
-    diagnosis = without_blame_for_ground(diagnosis, ground.unexplained or steeper, named=ground.uneven and not known)
+    unexplained = ground.unexplained or steeper
+    judged = without_blame_for_ground(diagnosis, unexplained, named=ground.uneven and not known)
+    rest: tuple[str, ...] = ()
+    if judged is not diagnosis:
+        # What gyro and wheels measure does not depend on the ground.
+        progress(0.94, "without what may be the ground's")
+        measured = diagnose(evidence, model, nominal=nominal, settings=replace(settings, sensors_only=True))
+        if measured.verdict == Verdict.EFFECT_FOUND:
+            judged, rest = measured, judged.advice
+    diagnosis = judged
     large = residual_complaint(None if nominal is None else nominal.residual, evidence.smoothed, evidence.commands)
     # Named effects stay, with this doubt.
-    steeper = steeper if diagnosis.effects else ""
+    steeper = steeper if diagnosis.effects and steeper not in rest else ""
     harder = "" if nominal is None else uncovered_doubt(evidence, settings.horizon, nominal.changes)
-    doubts = [text for text in (ground.complaint, steeper, harder, large) if text]
+    doubts = list(dict.fromkeys(text for text in (ground.complaint, *rest, steeper, harder, large) if text))
     if diagnosis.verdict == Verdict.NOT_IDENTIFIABLE:
         diagnosis = _with_wheels(diagnosis, evidence, model)
     robot_file = None
-    # On ground that no map shows slopes pass for effects: nothing of that belongs into a robot file.
-    credible = bool(diagnosis.effects) and not ground.unknown
+    # On ground that no map shows slopes pass for effects: of that only what sensors measured belongs into a robot file.
+    credible = bool(diagnosis.effects) and (bool(rest) or not ground.unknown)
     if credible and all(not complaint(effect, own_values(model, effect.name)) for effect in diagnosis.effects):
         effects = [effect_entry(effect) for effect in diagnosis.effects]
         robot_file = write_robot(robot, found_file, effects, [bag], data)

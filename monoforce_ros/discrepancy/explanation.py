@@ -37,6 +37,8 @@ class DiagnosisSettings:
     processes: int = 1
     """In which the diagnosis is repeated without parts of the recording."""
     thresholds: Thresholds = field(default_factory=Thresholds)
+    sensors_only: bool = False
+    """Only effects that gyro, wheel speeds or joints measured: of the rest something else may be the cause."""
 
 
 @dataclass(frozen=True)
@@ -109,6 +111,9 @@ def explain(
         )
 
     search = searched(windows)
+    if settings.sensors_only:
+        outcome = search.measured()
+        return Explanation(windows, sensors, search, outcome, *_decided(search, outcome, thresholds))
     outcome = search.run(settings.max_effects, exchange=not repeated)
     onset = None
     if not repeated and not outcome.fit.passed(thresholds):
@@ -128,12 +133,7 @@ def explain(
             outcome = search.run(settings.max_effects)
         else:
             onset = None
-    findings = Findings(
-        outcome.nominal, outcome.best, outcome.fit,
-        healthy_loss=search.healthy_loss,
-        commissioned=search.commissioned,
-        known=search.known,
-    )  # fmt: skip
+    findings, _ = _decided(search, outcome, thresholds)
     doubtful = bool(outcome.best.effects) and not findings.commissioned and leaves_most(findings, thresholds)
     if doubtful or not findings.fit.passed(thresholds):
         starts = windows.data.starts
@@ -148,3 +148,14 @@ def explain(
     decision = decide(findings, thresholds)
     decision = replace(decision, losses=replace(decision.losses, variance_ratio=outcome.variance_ratio))
     return Explanation(windows, sensors, search, outcome, findings, decision, onset)
+
+
+def _decided(search: Search, outcome: Outcome, thresholds: Thresholds) -> tuple[Findings, Decision]:
+    """What a search found, and the verdict without a formula."""
+    findings = Findings(
+        outcome.nominal, outcome.best, outcome.fit,
+        healthy_loss=search.healthy_loss,
+        commissioned=search.commissioned,
+        known=search.known,
+    )  # fmt: skip
+    return findings, decide(findings, thresholds)

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import BagError, Recording, SmoothedMotion
 from monoforce_ros.core import NANOSECOND
+from monoforce_ros.discrepancy.separate_stretches import starts_anew
 from monoforce_ros.robots import RobotModel
 
 LEVEL_SLOPE = np.arcsin(0.05)
@@ -21,6 +22,7 @@ for an effect.
 STEEPER = np.sqrt(2.0)
 """Ground that is so many times as steep as where the robot was commissioned leaves a residual that nobody has seen:
 what slopes contribute to its variance grows with their square, to twice as much."""
+_APART_TEXT = "; each stretch for itself, since the localisation starts anew in each"
 _APART = 1.0
 """Distance over which slopes are taken from heights [m]."""
 
@@ -42,6 +44,8 @@ class Ground:
     """Why an error without a name may be the ground's; empty if a map shows the ground, or it is level."""
     uneven: bool = False
     """Whether no map shows slopes that differ from place to place: forces that these exert may pass for effects."""
+    apart: bool = False
+    """Whether each stretch of the recording is traced for itself, since the localisation starts anew in each."""
 
     @property
     def unknown(self) -> bool:
@@ -64,7 +68,9 @@ def choose_ground(terrain: str, recording: Recording, smoothed: SmoothedMotion, 
         return Ground(terrain, f"lidar map of {len(recording.clouds)} sweeps", slope)
     if terrain == "traced":
         unexplained = _by_trace(slope, "as asked for") if uneven else ""
-        return Ground(terrain, "traced by the wheels along the measured poses", slope, "", unexplained, uneven)
+        apart = starts_anew(smoothed)
+        description = "traced by the wheels along the measured poses" + (_APART_TEXT if apart else "")
+        return Ground(terrain, description, slope, "", unexplained, uneven, apart)
     if terrain not in ("auto", "flat"):
         return Ground(terrain, f"map {Path(terrain).name}", slope)
     reason = "no clouds in the bag"
@@ -80,8 +86,10 @@ def choose_ground(terrain: str, recording: Recording, smoothed: SmoothedMotion, 
     said = "as asked for" if terrain == "flat" else reason
     complaint = ""
     if terrain == "auto" and uneven:
+        apart = starts_anew(smoothed)
         description = f"traced by the wheels: slopes of {np.degrees(slope):.1f}° by the poses, and {reason}"
-        return Ground("traced", description, slope, "", _by_trace(slope, reason), uneven)
+        description += _APART_TEXT if apart else ""
+        return Ground("traced", description, slope, "", _by_trace(slope, reason), uneven, apart)
     if slope > LEVEL_SLOPE:
         remedy = "use --terrain lidar or a map" if recording.clouds else "record a lidar, or give a map of fit_terrain"
         what = f"the ground is not level (slopes of {np.degrees(slope):.1f}° by the poses, root mean square)"

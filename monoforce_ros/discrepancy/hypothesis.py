@@ -25,8 +25,8 @@ Effects = tuple[tuple[str, Mapping[str, float]], ...]
 """Names of effects with the values of their parameters."""
 COMPONENTS = ("along", "across", "heading")
 """Of a residual: position in the frame of the window's start pose [m], heading [rad]."""
-HISTORY = 2.0
-"""Length of the commands before a window, for delays and lags [s]."""
+HISTORY = 4.0
+"""Length of the commands before a window, for delays, lags and the integral part of drives [s]."""
 _MARGIN = 1.3
 """Margin at both ends of a stretch, so that data remain available with a shifted clock [s]."""
 _SHORT = 12.0

@@ -129,14 +129,8 @@ class Search:
             exchange: replace each of several effects by every other one at the end, and find those that are
                 indistinguishable from it.
         """
-        nominal = Trial((), ((),) * FOLDS, self.loss_of(()))
-        start = nominal
-        if self.known:
-            start = Trial(self.known, (self.known,) * FOLDS, self.loss_of(self.known))
-            _, low = self._gain(start, nominal)
-            if low > 0:
-                # The motion contradicts the measurement of the other sensor.
-                self.known, start = (), nominal
+        measured = self.measured()
+        nominal, start = measured.nominal, measured.best
         judged, tried = self._round(start, 1, self.thresholds.effect_rate)
         ratio = self.screening.candidates(self.known, len(self.known), "1: ").variance_ratio(self.directions)
         if not judged:
@@ -160,6 +154,17 @@ class Search:
         if exchanged is not best:
             best, fit = exchanged, self.fit_test(exchanged, nominal)
         return Outcome(nominal, best, fit, tuple(tried), ratio, indistinguishable)
+
+    def measured(self) -> Outcome:
+        """The effects that another sensor measured, unless the motion contradicts them."""
+        nominal = Trial((), ((),) * FOLDS, self.loss_of(()))
+        start = nominal
+        if self.known:
+            start = Trial(self.known, (self.known,) * FOLDS, self.loss_of(self.known))
+            _, low = self._gain(start, nominal)
+            if low > 0:
+                self.known, start = (), nominal
+        return Outcome(nominal, start, FitTest(1.0, ""))
 
     def _extended(self, best: Trial, most_effects: int) -> tuple[Trial, list[CandidateScore]]:
         """Add effects one at a time while a further one is significant."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,14 +59,15 @@ class SensorFindings:
             return estimate
         if self.flippers is not None and estimate.name == BLOCKED:
             return self.flippers.estimate
+        half_widths: Mapping[str, float]
         if self.gyro is not None and estimate.name == "pose_clock_offset":
-            half_width = self.gyro.offset_half_width
+            half_widths = {"offset": self.gyro.offset_half_width}
         elif self.wheels is not None and estimate.name in dict(self.wheels.effects):
             names = [name for name, _ in self.wheels.effects]
-            half_width = self.wheels.half_widths[names.index(estimate.name)]
+            half_widths = self.wheels.half_widths[names.index(estimate.name)]
         else:
             return estimate
-        parameters = {key: value.with_half_width(half_width) for key, value in estimate.parameters.items()}
+        parameters = {key: value.with_half_width(half_widths[key]) for key, value in estimate.parameters.items()}
         return EffectEstimate(estimate.name, parameters)
 
 

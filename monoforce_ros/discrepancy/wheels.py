@@ -19,8 +19,8 @@ from monoforce_ros.robots import RobotModel
 
 _STEP, _FINE_STEP = 0.04, 0.01
 """Of the modelled wheel speeds, in the selection and in the final fit [s]."""
-_HISTORY = 2.0
-"""Length of the commands before a block [s]: the longest dead time of the catalogue."""
+_HISTORY = 4.0
+"""Length of the commands before a block [s]: twice the longest dead time of the catalogue, for the integral part of drives."""
 _LONGEST_GAP = 1.0
 _BLOCK = 4.0
 """Length of the blocks that are fitted or held out together [s]: longer than drives respond to a step."""
@@ -44,9 +44,10 @@ class WheelFinding:
     """How the drives follow commands."""
 
     effects: Effects
-    """One parameter each, in the order in which they act on a command; empty where the wheels follow the commands."""
-    half_widths: tuple[float, ...]
-    """Half-width of each parameter's 95 % confidence interval."""
+    """In the order in which they act on a command; empty where the wheels follow the commands. The first parameter of
+    each is the one that says how large it is."""
+    half_widths: tuple[Mapping[str, float], ...]
+    """Half-widths of the 95 % confidence intervals of each effect's parameters."""
     error_before: float
     """RMS of measured minus commanded wheel speed [m/s], at the best constant ratio of the two."""
     error_after: float
@@ -61,7 +62,7 @@ class WheelFinding:
 
     def summary(self) -> str:
         """One sentence for reports."""
-        parts = [_response(name).wording.format(next(iter(values.values()))) for name, values in self.effects]
+        parts = [_response(name).wording.format(*values.values()) for name, values in self.effects]
         text = "the measured wheel speeds follow the commands " + ", ".join(parts or ["without delay or limit"])
         if self.used_blocks < self.all_blocks:
             text += f" ({self.used_blocks} of {self.all_blocks} blocks of {_BLOCK:g} s, spread over the recording)"
@@ -109,10 +110,8 @@ def compare_with_wheels(commands: CommandTrack, wheels: WheelTrack | None, robot
         # The wheels do not follow the commands.
         return None
     return WheelFinding(
-        tuple(
-            (name, {_response(name).parameter: float(value)}) for name, value in zip(best.names, values, strict=True)
-        ),
-        tuple(float(value) for value in half_widths),
+        tuple((name, dict(zip(_keys(name), own, strict=True))) for name, own in _by_effect(best.names, values)),
+        tuple(dict(zip(_keys(name), own, strict=True)) for name, own in _by_effect(best.names, half_widths)),
         float(np.sqrt(baseline.loss / count)),
         float(np.sqrt(best.loss / count)),
         ratio,
@@ -130,7 +129,10 @@ def changed_drives(wheels: WheelFinding, robot: RobotModel) -> tuple[Effects, tu
         wheels; and the names of those that did not change.
     """
     in_file, shown = dict(robot.effects), dict(wheels.effects)
-    half_widths = dict(zip(shown, wheels.half_widths, strict=True))
+    half_widths = {
+        name: widths[_response(name).parameter] for name, widths in zip(shown, wheels.half_widths, strict=True)
+    }
+    largest = max(half_widths.values(), default=0.0)
     changed: list[tuple[str, Mapping[str, float]]] = []
     unchanged = []
     for effect in wheel_effects():
@@ -139,14 +141,14 @@ def changed_drives(wheels: WheelFinding, robot: RobotModel) -> tuple[Effects, tu
         expected = float(in_file.get(effect.name, {}).get(response.parameter, neutral))
         value = float(shown[effect.name][response.parameter]) if effect.name in shown else neutral
         # Of an effect that the wheels do not show the half-width is unknown: the largest one stands for it.
-        half_width = half_widths.get(effect.name, max(wheels.half_widths, default=0.0))
+        half_width = half_widths.get(effect.name, largest)
         if effect.name not in shown and expected == neutral and effect.name not in wheels.ruled_out:
             # The wheels neither show it nor rule it out.
             continue
         if value == expected or abs(value - expected) <= half_width:
             unchanged.append(effect.name)
         elif np.isfinite(value):
-            changed.append((effect.name, {response.parameter: value}))
+            changed.append((effect.name, dict(shown.get(effect.name, {response.parameter: value}))))
     return tuple(changed), tuple(unchanged)
 
 
@@ -260,7 +262,7 @@ class _Model:
 
     names: tuple[str, ...]
     values: np.ndarray
-    """Mean over the folds, ``[P]``."""
+    """Of all parameters, mean over the folds, ``[P]``."""
     losses: np.ndarray
     """Sum of squared errors of each block with the values fitted without its fold, ``[n]`` [m²/s²]."""
 
@@ -277,7 +279,7 @@ class _Selection:
         self._blocks = blocks
         self._fold = np.arange(len(blocks)) % 2
         self._known: dict[tuple[str, ...], _Model] = {}
-        self._order = [effect.name for effect in wheel_effects()]
+        self._order = [effect.name for effect in wheel_effects() if effect.applies_to(blocks.robot)]
 
     def run(self) -> _Model:
         """The smallest model that no larger one improves.
@@ -353,8 +355,8 @@ def _weak(model: _Model, blocks: _Blocks) -> list[str]:
     """Effects of a model whose values are too small to count."""
     return [
         name
-        for name, value in zip(model.names, model.values, strict=True)
-        if not _response(name).counts(float(value), blocks.fastest)
+        for name, (value, *_) in _by_effect(model.names, model.values)
+        if not _response(name).counts(value, blocks.fastest)
     ]
 
 
@@ -365,24 +367,43 @@ def _ruled_out(names: tuple[str, ...], values: np.ndarray, blocks: _Blocks) -> I
     for it. Each is therefore fitted beside the others, and its confidence interval looked at.
     """
     for effect in wheel_effects():
-        if effect.name in names:
+        if effect.name in names or not effect.applies_to(blocks.robot):
             continue
         together = _in_order((*names, effect.name))
         known = _Model(names, values, np.zeros(0))
         fitted = _fit(together, blocks, _starts(together, blocks.fastest, known))
-        place = together.index(effect.name)
-        value, half_width = float(fitted[place]), float(_half_widths(fitted, together, blocks)[place])
+        value, *_ = dict(_by_effect(together, fitted))[effect.name]
+        half_width, *_ = dict(_by_effect(together, _half_widths(fitted, together, blocks)))[effect.name]
         ends = (value - half_width, value + half_width)
         if np.isfinite(ends).all() and not any(_response(effect.name).counts(end, blocks.fastest) for end in ends):
             yield effect.name
 
 
-def _bounds(name: str, fastest: Fastest) -> tuple[float, float]:
-    """Bounds of a fit: values that the catalogue allows, for they become initial values of other fits."""
+def _keys(name: str) -> tuple[str, ...]:
+    """Parameters of an effect that a fit changes, the one that says how large it is first."""
     response = _response(name)
-    parameter = next(p for p in CATALOGUE[name].parameters if p.name == response.parameter)
-    low, high = (float(np.clip(end, parameter.low, parameter.high)) for end in response.bounds(fastest))
-    return low, max(high, low + 1e-3)
+    return (response.parameter, *response.further)
+
+
+def _by_effect(names: Sequence[str], values: np.ndarray) -> Iterator[tuple[str, tuple[float, ...]]]:
+    """Values ``[P]`` of the parameters of each effect."""
+    at = 0
+    for name in names:
+        count = len(_keys(name))
+        yield name, tuple(float(value) for value in values[at : at + count])
+        at += count
+
+
+def _bounds(names: Sequence[str], fastest: Fastest) -> np.ndarray:
+    """Bounds of a fit ``[P, 2]``: values that the catalogue allows, for they become initial values of other fits."""
+    bounds = []
+    for name in names:
+        response, known = _response(name), {parameter.name: parameter for parameter in CATALOGUE[name].parameters}
+        main = known[response.parameter]
+        low, high = (float(np.clip(end, main.low, main.high)) for end in response.bounds(fastest))
+        bounds.append((low, max(high, low + 1e-3)))
+        bounds += [(known[key].low, known[key].high) for key in response.further]
+    return np.array(bounds).reshape(-1, 2)
 
 
 def _in_order(names: Sequence[str]) -> tuple[str, ...]:
@@ -398,16 +419,16 @@ def _response(name: str) -> WheelResponse:
 
 def _modelled(values: np.ndarray, names: tuple[str, ...], blocks: _Blocks) -> np.ndarray:
     """Speeds ``[n, 2, T]`` [m/s] of wheels that follow the commands under effects: those on the twist act first."""
-    named = [(_response(name), float(value)) for name, value in zip(names, values, strict=True)]
+    named = [(_response(name), own) for name, own in _by_effect(names, values)]
     twists = blocks.twists
-    for response, value in named:
+    for response, own in named:
         if response.of_twist:
-            changed = response.speeds(twists[:, :2], value, blocks.step)
+            changed = response.speeds(twists[:, :2], *own, blocks.step)
             twists = np.concatenate([changed, twists[:, 2:]], axis=1) if twists.shape[1] > 2 else changed
     speeds = blocks.commanded(twists)
-    for response, value in named:
+    for response, own in named:
         if not response.of_twist:
-            speeds = response.speeds(speeds, value, blocks.step)
+            speeds = response.speeds(speeds, *own, blocks.step)
     return speeds
 
 
@@ -423,9 +444,14 @@ def _block_losses(values: np.ndarray, names: tuple[str, ...], blocks: _Blocks, t
 
 def _starts(names: tuple[str, ...], fastest: Fastest, similar: _Model | None) -> list[np.ndarray]:
     """Initial values: those of a similar model, with each initial value of what it does not hold."""
-    known = {} if similar is None else dict(zip(similar.names, similar.values, strict=True))
-    listed = [(float(known[name]),) if name in known else _response(name).starts(fastest) for name in names]
-    return [np.array([values[i % len(values)] for values in listed]) for i in range(max(map(len, listed), default=0))]
+    known = {} if similar is None else dict(_by_effect(similar.names, similar.values))
+    listed = []
+    for name in names:
+        neutral = {parameter.name: parameter.neutral for parameter in CATALOGUE[name].parameters}
+        further = tuple(float(neutral[key]) for key in _response(name).further)
+        listed.append([known[name]] if name in known else [(v, *further) for v in _response(name).starts(fastest)])
+    count = max(map(len, listed), default=0)
+    return [np.concatenate([values[i % len(values)] for values in listed]) for i in range(count)]
 
 
 def _fit(names: tuple[str, ...], blocks: _Blocks, starts: Sequence[np.ndarray]) -> np.ndarray:
@@ -433,7 +459,7 @@ def _fit(names: tuple[str, ...], blocks: _Blocks, starts: Sequence[np.ndarray]) 
     if not names:
         return np.zeros(0)
     fastest = blocks.fastest
-    bounds = np.array([_bounds(name, fastest) for name in names])
+    bounds = _bounds(names, fastest)
     inside = [np.clip(start, bounds[:, 0] + 1e-6, bounds[:, 1] - 1e-6) for start in starts]
     start = min(inside, key=lambda values: _block_losses(values, names, blocks, fastest.speed).sum())
     return least_squares(
@@ -444,12 +470,12 @@ def _fit(names: tuple[str, ...], blocks: _Blocks, starts: Sequence[np.ndarray]) 
 
 def _half_widths(values: np.ndarray, names: tuple[str, ...], blocks: _Blocks) -> np.ndarray:
     """Half-widths of 95 % intervals from the scores of each block (sandwich estimate, White 1980), ``[P]``."""
-    base = _residuals(values, names, blocks)
+    base, bounds = _residuals(values, names, blocks), _bounds(names, blocks.fastest)
     derivatives = []
     for i, value in enumerate(values):
         step = max(0.01 * abs(value), 1e-3)
         # A dead time of less than none is not defined.
-        ends = np.clip((value - step, value + step), *_bounds(names[i], blocks.fastest))
+        ends = np.clip((value - step, value + step), *bounds[i])
         shifted = [_residuals(values + (end - value) * np.eye(len(values))[i], names, blocks) for end in ends]
         derivatives.append((shifted[1] - shifted[0]) / (ends[1] - ends[0]))
     jacobian = np.array(derivatives)

@@ -51,12 +51,13 @@ class Fastest:
 
 @dataclass(frozen=True)
 class WheelResponse:
-    """An effect in measured wheel speeds: how one parameter changes commanded wheel speeds."""
+    """An effect in measured wheel speeds: how its parameters change commanded wheel speeds."""
 
     parameter: str
-    speeds: Callable[[np.ndarray, float, float], np.ndarray]
-    """(commands, parameter value, time step [s]) → changed commands. Commands are wheel speeds ``[..., 2, T]`` [m/s],
-    left and right, or, with ``of_twist``, forward speed [m/s] and yaw rate [rad/s]."""
+    """That says how large the effect is."""
+    speeds: Callable[..., np.ndarray]
+    """(commands, parameter value, those of ``further``, time step [s]) → changed commands. Commands are wheel speeds
+    ``[..., 2, T]`` [m/s], left and right, or, with ``of_twist``, forward speed [m/s] and yaw rate [rad/s]."""
     starts: Callable[[Fastest], tuple[float, ...]]
     """Initial values of a fit."""
     bounds: Callable[[Fastest], tuple[float, float]]
@@ -64,7 +65,9 @@ class WheelResponse:
     counts: Callable[[float, Fastest], bool]
     """Whether a fitted value is large enough to count as an effect."""
     wording: str
-    """Text for reports, with braces for the value."""
+    """Text for reports, with braces for the values."""
+    further: tuple[str, ...] = ()
+    """Further parameters; they start at their neutral values and keep to the catalogue's bounds."""
     of_twist: bool = False
     """Whether the effect changes the commanded twist rather than the wheel speeds."""
     excludes: tuple[str, ...] = ()
@@ -206,6 +209,10 @@ class Effect(ABC):
                 return f"{label}: parameters {unknown} are unknown; expected some of {known}"
         if self.identified and not self.manoeuvre:
             return "can be identified but has no manoeuvre: set the one that makes it observable"
+        if self.wheel_response is not None:
+            seen = {self.wheel_response.parameter, *self.wheel_response.further}
+            if not seen <= set(known):
+                return f"wheel_response: parameters {sorted(seen - set(known))} are unknown; expected some of {known}"
         unbounded = any(math.isinf(parameter.neutral) for parameter in self.parameters)
         if self.identified and unbounded and type(self).first_values is Effect.first_values:
             return "has an infinite neutral value: override first_values"

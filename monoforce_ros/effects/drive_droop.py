@@ -1,0 +1,98 @@
+"""Drives that give way to the scrub of a turn until integral action restores their speed."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from monoforce_ros.effects.effect import Effect, Parameter, Values, WheelResponse, per_trajectory
+from monoforce_ros.robots import RobotModel
+
+
+def _drooped(speeds: np.ndarray, loss: float, recovery: float, step: float) -> np.ndarray:
+    middle, turning = speeds.mean(axis=-2), 0.5 * (speeds[..., 1, :] - speeds[..., 0, :])
+    # Time first: each step then reads contiguous memory.
+    wanted = np.ascontiguousarray(np.moveaxis(turning, -1, 0))
+    held, share = np.sign(wanted[0]), 1.0 - np.exp(-step / recovery)
+    result = np.empty_like(wanted)
+    for index, value in enumerate(wanted):
+        drive = value + loss * held
+        load = np.clip(drive, -loss, loss)
+        result[index] = drive - load
+        held = held + share * (load / max(loss, 1e-9) - held)
+    turned = np.moveaxis(result, 0, -1)
+    return np.stack([middle - turned, middle + turned], axis=-2)
+
+
+class DriveDroop(Effect):
+    """Drives that give way to the scrub of a turn until integral action restores their speed.
+
+    Tyres that are dragged sideways load the drives of a skid-steered robot with dry friction: about the same at any
+    speed of the turn, and against it. A proportional speed controller gives way by a constant loss, which its integral
+    part takes back within some seconds. The robot therefore begins to turn late and slowly, though it drives ahead as
+    commanded; turns that go on in the same direction keep their load and follow at once.
+
+    Dry friction of size ``c`` acts on the difference of the sides' speeds ``d``, and the integral part holds ``c m``
+    against it. What the drives exceed the friction by is how fast they turn; below it the sides run alike.
+    """
+
+    name = "drive_droop"
+    stage = "command"
+    summary = "In turns the drives give way to the scrub of the tyres, until integral action restores their speed."
+    formula = "d ← y - clip(y, -c, c), y = d + c m, dm/dt = (clip(y / c, -1, 1) - m) / T, d half the sides' difference"
+    source = "proportional-integral speed control under dry friction"
+    # Typical: a drive that loses 0.2 m/s to the scrub of a turn, and has it back after some seconds.
+    parameters = (
+        Parameter("loss", "m/s", 0.0, 0.0, 2.0, 0.2, "speed that each side loses at first when a turn begins"),
+        Parameter("recovery", "s", 3.0, 0.2, 30.0, 2.0, "time constant in which integral action restores it"),
+    )
+    order = 49
+    identified = ("loss", "recovery")
+    manoeuvre = "turns on the spot and curves that begin from straight driving, each held for five seconds"
+    separated_by: ClassVar = {
+        "yaw_acceleration_limit": "turns to both sides, held for five seconds, and changes of the yaw rate within them",
+        "actuator_lag": "steps straight ahead, and turns held for five seconds",
+        "drive_compliance": "turns held for five seconds",
+        "turning_scrub": "turns held for five seconds",
+    }
+    wheel_response = WheelResponse(
+        parameter="loss",
+        further=("recovery",),
+        speeds=_drooped,
+        starts=lambda fastest: (0.05 * fastest.speed, 0.2 * fastest.speed),
+        bounds=lambda fastest: (0.0, 2.0),
+        # A side that runs this much slower for the recovery of two seconds turns a robot of average width by 5° less.
+        counts=lambda value, fastest: value >= 0.02,
+        wording="losing {:.2f} m/s of each side at the beginning of a turn, restored with a time constant of {:.1f} s",
+    )
+
+    def applies_to(self, robot: RobotModel | None) -> bool:
+        """Whether a robot is steered by its sides: others have no scrub."""
+        return robot is None or robot.steered is None
+
+    def drive_speeds(self, speeds: Tensor, values: Values, time_step: float, offsets: Tensor) -> Tensor:
+        """Drive speeds with this effect applied; see :class:`Effect`."""
+        place = offsets.to(speeds) - offsets.to(speeds).mean()
+        width = place.abs().max()
+        if not bool(width > 0):
+            return speeds
+        # Half the difference of the sides, by least squares where there are more than two drives.
+        shape = -place / width
+        wanted = speeds @ shape / (shape @ shape)
+        loss, share = (
+            per_trajectory(values["loss"], 1),
+            1.0 - torch.exp(-time_step / per_trajectory(values["recovery"], 1)),
+        )
+        yields = loss > 0
+        divisor = torch.where(yields, loss, torch.ones_like(loss))
+        held = torch.sign(wanted[:, 0])
+        lost = []
+        for value in wanted.unbind(1):
+            drive = value + loss * held
+            load = torch.minimum(torch.maximum(drive, -loss), loss)
+            lost.append(load - loss * held)
+            held = held + share * (load / divisor - held)
+        return speeds - torch.stack(lost, dim=1)[..., None] * shape
