@@ -20,7 +20,7 @@ from monoforce_ros.robots import RobotModel
 _STEP, _FINE_STEP = 0.04, 0.01
 """Of the modelled wheel speeds, in the selection and in the final fit [s]."""
 _HISTORY = 4.0
-"""Length of the commands before a block [s]: twice the longest dead time of the catalogue, for the integral part of drives."""
+"""Length of the commands before a block [s]: twice the longest dead time of the catalogue, for slow integral parts."""
 _LONGEST_GAP = 1.0
 _BLOCK = 4.0
 """Length of the blocks that are fitted or held out together [s]: longer than drives respond to a step."""

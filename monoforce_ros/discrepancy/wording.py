@@ -119,6 +119,10 @@ _FINDINGS: dict[str, Callable[[_Values], str]] = {
     "drive_compliance": lambda v: (
         f"The drives give way: a wheel that pulls with as much as its load runs {v['speed_loss']:.2f} m/s slower."
     ),
+    "drive_droop": lambda v: (
+        f"The drives give way when a turn begins: each side loses {v['loss']:.2f} m/s, and needs {v['recovery']:.1f} s "
+        "to win back most of it."
+    ),
     "turning_scrub": _scrub,
     "friction_scale": _friction,
     "friction_anisotropy": lambda v: f"Sideways, tyres grip {_change(v['factor'], 'less', 'more')} than lengthways.",
@@ -163,6 +167,7 @@ _REMEDIES = {
     "drive_gain": "measure the wheels and compare with the radius that the base controller has",
     "drive_asymmetry": "compare tyre pressure, wear, chain and motor of both sides",
     "drive_compliance": "give the motor controllers an integral part, or a larger gain",
+    "drive_droop": "raise the gains of the motors' speed controllers, first of the integral part",
     "turning_scrub": "set the wheel separation multiplier of the base controller (diagnose --export)",
     "friction_scale": "look at tyres and ground; drive slower in turns and when braking",
     "rolling_resistance": "look for soft ground, low tyre pressure, a dragging brake or a tight bearing",

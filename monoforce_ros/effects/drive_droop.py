@@ -11,18 +11,23 @@ from torch import Tensor
 from monoforce_ros.effects.effect import Effect, Parameter, Values, WheelResponse, per_trajectory
 from monoforce_ros.robots import RobotModel
 
+_HOLD = 0.12
+"""Time for which fits to wheel speeds take what the integral part holds as constant [s]: they need a third of the time,
+and at the typical recovery it changes by a twenty-fifth of the loss meanwhile."""
+
 
 def _drooped(speeds: np.ndarray, loss: float, recovery: float, step: float) -> np.ndarray:
     middle, turning = speeds.mean(axis=-2), 0.5 * (speeds[..., 1, :] - speeds[..., 0, :])
     # Time first: each step then reads contiguous memory.
     wanted = np.ascontiguousarray(np.moveaxis(turning, -1, 0))
-    held, share = np.sign(wanted[0]), 1.0 - np.exp(-step / recovery)
-    result = np.empty_like(wanted)
-    for index, value in enumerate(wanted):
-        drive = value + loss * held
+    count = max(1, round(_HOLD / step))
+    held, result = np.sign(wanted[0]), np.empty_like(wanted)
+    for first in range(0, len(wanted), count):
+        drive = wanted[first : first + count] + loss * held
         load = np.clip(drive, -loss, loss)
-        result[index] = drive - load
-        held = held + share * (load / max(loss, 1e-9) - held)
+        result[first : first + count] = drive - load
+        share = 1.0 - np.exp(-len(drive) * step / recovery)
+        held = held + share * (load.sum(axis=0) / max(len(drive) * loss, 1e-9) - held)
     turned = np.moveaxis(result, 0, -1)
     return np.stack([middle - turned, middle + turned], axis=-2)
 
