@@ -56,7 +56,7 @@ def test_wheels_that_confirm_the_file_show_no_change():
 
     def finding(delay):
         return WheelFinding(
-            (("command_delay", {"delay": delay}),), (0.03,), 0.2, 0.1, 6.0, ruled_out=("actuator_deadband",)
+            (("command_delay", {"delay": delay}),), ({"delay": 0.03},), 0.2, 0.1, 6.0, ruled_out=("actuator_deadband",)
         )
 
     changed, unchanged = changed_drives(finding(0.22), husky)

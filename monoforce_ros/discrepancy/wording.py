@@ -196,6 +196,7 @@ _CAUSES = {
     "drive_gain": "drives that run too slow or too fast",
     "drive_asymmetry": "sides of unequal speed",
     "drive_compliance": "drives that give way under load",
+    "drive_droop": "drives that give way when a turn begins",
     "turning_scrub": "turning less than the wheels ask for",
     "friction_scale": "slippery or grippy ground",
     "friction_anisotropy": "tyres that slip sideways",
