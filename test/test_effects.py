@@ -170,7 +170,7 @@ def test_command_effects_have_their_closed_forms(husky):
     np.testing.assert_allclose(steps(having(husky, drive_gain={"gain": 0.9}), [0.5]), [0.45])
 
 
-def test_drives_give_way_to_the_scrub_of_a_turn_until_integral_action_restores_them(husky):
+def test_drives_droop_under_the_scrub_of_a_turn_until_integral_action_restores_them(husky):
     fast = dataclasses.replace(husky, maximum_speed=9.0, maximum_yaw_rate=9.0)
     robot = having(fast, drive_droop={"loss": 0.2, "recovery": 1.5})
     width = float(husky.drive_offsets.max() - husky.drive_offsets.min())

@@ -24,7 +24,7 @@ from monoforce_ros.discrepancy.report import effect_entry, write_diagnosis
 from monoforce_ros.discrepancy.separate_stretches import laid_apart
 from monoforce_ros.discrepancy.step_errors import compare_after_steps
 from monoforce_ros.discrepancy.terrain_evidence import supporting_terrain, traced_terrain
-from monoforce_ros.discrepancy.verdict import Verdict
+from monoforce_ros.discrepancy.verdict import Decision, Verdict
 from monoforce_ros.discrepancy.wheels import compare_with_wheels
 from monoforce_ros.discrepancy.wording import finding
 from monoforce_ros.effects import CATALOGUE
@@ -153,29 +153,31 @@ def diagnose_bag(
         if fingerprint([other]) == data:
             raise ValueError(f"{other}: --held-out got the diagnosed recording {bag}, expected another recording")
     nominal = NominalModel.read(robot, settings.samples)
+    steeper = beyond_commissioning(ground.slope, None if nominal is None else nominal.slope)
+    # A robot that was commissioned on such slopes is known there, without a map, too.
+    known = nominal is not None and nominal.slope is not None and not steeper
+    unexplained, named = ground.unexplained or steeper, ground.uneven and not known
+
+    def ground_explains(decision: Decision) -> bool:
+        names = () if decision.trial is None else decision.trial.names
+        return bool(unexplained) and may_be_the_ground(decision.verdict, names, named=named)
+
     diagnosis = diagnose(
         evidence,
         model,
         nominal=nominal,
         settings=settings,
+        ground_explains=ground_explains,
         progress=progress,
     )
-    steeper = beyond_commissioning(ground.slope, None if nominal is None else nominal.slope)
-    # A robot that was commissioned on such slopes is known there, without a map, too.
-    known = nominal is not None and nominal.slope is not None and not steeper
-    unexplained = ground.unexplained or steeper
-    judged = without_blame_for_ground(diagnosis, unexplained, named=ground.uneven and not known)
     rest: tuple[str, ...] = ()
-    if judged is not diagnosis:
-        # What gyro and wheels measure does not depend on the ground.
-        progress(0.94, "without what may be the ground's")
-        measured = diagnose(evidence, model, nominal=nominal, settings=replace(settings, sensors_only=True))
-        if measured.verdict == Verdict.EFFECT_FOUND:
-            judged, rest = measured, judged.advice
-    diagnosis = judged
+    if diagnosis.set_aside is not None and diagnosis.verdict == Verdict.EFFECT_FOUND:
+        rest = without_blame_for_ground(diagnosis, unexplained, named=named).advice
+    else:
+        diagnosis = without_blame_for_ground(diagnosis, unexplained, named=named)
     large = residual_complaint(None if nominal is None else nominal.residual, evidence.smoothed, evidence.commands)
     # Named effects stay, with this doubt.
-    steeper = steeper if diagnosis.effects and steeper not in rest else ""
+    steeper = steeper if diagnosis.effects else ""
     harder = "" if nominal is None else uncovered_doubt(evidence, settings.horizon, nominal.changes)
     doubts = list(dict.fromkeys(text for text in (ground.complaint, *rest, steeper, harder, large) if text))
     if diagnosis.verdict == Verdict.NOT_IDENTIFIABLE:
@@ -218,24 +220,40 @@ def diagnose_bag(
     return BagDiagnosis(bag, diagnosis, report, page, robot_file, recording.warnings, tuple(doubts), ground)
 
 
+def may_be_the_ground(verdict: Verdict, names: Sequence[str], *, named: bool) -> bool:
+    """Whether slopes that no map shows may be the cause of what was found.
+
+    Args:
+        verdict: an error without a name may be theirs.
+        names: of effects that were found; slopes neither delay a command nor turn a sensor.
+        named: whether forces that slopes exert may pass for effects, too: those of contact and body.
+    """
+    return verdict == Verdict.UNKNOWN_EFFECT or (named and any(_is_force(name) for name in names))
+
+
+def _is_force(name: str) -> bool:
+    return CATALOGUE[name].stage in ("contact", "body")
+
+
 def without_blame_for_ground(diagnosis: Diagnosis, unexplained: str, *, named: bool) -> Diagnosis:
     """The diagnosis; ``not_identifiable`` where the error may be the ground's.
 
     Args:
         diagnosis: of a recording.
         unexplained: why an error without a name may be the ground's; empty if it is not.
-        named: whether forces that slopes exert may pass for effects, too: those of contact and body. Slopes neither
-            delay a command nor turn a sensor.
+        named: see :func:`may_be_the_ground`.
     """
-    forces = [effect for effect in diagnosis.effects if CATALOGUE[effect.name].stage in ("contact", "body")]
-    nameless = diagnosis.verdict == Verdict.UNKNOWN_EFFECT
-    if not unexplained or not (nameless or (named and forces)):
+    aside = diagnosis.set_aside
+    names = [effect.name for effect in diagnosis.effects]
+    if not unexplained or (aside is None and not may_be_the_ground(diagnosis.verdict, names, named=named)):
         return diagnosis
-    meanings = () if nameless else tuple(f"on known ground this would mean: {finding(effect)}" for effect in forces)
+    nameless = (aside or diagnosis.verdict) == Verdict.UNKNOWN_EFFECT
+    found = diagnosis.known_parts if nameless or aside is not None else diagnosis.effects
+    forces = () if nameless else tuple(effect for effect in found if _is_force(effect.name))
     return Diagnosis(
         Verdict.NOT_IDENTIFIABLE,
-        known_parts=diagnosis.known_parts if nameless else diagnosis.effects,
-        advice=(unexplained, *meanings),
+        known_parts=found,
+        advice=(unexplained, *(f"on known ground this would mean: {finding(effect)}" for effect in forces)),
         noise_floor=diagnosis.noise_floor,
         commissioned=diagnosis.commissioned,
     )

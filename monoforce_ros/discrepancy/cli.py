@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import multiprocessing
+import os
 import sys
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -103,8 +104,10 @@ def main(arguments: list[str] | None = None) -> int:
             export_target(target)
     except ValueError as error:
         parser.error(str(error))
-    # Many small operations: one thread is faster than several, and does not collapse on a busy machine.
+    # Many small operations: one thread is faster than several, and does not collapse on a busy machine. NumPy's threads
+    # are set as a process starts: this holds for those of the repetitions and of further bags.
     torch.set_num_threads(1)
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         # Report a wrong robot before a long recording is read.
         load_robot(options.robot)

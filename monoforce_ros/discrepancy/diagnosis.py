@@ -96,6 +96,9 @@ class Diagnosis:
     details: Details | None = None
     steps: StepComparison | None = None
     """Errors after steps of the command beside those of a kinematic fit."""
+    set_aside: Verdict | None = None
+    """Verdict on all effects where only those that sensors measured are kept, since the ground may be the cause of the
+    rest, which is listed in ``known_parts``; None where nothing was set aside."""
 
     def __post_init__(self):
         if self.verdict in _NOTHING_ADDED:
@@ -113,6 +116,7 @@ def diagnose(
     *,
     nominal: NominalModel | None = None,
     settings: DiagnosisSettings = DiagnosisSettings(),  # noqa: B008
+    ground_explains: Callable[[Decision], bool] = lambda decision: False,
     progress: Callable[[float, str], None] = lambda share, step: None,
 ) -> Diagnosis:
     """Find the physical effects that a robot's model lacks in a recording.
@@ -122,6 +126,8 @@ def diagnose(
         robot: the nominal model with the effects of its file.
         nominal: what commissioning learned, at ``settings.samples``; None for a robot that was never commissioned.
         settings: settings of the diagnosis.
+        ground_explains: whether what a decision names, or leaves without a name, may be the ground's. What gyro, wheel
+            speeds and joints measured does not depend on it and is kept.
         progress: called with the share of the work done and the next step.
     """
     progress(0.0, "preflight")
@@ -140,6 +146,12 @@ def diagnose(
     explanation = explain(evidence, robot, windows, nominal, settings, _Steps(progress, 0.05, 0.6))
     if explanation.onset is not None:
         left_out = (*left_out, explanation.onset.remark)
+    aside = None
+    if ground_explains(explanation.decision):
+        by_sensors = explanation.by_sensors(settings.thresholds)
+        if by_sensors.decision.verdict == Verdict.EFFECT_FOUND:
+            aside, explanation = explanation.decision, by_sensors
+            settings = replace(settings, sensors_only=True)
     search, outcome, sensors = explanation.search, explanation.outcome, explanation.sensors
     data, uncertainty, decision = explanation.windows.data, explanation.windows.uncertainty, explanation.decision
     floor = np.sqrt((uncertainty**2).mean(axis=0))
@@ -170,8 +182,11 @@ def diagnose(
             compared = compare(robot, data, smoothed, judged, noisy)
     gap = gap_table(compared, settings.seed)
     known_parts: tuple[EffectEstimate, ...] = ()
-    if decision.parts is not None:
-        partial = _estimated(search, search.refit(decision.parts.effects), outcome)
+    parts = decision.parts
+    if aside is not None:
+        parts = aside.trial if aside.verdict == Verdict.EFFECT_FOUND else aside.parts
+    if parts is not None:
+        partial = _estimated(search, search.refit(parts.effects), outcome)
         known_parts = tuple(sensors.with_interval(estimate, search) for estimate in partial)
     # Values for the robot's file are fitted to the whole recording.
     effects: tuple[EffectEstimate, ...] = ()
@@ -218,6 +233,7 @@ def diagnose(
         losses=decision.losses,
         commissioned=search.commissioned,
         details=Details(data, before, floor, tuple(compared), paths),
+        set_aside=None if aside is None else aside.verdict,
     )
 
 

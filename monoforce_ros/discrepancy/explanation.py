@@ -67,6 +67,10 @@ class Explanation:
     decision: Decision
     onset: Onset | None = None
 
+    def by_sensors(self, thresholds: Thresholds) -> Explanation:
+        """What gyro, wheel speeds and joints measured, without the effects that the motion showed in addition."""
+        return _measured(self.windows, self.sensors, self.search, thresholds)
+
 
 def explain(
     evidence: Evidence,
@@ -112,8 +116,7 @@ def explain(
 
     search = searched(windows)
     if settings.sensors_only:
-        outcome = search.measured()
-        return Explanation(windows, sensors, search, outcome, *_decided(search, outcome, thresholds))
+        return _measured(windows, sensors, search, thresholds)
     outcome = search.run(settings.max_effects, exchange=not repeated)
     onset = None
     if not repeated and not outcome.fit.passed(thresholds):
@@ -133,7 +136,7 @@ def explain(
             outcome = search.run(settings.max_effects)
         else:
             onset = None
-    findings, _ = _decided(search, outcome, thresholds)
+    findings = _findings(search, outcome)
     doubtful = bool(outcome.best.effects) and not findings.commissioned and leaves_most(findings, thresholds)
     if doubtful or not findings.fit.passed(thresholds):
         starts = windows.data.starts
@@ -150,12 +153,18 @@ def explain(
     return Explanation(windows, sensors, search, outcome, findings, decision, onset)
 
 
-def _decided(search: Search, outcome: Outcome, thresholds: Thresholds) -> tuple[Findings, Decision]:
-    """What a search found, and the verdict without a formula."""
-    findings = Findings(
+def _measured(windows: Windows, sensors: SensorFindings, search: Search, thresholds: Thresholds) -> Explanation:
+    """The explanation by the effects that sensors measured alone."""
+    outcome = search.measured()
+    findings = _findings(search, outcome)
+    return Explanation(windows, sensors, search, outcome, findings, decide(findings, thresholds))
+
+
+def _findings(search: Search, outcome: Outcome) -> Findings:
+    """What a search found, without a formula."""
+    return Findings(
         outcome.nominal, outcome.best, outcome.fit,
         healthy_loss=search.healthy_loss,
         commissioned=search.commissioned,
         known=search.known,
     )  # fmt: skip
-    return findings, decide(findings, thresholds)

@@ -22,7 +22,6 @@ for an effect.
 STEEPER = np.sqrt(2.0)
 """Ground that is so many times as steep as where the robot was commissioned leaves a residual that nobody has seen:
 what slopes contribute to its variance grows with their square, to twice as much."""
-_APART_TEXT = "; each stretch for itself, since the localisation starts anew in each"
 _APART = 1.0
 """Distance over which slopes are taken from heights [m]."""
 
@@ -67,10 +66,7 @@ def choose_ground(terrain: str, recording: Recording, smoothed: SmoothedMotion, 
     if terrain == "lidar":
         return Ground(terrain, f"lidar map of {len(recording.clouds)} sweeps", slope)
     if terrain == "traced":
-        unexplained = _by_trace(slope, "as asked for") if uneven else ""
-        apart = starts_anew(smoothed)
-        description = "traced by the wheels along the measured poses" + (_APART_TEXT if apart else "")
-        return Ground(terrain, description, slope, "", unexplained, uneven, apart)
+        return _traced("along the measured poses", smoothed, slope, "as asked for", uneven)
     if terrain not in ("auto", "flat"):
         return Ground(terrain, f"map {Path(terrain).name}", slope)
     reason = "no clouds in the bag"
@@ -86,10 +82,9 @@ def choose_ground(terrain: str, recording: Recording, smoothed: SmoothedMotion, 
     said = "as asked for" if terrain == "flat" else reason
     complaint = ""
     if terrain == "auto" and uneven:
-        apart = starts_anew(smoothed)
-        description = f"traced by the wheels: slopes of {np.degrees(slope):.1f}° by the poses, and {reason}"
-        description += _APART_TEXT if apart else ""
-        return Ground("traced", description, slope, "", _by_trace(slope, reason), uneven, apart)
+        return _traced(
+            f"(slopes of {np.degrees(slope):.1f}° by the poses, and {reason})", smoothed, slope, reason, uneven
+        )
     if slope > LEVEL_SLOPE:
         remedy = "use --terrain lidar or a map" if recording.clouds else "record a lidar, or give a map of fit_terrain"
         what = f"the ground is not level (slopes of {np.degrees(slope):.1f}° by the poses, root mean square)"
@@ -101,6 +96,14 @@ def choose_ground(terrain: str, recording: Recording, smoothed: SmoothedMotion, 
             remedy = "level the localisation's frame by its IMU, or " + remedy
         complaint = f"{what}; level ground is assumed ({said}), so that slopes may pass for an effect: {remedy}"
     return Ground("flat", f"level ({said})", slope, complaint, complaint, uneven)
+
+
+def _traced(how: str, smoothed: SmoothedMotion, slope: float, reason: str, uneven: bool) -> Ground:
+    """Ground that is only known along the poses."""
+    apart = starts_anew(smoothed)
+    each = "; each stretch for itself, since the localisation starts anew in each" if apart else ""
+    unexplained = _by_trace(slope, reason) if uneven else ""
+    return Ground("traced", f"traced by the wheels {how}{each}", slope, "", unexplained, uneven, apart)
 
 
 def _by_trace(slope: float, reason: str) -> str:

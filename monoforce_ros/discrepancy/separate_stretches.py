@@ -29,26 +29,21 @@ def height_agreement(smoothed: SmoothedMotion) -> float | None:
     Returns:
         None where fewer than ten places were passed by several stretches.
     """
-    rows = []
-    for number, stretch in enumerate(smoothed.stretches):
+    cells, heights = [np.zeros((0, 2), np.int64)], [np.zeros(0)]
+    for stretch in smoothed.stretches:
         positions = smoothed.motion.positions[stretch]
-        cells, inverse = np.unique(np.floor(positions[:, :2] / _CELL).astype(np.int64), axis=0, return_inverse=True)
-        counts = np.bincount(inverse.ravel())
-        heights = np.bincount(inverse.ravel(), positions[:, 2]) / counts
-        rows.append(np.c_[cells, np.full(len(cells), number), heights])
-    if not rows:
-        return None
-    table = np.concatenate(rows)
-    _, place, visits = np.unique(table[:, :2], axis=0, return_inverse=True, return_counts=True)
-    place = place.ravel()
-    again = visits[place] > 1
-    heights, place = table[again, 3], place[again]
-    _, place, visits = np.unique(place, return_inverse=True, return_counts=True)
+        places, visit = np.unique(np.floor(positions[:, :2] / _CELL).astype(np.int64), axis=0, return_inverse=True)
+        cells.append(places)
+        heights.append(np.bincount(visit.ravel(), positions[:, 2]) / np.bincount(visit.ravel()))
+    _, place, visits = np.unique(np.concatenate(cells), axis=0, return_inverse=True, return_counts=True)
+    again = visits[place.ravel()] > 1
+    height = np.concatenate(heights)[again]
+    _, place, visits = np.unique(place.ravel()[again], return_inverse=True, return_counts=True)
     if len(visits) < _FEWEST:
         return None
-    means = np.bincount(place, heights) / visits
-    within = float(((heights - means[place]) ** 2).sum() / (len(heights) - len(visits)))
-    total = float(np.var(heights, ddof=1))
+    means = np.bincount(place, height) / visits
+    within = float(((height - means[place]) ** 2).sum() / (len(height) - len(visits)))
+    total = float(np.var(height, ddof=1))
     return 1.0 - within / total if total > 0 else 1.0
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
@@ -31,6 +31,8 @@ _MOST_SAMPLES = 80
 _FEWEST_SAMPLES = 10
 _ALPHA = 0.05
 """Probability that a step of the selection adds an effect that the wheels do not show, over all candidates."""
+_MOST_REACHED = 24
+"""Signals that are kept of a fit [-]: a base point and what each value of the largest model changes."""
 _LARGEST_MODEL = 5
 """Largest number of effects in a wheel model: dead time, three limits of the twist and a lag."""
 _EVALUATIONS = 8
@@ -169,6 +171,9 @@ class _Blocks:
     """Time between commands [s]."""
     robot: RobotModel
     """Its kinematics make wheel speeds of twists."""
+    reached: dict[tuple[tuple[str, tuple[float, ...]], ...], np.ndarray] = field(default_factory=dict, init=False)
+    """What the commands become under the first effects of a model, by these and their values: a fit that changes one
+    value computes the effects before it once."""
 
     @classmethod
     def of(cls, commands: CommandTrack, wheels: WheelTrack, robot: RobotModel, step: float) -> _Blocks | None:
@@ -278,6 +283,7 @@ class _Selection:
     def __init__(self, blocks: _Blocks):
         self._blocks = blocks
         self._fold = np.arange(len(blocks)) % 2
+        self._parts = [blocks[self._fold == number] for number in (0, 1)]
         self._known: dict[tuple[str, ...], _Model] = {}
         self._order = [effect.name for effect in wheel_effects() if effect.applies_to(blocks.robot)]
 
@@ -310,10 +316,10 @@ class _Selection:
             losses, values = np.zeros(len(self._blocks)), []
             starts = _starts(names, self._blocks.fastest, start)
             for held_out in (0, 1):
-                fitted, judged = (self._blocks[self._fold == number] for number in (1 - held_out, held_out))
-                fit = _fit(names, fitted, starts)
+                fit = _fit(names, self._parts[1 - held_out], starts)
                 values.append(fit)
-                losses[self._fold == held_out] = _block_losses(fit, names, judged, self._blocks.fastest.speed)
+                judged = _block_losses(fit, names, self._parts[held_out], self._blocks.fastest.speed)
+                losses[self._fold == held_out] = judged
             self._known[names] = _Model(names, np.mean(values, axis=0), losses)
         return self._known[names]
 
@@ -419,17 +425,22 @@ def _response(name: str) -> WheelResponse:
 
 def _modelled(values: np.ndarray, names: tuple[str, ...], blocks: _Blocks) -> np.ndarray:
     """Speeds ``[n, 2, T]`` [m/s] of wheels that follow the commands under effects: those on the twist act first."""
-    named = [(_response(name), own) for name, own in _by_effect(names, values)]
-    twists = blocks.twists
-    for response, own in named:
-        if response.of_twist:
-            changed = response.speeds(twists[:, :2], *own, blocks.step)
-            twists = np.concatenate([changed, twists[:, 2:]], axis=1) if twists.shape[1] > 2 else changed
-    speeds = blocks.commanded(twists)
-    for response, own in named:
-        if not response.of_twist:
-            speeds = response.speeds(speeds, *own, blocks.step)
-    return speeds
+    ordered = sorted(_by_effect(names, values), key=lambda entry: not _response(entry[0]).of_twist)
+    signal, sides = blocks.twists, False
+    for count, (name, own) in enumerate(ordered):
+        response, first = _response(name), tuple(ordered[: count + 1])
+        known = blocks.reached.get(first)
+        if known is None:
+            if response.of_twist:
+                changed = response.speeds(signal[:, :2], *own, blocks.step)
+                known = np.concatenate([changed, signal[:, 2:]], axis=1) if signal.shape[1] > 2 else changed
+            else:
+                known = response.speeds(signal if sides else blocks.commanded(signal), *own, blocks.step)
+            if len(blocks.reached) >= _MOST_REACHED:
+                blocks.reached.clear()
+            blocks.reached[first] = known
+        signal, sides = known, not response.of_twist
+    return signal if sides else blocks.commanded(signal)
 
 
 def _residuals(values: np.ndarray, names: tuple[str, ...], blocks: _Blocks) -> np.ndarray:

@@ -120,7 +120,7 @@ _FINDINGS: dict[str, Callable[[_Values], str]] = {
         f"The drives give way: a wheel that pulls with as much as its load runs {v['speed_loss']:.2f} m/s slower."
     ),
     "drive_droop": lambda v: (
-        f"The drives give way when a turn begins: each side loses {v['loss']:.2f} m/s, and needs {v['recovery']:.1f} s "
+        f"The drives droop when a turn begins: each side loses {v['loss']:.2f} m/s, and needs {v['recovery']:.1f} s "
         "to win back most of it."
     ),
     "turning_scrub": _scrub,
@@ -196,7 +196,7 @@ _CAUSES = {
     "drive_gain": "drives that run too slow or too fast",
     "drive_asymmetry": "sides of unequal speed",
     "drive_compliance": "drives that give way under load",
-    "drive_droop": "drives that give way when a turn begins",
+    "drive_droop": "drives that droop when a turn begins",
     "turning_scrub": "turning less than the wheels ask for",
     "friction_scale": "slippery or grippy ground",
     "friction_anisotropy": "tyres that slip sideways",

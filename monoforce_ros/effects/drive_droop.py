@@ -1,4 +1,4 @@
-"""Drives that give way to the scrub of a turn until integral action restores their speed."""
+"""Drives whose speed droops under the scrub of a turn until integral action restores it."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ def _drooped(speeds: np.ndarray, loss: float, recovery: float, step: float) -> n
 
 
 class DriveDroop(Effect):
-    """Drives that give way to the scrub of a turn until integral action restores their speed.
+    """Drives whose speed droops under the scrub of a turn until integral action restores it.
 
     Tyres that are dragged sideways load the drives of a skid-steered robot with dry friction: about the same at any
-    speed of the turn, and against it. A proportional speed controller gives way by a constant loss, which its integral
-    part takes back within some seconds. The robot therefore begins to turn late and slowly, though it drives ahead as
-    commanded; turns that go on in the same direction keep their load and follow at once.
+    speed of the turn, and against it. Under it a proportional speed controller droops by a constant loss, which its
+    integral part takes back within some seconds. The robot therefore begins to turn late and slowly, though it drives
+    ahead as commanded; turns that go on in the same direction keep their load and follow at once.
 
     Dry friction of size ``c`` acts on the difference of the sides' speeds ``d``, and the integral part holds ``c m``
     against it. What the drives exceed the friction by is how fast they turn; below it the sides run alike.
@@ -46,7 +46,7 @@ class DriveDroop(Effect):
 
     name = "drive_droop"
     stage = "command"
-    summary = "In turns the drives give way to the scrub of the tyres, until integral action restores their speed."
+    summary = "In turns the drives droop under the scrub of the tyres, until integral action restores their speed."
     formula = "d ← y - clip(y, -c, c), y = d + c m, dm/dt = (clip(y / c, -1, 1) - m) / T, d half the sides' difference"
     source = "proportional-integral speed control under dry friction"
     # Typical: a drive that loses 0.2 m/s to the scrub of a turn, and has it back after some seconds.
@@ -87,12 +87,9 @@ class DriveDroop(Effect):
         # Half the difference of the sides, by least squares where there are more than two drives.
         shape = -place / width
         wanted = speeds @ shape / (shape @ shape)
-        loss, share = (
-            per_trajectory(values["loss"], 1),
-            1.0 - torch.exp(-time_step / per_trajectory(values["recovery"], 1)),
-        )
-        yields = loss > 0
-        divisor = torch.where(yields, loss, torch.ones_like(loss))
+        loss, recovery = (per_trajectory(values[key], 1) for key in self.identified)
+        share = 1.0 - torch.exp(-time_step / recovery)
+        divisor = torch.where(loss > 0, loss, torch.ones_like(loss))
         held = torch.sign(wanted[:, 0])
         lost = []
         for value in wanted.unbind(1):
