@@ -21,13 +21,12 @@ def _drooped(speeds: np.ndarray, loss: float, recovery: float, step: float) -> n
     # Time first: each step then reads contiguous memory.
     wanted = np.ascontiguousarray(np.moveaxis(turning, -1, 0))
     count = max(1, round(_HOLD / step))
-    held, result = np.sign(wanted[0]), np.empty_like(wanted)
+    held, result = loss * np.sign(wanted[0]), np.empty_like(wanted)
     for first in range(0, len(wanted), count):
-        drive = wanted[first : first + count] + loss * held
+        drive = wanted[first : first + count] + held
         load = np.clip(drive, -loss, loss)
         result[first : first + count] = drive - load
-        share = 1.0 - np.exp(-len(drive) * step / recovery)
-        held = held + share * (load.sum(axis=0) / max(len(drive) * loss, 1e-9) - held)
+        held = held + (1.0 - np.exp(-len(drive) * step / recovery)) * (load.mean(axis=0) - held)
     turned = np.moveaxis(result, 0, -1)
     return np.stack([middle - turned, middle + turned], axis=-2)
 
@@ -40,14 +39,14 @@ class DriveDroop(Effect):
     integral part takes back within some seconds. The robot therefore begins to turn late and slowly, though it drives
     ahead as commanded; turns that go on in the same direction keep their load and follow at once.
 
-    Dry friction of size ``c`` acts on the difference of the sides' speeds ``d``, and the integral part holds ``c m``
+    Dry friction of size ``c`` acts on half the difference ``d`` of the sides' speeds, and the integral part holds ``m``
     against it. What the drives exceed the friction by is how fast they turn; below it the sides run alike.
     """
 
     name = "drive_droop"
     stage = "command"
     summary = "In turns the drives droop under the scrub of the tyres, until integral action restores their speed."
-    formula = "d ← y - clip(y, -c, c), y = d + c m, dm/dt = (clip(y / c, -1, 1) - m) / T, d half the sides' difference"
+    formula = "d ← y - clip(y, -c, c), y = d + m, dm/dt = (clip(y, -c, c) - m) / T, d half the sides' difference"
     source = "proportional-integral speed control under dry friction"
     # Typical: a drive that loses 0.2 m/s to the scrub of a turn, and has it back after some seconds.
     parameters = (
@@ -89,12 +88,9 @@ class DriveDroop(Effect):
         wanted = speeds @ shape / (shape @ shape)
         loss, recovery = (per_trajectory(values[key], 1) for key in self.identified)
         share = 1.0 - torch.exp(-time_step / recovery)
-        divisor = torch.where(loss > 0, loss, torch.ones_like(loss))
-        held = torch.sign(wanted[:, 0])
+        held = loss * torch.sign(wanted[:, 0])
         lost = []
         for value in wanted.unbind(1):
-            drive = value + loss * held
-            load = torch.minimum(torch.maximum(drive, -loss), loss)
-            lost.append(load - loss * held)
-            held = held + share * (load / divisor - held)
+            lost.append(torch.clamp(value + held, -loss, loss) - held)
+            held = held + share * lost[-1]
         return speeds - torch.stack(lost, dim=1)[..., None] * shape
