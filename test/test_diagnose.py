@@ -29,7 +29,7 @@ from monoforce_ros.discrepancy import (
 )
 from monoforce_ros.discrepancy import diagnosis as diagnosis_module
 from monoforce_ros.discrepancy.clocks import compare_with_gyro
-from monoforce_ros.discrepancy.comparison import GapRow, compare
+from monoforce_ros.discrepancy.comparison import GapRow, compare, gets_worse
 from monoforce_ros.discrepancy.fit import first_values, fit_effects
 from monoforce_ros.discrepancy.gap import noise_floor, noisy_motions
 from monoforce_ros.discrepancy.hypothesis import (
@@ -284,6 +284,34 @@ def test_what_does_not_improve_held_out_windows_is_not_added(husky, monkeypatch,
     assert all(path.after is None for path in diagnosis.details.paths)
     assert all(comparison.after is None for comparison in diagnosis.details.compared)
     assert any("drive_gain" in row.values() for row in report["candidates"])
+
+
+def test_what_makes_windows_worse_that_no_search_saw_is_not_added(husky, monkeypatch):
+    compared = []
+
+    def worse_when_repeated(*arguments, **named):
+        found = compare(*arguments, **named)
+        compared.append(found)
+        return found if len(compared) == 1 else [replace(c, after=1.1 * c.before) for c in found]
+
+    monkeypatch.setattr(diagnosis_module, "compare", worse_when_repeated)
+    motion, commands = simulated_recording(husky, (("drive_gain", {"gain": 0.8}),), seconds=40.0)
+    smoothed = SmoothedMotion(motion, 0.003, 0.002, (slice(0, len(motion)),))
+    diagnosis = diagnose(Evidence(smoothed, commands), husky, settings=DiagnosisSettings(max_effects=1))
+    assert len(compared) == 2
+    assert diagnosis.verdict == Verdict.NO_IMPROVEMENT and "increase beyond chance" in diagnosis.remarks[-1]
+    assert diagnosis.effects == () and all(row.after is None for row in diagnosis.gap.values())
+
+
+def test_a_diagnosis_gets_worse_where_an_error_grows_and_none_shrinks():
+    def row(low: float, high: float, horizon: float = 2.0) -> GapRow:
+        return GapRow(horizon, 0.5, 0.5, low, high, "m", 0.1)
+
+    grown, shrunk, open_ = row(-0.2, -0.1), row(0.1, 0.2), row(-0.1, 0.1)
+    assert gets_worse({"position_2s": grown, "heading_2s": open_, "position_1s": row(0.1, 0.2, 1.0)})
+    assert not gets_worse({"position_2s": grown, "heading_2s": shrunk})
+    assert not gets_worse({"position_2s": open_, "heading_2s": open_, "position_5s": row(-0.2, -0.1, 5.0)})
+    assert gets_worse({"position_1s": row(-0.2, -0.1, 1.0)}) and not gets_worse({})
 
 
 def test_a_verdict_without_effects_cannot_hold_any():

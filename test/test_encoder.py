@@ -308,6 +308,19 @@ def test_maps_with_different_numbers_of_cameras_share_a_batch():
             torch.testing.assert_close(encoder(entry).height[0], together.height[i], atol=1e-4, rtol=1e-4)
 
 
+def test_unseen_copies_of_images_do_not_change_a_map():
+    torch.manual_seed(4)
+    encoder = TerrainEncoder(SMALL).eval()
+    torch.nn.init.normal_(encoder.heads.weight, std=0.2)
+    images = np.random.default_rng(1).integers(0, 255, (2, 96, 128, 3), np.uint8)
+    batch = encoder_input([view(images[0]), view(images[1])], None, encoder.config)
+    more = batch.with_images(5)
+    assert len(more.images) == 5 and batch.with_images(1) is batch
+    with torch.no_grad():
+        torch.testing.assert_close(encoder(more).height, encoder(batch).height, atol=1e-5, rtol=1e-5)
+        torch.testing.assert_close(encoder(more).evidence, encoder(batch).evidence)
+
+
 @pytest.mark.parametrize("size", [(64, 128), (256, 96), (128, 96), (1232, 1616)])
 def test_images_keep_their_aspect_ratio(size):
     image = np.zeros((size[1], size[0], 3), np.uint8)

@@ -16,6 +16,7 @@ from monoforce_ros.discrepancy.comparison import (
     RegimeRow,
     compare,
     gap_table,
+    gets_worse,
     improves,
     measured_paths,
     regime_table,
@@ -181,6 +182,11 @@ def diagnose(
             judged = None if decision.trial is None else repetition.held_out
             compared = compare(robot, data, smoothed, judged, noisy)
     gap = gap_table(compared, settings.seed)
+    if judged is not None and gets_worse(gap):
+        # Searches that never saw the judged windows contradict what was found.
+        decision, judged = decision.without_improvement("increase"), None
+        compared = [replace(entry, after=None) for entry in compared]
+        gap = gap_table(compared, settings.seed)
     known_parts: tuple[EffectEstimate, ...] = ()
     parts = decision.parts
     if aside is not None:

@@ -76,13 +76,17 @@ class Decision:
     parts: Trial | None = None
     """Known effects that explain a part of an ``unknown_effect``."""
 
-    def without_improvement(self) -> Decision:
-        """The decision after held-out windows did not improve: an effect is not added, nor is a formula."""
+    def without_improvement(self, errors: str = "do not decrease") -> Decision:
+        """The decision after held-out windows did not improve: an effect is not added, nor is a formula.
+
+        Args:
+            errors: what the errors do, beyond chance.
+        """
         if self.verdict == Verdict.EFFECT_FOUND:
-            remarks = (*self.remarks, "errors on held-out windows do not decrease beyond chance")
+            remarks = (*self.remarks, f"errors on held-out windows {errors} beyond chance")
             return replace(self, verdict=Verdict.NO_IMPROVEMENT, trial=None, remarks=remarks)
         if self.verdict == Verdict.UNKNOWN_EFFECT and self.trial is not None:
-            remarks = (*self.remarks, "the formula is not added: held-out errors do not decrease beyond chance")
+            remarks = (*self.remarks, f"the formula is not added: held-out errors {errors} beyond chance")
             return replace(self, trial=None, remarks=remarks)
         return self
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
@@ -91,6 +91,19 @@ class EncoderInput:
     def to(self, device: torch.device | str) -> EncoderInput:
         """The same on another device."""
         return EncoderInput(**{f.name: getattr(self, f.name).to(device, non_blocking=True) for f in fields(self)})
+
+    def with_images(self, count: int) -> EncoderInput:
+        """The same with unseen copies of its images, ``count`` images in all; none are added to none.
+
+        Maps do not change. On a GPU each new number of images takes a second or so, in which kernels are chosen.
+        """
+        present = len(self.images)
+        if not present or count <= present:
+            return self
+        index = torch.arange(count, device=self.images.device) % present
+        copied = {name: getattr(self, name)[index] for name in ("images", "rays", "seen", "origins", "map_of")}
+        copied["seen"][present:] = False
+        return replace(self, **copied)
 
     @classmethod
     def stack(cls, inputs: Sequence[EncoderInput]) -> EncoderInput:

@@ -103,6 +103,8 @@ class RecordingSamples:
     """Index of each sample's segment ``[N]``."""
     segments: tuple[Segment, ...]
     chunks: Chunks
+    file: Path | None = None
+    """File from which they were read."""
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -121,6 +123,7 @@ class RecordingSamples:
         sweeps, traces = ([own(int(i)) for i in chosen] for own in (self.sweep, self.trace))
         return replace(
             self,
+            file=None,
             images=self.images[chosen],
             **{name: getattr(self, name)[chosen] for name in _OF_EACH},
             sweeps=np.concatenate(sweeps) if sweeps else self.sweeps[:0],
@@ -201,6 +204,7 @@ def read_samples(file: Path) -> RecordingSamples:
             images=tensors["images"],
             segments=segments,
             chunks=Chunks(**chunks, history=description["history"]),
+            file=file,
             **{name: values[name] for name in _SAMPLE_ARRAYS},
         )
     except (SafetensorError, KeyError, TypeError, ValueError, OSError) as error:

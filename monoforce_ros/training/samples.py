@@ -18,6 +18,8 @@ from monoforce_ros.training.recording_samples import RecordingSamples, Segment
 MIRROR = np.diag([1.0, -1.0, 1.0])
 
 
+_LUMINANCE = 0.299, 0.587, 0.114
+"""Shares of red, green and blue in the brightness of a colour (ITU-R BT.601)."""
 _LARGEST_NOISE = 0.03
 """Standard deviation of the ranges of common lidars (data sheets of spinning ones: up to ±3 cm) [m]."""
 
@@ -42,8 +44,15 @@ class Augmentation:
     gain: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Of red, green and blue."""
     contrast: float = 1.0
+    saturation: float = 1.0
+    """Share of the colours that is kept; 0 for a grey image. Beyond 1 they become more vivid."""
+    exposure: float = 1.0
+    """Exponent of the brightness: below 1 shadows become brighter, above 1 darker."""
     blur: float = 0.0
     """Standard deviation of the Gaussian blur [px]."""
+    noise: float = 0.0
+    """Standard deviation of the noise of the brightness, of 255."""
+    noise_seed: int = 0
     cameras: tuple[float, ...] = ()
     """Random numbers 0..1, one for each camera; see :attr:`camera_share`."""
     camera_share: float = 1.0
@@ -79,6 +88,10 @@ class Augmentation:
             contrast=random.uniform(0.75, 1.3),
             blur=max(0.0, random.uniform(-1.0, 0.9)),
             **sensors,
+            saturation=random.uniform(0.2, 1.2),
+            exposure=float(np.exp(random.uniform(-0.4, 0.4))),
+            noise=max(0.0, random.uniform(-4.0, 6.0)),
+            noise_seed=int(random.integers(2**31)),
         )
 
     def image_from_view(self) -> np.ndarray:
@@ -109,7 +122,15 @@ class Augmentation:
         image = cv2.warpAffine(image, matrix, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE)
         if self.blur > 0.05:
             image = cv2.GaussianBlur(image, (0, 0), self.blur)
-        colours = (image.astype(np.float32) - 127.5) * self.contrast + 127.5
+        if self.exposure != 1.0:
+            image = cv2.LUT(image, (255.0 * np.linspace(0.0, 1.0, 256) ** self.exposure).round().astype(np.uint8))
+        colours = image.astype(np.float32)
+        brightness = colours @ np.array(_LUMINANCE, np.float32)
+        offset = (1.0 - self.saturation) * brightness
+        if self.noise:
+            random = np.random.default_rng(self.noise_seed)
+            offset += self.noise * random.standard_normal(offset.shape, np.float32)
+        colours = (self.saturation * colours + offset[..., None] - 127.5) * self.contrast + 127.5
         return np.clip(colours * np.array(self.gain, np.float32), 0.0, 255.0).astype(np.uint8)
 
     def _blank_image(self, image: np.ndarray) -> np.ndarray:

@@ -66,6 +66,7 @@ from monoforce_ros.training.world_samples import (
     PLACES,
     REPLAY_WORLD,
     WORLD_STYLES,
+    world_file,
     world_samples,
     world_settings,
 )
@@ -197,8 +198,8 @@ def build_parser() -> OptionParser:
                         "bfloat16 on CUDA)")  # fmt: skip
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="(default: CUDA if "
                         "available)")  # fmt: skip
-    parser.add_argument("--jobs", type=int, default=2, metavar="N", help="bags from which samples are extracted in "
-                        "parallel (default: %(default)s)")  # fmt: skip
+    parser.add_argument("--jobs", type=int, default=2, metavar="N", help="bags from which samples are extracted, "
+                        "and worlds that are drawn, in parallel (default: %(default)s)")  # fmt: skip
     parser.add_argument("--threads", type=int, default=0, help="threads of PyTorch and OpenCV (default: one per core)")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     parser.add_argument("--cut", type=Path, dest="samples", action=_RenamedOption, new="--samples")
@@ -460,14 +461,36 @@ def _world_samples(
 ) -> list[RecordingSamples]:
     """Samples of randomised worlds; those in which the robot cannot stand are left out."""
     folder = options.samples or options.out / "samples"
+    tasks = [(seed, config, folder, places, world_settings(seed, options.world_styles)) for seed in seeds]
+    missing = sum(
+        not world_file(seed, config, folder, places=places, settings=settings).is_file() for seed, *_, settings in tasks
+    )
+    bar = progress(tasks, label="worlds", unit="world", quiet=options.quiet or not tasks)
     found = []
-    for seed in progress(seeds, label="worlds", unit="world", quiet=options.quiet or not seeds):
-        try:
-            settings = world_settings(seed, options.world_styles)
-            found.append(read_samples(world_samples(seed, config, folder, places=places, settings=settings)))
-        except SamplesError as error:
-            print(f"left out: {error}", file=sys.stderr)
+    with _processes(min(options.jobs, missing)) as pool:
+        drawn = pool.map(_draw_world, tasks) if missing > 1 and options.jobs > 1 else map(_draw_world, tasks)
+        for _, (file, reason) in zip(bar, drawn, strict=False):
+            if file is not None:
+                found.append(read_samples(file))
+            else:
+                print(f"left out: {reason}", file=sys.stderr)
     return found
+
+
+def _draw_world(task: tuple) -> tuple[Path | None, str]:
+    """File of a world's samples, or the reason why there is none."""
+    seed, config, folder, places, settings = task
+    try:
+        return world_samples(seed, config, folder, places=places, settings=settings), ""
+    except SamplesError as error:
+        return None, str(error)
+
+
+def _processes(count: int) -> ProcessPoolExecutor:
+    """Processes of one thread each, at least one; they start with their first task."""
+    return ProcessPoolExecutor(
+        max(1, count), mp_context=multiprocessing.get_context("spawn"), initializer=_use_one_thread
+    )
 
 
 def _samples(
@@ -478,11 +501,7 @@ def _samples(
     settings = SampleSettings(period=options.period, iterations=options.fit_iterations, reading=read_options(options))
     folder = options.samples or options.out / "samples"
     bar = progress(bags, label=title, unit="bag", quiet=options.quiet or not title or not bags)
-    with ProcessPoolExecutor(
-        max(1, min(options.jobs, len(bags))),
-        mp_context=multiprocessing.get_context("spawn"),
-        initializer=_use_one_thread,
-    ) as pool:
+    with _processes(min(options.jobs, len(bags))) as pool:
         tasks = [(bag, robot, config, folder, settings, tuple(options.images)) for bag in bags]
         # A single bag is processed here: starting another process takes longer.
         extracted = pool.map(_extract, tasks) if len(bags) > 1 and options.jobs > 1 else map(_extract, tasks)
@@ -500,6 +519,7 @@ def _samples(
 def _use_one_thread() -> None:
     """Parallel processes use one thread each."""
     torch.set_num_threads(1)
+    cv2.setNumThreads(1)
 
 
 def _extract(task: tuple) -> tuple[Path | None, str]:

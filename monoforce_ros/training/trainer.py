@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import os
 import time
-from collections import deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +24,7 @@ from monoforce_ros.encoder import (
 )
 from monoforce_ros.physics import PhysicsOptions
 from monoforce_ros.robots import RobotModel
+from monoforce_ros.training.batches import Batches
 from monoforce_ros.training.judgement import BOTH, CAMERAS, SWEEP
 from monoforce_ros.training.losses import (
     HIGHEST,
@@ -49,6 +48,10 @@ from monoforce_ros.training.training_state import RENAMED_WEIGHTS, TrainingError
 BACKBONE_PARTS = ("none", "late", "all", "map")
 """Parts of the backbone that can be trained; ``late``: the stages at stride 16. Norms are trained with ``all`` only.
 ``map``: nothing before the map is trained, neither the backbone nor what follows it up to the lift."""
+
+
+_IMAGES_AT_ONCE = 16
+"""On a GPU the number of images in a batch is a multiple of this: cuDNN chooses kernels anew for each number."""
 
 
 @dataclass(frozen=True)
@@ -190,8 +193,8 @@ class Trainer:
         out: folder for ``encoder.safetensors``, ``training.json``, ``state/`` and logs.
         settings: settings of the training.
         process: this process and its device.
-        loaders: batches prepared at the same time, beside a step; by default one on the CPU, which the step needs
-            itself, and for a GPU one for each core up to eight.
+        loaders: batches prepared at the same time, beside a step: one in a thread, several in processes of their own.
+            By default one on the CPU, which the step needs itself, and for a GPU one for each core but one, up to 16.
     """
 
     def __init__(
@@ -207,11 +210,15 @@ class Trainer:
         loaders: int | None = None,
     ):
         self.out, self.settings, self.process = out, settings, process
-        self.loaders = loaders or (1 if process.device.type == "cpu" else min(8, os.cpu_count() or 1))
+        self.loaders = loaders or (1 if process.device.type == "cpu" else max(1, min(16, (os.cpu_count() or 1) - 1)))
         self.encoder = encoder.to(process.device).to(memory_format=torch.channels_last)
-        self.recordings, self.held_out = list(recordings), list(held_out)
-        self.index = [(r, i) for r, recording in enumerate(self.recordings) for i in range(len(recording))]
-        if not self.index:
+        self.held_out = list(held_out)
+        self.batches = Batches(
+            recordings, encoder.config, size=settings.batch, seed=settings.seed, augment=settings.augment,
+            sensor_shares=settings.sensor_shares if encoder.config.sensor == "camera_lidar" else None,
+            rank=process.rank, count=process.count,
+        )  # fmt: skip
+        if not self.batches.index:
             raise TrainingError("no samples to train on")
         if isinstance(encoder, TerrainEncoder) and settings.backbone == "map":
             encoder.freeze_images()
@@ -244,32 +251,35 @@ class Trainer:
         settings = self.settings
         not_finite = 0
         self.encoder.train()
-        with ThreadPoolExecutor(self.loaders) as pool:
-            first = range(self.step, min(self.step + self.loaders, settings.steps))
-            prepared = deque(pool.submit(self._batch, step) for step in first)
-            while self.step < settings.steps:
-                batch, targets = prepared.popleft().result()
-                if self.step + self.loaders < settings.steps:
-                    prepared.append(pool.submit(self._batch, self.step + self.loaders))
-                losses = self._descend(batch.to(self.process.device), targets.to(self.process.device))
-                self.step += 1
-                not_finite = 0 if np.isfinite(losses["total"]) else not_finite + 1
-                if not_finite >= 20:
-                    raise TrainingError(
-                        f"the loss was not finite for {not_finite} steps in a row, up to step {self.step}; earlier "
-                        "checkpoints are kept; try a smaller --rate"
-                    )
-                report(self.step, losses)
-                done = self.step == settings.steps
-                if done or self.step % settings.validate_every == 0:
-                    self._validate()
-                if self.process.first and (done or self.step % settings.save_every == 0):
-                    self.save()
+        for batch, targets in self.batches.prepared(range(self.step, settings.steps), self.loaders):
+            losses = self.descend(batch, targets)
+            self.step += 1
+            not_finite = 0 if np.isfinite(losses["total"]) else not_finite + 1
+            if not_finite >= 20:
+                raise TrainingError(
+                    f"the loss was not finite for {not_finite} steps in a row, up to step {self.step}; earlier "
+                    "checkpoints are kept; try a smaller --rate"
+                )
+            report(self.step, losses)
+            done = self.step == settings.steps
+            if done or self.step % settings.validate_every == 0:
+                self._validate()
+            if self.process.first and (done or self.step % settings.save_every == 0):
+                self.save()
 
-    def _descend(self, batch: EncoderInput, targets: Targets) -> dict[str, float]:
-        fraction = self.step / max(1, self.settings.steps)
+    @property
+    def fraction(self) -> float:
+        """Share of the training that is done, 0..1."""
+        return self.step / max(1, self.settings.steps)
+
+    def descend(self, batch: EncoderInput, targets: Targets) -> dict[str, float]:
+        """One step of gradient descent; returns the losses."""
+        device = self.process.device
+        if device.type == "cuda":
+            batch, targets = _evenly(batch, targets)
+        batch, targets = batch.to(device), targets.to(device)
         warm_up = min(1.0, (self.step + 1) / max(1, self.settings.warm_up))
-        factor = warm_up * (0.02 + 0.98 * 0.5 * (1 + np.cos(np.pi * fraction)))
+        factor = warm_up * (0.02 + 0.98 * 0.5 * (1 + np.cos(np.pi * self.fraction)))
         for group, share in zip(self.optimiser.param_groups, (1 / 3, 1.0), strict=True):
             group["lr"] = self.settings.rate * share * factor
         self.optimiser.zero_grad(set_to_none=True)
@@ -282,32 +292,14 @@ class Trainer:
             # A single rollout in which the robot tumbles must not corrupt the weights.
             if torch.isfinite(norm):
                 self.optimiser.step()
-        return {name: float(value.detach()) for name, value in losses.items()}
+        names, values = list(losses), torch.stack([value.detach() for value in losses.values()]).tolist()
+        return dict(zip(names, values, strict=True))
 
     def _cast(self) -> torch.autocast:
         kind = self.process.device.type
         fast = kind == "cuda" or multiplies_bfloat16()
         enabled = self.settings.precision == "bfloat16" or (self.settings.precision == "auto" and fast)
         return torch.autocast(kind, dtype=torch.bfloat16, enabled=enabled)
-
-    def _batch(self, step: int) -> tuple[EncoderInput, Targets]:
-        """Samples of a step, determined by seed and step alone, so that resuming does not change them."""
-        settings, process = self.settings, self.process
-        total = settings.batch * process.count
-        random = np.random.default_rng([settings.seed, step])
-        # Each epoch uses every sample once.
-        epoch, first = divmod(step * total, len(self.index))
-        order = np.random.default_rng([settings.seed, 7, epoch]).permutation(len(self.index))
-        first += process.rank * settings.batch
-        chosen = np.take(order, range(first, first + settings.batch), mode="wrap")
-        shares = settings.sensor_shares if self.encoder.config.sensor == "camera_lidar" else None
-        drawn = [Augmentation.draw(random, shares) if settings.augment else Augmentation() for _ in range(total)]
-        augmentations = drawn[process.rank * settings.batch :]
-        samples = [
-            sample(self.recordings[self.index[i][0]], self.index[i][1], self.encoder.config, augmentation)
-            for i, augmentation in zip(chosen, augmentations, strict=False)
-        ]
-        return EncoderInput.stack([s[0] for s in samples]), Targets.stack([s[1] for s in samples])
 
     def _validate(self) -> None:
         """Validate, and save the encoder if it has the lowest held-out loss so far."""
@@ -350,6 +342,13 @@ class Trainer:
             (e["step"], Validation(e["geometric"], e["supporting"], e["loss"])) for e in description["history"]
         ]
         return True
+
+
+def _evenly(batch: EncoderInput, targets: Targets) -> tuple[EncoderInput, Targets]:
+    """The same with a number of images of which there are few."""
+    count = -(-len(batch.images) // _IMAGES_AT_ONCE) * _IMAGES_AT_ONCE
+    added = targets.depth.new_zeros(count - len(batch.images), *targets.depth.shape[1:])
+    return batch.with_images(count), replace(targets, depth=torch.cat([targets.depth, added]))
 
 
 def state_file(out: Path) -> Path:

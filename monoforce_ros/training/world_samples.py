@@ -58,12 +58,17 @@ def world_samples(
         DrawingError: no graphics library can render images.
     """
     settings = settings or world_settings(seed)
-    content = [SAMPLES_VERSION, places, asdict(settings), config.image_width, config.image_height]
-    digest = hashlib.sha256(json.dumps(content, default=str).encode()).hexdigest()[:8]
-    file = folder / f"world-{seed}-{digest}.safetensors"
+    file = world_file(seed, config, folder, places=places, settings=settings)
     if not file.is_file():
         save_samples(_samples(take_snapshots(settings, seed, places), f"world {seed}", config), file)
     return file
+
+
+def world_file(seed: int, config: EncoderConfig, folder: Path, *, places: int, settings: WorldSettings) -> Path:
+    """File of a world's samples."""
+    content = [SAMPLES_VERSION, places, asdict(settings), config.image_width, config.image_height]
+    digest = hashlib.sha256(json.dumps(content, default=str).encode()).hexdigest()[:8]
+    return folder / f"world-{seed}-{digest}.safetensors"
 
 
 def world_settings(seed: int, styles: Sequence[str] = WORLD_STYLES) -> WorldSettings:
