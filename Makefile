@@ -6,7 +6,7 @@
 # make diagnosis  measure diagnose on drawn platforms in two engines (up to six hours, resumable), on hidden effects and
 #                 real drives (an hour), write the tables of docs/discrepancy.md
 # make diagnosis-quick  measure diagnose on six drawn platforms (about 15 minutes), write nothing to the documents
-# make checkpoint train the shipped terrain encoder on randomised worlds, from nothing (two hours)
+# make checkpoint train the shipped terrain encoder on randomised worlds, from nothing (a night)
 # make tables     compare terrain sources on worlds that no training saw, as the paper's tables do (three hours, resumable)
 SHELL := /bin/bash
 .PHONY: demo test test-lowest interfaces bench diagnosis diagnosis-quick engines checkpoint tables lint environment build graphics lock clean help

@@ -125,6 +125,7 @@ def _samples(
         images=torch.from_numpy(arrays.pop("images")),
         segments=tuple(segment for _, segment in segments),
         chunks=chunks,
+        file=None,
         **arrays,
     )
 

@@ -129,7 +129,7 @@ class Augmentation:
         offset = (1.0 - self.saturation) * brightness
         if self.noise:
             random = np.random.default_rng(self.noise_seed)
-            offset += self.noise * random.standard_normal(offset.shape, np.float32)
+            offset = offset + np.float32(self.noise) * random.standard_normal(offset.shape, np.float32)
         colours = (self.saturation * colours + offset[..., None] - 127.5) * self.contrast + 127.5
         return np.clip(colours * np.array(self.gain, np.float32), 0.0, 255.0).astype(np.uint8)
 
