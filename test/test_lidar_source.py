@@ -10,7 +10,7 @@ import torch
 
 from monoforce_ros.bags import Recording
 from monoforce_ros.core import MotionState
-from monoforce_ros.encoder import EncoderConfig, new_encoder, save_encoder
+from monoforce_ros.encoder import EncoderConfig, load_encoder, new_encoder, save_encoder
 from monoforce_ros.evaluation import evaluate_recording, observe
 from monoforce_ros.evaluation.tables import PHYSICS
 from monoforce_ros.perception import (
@@ -53,9 +53,32 @@ def test_in_tall_grass_paths_are_far_better_than_on_interpolated_heights(recordi
     assert learned < 0.5 * interpolated
 
 
-def test_interpolation_is_used_until_the_wheels_have_confirmed_the_encoder(recording, husky):
-    trusted, plain = (choose_terrain_source(kind, husky, fallback=True) for kind in ("lidar", "lidar_interpolation"))
-    assert isinstance(trusted, TrustedTerrain) and isinstance(plain, LidarTerrain)
+def test_the_encoder_s_sweep_is_used_from_the_start_and_images_are_not(recording, husky):
+    plain = choose_terrain_source("lidar", husky)
+    for kind, share in (("lidar", 1.0), ("lidar_camera", 0.0)):
+        trusted = choose_terrain_source(kind, husky, fallback=True)
+        assert isinstance(trusted, TrustedTerrain)
+        stamp = recording.clouds[0].stamp
+        sensors = tuple(kind.split("_"))
+        observation = observe(recording, husky, stamp, sensors, tuple(recording.images))
+        motion = recording.motion.at(stamp)
+        terrain = trusted.terrain(observation, motion)
+        assert trusted.report.share == share
+        expected = plain.terrain(replace(observation, images={}), motion)
+        torch.testing.assert_close(terrain.height, expected.height)
+        # What both sensors say is remembered, to be compared with the ground.
+        assert (kind == "lidar") == torch.equal(trusted.predicted.height, expected.height)
+
+
+def test_a_sweep_s_encoder_is_replaced_by_interpolation_where_the_ground_contradicts_it(recording, husky, tmp_path):
+    encoder = load_encoder("")
+    with torch.no_grad():
+        # Vegetation everywhere, at which the robot drives as if it were none.
+        encoder.heads.bias[1] += 0.6
+    file = tmp_path / "deep.safetensors"
+    save_encoder(encoder, file)
+    trusted = choose_terrain_source("lidar", husky, checkpoint=file, fallback=True)
+    plain = choose_terrain_source("lidar_interpolation", husky, grid=trusted.grid)
     shares = []
     for frame in recording.clouds[::5]:
         observation, motion = observe(recording, husky, frame.stamp, ("lidar",)), recording.motion.at(frame.stamp)
@@ -63,8 +86,7 @@ def test_interpolation_is_used_until_the_wheels_have_confirmed_the_encoder(recor
         shares.append(trusted.report.share)
         if not shares[-1]:
             torch.testing.assert_close(terrain.height, interpolated.height)
-    assert shares[0] == 0.0
-    assert shares[-1] > 0.3
+    assert shares[-1] < 0.3
 
 
 def test_other_grids_and_encoders_without_sweeps_are_interpolated(tmp_path, husky):

@@ -49,10 +49,11 @@ def test_outputs_carry_the_stamp_and_frame_of_their_input(peer, predictor):
     assert len(peer.received["/predicted/height_map"][-1].cells) == 128 * 128
     terrain = peer.received["/predicted/terrain"][-1]
     names = ["x", "y", "z", "geometric_height", "stiffness", "damping", "friction", "observed"]
+    names += ["geometric_spread", "decrease_spread"]
     assert [f.name for f in terrain.fields] == names
     values = np.frombuffer(terrain.data, "<f4").reshape(-1, len(names))
     assert np.isfinite(values).all()
-    np.testing.assert_allclose(values[values[:, 7] > 0.5, 2], 0.3 - 0.1323, atol=0.01)
+    np.testing.assert_allclose(values[values[:, 7] > 0.5, 2], 0.3 - 0.1323, atol=0.03)
     forces = next(m for m in peer.received["/predicted/contact_forces"][-1].markers if m.ns == "contact_forces")
     assert len(forces.points) > 20
     first_time = forces.points[0]
@@ -178,7 +179,7 @@ def test_clouds_in_the_odometry_frame_are_used(peer, predictor):
     assert peer.until(lambda: len(peer.received["/predicted/terrain"]) > 1, 5.0), peer.status("lidar")
     terrain = peer.received["/predicted/terrain"][-1]
     values = np.frombuffer(terrain.data, "<f4").reshape(-1, len(terrain.fields))
-    np.testing.assert_allclose(values[values[:, 7] > 0.5, 2], 0.3 - 0.1323, atol=0.01)
+    np.testing.assert_allclose(values[values[:, 7] > 0.5, 2], 0.3 - 0.1323, atol=0.03)
 
 
 def test_odometry_that_stops(peer, predictor):

@@ -83,6 +83,26 @@ def test_the_share_is_earned_and_small_for_what_says_nothing_of_the_ground():
     assert np.mean(shares) < 0.2
 
 
+def test_what_a_sweep_says_is_used_until_the_ground_says_otherwise():
+    def shares(said):
+        return np.array([report.share for report in drive(TerrainTrust(GRID, expected=1.0), said)])
+
+    right = shares(lambda ahead, x: hill(ahead + x) - hill(x))
+    assert right[0] == 1.0 and right.min() > 0.9
+    # Where it says what the fallback says, nothing speaks against it.
+    level = [
+        trust.update(at(x), np.column_stack([WHEELS, np.zeros(4)]), TerrainMap.flat(GRID), {}, 0.0).share
+        for trust in [TerrainTrust(GRID, expected=1.0)]
+        for x in np.arange(0.0, 8.0, 0.1)
+    ]
+    assert min(level) == 1.0
+    # Holes that are not there, too shallow to be refused at once.
+    wrong = shares(lambda ahead, x: hill(ahead + x) - hill(x) - np.where(np.abs(ahead) > 0.7, 0.25, 0.0))
+    assert wrong[0] == 1.0 and wrong[-1] < 0.6
+    half = shares(lambda ahead, x: 2.0 * (hill(ahead + x) - hill(x)))
+    assert half[0] == 1.0 and (0.4 < half[-1] < 0.7 or half[-1] == 0.0)
+
+
 def test_half_of_the_ground_is_used_by_half():
     report = drive(TerrainTrust(GRID), lambda ahead, x: 2.0 * (hill(ahead + x) - hill(x)))[-1]
     assert 0.35 < report.share < 0.6 or not report.trusted

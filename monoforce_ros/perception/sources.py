@@ -48,8 +48,8 @@ def choose_terrain_source(
         device: device of the encoder.
         precision: precision of the encoder, see :func:`monoforce_ros.encoder.fused`.
         threads: CPU threads of the encoder; by default PyTorch's current number.
-        fallback: whether sources with an encoder fall back (to level ground, or to interpolation of the lidar) while
-            the encoder is worse than level ground; see :class:`monoforce_ros.perception.TrustedTerrain`.
+        fallback: whether sources with an encoder fall back (to level ground, or to the lidar alone) while the encoder
+            is worse than level ground; see :class:`monoforce_ros.perception.TrustedTerrain`.
         retention_time: how long terrain seen by cameras is kept after it leaves the images [s]; 0 disables it.
         warn: called with the reason if the source ``lidar`` only interpolates.
 
@@ -81,7 +81,12 @@ def choose_terrain_source(
     if kind == "lidar_camera" and "lidar" not in sensors:
         learned = LidarCameraTerrain(lidar, learned)
     if fallback:
-        fallbacks: list[TerrainSource] = [] if kind == "camera" else [lidar]
-        fallbacks += [] if kind == "lidar" else [level]
-        learned = TrustedTerrain(learned, own, fallbacks)
+        fallbacks: list[TerrainSource] = [] if kind == "lidar" else [level]
+        if kind == "lidar_camera" and "lidar" in sensors:
+            # Without what images say, which has to be confirmed, there is still what the encoder makes of the sweep.
+            sweep = EncoderTerrain(encoder, robot, ("lidar",), threads=threads, material=material)
+            fallbacks.insert(0, TrustedTerrain(sweep, sweep, [lidar], expected=1.0))
+        elif kind != "camera":
+            fallbacks.insert(0, lidar)
+        learned = TrustedTerrain(learned, own, fallbacks, expected=1.0 if kind == "lidar" else 0.0)
     return learned

@@ -28,6 +28,8 @@ ERROR_RATE = 0.01
 TOLERANCE = 0.01
 """Difference between two mean errors that does not matter [m]: wheels sink in by as much (8 mm on firm soil)."""
 _FEWEST_BLOCKS = 3
+_SMALLEST_SQUARE = 1e-9
+"""Of differences of heights: where there are none the share is what was expected [m²]."""
 _NEAREST, _FARTHEST = 0.8, 5.0
 """Distances from the robot between which predictions are compared [m]: nearer cells are fitted to the wheels."""
 DISTANCES = (0.8, 2.0, 3.5, 5.0)
@@ -68,6 +70,8 @@ class TrustReport:
                 f" {100 * START_TOLERANCE:.0f} cm: check the sensors' poses, or {self.remedy}"
             )
         if not np.isfinite(self.error):
+            if self.share > 0.0:
+                return "nothing compared yet: until the robot reaches ground that was predicted, the prediction is used"
             return "nothing compared yet: until the robot reaches ground that was predicted, the fallback is used"
         compared = (
             f"ground predicted {_NEAREST:g} to {_FARTHEST:g} m ahead was off by {100 * self.error:.0f} cm over the last"
@@ -101,15 +105,23 @@ class TerrainTrust:
     Level ground at the height of the wheels is the rival: an encoder that loses against it over the last metres harms.
     Errors are averaged over blocks of half a metre of travel; a paired t-test over the blocks decides.
 
-    How much of a prediction is used has to be earned, too: the share w of its difference d to the fallback's heights is
-    the regression of the ground's difference g on d, g = w d + noise, with the prior w ~ N(0, 1). The posterior mean is
-    Σ d g / (Σ d² + σ²) over blocks; for σ², the variance of the noise, stands that of g, which it is if d says nothing.
-    One standard deviation less is used: two hills may be alike by chance. The share is 0 at the start, 3/4
-    after three blocks of perfect predictions, and near 0 for pictures of another place.
+    The share w of a prediction's difference d to the fallback's heights that is used is the regression of the ground's
+    difference g on d, g = w d + noise, with the prior w ~ N(w0, 1). The posterior mean is (Σ d g + w0 σ²) / (Σ d² + σ²)
+    over blocks; for σ², the variance of the noise, stands that of g - w0 d, which it is if w is w0.
+
+    What images say has to be earned, w0 = 0: they may be of another place, or of a world that looks different. One
+    standard deviation less is used, because two hills may be alike by chance. The share is 0 at the start, 3/4 after
+    three blocks of perfect predictions, and near 0 for pictures of another place. A sweep measures, and from one the
+    encoder is right on average wherever robots drove in simulation (docs/training.md): w0 = 1 until the ground
+    says otherwise. After three blocks of ground that it put as far off as it differs from the fallback, 1/4 is left.
+
+    Args:
+        grid: cells of the maps.
+        expected: prior mean w0 of the share, 0 to 1.
     """
 
-    def __init__(self, grid: Grid):
-        self._grid = grid
+    def __init__(self, grid: Grid, expected: float = 0.0):
+        self._grid, self._expected = grid, expected
         self._start_over()
 
     def _start_over(self) -> None:
@@ -216,15 +228,19 @@ class TerrainTrust:
             self._trusted = bool(difference.mean() <= TOLERANCE)
 
     def _share(self) -> float:
-        """The posterior mean of the share w, less its standard deviation."""
-        if len(self._moments) < _FEWEST_BLOCKS:
-            return 0.0
+        """The posterior mean of the share w, less its standard deviation where nothing is expected of it."""
+        expected, count = self._expected, len(self._moments)
+        if count < _FEWEST_BLOCKS:
+            return expected
         product, square, ground = np.array(self._moments).T.sum(axis=1)
-        count = len(self._moments)
-        precision = max(square + ground / count, 1e-9)
-        share = product / precision
-        unexplained = max(ground - 2.0 * share * product + share**2 * square, 0.0) / count
-        return float(np.clip(share - np.sqrt(unexplained / precision), 0.0, 1.0))
+
+        def noise(share: float) -> float:
+            return max(ground - 2.0 * share * product + share**2 * square, _SMALLEST_SQUARE) / count
+
+        precision = square + noise(expected)
+        share = (product + expected * noise(expected)) / precision
+        doubt = (1.0 - expected) * np.sqrt(noise(share) / precision)
+        return float(np.clip(share - doubt, 0.0, 1.0))
 
     def _report(self, start_error: float) -> TrustReport:
         own, level = (float(np.mean([b[i] for b in self._blocks])) if self._blocks else float("nan") for i in (0, 1))
@@ -260,13 +276,16 @@ class TrustedTerrain:
         encoder: the encoder's own source within it.
         fallbacks: sources of the maps where the encoder is not trusted; the first one whose sensors have measured
             enough.
+        expected: see :class:`TerrainTrust`.
     """
 
-    def __init__(self, source: TerrainSource, encoder: EncoderTerrain, fallbacks: Sequence[TerrainSource]):
+    def __init__(
+        self, source: TerrainSource, encoder: EncoderTerrain, fallbacks: Sequence[TerrainSource], expected: float = 0.0
+    ):
         self.source = source
         """Source of the encoder's maps."""
         self._encoder, self._fallbacks = encoder, tuple(fallbacks)
-        self._trust = TerrainTrust(source.grid)
+        self._trust = TerrainTrust(source.grid, expected)
         self.report: TrustReport | None = None
         """Result of the last comparison; None before the first map."""
         self.predicted: TerrainMap | None = None
