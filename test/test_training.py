@@ -41,7 +41,15 @@ from monoforce_ros.training.recording_samples import SamplesError, read_samples
 from monoforce_ros.training.sample_extraction import SampleSettings, extract_samples
 from monoforce_ros.training.samples import MIRROR, Augmentation, Targets, sample
 from monoforce_ros.training.train_cli import build_parser
-from monoforce_ros.training.trainer import Process, Trainer, TrainingSettings, _sensors, validate
+from monoforce_ros.training.trainer import (
+    Process,
+    Trainer,
+    TrainingSettings,
+    _evenly,
+    _Losses,
+    _sensors,
+    validate,
+)
 from monoforce_ros.training.training_state import TrainingError, read_state, save_state
 
 TINY = EncoderConfig(image_width=128, image_height=96, map_size=6.4, resolution=0.2)
@@ -100,12 +108,12 @@ def test_an_augmented_image_has_other_colours_and_noise():
     assert np.ptp(grey, axis=-1).max() <= 1 and grey.std() > 30
     flat = np.full_like(image, 64)
     assert Augmentation(exposure=0.5).image(flat).mean() == pytest.approx(255 * np.sqrt(64 / 255), abs=1.0)
-    noisy = Augmentation(noise=5.0, noise_seed=3)
+    noisy = Augmentation(noise=5.0, seed=3)
     assert noisy.image(flat).std() == pytest.approx(5.0, abs=0.3) and noisy.image(flat).mean() == pytest.approx(
         64, abs=1
     )
     np.testing.assert_array_equal(noisy.image(flat), noisy.image(flat))
-    assert np.any(replace(noisy, noise_seed=4).image(flat) != noisy.image(flat))
+    assert np.any(replace(noisy, seed=4).image(flat) != noisy.image(flat))
 
 
 def test_samples_that_were_not_read_from_a_file_are_prepared_without_another_process(recording):
@@ -117,6 +125,19 @@ def test_samples_that_were_not_read_from_a_file_are_prepared_without_another_pro
         expected, wanted = batches[step]
         assert torch.equal(batch.images, expected.images) and torch.equal(targets.supporting, wanted.supporting)
     assert list(batches.prepared(range(0), loaders=1)) == []
+
+
+def test_images_added_for_a_gpu_do_not_change_the_losses(recording, husky):
+    encoder = new_encoder(TINY).eval()
+    torch.nn.init.normal_(encoder.heads.weight, std=0.2)
+    losses = _Losses(encoder, husky, LossWeights(trajectory=0.0))
+    batch, targets = Batches([recording], TINY, size=3, seed=3)[0]
+    more = _evenly(batch, targets)
+    assert len(batch.images) < len(more[0].images) == len(more[1].depth) == 16
+    with torch.no_grad():
+        expected, found = losses(batch, targets), losses(*more)
+    for name, value in expected.items():
+        torch.testing.assert_close(found[name], value, atol=1e-5, rtol=1e-5)
 
 
 def test_worlds_drawn_side_by_side_are_those_drawn_one_after_another(tmp_path):
@@ -591,7 +612,8 @@ def test_trainings_with_images_alone_resume_whatever_a_sweep_would_show(tmp_path
 
 
 def test_shares_of_sensors_decide_what_a_sample_lacks():
-    random = np.random.default_rng(3)
+    # One in ninety samples of images alone has none: all cameras are left out.
+    random = np.random.default_rng(4)
     swept = [Augmentation.draw(random, (0.0, 0.0, 1.0)) for _ in range(20)]
     assert not any(drawn.shows(camera) for drawn in swept for camera in range(6))
     assert all(drawn.sweep_share > 0.0 for drawn in swept)

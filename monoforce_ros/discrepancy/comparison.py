@@ -191,7 +191,7 @@ def _closed(before: float, after: float, noise: float) -> float | None:
     return float(np.clip((before - after) / reducible, -1.0, 1.0)) if reducible > 0 else None
 
 
-_JUDGED = 2.0
+JUDGED = 2.0
 """Longest horizon at which effects are judged [s]: that of the windows to which they are fitted."""
 
 
@@ -204,7 +204,7 @@ def improves(gap: Mapping[str, GapRow]) -> bool:
 
 def gets_worse(gap: Mapping[str, GapRow]) -> bool:
     """Whether an error at 2 s, or at the longest shorter time, gets larger beyond chance and none smaller."""
-    rows = [row for row in gap.values() if row.gain_low is not None and 0 < row.horizon <= _JUDGED]
+    rows = [row for row in gap.values() if row.gain_low is not None and 0 < row.horizon <= JUDGED]
     longest = max((row.horizon for row in rows), default=0.0)
     gains = [(row.gain_low or 0.0, row.gain_high or 0.0) for row in rows if row.horizon == longest]
     return any(high < 0 for _, high in gains) and not any(low > 0 for low, _ in gains)

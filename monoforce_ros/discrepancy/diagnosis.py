@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -169,11 +169,7 @@ def diagnose(
         decision = decision.without_improvement()
         judged = held_out(decision)
         # Without the rejected effects; the same windows, where nothing is left.
-        compared = (
-            [replace(entry, after=None) for entry in compared]
-            if judged is None
-            else compare(robot, data, smoothed, judged, noisy)
-        )
+        compared = _without_effects(compared) if judged is None else compare(robot, data, smoothed, judged, noisy)
     repetition = None
     if decision.trial is not None:
         repetition = repeat(evidence, robot, explanation.windows, nominal, settings, _Steps(progress, 0.62, 0.95))
@@ -185,7 +181,7 @@ def diagnose(
     if judged is not None and gets_worse(gap):
         # Searches that never saw the judged windows contradict what was found.
         decision, judged = decision.without_improvement("increase"), None
-        compared = [replace(entry, after=None) for entry in compared]
+        compared = _without_effects(compared)
         gap = gap_table(compared, settings.seed)
     known_parts: tuple[EffectEstimate, ...] = ()
     parts = decision.parts
@@ -241,6 +237,11 @@ def diagnose(
         details=Details(data, before, floor, tuple(compared), paths),
         set_aside=None if aside is None else aside.verdict,
     )
+
+
+def _without_effects(compared: Sequence[Comparison]) -> list[Comparison]:
+    """The same windows, where nothing is added."""
+    return [replace(entry, after=None) for entry in compared]
 
 
 def _estimated(search: Search, fit: Fit, outcome: Outcome) -> tuple[EffectEstimate, ...]:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-from monoforce_ros.discrepancy.comparison import GapRow
+from monoforce_ros.discrepancy.comparison import JUDGED, GapRow
 from monoforce_ros.discrepancy.credibility import complaint
 from monoforce_ros.discrepancy.diagnosis import Diagnosis
 from monoforce_ros.discrepancy.estimates import EffectEstimate
@@ -98,7 +98,7 @@ def explained(diagnosis: Diagnosis) -> tuple[Explained, ...]:
             rows = [
                 row
                 for name, row in table.items()
-                if name.startswith(f"{metric}_") and 0 < row.horizon <= 2.0 and row.after is not None
+                if name.startswith(f"{metric}_") and 0 < row.horizon <= JUDGED and row.after is not None
             ]
             if rows:
                 found.append(Explained(metric, max(rows, key=lambda row: row.horizon), recording))
@@ -229,7 +229,9 @@ def _sizes(diagnosis: Diagnosis) -> tuple[str, ...]:
     if texts:
         return tuple(texts)
     for metric in ("position", "heading"):
-        rows = [entry for name, entry in diagnosis.gap.items() if name.startswith(metric) and 0 < entry.horizon <= 2.0]
+        rows = [
+            entry for name, entry in diagnosis.gap.items() if name.startswith(metric) and 0 < entry.horizon <= JUDGED
+        ]
         if rows:
             last = max(rows, key=lambda entry: entry.horizon)
             unit = "°" if last.unit == "deg" else f" {last.unit}"

@@ -81,12 +81,14 @@ def choose_terrain_source(
     if kind == "lidar_camera" and "lidar" not in sensors:
         learned = LidarCameraTerrain(lidar, learned)
     if fallback:
-        fallbacks: list[TerrainSource] = [] if kind == "lidar" else [level]
-        if kind == "lidar_camera" and "lidar" in sensors:
-            # Without what images say, which has to be confirmed, there is still what the encoder makes of the sweep.
+        if kind == "lidar":
+            return TrustedTerrain(learned, own, [lidar], expected=1.0)
+        if kind == "camera":
+            return TrustedTerrain(learned, own, [level])
+        without_images: TerrainSource = lidar
+        if "lidar" in sensors:
+            # What images say has to be confirmed; what the encoder makes of the sweep is there from the start.
             sweep = EncoderTerrain(encoder, robot, ("lidar",), threads=threads, material=material)
-            fallbacks.insert(0, TrustedTerrain(sweep, sweep, [lidar], expected=1.0))
-        elif kind != "camera":
-            fallbacks.insert(0, lidar)
-        learned = TrustedTerrain(learned, own, fallbacks, expected=1.0 if kind == "lidar" else 0.0)
+            without_images = TrustedTerrain(sweep, sweep, [lidar], expected=1.0)
+        return TrustedTerrain(learned, own, [without_images, level])
     return learned

@@ -72,7 +72,7 @@ class Batches(Dataset):
         """Batches of steps, prepared while others are used.
 
         Args:
-            steps: whose batches are prepared, in this order.
+            steps: whose batches are prepared, consecutive ones.
             loaders: batches that are prepared at the same time, in processes of their own: threads wait for each other
                 in Python. One, or recordings without a file, are prepared in a thread.
         """
@@ -80,20 +80,18 @@ class Batches(Dataset):
             # A forked process may hang in libraries that had threads before.
             yield from DataLoader(
                 self, batch_size=None, sampler=steps, num_workers=loaders, multiprocessing_context="spawn",
-                worker_init_fn=_use_one_thread,
+                worker_init_fn=use_one_thread,
             )  # fmt: skip
             return
         with ThreadPoolExecutor(1) as pool:
-            ahead = [pool.submit(self.__getitem__, step) for step in steps[:1]]
-            for following in (*steps[1:], None):
-                if not ahead:
-                    return
-                batch = ahead.pop().result()
-                if following is not None:
-                    ahead.append(pool.submit(self.__getitem__, following))
+            prepared = None
+            for step in steps:
+                batch = self[step] if prepared is None else prepared.result()
+                prepared = pool.submit(self.__getitem__, step + 1) if step + 1 in steps else None
                 yield batch
 
 
-def _use_one_thread(_: int) -> None:
+def use_one_thread(worker: int = 0) -> None:
+    """Parallel processes use one thread each."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)

@@ -52,7 +52,6 @@ class Augmentation:
     """Standard deviation of the Gaussian blur [px]."""
     noise: float = 0.0
     """Standard deviation of the noise of the brightness, of 255."""
-    noise_seed: int = 0
     cameras: tuple[float, ...] = ()
     """Random numbers 0..1, one for each camera; see :attr:`camera_share`."""
     camera_share: float = 1.0
@@ -63,9 +62,10 @@ class Augmentation:
     """Share of the sweep's points that is kept; 0 for no sweep."""
     sweep_noise: float = 0.0
     """Standard deviation of ranges beyond that of the recording [m]: lidars differ."""
-    sweep_seed: int = 0
     traced: bool = True
     """Whether the ground that the robot drove over is known."""
+    seed: int = 0
+    """Of the noise, and of which points of a sweep are kept."""
 
     @classmethod
     def draw(cls, random: np.random.Generator, sensor_shares: Sequence[float] | None = None) -> Augmentation:
@@ -91,7 +91,7 @@ class Augmentation:
             saturation=random.uniform(0.2, 1.2),
             exposure=float(np.exp(random.uniform(-0.4, 0.4))),
             noise=max(0.0, random.uniform(-4.0, 6.0)),
-            noise_seed=int(random.integers(2**31)),
+            seed=int(random.integers(2**31)),
         )
 
     def image_from_view(self) -> np.ndarray:
@@ -128,14 +128,14 @@ class Augmentation:
         brightness = colours @ np.array(_LUMINANCE, np.float32)
         offset = (1.0 - self.saturation) * brightness
         if self.noise:
-            random = np.random.default_rng(self.noise_seed)
+            random = np.random.default_rng(self.seed)
             offset = offset + np.float32(self.noise) * random.standard_normal(offset.shape, np.float32)
         colours = (self.saturation * colours + offset[..., None] - 127.5) * self.contrast + 127.5
         return np.clip(colours * np.array(self.gain, np.float32), 0.0, 255.0).astype(np.uint8)
 
     def _blank_image(self, image: np.ndarray) -> np.ndarray:
         """An image of a covered, blinded or broken camera: one colour with noise."""
-        random = np.random.default_rng(self.sweep_seed)
+        random = np.random.default_rng(self.seed)
         noise = random.normal(0.0, random.choice([0.0, 4.0, 40.0]), image.shape)
         return np.clip(random.uniform(0.0, 255.0) * np.array(self.gain) + noise, 0.0, 255.0).astype(np.uint8)
 
@@ -148,7 +148,7 @@ class Augmentation:
         each."""
         if self.sweep_share >= 1.0 or not len(points):
             return points
-        random = np.random.default_rng(self.sweep_seed)
+        random = np.random.default_rng(self.seed)
         offset = points - sensor
         distance = np.linalg.norm(offset, axis=1, keepdims=True)
         noise = self.sweep_noise * random.standard_normal((len(points), 1))
@@ -177,7 +177,6 @@ def _drawn_sensors(random: np.random.Generator, shares: Sequence[float]) -> dict
         "blank": bool(random.uniform() < 0.06),
         "sweep_share": 0.0 if kind == "images" else random.uniform(0.2, 1.0),
         "sweep_noise": random.uniform(0.0, _LARGEST_NOISE),
-        "sweep_seed": int(random.integers(2**31)),
         "traced": bool(random.uniform() < 0.5),
     }
 

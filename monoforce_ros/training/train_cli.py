@@ -42,6 +42,7 @@ from monoforce_ros.training.adaptation import (
     keep_obstacles,
     split_recording,
 )
+from monoforce_ros.training.batches import use_one_thread
 from monoforce_ros.training.depth_training import DepthSettings, DepthTrainer, depth_errors
 from monoforce_ros.training.image_features import image_features
 from monoforce_ros.training.judgement import BOTH, CAMERAS, SWEEP, calibrated
@@ -489,7 +490,7 @@ def _draw_world(task: tuple) -> tuple[Path | None, str]:
 def _processes(count: int) -> ProcessPoolExecutor:
     """Processes of one thread each, at least one; they start with their first task."""
     return ProcessPoolExecutor(
-        max(1, count), mp_context=multiprocessing.get_context("spawn"), initializer=_use_one_thread
+        max(1, count), mp_context=multiprocessing.get_context("spawn"), initializer=use_one_thread
     )
 
 
@@ -514,12 +515,6 @@ def _samples(
     if bags and not recordings:
         raise SamplesError(f"none of {len(bags)} bags gives samples")
     return recordings
-
-
-def _use_one_thread() -> None:
-    """Parallel processes use one thread each."""
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
 
 
 def _extract(task: tuple) -> tuple[Path | None, str]:

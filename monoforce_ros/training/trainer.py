@@ -48,8 +48,6 @@ from monoforce_ros.training.training_state import RENAMED_WEIGHTS, TrainingError
 BACKBONE_PARTS = ("none", "late", "all", "map")
 """Parts of the backbone that can be trained; ``late``: the stages at stride 16. Norms are trained with ``all`` only.
 ``map``: nothing before the map is trained, neither the backbone nor what follows it up to the lift."""
-
-
 _IMAGES_AT_ONCE = 16
 """On a GPU the number of images in a batch is a multiple of this: cuDNN chooses kernels anew for each number."""
 
@@ -252,7 +250,7 @@ class Trainer:
         not_finite = 0
         self.encoder.train()
         for batch, targets in self.batches.prepared(range(self.step, settings.steps), self.loaders):
-            losses = self.descend(batch, targets)
+            losses = self._descend(batch.to(self.process.device), targets.to(self.process.device))
             self.step += 1
             not_finite = 0 if np.isfinite(losses["total"]) else not_finite + 1
             if not_finite >= 20:
@@ -267,19 +265,12 @@ class Trainer:
             if self.process.first and (done or self.step % settings.save_every == 0):
                 self.save()
 
-    @property
-    def fraction(self) -> float:
-        """Share of the training that is done, 0..1."""
-        return self.step / max(1, self.settings.steps)
-
-    def descend(self, batch: EncoderInput, targets: Targets) -> dict[str, float]:
-        """One step of gradient descent; returns the losses."""
-        device = self.process.device
-        if device.type == "cuda":
+    def _descend(self, batch: EncoderInput, targets: Targets) -> dict[str, float]:
+        if self.process.device.type == "cuda":
             batch, targets = _evenly(batch, targets)
-        batch, targets = batch.to(device), targets.to(device)
+        fraction = self.step / max(1, self.settings.steps)
         warm_up = min(1.0, (self.step + 1) / max(1, self.settings.warm_up))
-        factor = warm_up * (0.02 + 0.98 * 0.5 * (1 + np.cos(np.pi * self.fraction)))
+        factor = warm_up * (0.02 + 0.98 * 0.5 * (1 + np.cos(np.pi * fraction)))
         for group, share in zip(self.optimiser.param_groups, (1 / 3, 1.0), strict=True):
             group["lr"] = self.settings.rate * share * factor
         self.optimiser.zero_grad(set_to_none=True)
