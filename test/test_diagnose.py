@@ -31,7 +31,7 @@ from monoforce_ros.discrepancy import diagnosis as diagnosis_module
 from monoforce_ros.discrepancy.clocks import compare_with_gyro
 from monoforce_ros.discrepancy.comparison import GapRow, compare, gets_worse
 from monoforce_ros.discrepancy.fit import first_values, fit_effects
-from monoforce_ros.discrepancy.gap import noise_floor, noisy_motions
+from monoforce_ros.discrepancy.gap import noise_floor, noisy_motions, relative_motion
 from monoforce_ros.discrepancy.hypothesis import (
     EvidenceWindows,
     Predictions,
@@ -165,6 +165,40 @@ def test_the_noise_floor_is_the_error_of_a_perfect_model(husky):
     rms = np.sqrt((Predictions(husky, data).residuals([()])[0] ** 2).mean(axis=0))
     assert (floor[-1] < 1.5 * rms[-1]).all()
     assert (rms[-1] < 2.5 * floor[-1]).all()
+
+
+def test_the_noise_floor_is_the_error_that_smoothing_leaves(husky):
+    """Of known motion with noise. As much smoothing as another rule asks for misses it, here and on other motion."""
+    motion, commands = simulated_recording(husky, (), seconds=60.0)
+    ratios = []
+    for seed in range(4):
+        random = np.random.default_rng(seed)
+        noise = Rotation.from_rotvec(np.radians(0.5) * random.standard_normal((len(motion), 3)))
+        noisy = replace(
+            motion,
+            positions=motion.positions + 0.01 * random.standard_normal(motion.positions.shape),
+            quaternions=(Rotation.from_quat(motion.quaternions) * noise).as_quat(),
+        )
+        smoothed = smooth(noisy)
+        starts = window_starts(motion, smoothed.stretches, 2.0, 0.5)
+        data = EvidenceWindows(smoothed.motion, commands, starts, 2.0, SAMPLES)
+        error = relative_motion(smoothed.motion, data) - relative_motion(motion, replace(data, motion=motion))
+        floor = noise_floor(smoothed.motion, noisy_motions(smoothed), data)
+        ratios.append(floor / np.quantile(np.abs(error), 0.683, axis=0))
+    assert np.exp(np.log(ratios).mean(axis=(0, 1))) == pytest.approx(1.0, abs=0.15)
+
+
+def test_motion_that_is_smoothed_like_another_keeps_its_stretches(husky):
+    motion, _ = simulated_recording(husky, (), seconds=6.0)
+    smoothed = smooth(motion)
+    again = smooth(motion, like=smoothed)
+    np.testing.assert_array_equal(again.motion.positions, smoothed.motion.positions)
+    np.testing.assert_array_equal(again.weights, smoothed.weights)
+    far = replace(motion, positions=motion.positions + 3.0 * (np.arange(len(motion)) % 2)[:, None])
+    assert len(smooth(far).stretches) > 1
+    assert smooth(far, like=smoothed).stretches == smoothed.stretches
+    with pytest.raises(ValueError, match="stamps"):
+        smooth(replace(motion, stamps=motion.stamps + 1), like=smoothed)
 
 
 @pytest.mark.parametrize("still", [True, False])

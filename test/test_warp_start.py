@@ -7,7 +7,7 @@ import pytest
 
 START = """
 import os
-from monoforce_ros.physics import warp_start
+from monoforce_ros.core import warp_start
 written = warp_start.wp.init
 warp_start.wp.init = lambda: (written(), os.write(2, b"another message\\n"))
 warp_start.start_warp()

@@ -6,10 +6,11 @@ import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.interpolate import BSpline, make_smoothing_spline
+from scipy.interpolate import make_smoothing_spline
 from scipy.optimize import brentq, minimize_scalar
 from scipy.spatial.transform import Rotation
 
+from monoforce_ros.bags.natural_spline import NaturalSplines
 from monoforce_ros.core import NANOSECOND, MotionTrack
 
 LARGEST_GAP = 1.0
@@ -35,15 +36,22 @@ class SmoothedMotion:
     """Standard deviation of the recorded rotation about each axis [rad]."""
     stretches: tuple[slice, ...]
     """Ranges of poses without gaps or jumps."""
+    weights: np.ndarray | None = None
+    """Curvature weight of each coordinate and angle in each stretch, ``[S, 6]``; NaN where nothing was smoothed."""
 
 
 def smooth(
-    motion: MotionTrack, *, position_noise: float | None = None, rotation_noise: float | None = None
+    motion: MotionTrack,
+    *,
+    position_noise: float | None = None,
+    rotation_noise: float | None = None,
+    like: SmoothedMotion | None = None,
 ) -> SmoothedMotion:
     """Smooth a recorded motion.
 
     A cubic smoothing spline over time (Reinsch 1967) is fitted to each coordinate and each angle. Its smoothness
-    follows from the noise if given, else from cross-validation of every other pose against the curve through the rest.
+    follows from the noise if given, else from cross-validation of every other pose against the curve through the rest,
+    unless the motion is smoothed as much as a similar one.
     The yaw rate is that of the unwrapped heading and not of the path, so it is also valid when the robot reverses,
     stands or turns on the spot.
 
@@ -51,9 +59,10 @@ def smooth(
         motion: recorded poses; velocities are ignored.
         position_noise: standard deviation of a recorded coordinate [m], if known.
         rotation_noise: standard deviation about an axis [rad], if known.
+        like: a motion at the same stamps: its stretches and its curvature weights are used.
 
     Raises:
-        ValueError: a given noise is negative, or a pose is not finite.
+        ValueError: a given noise is negative, a pose is not finite, or ``like`` has other stamps.
     """
     for name, value in (("position noise", position_noise), ("rotation noise", rotation_noise)):
         if value is not None and not value >= 0.0:
@@ -62,16 +71,23 @@ def smooth(
         raise ValueError("motion: some poses are not finite; remove them first")
     positions, angles = motion.positions.copy(), _angles(motion.quaternions)
     speeds, turns = np.zeros_like(positions), np.zeros_like(angles)
-    stretches = tuple(_stretches(motion))
+    if like is not None and not np.array_equal(like.motion.stamps, motion.stamps):
+        raise ValueError(f"like: got {len(like.motion)} other stamps, expected the {len(motion)} of the motion")
+    stretches = tuple(_stretches(motion)) if like is None else like.stretches
+    given = np.full((len(stretches), 6), np.nan) if like is None or like.weights is None else like.weights
+    used = np.full_like(given, np.nan)
     squares = [0.0, 0.0]
     freedom = [0.0, 0.0]
-    for stretch in stretches:
+    for number, stretch in enumerate(stretches):
         times = (motion.stamps[stretch] - motion.stamps[stretch.start]) * NANOSECOND
         for kind, (values, rates, noise) in enumerate(
             ((positions, speeds, position_noise), (angles, turns, rotation_noise))
         ):
             for axis in range(3):
-                residual, degrees = _fit(times, values[stretch, axis], rates[stretch, axis], noise)
+                place = number, 3 * kind + axis
+                used[place], residual, degrees = _fit(
+                    times, values[stretch, axis], rates[stretch, axis], noise, float(given[place])
+                )
                 squares[kind] += residual
                 freedom[kind] += degrees
     rotations = Rotation.from_euler("ZYX", angles[:, ::-1])
@@ -83,7 +99,7 @@ def smooth(
         angular_velocities=_body_rates(angles, turns),
     )
     found = [float(np.sqrt(s / f)) if f > 0 else 0.0 for s, f in zip(squares, freedom, strict=True)]
-    return SmoothedMotion(smoothed, found[0], found[1], stretches)
+    return SmoothedMotion(smoothed, found[0], found[1], stretches, used)
 
 
 def _angles(quaternions: np.ndarray) -> np.ndarray:
@@ -117,30 +133,40 @@ def _stretches(motion: MotionTrack) -> list[slice]:
     return [slice(int(low), int(high)) for low, high in itertools.pairwise(edges)]
 
 
-def _fit(times: np.ndarray, values: np.ndarray, rates: np.ndarray, noise: float | None) -> tuple[float, float]:
+def _fit(
+    times: np.ndarray, values: np.ndarray, rates: np.ndarray, noise: float | None, given: float
+) -> tuple[float, float, float]:
     """Replace ``values`` by a smooth curve and ``rates`` by its slope.
 
+    Args:
+        times: of the values [s].
+        values: replaced.
+        rates: replaced.
+        noise: standard deviation of the values, if known.
+        given: curvature weight; NaN to find it.
+
     Returns:
-        sum of the squared residuals, and their degrees of freedom.
+        the curvature weight, the sum of the squared residuals, and their degrees of freedom.
     """
     if len(times) < SHORTEST:
         if len(times) > 1:
             rates[:] = np.gradient(values, times)
-        return 0.0, 0.0
+        return np.nan, 0.0, 0.0
     centred = values - values.mean()
     if np.abs(centred).max() < 1e-12:
         rates[:] = 0.0
-        return 0.0, 0.0
-    if noise is None:
-        spline = make_smoothing_spline(times, centred, lam=_penalty(times, centred))
+        return np.nan, 0.0, 0.0
+    if np.isfinite(given):
+        weight = given
     else:
-        spline = _with_noise(times, centred, noise)
+        weight = _penalty(times, centred) if noise is None else _with_noise(times, centred, noise)
+    spline = make_smoothing_spline(times, centred, lam=weight)
     residuals = centred - spline(times)
     values[:] = values - residuals
     rates[:] = spline.derivative()(times)
     # A curve that partly follows the noise has residuals smaller than the noise, by its degrees of freedom.
     freedom = max(len(times) - _degrees(residuals), 0.25 * len(times))
-    return float((residuals**2).sum()), freedom
+    return weight, float((residuals**2).sum()), freedom
 
 
 def _pieces(length: int) -> list[slice]:
@@ -151,40 +177,38 @@ def _pieces(length: int) -> list[slice]:
 
 def _penalty(times: np.ndarray, values: np.ndarray) -> float:
     """The curvature weight that best predicts left-out poses, from a few pieces of the stretch."""
-    pieces = _pieces(len(times))
-
-    def error(exponent: float) -> float:
-        total = 0.0
-        for piece in pieces:
-            at, measured = times[piece], values[piece]
-            for kept, left in ((slice(0, None, 2), slice(1, -1, 2)), (slice(1, None, 2), slice(2, -1, 2))):
-                curve = make_smoothing_spline(at[kept], measured[kept], lam=10.0**exponent)
-                total += float(((curve(at[left]) - measured[left]) ** 2).sum())
-        return total
-
     if len(times) < 2 * SHORTEST:
         return 1e-3
+    halves = [
+        (NaturalSplines(times[piece][kept]), values[piece][kept], times[piece][left], values[piece][left])
+        for piece in _pieces(len(times))
+        for kept, left in ((slice(0, None, 2), slice(1, -1, 2)), (slice(1, None, 2), slice(2, -1, 2)))
+    ]
+
+    def error(exponent: float) -> float:
+        return sum(
+            float(((splines.between(measured, 10.0**exponent, at) - left) ** 2).sum())
+            for splines, measured, at, left in halves
+        )
+
     found = minimize_scalar(error, bounds=_EXPONENTS, method="bounded", options={"xatol": 0.1})
     return float(10.0**found.x)
 
 
-def _with_noise(times: np.ndarray, values: np.ndarray, noise: float) -> BSpline:
-    """The smoothest curve whose residuals have the given standard deviation, judged on a few pieces of the stretch."""
-    pieces = _pieces(len(times))
+def _with_noise(times: np.ndarray, values: np.ndarray, noise: float) -> float:
+    """The curvature weight whose residuals have the given standard deviation, judged on a few pieces of the stretch."""
+    pieces = [(NaturalSplines(times[piece]), values[piece]) for piece in _pieces(len(times))]
 
     def excess(exponent: float) -> float:
-        left = [
-            values[piece] - make_smoothing_spline(times[piece], values[piece], lam=10.0**exponent)(times[piece])
-            for piece in pieces
-        ]
+        left = [measured - splines.fitted(measured, 10.0**exponent)[0] for splines, measured in pieces]
         return float(np.std(np.concatenate(left)) - noise)
 
     low, high = _EXPONENTS
     if excess(low) >= 0.0:
-        return make_smoothing_spline(times, values, lam=10.0**low)
+        return float(10.0**low)
     if excess(high) <= 0.0:
-        return make_smoothing_spline(times, values, lam=10.0**high)
-    return make_smoothing_spline(times, values, lam=10.0 ** brentq(excess, low, high, xtol=0.05))
+        return float(10.0**high)
+    return float(10.0 ** brentq(excess, low, high, xtol=0.05))
 
 
 def _degrees(residuals: np.ndarray) -> float:

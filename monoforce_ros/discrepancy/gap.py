@@ -60,7 +60,8 @@ class Localisation:
 def noisy_motions(smoothed: SmoothedMotion, seed: int = 0) -> list[MotionTrack]:
     """The motion as smoothed from other draws of the pose noise.
 
-    The smoothed motion serves as truth; noise of the estimated size is added to it, and the result is smoothed again.
+    The smoothed motion serves as truth; noise of the estimated size is added to it, and the result is smoothed again,
+    as much as the recorded one was.
     """
     random = np.random.default_rng(seed)
     motion = smoothed.motion
@@ -72,7 +73,12 @@ def noisy_motions(smoothed: SmoothedMotion, seed: int = 0) -> list[MotionTrack]:
             positions=motion.positions + smoothed.position_noise * random.standard_normal(motion.positions.shape),
             quaternions=(Rotation.from_quat(motion.quaternions) * noise).as_quat(),
         )
-        again = smooth(noisy, position_noise=smoothed.position_noise, rotation_noise=smoothed.rotation_noise)
+        again = smooth(
+            noisy,
+            position_noise=smoothed.position_noise,
+            rotation_noise=smoothed.rotation_noise,
+            like=smoothed,
+        )
         drawn.append(again.motion)
     return drawn
 

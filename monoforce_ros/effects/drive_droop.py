@@ -9,26 +9,17 @@ import torch
 from torch import Tensor
 
 from monoforce_ros.effects.effect import Effect, Parameter, Values, WheelResponse, per_trajectory
+from monoforce_ros.effects.recurrence import droop
 from monoforce_ros.robots import RobotModel
-
-_HOLD = 0.12
-"""Time for which fits to wheel speeds take what the integral part holds as constant [s]: they need a third of the time,
-and at the typical recovery it changes by a twenty-fifth of the loss meanwhile."""
 
 
 def _drooped(speeds: np.ndarray, loss: float, recovery: float, step: float) -> np.ndarray:
-    middle, turning = speeds.mean(axis=-2), 0.5 * (speeds[..., 1, :] - speeds[..., 0, :])
-    # Time first: each step then reads contiguous memory.
-    wanted = np.ascontiguousarray(np.moveaxis(turning, -1, 0))
-    count = max(1, round(_HOLD / step))
-    held, result = loss * np.sign(wanted[0]), np.empty_like(wanted)
-    for first in range(0, len(wanted), count):
-        drive = wanted[first : first + count] + held
-        load = np.clip(drive, -loss, loss)
-        result[first : first + count] = drive - load
-        held = held + (1.0 - np.exp(-len(drive) * step / recovery)) * (load.mean(axis=0) - held)
-    turned = np.moveaxis(result, 0, -1)
-    return np.stack([middle - turned, middle + turned], axis=-2)
+    turning = 0.5 * (speeds[..., 1, :] - speeds[..., 0, :])
+    rows = torch.from_numpy(turning.reshape(-1, turning.shape[-1]))
+    share = 1.0 - np.exp(-step / recovery)
+    lost = droop(rows, torch.tensor(loss, dtype=rows.dtype), torch.tensor(share, dtype=rows.dtype))
+    change = lost.numpy().reshape(turning.shape)
+    return speeds + np.stack([change, -change], axis=-2)
 
 
 class DriveDroop(Effect):
@@ -88,9 +79,4 @@ class DriveDroop(Effect):
         wanted = speeds @ shape / (shape @ shape)
         loss, recovery = (per_trajectory(values[key], 1) for key in self.identified)
         share = 1.0 - torch.exp(-time_step / recovery)
-        held = loss * torch.sign(wanted[:, 0])
-        lost = []
-        for value in wanted.unbind(1):
-            lost.append(torch.clamp(value + held, -loss, loss) - held)
-            held = held + share * lost[-1]
-        return speeds - torch.stack(lost, dim=1)[..., None] * shape
+        return speeds - droop(wanted, loss, share)[..., None] * shape

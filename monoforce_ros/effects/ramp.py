@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from monoforce_ros.effects.effect import per_trajectory
+from monoforce_ros.effects.recurrence import follow
 
 
 def ramped(target: Tensor, rate: Tensor, time_step: float) -> Tensor:
@@ -17,26 +18,14 @@ def ramped(target: Tensor, rate: Tensor, time_step: float) -> Tensor:
         rate: largest change per second, a scalar or ``[B]``; infinite returns ``target`` bit for bit.
         time_step: time between values [s].
     """
-    change = per_trajectory(rate, 1) * time_step
-    state = target[:, 0]
-    values = [state]
-    for wanted in target.unbind(1)[1:]:
-        state = torch.minimum(torch.maximum(wanted, state - change), state + change)
-        values.append(state)
-    return torch.stack(values, dim=1)
+    return follow(target, per_trajectory(rate, 1) * time_step)
 
 
 def ramped_array(target: np.ndarray, rate: float, time_step: float) -> np.ndarray:
     """The same for arrays ``[..., T]``, at the stamps of the targets (:func:`at_stamps`)."""
-    change = rate * time_step
-    # Time first: each step then reads contiguous memory.
-    wanted = np.moveaxis(target, -1, 0)
-    result = np.empty_like(wanted)
-    state = wanted[0]
-    for index, value in enumerate(wanted):
-        state = np.minimum(np.maximum(value, state - change), state + change)
-        result[index] = state
-    return at_stamps(np.moveaxis(result, 0, -1))
+    rows = torch.from_numpy(np.ascontiguousarray(target).reshape(-1, target.shape[-1]))
+    followed = follow(rows, torch.tensor(rate * time_step, dtype=rows.dtype))
+    return at_stamps(followed.numpy().reshape(target.shape))
 
 
 def at_stamps(result: np.ndarray) -> np.ndarray:

@@ -32,7 +32,7 @@ from monoforce_ros.physics.warp_launch import (
     shares,
     summed,
 )
-from monoforce_ros.physics.warp_start import start_warp
+from monoforce_ros.core.warp_start import start_warp
 
 start_warp()
 
