@@ -9,6 +9,7 @@ from recorded_rollout import recorded
 
 from monoforce_ros.core import CommandTrack, WheelTrack
 from monoforce_ros.discrepancy.hypothesis import EvidenceWindows, window_starts
+from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.onset import find_onset
 from monoforce_ros.discrepancy.selection import Search
 from monoforce_ros.discrepancy.wheels import WheelFinding, changed_drives, compare_with_wheels
@@ -21,8 +22,8 @@ SAMPLES = np.array([0.5, 1.0, 1.5, 2.0])
 SECONDS, ONSET = 72.0, 40.0
 
 
-def _recording(begins: float) -> EvidenceWindows:
-    """Drives that reach three quarters of the commanded speed from a time on."""
+def _recording(begins: float, gain: float = 0.75) -> EvidenceWindows:
+    """Drives that reach a share of the commanded speed from a time on."""
     husky = load_robot("husky")
     random = np.random.default_rng(2)
     steps = round(SECONDS / 0.01)
@@ -30,7 +31,7 @@ def _recording(begins: float) -> EvidenceWindows:
     speeds = drive_speeds(husky, torch.as_tensor(commanded[None], dtype=torch.float32), 0.01)
     acting = torch.arange(steps)[None, :, None] * 0.01 >= begins
     level = TerrainMap.flat(Grid.square(2.0, 1.0))
-    result = rollout(level, husky, torch.where(acting, 0.75 * speeds, speeds), State.at_rest(0.13), with_forces=False)
+    result = rollout(level, husky, torch.where(acting, gain * speeds, speeds), State.at_rest(0.13), with_forces=False)
     motion = recorded(result)
     commands = CommandTrack(np.arange(steps, dtype=np.int64) * 10_000_000, commanded)
     starts = window_starts(motion, [slice(0, len(motion))], 2.0, 1.0)
@@ -49,6 +50,21 @@ def test_an_effect_that_begins_is_dated(begins):
         assert (onset.stamp - data.motion.stamps[0]) * 1e-9 == pytest.approx(ONSET, abs=3.0)
     else:
         assert onset is None
+
+
+@pytest.mark.parametrize("gain", [0.9, 1.0])
+def test_a_weak_effect_that_begins_late_is_significant_from_its_onset_on(gain):
+    data = _recording(ONSET, gain)
+    residual = np.tile([0.03, 0.03, 0.015], (4, 1))
+    names = ("drive_gain", "actuator_lag", "friction_scale", "turning_scrub", "command_delay")
+    healthy = NominalModel(residual, dict.fromkeys(names, 0.25), segments=5, loss=0.5, loss_spread=0.2)
+    search = Search(load_robot("husky"), data, residual, nominal=healthy)
+    outcome = search.run(2, exchange=False)
+    rate = search.thresholds.effect_rate
+    assert not outcome.best.effects and outcome.fit.passed(search.thresholds)
+    whole = min(entry.test.adjusted for entry in search.screening.candidates((), 0, "").screened)
+    assert whole > rate
+    assert outcome.onset_p <= rate if gain < 1.0 else outcome.onset_p > rate
 
 
 def test_wheels_that_confirm_the_file_show_no_change():

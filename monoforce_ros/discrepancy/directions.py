@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +21,14 @@ _KEPT = 8
 """Residuals of this many hypotheses are kept."""
 _KEPT_TERMS = 2
 """Those of all terms, in addition to this many bases: what was found, and nothing."""
+ONSETS = (1 / 3, 2 / 3)
+"""Shares of a recording after which effects that begin late are tested. Of one that begins before two thirds of it the
+nearest of these two, and of the start, has a correlation of at least 0.86 with the true course."""
+
+
+def onset_name(name: str) -> str:
+    """Name of an effect's direction from an onset on."""
+    return f"{name} that begins late"
 
 
 class Directions:
@@ -126,6 +134,16 @@ class Directions:
                 direction = self.direction(name, (factor[:, None, None] * change)[None], error)
                 directions.append(replace(direction, name=f"{name} changes {regime}"))
         return directions
+
+    def of_onsets(self, influences: Sequence[Direction]) -> list[Direction]:
+        """The same influences from a third and from two thirds of the recording on."""
+        starts = self.predictions.data.starts
+        share = (starts - starts[0]) / max(float(np.ptp(starts)), 1.0)
+        return [
+            replace(entry, name=onset_name(entry.name), columns=entry.columns * (share >= begin)[:, None, None])
+            for begin in ONSETS
+            for entry in influences
+        ]
 
     def mean_square(self, base: Effects, fixed: int, metric: np.ndarray | float = 1.0) -> float:
         """Mean square of what effects change in addition to the first ``fixed`` ones, in units of the scale."""

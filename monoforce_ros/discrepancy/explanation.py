@@ -119,23 +119,28 @@ def explain(
         return _measured(windows, sensors, search, thresholds)
     outcome = search.run(settings.max_effects, exchange=not repeated)
     onset = None
-    if not repeated and not outcome.fit.passed(thresholds):
+    late_only = outcome.fit.passed(thresholds) and outcome.onset_p <= thresholds.effect_rate
+    if not repeated and (late_only or not outcome.fit.passed(thresholds)):
         starts = windows.data.starts
         trials = [outcome.best]
         second = starts >= np.median(starts)
         unexplained = not outcome.best.effects or outcome.fit.explained < thresholds.most_share
         if unexplained and second.sum() >= FEWEST_WINDOWS:
             # An effect that begins late may be too weak over the whole recording, or another one stand in for it.
-            trials.append(search.judge(searched(windows[second]).run(1, exchange=False).best.effects))
+            found_late = searched(windows[second]).run(1, exchange=False, missing=late_only)
+            trials.append(search.judge(found_late.best.effects))
         onsets = [found for found in (find_onset(search, trial) for trial in trials) if found is not None]
         onset = min(onsets, key=lambda found: found.loss, default=None)
         late = starts >= (starts[0] if onset is None else onset.stamp)
+        after = None
         if onset is not None and late.sum() >= FEWEST_WINDOWS:
-            windows = windows[late]
-            search = searched(windows)
-            outcome = search.run(settings.max_effects)
-        else:
+            later = searched(windows[late])
+            after = later.run(settings.max_effects, missing=late_only)
+        if after is None or (late_only and not after.best.effects):
+            # What a whole recording does not show, and no effect explains from an onset on, is nothing.
             onset = None
+        else:
+            windows, search, outcome = windows[late], later, after
     findings = _findings(search, outcome)
     doubtful = bool(outcome.best.effects) and not findings.commissioned and leaves_most(findings, thresholds)
     if doubtful or not findings.fit.passed(thresholds):

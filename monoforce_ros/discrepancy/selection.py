@@ -38,6 +38,7 @@ from monoforce_ros.discrepancy.hypothesis import (
 from monoforce_ros.discrepancy.learned import learned_terms
 from monoforce_ros.discrepancy.left_out import values_without_parts
 from monoforce_ros.discrepancy.nominal import NominalModel
+from monoforce_ros.discrepancy.score_test import Direction
 from monoforce_ros.discrepancy.screening import Screening, admitted
 from monoforce_ros.discrepancy.thresholds import Thresholds
 from monoforce_ros.discrepancy.trial import (
@@ -121,20 +122,25 @@ class Search:
         self._ends = folds_of(np.r_[starts[0], starts + round(data.horizon * 1e9)], FOLDS)[1:]
         self._fits: dict[tuple[tuple[str, ...], ...], Fit] = {}
 
-    def run(self, most_effects: int, *, exchange: bool = True) -> Outcome:
+    def run(self, most_effects: int, *, exchange: bool = True, missing: bool = False) -> Outcome:
         """Add effects while a further one is significant, then test each in the presence of the others.
 
         Args:
             most_effects: largest number.
             exchange: replace each of several effects by every other one at the end, and find those that are
                 indistinguishable from it.
+            missing: it is known that something is missing: the first effect is a choice between explanations.
         """
         measured = self.measured()
         nominal, start = measured.nominal, measured.best
-        judged, tried = self._round(start, 1, self.thresholds.effect_rate)
-        ratio = self.screening.candidates(self.known, len(self.known), "1: ").variance_ratio(self.directions)
+        judged, tried = self._round(start, 1, self.thresholds.effect_rate, missing=missing)
+        first = self.screening.candidates(self.known, len(self.known), "1: ")
+        ratio = first.variance_ratio(self.directions)
         if not judged:
-            return Outcome(nominal, start, self.fit_test(start, nominal), tuple(tried), ratio)
+            return Outcome(
+                nominal, start, self.fit_test(start, nominal), tuple(tried),
+                onset_p=self._onset_p(first.influences), variance_ratio=ratio,
+            )  # fmt: skip
         best, listed = self._extended(self._preferred(judged), most_effects)
         tried += listed
         fit = self.fit_test(best, nominal)
@@ -153,7 +159,21 @@ class Search:
         exchanged, indistinguishable = self._exchanged(best) if exchange and not hopeless else (best, {})
         if exchanged is not best:
             best, fit = exchanged, self.fit_test(exchanged, nominal)
-        return Outcome(nominal, best, fit, tuple(tried), ratio, indistinguishable)
+        return Outcome(
+            nominal, best, fit, tuple(tried), variance_ratio=ratio, indistinguishable=indistinguishable
+        )  # fmt: skip
+
+    def _onset_p(self, influences: Sequence[Direction]) -> float:
+        """Smallest adjusted p-value of candidates that act always or from some time on, in addition to measured ones.
+
+        An effect that begins late may be too weak over the whole recording.
+        """
+        self._progress("testing for effects that begin late")
+        directions = [*influences, *self.directions.of_onsets(influences)]
+        if self.nominal is None or not directions:
+            return 1.0
+        tests = self.screening.tested(self.known, len(self.known), self.directions.scaled(self.known), directions)
+        return min(test.adjusted for test in tests)
 
     def measured(self) -> Outcome:
         """The effects that another sensor measured, unless the motion contradicts them."""
@@ -341,13 +361,15 @@ class Search:
         """Number of leading effects that keep the values which another sensor measured."""
         return len(self.known) if effects[: len(self.known)] == self.known else 0
 
-    def _round(self, best: Trial, number: int, rate: float) -> tuple[list[Trial], list[CandidateScore]]:
+    def _round(
+        self, best: Trial, number: int, rate: float, *, missing: bool = False
+    ) -> tuple[list[Trial], list[CandidateScore]]:
         """Trials with one more effect that is significant, smallest held-out loss first, and the scores of all."""
         base = self.refit(best.effects).effects if best.effects else ()
         # Two tests of the nominal model: the size of its residuals, and their directions. Beside effects that were
         # found the size only shows that these are not exact.
         size = self._size(best) if number == 1 else None
-        incomplete = size is not None and 2.0 * size.p <= self.thresholds.fit_rate
+        incomplete = missing or (size is not None and 2.0 * size.p <= self.thresholds.fit_rate)
         found = self.screening.candidates(base, self.fixed_count(base), f"{number}: ", incomplete=incomplete)
         entries = admitted(found.screened, found.before, rate, incomplete=incomplete)
         if not self.commissioned:
