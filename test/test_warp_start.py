@@ -7,10 +7,11 @@ import pytest
 
 START = """
 import os
-from monoforce_ros.core import warp_start
-written = warp_start.wp.init
-warp_start.wp.init = lambda: (written(), os.write(2, b"another message\\n"))
-warp_start.start_warp()
+import warp
+from monoforce_ros.core import start_warp
+written = warp.init
+warp.init = lambda: (written(), os.write(2, b"another message\\n"))
+start_warp()
 os.write(2, b"later\\n")
 """
 

@@ -29,6 +29,7 @@ from monoforce_ros.core.tracks import (
     WheelTrack,
 )
 from monoforce_ros.core.transform_history import PoseHistory, TransformHistory
+from monoforce_ros.core.warp_start import start_warp
 
 __all__ = [
     "FAST_SHARE",
@@ -63,6 +64,7 @@ __all__ = [
     "quaternions",
     "share_directory",
     "small_rotation",
+    "start_warp",
     "transform_points",
     "unfinished_path",
     "wrap_angle",

@@ -8,13 +8,18 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-import warp as wp
-
 _NO_DRIVER = b"Warp CUDA warning: Could not find or load the NVIDIA CUDA driver"
 
 
 def start_warp() -> None:
-    """Initialise Warp; its remark that there is no CUDA driver is dropped, other output is passed on."""
+    """Initialise Warp; its remark that there is no CUDA driver is dropped, other output is passed on.
+
+    Raises:
+        ImportError: Warp is not installed.
+    """
+    # Not above: what uses no physics does not load it.
+    import warp as wp
+
     with _without_lines(_NO_DRIVER):
         wp.init()
 

@@ -10,7 +10,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from monoforce_ros.core.warp_start import start_warp
+from monoforce_ros.core import start_warp
 
 wp.config.log_level = wp.LOG_ERROR
 start_warp()

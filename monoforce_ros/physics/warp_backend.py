@@ -11,7 +11,7 @@ import warp as wp
 from torch import Tensor
 from torch.nn.functional import pad
 
-from monoforce_ros.core.warp_start import start_warp
+from monoforce_ros.core import start_warp
 from monoforce_ros.physics import warp_joints
 from monoforce_ros.physics.clusters import point_clusters
 from monoforce_ros.physics.contact_summary import STEEP, ContactSummary
