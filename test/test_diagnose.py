@@ -149,16 +149,20 @@ def test_measurement_effects_are_corrected(husky):
     assert turned.magnitude().max() < 1e-7
 
 
-def test_the_noise_floor_is_the_error_of_a_perfect_model(husky):
-    motion, commands = simulated_recording(husky, (), seconds=40.0)
-    random = np.random.default_rng(1)
+def with_noise(motion: MotionTrack, seed: int) -> MotionTrack:
+    """Poses with noise of 1 cm and 0.5°."""
+    random = np.random.default_rng(seed)
     noise = Rotation.from_rotvec(np.radians(0.5) * random.standard_normal((len(motion), 3)))
-    noisy = replace(
+    return replace(
         motion,
         positions=motion.positions + 0.01 * random.standard_normal(motion.positions.shape),
         quaternions=(Rotation.from_quat(motion.quaternions) * noise).as_quat(),
     )
-    smoothed = smooth(noisy)
+
+
+def test_the_noise_floor_is_the_error_of_a_perfect_model(husky):
+    motion, commands = simulated_recording(husky, (), seconds=40.0)
+    smoothed = smooth(with_noise(motion, 1))
     starts = window_starts(motion, smoothed.stretches, 2.0, 0.5)
     data = EvidenceWindows(smoothed.motion, commands, starts, 2.0, SAMPLES)
     floor = noise_floor(smoothed.motion, noisy_motions(smoothed), data)
@@ -172,14 +176,7 @@ def test_the_noise_floor_is_the_error_that_smoothing_leaves(husky):
     motion, commands = simulated_recording(husky, (), seconds=60.0)
     ratios = []
     for seed in range(4):
-        random = np.random.default_rng(seed)
-        noise = Rotation.from_rotvec(np.radians(0.5) * random.standard_normal((len(motion), 3)))
-        noisy = replace(
-            motion,
-            positions=motion.positions + 0.01 * random.standard_normal(motion.positions.shape),
-            quaternions=(Rotation.from_quat(motion.quaternions) * noise).as_quat(),
-        )
-        smoothed = smooth(noisy)
+        smoothed = smooth(with_noise(motion, seed))
         starts = window_starts(motion, smoothed.stretches, 2.0, 0.5)
         data = EvidenceWindows(smoothed.motion, commands, starts, 2.0, SAMPLES)
         error = relative_motion(smoothed.motion, data) - relative_motion(motion, replace(data, motion=motion))

@@ -256,7 +256,7 @@ def test_a_base_is_stopped_before_another_type_is_published(robot, ros_environme
     listener = subprocess.Popen([sys.executable, "-c", code], env=ros_environment)
     try:
         assert robot.live(20.0, until=lambda: "no longer hears the commands" in robot.process.output)
-        assert robot.peer.until(lambda: not robot.driven, 10.0), "the base keeps the last command"
+        assert robot.peer.until(lambda: not robot.driven, 2.0), "the base keeps the last command"
     finally:
         listener.kill()
         listener.wait()

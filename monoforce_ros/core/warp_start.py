@@ -12,7 +12,7 @@ _NO_DRIVER = b"Warp CUDA warning: Could not find or load the NVIDIA CUDA driver"
 
 
 def start_warp() -> None:
-    """Initialise Warp; its remark that there is no CUDA driver is dropped, other output is passed on.
+    """Initialise Warp, which then tells of errors only; its remark that there is no CUDA driver is dropped.
 
     Raises:
         ImportError: Warp is not installed.
@@ -20,6 +20,7 @@ def start_warp() -> None:
     # Not above: what uses no physics does not load it.
     import warp as wp
 
+    wp.config.log_level = wp.LOG_ERROR
     with _without_lines(_NO_DRIVER):
         wp.init()
 

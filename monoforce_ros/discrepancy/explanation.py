@@ -119,8 +119,9 @@ def explain(
         return _measured(windows, sensors, search, thresholds)
     outcome = search.run(settings.max_effects, exchange=not repeated)
     onset = None
-    late_only = outcome.fit.passed(thresholds) and outcome.onset_p <= thresholds.effect_rate
-    if not repeated and (late_only or not outcome.fit.passed(thresholds)):
+    passed, found = outcome.fit.passed(thresholds), len(outcome.best.effects) > len(search.known)
+    late_only = not repeated and passed and not found and search.onset_p() <= thresholds.effect_rate
+    if not repeated and (late_only or not passed):
         starts = windows.data.starts
         trials = [outcome.best]
         second = starts >= np.median(starts)

@@ -38,7 +38,6 @@ from monoforce_ros.discrepancy.hypothesis import (
 from monoforce_ros.discrepancy.learned import learned_terms
 from monoforce_ros.discrepancy.left_out import values_without_parts
 from monoforce_ros.discrepancy.nominal import NominalModel
-from monoforce_ros.discrepancy.score_test import Direction
 from monoforce_ros.discrepancy.screening import Screening, admitted
 from monoforce_ros.discrepancy.thresholds import Thresholds
 from monoforce_ros.discrepancy.trial import (
@@ -134,13 +133,9 @@ class Search:
         measured = self.measured()
         nominal, start = measured.nominal, measured.best
         judged, tried = self._round(start, 1, self.thresholds.effect_rate, missing=missing)
-        first = self.screening.candidates(self.known, len(self.known), "1: ")
-        ratio = first.variance_ratio(self.directions)
+        ratio = self.screening.candidates(self.known, len(self.known), "1: ").variance_ratio(self.directions)
         if not judged:
-            return Outcome(
-                nominal, start, self.fit_test(start, nominal), tuple(tried),
-                onset_p=self._onset_p(first.influences), variance_ratio=ratio,
-            )  # fmt: skip
+            return Outcome(nominal, start, self.fit_test(start, nominal), tuple(tried), ratio)
         best, listed = self._extended(self._preferred(judged), most_effects)
         tried += listed
         fit = self.fit_test(best, nominal)
@@ -159,19 +154,18 @@ class Search:
         exchanged, indistinguishable = self._exchanged(best) if exchange and not hopeless else (best, {})
         if exchanged is not best:
             best, fit = exchanged, self.fit_test(exchanged, nominal)
-        return Outcome(
-            nominal, best, fit, tuple(tried), variance_ratio=ratio, indistinguishable=indistinguishable
-        )  # fmt: skip
+        return Outcome(nominal, best, fit, tuple(tried), ratio, indistinguishable)
 
-    def _onset_p(self, influences: Sequence[Direction]) -> float:
+    def onset_p(self) -> float:
         """Smallest adjusted p-value of candidates that act always or from some time on, in addition to measured ones.
 
-        An effect that begins late may be too weak over the whole recording.
+        An effect that begins late may be too weak over the whole recording. 1 for a robot that was never commissioned.
         """
         self._progress("testing for effects that begin late")
-        directions = [*influences, *self.directions.of_onsets(influences)]
-        if self.nominal is None or not directions:
+        influences = self.screening.candidates(self.known, len(self.known), "1: ").influences
+        if self.nominal is None or not influences:
             return 1.0
+        directions = [*influences, *self.directions.of_onsets(influences)]
         tests = self.screening.tested(self.known, len(self.known), self.directions.scaled(self.known), directions)
         return min(test.adjusted for test in tests)
 

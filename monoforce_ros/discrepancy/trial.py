@@ -86,9 +86,6 @@ class Outcome:
     fit: FitTest
     """Of the best trial."""
     tried: tuple[CandidateScore, ...] = ()
-    onset_p: float = 1.0
-    """Smallest p-value, adjusted for all candidates, of one that acts always or from some time on; 1 where effects were
-    found."""
     variance_ratio: float | None = None
     """See :class:`Search`; on healthy recordings its mean is ``drive_share`` of the thresholds."""
     indistinguishable: Mapping[str, Sequence[str]] = field(default_factory=dict)

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from monoforce_ros.core import start_warp
 
-wp.config.log_level = wp.LOG_ERROR
 start_warp()
 
 

@@ -1,7 +1,5 @@
 """Warp kernels of the rollout, one per file: motion, forces on each point, and their sums over the body."""
 
-import warp as wp
-
 from monoforce_ros.physics.warp_kernels.contact import COULOMB, NO_FRICTION, SIGMOID
 from monoforce_ros.physics.warp_kernels.forces import forces_kernel
 from monoforce_ros.physics.warp_kernels.forces_joints import forces_joints_kernel
@@ -11,8 +9,6 @@ from monoforce_ros.physics.warp_kernels.joints import joint_functions
 from monoforce_ros.physics.warp_kernels.loads import external_loads
 from monoforce_ros.physics.warp_kernels.structs import Types, types
 from monoforce_ros.physics.warp_kernels.summarise import summarise_kernel
-
-wp.config.log_level = wp.LOG_ERROR
 
 __all__ = [
     "COULOMB",
