@@ -258,6 +258,7 @@ class Engine:
                 servo.set_to_position(kp=10.0 * mass, kv=0.3 * mass)
         body = carrier.add_body(name=name, pos=centre)
         body.explicitinertial = True
+        body.ipos = np.zeros(3)
         body.mass = wheel_mass
         across = wheel_mass * (3 * wheel["radius"] ** 2 + wheel["width"] ** 2) / 12
         body.inertia = [across, wheel_mass * wheel["radius"] ** 2 / 2, across]
@@ -312,6 +313,8 @@ class Engine:
 
 def _massive(body: Any, mass: float) -> Any:
     body.explicitinertial = True
+    # Left out, it would be as far from the body's origin as that is from its parent's.
+    body.ipos = np.zeros(3)
     body.mass, body.inertia = mass, [1e-3 * mass] * 3
     return body
 

@@ -122,6 +122,8 @@ def _add_wheel(
 ) -> None:  # fmt: skip
     wheel = base.add_body(name=f"wheel_{index}", pos=centre)
     wheel.explicitinertial = True
+    # Left out, it would be as far from the axle as the axle is from the base frame's origin.
+    wheel.ipos = [0.0, 0.0, 0.0]
     wheel.mass = mass
     spin, across = mass * platform.radius**2 / 2, mass * (3 * platform.radius**2 + platform.width**2) / 12
     wheel.inertia = [across, spin, across]

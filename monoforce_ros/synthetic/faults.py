@@ -198,6 +198,8 @@ class Payload(Fault):
     def modify_spec(self, spec: mujoco.MjSpec, robot: Vehicle) -> None:
         box = spec.body("base").add_body(name="payload", pos=[self.x, self.y, self.z])
         box.explicitinertial = True
+        # Left out, it would be as far from the box as the box is from the base.
+        box.ipos = np.zeros(3)
         box.mass = self.mass
         box.inertia = np.full(3, self.mass * 0.15**2 / 6)
 

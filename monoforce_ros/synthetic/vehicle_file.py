@@ -94,7 +94,6 @@ def _wheel(
         spring=_spring(name, robot, content),
         arm=next((str(e["name"]) for e in content.get("rockers", []) if name in e["wheels"]), ""),
         is_scaled=steers or robot.point_grip is not None,
-        is_balanced=steers or robot.point_grip is not None,
         maximum_torque=force * radius / (1 if steers else count),
         differential=_differential(name, robot),
     )
@@ -155,7 +154,7 @@ def _flipper_wheels(flipper: Mapping[str, Any], sides: Mapping[str, float]) -> l
     return [
         Wheel(
             f"{flipper['name']}_{index}", sides[str(flipper["drive"])], joint + share * length * direction,
-            root + share * (tip - root), float(flipper["width"]), arm=str(flipper["name"]), is_balanced=True,
+            root + share * (tip - root), float(flipper["width"]), arm=str(flipper["name"]),
         )
         for index, share in enumerate(np.linspace(0.0, 1.0, _FLIPPER_WHEELS))
     ]  # fmt: skip

@@ -133,9 +133,6 @@ class Wheel:
     """Name of the arm that carries it; empty: the chassis."""
     is_scaled: bool = False
     """Whether servo and gear are scaled to the wheel's radius, as on robots that steer."""
-    is_balanced: bool = False
-    """Whether the wheel's centre of mass is on its axle. Without one of its own MuJoCo takes that of the frame around
-    it: wheels that turn a robot by skidding are out of balance, as they were when the bags and tables were recorded."""
     maximum_torque: float = math.inf
     """Of its motor at standstill [N m]."""
     differential: str = ""
@@ -174,8 +171,8 @@ class Wheel:
         body.explicitinertial = True
         body.mass = mass
         body.inertia = wheel_moments(self, mass)
-        if self.is_balanced:
-            body.ipos = np.zeros(3)
+        # Left out, it would be as far from the axle as the axle is from the carrier's origin.
+        body.ipos = np.zeros(3)
         share = robot_mass / _REFERENCE_MASS / wheels
         if not self.arm or self.spring is not None:
             self._add_tyre(body, share, robot_mass, wheels)
