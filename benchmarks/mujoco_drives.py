@@ -34,7 +34,7 @@ FRICTION = 0.8
 _WHEELS_SHARE = 0.12
 _TYRE_STIFFNESS, _TYRE_DAMPING, _SERVO_GAIN, _GEAR_INERTIA = 1200.0, 56.0, 24.0, 0.008
 """Of each kilogram of the robot, divided among its wheels, as in synthetic/vehicle.py."""
-_FLIPPER_WHEELS = 4
+_FLIPPER_WHEELS = 8
 _SETTLE = 1.0
 
 Heights = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -159,11 +159,12 @@ class Engine:
             for index, drives in enumerate(() if steered is None else steered.differentials)
         }
         self.arms = {joint.name: joint for joint in robot.joints if joint.kind == "flipper"}
-        for entry in content.get("flippers", []):
-            self.wheels += self._flipper_wheels(spec, base, entry)
-        share = mass / len(self.wheels)
+        flippers = content.get("flippers", [])
+        share = mass / (len(self.wheels) + _FLIPPER_WHEELS * len(flippers))
         wheel_mass = _WHEELS_SHARE * share
-        flipper_mass = sum(float(entry["mass"]) for entry in content.get("flippers", []))
+        for entry in flippers:
+            self.wheels += self._flipper_wheels(spec, base, entry, wheel_mass)
+        flipper_mass = sum(float(entry["mass"]) for entry in flippers)
         on_base = [wheel for wheel in self.wheels if wheel["carrier"] is None]
         # The rest of the body, so that the whole has the robot's mass, centre of mass and inertia.
         parts = [(wheel_mass, wheel["centre"]) for wheel in on_base]
@@ -203,27 +204,33 @@ class Engine:
             "radius": wheel["radius"], "width": wheel["width"],
         }  # fmt: skip
 
-    def _flipper_wheels(self, spec: mujoco.MjSpec, base: Any, entry: Mapping[str, Any]) -> list[dict[str, Any]]:
+    def _flipper_wheels(
+        self, spec: mujoco.MjSpec, base: Any, entry: Mapping[str, Any], wheel_mass: float
+    ) -> list[dict[str, Any]]:
         joint, place = np.array(entry["joint"], float), np.array(self.arms[entry["name"]].place)
+        angle, forward = float(entry["angle"]), 1.0 if entry["end"] == "front" else -1.0
+        direction = np.array([forward * np.cos(angle), 0.0, np.sin(angle)])
+        shares = np.linspace(0.0, 1.0, _FLIPPER_WHEELS)
+        centres = [share * float(entry["length"]) * direction for share in shares]
         arm = base.add_body(name=entry["name"], pos=joint)
         arm.explicitinertial = True
-        # A small inertia of its own: the rollout's flippers are point masses.
-        arm.mass, arm.ipos, arm.inertia = float(entry["mass"]), place - joint, [0.01, 0.01, 0.01]
+        # With its wheels it has the flipper's mass and centre of mass, and a small inertia: the rollout's flippers are
+        # point masses.
+        arm.mass = float(entry["mass"]) - wheel_mass * len(centres)
+        arm.ipos = (float(entry["mass"]) * (place - joint) - wheel_mass * np.sum(centres, axis=0)) / arm.mass
+        arm.inertia = [0.01, 0.01, 0.01]
         hinge = arm.add_joint(
             name=entry["name"], type=mujoco.mjtJoint.mjJNT_HINGE, axis=self.arms[entry["name"]].axis, damping=5.0
         )
         hinge.armature = 0.05
         servo = spec.add_actuator(name=entry["name"], target=entry["name"], trntype=mujoco.mjtTrn.mjTRN_JOINT)
         servo.set_to_position(kp=3000.0, kv=150.0)
-        angle, forward = float(entry["angle"]), 1.0 if entry["end"] == "front" else -1.0
-        direction = np.array([forward * np.cos(angle), 0.0, np.sin(angle)])
         return [
             {
                 "name": f"{entry['name']}_{k}", "drive": entry["drive"], "carrier": arm, "width": entry["width"],
-                "centre": share * float(entry["length"]) * direction,
-                "radius": entry["root_radius"] + share * (entry["tip_radius"] - entry["root_radius"]),
+                "centre": centre, "radius": entry["root_radius"] + share * (entry["tip_radius"] - entry["root_radius"]),
             }
-            for k, share in enumerate(np.linspace(0.0, 1.0, _FLIPPER_WHEELS))
+            for k, (share, centre) in enumerate(zip(shares, centres, strict=True))
         ]  # fmt: skip
 
     def _add_wheel(
