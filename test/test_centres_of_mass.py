@@ -1,4 +1,4 @@
-"""Simulated bodies have their centres of mass where their builders say: wheels on their axles, payloads where mounted."""
+"""Simulated bodies have their centres of mass where they belong: wheels on their axles, payloads where mounted."""
 
 import mujoco
 import numpy as np
