@@ -77,17 +77,6 @@ def test_effects_of_the_drives_are_recovered_from_wheel_speeds(husky, effects):
             assert 0.0 < half_widths[key] < 0.1 * max(1.0, injected)
 
 
-def test_wheels_show_a_supply_that_drains(husky):
-    commands = drawn_commands(90.0, 5)
-    wheels = wheels_of(commands, husky, ())
-    times = (wheels.stamps - commands.stamps[0]) * 1e-9
-    drained = WheelTrack(wheels.stamps, wheels.speeds * (1.0 - 0.3 * times / 60.0)[:, None])
-    found = compare_with_wheels(commands, drained, husky)
-    assert [name for name, _ in found.effects] == ["supply_drain"]
-    assert found.effects[0][1]["drain"] == pytest.approx(0.3, rel=0.05)
-    assert "slower by 0.30 of their speed every minute" in found.summary()
-
-
 def test_a_dead_time_is_found_though_it_is_a_small_share_of_the_error():
     """A fast robot with noisy wheel speeds and rare steps: the dead time removes less than 8 % of the squared error."""
     warthog, delays = load_robot("warthog"), []
