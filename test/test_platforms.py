@@ -90,7 +90,10 @@ def test_faults_act_in_the_engine():
     assert straight(platform, Delay(delay=1.0)).positions[-1, 0] < healthy - 0.35 * platform.maximum_speed
     assert straight(platform, Drag(coulomb=2.0 * platform.friction * platform.mass * 9.81)).positions[-1, 0] < 0.2
     weight = platform.mass * 9.81
-    assert straight(platform, BodyForce(y=0.9 * platform.friction * weight)).positions[-1, 1] > 0.1
+    # Below the limit of friction a robot creeps, above it slides.
+    creeping, sliding = (straight(platform, BodyForce(y=share * platform.friction * weight)) for share in (0.9, 1.2))
+    assert 0.01 < creeping.positions[-1, 1] < 0.2
+    assert sliding.positions[-1, 1] > 1.0
     unbalanced = straight(platform, DriveFactors(left=0.7, right=1.0))
     assert unbalanced.rates[-1, 2] > 0.02
 
