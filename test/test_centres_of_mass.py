@@ -3,14 +3,13 @@
 import mujoco
 import numpy as np
 import pytest
-import yaml
 from drawn_platform import draw_platform
 from drive_commands import ReplayedCommands
 from drive_session import DriveJob
 from ground_shape import Ground
 from mujoco_engine import simulate
 
-from monoforce_ros.robots import load_robot, shipped_robots
+from monoforce_ros.robots import shipped_robots
 from monoforce_ros.synthetic import TerrainSettings, Vehicle, build_model, build_scenery
 from monoforce_ros.synthetic.faults import Payload
 
@@ -37,16 +36,27 @@ def test_the_wheels_of_simulated_robots_are_balanced(level, name):
     assert gravity_on_axles(model, [wheel.joint for wheel in vehicle.wheels]) == pytest.approx(0.0, abs=1e-6 * weight)
 
 
-def test_the_wheels_of_the_outside_check_are_balanced(tmp_path):
+def test_the_wheels_of_the_outside_check_are_balanced():
     import mujoco_drives
 
     for name, case in mujoco_drives.cases().items():
-        path = tmp_path / "robot.yaml"
-        path.write_text(yaml.safe_dump(dict(case.content)))
-        robot = load_robot(path)
-        model = mujoco_drives.Engine(case.content, robot, case.heights).model
-        axles = [wheel["name"] for wheel in case.content.get("wheels", [])]
-        assert gravity_on_axles(model, axles) == pytest.approx(0.0, abs=1e-6), name
+        engine = mujoco_drives.Engine(case.content, case.robot(), case.heights)
+        axles = [wheel["name"] for wheel in engine.wheels]
+        assert gravity_on_axles(engine.model, axles) == pytest.approx(0.0, abs=1e-6), name
+
+
+def test_flippers_have_the_mass_of_the_file_with_their_belts():
+    import mujoco_drives
+
+    case = mujoco_drives.cases()["flippers"]
+    robot = case.robot()
+    model = mujoco_drives.Engine(case.content, robot, case.heights).model
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    base = model.body("base").id
+    assert model.body_subtreemass[base] == pytest.approx(float(robot.mass))
+    centre = data.subtree_com[base] - data.xpos[base]
+    assert centre == pytest.approx(robot.centre_of_mass.double().numpy(), abs=1e-6)
 
 
 def test_a_drawn_platform_rolls_ahead_without_ripple():

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from monoforce_ros.synthetic.fault import Fault, Parameter, Simulation
 from monoforce_ros.synthetic.graphics import mujoco
 from monoforce_ros.synthetic.vehicle import Vehicle
+from monoforce_ros.synthetic.vehicle_parts import set_inertia
 
 
 class CommandDelay(Fault):
@@ -197,11 +198,7 @@ class Payload(Fault):
     @override
     def modify_spec(self, spec: mujoco.MjSpec, robot: Vehicle) -> None:
         box = spec.body("base").add_body(name="payload", pos=[self.x, self.y, self.z])
-        box.explicitinertial = True
-        # Left out, it would be as far from the box as the box is from the base.
-        box.ipos = np.zeros(3)
-        box.mass = self.mass
-        box.inertia = np.full(3, self.mass * 0.15**2 / 6)
+        set_inertia(box, self.mass, np.full(3, self.mass * 0.15**2 / 6))
 
 
 class ViscousDrag(Fault):

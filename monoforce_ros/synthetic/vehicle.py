@@ -24,6 +24,7 @@ from monoforce_ros.synthetic.vehicle_parts import (
     collides,
     point_inertia,
     quaternion_wxyz,
+    set_inertia,
     wheel_moments,
 )
 
@@ -223,10 +224,7 @@ class Vehicle:
             inertia -= np.diag(wheel_moments(wheel, wheel_mass))
         for arm in massive:
             inertia -= point_inertia(arm.mass, arm.centre - self.centre_of_mass)
-        base.explicitinertial = True
-        base.mass = chassis_mass
-        base.ipos = centre
-        base.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+        set_inertia(base, chassis_mass, inertia, centre)
 
 
 def _rigid(pose: np.ndarray) -> np.ndarray:

@@ -99,13 +99,11 @@ class Arm:
         """Add the arm to the chassis; its wheels follow."""
         body = base.add_body(name=f"{self.name}_arm", pos=self.place)
         own = self.mass - wheel_mass * len(wheels) if self.mass else 0.0
-        body.explicitinertial = True
-        body.mass = max(own, 1e-3 * robot_mass)
-        body.inertia = np.full(3, _ARM_INERTIA * robot_mass / 60.0)
-        body.ipos = np.zeros(3)
+        centre = np.zeros(3)
         if own > 0.0:
             carried = sum((wheel.centre - self.place) * wheel_mass for wheel in wheels)
-            body.ipos = (self.mass * (self.centre - self.place) - carried) / own
+            centre = (self.mass * (self.centre - self.place) - carried) / own
+        set_inertia(body, max(own, 1e-3 * robot_mass), np.full(3, _ARM_INERTIA * robot_mass / 60.0), centre)
         hinge = body.add_joint(name=self.name, type=mujoco.mjtJoint.mjJNT_HINGE, axis=self.axis)
         hinge.armature = 8e-4 * robot_mass
         hinge.damping = [max(self.damping, 0.01 * robot_mass if self.servo else 0.0), 0.0, 0.0]
@@ -168,11 +166,7 @@ class Wheel:
             mass: of the wheel [kg].
         """
         body = carrier.add_body(name=self.joint, pos=self.centre - origin)
-        body.explicitinertial = True
-        body.mass = mass
-        body.inertia = wheel_moments(self, mass)
-        # Left out, it would be as far from the axle as the axle is from the carrier's origin.
-        body.ipos = np.zeros(3)
+        set_inertia(body, mass, wheel_moments(self, mass))
         share = robot_mass / _REFERENCE_MASS / wheels
         if not self.arm or self.spring is not None:
             self._add_tyre(body, share, robot_mass, wheels)
@@ -242,6 +236,24 @@ def wheel_moments(wheel: Wheel, mass: float) -> np.ndarray:
     """Principal moments of inertia ``[3]`` of a wheel as a disc [kg m²]."""
     across = mass * (3 * wheel.radius**2 + wheel.width**2) / 12
     return np.array([across, mass * wheel.radius**2 / 2, across])
+
+
+def set_inertia(body: mujoco.MjsBody, mass: float, inertia: np.ndarray, centre: np.ndarray | None = None) -> None:
+    """Give a body its mass [kg], its inertia about the centre of mass [kg m²], and that centre.
+
+    Args:
+        body: of a model that is not compiled yet.
+        mass: of the body alone.
+        inertia: in the body's axes, ``[3, 3]``, or its moments ``[3]`` about them.
+        centre: of mass in the body's frame [m], by default its origin. MuJoCo's own default is as far from the origin
+            as that is from the parent's.
+    """
+    body.explicitinertial = True
+    body.mass, body.ipos = mass, np.zeros(3) if centre is None else centre
+    if inertia.ndim == 1:
+        body.inertia = inertia
+    else:
+        body.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
 
 
 def point_inertia(mass: float, offset: np.ndarray) -> np.ndarray:
