@@ -16,6 +16,7 @@ import multiprocessing
 import time
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -91,11 +92,13 @@ def with_baselines(result: dict, bag: Path, robot: Path, row: Path) -> dict:
 
     model = load_robot(robot)
     evidence, _ = read_evidence(bag, model, "lidar" if result["ground"] == "hills" else "flat")
+    evidence = replace(evidence, with_attitude=False)
     smoothed = evidence.smoothed
     starts = window_starts(smoothed.motion, smoothed.stretches, 2.0, 1.0)
     data = evidence.cut(starts, np.array([0.5, 1.0, 1.5, 2.0]))
     floor = noise_floor(smoothed.motion, noisy_motions(smoothed), data)
     nominal = NominalModel.read(robot, tuple(float(sample) for sample in data.samples))
+    nominal = None if nominal is None else nominal.of_motion()
     scale = np.sqrt((residual_scale(floor, data, nominal) ** 2).reshape(-1, *floor.shape).mean(axis=0))
     errors = baseline_errors(evidence, data, model, scale)
     result["baselines"] = {name: float(np.median(np.hypot(e[:, 0], e[:, 1]))) for name, e in errors.items()}

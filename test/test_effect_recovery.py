@@ -85,3 +85,22 @@ def test_friction_that_fell_far_below_that_of_the_file_is_found():
     found = Search(file, data, SCALE).run(1, exchange=False).best
     assert found.names == ("friction_scale",)
     assert dict(found.effects)["friction_scale"]["factor"] == pytest.approx(0.05, rel=0.1)
+
+
+def hilly():
+    """Slopes of up to 9°."""
+    x, y = (torch.from_numpy(values).float() for values in np.meshgrid(GRID.x, GRID.y))
+    return TerrainMap.from_height(0.3 * torch.sin(0.5 * x) * torch.cos(0.4 * y), GRID)
+
+
+@pytest.mark.parametrize("height", [0.4, 0.0])
+def test_the_height_of_a_payload_is_found_where_slopes_show_it(height):
+    husky = load_robot("husky")
+    payload = {"mass": 15.0, "x": -0.2, "y": 0.1, "z": height}
+    data = driven(replace(husky, effects=(("payload", payload),)), hilly())
+    search = Search(husky, data, SCALE)
+    found = dict(search.refined(search.judge((("payload", {"mass": 10.0, "x": -0.1, "y": 0.0}),))).effects)["payload"]
+    assert ("z" in found) == (height > 0.0)
+    for key in found.keys() - {"mass"}:
+        # Mass and place trade off against each other; the moment is what moves the robot.
+        assert found["mass"] * found[key] == pytest.approx(payload["mass"] * payload[key], rel=0.2), key

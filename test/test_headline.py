@@ -243,7 +243,8 @@ def test_every_effect_is_said_in_words(name):
         estimate = EffectEstimate(name, {k: ParameterEstimate(v, v, v, units[k]) for k, v in values.items()})
         text = finding(estimate)
         assert text.endswith(".") and text[0].isupper() and name not in text
-    assert remedy(name) and cause(name)
+        assert not text.startswith(kind.summary.rstrip("."))
+    assert remedy(name) != remedy("none of them") and cause(name) != name.replace("_", " ")
 
 
 @pytest.mark.parametrize(
@@ -253,6 +254,9 @@ def test_every_effect_is_said_in_words(name):
         (effect("pose_clock_offset", offset=(-0.2, -0.3, -0.1)), "The poses are stamped 0.20 s early."),
         (effect("turning_scrub", track_width_factor=(2.0, 1.9, 2.1)), "The robot turns 50 % less than"),
         (effect("drive_asymmetry", difference=(0.1, 0.1, 0.1)), "The right side runs 10 % faster than the left"),
+        (effect("drive_loss", loss=(-0.4, -0.5, -0.3)), "the right side run 40 % slower"),
+        (effect("drive_loss", loss=(1.0, 1.0, 1.0)), "the left side do not run"),
+        (effect("rotation_centre", x=(-0.1, -0.2, -0.05)), "a point 0.10 m behind the one"),
         (effect("constant_force", x=(1.0, 0, 2), y=(-90.0, -95, -85)), "pulls the robot with 90 N to the right all"),
     ],
 )

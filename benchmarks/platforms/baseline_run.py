@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -34,10 +35,12 @@ def main() -> None:
     torch.set_num_threads(1)
     model = load_robot(robot)
     evidence, _ = read_evidence(Path(bag), model, terrain)
+    evidence = replace(evidence, with_attitude=False)
     smoothed = evidence.smoothed
     data = evidence.cut(window_starts(smoothed.motion, smoothed.stretches, 2.0, 1.0), SAMPLES)
     floor = noise_floor(smoothed.motion, noisy_motions(smoothed), data)
     nominal = NominalModel.read(robot, tuple(SAMPLES))
+    nominal = None if nominal is None else nominal.of_motion()
     scale = np.sqrt((residual_scale(floor, data, nominal) ** 2).reshape(-1, *floor.shape).mean(axis=0))
     errors = baseline_errors(evidence, data, model, scale)
     medians = {name: float(np.median(np.hypot(error[:, 0], error[:, 1]))) for name, error in errors.items()}

@@ -62,7 +62,7 @@ def closed_share(gap: dict[str, dict]) -> float | None:
 
     0 where nothing was added to the model; None where the error is within 10 % of its noise, so that there is no gap.
     """
-    entries = [entry for key, entry in gap.items() if key.endswith("_2s")]
+    entries = [gap[key] for key in ("position_2s", "heading_2s") if key in gap]
     entries = [entry for entry in entries if entry["before"] > 1.1 * entry["noise"]]
     if not entries:
         return None

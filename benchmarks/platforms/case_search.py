@@ -12,7 +12,7 @@ from monoforce_ros.discrepancy.comparable_windows import comparable_starts, wind
 from monoforce_ros.discrepancy.explanation import DiagnosisSettings
 from monoforce_ros.discrepancy.gap import noisy_motions, residual_scale
 from monoforce_ros.discrepancy.hypothesis import corrected_evidence
-from monoforce_ros.discrepancy.nominal import NominalModel
+from monoforce_ros.discrepancy.nominal import NominalModel, with_known_components
 from monoforce_ros.discrepancy.selection import Search
 from monoforce_ros.robots import load_robot
 
@@ -26,7 +26,7 @@ def search_of(files: CaseFiles, nominal_file: Path, onset: float = 0.0) -> Searc
         return None
     map_file = files.terrain(files.bag)
     read, _, _ = read_with_ground(files.bag, robot, str(map_file) if map_file.exists() else "auto")
-    evidence = corrected_evidence(read, robot)
+    evidence, nominal = with_known_components(corrected_evidence(read, robot), nominal)
     starts, _ = comparable_starts(evidence, robot, settings)
     noisy = noisy_motions(evidence.smoothed, settings.seed)
     if not len(starts):

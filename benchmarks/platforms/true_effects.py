@@ -4,8 +4,8 @@
 
 Fits the effects that are truly hidden in recorded drives, without a search, and prints for each drive which share of
 what exceeds a healthy robot's loss they explain, and how large their formula's error is beside what they change. The
-numbers calibrate ``most_share`` and ``model_error`` of ``discrepancy/thresholds.py``. Outside the catalogue nothing
-true can be fitted: there the effects that a search selects are measured, which should explain less.
+numbers calibrate ``explained_share`` and ``model_error`` of ``discrepancy/thresholds.py``. Outside the catalogue
+nothing true can be fitted: there the effects that a search selects are measured, which should explain less.
 Needs recordings and commissioned platforms: run.py makes both.
 """
 

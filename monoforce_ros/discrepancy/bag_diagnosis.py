@@ -91,10 +91,11 @@ def read_with_ground(
     )
     ground = choose_ground(terrain, recording, smoothed, robot)
     if ground.source == "flat":
-        return evidence, recording, ground
+        return replace(evidence, with_attitude=not ground.unknown), recording, ground
     if ground.source not in ("lidar", "traced"):
         terrain_map, pose = load_terrain(Path(ground.source))
-        return replace(evidence, terrain=terrain_map, odometry_from_terrain=pose), recording, ground
+        evidence = replace(evidence, terrain=terrain_map, odometry_from_terrain=pose, with_attitude=True)
+        return evidence, recording, ground
     if ground.apart:
         smoothed = laid_apart(smoothed, _MARGIN)
         evidence = replace(evidence, smoothed=smoothed)
@@ -108,6 +109,7 @@ def read_with_ground(
     maps, parts = split_maps(recording, motion, robot, grid)
     whole, even, odd = (supporting_terrain(part, motion, robot) for part in (maps, *parts))
     evidence = replace(evidence, terrain=whole, odometry_from_terrain=np.eye(4), split_maps=(even, odd))
+    evidence = replace(evidence, with_attitude=True)
     return evidence, recording, ground
 
 

@@ -243,10 +243,14 @@ def _commission(options: argparse.Namespace) -> int:
     for effect in effects:
         for key, parameter in effect.parameters.items():
             print(f"{effect.name}: {key} {parameter.value:.3g} {parameter.unit}")
-    along, across, heading = nominal.residual[-1]
+    along, across, heading, *attitude = nominal.residual[-1]
+    lean = ""
+    if attitude:
+        roll, pitch, height = attitude
+        lean = f", {np.degrees(roll):.2f}° in roll, {np.degrees(pitch):.2f}° in pitch, {100 * height:.1f} cm in height"
     print(
         f"nominal residual RMS of the healthy robot after {settings.horizon:g} s: {100 * along:.1f} cm along, "
-        f"{100 * across:.1f} cm across, {np.degrees(heading):.2f}° in heading"
+        f"{100 * across:.1f} cm across, {np.degrees(heading):.2f}° in heading{lean}"
     )
     print(f"robot file: {out}")
     for bag, evidence in zip(options.bags, recordings, strict=True):

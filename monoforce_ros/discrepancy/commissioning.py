@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from monoforce_ros.discrepancy.attitude import lean_of
 from monoforce_ros.discrepancy.command_changes import covered_changes
 from monoforce_ros.discrepancy.directions import Directions
 from monoforce_ros.discrepancy.estimates import EffectEstimate
@@ -23,7 +24,7 @@ from monoforce_ros.discrepancy.fit import (
 )
 from monoforce_ros.discrepancy.gap import noise_floor, noisy_motions, residual_scale
 from monoforce_ros.discrepancy.ground import slopes_of
-from monoforce_ros.discrepancy.hypothesis import Effects, Evidence, EvidenceWindows, Predictions, window_starts
+from monoforce_ros.discrepancy.hypothesis import MOTION, Effects, Evidence, EvidenceWindows, Predictions, window_starts
 from monoforce_ros.discrepancy.nominal import SEGMENT, NominalModel
 from monoforce_ros.discrepancy.preflight import complaints
 from monoforce_ros.discrepancy.residual_model import fit_terms, motion_terms
@@ -54,7 +55,7 @@ class _Prepared:
     data: EvidenceWindows
     predictions: Predictions
     floor: np.ndarray
-    """Residuals by noise and map, ``[W, K, 3]``."""
+    """Residuals by noise and map, ``[W, K, C]``."""
 
     def __getitem__(self, chosen: np.ndarray) -> _Prepared:
         data = replace(self.data, starts=self.data.starts[chosen])
@@ -88,6 +89,9 @@ def commission(
     Raises:
         ValueError: a recording is not sufficient; the message says why.
     """
+    # What some recordings lack nothing can be learned of.
+    with_attitude = all(evidence.with_attitude for evidence in recordings)
+    recordings = [replace(evidence, with_attitude=with_attitude) for evidence in recordings]
     prepared = []
     for number, evidence in enumerate(recordings):
         progress(0.3 * number / len(recordings), "reading the noise")
@@ -114,6 +118,9 @@ def commission(
         nominal,
         slope=max(slopes_of(evidence.smoothed).total for evidence in recordings),
         changes=covered_changes([entry.data for entry in prepared]),
+        lean=np.mean([lean_of(evidence.smoothed.motion).own for evidence in recordings], axis=0)
+        if with_attitude
+        else None,
     )
     progress(1.0, "done")
     return estimate_effects(merged, {}), nominal
@@ -156,7 +163,7 @@ def _further(robot: RobotModel, entry: _Prepared, effects: Effects, wheels: Whee
 
 
 def _held_out_residuals(prepared: Sequence[_Prepared], fits: Sequence[Fit], effects: Effects) -> list[np.ndarray]:
-    """Residuals ``[W, K, 3]`` of each recording, predicted with values that were fitted without it.
+    """Residuals ``[W, K, C]`` of each recording, predicted with values that were fitted without it.
 
     With the values that were fitted to it a recording looks better than the robot's next one will. Of several
     recordings each is predicted by the others; a single one is cut into segments that take turns in being left out.
@@ -173,7 +180,7 @@ def _held_out_residuals(prepared: Sequence[_Prepared], fits: Sequence[Fit], effe
     held_out = _segments(entry) % _PARTS
     # A window that reaches into the next segment shares motion with it.
     ends = held_out[np.searchsorted(starts, np.minimum(starts + round(data.horizon * 1e9), starts[-1]))]
-    residuals = np.zeros((len(starts), len(data.samples), 3))
+    residuals = np.zeros((len(starts), len(data.samples), len(data.components)))
     for part in range(_PARTS):
         fitted, judged = (held_out != part) & (ends != part), held_out == part
         fit = _fitted(entry[fitted], effects, iterations=6)
@@ -196,7 +203,7 @@ def _nominal(prepared: Sequence[_Prepared], effects: Effects, residuals: Sequenc
     Args:
         prepared: its recordings.
         effects: with the values of the robot file.
-        residuals: of each recording, held out, ``[W, K, 3]``.
+        residuals: of each recording, held out, ``[W, K, C]``.
     """
     squares = []
     for entry, residual in zip(prepared, residuals, strict=True):
@@ -210,13 +217,15 @@ def _nominal(prepared: Sequence[_Prepared], effects: Effects, residuals: Sequenc
     )
     nominal = NominalModel(np.sqrt(np.mean(squares, axis=0)), terms=terms)
     changes: dict[str, list[float]] = {}
-    losses, segments = [], []
+    losses: list[float] = []
+    motion_losses: list[float] = []
+    segments: list[int] = []
     for entry, residual in zip(prepared, residuals, strict=True):
         scale = residual_scale(entry.floor, entry.data, nominal)
         numbers = _segments(entry)
         scaled = residual / scale
-        window_losses = robust(scaled)
-        losses += [float(window_losses[numbers == number].mean()) for number in np.unique(numbers)]
+        for kept, of in ((losses, scaled), (motion_losses, scaled[..., : len(MOTION)])):
+            kept += [float(robust(of)[numbers == number].mean()) for number in np.unique(numbers)]
         segments.append(len(np.unique(numbers)))
         weights = robust_weights(scaled)
         metric = scale / nominal.scale_in(entry.data)
@@ -230,6 +239,7 @@ def _nominal(prepared: Sequence[_Prepared], effects: Effects, residuals: Sequenc
         variation={name: float(np.sqrt(np.mean(np.square(values)))) for name, values in changes.items()},
         segments=sum(segments),
         loss=float(np.exp(np.mean(np.log(losses)))),
+        motion_loss=float(np.exp(np.mean(np.log(motion_losses)))) if nominal.with_attitude else None,
         loss_spread=float(np.std(np.log(losses), ddof=1)),
     )
 

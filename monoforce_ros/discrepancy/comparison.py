@@ -25,6 +25,8 @@ from monoforce_ros.discrepancy.trial import BLOCK, blocks_of
 from monoforce_ros.robots import RobotModel
 
 HORIZONS = (1.0, 2.0, 5.0)
+_METRICS = (("position", "m"), ("heading", "deg"), ("lean", "deg"), ("height", "m"))
+"""Errors and their units; the last two where the ground is known."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,7 @@ class HeldOut:
         return starts[into + horizon <= self.block + 0.5]
 
     def residuals(self, robot: RobotModel, windows: EvidenceWindows) -> np.ndarray:
-        """Residuals ``[W, K, 3]`` of each window with the effects of its part."""
+        """Residuals ``[W, K, C]`` of each window with the effects of its part."""
         return residuals_by_part(robot, windows, self.part_of(windows.starts), self.effects)
 
 
@@ -68,18 +70,20 @@ class Comparison:
     starts: np.ndarray
     """``[W]`` [ns]."""
     before: np.ndarray
-    """By the nominal model, ``[W, 3]`` [m, m, rad]."""
+    """By the nominal model, ``[W, C]``."""
     after: np.ndarray | None
     """With the identified effects; None where none was added to the model."""
     floor: np.ndarray
-    """Due to pose noise alone, ``[any, 3]``."""
+    """Due to pose noise alone, ``[any, C]``."""
     data: EvidenceWindows
 
     def errors(self, metric: str, which: np.ndarray) -> np.ndarray:
-        """``position`` [m] or ``heading`` [deg] of residuals ``[..., 3]``."""
+        """Errors by residuals ``[..., C]``: ``position``, ``height`` [m], ``heading``, ``lean`` [deg]."""
         if metric == "position":
             return np.hypot(which[..., 0], which[..., 1])
-        return np.degrees(np.abs(which[..., 2]))
+        if metric == "lean":
+            return np.degrees(np.hypot(which[..., 3], which[..., 4]))
+        return np.abs(which[..., 5]) if metric == "height" else np.degrees(np.abs(which[..., 2]))
 
 
 @dataclass(frozen=True)
@@ -162,7 +166,7 @@ def gap_table(comparisons: Sequence[Comparison], seed: int = 0) -> dict[str, Gap
     random = np.random.default_rng(seed)
     table: dict[str, GapRow] = {}
     for found in comparisons:
-        for metric, unit in (("position", "m"), ("heading", "deg")):
+        for metric, unit in _METRICS if found.data.with_attitude else _METRICS[:2]:
             before = found.errors(metric, found.before)
             noise = float(np.median(found.errors(metric, found.floor)))
             row = GapRow(found.horizon, float(np.median(before)), None, None, None, unit, noise)
@@ -245,7 +249,8 @@ def measured_paths(
         starts = held_out.judged(starts, horizon)
     if not len(starts):
         return []
-    windows = replace(data, starts=starts, horizon=horizon, samples=np.arange(0.25, horizon + 0.01, 0.25))
+    times = np.arange(0.25, horizon + 0.01, 0.25)
+    windows = replace(data, starts=starts, horizon=horizon, samples=times, with_attitude=False)
     measured = relative_motion(windows.motion, windows)
     predictions = Predictions(robot, windows)
     before = predictions.residuals([()])[0]

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from monoforce_ros.discrepancy.attitude import changed_lean, lean_of
 from monoforce_ros.discrepancy.comparable_windows import comparable_starts, windows_of
 from monoforce_ros.discrepancy.comparison import (
     Comparison,
@@ -33,13 +34,14 @@ from monoforce_ros.discrepancy.gap import (
     noisy_motions,
 )
 from monoforce_ros.discrepancy.hypothesis import (
+    MOTION,
     Effects,
     Evidence,
     EvidenceWindows,
     corrected_evidence,
 )
 from monoforce_ros.discrepancy.kinematic_baseline import StepComparison
-from monoforce_ros.discrepancy.nominal import NominalModel
+from monoforce_ros.discrepancy.nominal import NominalModel, with_known_components
 from monoforce_ros.discrepancy.preflight import advice, complaints
 from monoforce_ros.discrepancy.repetition import prepare_processes, repeat
 from monoforce_ros.discrepancy.selection import Search
@@ -60,9 +62,9 @@ class Details:
 
     data: EvidenceWindows
     before: np.ndarray
-    """Residuals of the nominal model, ``[W, K, 3]`` [m, m, rad]."""
+    """Residuals of the nominal model, ``[W, K, C]``."""
     floor: np.ndarray
-    """Residuals by noise and map, ``[K, 3]`` [m, m, rad]."""
+    """Residuals by noise and map, ``[K, C]``."""
     compared: tuple[Comparison, ...]
     paths: tuple[PathComparison, ...]
 
@@ -135,8 +137,12 @@ def diagnose(
     if settings.processes > 1:
         prepare_processes()
     evidence = corrected_evidence(evidence, robot)
+    evidence, nominal = with_known_components(evidence, nominal)
     smoothed = evidence.smoothed
     starts, left_out = comparable_starts(evidence, robot, settings)
+    leans = (
+        changed_lean(lean_of(smoothed.motion), nominal.lean) if nominal is not None and evidence.with_attitude else ""
+    )
     found = complaints(smoothed, evidence.commands, starts)
     if found:
         return Diagnosis(Verdict.NOT_IDENTIFIABLE, advice=(*left_out, *found))
@@ -212,8 +218,8 @@ def diagnose(
             effects, gap = (*others, sensors.flippers.estimate), {**gap, "flippers": sensors.flippers.row}
             decision = replace(decision, verdict=Verdict.EFFECT_FOUND)
         decision = replace(decision, remarks=(*decision.remarks, sensors.flippers.summary()))
-    if left_out:
-        decision = replace(decision, remarks=(*decision.remarks, *left_out))
+    if left_out or leans:
+        decision = replace(decision, remarks=(*decision.remarks, *left_out, *([leans] if leans else [])))
     if sensors.wheels is not None:
         decision = replace(decision, remarks=(*decision.remarks, sensors.wheels.summary()))
     at_horizon = next((comparison for comparison in compared if comparison.horizon == settings.horizon), None)
@@ -226,7 +232,7 @@ def diagnose(
         known_parts=known_parts,
         localisation=localise(before, expected, data, find_regimes(data)),
         gap=gap,
-        noise_floor=NoiseFloor(float(samples[-1]), *(float(value) for value in floor[-1])),
+        noise_floor=NoiseFloor(float(samples[-1]), *(float(value) for value in floor[-1, : len(MOTION)])),
         advice=advice(decision.verdict, effects),
         candidates=outcome.tried,
         regimes=() if at_horizon is None else tuple(regime_table(at_horizon)),

@@ -11,7 +11,7 @@ from monoforce_ros.discrepancy.fit import without
 from monoforce_ros.discrepancy.hypothesis import Effects, Predictions, own_values, values_key
 from monoforce_ros.discrepancy.learned import LEARNED, FormulaTerms
 from monoforce_ros.discrepancy.nominal import NominalModel
-from monoforce_ros.discrepancy.score_test import Direction
+from monoforce_ros.discrepancy.score_test import Direction, motion_count
 from monoforce_ros.discrepancy.thresholds import Thresholds
 from monoforce_ros.effects import CATALOGUE
 
@@ -150,4 +150,4 @@ class Directions:
         if len(base) <= fixed:
             return 0.0
         change = self.scaled(base) - self.scaled(base[:fixed])
-        return float(np.mean((np.nan_to_num(change) * metric) ** 2))
+        return float(np.sum((np.nan_to_num(change) * metric) ** 2)) / motion_count(change)

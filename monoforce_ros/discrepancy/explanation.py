@@ -47,7 +47,7 @@ class Windows:
 
     data: EvidenceWindows
     uncertainty: np.ndarray
-    """Residuals by noise and map, ``[W, K, 3]`` [m, m, rad]."""
+    """Residuals by noise and map, ``[W, K, C]``."""
 
     def __getitem__(self, chosen: np.ndarray) -> Windows:
         return Windows(replace(self.data, starts=self.data.starts[chosen]), self.uncertainty[chosen])
@@ -125,7 +125,7 @@ def explain(
         starts = windows.data.starts
         trials = [outcome.best]
         second = starts >= np.median(starts)
-        unexplained = not outcome.best.effects or outcome.fit.explained < thresholds.most_share
+        unexplained = not outcome.best.effects or outcome.fit.explained < thresholds.explained_share
         if unexplained and second.sum() >= FEWEST_WINDOWS:
             # An effect that begins late may be too weak over the whole recording, or another one stand in for it.
             found_late = searched(windows[second]).run(1, exchange=False, missing=late_only)

@@ -10,8 +10,8 @@ from scipy.stats import t as student_distribution
 
 from monoforce_ros.core import huber
 from monoforce_ros.discrepancy.estimates import EffectEstimate, ParameterEstimate
-from monoforce_ros.discrepancy.hypothesis import Effects, EvidenceWindows, Predictions
-from monoforce_ros.discrepancy.score_test import block_numbers
+from monoforce_ros.discrepancy.hypothesis import MOTION, Effects, EvidenceWindows, Predictions
+from monoforce_ros.discrepancy.score_test import block_numbers, motion_count
 from monoforce_ros.effects import CATALOGUE, Effect
 
 OUTLIER = 3.0
@@ -46,11 +46,13 @@ class Fit:
 
 
 def robust(scaled: np.ndarray) -> np.ndarray:
-    """Huber loss of scaled residuals ``[..., W, K, 3]``, averaged over each window, ``[..., W]``.
+    """Huber loss of scaled residuals ``[..., W, K, C]``, averaged over each window, ``[..., W]``.
 
-    A prediction that is not finite gets a large residual.
+    It is a mean over the components of the motion. Roll, pitch and height add to it, so that they do not dilute what
+    the motion shows. A prediction that is not finite gets a large residual.
     """
-    return np.minimum(huber(np.nan_to_num(scaled, nan=_NOT_FINITE), OUTLIER), 1e6).mean(axis=(-1, -2))
+    losses = np.minimum(huber(np.nan_to_num(scaled, nan=_NOT_FINITE), OUTLIER), 1e6)
+    return losses.mean(axis=-2).sum(axis=-1) / len(MOTION)
 
 
 def robust_weights(scaled: np.ndarray) -> np.ndarray:
@@ -137,8 +139,9 @@ def fit_effects(
         curvature = (rows * weight) @ rows.T
         if prior:
             # The loss is a mean over residuals, the sums here are not.
-            gradient = gradient + prior * residual.size * ((values - neutral) / typical)[fixed:]
-            curvature = curvature + prior * residual.size * np.eye(len(curvature))
+            count = motion_count(residual)
+            gradient = gradient + prior * count * ((values - neutral) / typical)[fixed:]
+            curvature = curvature + prior * count * np.eye(len(curvature))
         diagonal = np.diag(np.diag(curvature) + 1e-6 * np.trace(curvature) + 1e-9)
         candidates = []
         for damping in _DAMPINGS:

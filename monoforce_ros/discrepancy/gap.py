@@ -10,10 +10,20 @@ from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import SmoothedMotion, smooth
 from monoforce_ros.core import MotionTrack, motion_regimes, wrap_angle
+from monoforce_ros.discrepancy.attitude import vertical
 from monoforce_ros.discrepancy.hypothesis import EvidenceWindows, sample_motion
-from monoforce_ros.discrepancy.nominal import SMALLEST, NominalModel
+from monoforce_ros.discrepancy.nominal import NominalModel, smallest_of
 
 _NOISE_DRAWS = 3
+_ERRORS = (
+    ("along-track error", "m"),
+    ("cross-track error", "m"),
+    ("heading error", "rad"),
+    ("roll error", "rad"),
+    ("pitch error", "rad"),
+    ("height error", "m"),
+)
+"""Names and units of the components of a residual."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +94,7 @@ def noisy_motions(smoothed: SmoothedMotion, seed: int = 0) -> list[MotionTrack]:
 
 
 def noise_residuals(motion: MotionTrack, noisy: Sequence[MotionTrack], data: EvidenceWindows) -> np.ndarray:
-    """Residuals of a perfect model due to pose noise alone, ``[draws W, K, 3]``.
+    """Residuals of a perfect model due to pose noise alone, ``[draws W, K, C]``.
 
     Args:
         motion: smoothed.
@@ -96,7 +106,7 @@ def noise_residuals(motion: MotionTrack, noisy: Sequence[MotionTrack], data: Evi
 
 
 def noise_floor(motion: MotionTrack, noisy: Sequence[MotionTrack], data: EvidenceWindows) -> np.ndarray:
-    """Size of :func:`noise_residuals`, ``[K, 3]`` [m, m, rad]: their 68 % quantile, a robust standard deviation.
+    """Size of :func:`noise_residuals`, ``[K, C]``: their 68 % quantile, a robust standard deviation.
 
     Where a localisation jumps, smoothing with other noise gives an entirely different motion.
     """
@@ -104,22 +114,29 @@ def noise_floor(motion: MotionTrack, noisy: Sequence[MotionTrack], data: Evidenc
 
 
 def relative_motion(motion: MotionTrack, data: EvidenceWindows) -> np.ndarray:
-    """Motion since the start of each window, in the frame of the start pose, ``[W, K, 3]`` [m, m, rad]."""
+    """Motion since the start of each window, in the frame of the start pose, ``[W, K, C]`` [m, m, rad].
+
+    With attitude: roll and pitch themselves [rad], and the height since the start [m], too.
+    """
     stamps = data.starts[:, None] + np.rint(np.r_[0.0, data.samples] * 1e9).astype(np.int64)
     positions, rotations, _, _ = sample_motion(motion, stamps)
     headings = np.arctan2(rotations[..., 1, 0], rotations[..., 0, 0])
     turn = Rotation.from_euler("z", headings[:, 0, None]).as_matrix()
     moved = np.einsum("wji,wkj->wki", turn, positions[:, 1:] - positions[:, :1])
     turned = wrap_angle(headings[:, 1:] - headings[:, :1])
-    return np.concatenate([moved[..., :2], turned[..., None]], axis=-1)
+    parts = [moved[..., :2], turned[..., None]]
+    if data.with_attitude:
+        lean = vertical(rotations[:, 1:])
+        parts += [lean[..., 1:], -lean[..., :1], moved[..., 2:]]
+    return np.concatenate(parts, axis=-1)
 
 
 def residual_scale(floor: np.ndarray, data: EvidenceWindows, nominal: NominalModel | None) -> np.ndarray:
-    """Expected size of a residual by noise, map and the healthy robot's own error, like ``floor`` ``[..., K, 3]``.
+    """Expected size of a residual by noise, map and the healthy robot's own error, like ``floor`` ``[..., K, C]``.
 
-    With a nominal model it depends on the windows' commands, ``[W, K, 3]``.
+    With a nominal model it depends on the windows' commands, ``[W, K, C]``.
     """
-    squares = floor**2 + SMALLEST**2
+    squares = floor**2 + smallest_of(floor) ** 2
     if nominal is not None:
         squares = squares + nominal.residual_in(data) ** 2
     return np.sqrt(squares)
@@ -149,8 +166,8 @@ def localise(
     """Where errors above the floor are largest: shares of the squared error by component and motion regime.
 
     Args:
-        residuals: ``[W, K, 3]``.
-        floor: ``[K, 3]``.
+        residuals: ``[W, K, C]``.
+        floor: ``[K, C]``.
         data: the windows.
         regimes: result of :func:`find_regimes`.
 
@@ -158,9 +175,9 @@ def localise(
         the strongest entries, in order.
     """
     horizon = float(data.samples[-1])
-    names = (("along-track error", "m"), ("cross-track error", "m"), ("heading error", "rad"))
+    names = _ERRORS[: residuals.shape[-1]]
     squares = residuals[:, -1] ** 2
-    scaled = squares.mean(axis=0) / (floor[-1] ** 2 + SMALLEST**2)
+    scaled = squares.mean(axis=0) / (floor[-1] ** 2 + smallest_of(floor) ** 2)
     entries = []
     for axis, (name, unit) in enumerate(names):
         total = squares[:, axis].sum()

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import BagError, Recording, SmoothedMotion
 from monoforce_ros.core import NANOSECOND
+from monoforce_ros.discrepancy.attitude import Lean, vertical
 from monoforce_ros.discrepancy.separate_stretches import starts_anew
 from monoforce_ros.robots import RobotModel
 
@@ -151,17 +152,7 @@ def slopes_of(smoothed: SmoothedMotion) -> Slopes:
     """
     motion = smoothed.motion
     rotations = Rotation.from_quat(motion.quaternions).as_matrix()
-    every = max(1, len(motion) // 4000)
-    up = rotations[::every, 2, :2]  # of the odometry frame's z axis, in the base frame: minus pitch and roll
-    yaw = np.arctan2(rotations[::every, 1, 0], rotations[::every, 0, 0])
-    # up = mounting + slope turned into the base frame; where the robot hardly turns all of it is slope.
-    rows = np.zeros((len(up), 2, 4))
-    rows[:, 0, 0] = rows[:, 1, 1] = 1.0
-    rows[:, 0, 2], rows[:, 0, 3] = np.cos(yaw), np.sin(yaw)
-    rows[:, 1, 2], rows[:, 1, 3] = -np.sin(yaw), np.cos(yaw)
-    matrix = rows.reshape(-1, 4)
-    prior = np.diag([1.0, 1.0, 0.0, 0.0]) * 0.02 * len(up) + 1e-9 * np.eye(4)
-    solution = np.linalg.solve(matrix.T @ matrix + prior, matrix.T @ up.ravel())
+    lean, up = Lean.of(rotations), vertical(rotations)
     places = np.c_[motion.positions[:, :2], np.ones(len(motion))]
     plane = np.linalg.lstsq(places, motion.positions[:, 2], rcond=1e-6)[0]
 
@@ -170,9 +161,9 @@ def slopes_of(smoothed: SmoothedMotion) -> Slopes:
         return float(np.sqrt(max(tilt, _rise(smoothed, heights), 0.0)))
 
     return Slopes(
-        root_mean_square(up - solution[:2], motion.positions[:, 2]),
+        root_mean_square(up - lean.own, motion.positions[:, 2]),
         float(np.arctan(np.hypot(*plane[:2]))),
-        root_mean_square(up - rows @ solution, motion.positions[:, 2] - places @ plane),
+        root_mean_square(up - lean.own - lean.of_plane(rotations), motion.positions[:, 2] - places @ plane),
     )
 
 

@@ -16,15 +16,19 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from monoforce_ros.bags import JointRecord, SmoothedMotion
 from monoforce_ros.core import AngularVelocityTrack, CommandTrack, MotionTrack, WheelTrack, wrap_angle
-from monoforce_ros.effects import CATALOGUE, controls, corrected_commands, corrected_motion
+from monoforce_ros.discrepancy.attitude import Lean, lean_of, vertical
+from monoforce_ros.effects import CATALOGUE, applied_setup, controls, corrected_commands, corrected_motion
 from monoforce_ros.physics import PhysicsOptions, State, TerrainLookup, rest_depth, rollout
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import Grid, TerrainMap
 
 Effects = tuple[tuple[str, Mapping[str, float]], ...]
 """Names of effects with the values of their parameters."""
-COMPONENTS = ("along", "across", "heading")
-"""Of a residual: position in the frame of the window's start pose [m], heading [rad]."""
+MOTION = ("along", "across", "heading")
+"""Components of a residual: position in the frame of the window's start pose [m], heading [rad]."""
+COMPONENTS = (*MOTION, "roll", "pitch", "height")
+"""Those where the ground is known: roll and pitch beside what the recording always leans [rad], and the height since
+the start of the window [m], too."""
 HISTORY = 4.0
 """Length of the commands before a window, for delays, lags and the integral part of drives [s]."""
 _MARGIN = 1.3
@@ -54,6 +58,8 @@ class Evidence:
     """Measured wheel speeds."""
     joints: JointRecord | None = None
     """Measured joints and commands to flippers."""
+    with_attitude: bool = False
+    """Whether roll, pitch and height are residuals, too: the ground is known from something else than they."""
 
     def cut(self, starts: np.ndarray, samples: np.ndarray) -> EvidenceWindows:
         """Windows from ``starts`` [ns] to the last of ``samples`` [s]."""
@@ -66,6 +72,7 @@ class Evidence:
             self.terrain,
             self.odometry_from_terrain,
             self.joints,
+            self.with_attitude,
         )
 
 
@@ -87,6 +94,13 @@ class EvidenceWindows:
     odometry_from_terrain: np.ndarray | None = None
     joints: JointRecord | None = None
     """Measured joints and commands to flippers."""
+    with_attitude: bool = False
+    """Whether roll, pitch and height are residuals, too."""
+
+    @property
+    def components(self) -> tuple[str, ...]:
+        """Names of the ``C`` components of a residual."""
+        return COMPONENTS if self.with_attitude else MOTION
 
 
 def window_starts(motion: MotionTrack, stretches: Sequence[slice], horizon: float, stride: float) -> np.ndarray:
@@ -128,7 +142,7 @@ def sample_motion(motion: MotionTrack, stamps: np.ndarray) -> tuple[np.ndarray, 
 def residuals_by_part(
     robot: RobotModel, data: EvidenceWindows, parts: np.ndarray, effects: Sequence[Effects]
 ) -> np.ndarray:
-    """Predicted minus measured, ``[W, K, 3 (COMPONENTS)]``, each window with the effects of its part.
+    """Predicted minus measured, ``[W, K, C]``, each window with the effects of its part.
 
     Args:
         robot: robot with the effects of its file.
@@ -136,7 +150,7 @@ def residuals_by_part(
         parts: number of the part of each, ``[W]``.
         effects: by part.
     """
-    residuals = np.zeros((len(data.starts), len(data.samples), len(COMPONENTS)))
+    residuals = np.zeros((len(data.starts), len(data.samples), len(data.components)))
     alike: dict[tuple[object, ...], list[int]] = {}
     for part in np.unique(parts):
         key = tuple((name, *values.items()) for name, values in effects[part])
@@ -173,6 +187,7 @@ def correct_measurements(
     return corrected_motion(motion, effects), corrected_commands(commands, effects)
 
 
+_LEVEL = Lean(np.zeros(2), np.zeros(2), np.zeros(2))
 _MeasurementKey = tuple[tuple[str, tuple[tuple[str, float], ...]], ...]
 """Measurement effects with their parameters, hashable."""
 
@@ -185,6 +200,10 @@ class _Prepared:
     """Measured displacement, ``[W, K, 3]`` [m]."""
     turned: np.ndarray
     """Measured change of heading, ``[W, K]`` [rad]."""
+    leaned: np.ndarray
+    """Measured vertical in the base frame, without the tilt of level ground's plane, ``[W, K, 2]``."""
+    risen: np.ndarray
+    """Measured change of height above that plane, or on the map, ``[W, K]`` [m]."""
     frames: np.ndarray
     """Rotation of the start headings, ``[W, 1, 3, 3]``."""
     places: np.ndarray
@@ -218,7 +237,8 @@ class Predictions:
             self._terrain = TerrainMap.flat(Grid.square(2.0, 1.0))
         else:
             self._terrain = data.terrain
-        self._depth = rest_depth(robot, float(self._terrain.stiffness.median()))
+        self._stiffness = float(self._terrain.stiffness.median())
+        self._depth = rest_depth(robot, self._stiffness)
         # Contact points that never touch the ground are left out, which makes rollouts twice as fast.
         reach = _LEVEL_REACH if data.terrain is None else _HILLY_REACH
         touching = robot.points[:, 2] < reach - robot.ground_clearance
@@ -230,7 +250,7 @@ class Predictions:
         self._index = np.rint(data.samples / self.options.time_step).astype(int)
 
     def residuals(self, hypotheses: Sequence[Effects]) -> np.ndarray:
-        """Predicted minus measured, ``[H, W, K, 3 (COMPONENTS)]``, with the robot's own effects and each hypothesis."""
+        """Predicted minus measured, ``[H, W, K, C]``, with the robot's own effects and each hypothesis."""
         results: dict[int, np.ndarray] = {}
         # Other measurement effects mean other windows; hypotheses that share them share a batch.
         groups: dict[tuple[_MeasurementKey, tuple[str, ...]], list[int]] = {}
@@ -273,6 +293,9 @@ class Predictions:
         command_stamps = data.starts[:, None] + np.rint(steps * self.options.time_step * 1e9).astype(np.int64)
         if data.terrain is None:
             # On level ground every window starts at the origin, with the wheels on the ground.
+            lean = lean_of(motion) if data.with_attitude else _LEVEL
+            leaned = vertical(rotations[:, 1:]) - lean.of_plane(rotations[:, 1:])
+            risen = (positions[:, 1:] - positions[:, :1]) @ np.r_[-lean.plane, 1.0]
             frame_rotation = rotations[:, 0]
             if self._moves_flippers:
                 lowest = self._lowest(np.einsum("wij,wnj->wni", frame_rotation, self._posed())[..., 2]).mean(axis=1)
@@ -283,6 +306,8 @@ class Predictions:
             if data.odometry_from_terrain is None:
                 raise ValueError("a terrain map needs its pose: odometry_from_terrain is None")
             pose = np.linalg.inv(data.odometry_from_terrain)
+            leaned = vertical(pose[:3, :3] @ rotations[:, 1:])
+            risen = (positions[:, 1:] - positions[:, :1]) @ pose[2, :3]
             frame_rotation = pose[:3, :3] @ rotations[:, 0]
             place = positions[:, 0] @ pose[:3, :3].T + pose[:3, 3]
             place[:, 2] += self._settling(place, frame_rotation)
@@ -298,6 +323,8 @@ class Predictions:
         return _Prepared(
             moved=moved,
             turned=turned,
+            leaned=leaned,
+            risen=risen,
             frames=frames,
             places=place,
             twists=tensor(commands.sample(command_stamps)),
@@ -361,8 +388,11 @@ class Predictions:
                 joint_start=None if windows.joint_start is None else windows.joint_start.repeat(count, 1),
                 flippers=None if windows.flippers is None else windows.flippers.repeat(count, 1, 1),
             )
+            sunk = self._sunk(hypotheses)
+            position = windows.position.repeat(count, 1)
+            position[:, 2] -= torch.from_numpy(np.repeat(sunk, width)).to(position)
             state = State(
-                windows.position.repeat(count, 1),
+                position,
                 windows.rotation.repeat(count, 1, 1),
                 windows.velocity.repeat(count, 1),
                 windows.angular_velocity.repeat(count, 1),
@@ -373,15 +403,31 @@ class Predictions:
         displacement = np.einsum("wji,hwkj->hwki", windows.frames, positions - windows.places[None, :, None])
         forward = np.einsum("wji,hwkj->hwki", windows.frames, rotations[..., :, 0])
         heading = np.arctan2(forward[..., 1], forward[..., 0])
-        error = np.stack(
-            [
-                displacement[..., 0] - windows.moved[..., 0],
-                displacement[..., 1] - windows.moved[..., 1],
-                wrap_angle(heading - windows.turned),
-            ],
-            axis=-1,
+        errors = [
+            displacement[..., 0] - windows.moved[..., 0],
+            displacement[..., 1] - windows.moved[..., 1],
+            wrap_angle(heading - windows.turned),
+        ]
+        if self.data.with_attitude:
+            lean = vertical(rotations) - windows.leaned
+            # What the robot always leans may be the sensor's mounting, or its accelerometer's bias.
+            lean = lean - np.nanmedian(lean, axis=(1, 2), keepdims=True)
+            risen = displacement[..., 2] + sunk[:, None, None]
+            errors += [lean[..., 1], -lean[..., 0], risen - windows.risen]
+        return list(np.stack(errors, axis=-1))
+
+    def _sunk(self, hypotheses: list[Effects]) -> np.ndarray:
+        """How much deeper than the plain robot each hypothesis rests in its ground, ``[H]`` [m].
+
+        A robot that starts above its place of rest drops into it, and pitches and slips as no measured one does.
+        """
+        setup = applied_setup(self._terrain, replace(self.robot, effects=self._joined(hypotheses, 1)))
+        count = len(hypotheses)
+        softness, mass = (
+            np.broadcast_to(values.double().cpu().numpy().reshape(-1), count)
+            for values in (setup.softness, setup.robot.mass)
         )
-        return list(error)
+        return rest_depth(self.robot, self._stiffness / softness, mass=mass) - self._depth
 
     def _joined(
         self, hypotheses: list[Effects], width: int

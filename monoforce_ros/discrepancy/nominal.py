@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from monoforce_ros.discrepancy.command_changes import uncovered_residual
-from monoforce_ros.discrepancy.hypothesis import COMPONENTS, EvidenceWindows
+from monoforce_ros.discrepancy.hypothesis import COMPONENTS, MOTION, Evidence, EvidenceWindows
 from monoforce_ros.discrepancy.moderation import VariancePrior
 from monoforce_ros.discrepancy.residual_model import TERMS, motion_terms
 from monoforce_ros.effects import CATALOGUE
@@ -20,8 +20,7 @@ from monoforce_ros.robots import RobotFileError, read_commissioning, read_nomina
 SEGMENT = 16.0
 """Length of the segments between which the healthy robot varies [s]: two blocks of cross-validation, so that most kinds
 of motion occur in each."""
-SMALLEST = np.array([0.01, 0.01, np.radians(0.3)])
-"""Residuals below this are insignificant even on noise-free data [m, m, rad]."""
+_SMALLEST = np.array([0.01, 0.01, *np.radians([0.3, 0.3, 0.3]), 0.01])
 _CHANGES = ("speed_m_s", "yaw_rate_rad_s")
 
 
@@ -30,35 +29,64 @@ class NominalModel:
     """The healthy robot's residual, and how much each effect's influence varies between its segments."""
 
     residual: np.ndarray
-    """RMS residual beyond noise and terrain, ``[K, 3]`` at the times of the windows [m, m, rad]."""
+    """RMS residual beyond noise and terrain, ``[K, C]`` at the times of the windows."""
     variation: Mapping[str, float] = field(default_factory=dict)
     """By effect: RMS change of the residual by the effect's variation between segments, in units of
     :meth:`scale_in`."""
     segments: int = 0
     """Number of segments."""
     loss: float = 0.5
-    """Mean robust loss of the healthy robot; 0.5 if its residuals are normal."""
+    """Mean robust loss of the healthy robot; 0.5 if its residuals are normal and of the motion alone."""
+    motion_loss: float | None = None
+    """The same without roll, pitch and height; None where they are no part of ``residual``."""
     loss_spread: float = 0.0
     """Standard deviation of the logarithm of a segment's mean loss."""
     terms: np.ndarray | None = None
-    """Coefficients of the residual's variance, ``[3, len(TERMS)]`` (:mod:`residual_model`); None: the same residual in
+    """Coefficients of the residual's variance, ``[C, len(TERMS)]`` (:mod:`residual_model`); None: the same residual in
     all windows."""
     slope: float | None = None
     """Root mean square slope of the ground on which the robot was commissioned [rad]; None if unknown."""
     changes: np.ndarray | None = None
     """Changes of speed [m/s] and of yaw rate [rad/s] that commissioning covered, ``[2]`` (:mod:`command_changes`);
     None: all."""
+    lean: np.ndarray | None = None
+    """The vertical in the base frame, forward and left, that the robot kept on known ground, ``[2]`` [rad]; None if
+    unknown."""
+
+    @property
+    def with_attitude(self) -> bool:
+        """Whether roll, pitch and height of the healthy robot are known."""
+        return self.residual.shape[-1] > len(MOTION)
+
+    def of_motion(self) -> NominalModel:
+        """The model of the motion alone, without roll, pitch and height."""
+        if not self.with_attitude:
+            return self
+        count = len(MOTION)
+        return replace(
+            self,
+            residual=self.residual[:, :count],
+            terms=None if self.terms is None else self.terms[:count],
+            loss=self.loss if self.motion_loss is None else self.motion_loss,
+            motion_loss=None,
+        )
 
     def residual_in(self, data: EvidenceWindows) -> np.ndarray:
-        """RMS residual of the healthy robot in each window, ``[W, K, 3]`` [m, m, rad]."""
+        """RMS residual of the healthy robot in each window, ``[W, K, C]``."""
         residual = np.broadcast_to(self.residual, (len(data.starts), *self.residual.shape))
         if self.terms is not None:
             residual = np.sqrt(np.einsum("wkj,cj->wkc", motion_terms(data), self.terms))
-        return residual if self.changes is None else np.hypot(residual, uncovered_residual(data, self.changes))
+        if self.changes is None:
+            return residual
+        result = np.array(residual)
+        count = len(MOTION)
+        result[..., :count] = np.hypot(result[..., :count], uncovered_residual(data, self.changes))
+        return result
 
     def scale_in(self, data: EvidenceWindows) -> np.ndarray:
-        """Unit of ``variation`` in each window, ``[W, K, 3]`` [m, m, rad]."""
-        return np.sqrt(self.residual_in(data) ** 2 + SMALLEST**2)
+        """Unit of ``variation`` in each window, ``[W, K, C]``."""
+        residual = self.residual_in(data)
+        return np.sqrt(residual**2 + smallest_of(residual) ** 2)
 
     @cached_property
     def prior(self) -> VariancePrior:
@@ -96,8 +124,12 @@ class NominalModel:
             "segments": self.segments,
             "loss": float(f"{self.loss:.4g}"),
             "loss_spread": float(f"{self.loss_spread:.4g}"),
-        } | ({} if self.terms is None else {"residual_terms": self._named_terms()}) | (
+        } | (
+            {} if self.motion_loss is None else {"motion_loss": float(f"{self.motion_loss:.4g}")}
+        ) | ({} if self.terms is None else {"residual_terms": self._named_terms()}) | (
             {} if self.slope is None else {"slope_rad": float(f"{self.slope:.3g}")}
+        ) | (
+            {} if self.lean is None else {"lean_rad": [float(f"{value:.3g}") for value in self.lean]}
         ) | (
             {} if self.changes is None else
             {"command_changes": {key: float(f"{value:.3g}") for key, value in zip(_CHANGES, self.changes, strict=True)}}
@@ -107,7 +139,7 @@ class NominalModel:
         assert self.terms is not None
         return {
             component: {term: float(f"{value:.4g}") for term, value in zip(TERMS, row, strict=True)}
-            for component, row in zip(COMPONENTS, self.terms, strict=True)
+            for component, row in zip(COMPONENTS, self.terms, strict=False)
         }
 
     @classmethod
@@ -131,12 +163,16 @@ class NominalModel:
             named = entry.get("residual_terms")
             terms = None
             if named is not None:
-                terms = np.array([[float(named[component][term]) for term in TERMS] for component in COMPONENTS])
+                components = COMPONENTS[: residual.shape[-1]]
+                terms = np.array([[float(named[component][term]) for term in TERMS] for component in components])
+            motion_loss = None if entry.get("motion_loss") is None else float(entry["motion_loss"])
             covered = entry.get("command_changes")
             changes = None if covered is None else np.array([float(covered[key]) for key in _CHANGES])
-        except (KeyError, TypeError, ValueError) as error:
+            leaned = entry.get("lean_rad")
+            lean = None if leaned is None else np.array([float(leaned[0]), float(leaned[1])])
+        except (KeyError, IndexError, TypeError, ValueError) as error:
             raise RobotFileError(f"{robot_file(robot)}: commissioning: expected numbers, got {error!r}") from error
-        values = [*variation.values(), *numbers]
+        values = [*variation.values(), *numbers, *([] if motion_loss is None else [motion_loss])]
         if segments < 0 or not all(np.isfinite(value) and value >= 0 for value in values) or numbers[0] <= 0:
             raise RobotFileError(
                 f"{robot_file(robot)}: commissioning: variation, loss and loss_spread: expected finite numbers of 0 or "
@@ -146,6 +182,11 @@ class NominalModel:
             raise RobotFileError(
                 f"{robot_file(robot)}: commissioning.slope_rad: got {slope}, expected 0 to 1.57; commission the robot "
                 "again"
+            )
+        if lean is not None and not (np.abs(lean) < 1.0).all():
+            raise RobotFileError(
+                f"{robot_file(robot)}: commissioning.lean_rad: got {lean.tolist()}, expected two numbers between -1 "
+                "and 1; commission the robot again"
             )
         if terms is not None and not (np.isfinite(terms).all() and (terms >= 0).all()):
             raise RobotFileError(
@@ -158,9 +199,24 @@ class NominalModel:
                 "the robot again"
             )
         return cls(
-            residual, variation, segments, loss=numbers[0], loss_spread=numbers[1], terms=terms, slope=slope,
-            changes=changes,
+            residual, variation, segments, loss=numbers[0], motion_loss=motion_loss, loss_spread=numbers[1],
+            terms=terms, slope=slope, changes=changes, lean=lean,
         )  # fmt: skip
+
+
+def with_known_components(evidence: Evidence, nominal: NominalModel | None) -> tuple[Evidence, NominalModel | None]:
+    """A recording and the healthy robot with the components of residuals that both know.
+
+    How a healthy robot leans is known from commissioning only.
+    """
+    known = evidence.with_attitude and nominal is not None and nominal.with_attitude
+    evidence = replace(evidence, with_attitude=known)
+    return evidence, nominal if known or nominal is None else nominal.of_motion()
+
+
+def smallest_of(residuals: np.ndarray) -> np.ndarray:
+    """Residuals below this are insignificant even on noise-free data [m, m, rad, rad, rad, m], for ``[..., C]``."""
+    return _SMALLEST[: residuals.shape[-1]]
 
 
 def _coefficients(name: str) -> int:

@@ -7,7 +7,7 @@ import numpy as np
 from monoforce_ros.bags import SmoothedMotion
 from monoforce_ros.core import CommandTrack
 from monoforce_ros.discrepancy.gap import relative_motion
-from monoforce_ros.discrepancy.hypothesis import EvidenceWindows, window_starts
+from monoforce_ros.discrepancy.hypothesis import MOTION, EvidenceWindows, window_starts
 
 LARGEST_SHARE = 0.1
 """Share of the motion in 2 s above which a nominal residual is reported: effects that change the motion by less than a
@@ -18,7 +18,7 @@ def residual_complaint(nominal_residual: np.ndarray | None, smoothed: SmoothedMo
     """Why a commissioned file hides effects, with what to do; empty where its residual is small.
 
     Args:
-        nominal_residual: residual RMS of the healthy robot ``[K, 3]``, the last row after 2 s [m, m, rad]; or None.
+        nominal_residual: residual RMS of the healthy robot ``[K, C]``, the last row after 2 s [m, m, rad, …]; or None.
         smoothed: the motion of a recording, whose displacements and turns in 2 s are the measure.
         commands: its commands.
     """
@@ -30,7 +30,7 @@ def residual_complaint(nominal_residual: np.ndarray | None, smoothed: SmoothedMo
     moved = relative_motion(smoothed.motion, EvidenceWindows(smoothed.motion, commands, starts, 2.0, np.array([2.0])))
     distance = float(np.sqrt(np.mean(moved[:, 0, 0] ** 2 + moved[:, 0, 1] ** 2)))
     turn = float(np.sqrt(np.mean(moved[:, 0, 2] ** 2)))
-    along, across, heading = nominal_residual[-1]
+    along, across, heading = nominal_residual[-1, : len(MOTION)]
     position = float(np.hypot(along, across))
     parts = []
     if position > LARGEST_SHARE * max(distance, 1e-9):

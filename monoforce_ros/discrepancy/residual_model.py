@@ -50,22 +50,22 @@ def motion_terms(data: EvidenceWindows) -> np.ndarray:
 
 
 def fit_terms(residuals: Sequence[np.ndarray], floors: Sequence[np.ndarray], terms: Sequence[np.ndarray]) -> np.ndarray:
-    """Coefficients of the variance of each component beyond what is known already, ``[3, len(TERMS)]``.
+    """Coefficients of the variance of each component beyond what is known already, ``[C, len(TERMS)]``.
 
     A prior of the weight of one window shares the mean square of the residuals equally between the terms: what a
     recording does not show is not taken for impossible.
 
     Args:
-        residuals: of recordings of the healthy robot, ``[W, K, 3]`` each [m, m, rad].
-        floors: their size by noise and map, ``[W, K, 3]``.
+        residuals: of recordings of the healthy robot, ``[W, K, C]`` each.
+        floors: their size by noise and map, ``[W, K, C]``.
         terms: result of :func:`motion_terms` for each.
     """
     features = np.concatenate([values.reshape(-1, len(TERMS)) for values in terms])
     count = features.shape[1]
     means = np.maximum(features.mean(axis=0), 1e-12)
-    samples = residuals[0].shape[1]
-    result = np.zeros((3, count))
-    for component in range(3):
+    samples, components = residuals[0].shape[1:]
+    result = np.zeros((components, count))
+    for component in range(components):
         squares = np.concatenate([values[..., component].ravel() ** 2 for values in residuals])
         known = np.concatenate([values[..., component].ravel() ** 2 for values in floors])
         least = 1e-3 * float(known.mean()) + 1e-12

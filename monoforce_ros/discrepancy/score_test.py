@@ -22,6 +22,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import f as f_distribution
 
+from monoforce_ros.discrepancy.hypothesis import MOTION
+
 _RIDGE = 1e-6
 """Relative size of a ridge that keeps singular directions finite."""
 
@@ -127,6 +129,14 @@ class _Scores:
         return f_distribution.sf(statistic, q, np.maximum(degrees, 1.0)), total, degrees
 
 
+def motion_count(residuals: np.ndarray) -> int:
+    """Number of residuals of the motion among ``[..., C]``: what means over residuals are taken over.
+
+    Roll, pitch and height add to what the motion shows and do not dilute it.
+    """
+    return residuals[..., : len(MOTION)].size
+
+
 def block_numbers(starts: np.ndarray, length: float) -> np.ndarray:
     """Number of the block of ``length`` [s] in which each window starts, ``[W]``."""
     return ((starts - starts[0]) // round(length * 1e9)).astype(int)
@@ -190,7 +200,7 @@ def score_tests(
                 float(degrees[0]),
                 float(p[0]),
                 max(adjusted, float(p[0])),
-                0.5 * float(scores.estimate @ scores.information.sum(axis=0) @ scores.estimate) / used.size,
+                0.5 * float(scores.estimate @ scores.information.sum(axis=0) @ scores.estimate) / motion_count(used),
                 scores.excess(covariance[0]),
             )
         )
@@ -226,7 +236,7 @@ def variation(
     if scores is None:
         return None
     flat = (np.nan_to_num(columns) * metric).reshape(len(columns), -1)
-    squares = flat @ flat.T / flat.shape[1]
+    squares = flat @ flat.T / motion_count(columns[0])
     total = scores.information.sum(axis=0)
     size = np.trace(total)
     shares, values = [], []
@@ -275,7 +285,7 @@ def _scores(
         return None
     # The part that fitted parameters do not do: whatever its shape, the healthy robot varies by about as much.
     scaled = (flat.reshape(columns.shape) * metric).reshape(q, -1)
-    squares = scaled @ scaled.T / scaled.shape[1]
+    squares = scaled @ scaled.T / motion_count(columns[0])
     squares += _RIDGE * np.trace(squares) * np.eye(q)
     nominal = direction.variation**2 / q * np.linalg.inv(squares)
     deviations = scores - np.einsum("bpq,q->bp", information, estimate)

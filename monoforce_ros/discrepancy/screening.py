@@ -10,7 +10,7 @@ import numpy as np
 from monoforce_ros.discrepancy.directions import Directions
 from monoforce_ros.discrepancy.fit import first_values, fit_effects, jacobian, robust, robust_weights
 from monoforce_ros.discrepancy.hypothesis import Effects, EvidenceWindows, Predictions, values_key
-from monoforce_ros.discrepancy.score_test import Direction, ScoreResult, block_numbers, score_tests
+from monoforce_ros.discrepancy.score_test import Direction, ScoreResult, block_numbers, motion_count, score_tests
 from monoforce_ros.discrepancy.thresholds import Thresholds
 from monoforce_ros.effects import Effect, identifiable_effects
 from monoforce_ros.robots import RobotModel
@@ -198,7 +198,7 @@ class Screening:
         changes = scaled - residual
         slopes = (weights * residual * changes).sum(axis=(1, 2, 3))
         curvatures = np.maximum((weights * changes**2).sum(axis=(1, 2, 3)), 1e-12)
-        promised = robust(residual).mean() - 0.5 * slopes**2 / curvatures / residual.size
+        promised = robust(residual).mean() - 0.5 * slopes**2 / curvatures / motion_count(residual)
         return float(min(promised.min(), losses.min())), effect, starts[int(np.argmin(losses))]
 
     def _starts(self, effect: Effect) -> list[Effects]:

@@ -38,6 +38,7 @@ from monoforce_ros.discrepancy.hypothesis import (
 from monoforce_ros.discrepancy.learned import learned_terms
 from monoforce_ros.discrepancy.left_out import values_without_parts
 from monoforce_ros.discrepancy.nominal import NominalModel
+from monoforce_ros.discrepancy.score_test import motion_count
 from monoforce_ros.discrepancy.screening import Screening, admitted
 from monoforce_ros.discrepancy.thresholds import Thresholds
 from monoforce_ros.discrepancy.trial import (
@@ -61,8 +62,8 @@ _PROMISING = 0.5
 """Share of the best gain on held-out windows that an effect must promise on those of its quick fit to be judged. It
 only saves time: effects that promise half as much hardly predict more."""
 _SMALL_SHARE = 0.5
-"""Effects that explain less than this share of what an explanation must explain (``most_share``) are neither exchanged
-nor replaced by combinations with another beginning: it only saves time on what is unknown anyway."""
+"""Effects that explain less than this share of what an explanation must explain (``explained_share``) are neither
+exchanged nor replaced by combinations with another beginning: it only saves time on what is unknown anyway."""
 _ALTERNATIVES = 1
 """Combinations that do not begin with the best single effect and are tried where that one leads to no good fit."""
 
@@ -83,7 +84,7 @@ class Search:
     Args:
         robot: robot with the effects of its file.
         data: the recording's windows.
-        scale: expected size of a residual, ``[W, K, 3]``.
+        scale: expected size of a residual, ``[W, K, C]``.
         nominal: what commissioning learned; None for a robot that was never commissioned.
         known: effects that another sensor measured: they always act and keep their values.
         hints: values that another sensor suggests; fits start there, too.
@@ -107,7 +108,7 @@ class Search:
         progress: Callable[[str], None] = lambda step: None,
     ):
         self.robot, self.data, self.nominal, self.thresholds = robot, data, nominal, thresholds
-        self.scale = np.broadcast_to(scale, (len(data.starts), len(data.samples), 3))
+        self.scale = np.broadcast_to(scale, (len(data.starts), len(data.samples), len(data.components)))
         self.known = known
         self.predictions = Predictions(robot, data)
         self.directions = Directions(self.predictions, self.scale, nominal, thresholds)
@@ -143,17 +144,20 @@ class Search:
             # The effect that explains most alone need not be part of the best combination.
             if fit.passed(self.thresholds) or most_effects < 2:
                 break
-            if fit.explained < _SMALL_SHARE * self.thresholds.most_share:
+            if fit.explained < _SMALL_SHARE * self.thresholds.explained_share:
                 break
             extended, listed = self._extended(other, most_effects)
             tried += listed
             gain, low = self._gain(best, extended)
             if low > 0 and gain > self.thresholds.smallest_share * nominal.loss:
                 best, fit = extended, self.fit_test(extended, nominal)
-        hopeless = fit.explained < _SMALL_SHARE * self.thresholds.most_share
+        hopeless = fit.explained < _SMALL_SHARE * self.thresholds.explained_share
         exchanged, indistinguishable = self._exchanged(best) if exchange and not hopeless else (best, {})
         if exchanged is not best:
             best, fit = exchanged, self.fit_test(exchanged, nominal)
+        refined = self.refined(best)
+        if refined is not best:
+            best, fit = refined, self.fit_test(refined, nominal)
         return Outcome(nominal, best, fit, tuple(tried), ratio, indistinguishable)
 
     def onset_p(self) -> float:
@@ -260,7 +264,7 @@ class Search:
             if place[0] < fixed:
                 continue
             columns = (fit.derivatives[place - fixed] * self.directions.metric).reshape(len(values), -1)
-            squares = columns @ columns.T / columns.shape[1]
+            squares = columns @ columns.T / motion_count(fit.derivatives[0])
             squares += 1e-6 * np.trace(squares) * np.eye(len(values)) + 1e-12 * np.eye(len(values))
             spread = (
                 self.nominal.variation_of(name, self.thresholds.drive_share)[0] ** 2
@@ -407,6 +411,28 @@ class Search:
             _, low = self._gain(trial, best)
             if _parameter_count(trial) < _parameter_count(best) and low <= 0:
                 best = trial
+        return best
+
+    def refined(self, best: Trial) -> Trial:
+        """The trial with further parameters of its effects, such as a payload's height, that the recording shows."""
+        for name in best.names[len(self.known) :]:
+            known = {parameter.name: parameter for parameter in CATALOGUE[name].parameters}
+            for key in CATALOGUE[name].refined:
+                base = self.refit(best.effects).effects
+                values = dict(base)[name]
+                if key in values:
+                    continue
+                changed = {**values, key: known[key].neutral + known[key].scale}
+                more = tuple((other, changed if other == name else found) for other, found in base)
+                residual = self.directions.scaled(base)
+                change = np.nan_to_num(self.directions.scaled(more) - residual)
+                direction = self.directions.direction(name, change[None])
+                (test,) = self.screening.tested(base, self.fixed_count(base), residual, [direction])
+                if test.p > self.thresholds.further_rate:
+                    continue
+                trial = self.judge(more)
+                if self._pays(best, trial):
+                    best = trial
         return best
 
     def _pruned(self, best: Trial) -> Trial:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from monoforce_ros.discrepancy.fit import fit_effects
@@ -28,7 +30,7 @@ def compare_after_steps(evidence: Evidence, robot: RobotModel, effects: Effects)
     Returns:
         None where there are too few steps.
     """
-    evidence = corrected_evidence(evidence, robot)
+    evidence = replace(corrected_evidence(evidence, robot), with_attitude=False)
     motion = evidence.smoothed.motion
     starts = step_starts(
         evidence.commands, np.sort(window_starts(motion, evidence.smoothed.stretches, HORIZON, _SPACING))

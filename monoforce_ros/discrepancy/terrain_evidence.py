@@ -65,7 +65,7 @@ def supporting_terrain(
 def terrain_uncertainty(
     robot: RobotModel, data: EvidenceWindows, split: tuple[TerrainMap, TerrainMap] | None
 ) -> np.ndarray:
-    """Residuals that errors of the map cause in each window with a perfect robot model, ``[W, K, 3]`` [m, m, rad].
+    """Residuals that errors of the map cause in each window with a perfect robot model, ``[W, K, C]``.
 
     It has two parts, both measured on the maps at hand. Predictions on maps from every other sweep differ by twice the
     effect of the whole map's noise. And predictions on the map at half its resolution differ by as much as the map's
@@ -73,7 +73,7 @@ def terrain_uncertainty(
     of the window, half that of all windows, for a single difference is a poor estimate of a standard deviation.
     Zero on level ground.
     """
-    shape = (len(data.starts), len(data.samples), 3)
+    shape = (len(data.starts), len(data.samples), len(data.components))
     if data.terrain is None:
         return np.zeros(shape)
 

@@ -73,7 +73,7 @@ class FitTest:
 
     def passed(self, thresholds: Thresholds) -> bool:
         """Whether the effects are the explanation: they explain most, and the rest looks like a healthy robot's."""
-        return self.p > thresholds.fit_rate and self.explained >= thresholds.most_share
+        return self.p > thresholds.fit_rate and self.explained >= thresholds.explained_share
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def expected_loss(healthy: float, change: np.ndarray, model_error: float) -> flo
 
     Args:
         healthy: mean loss of the healthy robot.
-        change: what the effects change, scaled, ``[W, K, 3]``.
+        change: what the effects change, scaled, ``[W, K, C]``.
         model_error: error of a formula as a share of what it changes.
     """
     return healthy + float(robust(model_error * change).mean())

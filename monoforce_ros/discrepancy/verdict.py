@@ -131,7 +131,7 @@ def decide(findings: Findings, thresholds: Thresholds = Thresholds()) -> Decisio
                 "the robot was never commissioned: whether the rest is normal cannot be told (diagnose --commission)",
             )
         return Decision(Verdict.EFFECT_FOUND, best, remarks, losses)
-    reason = "what is left exceeds a healthy robot's error by more than what is explained"
+    reason = f"more than {100 * (1.0 - thresholds.explained_share):.0f} % of the excess is left"
     if not findings.commissioned:
         reason = "a formula explains most of what is left"
     if findings.fit.p <= thresholds.fit_rate:

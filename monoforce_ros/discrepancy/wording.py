@@ -90,6 +90,8 @@ def _payload(values: _Values) -> str:
         x, y = values["x"], values["y"]
         ahead = f"{abs(x):.2f} m {'ahead of' if x > 0 else 'behind'} the base frame's origin"
         place = f", {ahead} and {abs(y):.2f} m to its {'left' if y > 0 else 'right'}"
+    if "z" in values:
+        place += f", {abs(values['z']):.2f} m {'above' if values['z'] > 0 else 'below'} it"
     if mass < 0:
         return f"The robot is {-mass:.0f} kg lighter than modelled{place}."
     return f"The robot carries {mass:.0f} kg that its model does not have{place}."
@@ -98,6 +100,14 @@ def _payload(values: _Values) -> str:
 def _tilt(values: _Values) -> str:
     angle = math.degrees(math.hypot(values.get("about_x", 0.0), values.get("about_y", 0.0)))
     return f"Down is {angle:.1f}° off: the ground slopes, or the localisation is tilted."
+
+
+def _drive_loss(values: _Values) -> str:
+    loss = values["loss"]
+    side, share = "left" if loss > 0 else "right", abs(loss)
+    if share > 0.95:
+        return f"The drives of the {side} side do not run."
+    return f"The drives of the {side} side run {100 * share:.0f} % slower than commanded."
 
 
 def _flippers(values: _Values) -> str:
@@ -119,6 +129,16 @@ _FINDINGS: dict[str, Callable[[_Values], str]] = {
     "drive_compliance": lambda v: (
         f"The drives give way: a wheel that pulls with as much as its load runs {v['speed_loss']:.2f} m/s slower."
     ),
+    "drive_loss": _drive_loss,
+    "supply_sag": lambda v: (
+        f"The faster the drives run, the more of their speed they lose, {100 * v['sag'] / (1.0 + v['sag']):.0f} % at "
+        "1 m/s: their supply sags."
+    ),
+    "yaw_rate_limit": lambda v: f"The base turns no faster than {v['limit']:.2f} rad/s, whatever is commanded.",
+    "acceleration_limit": lambda v: f"The base changes its speed by no more than {v['limit']:.2f} m/s in a second.",
+    "yaw_acceleration_limit": lambda v: (
+        f"The base changes its yaw rate by no more than {v['limit']:.2f} rad/s in a second."
+    ),
     "drive_droop": lambda v: (
         f"The drives droop when a turn begins: each side loses {v['loss']:.2f} m/s, and needs {v['recovery']:.1f} s "
         "to win back most of it."
@@ -126,6 +146,18 @@ _FINDINGS: dict[str, Callable[[_Values], str]] = {
     "turning_scrub": _scrub,
     "friction_scale": _friction,
     "friction_anisotropy": lambda v: f"Sideways, tyres grip {_change(v['factor'], 'less', 'more')} than lengthways.",
+    "rotation_centre": lambda v: (
+        f"The robot turns about a point {abs(v['x']):.2f} m {'ahead of' if v['x'] > 0 else 'behind'} the one that its "
+        "model turns about."
+    ),
+    "terrain_softness": lambda v: (
+        f"The ground or the tyres are {v['factor']:.1f} times as soft as assumed."
+        if v["factor"] >= 1.0
+        else f"The ground or the tyres are {1.0 / v['factor']:.1f} times as hard as assumed."
+    ),
+    "vegetation_drag": lambda v: (
+        f"Plants hold the robot back: {v['coefficient']:.0f} N per metre of height, square metre and m/s."
+    ),
     "rolling_resistance": lambda v: (
         f"The robot rolls heavily: it is held back by {100 * v['coefficient']:.0f} % of its weight at any speed."
     ),
@@ -166,6 +198,15 @@ _REMEDIES = {
     "actuator_deadband": "look at the smallest output of the motor controller, and for friction in motor and gear",
     "drive_gain": "measure the wheels and compare with the radius that the base controller has",
     "drive_asymmetry": "compare tyre pressure, wear, chain and motor of both sides",
+    "drive_loss": "look at motor, gear, chain, fuse and motor driver of this side",
+    "supply_sag": "look at charge and age of the battery, and at the resistance of its cables",
+    "yaw_rate_limit": "look at the base controller's limit of the yaw rate, and enter it in the robot's file",
+    "acceleration_limit": "look at the base controller's limit of the acceleration; plan with it",
+    "yaw_acceleration_limit": "look at the base controller's limit of the yaw acceleration; plan with it",
+    "friction_anisotropy": "look at the tread of the tyres, and for ruts that guide them",
+    "terrain_softness": "look at the tyres' pressure, and for mud, sand or snow",
+    "vegetation_drag": "look at how high and how dense the plants are; record a lidar so that the map shows them",
+    "rotation_centre": "look for a load ahead or behind, and for tyres of unequal grip or pressure",
     "drive_compliance": "give the motor controllers an integral part, or a larger gain",
     "drive_droop": "raise the gains of the motors' speed controllers, first of the integral part",
     "turning_scrub": "set the wheel separation multiplier of the base controller (diagnose --export)",
@@ -196,6 +237,14 @@ _CAUSES = {
     "drive_gain": "drives that run too slow or too fast",
     "drive_asymmetry": "sides of unequal speed",
     "drive_compliance": "drives that give way under load",
+    "drive_loss": "a side that runs slow or not at all",
+    "supply_sag": "a supply that sags",
+    "yaw_rate_limit": "a limit of the yaw rate",
+    "acceleration_limit": "a limit of the acceleration",
+    "yaw_acceleration_limit": "a limit of the yaw acceleration",
+    "rotation_centre": "turning about another point",
+    "terrain_softness": "soft ground or tyres",
+    "vegetation_drag": "plants",
     "drive_droop": "drives that droop when a turn begins",
     "turning_scrub": "turning less than the wheels ask for",
     "friction_scale": "slippery or grippy ground",

@@ -105,6 +105,8 @@ class Effect(ABC):
     """Similar effects and the manoeuvre that separates each from this one. One of the two files is enough."""
     separated_by_sensor: ClassVar[Mapping[str, str]] = {}
     """Effects that no manoeuvre separates from this one, and the sensor that does."""
+    refined: ClassVar[tuple[str, ...]] = ()
+    """Parameters that are fitted in addition where a recording shows them beyond chance."""
     formula_terms: ClassVar[tuple[str, ...]] = ()
     """Terms of ``learned_term`` that are equivalent to this effect."""
     commissioning_start: ClassVar[Mapping[str, float]] = {}
@@ -203,7 +205,11 @@ class Effect(ABC):
             return f"order: got {self.order!r}, expected a whole number"
         if (changes_speeds or self.stage == "command") and self.order is None:
             return "changes drive speeds but has no order: set its position among the command effects"
-        for label, keys in (("identified", self.identified), ("commissioning_start", tuple(self.commissioning_start))):
+        listed = {
+            "identified": self.identified, "refined": self.refined,
+            "commissioning_start": tuple(self.commissioning_start),
+        }  # fmt: skip
+        for label, keys in listed.items():
             unknown = sorted(set(keys) - set(known))
             if unknown:
                 return f"{label}: parameters {unknown} are unknown; expected some of {known}"

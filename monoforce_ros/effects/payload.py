@@ -27,6 +27,7 @@ class Payload(Effect):
         Parameter("z", "m", 0.0, -0.5, 1.5, 0.2, "position above"),
     )
     identified = ("mass", "x", "y")
+    refined = ("z",)
     manoeuvre = "turns on the spot, and driving up and across a slope"
     separated_by: ClassVar = {
         "turning_scrub": "turns on the spot, and driving across a slope",

@@ -90,7 +90,8 @@ def read_commissioning(robot: str | Path) -> Mapping[str, Any] | None:
 
 
 def read_nominal_residual(robot: str | Path, samples: Sequence[float]) -> np.ndarray | None:
-    """RMS residual of the healthy robot from its file, ``[K, 3]`` [m, m, rad]; None without commissioning.
+    """RMS residual of the healthy robot from its file, ``[K, 3]`` [m, m, rad], or ``[K, 6]`` with roll, pitch [rad] and
+    height [m]; None without commissioning.
 
     Args:
         robot: name or file.
@@ -107,9 +108,10 @@ def read_nominal_residual(robot: str | Path, samples: Sequence[float]) -> np.nda
         times, rows = np.array(entry["samples_s"], float), np.array(entry["residual_rms"], float)
     except (KeyError, TypeError, ValueError) as error:
         raise RobotFileError(f"{path}: commissioning: expected samples_s and residual_rms, got {error!r}") from error
-    if rows.shape != (len(samples), 3) or times.shape != (len(samples),) or not np.allclose(times, samples):
+    known = rows.shape in ((len(samples), 3), (len(samples), 6))
+    if not known or times.shape != (len(samples),) or not np.allclose(times, samples):
         raise RobotFileError(
-            f"{path}: commissioning: got residuals {rows.shape} at {times.tolist()} s, expected three each at "
+            f"{path}: commissioning: got residuals {rows.shape} at {times.tolist()} s, expected three or six each at "
             f"{list(samples)} s; commission the robot again"
         )
     if not (np.isfinite(rows).all() and (rows >= 0).all()):
