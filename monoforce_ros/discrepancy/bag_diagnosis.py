@@ -18,7 +18,7 @@ from monoforce_ros.discrepancy.gap import noisy_motions
 from monoforce_ros.discrepancy.ground import Ground, beyond_commissioning, choose_ground
 from monoforce_ros.discrepancy.hypothesis import Effects, Evidence, corrected_evidence, own_values, window_starts
 from monoforce_ros.discrepancy.motion_check import motion_faults
-from monoforce_ros.discrepancy.nominal import NominalModel
+from monoforce_ros.discrepancy.nominal import NominalModel, with_known_components
 from monoforce_ros.discrepancy.nominal_residual import residual_complaint
 from monoforce_ros.discrepancy.report import effect_entry, write_diagnosis
 from monoforce_ros.discrepancy.separate_stretches import laid_apart
@@ -199,7 +199,8 @@ def diagnose_bag(
     if others:
         progress(0.97, "held-out recordings")
         tables = {
-            name: _held_out_table(path, model, diagnosis.fitted, terrain, reading) for name, path in others.items()
+            name: _held_out_table(path, model, nominal, diagnosis.fitted, terrain, reading)
+            for name, path in others.items()
         }
         diagnosis = replace(diagnosis, held_out=tables)
     smoothed = evidence.smoothed
@@ -284,11 +285,11 @@ def _distinct_names(bags: Sequence[Path]) -> dict[str, Path]:
 
 
 def _held_out_table(
-    bag: Path, robot: RobotModel, effects: Effects, terrain: str, reading: ReadOptions
+    bag: Path, robot: RobotModel, nominal: NominalModel | None, effects: Effects, terrain: str, reading: ReadOptions
 ) -> dict[str, GapRow]:
     """Errors without and with the effects on a recording to which nothing was fitted."""
     evidence, _ = read_evidence(bag, robot, terrain, reading)
-    evidence = corrected_evidence(evidence, robot)
+    evidence, _ = with_known_components(corrected_evidence(evidence, robot), nominal)
     smoothed = evidence.smoothed
     starts = window_starts(smoothed.motion, smoothed.stretches, 2.0, 1.0)
     if not len(starts):
