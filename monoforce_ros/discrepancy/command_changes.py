@@ -37,7 +37,7 @@ def covered_changes(recordings: Sequence[EvidenceWindows]) -> np.ndarray:
 
 
 def uncovered_residual(data: EvidenceWindows, covered: np.ndarray) -> np.ndarray:
-    """RMS residual of a healthy robot by changes harder than covered, ``[W, K, 3]`` [m, m, rad].
+    """RMS residual of a healthy robot by changes harder than covered, ``[W, K, C]``; none in roll, pitch and height.
 
     The robot is where it would be up to :data:`RESPONSE_TIME` earlier or later: along by the change of speed, in
     heading by that of the yaw rate, and by the yaw rate itself where the speed changes. A heading error grows over the
@@ -57,7 +57,9 @@ def uncovered_residual(data: EvidenceWindows, covered: np.ndarray) -> np.ndarray
     distance = np.cumsum(speed[:, first:] * STEP, axis=1)[:, columns - first]
     along = RESPONSE_TIME * beyond[..., 0]
     heading = RESPONSE_TIME * np.hypot(beyond[..., 1], rate * share)
-    return np.stack([along, 0.5 * distance * heading, heading], axis=-1)
+    result = np.zeros((*along.shape, len(data.components)))
+    result[..., :3] = np.stack([along, 0.5 * distance * heading, heading], axis=-1)
+    return result
 
 
 def uncovered_doubt(evidence: Evidence, horizon: float, covered: np.ndarray | None) -> str:

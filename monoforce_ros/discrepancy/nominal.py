@@ -76,12 +76,7 @@ class NominalModel:
         residual = np.broadcast_to(self.residual, (len(data.starts), *self.residual.shape))
         if self.terms is not None:
             residual = np.sqrt(np.einsum("wkj,cj->wkc", motion_terms(data), self.terms))
-        if self.changes is None:
-            return residual
-        result = np.array(residual)
-        count = len(MOTION)
-        result[..., :count] = np.hypot(result[..., :count], uncovered_residual(data, self.changes))
-        return result
+        return residual if self.changes is None else np.hypot(residual, uncovered_residual(data, self.changes))
 
     def scale_in(self, data: EvidenceWindows) -> np.ndarray:
         """Unit of ``variation`` in each window, ``[W, K, C]``."""
