@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from monoforce_ros.discrepancy.hypothesis import Evidence, EvidenceWindows, window_starts
+from monoforce_ros.discrepancy.hypothesis import MOTION, Evidence, EvidenceWindows, window_starts
 from monoforce_ros.discrepancy.residual_model import BEFORE, STEP, window_commands
 
 RESPONSE_TIME = 0.06
@@ -58,7 +58,7 @@ def uncovered_residual(data: EvidenceWindows, covered: np.ndarray) -> np.ndarray
     along = RESPONSE_TIME * beyond[..., 0]
     heading = RESPONSE_TIME * np.hypot(beyond[..., 1], rate * share)
     result = np.zeros((*along.shape, len(data.components)))
-    result[..., :3] = np.stack([along, 0.5 * distance * heading, heading], axis=-1)
+    result[..., : len(MOTION)] = np.stack([along, 0.5 * distance * heading, heading], axis=-1)
     return result
 
 

@@ -134,7 +134,7 @@ class NominalModel:
         assert self.terms is not None
         return {
             component: {term: float(f"{value:.4g}") for term, value in zip(TERMS, row, strict=True)}
-            for component, row in zip(COMPONENTS, self.terms, strict=False)
+            for component, row in zip(COMPONENTS[: self.residual.shape[-1]], self.terms, strict=True)
         }
 
     @classmethod
