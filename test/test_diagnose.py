@@ -650,25 +650,29 @@ def test_the_node_predicts_better_with_the_written_file(tmp_path, start, peer):
     found = diagnose_bag(bag, "husky", tmp_path / "report", settings=DiagnosisSettings(max_effects=1))
     assert [effect.name for effect in found.diagnosis.effects] == ["drive_gain"]
     recording = Recording.open(bag)
-    errors = []
+    runs = []
     for robot in ("husky", found.robot_file):
         peer.clear()
         node = start("predictor", "--ros-args", "-p", f"robot:={robot}", "-p", "terrain_source:=flat")
         node.wait_for("predicting 5 s ahead for husky")
         player = start("bag_player", bag, "--duration", "12")
         assert peer.until(lambda player=player: not player.running, 90.0)
-        peer.spin(1.0)
+        # On a busy machine the last paths arrive after the player has ended; they must not count as the next run's.
+        peer.settle(1.0)
         node.stop()
-        distances = []
+        errors = {}
         for path in peer.received["/predicted/path"]:
             stamp = path.header.stamp.sec * 10**9 + path.header.stamp.nanosec
             # Where the robot was one second later; the path has a pose every tenth of a second.
             there = recording.motion.at(stamp + 10**9).position
             pose = path.poses[10].pose.position
-            distances.append(np.hypot(pose.x - there[0], pose.y - there[1]))
-        assert len(distances) > 10, node.output[-2000:]
-        errors.append(np.median(distances))
-    assert errors[1] < 0.75 * errors[0], errors
+            errors[stamp] = np.hypot(pose.x - there[0], pose.y - there[1])
+        runs.append(errors)
+    # A busy machine leaves predictions out, other ones in each run: predictions from the same instant are compared.
+    stamps = sorted(set(runs[0]) & set(runs[1]))
+    assert len(stamps) > 10, node.output[-2000:]
+    before, after = (np.median([errors[stamp] for stamp in stamps]) for errors in runs)
+    assert after < 0.75 * before, (before, after)
 
 
 def test_errors_are_one_line(tmp_path, executables, ros_environment):
