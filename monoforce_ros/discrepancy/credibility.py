@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from monoforce_ros.discrepancy.estimates import EffectEstimate, ParameterEstimate
-from monoforce_ros.effects import CATALOGUE, Effect, Parameter
+from monoforce_ros.effects import CATALOGUE, Effect, Parameter, Product
 
 RESOLUTION = 0.03
 """Distance from a bound, in typical sizes of the parameter, below which a value lies at it.
@@ -22,8 +22,8 @@ def complaint(estimate: EffectEstimate, nominal: Mapping[str, float] | None = No
     Two kinds are refused. A value at a bound of its parameter says where the search stopped, not what the robot does,
     unless a robot can have it, as one whose drive is dead.
     An effect all of whose intervals hold the neutral value may as well be absent. Parameters that act only together
-    with another one (the place of a payload, without its mass) do not count: those that do are the main parameter and
-    the others of its unit.
+    with another one (the place of a payload, without its mass) do not count: those that do are the main parameter, the
+    others of its unit, and the effect's products.
 
     Args:
         estimate: values and intervals.
@@ -51,7 +51,10 @@ def complaint(estimate: EffectEstimate, nominal: Mapping[str, float] | None = No
                 "where the search stopped; it is no measurement"
             )
     acting = _acting(estimate, effect)
-    if all(_holds_neutral(estimate.parameters[key], known[key]) for key in acting):
+    products = [product for product in effect.products if product.name in estimate.products]
+    held = [_holds_neutral(estimate.parameters[key], known[key]) for key in acting]
+    held += [_holds(estimate.products[product.name], _neutral_product(product, known)) for product in products]
+    if all(held):
         key = acting[0]
         value, neutral = estimate.parameters[key], known[key].neutral
         without = "no limit" if math.isinf(neutral) else f"{neutral:g} {value.unit}"
@@ -83,5 +86,13 @@ def _reached_bound(value: ParameterEstimate, known: Parameter) -> float | None:
 
 def _holds_neutral(value: ParameterEstimate, known: Parameter) -> bool:
     # Intervals are cut at the bounds of the range, so an infinite neutral value lies in one that reaches the bound.
-    neutral = min(max(known.neutral, known.low), known.high)
+    return _holds(value, min(max(known.neutral, known.low), known.high))
+
+
+def _holds(value: ParameterEstimate, neutral: float) -> bool:
     return value.low <= neutral <= value.high
+
+
+def _neutral_product(product: Product, known: Mapping[str, Parameter]) -> float:
+    one, other = product.factors
+    return known[one].neutral * known[other].neutral

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -36,9 +36,16 @@ class EffectEstimate:
     parameters: Mapping[str, ParameterEstimate]
     indistinguishable: tuple[str, ...] = ()
     """Other effects that explain the recording about as well in its place."""
+    products: Mapping[str, ParameterEstimate] = field(default_factory=dict)
+    """Products of two of its parameters, see :class:`~monoforce_ros.effects.effect.Product`."""
     found_again: tuple[int, int] | None = None
     """In how many of how many repetitions, each without another part of the recording, it or one of these others is
     found; None for a recording too short for that, and for a formula."""
+
+    @property
+    def shown(self) -> Mapping[str, ParameterEstimate]:
+        """What people are shown: parameters, then products."""
+        return {**self.parameters, **self.products}
 
 
 def effect_sizes(name: str, values: Mapping[str, float], without: np.ndarray) -> np.ndarray:

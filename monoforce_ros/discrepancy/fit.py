@@ -238,7 +238,7 @@ def estimate_effects(
     fit: Fit,
     indistinguishable: Mapping[str, Sequence[str]],
     *,
-    healthy_variances: np.ndarray | None = None,
+    healthy_covariance: np.ndarray | None = None,
     segments: int = 0,
     formula_variances: np.ndarray | None = None,
     confidence: float = 0.95,
@@ -248,31 +248,52 @@ def estimate_effects(
     Args:
         fit: its covariance gives the intervals.
         indistinguishable: for each effect, others that explain the recording about as well.
-        healthy_variances: variance of each parameter on the healthy robot, ``[P]``: the model's own error, which no
-            residual of this recording shows.
+        healthy_covariance: of the parameters on the healthy robot, ``[P, P]``: the model's own error, which no residual
+            of this recording shows.
         segments: number of healthy segments from which they were estimated.
         formula_variances: variance of each parameter because no formula of an effect is exact, ``[P]``.
         confidence: of the intervals.
     """
-    sampling = np.maximum(np.diag(fit.covariance), 0.0)
-    healthy = np.zeros_like(sampling) if healthy_variances is None else healthy_variances
-    formula = np.zeros_like(sampling) if formula_variances is None else formula_variances
-    total = sampling + healthy + formula
-    # Welch and Satterthwaite: degrees of freedom of a sum of estimated variances.
-    parts = sampling**2 / max(fit.blocks - len(sampling), 1) + healthy**2 / max(segments, 1)
-    degrees = np.where(parts > 0, total**2 / np.maximum(parts, 1e-300), np.inf)
-    half_widths = student_distribution.ppf(0.5 + 0.5 * confidence, np.maximum(degrees, 1.0)) * np.sqrt(total)
+    values = flat(fit.effects)
+    healthy_part = np.zeros_like(fit.covariance) if healthy_covariance is None else healthy_covariance
+    formula_part = np.zeros(len(values)) if formula_variances is None else formula_variances
+    share = 0.5 + 0.5 * confidence
+
+    def half_width(gradient: np.ndarray, formula: float) -> float:
+        """Of what depends on the parameters, to first order."""
+        sampling = max(float(gradient @ fit.covariance @ gradient), 0.0)
+        healthy = max(float(gradient @ healthy_part @ gradient), 0.0)
+        total = sampling + healthy + formula
+        # Welch and Satterthwaite: degrees of freedom of a sum of estimated variances.
+        parts = sampling**2 / max(fit.blocks - len(values), 1) + healthy**2 / max(segments, 1)
+        degrees = total**2 / parts if parts > 0 else np.inf
+        return float(student_distribution.ppf(share, max(degrees, 1.0)) * np.sqrt(total))
+
+    units = np.eye(len(values))
     estimates, at = [], 0
     for name, parameters in fit.effects:
         known = {p.name: p for p in CATALOGUE[name].parameters}
+        place = {key: at + number for number, key in enumerate(parameters)}
+        at += len(parameters)
         listed = {}
         for key, value in parameters.items():
+            half = half_width(units[place[key]], float(formula_part[place[key]]))
             listed[key] = ParameterEstimate(
                 value=float(value),
-                low=float(max(value - half_widths[at], known[key].low)),
-                high=float(min(value + half_widths[at], known[key].high)),
+                low=float(max(value - half, known[key].low)),
+                high=float(min(value + half, known[key].high)),
                 unit=known[key].unit,
             )
-            at += 1
-        estimates.append(EffectEstimate(name, listed, tuple(indistinguishable.get(name, ()))))
+        products = {}
+        for product in CATALOGUE[name].products:
+            if not set(product.factors) <= set(place):
+                continue
+            one, other = (place[key] for key in product.factors)
+            gradient = values[other] * units[one] + values[one] * units[other]
+            # The formula's error is a share of the effect, whose size is that of the first factor.
+            half = half_width(gradient, float(formula_part[one] * values[other] ** 2))
+            value = float(values[one] * values[other])
+            products[product.name] = ParameterEstimate(value, value - half, value + half, product.unit)
+        others = tuple(indistinguishable.get(name, ()))
+        estimates.append(EffectEstimate(name, listed, others, products))
     return tuple(estimates)

@@ -247,7 +247,7 @@ def _intervals(effects: Sequence[EffectEstimate]) -> list[str]:
         if effect.name == LEARNED:
             continue
         listed = []
-        for key, value in effect.parameters.items():
+        for key, value in effect.shown.items():
             unit = "" if value.unit == "-" else f" {value.unit}"
             listed.append(f"{key.replace('_', ' ')} {value.low:.3g} to {value.high:.3g}{unit}")
         texts.append(f"{cause(effect.name)}: {', '.join(listed)} with 95 % confidence")

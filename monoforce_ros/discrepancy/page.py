@@ -155,7 +155,7 @@ def _effects_cards(diagnosis: Diagnosis) -> str:
 def _effects_table(effects: Sequence[EffectEstimate]) -> str:
     rows = []
     for effect in effects:
-        for number, (key, parameter) in enumerate(effect.parameters.items()):
+        for number, (key, parameter) in enumerate(effect.shown.items()):
             name = f"<b>{effect.name}</b><br><small>{html.escape(finding(effect))}</small>" if number == 0 else ""
             others = html.escape(", ".join(effect.indistinguishable)) or "–"
             rows.append(

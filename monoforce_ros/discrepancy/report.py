@@ -26,6 +26,7 @@ def effect_entry(effect: EffectEstimate) -> dict:
     return {
         "name": effect.name,
         "parameters": {key: asdict(parameter) for key, parameter in effect.parameters.items()},
+        "products": {key: asdict(product) for key, product in effect.products.items()},
         "indistinguishable": others,
         "rivals": others,
         "found_again": None if effect.found_again is None else list(effect.found_again),
@@ -127,7 +128,7 @@ def summary_lines(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> list[
     for effect in diagnosis.effects:
         values = ", ".join(
             f"{key} {parameter.value:.3g} {parameter.unit} ({parameter.low:.3g} to {parameter.high:.3g})"
-            for key, parameter in effect.parameters.items()
+            for key, parameter in effect.shown.items()
         )
         others = ", ".join(effect.indistinguishable)
         lines.append(f"  {effect.name}: {values}{f'; indistinguishable from {others}' if others else ''}")

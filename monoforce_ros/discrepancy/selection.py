@@ -251,12 +251,13 @@ class Search:
         )
         return self._fits[key]
 
-    def healthy_variances(self, fit: Fit) -> np.ndarray:
-        """Variance of each parameter of a fit if its effect varies as much as on the healthy robot, ``[P]``."""
+    def healthy_covariance(self, fit: Fit) -> np.ndarray:
+        """Covariance of the parameters of a fit if each effect varies as much as on the healthy robot, ``[P, P]``."""
         fixed = sum(len(values) for _, values in fit.effects[: self.fixed_count(fit.effects)])
-        variances = np.zeros(len(flat(fit.effects)))
+        count = len(flat(fit.effects))
+        covariance = np.zeros((count, count))
         if self.nominal is None or fit.derivatives is None:
-            return variances
+            return covariance
         typical, at = scales(fit.effects), 0
         for name, values in fit.effects:
             place = np.arange(at, at + len(values))
@@ -271,8 +272,8 @@ class Search:
                 / len(values)
                 * np.linalg.inv(squares)
             )
-            variances[place] = np.diag(spread) * typical[place] ** 2
-        return variances
+            covariance[np.ix_(place, place)] = spread * np.outer(typical[place], typical[place])
+        return covariance
 
     def formula_variances(self, fit: Fit) -> np.ndarray:
         """Variance of each parameter of a fit because its effect's formula is not exact, ``[P]``.
@@ -289,7 +290,7 @@ class Search:
         return estimate_effects(
             fit,
             indistinguishable or {},
-            healthy_variances=self.healthy_variances(fit),
+            healthy_covariance=self.healthy_covariance(fit),
             segments=0 if self.nominal is None else self.nominal.segments,
             formula_variances=self.formula_variances(fit),
             confidence=self.thresholds.confidence,

@@ -23,13 +23,29 @@ def finding(estimate: EffectEstimate) -> str:
     described = _FINDINGS.get(estimate.name)
     try:
         if described is not None:
-            return described(values)
+            return described(values) + _determined(estimate)
     except KeyError:
         # An estimate with other parameters than this sentence expects.
         pass
     summary = CATALOGUE[estimate.name].summary if estimate.name in CATALOGUE else estimate.name
     listed = ", ".join(f"{key} {value.value:.3g} {value.unit}" for key, value in estimate.parameters.items())
     return f"{summary.rstrip('.')}: {listed}."
+
+
+def _determined(estimate: EffectEstimate) -> str:
+    """A sentence on products that a recording determines where it does not determine their factors; else empty."""
+    effect = CATALOGUE.get(estimate.name)
+    if effect is None or not estimate.products:
+        return ""
+    known = {parameter.name: parameter for parameter in effect.parameters}
+    told = []
+    for product in effect.products:
+        value, main = estimate.products.get(product.name), estimate.parameters.get(product.factors[0])
+        if value is None or main is None or value.low <= 0.0 <= value.high:
+            continue
+        if main.low <= known[product.factors[0]].neutral <= main.high:
+            told.append(f" Only its {product.meaning} is certain: {value.value:.3g} {value.unit}.")
+    return "".join(told)
 
 
 def remedy(name: str) -> str:

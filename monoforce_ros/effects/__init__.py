@@ -18,7 +18,7 @@ from monoforce_ros.effects.catalogue import (
     turned_effects,
     wheel_effects,
 )
-from monoforce_ros.effects.effect import STAGES, Effect, Fastest, Parameter, WheelResponse, per_trajectory
+from monoforce_ros.effects.effect import STAGES, Effect, Fastest, Parameter, Product, WheelResponse, per_trajectory
 from monoforce_ros.effects.joint_controls import controls
 from monoforce_ros.effects.setup import FEATURE_SIZES, FEATURES, Loads, Setup
 from monoforce_ros.effects.timing import contains, values_from, values_growing
@@ -33,6 +33,7 @@ __all__ = [
     "Fastest",
     "Loads",
     "Parameter",
+    "Product",
     "Setup",
     "WheelResponse",
     "applied_setup",

@@ -40,6 +40,16 @@ class Parameter:
 
 
 @dataclass(frozen=True)
+class Product:
+    """A product of two parameters, which a recording may determine better than either of them."""
+
+    name: str
+    factors: tuple[str, str]
+    unit: str
+    meaning: str
+
+
+@dataclass(frozen=True)
 class Fastest:
     """Fastest commands of a recording."""
 
@@ -107,6 +117,8 @@ class Effect(ABC):
     """Effects that no manoeuvre separates from this one, and the sensor that does."""
     refined: ClassVar[tuple[str, ...]] = ()
     """Parameters that are fitted in addition where a recording shows them beyond chance."""
+    products: ClassVar[tuple[Product, ...]] = ()
+    """Products of parameters that act on the motion by themselves, as a load's moment does."""
     formula_terms: ClassVar[tuple[str, ...]] = ()
     """Terms of ``learned_term`` that are equivalent to this effect."""
     commissioning_start: ClassVar[Mapping[str, float]] = {}
@@ -208,6 +220,7 @@ class Effect(ABC):
         listed = {
             "identified": self.identified, "refined": self.refined,
             "commissioning_start": tuple(self.commissioning_start),
+            **{f"products: {product.name}": product.factors for product in self.products},
         }  # fmt: skip
         for label, keys in listed.items():
             unknown = sorted(set(keys) - set(known))

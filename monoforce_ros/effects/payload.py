@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import torch
 
-from monoforce_ros.effects.effect import Effect, Parameter, Values
+from monoforce_ros.effects.effect import Effect, Parameter, Product, Values
 from monoforce_ros.effects.setup import Setup
 from monoforce_ros.robots import add_point_mass
 
@@ -28,6 +28,11 @@ class Payload(Effect):
     )
     identified = ("mass", "x", "y")
     refined = ("z",)
+    # A heavy load near the middle and a light one far out move the centre of mass alike.
+    products = (
+        Product("moment_x", ("mass", "x"), "kg m", "moment forward of the base frame's origin"),
+        Product("moment_y", ("mass", "y"), "kg m", "moment to the left of the base frame's origin"),
+    )
     manoeuvre = "turns on the spot, and driving up and across a slope"
     separated_by: ClassVar = {
         "turning_scrub": "turns on the spot, and driving across a slope",
