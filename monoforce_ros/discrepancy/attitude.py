@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from monoforce_ros.core import MotionTrack
 
+_UP = np.array([0.0, 0.0, 1.0])
 _MOST = 4000
 """Rotations that a fit takes from a recording at most."""
 _PARTS = 16
@@ -50,7 +51,10 @@ class Lean:
         rows[:, :, 2:] = _heading_rows(some)
         matrix = rows.reshape(-1, 4)
         prior = np.diag([1.0, 1.0, 0.0, 0.0]) * _PRIOR * len(up) + 1e-9 * np.eye(4)
-        solution = np.linalg.solve(matrix.T @ matrix + prior, matrix.T @ up.ravel())
+        normal, right = matrix.T @ matrix, matrix.T @ up.ravel()
+        solution = np.linalg.solve(normal + prior, right)
+        # Iterated Tikhonov regularisation: without the second step the prior keeps its share of a lean that is certain.
+        solution += np.linalg.solve(normal + prior, right - normal @ solution)
         parts = np.array_split(up - rows[:, :, 2:] @ solution[2:], min(_PARTS, len(up)))
         means = np.array([part.mean(axis=0) for part in parts])
         error = means.std(axis=0, ddof=1) / np.sqrt(len(means)) if len(means) > 1 else np.full(2, np.inf)
@@ -59,6 +63,17 @@ class Lean:
     def of_plane(self, rotations: np.ndarray) -> np.ndarray:
         """The plane's part of the lean at each of the rotations ``[..., 3, 3]``, ``[..., 2]``."""
         return _heading_rows(rotations) @ self.plane
+
+    @property
+    def onto_plane(self) -> np.ndarray:
+        """Rotation that makes the plane level, ``[3, 3]``."""
+        normal = np.r_[-self.plane, 1.0]
+        return _shortest(normal / np.linalg.norm(normal), _UP)
+
+    @property
+    def upright(self) -> np.ndarray:
+        """Rotation from a base frame that stands upright to the one that is measured, ``[3, 3]``."""
+        return _shortest(_UP, np.r_[self.own, np.sqrt(max(1.0 - float(self.own @ self.own), 0.0))])
 
 
 def lean_of(motion: MotionTrack) -> Lean:
@@ -94,6 +109,15 @@ def changed_lean(lean: Lean, commissioned: np.ndarray | None) -> str:
 def vertical(rotations: np.ndarray) -> np.ndarray:
     """The vertical in the base frame, forward and left, of rotations ``[..., 3, 3]``: minus pitch, and roll."""
     return rotations[..., 2, :2]
+
+
+def _shortest(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """The smallest rotation ``[3, 3]`` between two unit vectors at an acute angle."""
+    axis = np.cross(start, end)
+    sine = float(np.linalg.norm(axis))
+    if sine < 1e-12:
+        return np.eye(3)
+    return Rotation.from_rotvec(axis / sine * np.arctan2(sine, float(start @ end))).as_matrix()
 
 
 def _heading_rows(rotations: np.ndarray) -> np.ndarray:

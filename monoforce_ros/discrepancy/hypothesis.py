@@ -201,7 +201,7 @@ class _Prepared:
     turned: np.ndarray
     """Measured change of heading, ``[W, K]`` [rad]."""
     leaned: np.ndarray
-    """Measured vertical in the base frame, without the tilt of level ground's plane, ``[W, K, 2]``."""
+    """Measured vertical in the base frame, that of level ground's plane or of the map, ``[W, K, 2]``."""
     risen: np.ndarray
     """Measured change of height above that plane, or on the map, ``[W, K]`` [m]."""
     frames: np.ndarray
@@ -285,6 +285,9 @@ class Predictions:
         data = self.data
         stamps = data.starts[:, None] + np.rint(np.r_[0.0, data.samples] * 1e9).astype(np.int64)
         positions, rotations, linear, angular = sample_motion(motion, stamps)
+        # Level ground is the plane of the recording, whichever way the localisation's z axis points.
+        lean = lean_of(motion) if data.terrain is None else _LEVEL
+        positions, rotations = positions @ lean.onto_plane.T, lean.onto_plane @ rotations
         headings = np.arctan2(rotations[..., 1, 0], rotations[..., 0, 0])
         turn = Rotation.from_euler("z", headings[:, 0, None]).as_matrix()
         moved = np.einsum("wji,wkj->wki", turn, positions[:, 1:] - positions[:, :1])
@@ -293,13 +296,14 @@ class Predictions:
         command_stamps = data.starts[:, None] + np.rint(steps * self.options.time_step * 1e9).astype(np.int64)
         if data.terrain is None:
             # On level ground every window starts at the origin, with the wheels on the ground.
-            lean = lean_of(motion) if data.with_attitude else _LEVEL
-            leaned = vertical(rotations[:, 1:]) - lean.of_plane(rotations[:, 1:])
-            risen = (positions[:, 1:] - positions[:, :1]) @ np.r_[-lean.plane, 1.0]
-            frame_rotation = rotations[:, 0]
+            leaned, risen = vertical(rotations[:, 1:]), moved[..., 2]
+            frame_rotation = measured_rotation = rotations[:, 0]
             if self._moves_flippers:
                 lowest = self._lowest(np.einsum("wij,wnj->wni", frame_rotation, self._posed())[..., 2]).mean(axis=1)
             else:
+                # In truth the robot does not tumble from a tilted sensor's attitude to its own in each window.
+                # Flippers, however, lift it for good.
+                frame_rotation = measured_rotation @ lean.upright
                 lowest = np.einsum("wij,nj->wni", frame_rotation, self._underside())[..., 2].mean(axis=1)
             place = np.stack([0 * lowest, 0 * lowest, -lowest - self._depth], axis=1)
         else:
@@ -308,7 +312,7 @@ class Predictions:
             pose = np.linalg.inv(data.odometry_from_terrain)
             leaned = vertical(pose[:3, :3] @ rotations[:, 1:])
             risen = (positions[:, 1:] - positions[:, :1]) @ pose[2, :3]
-            frame_rotation = pose[:3, :3] @ rotations[:, 0]
+            frame_rotation = measured_rotation = pose[:3, :3] @ rotations[:, 0]
             place = positions[:, 0] @ pose[:3, :3].T + pose[:3, 3]
             place[:, 2] += self._settling(place, frame_rotation)
         heading = np.arctan2(frame_rotation[:, 1, 0], frame_rotation[:, 0, 0])
@@ -331,8 +335,8 @@ class Predictions:
             history=history,
             position=tensor(place),
             rotation=tensor(frame_rotation),
-            velocity=tensor(np.einsum("wij,wj->wi", frame_rotation, linear[:, 0])),
-            angular_velocity=tensor(np.einsum("wij,wj->wi", frame_rotation, angular[:, 0])),
+            velocity=tensor(np.einsum("wij,wj->wi", measured_rotation, linear[:, 0])),
+            angular_velocity=tensor(np.einsum("wij,wj->wi", measured_rotation, angular[:, 0])),
             joint_start=None if measured is None else tensor(measured),
             flippers=None if program is None else tensor(program),
         )
