@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.stats import t as student_distribution
@@ -387,7 +388,7 @@ class Search:
             listed.append(
                 CandidateScore(entry.name, number, float(gain), entry.test.adjusted, judged=trial is not None)
             )
-        kept = [trial for trial in judged if self._pays(best, trial) and self._credible(trial)]
+        kept = [trial for trial in judged if self._adds(best, trial) and self._credible(trial)]
         return sorted(kept, key=lambda trial: trial.loss), listed
 
     def _pays(self, before: Trial, after: Trial) -> bool:
@@ -400,6 +401,16 @@ class Search:
         # Where residuals are far below what counts as healthy, any share of them is nothing.
         least = self.thresholds.smallest_share * max(before.loss, self.healthy_loss)
         return gain > least and (self.commissioned or low > 0)
+
+    def _adds(self, before: Trial, after: Trial) -> bool:
+        """Whether an effect beside others pays, and is more than what makes up for the error of their formulas."""
+        explained = self._loss_without_effects - before.loss
+        gain, _ = self._gain(before, after)
+        return gain > self.thresholds.further_share * explained and self._pays(before, after)
+
+    @cached_property
+    def _loss_without_effects(self) -> float:
+        return float(self.loss_of(()).mean())
 
     def _gain(self, before: Trial, after: Trial) -> tuple[float, float]:
         rate = self.thresholds.comparison_rate
@@ -445,7 +456,7 @@ class Search:
             effect = next(entry for entry in best.effects if entry[0] == name)
             influence = self.directions.influence(base, effect)
             (test,) = self.screening.tested(base, self.fixed_count(base), residual, [influence])
-            if test.p > self.thresholds.further_rate or not self._pays(fewer, best):
+            if test.p > self.thresholds.further_rate or not self._adds(fewer, best):
                 best = fewer
         return best
 
