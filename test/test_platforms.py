@@ -18,7 +18,7 @@ from diagnosis_run import Judged, commission_platform
 from drawn_platform import draw_platform, write_robot_file
 from drive_commands import FollowingDriver, LeadingDriver, ManoeuvreDriver, ReplayedCommands
 from drive_session import DriveJob
-from force_faults import BodyForce, Drag
+from force_faults import BodyForce, Drag, RollingResistance
 from ground_shape import Ground, draw_hills, write_map
 from hidden_effect import KINDS, OUTSIDE, SINGLES, HiddenEffect, draw_effect
 from injection import TICK, BaseState, Injection, Measurement
@@ -118,6 +118,26 @@ def test_command_faults_follow_their_formulas():
     for _ in range(20):
         speeds = lag.drives(0.0, np.ones(2))
     np.testing.assert_allclose(speeds, 1 - np.exp(-1.0))
+
+
+def test_rolling_resistance_brakes_wheels_and_so_turns_on_the_spot_too():
+    wheels = np.array([[0.3, 0.25, -0.1], [0.3, -0.25, -0.1], [-0.3, 0.25, -0.1], [-0.3, -0.25, -0.1]])
+    resistance = RollingResistance(force=10.0, wheels=wheels, centre=np.array([0.0, 0.0, 0.1]))
+
+    def at(speed, rate):
+        return resistance.wrench(
+            1.0, BaseState(np.zeros(3), np.eye(3), np.array([speed, 0.0, 0.0]), np.array([0.0, 0.0, rate]), np.ones(4))
+        )
+
+    force, torque = at(0.5, 0.0)
+    np.testing.assert_allclose(force, [-40.0, 0.0, 0.0], atol=1e-9)
+    # It acts at the ground, 0.2 m below the centre of mass: the nose goes down.
+    np.testing.assert_allclose(torque, [0.0, 8.0, 0.0], atol=1e-9)
+    force, torque = at(0.0, 1.0)
+    np.testing.assert_allclose(force, 0.0, atol=1e-9)
+    np.testing.assert_allclose(torque, [0.0, 0.0, -10.0], atol=1e-9)
+    # In a wide curve all wheels roll forward, and nothing resists the turn.
+    np.testing.assert_allclose(at(0.5, 0.4)[1][2], 0.0, atol=1e-9)
 
 
 def test_every_kind_can_be_injected_and_none_uses_the_packages_effects():

@@ -59,6 +59,29 @@ class Drag(Injection):
 
 
 @dataclass
+class RollingResistance(Injection):
+    """Resistance of the ground to every wheel that rolls over it: in turns on the spot, too, unlike a drag of the body.
+
+    Attributes:
+        force: on each wheel at more than a creep [N], against its velocity along the robot.
+        wheels: where they touch the ground, in the base frame ``[wheels, 3]`` [m].
+        centre: of mass, in the base frame ``[3]`` [m].
+    """
+
+    force: float = 0.0
+    wheels: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    centre: np.ndarray = field(default_factory=lambda: np.zeros(3))
+
+    def wrench(self, time: float, state: BaseState) -> tuple[np.ndarray, np.ndarray]:
+        """The forces on all wheels together."""
+        along = state.velocity[0] - state.rates[2] * self.wheels[:, 1]
+        forces = np.zeros_like(self.wheels)
+        forces[:, 0] = -self.force * sign(along, 0.05)
+        torque = np.cross(self.wheels - self.centre, forces).sum(axis=0)
+        return state.rotation @ forces.sum(axis=0), state.rotation @ torque
+
+
+@dataclass
 class TurnResistance(Injection):
     """A torque against turning, as of tyres that scrub.
 

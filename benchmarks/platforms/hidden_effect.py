@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from command_faults import (
@@ -27,6 +28,7 @@ from force_faults import (
     Drag,
     Furrows,
     GustingWind,
+    RollingResistance,
     SloshingLoad,
     SpeedPull,
     SteeringHunt,
@@ -182,7 +184,16 @@ def _slippery_across(values: Values, platform: Platform) -> Injection:
 
 
 def _soft(values: Values, platform: Platform) -> Injection:
-    return Drag(build=Build(contact_time=4.0), coulomb=values["resistance"] * _weight(platform), linear=0.0)
+    return RollingResistance(build=Build(contact_time=4.0), **_on_wheels(values["resistance"], platform))
+
+
+def _on_wheels(coefficient: float, platform: Platform) -> dict[str, Any]:
+    """Resistance of a share of each wheel's load."""
+    return {
+        "force": coefficient * platform.load,
+        "wheels": platform.wheel_centres - np.array([0.0, 0.0, platform.radius]),
+        "centre": np.array(platform.centre_of_mass),
+    }
 
 
 def _load(values: Values, platform: Platform) -> Injection:
@@ -228,7 +239,7 @@ KINDS: dict[str, Kind] = {
     "friction_scale": Kind((0.1, 0.6), _one("factor"), _friction, ("friction_scale",)),
     "rolling_resistance": Kind(
         (0.1, 0.8), _one("coefficient", lambda p: 0.7 * p.friction),
-        lambda v, p: Drag(coulomb=v["coefficient"] * _weight(p)), _SLOWING, ("coefficient",),
+        lambda v, p: RollingResistance(**_on_wheels(v["coefficient"], p)), _SLOWING, ("coefficient",),
     ),
     "viscous_drag": Kind(
         (0.1, 0.8), _one("coefficient", lambda p: 0.7 * p.friction * _weight(p) / p.maximum_speed),
