@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from command_faults import (
@@ -184,16 +183,14 @@ def _slippery_across(values: Values, platform: Platform) -> Injection:
 
 
 def _soft(values: Values, platform: Platform) -> Injection:
-    return RollingResistance(build=Build(contact_time=4.0), **_on_wheels(values["resistance"], platform))
+    return _resistance(values["resistance"], platform, Build(contact_time=4.0))
 
 
-def _on_wheels(coefficient: float, platform: Platform) -> dict[str, Any]:
-    """Resistance of a share of each wheel's load."""
-    return {
-        "force": coefficient * platform.load,
-        "wheels": platform.wheel_centres - np.array([0.0, 0.0, platform.radius]),
-        "centre": np.array(platform.centre_of_mass),
-    }
+def _resistance(coefficient: float, platform: Platform, build: Build) -> Injection:
+    """A share of each wheel's load resists its rolling."""
+    ground = platform.wheel_centres - np.array([0.0, 0.0, platform.radius])
+    centre = np.array(platform.centre_of_mass)
+    return RollingResistance(build=build, force=coefficient * platform.load, wheels=ground, centre=centre)
 
 
 def _load(values: Values, platform: Platform) -> Injection:
@@ -239,7 +236,7 @@ KINDS: dict[str, Kind] = {
     "friction_scale": Kind((0.1, 0.6), _one("factor"), _friction, ("friction_scale",)),
     "rolling_resistance": Kind(
         (0.1, 0.8), _one("coefficient", lambda p: 0.7 * p.friction),
-        lambda v, p: RollingResistance(**_on_wheels(v["coefficient"], p)), _SLOWING, ("coefficient",),
+        lambda v, p: _resistance(v["coefficient"], p, Build()), _SLOWING, ("coefficient",),
     ),
     "viscous_drag": Kind(
         (0.1, 0.8), _one("coefficient", lambda p: 0.7 * p.friction * _weight(p) / p.maximum_speed),

@@ -44,7 +44,7 @@ class Lean:
     @classmethod
     def of(cls, rotations: np.ndarray) -> Lean:
         """Fit to rotation matrices ``[N, 3, 3]``, odometry ← base."""
-        some = rotations[:: max(1, len(rotations) // _MOST)]
+        some = _some(rotations)
         up = vertical(some)
         rows = np.zeros((len(up), 2, 4))
         rows[:, 0, 0] = rows[:, 1, 1] = 1.0
@@ -78,7 +78,7 @@ class Lean:
 
 def lean_of(motion: MotionTrack) -> Lean:
     """The lean of a motion."""
-    return Lean.of(Rotation.from_quat(motion.quaternions).as_matrix())
+    return Lean.of(Rotation.from_quat(_some(motion.quaternions)).as_matrix())
 
 
 def changed_lean(lean: Lean, commissioned: np.ndarray | None) -> str:
@@ -109,6 +109,11 @@ def changed_lean(lean: Lean, commissioned: np.ndarray | None) -> str:
 def vertical(rotations: np.ndarray) -> np.ndarray:
     """The vertical in the base frame, forward and left, of rotations ``[..., 3, 3]``: minus pitch, and roll."""
     return rotations[..., 2, :2]
+
+
+def _some(rotations: np.ndarray) -> np.ndarray:
+    """Rotations of a recording at equal intervals, as many as a fit takes."""
+    return rotations[:: max(1, len(rotations) // _MOST)]
 
 
 def _shortest(start: np.ndarray, end: np.ndarray) -> np.ndarray:

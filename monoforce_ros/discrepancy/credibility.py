@@ -53,7 +53,7 @@ def complaint(estimate: EffectEstimate, nominal: Mapping[str, float] | None = No
     acting = _acting(estimate, effect)
     products = [product for product in effect.products if product.name in estimate.products]
     held = [_holds_neutral(estimate.parameters[key], known[key]) for key in acting]
-    held += [_holds(estimate.products[product.name], _neutral_product(product, known)) for product in products]
+    held += [estimate.products[product.name].holds(_neutral_product(product, known)) for product in products]
     if all(held):
         key = acting[0]
         value, neutral = estimate.parameters[key], known[key].neutral
@@ -86,11 +86,7 @@ def _reached_bound(value: ParameterEstimate, known: Parameter) -> float | None:
 
 def _holds_neutral(value: ParameterEstimate, known: Parameter) -> bool:
     # Intervals are cut at the bounds of the range, so an infinite neutral value lies in one that reaches the bound.
-    return _holds(value, min(max(known.neutral, known.low), known.high))
-
-
-def _holds(value: ParameterEstimate, neutral: float) -> bool:
-    return value.low <= neutral <= value.high
+    return value.holds(min(max(known.neutral, known.low), known.high))
 
 
 def _neutral_product(product: Product, known: Mapping[str, Parameter]) -> float:

@@ -19,6 +19,10 @@ class ParameterEstimate:
     high: float
     unit: str
 
+    def holds(self, value: float) -> bool:
+        """Whether the interval contains a value."""
+        return self.low <= value <= self.high
+
     def with_half_width(self, half_width: float) -> ParameterEstimate:
         """The same value with a symmetric interval."""
         return replace(self, low=self.value - half_width, high=self.value + half_width)

@@ -287,7 +287,8 @@ class Predictions:
         positions, rotations, linear, angular = sample_motion(motion, stamps)
         # Level ground is the plane of the recording, whichever way the localisation's z axis points.
         lean = lean_of(motion) if data.terrain is None else _LEVEL
-        positions, rotations = positions @ lean.onto_plane.T, lean.onto_plane @ rotations
+        turned_level = lean.onto_plane
+        positions, rotations = positions @ turned_level.T, turned_level @ rotations
         headings = np.arctan2(rotations[..., 1, 0], rotations[..., 0, 0])
         turn = Rotation.from_euler("z", headings[:, 0, None]).as_matrix()
         moved = np.einsum("wji,wkj->wki", turn, positions[:, 1:] - positions[:, :1])

@@ -176,8 +176,7 @@ class Search:
 
     def measured(self) -> Outcome:
         """The effects that another sensor measured, unless the motion contradicts them."""
-        nominal = Trial((), ((),) * FOLDS, self.loss_of(()))
-        start = nominal
+        nominal = start = self._without_effects
         if self.known:
             start = Trial(self.known, (self.known,) * FOLDS, self.loss_of(self.known))
             _, low = self._gain(start, nominal)
@@ -391,7 +390,7 @@ class Search:
         kept = [trial for trial in judged if self._adds(best, trial) and self._credible(trial)]
         return sorted(kept, key=lambda trial: trial.loss), listed
 
-    def _pays(self, before: Trial, after: Trial) -> bool:
+    def _pays(self, before: Trial, after: Trial, *, least: float = 0.0) -> bool:
         """Whether a significant effect predicts held-out blocks better.
 
         Of a robot that was never commissioned the test does not know how much the model's own error does: the gain must
@@ -399,18 +398,17 @@ class Search:
         """
         gain, low = self._gain(before, after)
         # Where residuals are far below what counts as healthy, any share of them is nothing.
-        least = self.thresholds.smallest_share * max(before.loss, self.healthy_loss)
+        least = max(least, self.thresholds.smallest_share * max(before.loss, self.healthy_loss))
         return gain > least and (self.commissioned or low > 0)
 
     def _adds(self, before: Trial, after: Trial) -> bool:
         """Whether an effect beside others pays, and is more than what makes up for the error of their formulas."""
-        explained = self._loss_without_effects - before.loss
-        gain, _ = self._gain(before, after)
-        return gain > self.thresholds.further_share * explained and self._pays(before, after)
+        explained = self._without_effects.loss - before.loss
+        return self._pays(before, after, least=self.thresholds.further_share * explained)
 
     @cached_property
-    def _loss_without_effects(self) -> float:
-        return float(self.loss_of(()).mean())
+    def _without_effects(self) -> Trial:
+        return Trial((), ((),) * FOLDS, self.loss_of(()))
 
     def _gain(self, before: Trial, after: Trial) -> tuple[float, float]:
         rate = self.thresholds.comparison_rate

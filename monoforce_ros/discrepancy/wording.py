@@ -34,18 +34,17 @@ def finding(estimate: EffectEstimate) -> str:
 
 def _determined(estimate: EffectEstimate) -> str:
     """A sentence on products that a recording determines where it does not determine their factors; else empty."""
-    effect = CATALOGUE.get(estimate.name)
-    if effect is None or not estimate.products:
+    if not estimate.products:
         return ""
-    known = {parameter.name: parameter for parameter in effect.parameters}
-    told = []
+    effect, sentences = CATALOGUE[estimate.name], []
+    neutral = {parameter.name: parameter.neutral for parameter in effect.parameters}
     for product in effect.products:
-        value, main = estimate.products.get(product.name), estimate.parameters.get(product.factors[0])
-        if value is None or main is None or value.low <= 0.0 <= value.high:
+        if product.name not in estimate.products:
             continue
-        if main.low <= known[product.factors[0]].neutral <= main.high:
-            told.append(f" Only its {product.meaning} is certain: {value.value:.3g} {value.unit}.")
-    return "".join(told)
+        value, (main, _) = estimate.products[product.name], product.factors
+        if not value.holds(0.0) and estimate.parameters[main].holds(neutral[main]):
+            sentences.append(f" Only its {product.meaning} is certain: {value.value:.3g} {value.unit}.")
+    return "".join(sentences)
 
 
 def remedy(name: str) -> str:
