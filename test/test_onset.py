@@ -64,7 +64,7 @@ def test_a_weak_effect_that_begins_late_is_significant_from_its_onset_on(gain):
     assert not outcome.best.effects and outcome.fit.passed(search.thresholds)
     whole = min(entry.test.adjusted for entry in search.screening.candidates((), 0, "").screened)
     assert whole > rate
-    assert search.onset_p() <= rate if gain < 1.0 else search.onset_p() > rate
+    assert search.part_p() <= rate if gain < 1.0 else search.part_p() > rate
 
 
 def test_wheels_that_confirm_the_file_show_no_change():

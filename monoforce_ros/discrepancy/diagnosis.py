@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from monoforce_ros.discrepancy.areas import Area
 from monoforce_ros.discrepancy.attitude import changed_lean, lean_of
 from monoforce_ros.discrepancy.comparable_windows import comparable_starts, windows_of
 from monoforce_ros.discrepancy.comparison import (
@@ -43,6 +44,7 @@ from monoforce_ros.discrepancy.hypothesis import (
 from monoforce_ros.discrepancy.kinematic_baseline import StepComparison
 from monoforce_ros.discrepancy.nominal import NominalModel, with_known_components
 from monoforce_ros.discrepancy.preflight import advice, complaints
+from monoforce_ros.discrepancy.region import Region
 from monoforce_ros.discrepancy.repetition import prepare_processes, repeat
 from monoforce_ros.discrepancy.selection import Search
 from monoforce_ros.discrepancy.sensor_findings import (
@@ -67,6 +69,8 @@ class Details:
     """Residuals by noise and map, ``[K, C]``."""
     compared: tuple[Comparison, ...]
     paths: tuple[PathComparison, ...]
+    area: Area | None = None
+    """Where the effects act, if only there."""
 
 
 @dataclass(frozen=True)
@@ -151,8 +155,10 @@ def diagnose(
     noisy = noisy_motions(smoothed, settings.seed)
     windows = windows_of(evidence, robot, starts, samples, noisy)
     explanation = explain(evidence, robot, windows, nominal, settings, _Steps(progress, 0.05, 0.6))
-    if explanation.onset is not None:
-        left_out = (*left_out, explanation.onset.remark)
+    part = explanation.part
+    area = part.area if isinstance(part, Region) else None
+    if part is not None:
+        left_out = (*left_out, part.remark)
     aside = None
     if ground_explains(explanation.decision):
         by_sensors = explanation.by_sensors(settings.thresholds)
@@ -240,7 +246,7 @@ def diagnose(
         remarks=decision.remarks,
         losses=decision.losses,
         commissioned=search.commissioned,
-        details=Details(data, before, floor, tuple(compared), paths),
+        details=Details(data, before, floor, tuple(compared), paths, area),
         set_aside=None if aside is None else aside.verdict,
     )
 

@@ -145,6 +145,14 @@ class Directions:
             for entry in influences
         ]
 
+    def within(self, influences: Sequence[Direction], masks: Sequence[np.ndarray]) -> list[Direction]:
+        """The same influences in parts of the recording alone, each a mask of its windows ``[W]``."""
+        return [
+            replace(entry, name=f"{entry.name} in an area", columns=entry.columns * mask[:, None, None])
+            for mask in masks
+            for entry in influences
+        ]
+
     def mean_square(self, base: Effects, fixed: int, metric: np.ndarray | float = 1.0) -> float:
         """Mean square of what effects change in addition to the first ``fixed`` ones, in units of the scale."""
         if len(base) <= fixed:

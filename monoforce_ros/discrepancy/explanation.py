@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 
 from monoforce_ros.discrepancy.gap import residual_scale
 from monoforce_ros.discrepancy.hypothesis import Evidence, EvidenceWindows, Predictions
 from monoforce_ros.discrepancy.nominal import NominalModel
-from monoforce_ros.discrepancy.onset import Onset, find_onset
+from monoforce_ros.discrepancy.onset import find_onset
 from monoforce_ros.discrepancy.preflight import FEWEST_WINDOWS
+from monoforce_ros.discrepancy.region import find_region
 from monoforce_ros.discrepancy.selection import Search
 from monoforce_ros.discrepancy.sensor_findings import SensorFindings, refined_clock
 from monoforce_ros.discrepancy.thresholds import Thresholds
-from monoforce_ros.discrepancy.trial import Outcome, paired
+from monoforce_ros.discrepancy.trial import Outcome, Trial, paired
 from monoforce_ros.discrepancy.verdict import Decision, Findings, decide, leaves_most
 from monoforce_ros.robots import RobotModel
 
@@ -41,6 +43,25 @@ class DiagnosisSettings:
     """Only effects that gyro, wheel speeds or joints measured: of the rest something else may be the cause."""
 
 
+class Part(Protocol):
+    """A part of a recording in which effects act, while the robot is healthy in the rest."""
+
+    @property
+    def acting(self) -> np.ndarray:
+        """Windows in which they act, ``[W]`` bool."""
+        ...
+
+    @property
+    def losses(self) -> np.ndarray:
+        """Of each window, ``[W]``."""
+        ...
+
+    @property
+    def remark(self) -> str:
+        """One sentence for reports."""
+        ...
+
+
 @dataclass(frozen=True)
 class Windows:
     """Windows of a recording with what noise and map leave uncertain in each."""
@@ -58,14 +79,15 @@ class Explanation:
     """The effects that explain a recording, and the search that found them."""
 
     windows: Windows
-    """Those that were searched: after an onset the later ones."""
+    """Those that were searched: of an effect that acts in a part of the recording, these."""
     sensors: SensorFindings
     search: Search
     outcome: Outcome
     findings: Findings
     """From which the decision follows."""
     decision: Decision
-    onset: Onset | None = None
+    part: Part | None = None
+    """The part in which the effects act; None if that is the whole recording."""
 
     def by_sensors(self, thresholds: Thresholds) -> Explanation:
         """What gyro, wheel speeds and joints measured, without the effects that the motion showed in addition."""
@@ -91,8 +113,8 @@ def explain(
         nominal: what commissioning learned; None for a robot that was never commissioned.
         settings: settings of the diagnosis.
         progress: called with each step.
-        repeated: the windows are a part of those that were explained already: they begin after an onset, and what could
-            stand in an effect's place is known.
+        repeated: the windows are a part of those that were explained already: the effects act in all of them, and what
+            could stand in an effect's place is known.
     """
     thresholds = settings.thresholds
     sensors = SensorFindings.of(evidence, robot, commissioned=nominal is not None)
@@ -118,30 +140,26 @@ def explain(
     if settings.sensors_only:
         return _measured(windows, sensors, search, thresholds)
     outcome = search.run(settings.max_effects, exchange=not repeated)
-    onset = None
+    part: Part | None = None
     passed, found = outcome.fit.passed(thresholds), len(outcome.best.effects) > len(search.known)
-    late_only = not repeated and passed and not found and search.onset_p() <= thresholds.effect_rate
-    if not repeated and (late_only or not passed):
+    partly = not repeated and passed and not found and search.part_p() <= thresholds.effect_rate
+    if not repeated and (partly or not passed):
         starts = windows.data.starts
         trials = [outcome.best]
         second = starts >= np.median(starts)
         unexplained = not outcome.best.effects or outcome.fit.explained < thresholds.explained_share
         if unexplained and second.sum() >= FEWEST_WINDOWS:
             # An effect that begins late may be too weak over the whole recording, or another one stand in for it.
-            found_late = searched(windows[second]).run(1, exchange=False, missing=late_only)
+            found_late = searched(windows[second]).run(1, exchange=False, missing=partly)
             trials.append(search.judge(found_late.best.effects))
-        onsets = [found for found in (find_onset(search, trial) for trial in trials) if found is not None]
-        onset = min(onsets, key=lambda found: found.loss, default=None)
-        late = starts >= (starts[0] if onset is None else onset.stamp)
-        after = None
-        if onset is not None and late.sum() >= FEWEST_WINDOWS:
-            later = searched(windows[late])
-            after = later.run(settings.max_effects, missing=late_only)
-        if after is None or (late_only and not after.best.effects):
-            # What a whole recording does not show, and no effect explains from an onset on, is nothing.
-            onset = None
-        else:
-            windows, search, outcome = windows[late], later, after
+        found_part = _part(search, trials)
+        if found_part is not None and found_part.acting.sum() >= FEWEST_WINDOWS:
+            acting = windows[found_part.acting]
+            there = searched(acting)
+            after = there.run(settings.max_effects, missing=partly)
+            # What a whole recording does not show, and no effect explains in a part of it, is nothing.
+            if after.best.effects or not partly:
+                part, windows, search, outcome = found_part, acting, there, after
     findings = _findings(search, outcome)
     doubtful = bool(outcome.best.effects) and not findings.commissioned and leaves_most(findings, thresholds)
     if doubtful or not findings.fit.passed(thresholds):
@@ -156,7 +174,19 @@ def explain(
         findings = replace(findings, formula=learned, formula_gain=gain)
     decision = decide(findings, thresholds)
     decision = replace(decision, losses=replace(decision.losses, variance_ratio=outcome.variance_ratio))
-    return Explanation(windows, sensors, search, outcome, findings, decision, onset)
+    return Explanation(windows, sensors, search, outcome, findings, decision, part)
+
+
+def _part(search: Search, trials: Sequence[Trial]) -> Part | None:
+    """The part of a recording in which effects act: from a time on, or in a region of the ground."""
+    parts: list[Part] = [found for found in (find_onset(search, trial) for trial in trials) if found is not None]
+    best = min(parts, key=lambda part: part.losses.mean(), default=None)
+    region = find_region(search, trials)
+    if best is None or region is None:
+        return region if best is None else best
+    # There are more regions than onsets to choose from: one must predict better beyond chance.
+    _, low = paired(best.losses, region.losses, search.data.starts, search.thresholds.comparison_rate)
+    return region if low > 0 else best
 
 
 def _measured(windows: Windows, sensors: SensorFindings, search: Search, thresholds: Thresholds) -> Explanation:

@@ -23,10 +23,10 @@ class Onset:
     """[ns]."""
     since_start: float
     """Since the first window [s]."""
-    gain: float
-    """Reduction of the mean loss against the same effects over the whole recording."""
-    loss: float
-    """Mean loss of the recording."""
+    losses: np.ndarray
+    """Of each window, ``[W]``."""
+    acting: np.ndarray
+    """Windows after it, ``[W]`` bool."""
 
     @property
     def remark(self) -> str:
@@ -67,4 +67,5 @@ def find_onset(search: Search, trial: Trial) -> Onset | None:
     least = search.thresholds.smallest_share * float(before.mean())
     if low <= 0 or nominal_low <= 0 or min(gain, nominal_gain) < least:
         return None
-    return Onset(int(begin + round(edge * 1e9)), edge, gain, float(combined.mean()))
+    stamp = int(begin + round(edge * 1e9))
+    return Onset(stamp, edge, combined, starts >= stamp)

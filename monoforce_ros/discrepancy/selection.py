@@ -16,6 +16,7 @@ from functools import cached_property
 import numpy as np
 from scipy.stats import t as student_distribution
 
+from monoforce_ros.discrepancy.areas import clusters
 from monoforce_ros.discrepancy.credibility import complaint
 from monoforce_ros.discrepancy.directions import Directions
 from monoforce_ros.discrepancy.estimates import EffectEstimate, effect_sizes
@@ -110,7 +111,7 @@ class Search:
     ):
         self.robot, self.data, self.nominal, self.thresholds = robot, data, nominal, thresholds
         self.scale = np.broadcast_to(scale, (len(data.starts), len(data.samples), len(data.components)))
-        self.known = known
+        self.known, self.seed = known, seed
         self.predictions = Predictions(robot, data)
         self.directions = Directions(self.predictions, self.scale, nominal, thresholds)
         self._progress = progress
@@ -161,16 +162,19 @@ class Search:
             best, fit = refined, self.fit_test(refined, nominal)
         return Outcome(nominal, best, fit, tuple(tried), ratio, indistinguishable)
 
-    def onset_p(self) -> float:
-        """Smallest adjusted p-value of candidates that act always or from some time on, in addition to measured ones.
+    def part_p(self) -> float:
+        """Smallest adjusted p-value of candidates that act always, from some time on or in some area, in addition to
+        measured ones.
 
-        An effect that begins late may be too weak over the whole recording. 1 for a robot that was never commissioned.
+        An effect that acts in a part of a recording may be too weak over the whole. 1 for a robot that was never
+        commissioned.
         """
-        self._progress("testing for effects that begin late")
+        self._progress("testing for effects in parts of the recording")
         influences = self.screening.candidates(self.known, len(self.known), "1: ").influences
         if self.nominal is None or not influences:
             return 1.0
-        directions = [*influences, *self.directions.of_onsets(influences)]
+        masks = [area.inside for area in clusters(self.data)]
+        directions = [*influences, *self.directions.of_onsets(influences), *self.directions.within(influences, masks)]
         tests = self.screening.tested(self.known, len(self.known), self.directions.scaled(self.known), directions)
         return min(test.adjusted for test in tests)
 

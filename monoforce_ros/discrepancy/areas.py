@@ -1,0 +1,114 @@
+"""Areas: parts of the ground in which effects may act, as masks of a recording's windows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.cluster.vq import kmeans2
+
+from monoforce_ros.core import transform_points
+from monoforce_ros.discrepancy.hypothesis import EvidenceWindows, sample_motion
+from monoforce_ros.discrepancy.preflight import FEWEST_WINDOWS
+from monoforce_ros.discrepancy.trial import blocks_of
+
+_FEWEST_BLOCKS = 3
+"""Half blocks within and outside an area: fewer do not show that anything differs."""
+_SHARES = (0.1, 0.2, 0.3, 0.4, 0.5)
+"""Shares of the windows that circles hold."""
+_MOST_CENTRES = 60
+_CLUSTERS = 3
+"""Places that are tested without a scan."""
+_CLASSES = (("the vegetation is taller than", " m", 0.05), ("the map's friction is above", "", 0.1))
+"""Words, unit and least difference of the means of two classes of ground: half a cell of a map [m], and friction on one
+ground."""
+
+
+@dataclass(frozen=True)
+class Area:
+    """A part of the ground."""
+
+    inside: np.ndarray
+    """Windows whose middle lies in it, ``[W]`` bool."""
+    words: str
+    """Where it is, after "where" or "within"."""
+    circle: tuple[float, float, float] | None = None
+    """Centre and radius in the odometry frame [m]; None for a class of ground."""
+
+    @property
+    def visits(self) -> int:
+        """How often the robot came into it."""
+        return int(self.inside[0]) + int((np.diff(self.inside.astype(int)) > 0).sum())
+
+
+def window_places(data: EvidenceWindows) -> np.ndarray:
+    """Position in the odometry frame in the middle of each window, ``[W, 2]`` [m]."""
+    return sample_motion(data.motion, data.starts + round(0.5e9 * data.horizon))[0][:, :2]
+
+
+def ground_classes(data: EvidenceWindows) -> list[Area]:
+    """Windows on either class of ground, where a map tells two apart: by depth of vegetation, and by friction."""
+    if data.terrain is None or data.odometry_from_terrain is None:
+        return []
+    times = data.starts[:, None] + np.rint(np.linspace(0.0, data.horizon, 5) * 1e9).astype(np.int64)
+    positions = sample_motion(data.motion, times)[0]
+    on_map = transform_points(np.linalg.inv(data.odometry_from_terrain), positions.reshape(-1, 3))
+    terrain = data.terrain
+    rows, columns, _ = terrain.grid.cells(on_map[:, :2])
+    found = []
+    for channel, (words, unit, least) in zip(
+        (terrain.geometric_height - terrain.height, terrain.friction), _CLASSES, strict=True
+    ):
+        values = channel.double().numpy()[rows, columns].reshape(times.shape).mean(axis=1)
+        cut, difference = _cut(values)
+        if difference < least:
+            continue
+        size = f"{cut:.2f}{unit}"
+        found += [Area(values > cut, f"where {words} {size}"), Area(values <= cut, f"except where {words} {size}")]
+    return [area for area in found if _large_enough(area, data)]
+
+
+def circles(data: EvidenceWindows) -> list[Area]:
+    """Circles of several sizes about places of the recording."""
+    places = window_places(data)
+    picked = np.unique(np.linspace(0, len(places) - 1, min(len(places), _MOST_CENTRES)).round().astype(int))
+    listed = []
+    for centre in places[picked]:
+        distance = np.linalg.norm(places - centre, axis=1)
+        for radius in np.quantile(distance, _SHARES):
+            listed.append(_circle(distance <= radius, centre, float(radius)))
+    return [area for area in listed if _large_enough(area, data)]
+
+
+def clusters(data: EvidenceWindows) -> list[Area]:
+    """Classes of ground, and a few places that divide the recording: areas to be tested without a scan."""
+    places = window_places(data)
+    _, label = kmeans2(places, _CLUSTERS, minit="++", seed=0)
+    listed = []
+    for number in np.unique(label):
+        centre = places[label == number].mean(axis=0)
+        radius = float(np.linalg.norm(places[label == number] - centre, axis=1).max())
+        listed.append(_circle(label == number, centre, radius))
+    return [*ground_classes(data), *(area for area in listed if _large_enough(area, data))]
+
+
+def _circle(inside: np.ndarray, centre: np.ndarray, radius: float) -> Area:
+    x, y = (float(value) for value in centre)
+    return Area(inside, f"within {radius:.1f} m of ({x:.1f}, {y:.1f}) in the odometry frame", (x, y, radius))
+
+
+def _large_enough(area: Area, data: EvidenceWindows) -> bool:
+    numbers = blocks_of(data.starts)
+    blocks = min(len(np.unique(numbers[mask])) for mask in (area.inside, ~area.inside)) if area.inside.any() else 0
+    return blocks >= _FEWEST_BLOCKS and int(area.inside.sum()) >= FEWEST_WINDOWS
+
+
+def _cut(values: np.ndarray) -> tuple[float, float]:
+    """Value that divides others into two classes of the largest variance between them (Otsu 1979), and the difference
+    of their means."""
+    ordered = np.sort(values)
+    count = np.arange(1, len(ordered))
+    sums = np.cumsum(ordered)
+    low, high = sums[:-1] / count, (sums[-1] - sums[:-1]) / (len(ordered) - count)
+    best = int(np.argmax(count * (len(ordered) - count) * (high - low) ** 2))
+    return float(0.5 * (ordered[best] + ordered[best + 1])), float(high[best] - low[best])

@@ -1,0 +1,167 @@
+"""Region: the part of the ground in which effects act, such as ice or tall grass.
+
+Where a map tells classes of ground apart, these are tried; else circles on the ground. Which of them it is follows from
+a scan (Kulldorff 1997): an effect that acts in a region alone pulls at the residuals there and nowhere else. What the
+best of all areas gains by chance is known from the same scan with block sums of random sign.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from monoforce_ros.discrepancy.areas import Area, circles, ground_classes
+from monoforce_ros.discrepancy.fit import fit_effects, robust_weights
+from monoforce_ros.discrepancy.hypothesis import Effects, Predictions
+from monoforce_ros.discrepancy.selection import Search
+from monoforce_ros.discrepancy.trial import Trial, blocks_of, paired
+
+_TRIED = 3
+"""Effects of the catalogue whose region is sought with fitted values: those that pull most in any area. It only saves
+time."""
+_PROMISING = 0.3
+"""Share of the largest pull below which the others of these are not fitted."""
+
+
+@dataclass(frozen=True)
+class Region:
+    """A recording that is healthy outside an area and has effects within it."""
+
+    area: Area
+    losses: np.ndarray
+    """Of each window, ``[W]``."""
+
+    @property
+    def acting(self) -> np.ndarray:
+        """Windows in which the effects act, ``[W]`` bool."""
+        return self.area.inside
+
+    @property
+    def remark(self) -> str:
+        """One sentence for reports."""
+        count, number = int(self.area.inside.sum()), len(self.area.inside)
+        text = f"it acts {self.area.words} ({count} of {number} windows): what follows describes the robot there"
+        if self.area.visits == 1:
+            text += "; it was there once, so that the time may be the cause and not the place"
+        return text
+
+
+@dataclass(frozen=True)
+class _Pull:
+    """What an effect would change in each window, to first order."""
+
+    score: np.ndarray
+    """``[W]``: the effect's share of the residuals, weighted."""
+    information: np.ndarray
+    """``[W]``."""
+
+    def gains(self, masks: np.ndarray) -> np.ndarray:
+        """Reduction of the loss by the effect in each area ``[A, W]`` alone, ``[A]``."""
+        return (masks @ self.score) ** 2 / np.maximum(masks @ self.information, 1e-12)
+
+    def scan_p(self, masks: np.ndarray, blocks: np.ndarray, draws: int, seed: int) -> float:
+        """p-value of the largest difference between an area and the rest, adjusted for all areas ``[A, W]``.
+
+        Differences are divided by their standard errors from the scores of blocks (White 1980), in the recording and in
+        draws in which the scores that a common value leaves have random signs by block (wild cluster bootstrap).
+        """
+        common = self.score.sum() / max(self.information.sum(), 1e-12)
+        left = self.score - common * self.information
+        member = (blocks[:, None] == np.unique(blocks)).astype(float)
+        signs = np.random.default_rng(seed).choice((-1.0, 1.0), (draws, member.shape[1]))
+        signs = np.concatenate([np.ones((1, member.shape[1])), signs])
+        difference, deviation = 0.0, 0.0
+        for sign, part in ((1.0, masks), (-1.0, 1.0 - masks)):
+            total = np.maximum(part @ self.information, 1e-12)[:, None]
+            sums, shares = (part * left) @ member / total, (part * self.information) @ member / total
+            drawn = signs[:, None] * sums
+            value = drawn.sum(axis=2)
+            difference = difference + sign * value
+            deviation = deviation + sign * (drawn - value[..., None] * shares)
+        statistic = (np.abs(difference) / np.maximum(np.linalg.norm(deviation, axis=2), 1e-12)).max(axis=1)
+        return float((statistic >= statistic[0]).mean())
+
+
+def find_region(search: Search, trials: Sequence[Trial]) -> Region | None:
+    """The part of the ground in which effects act, if that explains a recording better than effects everywhere.
+
+    The effects of ``trials``, and those of the catalogue that pull most in any area, are fitted there. Outside the area
+    the residuals without them count, within it those with them; the smallest loss is taken. It must gain beyond chance
+    over blocks, and the area differ from the rest by more than the best of all areas does by chance.
+
+    Args:
+        search: search on the whole recording.
+        trials: effects that were found on it and on parts of it.
+    """
+    classes = ground_classes(search.data)
+    found = [region for areas in (classes, circles(search.data)) for region in _scanned(search, trials, areas)]
+    rate, best = search.thresholds.comparison_rate, None
+    # A class of ground says why an effect acts where it does: a circle must predict better beyond chance.
+    for region in found:
+        if best is None or paired(best.losses, region.losses, search.data.starts, rate)[1] > 0:
+            best = region
+    return best
+
+
+def _scanned(search: Search, trials: Sequence[Trial], areas: Sequence[Area]) -> list[Region]:
+    """The best region of some areas, if any is better than effects everywhere; one or none."""
+    if not areas:
+        return []
+    masks = np.array([area.inside for area in areas], float)
+    starts, before = search.data.starts, search.loss_of(search.known)
+    tried = []
+    for effects in _candidates(search, trials, masks):
+        chosen, fitted = _located(search, effects, masks)
+        losses = np.where(areas[chosen].inside, search.loss_of(fitted), before)
+        tried.append((float(losses.mean()), chosen, fitted, losses, effects))
+    if not tried:
+        return []
+    _, chosen, fitted, losses, effects = min(tried, key=lambda entry: entry[0])
+    whole = search.loss_of(search.refit(effects).effects)
+    least = search.thresholds.smallest_share * max(float(before.mean()), search.healthy_loss)
+    rate = search.thresholds.comparison_rate
+    gains = [paired(other, losses, starts, rate) for other in (whole, before)]
+    if any(low <= 0 or gain < least for gain, low in gains):
+        return []
+    thresholds = search.thresholds
+    p = _pull(search, fitted).scan_p(masks, blocks_of(starts), thresholds.draws, search.seed)
+    if p > thresholds.effect_rate:
+        return []
+    return [Region(areas[chosen], losses)]
+
+
+def _candidates(search: Search, trials: Sequence[Trial], masks: np.ndarray) -> list[Effects]:
+    """The effects of trials, and those that pull most in any area."""
+    fixed = len(search.known)
+    screened = search.screening.candidates(search.known, fixed, "1: ").screened
+    gains = [(float(_pull(search, entry.effects).gains(masks).max()), entry.effects) for entry in screened]
+    gains = sorted(gains, key=lambda entry: -entry[0])[:_TRIED]
+    listed = [trial.effects for trial in trials if len(trial.effects) > fixed]
+    return [*listed, *(effects for gain, effects in gains if gain > _PROMISING * gains[0][0])]
+
+
+def _pull(search: Search, effects: Effects) -> _Pull:
+    residual = search.directions.scaled(search.known)
+    change = np.nan_to_num(search.directions.scaled(effects) - residual)
+    weights, used = robust_weights(residual), np.nan_to_num(residual)
+    return _Pull(-(weights * change * used).sum(axis=(1, 2)), (weights * change**2).sum(axis=(1, 2)))
+
+
+def _located(search: Search, effects: Effects, masks: np.ndarray) -> tuple[int, Effects]:
+    """The area in which effects act, and their values there."""
+    chosen, fitted = int(np.argmax(_pull(search, effects).gains(masks))), effects
+    before = search.loss_of(search.known)
+    for _ in range(2):
+        inside = masks[chosen] > 0
+        there = Predictions(search.robot, replace(search.data, starts=search.data.starts[inside]))
+        fit = fit_effects(
+            there, [fitted, effects], search.scale[inside], iterations=6, free=search.fixed_count(effects)
+        )
+        fitted = fit.effects
+        better = int(np.argmax(masks @ (before - search.loss_of(fitted))))
+        if better == chosen:
+            break
+        chosen = better
+    return chosen, fitted

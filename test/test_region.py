@@ -1,0 +1,132 @@
+"""Region: an effect that acts on a part of the ground is found and placed; one that acts everywhere is not."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from recorded_rollout import recorded
+
+from monoforce_ros.bags import SmoothedMotion
+from monoforce_ros.core import CommandTrack
+from monoforce_ros.discrepancy.areas import Area, circles, ground_classes, window_places
+from monoforce_ros.discrepancy.explanation import DiagnosisSettings, Windows, explain
+from monoforce_ros.discrepancy.hypothesis import Evidence, EvidenceWindows, window_starts
+from monoforce_ros.discrepancy.nominal import NominalModel
+from monoforce_ros.discrepancy.region import Region, _Pull, find_region
+from monoforce_ros.discrepancy.selection import Search
+from monoforce_ros.discrepancy.verdict import Verdict
+from monoforce_ros.effects import drive_speeds, identifiable_effects
+from monoforce_ros.physics import State, rollout
+from monoforce_ros.robots import load_robot
+from monoforce_ros.terrain import Grid, TerrainMap
+
+SAMPLES = np.array([0.5, 1.0, 1.5, 2.0])
+RESIDUAL = np.tile([0.01, 0.012, 0.007], (4, 1))
+"""About what a commissioned robot of the benchmark leaves on level ground after 2 s [m, m, rad]."""
+CENTRE, RADIUS = np.array([3.2, 3.3]), 3.0
+ICE = (("friction_scale", {"factor": 0.15}),)
+"""Friction of wet ice."""
+
+
+def _drive(effects, seconds=90.0, seed=1) -> EvidenceWindows:
+    """Loops to the left, some of them through a circle in which a Husky has effects."""
+    husky = load_robot("husky")
+    random, steps = np.random.default_rng(seed), round(seconds / 0.01)
+    commanded = np.repeat(random.uniform([0.2, 0.0], [0.9, 0.7], (round(seconds / 1.5), 2)), 150, axis=0)[:steps]
+    speeds = drive_speeds(husky, torch.as_tensor(commanded[None], dtype=torch.float32), 0.01)
+    level, state = TerrainMap.flat(Grid.square(2.0, 1.0)), State.at_rest(0.13)
+    robots = {False: husky, True: replace(husky, effects=effects)}
+    parts = []
+    for first in range(0, steps, 10):
+        inside = bool(np.linalg.norm(state.position[0, :2].numpy() - CENTRE) < RADIUS)
+        result = rollout(level, robots[inside], speeds[:, first : first + 10], state, with_forces=False)
+        states = (result.position, result.rotation, result.velocity, result.angular_velocity)
+        parts.append([values[:, bool(first) :] for values in states])
+        state = State(*(values[:, -1] for values in states))
+    names = ("position", "rotation", "velocity", "angular_velocity")
+    whole = {name: torch.cat([part[i] for part in parts], dim=1) for i, name in enumerate(names)}
+    motion = recorded(SimpleNamespace(**whole))
+    commands = CommandTrack(np.arange(steps, dtype=np.int64) * 10_000_000, commanded)
+    return EvidenceWindows(motion, commands, window_starts(motion, [slice(0, len(motion))], 2.0, 1.0), 2.0, SAMPLES)
+
+
+@pytest.fixture(scope="module")
+def icy() -> EvidenceWindows:
+    return _drive(ICE)
+
+
+def _healthy() -> NominalModel:
+    """A robot whose healthy residuals are some centimetres."""
+    names = [effect.name for effect in identifiable_effects(load_robot("husky"))]
+    return NominalModel(RESIDUAL, dict.fromkeys(names, 0.25), segments=5, loss=0.3, loss_spread=0.2)
+
+
+def test_ice_that_a_whole_drive_does_not_show_is_found_where_it_is(icy):
+    smoothed = SmoothedMotion(icy.motion, 0.0, 0.0, (slice(0, len(icy.motion)),))
+    evidence = Evidence(smoothed, icy.commands)
+    windows = Windows(icy, np.zeros((len(icy.starts), 4, 3)))
+    found = explain(evidence, load_robot("husky"), windows, _healthy(), DiagnosisSettings(max_effects=1))
+    assert found.decision.verdict == Verdict.EFFECT_FOUND
+    assert isinstance(found.part, Region)
+    ((name, values),) = found.decision.trial.effects
+    assert name == "friction_scale" and values["factor"] == pytest.approx(0.15, abs=0.05)
+    truly = np.linalg.norm(window_places(icy) - CENTRE, axis=1) < RADIUS
+    # Windows of 2 s at the edge are partly on the ice.
+    assert (found.part.acting == truly).mean() > 0.9
+    assert "within" in found.part.remark and "was there once" not in found.part.remark
+    assert len(found.windows.data.starts) == found.part.acting.sum()
+
+
+def test_an_effect_that_acts_everywhere_has_no_region():
+    data = _drive((), seconds=60.0)
+    slower = replace(load_robot("husky"), effects=(("drive_gain", {"gain": 0.9}),))
+    search = Search(slower, data, RESIDUAL, nominal=_healthy())
+    trial = search.judge((("drive_gain", {"gain": 1.0}),))
+    assert search.loss_of(()).mean() > 1.0 and trial.loss < 0.1
+    assert find_region(search, [trial]) is None
+    # With effects that are wrong everywhere, those that pull most are found to do so everywhere, too.
+    wrong = search.judge((("sensor_yaw_offset", {"angle": 0.01}),))
+    assert find_region(search, [wrong]) is None
+
+
+def test_classes_of_ground_follow_from_the_map(icy):
+    grid = Grid.square(40.0, 0.2)
+    level = TerrainMap.flat(grid)
+    tall = torch.from_numpy(np.broadcast_to(grid.x[None] > 3.0, level.height.shape).copy())
+    grown = replace(level, geometric_height=level.height + 0.4 * tall)
+    known = replace(icy, terrain=grown, odometry_from_terrain=np.eye(4))
+    taller, except_there = ground_classes(known)
+    places = window_places(icy)
+    assert (taller.inside == (places[:, 0] > 3.0)).mean() > 0.9
+    assert (except_there.inside == ~taller.inside).all()
+    assert taller.words.startswith("where the vegetation is taller than 0.")
+    # Ground of one class has none, and level ground without a map has none either.
+    assert ground_classes(replace(known, terrain=level)) == [] and ground_classes(icy) == []
+
+
+def test_circles_hold_enough_windows_on_both_sides(icy):
+    listed = circles(icy)
+    assert len(listed) > 50
+    assert all(12 <= area.inside.sum() <= len(icy.starts) - 12 for area in listed)
+    inside = np.array([False, True, True, False, True])
+    assert Area(inside, "").visits == 2 and Area(~inside, "").visits == 2
+
+
+def test_the_scan_is_adjusted_for_all_areas():
+    random, p = np.random.default_rng(0), []
+    for _ in range(100):
+        angle = 0.25 * np.arange(80) + random.uniform(0.0, 6.0)
+        places = np.column_stack([3 * np.cos(angle), 3 * np.sin(angle)]) + random.normal(0.0, 0.5, (80, 2))
+        distance = np.linalg.norm(places[:, None] - places, axis=2)
+        masks = np.concatenate([distance <= np.quantile(distance, share, axis=1)[:, None] for share in (0.2, 0.4)])
+        information = random.gamma(2.0, 1.0, 80)
+        score = random.standard_t(4, 80) * np.sqrt(information) + 0.5 * information
+        pull = _Pull(score, information)
+        p.append(pull.scan_p(masks.astype(float), np.arange(80) // 4, 200, 1))
+        alone = masks[20] * information
+        if len(p) <= 20:
+            assert _Pull(score + 3.0 * alone, information).scan_p(masks * 1.0, np.arange(80) // 4, 200, 1) < p[-1] + 0.2
+    # A scan without an adjustment calls four of five such drives different somewhere.
+    assert np.mean(np.array(p) <= 0.05) <= 0.12
