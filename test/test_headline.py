@@ -50,6 +50,17 @@ def test_an_explained_error_is_good_and_what_is_left_is_said_first():
     assert lines[0].startswith("effect_found: ") and "Unexplained" in lines[1]
 
 
+def test_a_part_of_the_recording_is_said_beside_what_acts_there():
+    there = "It acts within 2.5 m of (7.3, 3.3) in the odometry frame (26 of 86 windows)."
+    found = diagnosed((0.5, 0.06), (8.0, 1.0), part=there)
+    top = headline(found)
+    assert top.findings == ("The drives react 0.30 s late to every command.", there)
+    assert any("only for" in action for action in top.actions)
+    assert there in "\n".join(summary_lines(found)) and there in diagnosis_page(found, {}, None)
+    assert report_content(found, {}, None)["part"] == there
+    assert report_content(diagnosed((0.5, 0.06), (8.0, 1.0)), {}, None)["part"] is None
+
+
 @pytest.mark.parametrize(
     ("position", "heading", "sentence"),
     [

@@ -19,26 +19,60 @@ _SHARES = (0.1, 0.2, 0.3, 0.4, 0.5)
 _MOST_CENTRES = 60
 _CLUSTERS = 3
 """Places that are tested without a scan."""
-_CLASSES = (("the vegetation is taller than", " m", 0.05), ("the map's friction is above", "", 0.1))
-"""Words, unit and least difference of the means of two classes of ground: half a cell of a map [m], and friction on one
-ground."""
+
+
+@dataclass(frozen=True)
+class GroundClass:
+    """Ground on which a channel of the map is above a value, or not."""
+
+    channel: str
+    """``vegetation`` or ``friction``."""
+    cut: float
+    above: bool
+
+    @property
+    def words(self) -> str:
+        """Such as "where the vegetation is taller than 0.20 m"."""
+        words, unit, _ = _CHANNELS[self.channel]
+        return f"{'where' if self.above else 'except where'} {words} {self.cut:.2f}{unit}"
+
+
+_CHANNELS = {
+    "vegetation": ("the vegetation is taller than", " m", 0.05),
+    "friction": ("the map's friction is above", "", 0.1),
+}
+"""Words, unit and least difference of the means of two classes: half a cell of a map [m]; friction on one ground."""
 
 
 @dataclass(frozen=True)
 class Area:
-    """A part of the ground."""
+    """A part of the ground: a circle or a class of ground."""
 
     inside: np.ndarray
-    """Windows whose middle lies in it, ``[W]`` bool."""
-    words: str
-    """Where it is, after "where" or "within"."""
+    """Windows of the recording that lie in it, ``[W]`` bool."""
     circle: tuple[float, float, float] | None = None
-    """Centre and radius in the odometry frame [m]; None for a class of ground."""
+    """Centre and radius in the odometry frame [m]."""
+    ground: GroundClass | None = None
+
+    @property
+    def words(self) -> str:
+        """Where it is, after "it acts"."""
+        if self.ground is not None:
+            return self.ground.words
+        x, y, radius = self.circle or (0.0, 0.0, 0.0)
+        return f"within {radius:.1f} m of ({x:.1f}, {y:.1f}) in the odometry frame"
 
     @property
     def visits(self) -> int:
         """How often the robot came into it."""
         return int(self.inside[0]) + int((np.diff(self.inside.astype(int)) > 0).sum())
+
+    def contains(self, data: EvidenceWindows) -> np.ndarray:
+        """Windows of any length that lie in it, by their middle or by their mean ground, ``[W]`` bool."""
+        if self.ground is not None:
+            return (_along(data, self.ground.channel) > self.ground.cut) == self.ground.above
+        x, y, radius = self.circle or (0.0, 0.0, 0.0)
+        return np.linalg.norm(window_places(data) - np.array([x, y]), axis=1) <= radius
 
 
 def window_places(data: EvidenceWindows) -> np.ndarray:
@@ -48,24 +82,28 @@ def window_places(data: EvidenceWindows) -> np.ndarray:
 
 def ground_classes(data: EvidenceWindows) -> list[Area]:
     """Windows on either class of ground, where a map tells two apart: by depth of vegetation, and by friction."""
-    if data.terrain is None or data.odometry_from_terrain is None:
+    if data.terrain is None:
         return []
+    found = []
+    for channel, (_, _, least) in _CHANNELS.items():
+        values = _along(data, channel)
+        cut, difference = _cut(values)
+        if difference >= least:
+            found += [Area((values > cut) == above, ground=GroundClass(channel, cut, above)) for above in (True, False)]
+    return [area for area in found if _large_enough(area, data)]
+
+
+def _along(data: EvidenceWindows, channel: str) -> np.ndarray:
+    """Mean of a channel of the map along the path of each window, ``[W]``."""
+    if data.terrain is None or data.odometry_from_terrain is None:
+        raise ValueError("classes of ground: got no terrain map, expected one with its pose in the odometry frame")
     times = data.starts[:, None] + np.rint(np.linspace(0.0, data.horizon, 5) * 1e9).astype(np.int64)
-    positions = sample_motion(data.motion, times)[0]
-    on_map = transform_points(np.linalg.inv(data.odometry_from_terrain), positions.reshape(-1, 3))
+    positions = sample_motion(data.motion, times)[0].reshape(-1, 3)
+    on_map = transform_points(np.linalg.inv(data.odometry_from_terrain), positions)
     terrain = data.terrain
     rows, columns, _ = terrain.grid.cells(on_map[:, :2])
-    found = []
-    for channel, (words, unit, least) in zip(
-        (terrain.geometric_height - terrain.height, terrain.friction), _CLASSES, strict=True
-    ):
-        values = channel.double().numpy()[rows, columns].reshape(times.shape).mean(axis=1)
-        cut, difference = _cut(values)
-        if difference < least:
-            continue
-        size = f"{cut:.2f}{unit}"
-        found += [Area(values > cut, f"where {words} {size}"), Area(values <= cut, f"except where {words} {size}")]
-    return [area for area in found if _large_enough(area, data)]
+    values = terrain.friction if channel == "friction" else terrain.geometric_height - terrain.height
+    return values.double().numpy()[rows, columns].reshape(times.shape).mean(axis=1)
 
 
 def circles(data: EvidenceWindows) -> list[Area]:
@@ -76,7 +114,7 @@ def circles(data: EvidenceWindows) -> list[Area]:
     for centre in places[picked]:
         distance = np.linalg.norm(places - centre, axis=1)
         for radius in np.quantile(distance, _SHARES):
-            listed.append(_circle(distance <= radius, centre, float(radius)))
+            listed.append(_circle(places, centre, float(radius)))
     return [area for area in listed if _large_enough(area, data)]
 
 
@@ -87,14 +125,14 @@ def clusters(data: EvidenceWindows) -> list[Area]:
     listed = []
     for number in np.unique(label):
         centre = places[label == number].mean(axis=0)
-        radius = float(np.linalg.norm(places[label == number] - centre, axis=1).max())
-        listed.append(_circle(label == number, centre, radius))
+        radius = float(np.quantile(np.linalg.norm(places[label == number] - centre, axis=1), 0.9))
+        listed.append(_circle(places, centre, radius))
     return [*ground_classes(data), *(area for area in listed if _large_enough(area, data))]
 
 
-def _circle(inside: np.ndarray, centre: np.ndarray, radius: float) -> Area:
-    x, y = (float(value) for value in centre)
-    return Area(inside, f"within {radius:.1f} m of ({x:.1f}, {y:.1f}) in the odometry frame", (x, y, radius))
+def _circle(places: np.ndarray, centre: np.ndarray, radius: float) -> Area:
+    inside = np.linalg.norm(places - centre, axis=1) <= radius
+    return Area(inside, circle=(float(centre[0]), float(centre[1]), radius))
 
 
 def _large_enough(area: Area, data: EvidenceWindows) -> bool:

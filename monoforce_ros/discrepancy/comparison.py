@@ -6,7 +6,7 @@ for that, with parameters fitted to the other fold.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -135,6 +135,7 @@ def compare(
     smoothed: SmoothedMotion,
     held_out: HeldOut | None,
     noisy: Sequence[MotionTrack],
+    acting_in: Callable[[EvidenceWindows], np.ndarray] | None = None,
 ) -> list[Comparison]:
     """Residuals at 1, 2 and 5 s without and with the identified effects.
 
@@ -144,15 +145,18 @@ def compare(
         smoothed: the recording's motion and noise.
         held_out: the effects that predict each window, or None.
         noisy: the motion with other noise, from :func:`noisy_motions`.
+        acting_in: mask of those windows in which the effects act, ``[W]``; None for all.
     """
     results = []
     for horizon in HORIZONS:
         starts = window_starts(data.motion, smoothed.stretches, horizon, 1.0)
         if held_out is not None:
             starts = held_out.judged(starts, horizon)
-        if len(starts) < 6:
-            continue
         windows = replace(data, starts=starts, horizon=horizon, samples=np.array([horizon]))
+        if acting_in is not None and len(starts):
+            windows = replace(windows, starts=starts[acting_in(windows)])
+        if len(windows.starts) < 6:
+            continue
         floor = noise_residuals(data.motion, noisy, windows)
         predictions = Predictions(robot, windows)
         before = predictions.residuals([()])[0][:, 0]

@@ -103,6 +103,8 @@ class Diagnosis:
     details: Details | None = None
     steps: StepComparison | None = None
     """Errors after steps of the command beside those of a kinematic fit."""
+    part: str = ""
+    """The part of the recording in which alone the effects act, in words; empty if they act in all of it."""
     set_aside: Verdict | None = None
     """Verdict on all effects where only those that sensors measured are kept, since the ground may be the cause of the
     rest, which is listed in ``known_parts``; None where nothing was set aside."""
@@ -157,8 +159,6 @@ def diagnose(
     explanation = explain(evidence, robot, windows, nominal, settings, _Steps(progress, 0.05, 0.6))
     part = explanation.part
     area = part.area if isinstance(part, Region) else None
-    if part is not None:
-        left_out = (*left_out, part.remark)
     aside = None
     if ground_explains(explanation.decision):
         by_sensors = explanation.by_sensors(settings.thresholds)
@@ -174,21 +174,24 @@ def diagnose(
     def held_out(decision: Decision) -> HeldOut | None:
         return None if decision.trial is None else HeldOut(decision.trial.parts, int(data.starts[0]))
 
+    def compared_with(judged: HeldOut | None) -> list[Comparison]:
+        return compare(robot, data, smoothed, judged, noisy, None if part is None else part.acting_in)
+
     # Whether an effect is added follows from the folds on which it was selected. How much it helps does not.
     judged = held_out(decision)
-    compared = compare(robot, data, smoothed, judged, noisy)
+    compared = compared_with(judged)
     if judged is not None and not improves(gap_table(compared, settings.seed)):
         decision = decision.without_improvement()
         judged = held_out(decision)
         # Without the rejected effects; the same windows, where nothing is left.
-        compared = _without_effects(compared) if judged is None else compare(robot, data, smoothed, judged, noisy)
+        compared = _without_effects(compared) if judged is None else compared_with(judged)
     repetition = None
     if decision.trial is not None:
         repetition = repeat(evidence, robot, explanation.windows, nominal, settings, _Steps(progress, 0.62, 0.95))
         if repetition is not None:
             decision = repetition.confirmed(explanation, decision, settings.thresholds)
             judged = None if decision.trial is None else repetition.held_out
-            compared = compare(robot, data, smoothed, judged, noisy)
+            compared = compared_with(judged)
     gap = gap_table(compared, settings.seed)
     if judged is not None and gets_worse(gap):
         # Searches that never saw the judged windows contradict what was found.
@@ -247,6 +250,7 @@ def diagnose(
         losses=decision.losses,
         commissioned=search.commissioned,
         details=Details(data, before, floor, tuple(compared), paths, area),
+        part="" if part is None or decision.verdict in _NOTHING_ADDED else part.remark,
         set_aside=None if aside is None else aside.verdict,
     )
 

@@ -51,6 +51,10 @@ class Part(Protocol):
         """Windows in which they act, ``[W]`` bool."""
         ...
 
+    def acting_in(self, data: EvidenceWindows) -> np.ndarray:
+        """Windows of any length in which they act, ``[W]`` bool."""
+        ...
+
     @property
     def losses(self) -> np.ndarray:
         """Of each window, ``[W]``."""
@@ -58,7 +62,7 @@ class Part(Protocol):
 
     @property
     def remark(self) -> str:
-        """One sentence for reports."""
+        """When or where, in words."""
         ...
 
 

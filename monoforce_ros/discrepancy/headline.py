@@ -164,6 +164,10 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
             f"The {entry.axis} shows most in this regime: {entry.regime} ({100 * entry.share_of_error:.0f} % of it)."
             for entry in diagnosis.localisation[:2]
         )
+    if diagnosis.part:
+        findings += (diagnosis.part,)
+        if effects:
+            actions.append("use the robot's new file only for what is like this part of the recording")
     helps = bool(effects) and not grew and not refused and any(row.share > 0 for row in rows)
 
     def result(tone: Tone, sentence: str) -> Headline:

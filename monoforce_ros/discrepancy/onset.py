@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from monoforce_ros.discrepancy.fit import fit_effects, robust
-from monoforce_ros.discrepancy.hypothesis import Predictions
+from monoforce_ros.discrepancy.hypothesis import EvidenceWindows, Predictions
 from monoforce_ros.discrepancy.selection import Search
 from monoforce_ros.discrepancy.trial import BLOCK, Trial, paired
 
@@ -28,10 +28,14 @@ class Onset:
     acting: np.ndarray
     """Windows after it, ``[W]`` bool."""
 
+    def acting_in(self, data: EvidenceWindows) -> np.ndarray:
+        """Windows of any length in which the effects act, ``[W]`` bool."""
+        return data.starts >= self.stamp
+
     @property
     def remark(self) -> str:
-        """One sentence for reports."""
-        return f"it begins {self.since_start:.0f} s after the start: what follows describes the time after that"
+        """When, in words."""
+        return f"It begins {self.since_start:.0f} s after the start; these figures are of the time after that."
 
 
 def find_onset(search: Search, trial: Trial) -> Onset | None:

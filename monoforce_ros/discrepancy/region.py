@@ -14,7 +14,7 @@ import numpy as np
 
 from monoforce_ros.discrepancy.areas import Area, circles, ground_classes
 from monoforce_ros.discrepancy.fit import fit_effects, robust_weights
-from monoforce_ros.discrepancy.hypothesis import Effects, Predictions
+from monoforce_ros.discrepancy.hypothesis import Effects, EvidenceWindows, Predictions
 from monoforce_ros.discrepancy.selection import Search
 from monoforce_ros.discrepancy.trial import Trial, blocks_of, paired
 
@@ -38,13 +38,17 @@ class Region:
         """Windows in which the effects act, ``[W]`` bool."""
         return self.area.inside
 
+    def acting_in(self, data: EvidenceWindows) -> np.ndarray:
+        """Windows of any length in which the effects act, ``[W]`` bool."""
+        return self.area.contains(data)
+
     @property
     def remark(self) -> str:
-        """One sentence for reports."""
+        """Where, in words."""
         count, number = int(self.area.inside.sum()), len(self.area.inside)
-        text = f"it acts {self.area.words} ({count} of {number} windows): what follows describes the robot there"
+        text = f"It acts {self.area.words} ({count} of {number} windows); these figures are of the robot there."
         if self.area.visits == 1:
-            text += "; it was there once, so that the time may be the cause and not the place"
+            text += " The robot was there once: the time may be the cause, not the place."
         return text
 
 

@@ -8,6 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from monoforce_ros.core import write_text
+from monoforce_ros.discrepancy.areas import Area
 from monoforce_ros.discrepancy.comparison import GapRow
 from monoforce_ros.discrepancy.diagnosis import Diagnosis
 from monoforce_ros.discrepancy.estimates import EffectEstimate
@@ -50,6 +51,8 @@ def report_content(
         "robot_file": None if robot_file is None else str(robot_file),
         "inputs": dict(inputs),
         "advice": list(diagnosis.advice),
+        "part": diagnosis.part or None,
+        "area": None if diagnosis.details is None else _area_entry(diagnosis.details.area),
         "candidates": [asdict(candidate) for candidate in diagnosis.candidates],
         "regimes": [asdict(row) for row in diagnosis.regimes],
         "remarks": list(diagnosis.remarks),
@@ -57,6 +60,16 @@ def report_content(
         "steps": None if diagnosis.steps is None else asdict(diagnosis.steps),
         "held_out": {name: _gap_entries(table) for name, table in diagnosis.held_out.items()},
     }
+
+
+def _area_entry(area: Area | None) -> dict | None:
+    """Where the effects act alone: a circle in the odometry frame, or a class of ground."""
+    if area is None:
+        return None
+    if area.ground is not None:
+        return {"ground": asdict(area.ground)}
+    x, y, radius = area.circle or (0.0, 0.0, 0.0)
+    return {"circle": {"x": x, "y": y, "radius": radius, "unit": "m"}}
 
 
 def _localisation_entry(entry: Localisation) -> dict:
