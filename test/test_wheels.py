@@ -77,6 +77,18 @@ def test_effects_of_the_drives_are_recovered_from_wheel_speeds(husky, effects):
             assert 0.0 < half_widths[key] < 0.1 * max(1.0, injected)
 
 
+@pytest.mark.parametrize("gain", [0.9, 1.2])
+def test_drives_that_multiply_every_command_are_not_called_slow_or_limited(husky, gain):
+    commands = drawn_commands(90.0, 5)
+    lag = ("actuator_lag", {"time_constant": 0.15})
+    found = compare_with_wheels(commands, wheels_of(commands, husky, (("drive_gain", {"gain": gain}), lag)), husky)
+    assert [name for name, _ in found.effects] == ["actuator_lag"]
+    assert dict(found.effects)["actuator_lag"]["time_constant"] == pytest.approx(0.15, abs=0.02)
+    assert found.gain == pytest.approx(gain, abs=0.02) and f"at {found.gain:.2f} times" in found.summary()
+    plain = compare_with_wheels(commands, wheels_of(commands, husky, (lag,)), husky)
+    assert plain.gain == 1.0 and "times" not in plain.summary()
+
+
 def test_a_dead_time_is_found_though_it_is_a_small_share_of_the_error():
     """A fast robot with noisy wheel speeds and rare steps: the dead time removes less than 8 % of the squared error."""
     warthog, delays = load_robot("warthog"), []

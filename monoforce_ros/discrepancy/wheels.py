@@ -37,6 +37,9 @@ _LARGEST_MODEL = 5
 """Largest number of effects in a wheel model: dead time, three limits of the twist and a lag."""
 _EVALUATIONS = 8
 """Of a fit: it starts from the values of a similar model."""
+_GAIN = "drive_gain"
+_SAME_RATIO = 0.02
+"""Relative difference of the measured speed ratio from the known radius' within which they are one: a worn tyre's."""
 _FURTHER = 0.01
 """Share of the error that a further effect must remove for the search to go on."""
 
@@ -59,12 +62,17 @@ class WheelFinding:
     """Blocks of the recording that were used."""
     all_blocks: int = 0
     """Blocks of the recording in which the robot was driven by commands."""
+    gain: float = 1.0
+    """Speed of the wheels' rims over the commanded one, where that is not 1: the drives multiply every command, or the
+    wheels have another radius than the robot's file says."""
     ruled_out: tuple[str, ...] = ()
     """Further effects whose confidence interval holds no value that would count."""
 
     def summary(self) -> str:
         """One sentence for reports."""
         parts = [_response(name).wording.format(*values.values()) for name, values in self.effects]
+        if self.gain != 1.0:
+            parts.append(f"at {self.gain:.2f} times their speed")
         text = "the measured wheel speeds follow the commands " + ", ".join(parts or ["without delay or limit"])
         if self.used_blocks < self.all_blocks:
             text += f" ({self.used_blocks} of {self.all_blocks} blocks of {_BLOCK:g} s, spread over the recording)"
@@ -86,14 +94,10 @@ def compare_with_wheels(commands: CommandTrack, wheels: WheelTrack | None, robot
     chosen = found.spread(_MOST_BLOCKS)
     blocks = found[chosen]
     ratio = blocks.ratio()
-    if ratio is not None and robot.wheel_radius is not None and 0.4 < ratio * robot.wheel_radius < 2.5:
-        # Use the known radius if the ratio is plausible, so that a drive that is too slow appears as an error.
-        ratio = 1.0 / robot.wheel_radius
     if len(blocks) < 2 or ratio is None:
         return None
-    blocks = replace(blocks, measured=blocks.measured / ratio)
-    selection = _Selection(blocks)
-    best = selection.run()
+    selection, ratio, gain = _selected(blocks, ratio)
+    best, blocks = selection.run(), selection.blocks
     weak = _weak(best, blocks)
     if weak:
         # Too small to matter: fitted again without them.
@@ -117,10 +121,31 @@ def compare_with_wheels(commands: CommandTrack, wheels: WheelTrack | None, robot
         float(np.sqrt(baseline.loss / count)),
         float(np.sqrt(best.loss / count)),
         ratio,
+        gain=gain,
         used_blocks=len(blocks),
         all_blocks=len(found),
         ruled_out=tuple(_ruled_out(best.names, values, blocks)),
     )
+
+
+def _selected(blocks: _Blocks, measured: float) -> tuple[_Selection, float, float]:
+    """The selection on wheel speeds as speeds of the wheels' rims, with the ratio of the two and the gain.
+
+    The known radius is used if the measured ratio is plausible, so that a drive that is too slow appears as an error,
+    unless the wheels follow another ratio better beyond chance: drives that multiply every command have no limit or
+    delay that would explain it. Effects that are too similar to a gain are not combined with one.
+    """
+    radius = blocks.robot.wheel_radius
+    free = _Selection(replace(blocks, measured=blocks.measured / measured))
+    if radius is None or not 0.4 < measured * radius < 2.5:
+        return free, measured, 1.0
+    known, gain = _Selection(replace(blocks, measured=blocks.measured * radius)), measured * radius
+    if abs(gain - 1.0) > _SAME_RATIO:
+        other = free.run()
+        alike = any(_GAIN in _response(name).excludes for name in other.names)
+        if not alike and _better(known.run(), replace(other, losses=other.losses * gain**2), 1):
+            return free, measured, gain
+    return known, 1.0 / radius, 1.0
 
 
 def changed_drives(wheels: WheelFinding, robot: RobotModel) -> tuple[Effects, tuple[str, ...]]:
@@ -281,7 +306,7 @@ class _Selection:
     """Selection of the effects that measured wheel speeds show."""
 
     def __init__(self, blocks: _Blocks):
-        self._blocks = blocks
+        self.blocks = blocks
         self._fold = np.arange(len(blocks)) % 2
         self._parts = [blocks[self._fold == number] for number in (0, 1)]
         self._known: dict[tuple[str, ...], _Model] = {}
@@ -313,12 +338,12 @@ class _Selection:
     def scored(self, names: tuple[str, ...], start: _Model | None) -> _Model:
         """A model fitted to each fold and judged on the other, from the values of a similar one."""
         if names not in self._known:
-            losses, values = np.zeros(len(self._blocks)), []
-            starts = _starts(names, self._blocks.fastest, start)
+            losses, values = np.zeros(len(self.blocks)), []
+            starts = _starts(names, self.blocks.fastest, start)
             for held_out in (0, 1):
                 fit = _fit(names, self._parts[1 - held_out], starts)
                 values.append(fit)
-                judged = _block_losses(fit, names, self._parts[held_out], self._blocks.fastest.speed)
+                judged = _block_losses(fit, names, self._parts[held_out], self.blocks.fastest.speed)
                 losses[self._fold == held_out] = judged
             self._known[names] = _Model(names, np.mean(values, axis=0), losses)
         return self._known[names]

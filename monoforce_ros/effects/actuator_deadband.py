@@ -31,7 +31,7 @@ class ActuatorDeadband(Effect):
         bounds=lambda fastest: (0.0, 0.6 * fastest.speed),
         counts=lambda value, fastest: value >= 0.02,
         wording="slower by {:.2f} m/s",
-        excludes=("actuator_saturation",),
+        excludes=("actuator_saturation", "drive_gain"),
     )
 
     def drive_speeds(self, speeds: Tensor, values: Values, time_step: float, offsets: Tensor) -> Tensor:

@@ -33,7 +33,7 @@ class ActuatorSaturation(Effect):
         # A limit just below the fastest command, or above it, has no effect.
         counts=lambda value, fastest: value <= 0.95 * fastest.speed,
         wording="up to {:.2f} m/s",
-        excludes=("actuator_deadband",),
+        excludes=("actuator_deadband", "drive_gain"),
     )
 
     def first_values(self) -> list[dict[str, float]]:

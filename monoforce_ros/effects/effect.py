@@ -81,7 +81,8 @@ class WheelResponse:
     of_twist: bool = False
     """Whether the effect changes the commanded twist rather than the wheel speeds."""
     excludes: tuple[str, ...] = ()
-    """Effects that a wheel model does not combine with this one because they are too similar to be fitted together."""
+    """Effects that a wheel model does not combine with this one because they are too similar to be fitted together;
+    ``drive_gain`` stands for a ratio of wheel speeds and commands that is fitted."""
 
 
 class Effect(ABC):

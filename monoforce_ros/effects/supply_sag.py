@@ -46,7 +46,7 @@ class SupplySag(Effect):
         # Less than the wheel radius is known by.
         counts=lambda value, fastest: value * fastest.speed >= 0.05,
         wording="slower by {:.2f} of their speed per m/s",
-        excludes=("actuator_saturation",),
+        excludes=("actuator_saturation", "drive_gain"),
     )
 
     def drive_speeds(self, speeds: Tensor, values: Values, time_step: float, offsets: Tensor) -> Tensor:
