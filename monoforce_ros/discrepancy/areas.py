@@ -22,6 +22,31 @@ _CLUSTERS = 3
 
 
 @dataclass(frozen=True)
+class Circle:
+    """A circle on the ground, in the odometry frame."""
+
+    x: float
+    """[m]."""
+    y: float
+    """[m]."""
+    radius: float
+    """[m]."""
+
+    @property
+    def words(self) -> str:
+        """Where it is, after "it acts"."""
+        return f"within {self.radius:.1f} m of ({self.x:.1f}, {self.y:.1f}) in the odometry frame"
+
+    def contains(self, data: EvidenceWindows) -> np.ndarray:
+        """Windows of any length whose middle lies in it, ``[W]`` bool."""
+        return self.holds(window_places(data))
+
+    def holds(self, places: np.ndarray) -> np.ndarray:
+        """Places ``[W, 2]`` [m] in it, ``[W]`` bool."""
+        return np.linalg.norm(places - np.array([self.x, self.y]), axis=1) <= self.radius
+
+
+@dataclass(frozen=True)
 class GroundClass:
     """Ground on which a channel of the map is above a value, or not."""
 
@@ -32,9 +57,13 @@ class GroundClass:
 
     @property
     def words(self) -> str:
-        """Such as "where the vegetation is taller than 0.20 m"."""
+        """Where it is, after "it acts"."""
         words, unit, _ = _CHANNELS[self.channel]
         return f"{'where' if self.above else 'except where'} {words} {self.cut:.2f}{unit}"
+
+    def contains(self, data: EvidenceWindows) -> np.ndarray:
+        """Windows of any length that lie on it by their mean, ``[W]`` bool."""
+        return (_along(data, self.channel) > self.cut) == self.above
 
 
 _CHANNELS = {
@@ -46,33 +75,16 @@ _CHANNELS = {
 
 @dataclass(frozen=True)
 class Area:
-    """A part of the ground: a circle or a class of ground."""
+    """A part of the ground, and the windows of a recording in it."""
 
     inside: np.ndarray
-    """Windows of the recording that lie in it, ``[W]`` bool."""
-    circle: tuple[float, float, float] | None = None
-    """Centre and radius in the odometry frame [m]."""
-    ground: GroundClass | None = None
-
-    @property
-    def words(self) -> str:
-        """Where it is, after "it acts"."""
-        if self.ground is not None:
-            return self.ground.words
-        x, y, radius = self.circle or (0.0, 0.0, 0.0)
-        return f"within {radius:.1f} m of ({x:.1f}, {y:.1f}) in the odometry frame"
+    """``[W]`` bool."""
+    place: Circle | GroundClass
 
     @property
     def visits(self) -> int:
         """How often the robot came into it."""
         return int(self.inside[0]) + int((np.diff(self.inside.astype(int)) > 0).sum())
-
-    def contains(self, data: EvidenceWindows) -> np.ndarray:
-        """Windows of any length that lie in it, by their middle or by their mean ground, ``[W]`` bool."""
-        if self.ground is not None:
-            return (_along(data, self.ground.channel) > self.ground.cut) == self.ground.above
-        x, y, radius = self.circle or (0.0, 0.0, 0.0)
-        return np.linalg.norm(window_places(data) - np.array([x, y]), axis=1) <= radius
 
 
 def window_places(data: EvidenceWindows) -> np.ndarray:
@@ -89,7 +101,7 @@ def ground_classes(data: EvidenceWindows) -> list[Area]:
         values = _along(data, channel)
         cut, difference = _cut(values)
         if difference >= least:
-            found += [Area((values > cut) == above, ground=GroundClass(channel, cut, above)) for above in (True, False)]
+            found += [Area((values > cut) == above, GroundClass(channel, cut, above)) for above in (True, False)]
     return [area for area in found if _large_enough(area, data)]
 
 
@@ -131,8 +143,8 @@ def clusters(data: EvidenceWindows) -> list[Area]:
 
 
 def _circle(places: np.ndarray, centre: np.ndarray, radius: float) -> Area:
-    inside = np.linalg.norm(places - centre, axis=1) <= radius
-    return Area(inside, circle=(float(centre[0]), float(centre[1]), radius))
+    circle = Circle(float(centre[0]), float(centre[1]), radius)
+    return Area(circle.holds(places), circle)
 
 
 def _large_enough(area: Area, data: EvidenceWindows) -> bool:

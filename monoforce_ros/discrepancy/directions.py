@@ -26,11 +26,6 @@ ONSETS = (1 / 3, 2 / 3)
 nearest of these two, and of the start, has a correlation of at least 0.86 with the true course."""
 
 
-def onset_name(name: str) -> str:
-    """Name of an effect's direction from an onset on."""
-    return f"{name} that begins late"
-
-
 class Directions:
     """Directions on one recording, each with how much it varies on the healthy robot.
 
@@ -135,20 +130,16 @@ class Directions:
                 directions.append(replace(direction, name=f"{name} changes {regime}"))
         return directions
 
-    def of_onsets(self, influences: Sequence[Direction]) -> list[Direction]:
-        """The same influences from a third and from two thirds of the recording on."""
+    def late_parts(self) -> list[np.ndarray]:
+        """Windows from a third and from two thirds of the recording on, masks ``[W]``."""
         starts = self.predictions.data.starts
         share = (starts - starts[0]) / max(float(np.ptp(starts)), 1.0)
-        return [
-            replace(entry, name=onset_name(entry.name), columns=entry.columns * (share >= begin)[:, None, None])
-            for begin in ONSETS
-            for entry in influences
-        ]
+        return [share >= begin for begin in ONSETS]
 
     def within(self, influences: Sequence[Direction], masks: Sequence[np.ndarray]) -> list[Direction]:
         """The same influences in parts of the recording alone, each a mask of its windows ``[W]``."""
         return [
-            replace(entry, name=f"{entry.name} in an area", columns=entry.columns * mask[:, None, None])
+            replace(entry, name=f"{entry.name} in a part", columns=entry.columns * mask[:, None, None])
             for mask in masks
             for entry in influences
         ]

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
+from matplotlib.patches import Circle as Disc
 
+from monoforce_ros.discrepancy.areas import Circle
 from monoforce_ros.discrepancy.comparison import PathComparison, RegimeRow
 from monoforce_ros.discrepancy.diagnosis import Details, Diagnosis
 
@@ -89,9 +90,18 @@ def map_figure(details: Details) -> Figure:
     for ax, (name, _), error in zip(axes, sets, errors, strict=True):
         ax.add_collection(LineCollection([track], colors=_PALE, linewidths=1.2))
         points = ax.scatter(*places.T, c=error, cmap="inferno_r", vmin=0, vmax=top, s=46, edgecolors="white", lw=0.4)
-        if details.area is not None and details.area.circle is not None:
-            x, y, radius = details.area.circle
-            ax.add_patch(Circle((x, y), radius, facecolor="#0b84a51f", edgecolor=_AFTER, ls="--", label="acts here"))
+        if details.area is not None and isinstance(details.area.place, Circle):
+            circle = details.area.place
+            ax.add_patch(
+                Disc(
+                    (circle.x, circle.y),
+                    circle.radius,
+                    facecolor="#0b84a51f",
+                    edgecolor=_AFTER,
+                    ls="--",
+                    label="acts here",
+                )
+            )
             ax.legend(frameon=False, loc="best", fontsize=9)
         ax.set_aspect("equal", adjustable="box")
         ax.set_title(name, loc="left", fontweight="bold")

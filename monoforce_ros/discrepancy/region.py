@@ -40,13 +40,13 @@ class Region:
 
     def acting_in(self, data: EvidenceWindows) -> np.ndarray:
         """Windows of any length in which the effects act, ``[W]`` bool."""
-        return self.area.contains(data)
+        return self.area.place.contains(data)
 
     @property
     def remark(self) -> str:
         """Where, in words."""
         count, number = int(self.area.inside.sum()), len(self.area.inside)
-        text = f"It acts {self.area.words} ({count} of {number} windows); these figures are of the robot there."
+        text = f"It acts {self.area.place.words} ({count} of {number} windows); these figures are of the robot there."
         if self.area.visits == 1:
             text += " The robot was there once: the time may be the cause, not the place."
         return text
@@ -60,6 +60,14 @@ class _Pull:
     """``[W]``: the effect's share of the residuals, weighted."""
     information: np.ndarray
     """``[W]``."""
+
+    @classmethod
+    def of(cls, search: Search, change: np.ndarray) -> _Pull:
+        """Of a change of the scaled residuals, ``[W, K, C]``."""
+        residual, change = search.directions.scaled(search.known), np.nan_to_num(change)
+        weights = robust_weights(residual)
+        score = -(weights * change * np.nan_to_num(residual)).sum(axis=(1, 2))
+        return cls(score, (weights * change**2).sum(axis=(1, 2)))
 
     def gains(self, masks: np.ndarray) -> np.ndarray:
         """Reduction of the loss by the effect in each area ``[A, W]`` alone, ``[A]``."""
@@ -99,20 +107,19 @@ def find_region(search: Search, trials: Sequence[Trial]) -> Region | None:
         search: search on the whole recording.
         trials: effects that were found on it and on parts of it.
     """
-    classes = ground_classes(search.data)
-    found = [region for areas in (classes, circles(search.data)) for region in _scanned(search, trials, areas)]
-    rate, best = search.thresholds.comparison_rate, None
+    classes = _scanned(search, trials, ground_classes(search.data))
+    circle = _scanned(search, trials, circles(search.data))
+    if classes is None or circle is None:
+        return classes or circle
     # A class of ground says why an effect acts where it does: a circle must predict better beyond chance.
-    for region in found:
-        if best is None or paired(best.losses, region.losses, search.data.starts, rate)[1] > 0:
-            best = region
-    return best
+    _, low = paired(classes.losses, circle.losses, search.data.starts, search.thresholds.comparison_rate)
+    return circle if low > 0 else classes
 
 
-def _scanned(search: Search, trials: Sequence[Trial], areas: Sequence[Area]) -> list[Region]:
-    """The best region of some areas, if any is better than effects everywhere; one or none."""
+def _scanned(search: Search, trials: Sequence[Trial], areas: Sequence[Area]) -> Region | None:
+    """The best region of some areas, if any is better than effects everywhere."""
     if not areas:
-        return []
+        return None
     masks = np.array([area.inside for area in areas], float)
     starts, before = search.data.starts, search.loss_of(search.known)
     tried = []
@@ -121,41 +128,36 @@ def _scanned(search: Search, trials: Sequence[Trial], areas: Sequence[Area]) -> 
         losses = np.where(areas[chosen].inside, search.loss_of(fitted), before)
         tried.append((float(losses.mean()), chosen, fitted, losses, effects))
     if not tried:
-        return []
+        return None
     _, chosen, fitted, losses, effects = min(tried, key=lambda entry: entry[0])
     whole = search.loss_of(search.refit(effects).effects)
-    least = search.thresholds.smallest_share * max(float(before.mean()), search.healthy_loss)
-    rate = search.thresholds.comparison_rate
-    gains = [paired(other, losses, starts, rate) for other in (whole, before)]
-    if any(low <= 0 or gain < least for gain, low in gains):
-        return []
     thresholds = search.thresholds
-    p = _pull(search, fitted).scan_p(masks, blocks_of(starts), thresholds.draws, search.seed)
-    if p > thresholds.effect_rate:
-        return []
-    return [Region(areas[chosen], losses)]
+    least = thresholds.smallest_share * max(float(before.mean()), search.healthy_loss)
+    gains = [paired(other, losses, starts, thresholds.comparison_rate) for other in (whole, before)]
+    if any(low <= 0 or gain < least for gain, low in gains):
+        return None
+    pull = _Pull.of(search, search.directions.scaled(fitted) - search.directions.scaled(search.known))
+    p = pull.scan_p(masks, blocks_of(starts), thresholds.draws, search.seed)
+    return Region(areas[chosen], losses) if p <= thresholds.effect_rate else None
 
 
 def _candidates(search: Search, trials: Sequence[Trial], masks: np.ndarray) -> list[Effects]:
     """The effects of trials, and those that pull most in any area."""
     fixed = len(search.known)
-    screened = search.screening.candidates(search.known, fixed, "1: ").screened
-    gains = [(float(_pull(search, entry.effects).gains(masks).max()), entry.effects) for entry in screened]
+    found = search.screening.candidates(search.known, fixed, "1: ")
+    changes = {entry.name: entry.columns.sum(axis=0) for entry in found.influences}
+    gains = [
+        (float(_Pull.of(search, changes[entry.name]).gains(masks).max()), entry.effects) for entry in found.screened
+    ]
     gains = sorted(gains, key=lambda entry: -entry[0])[:_TRIED]
     listed = [trial.effects for trial in trials if len(trial.effects) > fixed]
     return [*listed, *(effects for gain, effects in gains if gain > _PROMISING * gains[0][0])]
 
 
-def _pull(search: Search, effects: Effects) -> _Pull:
-    residual = search.directions.scaled(search.known)
-    change = np.nan_to_num(search.directions.scaled(effects) - residual)
-    weights, used = robust_weights(residual), np.nan_to_num(residual)
-    return _Pull(-(weights * change * used).sum(axis=(1, 2)), (weights * change**2).sum(axis=(1, 2)))
-
-
 def _located(search: Search, effects: Effects, masks: np.ndarray) -> tuple[int, Effects]:
     """The area in which effects act, and their values there."""
-    chosen, fitted = int(np.argmax(_pull(search, effects).gains(masks))), effects
+    pull = _Pull.of(search, search.directions.scaled(effects) - search.directions.scaled(search.known))
+    chosen, fitted = int(np.argmax(pull.gains(masks))), effects
     before = search.loss_of(search.known)
     for _ in range(2):
         inside = masks[chosen] > 0

@@ -8,7 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from monoforce_ros.core import write_text
-from monoforce_ros.discrepancy.areas import Area
+from monoforce_ros.discrepancy.areas import Area, Circle
 from monoforce_ros.discrepancy.comparison import GapRow
 from monoforce_ros.discrepancy.diagnosis import Diagnosis
 from monoforce_ros.discrepancy.estimates import EffectEstimate
@@ -64,12 +64,7 @@ def report_content(
 
 def _area_entry(area: Area | None) -> dict | None:
     """Where the effects act alone: a circle in the odometry frame, or a class of ground."""
-    if area is None:
-        return None
-    if area.ground is not None:
-        return {"ground": asdict(area.ground)}
-    x, y, radius = area.circle or (0.0, 0.0, 0.0)
-    return {"circle": {"x": x, "y": y, "radius": radius, "unit": "m"}}
+    return None if area is None else {"circle" if isinstance(area.place, Circle) else "ground": asdict(area.place)}
 
 
 def _localisation_entry(entry: Localisation) -> dict:

@@ -173,8 +173,8 @@ class Search:
         influences = self.screening.candidates(self.known, len(self.known), "1: ").influences
         if self.nominal is None or not influences:
             return 1.0
-        masks = [area.inside for area in clusters(self.data)]
-        directions = [*influences, *self.directions.of_onsets(influences), *self.directions.within(influences, masks)]
+        parts = [*self.directions.late_parts(), *(area.inside for area in clusters(self.data))]
+        directions = [*influences, *self.directions.within(influences, parts)]
         tests = self.screening.tested(self.known, len(self.known), self.directions.scaled(self.known), directions)
         return min(test.adjusted for test in tests)
 
@@ -227,7 +227,7 @@ class Search:
 
     def loss_of(self, effects: Effects) -> np.ndarray:
         """Robust loss of each window, ``[W]``."""
-        return robust(self.predictions.residuals([effects])[0] / self.scale)
+        return robust(self.directions.scaled(effects))
 
     def judge(self, effects: Effects) -> Trial:
         """Cross-validate: judge each fold with the values that the effects have without it."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
@@ -38,6 +39,7 @@ _LARGEST_MODEL = 5
 _EVALUATIONS = 8
 """Of a fit: it starts from the values of a similar model."""
 _GAIN = "drive_gain"
+"""Stands for a fitted ratio among what effects exclude."""
 _SAME_RATIO = 0.02
 """Relative difference of the measured speed ratio from the known radius' within which they are one: a worn tyre's."""
 _FURTHER = 0.01
@@ -97,7 +99,7 @@ def compare_with_wheels(commands: CommandTrack, wheels: WheelTrack | None, robot
     if len(blocks) < 2 or ratio is None:
         return None
     selection, ratio, gain = _selected(blocks, ratio)
-    best, blocks = selection.run(), selection.blocks
+    best, blocks = selection.best, selection.blocks
     weak = _weak(best, blocks)
     if weak:
         # Too small to matter: fitted again without them.
@@ -141,9 +143,9 @@ def _selected(blocks: _Blocks, measured: float) -> tuple[_Selection, float, floa
         return free, measured, 1.0
     known, gain = _Selection(replace(blocks, measured=blocks.measured * radius)), measured * radius
     if abs(gain - 1.0) > _SAME_RATIO:
-        other = free.run()
+        other = free.best
         alike = any(_GAIN in _response(name).excludes for name in other.names)
-        if not alike and _better(known.run(), replace(other, losses=other.losses * gain**2), 1):
+        if not alike and _better(known.best, replace(other, losses=other.losses * gain**2), 1):
             return free, measured, gain
     return known, 1.0 / radius, 1.0
 
@@ -312,7 +314,8 @@ class _Selection:
         self._known: dict[tuple[str, ...], _Model] = {}
         self._order = [effect.name for effect in wheel_effects() if effect.applies_to(blocks.robot)]
 
-    def run(self) -> _Model:
+    @cached_property
+    def best(self) -> _Model:
         """The smallest model that no larger one improves.
 
         The best model of each size is found by a floating search (Pudil et al. 1994): one more effect, exchanges, and
