@@ -5,15 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+import yaml
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import Recording
 from monoforce_ros.core import CommandTrack, MotionTrack, WheelTrack
+from monoforce_ros.discrepancy.healthy_wheels import HealthyWheels, drives_of
+from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.wheel_motion import undriven_stretches, wheels_without_motion
-from monoforce_ros.discrepancy.wheels import changed_drives, compare_with_wheels
+from monoforce_ros.discrepancy.wheels import best_of, changed_drives, compare_with_wheels
 from monoforce_ros.effects import CATALOGUE, drive_speeds, effect_values
 from monoforce_ros.physics import State, rollout
-from monoforce_ros.robots import load_robot
+from monoforce_ros.robots import RobotFileError, load_robot, robot_file
 from monoforce_ros.terrain import Grid, TerrainMap
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -164,6 +167,90 @@ def test_the_limits_of_the_robot_file_are_no_effect(husky):
     found = compare_with_wheels(commands, wheels_of(commands, narrow, ()), husky)
     assert [name for name, _ in found.effects] == ["yaw_rate_limit"]
     assert found.effects[0][1]["limit"] == pytest.approx(0.8, abs=0.02)
+
+
+def servo_wheels(commands, robot, time_constant, seed, *, late=None):
+    """Wheels under servos with a limited torque, which no effect describes exactly; ``late`` from the middle on."""
+    stamps = commands.stamps[0] + np.arange(round((commands.stamps[-1] - commands.stamps[0]) * 1e-7)) * 10_000_000
+    commanded = torch.as_tensor(commands.sample(stamps)[None], dtype=torch.float32)
+    wanted = drive_speeds(replace(robot, effects=()), commanded, 0.01)[0].double().numpy()
+    speeds = np.zeros_like(wanted)
+    for step in range(1, len(wanted)):
+        slow = late if late is not None and step > len(wanted) // 2 else time_constant
+        speeds[step] = speeds[step - 1] + 0.01 * np.clip((wanted[step] - speeds[step - 1]) / slow, -2.5, 2.5)
+    measured = speeds[::7] / robot.wheel_radius
+    return WheelTrack(stamps[::7], measured + 0.02 * np.random.default_rng(seed).standard_normal(measured.shape))
+
+
+@pytest.fixture(scope="module")
+def healthy_wheels(husky):
+    commands = drawn_commands(90.0, 5)
+    return compare_with_wheels(commands, servo_wheels(commands, husky, 0.2, 5), husky).model
+
+
+@pytest.mark.parametrize("seed", [7, 11])
+def test_wheels_as_when_the_robot_was_commissioned_show_no_change(husky, healthy_wheels, seed):
+    commands = drawn_commands(60.0, seed)
+    found = compare_with_wheels(commands, servo_wheels(commands, husky, 0.2, seed), husky, healthy_wheels)
+    assert found.unchanged and found.effects == healthy_wheels.effects
+    assert "as when the robot was commissioned, with a time constant" in found.summary()
+    changed, unchanged = changed_drives(found, husky, healthy_wheels)
+    assert changed == () and {"actuator_lag", "command_delay", "actuator_deadband", "drive_loss"} <= set(unchanged)
+    # What they differ from is what was learned of the wheels, not what the motion made of it for the robot's file.
+    alone = compare_with_wheels(commands, servo_wheels(commands, husky, 0.2, seed), husky)
+    assert "actuator_lag" in dict(changed_drives(alone, husky)[0])
+
+
+@pytest.mark.parametrize("share", [1.0, 0.5])
+def test_slower_drives_are_a_change_under_hard_and_under_gentle_commands(husky, healthy_wheels, share):
+    commands = drawn_commands(60.0, 8)
+    commands = CommandTrack(commands.stamps, share * commands.twists)
+    found = compare_with_wheels(commands, servo_wheels(commands, husky, 0.35, 8), husky, healthy_wheels)
+    assert not found.unchanged
+    changed, _ = changed_drives(found, husky, healthy_wheels)
+    assert dict(changed)["actuator_lag"]["time_constant"] == pytest.approx(0.35, abs=0.03)
+
+
+def test_drives_that_become_slow_in_the_middle_are_not_ruled_out(husky, healthy_wheels):
+    commands = drawn_commands(60.0, 13)
+    found = compare_with_wheels(commands, servo_wheels(commands, husky, 0.2, 8, late=0.6), husky, healthy_wheels)
+    assert not found.unchanged
+    assert "actuator_lag" not in changed_drives(found, husky, healthy_wheels)[1]
+
+
+def test_the_wheels_that_fit_all_commissioning_drives_best_are_kept(husky, healthy_wheels):
+    recordings = [(commands, servo_wheels(commands, husky, 0.2, 3)) for commands in (drawn_commands(60.0, 3),)]
+    other = replace(healthy_wheels, effects=(("actuator_lag", {"time_constant": 0.5}),))
+    kept = best_of([other, healthy_wheels], recordings, husky)
+    assert kept.effects == healthy_wheels.effects and kept.noise + kept.share > 0.0
+    assert best_of([], recordings, husky) is None
+
+
+def test_healthy_wheels_in_a_robot_file(tmp_path, husky, healthy_wheels):
+    robot = replace(husky, effects=(("actuator_lag", {"time_constant": 0.21}), ("friction_scale", {"factor": 0.9})))
+    known = replace(healthy_wheels, in_file=drives_of(robot.effects))
+    assert known.in_file == (("actuator_lag", {"time_constant": 0.21}),)
+    read = HealthyWheels.read(known.entry())
+    assert read.effects[0][1]["time_constant"] == pytest.approx(known.effects[0][1]["time_constant"], rel=1e-4)
+    assert read.ratio == pytest.approx(known.ratio, rel=1e-4) and read.share == pytest.approx(known.share, rel=1e-3)
+    assert read.known_to(robot)
+    # A fault that was found since then, and written into the file, is no longer the healthy robot.
+    assert not read.known_to(replace(robot, effects=(("actuator_lag", {"time_constant": 0.4}),)))
+    assert not read.known_to(replace(robot, effects=(*robot.effects, ("command_delay", {"delay": 0.1}))))
+    for wrong in (
+        {**known.entry(), "ratio_rad_m": 0.0},
+        {**known.entry(), "share": float("nan")},
+        {**known.entry(), "effects": {"friction_scale": {"factor": 0.5}}},
+        {**known.entry(), "effects": {"actuator_lag": {"delay": 0.5}}},
+        {key: value for key, value in known.entry().items() if key != "noise_m2_s2"},
+        "none",
+    ):
+        content = {"samples_s": [2.0], "residual_rms": [[0.1, 0.1, 0.1]], "wheels": wrong}
+        text = (husky_text := robot_file("husky").read_text()) + yaml.safe_dump({"commissioning": content})
+        assert "commissioning:" not in husky_text
+        (tmp_path / "husky.yaml").write_text(text)
+        with pytest.raises(RobotFileError, match=r"husky\.yaml: commissioning"):
+            NominalModel.read(tmp_path / "husky.yaml", (2.0,))
 
 
 def driven(robot, commands, effects=(), noise=0.01):

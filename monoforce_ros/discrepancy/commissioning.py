@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from monoforce_ros.discrepancy.fit import (
 )
 from monoforce_ros.discrepancy.gap import noise_floor, noisy_motions, residual_scale
 from monoforce_ros.discrepancy.ground import slopes_of
+from monoforce_ros.discrepancy.healthy_wheels import HealthyWheels, drives_of
 from monoforce_ros.discrepancy.hypothesis import MOTION, Effects, Evidence, EvidenceWindows, Predictions, window_starts
 from monoforce_ros.discrepancy.nominal import SEGMENT, NominalModel
 from monoforce_ros.discrepancy.preflight import complaints
@@ -33,7 +35,7 @@ from monoforce_ros.discrepancy.selection import Search
 from monoforce_ros.discrepancy.terrain_evidence import terrain_uncertainty
 from monoforce_ros.discrepancy.thresholds import Thresholds
 from monoforce_ros.discrepancy.trial import blocks_of
-from monoforce_ros.discrepancy.wheels import WheelFinding, changed_drives, compare_with_wheels
+from monoforce_ros.discrepancy.wheels import WheelFinding, best_of, changed_drives, compare_with_wheels
 from monoforce_ros.effects import CATALOGUE, identifiable_effects
 from monoforce_ros.robots import RobotModel
 
@@ -99,9 +101,11 @@ def commission(
     fits = [_fitted(entry, COMMISSIONED) for entry in prepared]
     chosen = COMMISSIONED
     found: list[tuple[str, Mapping[str, float]]] = []
+    drives: list[WheelFinding] = []
     for number, (entry, fit) in enumerate(zip(prepared, fits, strict=True)):
         progress(0.3 + 0.4 * number / len(prepared), "searching for further effects")
         wheels = compare_with_wheels(recordings[number].commands, recordings[number].wheels, robot)
+        drives += [] if wheels is None else [wheels]
         found += _further(robot, entry, fit.effects, wheels)
     counted = [name for name, _ in found]
     further = {name: values for name, values in found if counted.count(name) > 0.5 * len(prepared)}
@@ -121,6 +125,7 @@ def commission(
         lean=np.mean([lean_of(evidence.smoothed.motion).own for evidence in recordings], axis=0)
         if with_attitude
         else None,
+        wheels=_healthy_wheels(recordings, drives, replace(robot, effects=_together(robot, merged.effects))),
     )
     progress(1.0, "done")
     return estimate_effects(merged, {}), nominal
@@ -148,9 +153,32 @@ def _fitted(entry: _Prepared, effects: Effects, iterations: int = 12) -> Fit:
     )
 
 
+def _together(robot: RobotModel, effects: Effects) -> tuple[tuple[str, Mapping[str, Any]], ...]:
+    """The effects of a robot's file with those that were fitted."""
+    return tuple({**dict(robot.effects), **dict(effects)}.items())
+
+
+def _healthy_wheels(
+    recordings: Sequence[Evidence], drives: Sequence[WheelFinding], robot: RobotModel
+) -> HealthyWheels | None:
+    """How the drives follow commands, by the wheel speeds of all recordings; None where one does not show it.
+
+    Args:
+        recordings: of the healthy robot.
+        drives: what the wheels of each recording show.
+        robot: with the effects of the commissioned file.
+    """
+    if len(drives) < len(recordings):
+        return None
+    models = [finding.model for finding in drives if finding.model is not None]
+    tracks = [(evidence.commands, evidence.wheels) for evidence in recordings if evidence.wheels is not None]
+    model = models[0] if len(models) == 1 else best_of(models, tracks, robot)
+    return None if model is None else replace(model, in_file=drives_of(robot.effects))
+
+
 def _further(robot: RobotModel, entry: _Prepared, effects: Effects, wheels: WheelFinding | None) -> Effects:
     """The effects that one recording needs in addition; wheels suggest what the drives do, and what they do not."""
-    fitted = replace(robot, effects=tuple({**dict(robot.effects), **dict(effects)}.items()))
+    fitted = replace(robot, effects=_together(robot, effects))
     floor = entry.floor
     residuals = np.nan_to_num(Predictions(fitted, entry.data).residuals([()])[0])
     spread = np.quantile(np.abs(residuals), 0.683, axis=0)

@@ -121,7 +121,10 @@ def explain(
             could stand in an effect's place is known.
     """
     thresholds = settings.thresholds
-    sensors = SensorFindings.of(evidence, robot, commissioned=nominal is not None)
+    healthy = None if nominal is None else nominal.wheels
+    sensors = SensorFindings.of(
+        evidence, robot, commissioned=nominal is not None, healthy=healthy, thresholds=thresholds
+    )
 
     def searched(part: Windows) -> Search:
         scale, known = residual_scale(part.uncertainty, part.data, nominal), sensors.known

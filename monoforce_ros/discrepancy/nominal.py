@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from monoforce_ros.discrepancy.command_changes import uncovered_residual
+from monoforce_ros.discrepancy.healthy_wheels import HealthyWheels
 from monoforce_ros.discrepancy.hypothesis import COMPONENTS, MOTION, Evidence, EvidenceWindows
 from monoforce_ros.discrepancy.moderation import VariancePrior
 from monoforce_ros.discrepancy.residual_model import TERMS, motion_terms
@@ -52,6 +53,8 @@ class NominalModel:
     lean: np.ndarray | None = None
     """The vertical in the base frame, forward and left, that the robot kept on known ground, ``[2]`` [rad]; None if
     unknown."""
+    wheels: HealthyWheels | None = None
+    """How the drives followed commands; None without wheel speeds."""
 
     @property
     def with_attitude(self) -> bool:
@@ -126,6 +129,8 @@ class NominalModel:
         ) | (
             {} if self.lean is None else {"lean_rad": [float(f"{value:.3g}") for value in self.lean]}
         ) | (
+            {} if self.wheels is None else {"wheels": self.wheels.entry()}
+        ) | (
             {} if self.changes is None else
             {"command_changes": {key: float(f"{value:.3g}") for key, value in zip(_CHANGES, self.changes, strict=True)}}
         )  # fmt: skip
@@ -165,6 +170,7 @@ class NominalModel:
             changes = None if covered is None else np.array([float(covered[key]) for key in _CHANGES])
             leaned = entry.get("lean_rad")
             lean = None if leaned is None else np.array([float(leaned[0]), float(leaned[1])])
+            wheels = None if entry.get("wheels") is None else HealthyWheels.read(entry["wheels"])
         except (KeyError, IndexError, TypeError, ValueError) as error:
             raise RobotFileError(f"{robot_file(robot)}: commissioning: expected numbers, got {error!r}") from error
         values = [*variation.values(), *numbers, *([] if motion_loss is None else [motion_loss])]
@@ -195,7 +201,7 @@ class NominalModel:
             )
         return cls(
             residual, variation, segments, loss=numbers[0], motion_loss=motion_loss, loss_spread=numbers[1],
-            terms=terms, slope=slope, changes=changes, lean=lean,
+            terms=terms, slope=slope, changes=changes, lean=lean, wheels=wheels,
         )  # fmt: skip
 
 

@@ -12,8 +12,10 @@ from monoforce_ros.discrepancy.comparison import GapRow
 from monoforce_ros.discrepancy.estimates import EffectEstimate, ParameterEstimate
 from monoforce_ros.discrepancy.fit import robust
 from monoforce_ros.discrepancy.flippers import BLOCKED, FlipperFinding, compare_with_commands
+from monoforce_ros.discrepancy.healthy_wheels import HealthyWheels
 from monoforce_ros.discrepancy.hypothesis import Effects, Evidence, Predictions
 from monoforce_ros.discrepancy.selection import Search
+from monoforce_ros.discrepancy.thresholds import Thresholds
 from monoforce_ros.discrepancy.verdict import Decision, Verdict
 from monoforce_ros.discrepancy.wheels import WheelFinding, changed_drives, compare_with_wheels
 from monoforce_ros.effects import CATALOGUE
@@ -35,21 +37,38 @@ class SensorFindings:
     flippers: FlipperFinding | None = None
 
     @classmethod
-    def of(cls, evidence: Evidence, robot: RobotModel, *, commissioned: bool) -> SensorFindings:
+    def of(
+        cls,
+        evidence: Evidence,
+        robot: RobotModel,
+        *,
+        commissioned: bool,
+        healthy: HealthyWheels | None = None,
+        thresholds: Thresholds = Thresholds(),  # noqa: B008
+    ) -> SensorFindings:
         """Compare the sensors of a recording with its poses and commands.
 
         The gyro measures the offset of the pose clock, or that there is none. A commissioned file knows how the drives
         respond. What the wheels show may be different now, or only look so: the motion decides, against how much it
         varies on the healthy robot.
+
+        Args:
+            evidence: the recording.
+            robot: the nominal model with the effects of its file.
+            commissioned: whether the healthy robot is known.
+            healthy: what commissioning learned of its wheels; None if unknown.
+            thresholds: how much healthy drives differ.
         """
+        if healthy is not None and not healthy.known_to(robot):
+            healthy = None
         gyro = compare_with_gyro(evidence.smoothed, evidence.gyro)
-        wheels = compare_with_wheels(evidence.commands, evidence.wheels, robot)
+        wheels = compare_with_wheels(evidence.commands, evidence.wheels, robot, healthy, thresholds.drive_spread)
         excluded: tuple[str, ...] = () if gyro is None else ("pose_clock_offset",)
         flippers = compare_with_commands(evidence.joints, robot, evidence.smoothed.motion.stamps)
         if not commissioned and not any(CATALOGUE[name].stage == "command" for name, _ in robot.effects):
             known = measured_effects(gyro, wheels, flippers, robot)
             return cls(gyro, wheels, known, excluded=excluded, flippers=flippers)
-        hints, unchanged = ((), ()) if wheels is None else changed_drives(wheels, robot)
+        hints, unchanged = ((), ()) if wheels is None else changed_drives(wheels, robot, healthy)
         known = measured_effects(gyro, None, flippers, robot)
         return cls(gyro, wheels, known, hints, excluded + unchanged, flippers)
 

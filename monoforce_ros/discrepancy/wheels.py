@@ -3,33 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d, minimum_filter1d
 from scipy.optimize import least_squares
 from scipy.stats import t as student
 from scipy.stats import wilcoxon
 
 from monoforce_ros.core import CommandTrack, WheelTrack
+from monoforce_ros.discrepancy.healthy_wheels import HealthyWheels
 from monoforce_ros.discrepancy.hypothesis import Effects
-from monoforce_ros.discrepancy.wheel_motion import side_speeds, undriven_stretches
+from monoforce_ros.discrepancy.thresholds import Thresholds
+from monoforce_ros.discrepancy.wheel_blocks import BLOCK, WheelBlocks
 from monoforce_ros.effects import CATALOGUE, Fastest, WheelResponse, wheel_effects
 from monoforce_ros.robots import RobotModel
 
 _STEP, _FINE_STEP = 0.04, 0.01
 """Of the modelled wheel speeds, in the selection and in the final fit [s]."""
-_HISTORY = 4.0
-"""Length of the commands before a block [s]: twice the longest dead time of the catalogue, for slow integral parts."""
-_LONGEST_GAP = 1.0
-_BLOCK = 4.0
-"""Length of the blocks that are fitted or held out together [s]: longer than drives respond to a step."""
 _MOST_BLOCKS = 60
 """Blocks that are used at most: whole ones, spread evenly over the recording."""
-_MOST_SAMPLES = 80
-"""Samples of a block that are used at most: about 13 Hz, which shows a time constant of 0.08 s."""
-_FEWEST_SAMPLES = 10
 _ALPHA = 0.05
 """Probability that a step of the selection adds an effect that the wheels do not show, over all candidates."""
 _MOST_REACHED = 24
@@ -69,28 +62,49 @@ class WheelFinding:
     wheels have another radius than the robot's file says."""
     ruled_out: tuple[str, ...] = ()
     """Further effects whose confidence interval holds no value that would count."""
+    unchanged: bool = False
+    """Whether these are the effects of commissioning, which predict the wheels still."""
+    model: HealthyWheels | None = None
+    """The same as what is known of the drives of a healthy robot, if this is one."""
 
     def summary(self) -> str:
         """One sentence for reports."""
         parts = [_response(name).wording.format(*values.values()) for name, values in self.effects]
         if self.gain != 1.0:
             parts.append(f"at {self.gain:.2f} times their speed")
-        text = "the measured wheel speeds follow the commands " + ", ".join(parts or ["without delay or limit"])
+        text = "the measured wheel speeds follow the commands "
+        text += "as when the robot was commissioned, " if self.unchanged else ""
+        text += ", ".join(parts or ["without delay or limit"])
         if self.used_blocks < self.all_blocks:
-            text += f" ({self.used_blocks} of {self.all_blocks} blocks of {_BLOCK:g} s, spread over the recording)"
+            text += f" ({self.used_blocks} of {self.all_blocks} blocks of {BLOCK:g} s, spread over the recording)"
         return text
 
 
-def compare_with_wheels(commands: CommandTrack, wheels: WheelTrack | None, robot: RobotModel) -> WheelFinding | None:
+def compare_with_wheels(
+    commands: CommandTrack,
+    wheels: WheelTrack | None,
+    robot: RobotModel,
+    healthy: HealthyWheels | None = None,
+    spread: float = Thresholds().drive_spread,
+) -> WheelFinding | None:
     """How measured wheel speeds follow commands; None without wheel speeds, or where they do not follow at all.
 
-    The recording is cut into blocks, every other of which is fitted and the others held out, and the reverse. A model
-    with more effects is selected if it reduces the held-out error: its gains, one for each block, must be positive on
-    average by Wilcoxon's signed-rank test at an error rate of 5 % over all effects that could be added (Bonferroni).
+    Of a commissioned robot it is asked first whether what was learned of its wheels still predicts them. Otherwise a
+    model is selected: the recording is cut into blocks, every other of which is fitted and the others held out, and the
+    reverse. A model with more effects is selected if it reduces the held-out error: its gains, one for each block, must
+    be positive on average by Wilcoxon's signed-rank test at an error rate of 5 % over all effects that could be added
+    (Bonferroni).
+
+    Args:
+        commands: of the recording.
+        wheels: measured wheel speeds.
+        robot: its kinematics make wheel speeds of commands.
+        healthy: what commissioning learned of the wheels; None where it is unknown.
+        spread: standard deviation of the logarithm of a mean loss between healthy drives.
     """
     if wheels is None or len(wheels) < 100 or not len(commands):
         return None
-    found = _Blocks.of(commands, wheels, robot, _STEP)
+    found = WheelBlocks.of(commands, wheels, robot, _STEP)
     if found is None or found.fastest.speed < 0.1:
         return None
     chosen = found.spread(_MOST_BLOCKS)
@@ -98,7 +112,11 @@ def compare_with_wheels(commands: CommandTrack, wheels: WheelTrack | None, robot
     ratio = blocks.ratio()
     if len(blocks) < 2 or ratio is None:
         return None
-    selection, ratio, gain = _selected(blocks, ratio)
+    if healthy is not None:
+        still = _still_healthy(blocks, ratio, healthy, spread)
+        if still is not None:
+            return replace(still, used_blocks=len(blocks), all_blocks=len(found))
+    selection, ratio, gain = _selected(blocks, ratio, healthy)
     best, blocks = selection.best, selection.blocks
     weak = _weak(best, blocks)
     if weak:
@@ -106,7 +124,7 @@ def compare_with_wheels(commands: CommandTrack, wheels: WheelTrack | None, robot
         best = selection.scored(tuple(name for name in best.names if name not in weak), best)
     values, half_widths = best.values, np.zeros(0)
     if best.names:
-        fine = _Blocks.of(commands, wheels, robot, _FINE_STEP)
+        fine = WheelBlocks.of(commands, wheels, robot, _FINE_STEP)
         assert fine is not None
         fine = replace(fine, measured=fine.measured / ratio)[chosen]
         values = _fit(best.names, fine, [best.values])
@@ -117,9 +135,10 @@ def compare_with_wheels(commands: CommandTrack, wheels: WheelTrack | None, robot
     if best.loss / count > 0.5 * min(spreads):
         # The wheels do not follow the commands.
         return None
+    effects = _named(best.names, values)
     return WheelFinding(
-        tuple((name, dict(zip(_keys(name), own, strict=True))) for name, own in _by_effect(best.names, values)),
-        tuple(dict(zip(_keys(name), own, strict=True)) for name, own in _by_effect(best.names, half_widths)),
+        effects,
+        tuple(widths for _, widths in _named(best.names, half_widths)),
         float(np.sqrt(baseline.loss / count)),
         float(np.sqrt(best.loss / count)),
         ratio,
@@ -127,17 +146,83 @@ def compare_with_wheels(commands: CommandTrack, wheels: WheelTrack | None, robot
         used_blocks=len(blocks),
         all_blocks=len(found),
         ruled_out=tuple(_ruled_out(best.names, values, blocks)),
+        model=HealthyWheels.learned(effects, ratio, best.losses, *_sizes(values, best.names, blocks)),
     )
 
 
-def _selected(blocks: _Blocks, measured: float) -> tuple[_Selection, float, float]:
+def _still_healthy(blocks: WheelBlocks, measured: float, healthy: HealthyWheels, spread: float) -> WheelFinding | None:
+    """The wheels as they were when the robot was commissioned, if that predicts them still.
+
+    It does where its error is no larger than on healthy drives, and neither other values, nor another ratio of wheels
+    and commands, nor any further effect predict held-out blocks better beyond chance.
+    """
+    selection = _Selection(replace(blocks, measured=blocks.measured / healthy.ratio))
+    blocks, before = selection.blocks, _as_known(healthy, selection.blocks)
+    names, values = before.names, before.values
+    samples, changes = _sizes(values, names, blocks)
+    if before.loss > np.exp(spread) * healthy.expected(samples, changes).sum():
+        return None
+    gain = measured / healthy.ratio
+    free = _Selection(replace(blocks, measured=blocks.measured / gain)).scored(names, before)
+    others = [replace(free, losses=free.losses * gain**2), selection.scored(names, before)]
+    others += [selection.scored(larger, before) for larger in selection.larger(names)]
+    if any(_better(before, other, len(others)) for other in others):
+        return None
+    return WheelFinding(
+        healthy.effects,
+        tuple(widths for _, widths in _named(names, _half_widths(values, names, blocks) if names else values)),
+        float(np.sqrt(selection.scored((), None).loss / samples.sum())),
+        float(np.sqrt(before.loss / samples.sum())),
+        healthy.ratio,
+        ruled_out=tuple(_ruled_out(names, values, blocks, unchanged=True)),
+        unchanged=True,
+        model=healthy,
+    )
+
+
+def best_of(
+    models: Sequence[HealthyWheels], recordings: Sequence[tuple[CommandTrack, WheelTrack]], robot: RobotModel
+) -> HealthyWheels | None:
+    """That of several models which predicts the wheels of all recordings best, with its error on all; None without any.
+
+    What the wheels of one recording show need not predict another.
+    """
+    cut = [WheelBlocks.of(commands, wheels, robot, _STEP) for commands, wheels in recordings]
+    judged: list[tuple[float, HealthyWheels]] = []
+    for model in models:
+        parts = []
+        for blocks in (blocks for blocks in cut if blocks is not None):
+            used = replace(blocks, measured=blocks.measured / model.ratio)
+            known = _as_known(model, used)
+            parts.append((known.losses, *_sizes(known.values, known.names, used)))
+        losses, samples, changes = (np.concatenate(rows) for rows in zip(*parts, strict=True))
+        learned = HealthyWheels.learned(model.effects, model.ratio, losses, samples, changes)
+        judged.append((float(losses.sum()), learned))
+    return min(judged, key=lambda entry: entry[0])[1] if judged else None
+
+
+def _as_known(healthy: HealthyWheels, blocks: WheelBlocks) -> _Model:
+    """What commissioning learned, judged on blocks of the speeds of the wheels' rims."""
+    known = dict(healthy.effects)
+    names = _in_order(tuple(known))
+    values = np.array([known[name][key] for name in names for key in _keys(name)])
+    return _Model(names, values, _block_losses(values, names, blocks, blocks.fastest.speed))
+
+
+def _sizes(values: np.ndarray, names: tuple[str, ...], blocks: WheelBlocks) -> tuple[np.ndarray, np.ndarray]:
+    """Samples of each block, of both sides, and the sum of squared changes of the commands by effects, ``[n]``."""
+    changes = blocks.at_samples(_modelled(values, names, blocks) - blocks.commanded()) * blocks.pairs
+    return blocks.pairs.sum(axis=(1, 2)), (changes**2).sum(axis=(1, 2))
+
+
+def _selected(blocks: WheelBlocks, measured: float, healthy: HealthyWheels | None) -> tuple[_Selection, float, float]:
     """The selection on wheel speeds as speeds of the wheels' rims, with the ratio of the two and the gain.
 
     The known radius is used if the measured ratio is plausible, so that a drive that is too slow appears as an error,
     unless the wheels follow another ratio better beyond chance: drives that multiply every command have no limit or
     delay that would explain it. Effects that are too similar to a gain are not combined with one.
     """
-    radius = blocks.robot.wheel_radius
+    radius = blocks.robot.wheel_radius if healthy is None else 1.0 / healthy.ratio
     free = _Selection(replace(blocks, measured=blocks.measured / measured))
     if radius is None or not 0.4 < measured * radius < 2.5:
         return free, measured, 1.0
@@ -150,14 +235,18 @@ def _selected(blocks: _Blocks, measured: float) -> tuple[_Selection, float, floa
     return known, 1.0 / radius, 1.0
 
 
-def changed_drives(wheels: WheelFinding, robot: RobotModel) -> tuple[Effects, tuple[str, ...]]:
-    """Where the wheels differ from what the robot's file says of its drives.
+def changed_drives(
+    wheels: WheelFinding, robot: RobotModel, healthy: HealthyWheels | None = None
+) -> tuple[Effects, tuple[str, ...]]:
+    """Where the wheels differ from what commissioning learned of them, or else from what the robot's file says.
 
     Returns:
-        the effects whose value differs from the file's by more than its confidence interval, with the values of the
-        wheels; and the names of those that did not change.
+        the effects whose value differs by more than its confidence interval, with the values of the wheels; and the
+        names of those that did not change.
     """
-    in_file, shown = dict(robot.effects), dict(wheels.effects)
+    if wheels.unchanged:
+        return (), (*(name for name, _ in wheels.effects), *wheels.ruled_out)
+    in_file, shown = dict(robot.effects if healthy is None else healthy.effects), dict(wheels.effects)
     half_widths = {
         name: widths[_response(name).parameter] for name, widths in zip(shown, wheels.half_widths, strict=True)
     }
@@ -166,7 +255,7 @@ def changed_drives(wheels: WheelFinding, robot: RobotModel) -> tuple[Effects, tu
     unchanged = []
     for effect in wheel_effects():
         response = _response(effect.name)
-        neutral = next(p.neutral for p in effect.parameters if p.name == response.parameter)
+        neutral = _neutral(effect.name)
         expected = float(in_file.get(effect.name, {}).get(response.parameter, neutral))
         value = float(shown[effect.name][response.parameter]) if effect.name in shown else neutral
         # Of an effect that the wheels do not show the half-width is unknown: the largest one stands for it.
@@ -179,113 +268,6 @@ def changed_drives(wheels: WheelFinding, robot: RobotModel) -> tuple[Effects, tu
         elif np.isfinite(value):
             changed.append((effect.name, dict(shown.get(effect.name, {response.parameter: value}))))
     return tuple(changed), tuple(unchanged)
-
-
-@dataclass(frozen=True)
-class _Blocks:
-    """Commands and measured wheel speeds in blocks of one length."""
-
-    twists: np.ndarray
-    """Commanded forward speed [m/s], yaw rate [rad/s] and, of a robot that crabs, lateral speed [m/s], with those
-    before the block, ``[n, 2, T]`` or ``[n, 3, T]``."""
-    measured: np.ndarray
-    """Measured speed of the left and right wheels, ``[n, 2, K]`` [rad/s], or [m/s] after division by the ratio."""
-    place: np.ndarray
-    """Time of each sample since the first command, in steps, ``[n, K]``."""
-    known: np.ndarray
-    """Samples that exist, ``[n, K]`` bool; others fill the array."""
-    step: float
-    """Time between commands [s]."""
-    robot: RobotModel
-    """Its kinematics make wheel speeds of twists."""
-    reached: dict[tuple[tuple[str, tuple[float, ...]], ...], np.ndarray] = field(default_factory=dict, init=False)
-    """What the commands become under the first effects of a model, by these and their values: a fit that changes one
-    value computes the effects before it once."""
-
-    @classmethod
-    def of(cls, commands: CommandTrack, wheels: WheelTrack, robot: RobotModel, step: float) -> _Blocks | None:
-        """All blocks of about ``_BLOCK`` in which the robot is driven by commands, at time steps of ``step`` [s]."""
-        stamps = wheels.stamps
-        undriven = undriven_stretches(commands, wheels, None, robot)
-        breaks = np.flatnonzero(np.diff(stamps) > _LONGEST_GAP * 1e9) + 1
-        length = round((_HISTORY + _BLOCK) / step) + 1
-        twists, measured, place, known = [], [], [], []
-        for run in np.split(np.arange(len(stamps)), breaks):
-            number = (stamps[run] - stamps[run[0]]) // round(_BLOCK * 1e9)
-            for part in np.split(run, np.flatnonzero(np.diff(number)) + 1):
-                if len(part) < _FEWEST_SAMPLES or stamps[part[-1]] - stamps[part[0]] < 0.5 * _BLOCK * 1e9:
-                    continue
-                part = part[:: -(-len(part) // _MOST_SAMPLES)]
-                first, last = int(stamps[part[0]]) - round(_HISTORY * 1e9), int(stamps[part[-1]])
-                if ((undriven[:, 0] < last) & (undriven[:, 1] > first)).any():
-                    continue
-                grid = first + np.rint(np.arange(length) * step * 1e9).astype(np.int64)
-                fill = (0, _MOST_SAMPLES - len(part))
-                twists.append(commands.sample(grid).T)
-                measured.append(np.pad(wheels.speeds[part].T, ((0, 0), fill)))
-                place.append(np.pad((stamps[part] - first) * 1e-9 / step, fill))
-                known.append(np.arange(_MOST_SAMPLES) < len(part))
-        if not twists:
-            return None
-        bounds = np.array([[robot.maximum_speed], [robot.maximum_yaw_rate], [robot.maximum_lateral_speed]])
-        bounds = bounds[: twists[0].shape[0]]
-        limited = np.clip(np.array(twists), -bounds, bounds)
-        return cls(limited, np.array(measured), np.array(place), np.array(known), step, robot)
-
-    def __len__(self) -> int:
-        return len(self.twists)
-
-    def __getitem__(self, chosen: np.ndarray) -> _Blocks:
-        parts = {name: getattr(self, name)[chosen] for name in ("twists", "measured", "place", "known")}
-        return replace(self, **parts)
-
-    def spread(self, most: int) -> np.ndarray:
-        """Indices of at most ``most`` blocks, evenly spread over the recording; those without any motion go first."""
-        if len(self) <= most:
-            return np.arange(len(self))
-        moving = np.flatnonzero((np.abs(self.commanded()).max(axis=(1, 2)) > 0) | (self.measured != 0).any(axis=(1, 2)))
-        return moving[np.unique(np.linspace(0, len(moving) - 1, min(most, len(moving))).round().astype(int))]
-
-    @property
-    def fastest(self) -> Fastest:
-        """Fastest commands: 99.5 % quantiles."""
-        speeds = np.abs(self.commanded()).max(axis=1)
-        return Fastest(float(np.quantile(speeds, 0.995)), float(np.quantile(np.abs(self.twists[:, 1]), 0.995)))
-
-    @property
-    def pairs(self) -> np.ndarray:
-        """Mask of the known samples of both sides, ``[n, 2, K]``."""
-        return np.broadcast_to(self.known[:, None], self.measured.shape)
-
-    def commanded(self, twists: np.ndarray | None = None) -> np.ndarray:
-        """Wheel speeds ``[n, 2, T]`` [m/s] of commanded or given twists."""
-        given = self.twists if twists is None else twists
-        return np.moveaxis(side_speeds(self.robot, np.moveaxis(given, 1, -1)), -1, 1)
-
-    def at_samples(self, speeds: np.ndarray) -> np.ndarray:
-        """Speeds ``[n, 2, T]`` at the samples, ``[n, 2, K]``."""
-        index = np.minimum(self.place.astype(int), speeds.shape[2] - 2)[:, None]
-        before, after = (np.take_along_axis(speeds, index + shift, axis=2) for shift in (0, 1))
-        return before + (self.place[:, None] - index) * (after - before)
-
-    def ratio(self) -> float | None:
-        """Measured [rad/s] over commanded speed [m/s] where a command of medium size was constant for a while."""
-        commanded, top = self.commanded(), self.fastest.speed
-        # From 1.5 s before a sample until it.
-        settled = round(1.5 / self.step)
-        shift = {"size": settled + 1, "origin": settled // 2, "axis": 2}
-        extent = self.at_samples(maximum_filter1d(commanded, **shift) - minimum_filter1d(commanded, **shift))
-        recent = self.at_samples(commanded)
-        steady = self.pairs & (extent < 0.02 * top) & (np.abs(recent) > 0.1 * top) & (np.abs(recent) < 0.6 * top)
-        sides = [self.measured[:, side][steady[:, side]] / recent[:, side][steady[:, side]] for side in range(2)]
-        if min(map(len, sides)) < 10:
-            measured, recent = self.measured[self.pairs], recent[self.pairs]
-            ratio = float(recent @ measured) / max(float(recent @ recent), 1e-9)
-        else:
-            # A dead side says nothing about the wheel's radius.
-            left, right = (float(np.median(side)) for side in sides)
-            ratio = 0.5 * (left + right) if min(left, right) > 0.5 * max(left, right) else max(left, right)
-        return ratio if ratio > 0.1 else None
 
 
 @dataclass(frozen=True)
@@ -307,7 +289,7 @@ class _Model:
 class _Selection:
     """Selection of the effects that measured wheel speeds show."""
 
-    def __init__(self, blocks: _Blocks):
+    def __init__(self, blocks: WheelBlocks):
         self.blocks = blocks
         self._fold = np.arange(len(blocks)) % 2
         self._parts = [blocks[self._fold == number] for number in (0, 1)]
@@ -323,7 +305,7 @@ class _Selection:
         """
         found = [self.scored((), None)]
         while len(found) <= _LARGEST_MODEL:
-            candidates = [self.scored(names, found[-1]) for names in self._larger(found[-1].names)]
+            candidates = [self.scored(names, found[-1]) for names in self.larger(found[-1].names)]
             if not candidates:
                 break
             further = self._exchanged(min(candidates, key=lambda model: model.loss))
@@ -351,7 +333,8 @@ class _Selection:
             self._known[names] = _Model(names, np.mean(values, axis=0), losses)
         return self._known[names]
 
-    def _larger(self, names: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
+    def larger(self, names: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
+        """Models with one more effect."""
         for name in self._order:
             excluded = any(other in _response(name).excludes or name in _response(other).excludes for other in names)
             if name not in names and not excluded:
@@ -362,7 +345,7 @@ class _Selection:
         tried = [best]
         for name in best.names:
             rest = tuple(other for other in best.names if other != name)
-            tried += [self.scored(names, best) for names in self._larger(rest) if name not in names]
+            tried += [self.scored(names, best) for names in self.larger(rest) if name not in names]
         return min(tried, key=lambda model: model.loss)
 
     def _smaller(self, model: _Model) -> list[_Model]:
@@ -385,7 +368,7 @@ def _better(smaller: _Model, larger: _Model, candidates: int) -> bool:
     return bool(wilcoxon(gains, alternative="greater").pvalue * candidates < _ALPHA)
 
 
-def _weak(model: _Model, blocks: _Blocks) -> list[str]:
+def _weak(model: _Model, blocks: WheelBlocks) -> list[str]:
     """Effects of a model whose values are too small to count."""
     return [
         name
@@ -394,11 +377,15 @@ def _weak(model: _Model, blocks: _Blocks) -> list[str]:
     ]
 
 
-def _ruled_out(names: tuple[str, ...], values: np.ndarray, blocks: _Blocks) -> Iterator[str]:
+def _ruled_out(
+    names: tuple[str, ...], values: np.ndarray, blocks: WheelBlocks, *, unchanged: bool = False
+) -> Iterator[str]:
     """Effects that a model does not hold, and that would count only at values which the wheels contradict.
 
     That a selection leaves an effect out does not show that it is absent: noise may hide it, or another effect stand in
-    for it. Each is therefore fitted beside the others, and its confidence interval looked at.
+    for it. Each is therefore fitted beside the others, and its confidence interval looked at. Where the model of
+    commissioning still holds, ``unchanged``, an effect is ruled out, too, if its interval would be narrow enough to
+    show one that counts: what it holds was so when the robot was healthy.
     """
     for effect in wheel_effects():
         if effect.name in names or not effect.applies_to(blocks.robot):
@@ -408,9 +395,14 @@ def _ruled_out(names: tuple[str, ...], values: np.ndarray, blocks: _Blocks) -> I
         fitted = _fit(together, blocks, _starts(together, blocks.fastest, known))
         value, *_ = dict(_by_effect(together, fitted))[effect.name]
         half_width, *_ = dict(_by_effect(together, _half_widths(fitted, together, blocks)))[effect.name]
-        ends = (value - half_width, value + half_width)
-        if np.isfinite(ends).all() and not any(_response(effect.name).counts(end, blocks.fastest) for end in ends):
-            yield effect.name
+        response, neutral = _response(effect.name), _neutral(effect.name)
+        intervals = [(value - half_width, value + half_width)]
+        if unchanged and np.isfinite(neutral):
+            intervals.append((neutral - half_width, neutral + half_width))
+        for ends in intervals:
+            if np.isfinite(ends).all() and not any(response.counts(end, blocks.fastest) for end in ends):
+                yield effect.name
+                break
 
 
 def _keys(name: str) -> tuple[str, ...]:
@@ -426,6 +418,16 @@ def _by_effect(names: Sequence[str], values: np.ndarray) -> Iterator[tuple[str, 
         count = len(_keys(name))
         yield name, tuple(float(value) for value in values[at : at + count])
         at += count
+
+
+def _named(names: Sequence[str], values: np.ndarray) -> Effects:
+    """Values ``[P]`` of the parameters of each effect, by their names."""
+    return tuple((name, dict(zip(_keys(name), own, strict=True))) for name, own in _by_effect(names, values))
+
+
+def _neutral(name: str) -> float:
+    """Value without effect of the parameter that says how large an effect is."""
+    return next(p.neutral for p in CATALOGUE[name].parameters if p.name == _response(name).parameter)
 
 
 def _bounds(names: Sequence[str], fastest: Fastest) -> np.ndarray:
@@ -451,7 +453,7 @@ def _response(name: str) -> WheelResponse:
     return response
 
 
-def _modelled(values: np.ndarray, names: tuple[str, ...], blocks: _Blocks) -> np.ndarray:
+def _modelled(values: np.ndarray, names: tuple[str, ...], blocks: WheelBlocks) -> np.ndarray:
     """Speeds ``[n, 2, T]`` [m/s] of wheels that follow the commands under effects: those on the twist act first."""
     ordered = sorted(_by_effect(names, values), key=lambda entry: not _response(entry[0]).of_twist)
     signal, sides = blocks.twists, False
@@ -471,12 +473,12 @@ def _modelled(values: np.ndarray, names: tuple[str, ...], blocks: _Blocks) -> np
     return signal if sides else blocks.commanded(signal)
 
 
-def _residuals(values: np.ndarray, names: tuple[str, ...], blocks: _Blocks) -> np.ndarray:
+def _residuals(values: np.ndarray, names: tuple[str, ...], blocks: WheelBlocks) -> np.ndarray:
     """Measured minus modelled speed ``[n, 2, K]`` [m/s]; zero where there is no sample."""
     return (blocks.measured - blocks.at_samples(_modelled(values, names, blocks))) * blocks.pairs
 
 
-def _block_losses(values: np.ndarray, names: tuple[str, ...], blocks: _Blocks, top: float) -> np.ndarray:
+def _block_losses(values: np.ndarray, names: tuple[str, ...], blocks: WheelBlocks, top: float) -> np.ndarray:
     """Sum of squared errors of each block ``[n]``, each clipped so that a few outliers do not decide."""
     return np.minimum(_residuals(values, names, blocks) ** 2, (0.5 * top) ** 2).sum(axis=(1, 2))
 
@@ -493,7 +495,7 @@ def _starts(names: tuple[str, ...], fastest: Fastest, similar: _Model | None) ->
     return [np.concatenate([values[i % len(values)] for values in listed]) for i in range(count)]
 
 
-def _fit(names: tuple[str, ...], blocks: _Blocks, starts: Sequence[np.ndarray]) -> np.ndarray:
+def _fit(names: tuple[str, ...], blocks: WheelBlocks, starts: Sequence[np.ndarray]) -> np.ndarray:
     """Parameters by robust least squares from the best of a few starts."""
     if not names:
         return np.zeros(0)
@@ -507,7 +509,7 @@ def _fit(names: tuple[str, ...], blocks: _Blocks, starts: Sequence[np.ndarray]) 
     ).x  # fmt: skip
 
 
-def _half_widths(values: np.ndarray, names: tuple[str, ...], blocks: _Blocks) -> np.ndarray:
+def _half_widths(values: np.ndarray, names: tuple[str, ...], blocks: WheelBlocks) -> np.ndarray:
     """Half-widths of 95 % intervals from the scores of each block (sandwich estimate, White 1980), ``[P]``."""
     base, bounds = _residuals(values, names, blocks), _bounds(names, blocks.fastest)
     derivatives = []
