@@ -10,11 +10,9 @@ again, and may be dropped or replaced.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.stats import t as student_distribution
 
 from monoforce_ros.discrepancy.areas import clusters
 from monoforce_ros.discrepancy.credibility import complaint
@@ -40,6 +38,7 @@ from monoforce_ros.discrepancy.hypothesis import (
 from monoforce_ros.discrepancy.learned import learned_terms
 from monoforce_ros.discrepancy.left_out import values_without_parts
 from monoforce_ros.discrepancy.nominal import NominalModel
+from monoforce_ros.discrepancy.residual_size import ResidualSize, residual_size
 from monoforce_ros.discrepancy.score_test import motion_count
 from monoforce_ros.discrepancy.screening import Screening, admitted
 from monoforce_ros.discrepancy.thresholds import Thresholds
@@ -68,16 +67,6 @@ _SMALL_SHARE = 0.5
 exchanged nor replaced by combinations with another beginning: it only saves time on what is unknown anyway."""
 _ALTERNATIVES = 1
 """Combinations that do not begin with the best single effect and are tried where that one leads to no good fit."""
-
-
-@dataclass(frozen=True)
-class _Size:
-    """The size of residuals beside those of a healthy robot."""
-
-    above: float
-    """Logarithm of the ratio of the losses."""
-    p: float
-    """p-value of a healthy drive as large."""
 
 
 class Search:
@@ -335,7 +324,7 @@ class Search:
         p, name = (1.0, "") if strongest is None else (strongest.adjusted, strongest.name)
         size = self._size(trial)
         if size is not None:
-            if size.above < self.thresholds.drive_spread:
+            if size.above < size.spread:
                 # What is about as small as on the healthy robot is nothing that is missing.
                 p, name = 1.0, ""
             if trial.loss - self.healthy_loss > least and size.p < p:
@@ -347,7 +336,7 @@ class Search:
             explained = excess_share(nominal.loss, trial.loss, self.healthy_loss)
         return FitTest(p, name, tuple(tests), explained)
 
-    def _size(self, trial: Trial) -> _Size | None:
+    def _size(self, trial: Trial) -> ResidualSize | None:
         """How much larger a trial's residuals are than a healthy robot's; None where these are unknown."""
         healthy = self.nominal
         if healthy is None or healthy.segments < 2:
@@ -356,9 +345,7 @@ class Search:
         # An effect of the right kind leaves some of what it does: no formula is exact.
         change = self.directions.scaled(base) - self.directions.scaled(base[: self.fixed_count(base)])
         expected = expected_loss(healthy.loss, change, self.thresholds.model_error)
-        above = float(np.log(max(trial.loss, 1e-9) / expected))
-        degrees = self.thresholds.calibration_degrees
-        return _Size(above, float(student_distribution.sf(above / self.thresholds.drive_spread, degrees)))
+        return residual_size(trial.held_out_loss, self.data.starts, expected, healthy, self.thresholds)
 
     def fixed_count(self, effects: Effects) -> int:
         """Number of leading effects that keep the values which another sensor measured."""

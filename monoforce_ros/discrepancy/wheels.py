@@ -14,6 +14,7 @@ from scipy.stats import wilcoxon
 from monoforce_ros.core import CommandTrack, WheelTrack
 from monoforce_ros.discrepancy.healthy_wheels import HealthyWheels
 from monoforce_ros.discrepancy.hypothesis import Effects
+from monoforce_ros.discrepancy.residual_size import relative_error
 from monoforce_ros.discrepancy.thresholds import Thresholds
 from monoforce_ros.discrepancy.wheel_blocks import BLOCK, WheelBlocks
 from monoforce_ros.effects import CATALOGUE, Fastest, WheelResponse, wheel_effects
@@ -153,14 +154,17 @@ def compare_with_wheels(
 def _still_healthy(blocks: WheelBlocks, measured: float, healthy: HealthyWheels, spread: float) -> WheelFinding | None:
     """The wheels as they were when the robot was commissioned, if that predicts them still.
 
-    It does where its error is no larger than on healthy drives, and neither other values, nor another ratio of wheels
-    and commands, nor any further effect predict held-out blocks better beyond chance.
+    It does where its error is within a standard deviation of that on healthy drives, and neither other values, nor
+    another ratio of wheels and commands, nor any further effect predict held-out blocks better beyond chance.
     """
     selection = _Selection(replace(blocks, measured=blocks.measured / healthy.ratio))
     blocks, before = selection.blocks, _as_known(healthy, selection.blocks)
     names, values = before.names, before.values
     samples, changes = _sizes(values, names, blocks)
-    if before.loss > np.exp(spread) * healthy.expected(samples, changes).sum():
+    expected = healthy.expected(samples, changes)
+    ratio = before.loss / max(float(expected.sum()), 1e-12)
+    error = relative_error(before.losses - ratio * expected, before.loss)
+    if np.log(max(ratio, 1e-12)) > np.hypot(spread, error):
         return None
     gain = measured / healthy.ratio
     free = _Selection(replace(blocks, measured=blocks.measured / gain)).scored(names, before)
