@@ -416,7 +416,8 @@ class Predictions:
         if self.data.with_attitude:
             lean = vertical(rotations) - windows.leaned
             # What the robot always leans may be the sensor's mounting, or its accelerometer's bias.
-            lean = lean - np.nanmedian(lean, axis=(1, 2), keepdims=True)
+            diverged = np.isnan(lean).all(axis=(1, 2), keepdims=True)
+            lean = lean - np.nanmedian(np.where(diverged, 0.0, lean), axis=(1, 2), keepdims=True)
             risen = displacement[..., 2] + sunk[:, None, None]
             errors += [lean[..., 1], -lean[..., 0], risen - windows.risen]
         return list(np.stack(errors, axis=-1))
