@@ -29,11 +29,15 @@ def rough_and_grassy():
     return TerrainMap.from_height(ground, GRID, geometric_height=ground + 0.4 * torch.sigmoid(2.0 * x))
 
 
-def driven(robot, terrain=None):
-    """Windows of a drive at random commands by a robot with the effects of its file."""
+def driven(robot, terrain=None, factor=1.0):
+    """Windows of a drive at random commands by a robot with the effects of its file.
+
+    Drives follow ``factor`` times the commands, a scalar or one for each of 2700 steps of 10 ms.
+    """
     random = np.random.default_rng(4)
     commanded = np.repeat(random.uniform([-0.3, -1.2], [1.0, 1.2], (18, 2)), 150, axis=0)
     speeds = drive_speeds(robot, torch.as_tensor(commanded[None], dtype=torch.float32), 0.01)
+    speeds = speeds * torch.as_tensor(np.broadcast_to(factor, len(commanded)).copy(), dtype=torch.float32)[:, None]
     ground = TerrainMap.flat(Grid.square(2.0, 1.0)) if terrain is None else terrain
     result = rollout(ground, robot, speeds, State.at_rest(0.14), with_forces=False)
     motion = recorded(result, 10**9)
@@ -76,6 +80,24 @@ def test_injected_values_are_recovered_from_motion(name, parameters, tolerance):
     after = np.abs(predictions.residuals([fit.effects])[0]).mean()
     assert after < max(0.25 * before, 1.1 * floor)
     assert after < 0.9 * before
+
+
+def test_a_supply_that_drains_is_no_supply_that_is_low():
+    husky = load_robot("husky")
+    data = driven(husky, factor=1.0 - 0.8 * np.arange(2700) * 0.01 / 60.0)
+    found = Search(husky, data, SCALE, of_time=True).run(1).best
+    assert found.names == ("supply_drain",)
+    assert dict(found.effects)["supply_drain"]["drain"] == pytest.approx(0.8, rel=0.1)
+    low = Search(husky, driven(husky, factor=0.8), SCALE, of_time=True).run(1).best
+    assert low.names == ("drive_gain",)
+
+
+def test_a_robot_whose_file_says_how_fast_its_supply_drains_is_predicted_with_it():
+    husky = load_robot("husky")
+    data = driven(husky, factor=1.0 - 0.8 * np.arange(2700) * 0.01 / 60.0)
+    drained = replace(husky, effects=(("supply_drain", {"drain": 0.8}),))
+    before, after = (np.abs(Predictions(robot, data).residuals([()])[0]).mean() for robot in (husky, drained))
+    assert after < 0.3 * before
 
 
 def test_friction_that_fell_far_below_that_of_the_file_is_found():

@@ -117,6 +117,7 @@ ALL_STAGES = {
     "yaw_rate_limit": {"limit": 0.11},
     "drive_loss": {"loss": -0.3},
     "supply_sag": {"sag": 0.25},
+    "supply_drain": {"drain": 0.3, "time": 40.0},
     "drive_droop": {"loss": 0.06, "recovery": 0.8},
     "acceleration_limit": {"limit": 0.13},
     "yaw_acceleration_limit": {"limit": 0.21},
@@ -517,6 +518,13 @@ def test_the_slip_that_a_soft_drive_leaves_solves_its_equation(giving, error):
     exact = torch.tensor([solved(float(along), float(across)) for along, across in slip.T])
     force, wanted = (left / torch.sqrt(left**2 + slip[1] ** 2 + 0.02**2) for left in (kept * slip[0], exact))
     assert (force - wanted).abs().max() < error
+
+
+def test_the_supply_drains_with_the_time_since_it_was_full(husky):
+    speeds = steps(having(husky, supply_drain={"drain": 0.3, "time": 40.0}), [0.5, -0.8])
+    np.testing.assert_allclose(speeds, [0.4, -0.64])
+    np.testing.assert_allclose(steps(having(husky, supply_drain={"drain": 0.3}), [0.5]), [0.5])
+    np.testing.assert_allclose(steps(having(husky, supply_drain={"drain": 2.0, "time": 600.0}), [0.5]), [0.05])
 
 
 def test_the_supply_sags_with_the_speed_of_all_drives(husky):

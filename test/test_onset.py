@@ -7,13 +7,16 @@ import pytest
 import torch
 from recorded_rollout import recorded
 
+from monoforce_ros.bags import SmoothedMotion
 from monoforce_ros.core import CommandTrack, WheelTrack
-from monoforce_ros.discrepancy.hypothesis import EvidenceWindows, window_starts
+from monoforce_ros.discrepancy.explanation import DiagnosisSettings, Explanation, Windows, explain
+from monoforce_ros.discrepancy.hypothesis import Evidence, EvidenceWindows, window_starts
 from monoforce_ros.discrepancy.nominal import NominalModel
-from monoforce_ros.discrepancy.onset import find_onset
+from monoforce_ros.discrepancy.onset import Onset, find_onset
 from monoforce_ros.discrepancy.selection import Search
+from monoforce_ros.discrepancy.verdict import Verdict
 from monoforce_ros.discrepancy.wheels import WheelFinding, changed_drives, compare_with_wheels
-from monoforce_ros.effects import drive_speeds
+from monoforce_ros.effects import drive_speeds, identifiable_effects
 from monoforce_ros.physics import State, rollout
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainMap
@@ -22,13 +25,14 @@ SAMPLES = np.array([0.5, 1.0, 1.5, 2.0])
 SECONDS, ONSET = 72.0, 40.0
 
 
-def _recording(begins: float, gain: float = 0.75) -> EvidenceWindows:
-    """Drives that reach a share of the commanded speed from a time on."""
+def _recording(begins: float, gain: float = 0.75, drain: float = 0.0) -> EvidenceWindows:
+    """Drives that reach a share of the commanded speed from a time on, and lose ``drain`` of it every minute."""
     husky = load_robot("husky")
     random = np.random.default_rng(2)
     steps = round(SECONDS / 0.01)
     commanded = np.repeat(random.uniform([0.1, -0.8], [0.9, 0.8], (round(SECONDS / 1.5), 2)), 150, axis=0)[:steps]
     speeds = drive_speeds(husky, torch.as_tensor(commanded[None], dtype=torch.float32), 0.01)
+    speeds = speeds * (1.0 - drain * torch.arange(steps)[None, :, None] * 0.01 / 60.0)
     acting = torch.arange(steps)[None, :, None] * 0.01 >= begins
     level = TerrainMap.flat(Grid.square(2.0, 1.0))
     result = rollout(level, husky, torch.where(acting, gain * speeds, speeds), State.at_rest(0.13), with_forces=False)
@@ -50,6 +54,31 @@ def test_an_effect_that_begins_is_dated(begins):
         assert (onset.stamp - data.motion.stamps[0]) * 1e-9 == pytest.approx(ONSET, abs=3.0)
     else:
         assert onset is None
+
+
+def _explained(data: EvidenceWindows) -> Explanation:
+    """Of a commissioned robot whose healthy residuals are some centimetres."""
+    residual = np.tile([0.01, 0.012, 0.007], (4, 1))
+    names = [effect.name for effect in identifiable_effects(load_robot("husky"))]
+    healthy = NominalModel(residual, dict.fromkeys(names, 0.25), segments=5, loss=0.3, loss_spread=0.2)
+    evidence = Evidence(SmoothedMotion(data.motion, 0.0, 0.0, (slice(0, len(data.motion)),)), data.commands)
+    windows = Windows(data, np.zeros((len(data.starts), 4, 3)))
+    return explain(evidence, load_robot("husky"), windows, healthy, DiagnosisSettings(max_effects=1))
+
+
+@pytest.mark.parametrize("drain", [0.15])
+def test_a_supply_that_drains_is_named(drain):
+    found = _explained(_recording(0.0, 1.0, drain))
+    assert found.decision.verdict == Verdict.EFFECT_FOUND and found.part is None
+    ((name, values),) = found.decision.trial.effects
+    assert name == "supply_drain" and values["drain"] == pytest.approx(drain, rel=0.15)
+
+
+@pytest.mark.parametrize("gain", [0.9])
+def test_drives_that_become_slow_at_once_have_no_supply_that_drains(gain):
+    found = _explained(_recording(ONSET, gain))
+    assert isinstance(found.part, Onset) and found.part.since_start == pytest.approx(ONSET, abs=5.0)
+    assert [name for name, _ in found.decision.trial.effects] == ["drive_gain"]
 
 
 @pytest.mark.parametrize("gain", [0.9, 1.0])

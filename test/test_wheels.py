@@ -92,6 +92,28 @@ def test_drives_that_multiply_every_command_are_not_called_slow_or_limited(husky
     assert plain.gain == 1.0 and "times" not in plain.summary()
 
 
+def test_wheels_show_a_supply_that_drains(husky):
+    commands = drawn_commands(90.0, 5)
+    wheels = wheels_of(commands, husky, ())
+    times = (wheels.stamps - commands.stamps[0]) * 1e-9
+    drained = WheelTrack(wheels.stamps, wheels.speeds * (1.0 - 0.3 * times / 60.0)[:, None])
+    found = compare_with_wheels(commands, drained, husky)
+    assert [name for name, _ in found.effects] == ["supply_drain"]
+    assert found.effects[0][1]["drain"] == pytest.approx(0.3, rel=0.05)
+    assert "slower by 0.30 of their speed every minute" in found.summary()
+
+
+@pytest.mark.parametrize("gain", [0.75, 0.95])
+def test_wheels_that_become_slow_at_once_show_no_supply_that_drains(husky, gain):
+    commands = drawn_commands(90.0, 5)
+    wheels = wheels_of(commands, husky, ())
+    late = wheels.stamps > commands.stamps[0] + 50 * 10**9
+    found = compare_with_wheels(
+        commands, WheelTrack(wheels.stamps, wheels.speeds * np.where(late, gain, 1.0)[:, None]), husky
+    )
+    assert found is None or "supply_drain" not in dict(found.effects)
+
+
 def test_a_dead_time_is_found_though_it_is_a_small_share_of_the_error():
     """A fast robot with noisy wheel speeds and rare steps: the dead time removes less than 8 % of the squared error."""
     warthog, delays = load_robot("warthog"), []

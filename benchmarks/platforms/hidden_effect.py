@@ -208,6 +208,7 @@ _LATE = ("command_delay", "command_clock_offset", "pose_clock_offset")
 """Dead time, late pose stamps and early command stamps are the same in a recording without gyro or wheel speeds."""
 _TURNING = ("turning_scrub", "friction_anisotropy", "friction_scale")
 _SLOWING = ("viscous_drag", "quadratic_drag", "rolling_resistance", "vegetation_drag")
+_SUPPLY = ("supply_drain", "supply_sag")
 _RAMPS = ("command_limits", "yaw_rate_limit", "acceleration_limit", "yaw_acceleration_limit", "twist_limits")
 
 KINDS: dict[str, Kind] = {
@@ -290,7 +291,7 @@ KINDS: dict[str, Kind] = {
         (0.05, 0.5), _one_side, lambda v, p: DriveFactors(left=v["left"], right=v["right"]),
         ("drive_loss", "drive_asymmetry"),
     ),
-    "supply_sag": Kind((0.003, 0.012), _one("rate"), lambda v, p: SupplySag(rate=v["rate"]), ("supply_sag",)),
+    "supply_sag": Kind((0.003, 0.012), _one("rate"), lambda v, p: SupplySag(rate=v["rate"]), _SUPPLY),
     # Outside the catalogue.
     "gusting_wind": Kind(
         (0.05, 0.4), lambda s, r, p: {"force": s * _weight(p) * p.friction, "seed": r.integers(1 << 30)},

@@ -19,6 +19,7 @@ from monoforce_ros.discrepancy.sensor_findings import SensorFindings, refined_cl
 from monoforce_ros.discrepancy.thresholds import Thresholds
 from monoforce_ros.discrepancy.trial import Outcome, Trial, paired
 from monoforce_ros.discrepancy.verdict import Decision, Findings, decide, leaves_most
+from monoforce_ros.effects import CATALOGUE
 from monoforce_ros.robots import RobotModel
 
 
@@ -126,7 +127,7 @@ def explain(
         evidence, robot, commissioned=nominal is not None, healthy=healthy, thresholds=thresholds
     )
 
-    def searched(part: Windows) -> Search:
+    def searched(part: Windows, *, of_time: bool = False) -> Search:
         scale, known = residual_scale(part.uncertainty, part.data, nominal), sensors.known
         if sensors.gyro is not None:
             known = refined_clock(known, sensors.gyro, Predictions(robot, part.data), scale)
@@ -138,6 +139,7 @@ def explain(
             known=known,
             hints=sensors.hints,
             excluded=sensors.excluded,
+            of_time=of_time,
             thresholds=thresholds,
             seed=settings.seed,
             progress=progress,
@@ -147,6 +149,7 @@ def explain(
     if settings.sensors_only:
         return _measured(windows, sensors, search, thresholds)
     outcome = search.run(settings.max_effects, exchange=not repeated)
+    whole, first = windows, outcome.best
     part: Part | None = None
     passed, found = outcome.fit.passed(thresholds), len(outcome.best.effects) > len(search.known)
     partly = not repeated and passed and not found and search.part_p() <= thresholds.effect_rate
@@ -167,6 +170,14 @@ def explain(
             # What a whole recording does not show, and no effect explains in a part of it, is nothing.
             if after.best.effects or not partly:
                 part, windows, search, outcome = found_part, acting, there, after
+    if (partly or not passed) and search.grows_with_time(first):
+        # From one block to the next, like a supply that drains, rather than from some time on.
+        growing = searched(whole, of_time=True)
+        after = growing.run(settings.max_effects, exchange=not repeated, missing=partly)
+        if _grows(after.best) and after.fit.passed(thresholds):
+            losses = first.held_out_loss if part is None else part.losses
+            if after.best.loss < float(losses.mean()):
+                part, windows, search, outcome = None, whole, growing, after
     findings = _findings(search, outcome)
     doubtful = bool(outcome.best.effects) and not findings.commissioned and leaves_most(findings, thresholds)
     if doubtful or not findings.fit.passed(thresholds):
@@ -182,6 +193,11 @@ def explain(
     decision = decide(findings, thresholds)
     decision = replace(decision, losses=replace(decision.losses, variance_ratio=outcome.variance_ratio))
     return Explanation(windows, sensors, search, outcome, findings, decision, part)
+
+
+def _grows(trial: Trial) -> bool:
+    """Whether effects are among those of a trial that grow with time."""
+    return any(CATALOGUE[name].clock for name in trial.names)
 
 
 def _part(search: Search, trials: Sequence[Trial]) -> Part | None:

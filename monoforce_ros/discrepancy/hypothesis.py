@@ -248,6 +248,9 @@ class Predictions:
         self.robot = robot.with_points(touching)
         self._prepared: dict[_MeasurementKey, _Prepared] = {}
         self._index = np.rint(data.samples / self.options.time_step).astype(int)
+        # Of the windows, since the recording's start [s].
+        middles = (data.starts - data.motion.stamps[0]) * 1e-9 + 0.5 * data.horizon
+        self._middles = torch.as_tensor(np.maximum(middles, 0.0), dtype=torch.float32)
 
     def residuals(self, hypotheses: Sequence[Effects]) -> np.ndarray:
         """Predicted minus measured, ``[H, W, K, C]``, with the robot's own effects and each hypothesis."""
@@ -447,4 +450,7 @@ class Predictions:
                 key: torch.tensor([float(v[key]) for v in values], dtype=torch.float32).repeat_interleave(width)
                 for key in values[0]
             }
+        for name, parameters in joined.items():
+            if clock := CATALOGUE[name].clock:
+                joined[name] = {**parameters, clock: self._middles.repeat(len(hypotheses))}
         return tuple(joined.items())

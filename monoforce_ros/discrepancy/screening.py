@@ -12,7 +12,7 @@ from monoforce_ros.discrepancy.fit import first_values, fit_effects, jacobian, r
 from monoforce_ros.discrepancy.hypothesis import Effects, EvidenceWindows, Predictions, values_key
 from monoforce_ros.discrepancy.score_test import Direction, ScoreResult, block_numbers, motion_count, score_tests
 from monoforce_ros.discrepancy.thresholds import Thresholds
-from monoforce_ros.effects import Effect, identifiable_effects
+from monoforce_ros.effects import CATALOGUE, Effect, identifiable_effects
 from monoforce_ros.robots import RobotModel
 
 _FITTED = 8
@@ -72,6 +72,8 @@ class Screening:
         directions: of the same windows.
         hints: values that another sensor suggests; fits start there, too.
         excluded: effects that another sensor rules out.
+        of_time: whether effects that grow with time are candidates, too, without a hint. An effect that begins late
+            looks like them.
         thresholds: error rates.
         seed: of the null distributions.
         progress: called with a description of the next step.
@@ -85,12 +87,15 @@ class Screening:
         *,
         hints: Effects = (),
         excluded: Sequence[str] = (),
+        of_time: bool = False,
         thresholds: Thresholds = Thresholds(),  # noqa: B008
         seed: int = 0,
         progress: Callable[[str], None] = lambda step: None,
     ):
         self._robot, self._directions, self._thresholds = robot, directions, thresholds
         self._hints, self._excluded = dict(hints), set(excluded)
+        if not of_time:
+            self._excluded |= {effect.name for effect in CATALOGUE.values() if effect.clock} - self._hints.keys()
         self._seed, self._progress = seed, progress
         starts, scale = data.starts, directions.scale
         self._coarse, self._coarse_scale = Predictions(robot, replace(data, starts=starts[::2])), scale[::2]

@@ -21,6 +21,7 @@ from monoforce_ros.discrepancy.estimates import EffectEstimate, effect_sizes
 from monoforce_ros.discrepancy.fit import (
     Fit,
     estimate_effects,
+    first_values,
     fit_effects,
     flat,
     neutral_values,
@@ -54,7 +55,7 @@ from monoforce_ros.discrepancy.trial import (
     folds_of,
     paired,
 )
-from monoforce_ros.effects import CATALOGUE, separating_sensor
+from monoforce_ros.effects import CATALOGUE, identifiable_effects, separating_sensor
 from monoforce_ros.robots import RobotModel
 
 _JUDGED = 6
@@ -80,6 +81,7 @@ class Search:
         known: effects that another sensor measured: they always act and keep their values.
         hints: values that another sensor suggests; fits start there, too.
         excluded: effects that another sensor rules out.
+        of_time: whether effects that grow with time are candidates, too, without a hint.
         thresholds: error rates.
         progress: called with a description of the next step.
     """
@@ -94,6 +96,7 @@ class Search:
         known: Effects = (),
         hints: Effects = (),
         excluded: Sequence[str] = (),
+        of_time: bool = False,
         thresholds: Thresholds = Thresholds(),  # noqa: B008
         seed: int = 0,
         progress: Callable[[str], None] = lambda step: None,
@@ -105,8 +108,8 @@ class Search:
         self.directions = Directions(self.predictions, self.scale, nominal, thresholds)
         self._progress = progress
         self.screening = Screening(
-            robot, data, self.directions, hints=hints, excluded=excluded, thresholds=thresholds, seed=seed,
-            progress=progress,
+            robot, data, self.directions, hints=hints, excluded=excluded, of_time=of_time,
+            thresholds=thresholds, seed=seed, progress=progress,
         )  # fmt: skip
         starts = data.starts
         self._folds = folds_of(starts, FOLDS)
@@ -166,6 +169,15 @@ class Search:
         directions = [*influences, *self.directions.within(influences, parts)]
         tests = self.screening.tested(self.known, len(self.known), self.directions.scaled(self.known), directions)
         return min(test.adjusted for test in tests)
+
+    def grows_with_time(self, best: Trial) -> bool:
+        """Whether an effect that grows with time is significant beside those of a trial."""
+        base = self.refit(best.effects).effects if best.effects else ()
+        fixed, residual = self.fixed_count(base), self.directions.scaled(base)
+        entries = [first_values(effect)[0][0] for effect in identifiable_effects(self.robot) if effect.clock]
+        directions = [self.directions.influence(base, entry) for entry in entries if entry[0] not in best.names]
+        tests = self.screening.tested(base, fixed, residual, directions) if directions else []
+        return any(test.adjusted <= self.thresholds.further_rate for test in tests)
 
     def measured(self) -> Outcome:
         """The effects that another sensor measured, unless the motion contradicts them."""

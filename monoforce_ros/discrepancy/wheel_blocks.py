@@ -35,6 +35,8 @@ class WheelBlocks:
     """Time of each sample since the first command, in steps, ``[n, K]``."""
     known: np.ndarray
     """Samples that exist, ``[n, K]`` bool; others fill the array."""
+    since: np.ndarray
+    """Time of the first command of each block since that of the recording, ``[n]`` [s]."""
     step: float
     """Time between commands [s]."""
     robot: RobotModel
@@ -50,7 +52,7 @@ class WheelBlocks:
         undriven = undriven_stretches(commands, wheels, None, robot)
         breaks = np.flatnonzero(np.diff(stamps) > _LONGEST_GAP * 1e9) + 1
         length = round((_HISTORY + BLOCK) / step) + 1
-        twists, measured, place, known = [], [], [], []
+        twists, measured, place, known, since = [], [], [], [], []
         for run in np.split(np.arange(len(stamps)), breaks):
             number = (stamps[run] - stamps[run[0]]) // round(BLOCK * 1e9)
             for part in np.split(run, np.flatnonzero(np.diff(number)) + 1):
@@ -66,18 +68,19 @@ class WheelBlocks:
                 measured.append(np.pad(wheels.speeds[part].T, ((0, 0), fill)))
                 place.append(np.pad((stamps[part] - first) * 1e-9 / step, fill))
                 known.append(np.arange(_MOST_SAMPLES) < len(part))
+                since.append((first - int(commands.stamps[0])) * 1e-9)
         if not twists:
             return None
         bounds = np.array([[robot.maximum_speed], [robot.maximum_yaw_rate], [robot.maximum_lateral_speed]])
         bounds = bounds[: twists[0].shape[0]]
         limited = np.clip(np.array(twists), -bounds, bounds)
-        return cls(limited, np.array(measured), np.array(place), np.array(known), step, robot)
+        return cls(limited, np.array(measured), np.array(place), np.array(known), np.array(since), step, robot)
 
     def __len__(self) -> int:
         return len(self.twists)
 
     def __getitem__(self, chosen: np.ndarray) -> WheelBlocks:
-        parts = {name: getattr(self, name)[chosen] for name in ("twists", "measured", "place", "known")}
+        parts = {name: getattr(self, name)[chosen] for name in ("twists", "measured", "place", "known", "since")}
         return replace(self, **parts)
 
     def spread(self, most: int) -> np.ndarray:
@@ -92,6 +95,11 @@ class WheelBlocks:
         """Fastest commands: 99.5 % quantiles."""
         speeds = np.abs(self.commanded()).max(axis=1)
         return Fastest(float(np.quantile(speeds, 0.995)), float(np.quantile(np.abs(self.twists[:, 1]), 0.995)))
+
+    @property
+    def times(self) -> np.ndarray:
+        """Of the commands since the recording's start, ``[n, 1, T]`` [s]."""
+        return np.maximum(self.since[:, None, None] + self.step * np.arange(self.twists.shape[2]), 0.0)
 
     @property
     def pairs(self) -> np.ndarray:

@@ -298,7 +298,9 @@ class _Selection:
         self._fold = np.arange(len(blocks)) % 2
         self._parts = [blocks[self._fold == number] for number in (0, 1)]
         self._known: dict[tuple[str, ...], _Model] = {}
-        self._order = [effect.name for effect in wheel_effects() if effect.applies_to(blocks.robot)]
+        names = [effect.name for effect in wheel_effects() if effect.applies_to(blocks.robot)]
+        self._order = [name for name in names if not _response(name).of_time]
+        self._of_time = [name for name in names if _response(name).of_time]
 
     @cached_property
     def best(self) -> _Model:
@@ -322,7 +324,31 @@ class _Selection:
         for model in found[1:]:
             if _better(best, model, len(self._order) - len(best.names)):
                 best = model
-        return self._pruned(best)
+        return self._with_time(self._pruned(best))
+
+    def _with_time(self, best: _Model) -> _Model:
+        """The model with an effect that grows with time, if that is better than a change at some time."""
+        for name in self._of_time:
+            further = self.scored(_in_order((*best.names, name)), best)
+            if _better(best, further, len(self._order)) and further.loss < self._stepped_loss(best):
+                best = further
+        return best
+
+    def _stepped_loss(self, model: _Model) -> float:
+        """Smallest held-out loss if the wheels follow the model at another ratio from some block on."""
+        blocks, top = self.blocks, self.blocks.fastest.speed
+        modelled = blocks.at_samples(_modelled(model.values, model.names, blocks)) * blocks.pairs
+        products, squares = ((part * modelled).sum(axis=(1, 2)) for part in (blocks.measured * blocks.pairs, modelled))
+        losses = []
+        for first in range(1, len(blocks)):
+            ratio = np.ones(len(blocks))
+            for held_out in (0, 1):
+                fitted = (np.arange(len(blocks)) >= first) & (self._fold != held_out)
+                judged = (np.arange(len(blocks)) >= first) & (self._fold == held_out)
+                ratio[judged] = products[fitted].sum() / max(float(squares[fitted].sum()), 1e-12)
+            rest = (blocks.measured - ratio[:, None, None] * modelled) * blocks.pairs
+            losses.append(float(np.minimum(rest**2, (0.5 * top) ** 2).sum()))
+        return min(losses)
 
     def scored(self, names: tuple[str, ...], start: _Model | None) -> _Model:
         """A model fitted to each fold and judged on the other, from the values of a similar one."""
@@ -465,11 +491,12 @@ def _modelled(values: np.ndarray, names: tuple[str, ...], blocks: WheelBlocks) -
         response, first = _response(name), tuple(ordered[: count + 1])
         known = blocks.reached.get(first)
         if known is None:
+            further = (blocks.step, blocks.times) if response.of_time else (blocks.step,)
             if response.of_twist:
-                changed = response.speeds(signal[:, :2], *own, blocks.step)
+                changed = response.speeds(signal[:, :2], *own, *further)
                 known = np.concatenate([changed, signal[:, 2:]], axis=1) if signal.shape[1] > 2 else changed
             else:
-                known = response.speeds(signal if sides else blocks.commanded(signal), *own, blocks.step)
+                known = response.speeds(signal if sides else blocks.commanded(signal), *own, *further)
             if len(blocks.reached) >= _MOST_REACHED:
                 blocks.reached.clear()
             blocks.reached[first] = known

@@ -149,6 +149,9 @@ _FINDINGS: dict[str, Callable[[_Values], str]] = {
         f"The faster the drives run, the more of their speed they lose, {100 * v['sag'] / (1.0 + v['sag']):.0f} % at "
         "1 m/s: their supply sags."
     ),
+    "supply_drain": lambda v: (
+        f"The drives lose {100 * v['drain']:.0f} % of their speed every minute, as when a battery empties."
+    ),
     "yaw_rate_limit": lambda v: f"The base turns no faster than {v['limit']:.2f} rad/s, whatever is commanded.",
     "acceleration_limit": lambda v: f"The base changes its speed by no more than {v['limit']:.2f} m/s in a second.",
     "yaw_acceleration_limit": lambda v: (
@@ -215,6 +218,7 @@ _REMEDIES = {
     "drive_asymmetry": "compare tyre pressure, wear, chain and motor of both sides",
     "drive_loss": "look at motor, gear, chain, fuse and motor driver of this side",
     "supply_sag": "look at charge and age of the battery, and at the resistance of its cables",
+    "supply_drain": "charge the battery, and look at its age; look at the temperature of motors and motor drivers",
     "yaw_rate_limit": "look at the base controller's limit of the yaw rate, and enter it in the robot's file",
     "acceleration_limit": "look at the base controller's limit of the acceleration; plan with it",
     "yaw_acceleration_limit": "look at the base controller's limit of the yaw acceleration; plan with it",
@@ -254,6 +258,7 @@ _CAUSES = {
     "drive_compliance": "drives that give way under load",
     "drive_loss": "a side that runs slow or not at all",
     "supply_sag": "a supply that sags",
+    "supply_drain": "a supply that drains",
     "yaw_rate_limit": "a limit of the yaw rate",
     "acceleration_limit": "a limit of the acceleration",
     "yaw_acceleration_limit": "a limit of the yaw acceleration",

@@ -80,6 +80,8 @@ class WheelResponse:
     """Further parameters; they start at their neutral values and keep to the catalogue's bounds."""
     of_twist: bool = False
     """Whether the effect changes the commanded twist rather than the wheel speeds."""
+    of_time: bool = False
+    """Whether ``speeds`` also takes the times of the commands since the recording's start, ``[n, 1, T]`` [s]."""
     excludes: tuple[str, ...] = ()
     """Effects that a wheel model does not combine with this one because they are too similar to be fitted together;
     ``drive_gain`` stands for a ratio of wheel speeds and commands that is fitted."""
@@ -104,6 +106,8 @@ class Effect(ABC):
     Required for every effect that overrides :meth:`twists` or :meth:`drive_speeds`; all twists change first."""
     acts_on_steering: ClassVar[bool] = False
     """Whether :meth:`drive_speeds` also acts on steering angles, as a delay of all commands does."""
+    clock: ClassVar[str] = ""
+    """Parameter that is the time since a recording's start: predictions of recordings set it for each trajectory."""
     needs: ClassVar[str] = ""
     """``steering`` or ``flippers`` for an effect on these joints: it does nothing on robots without them, and is no
     candidate there."""
