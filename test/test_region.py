@@ -10,7 +10,7 @@ from recorded_rollout import recorded
 
 from monoforce_ros.bags import SmoothedMotion
 from monoforce_ros.core import CommandTrack
-from monoforce_ros.discrepancy.areas import Area, circles, ground_classes, window_places
+from monoforce_ros.discrepancy.areas import Area, circles, ground_classes, window_places, worst_place
 from monoforce_ros.discrepancy.explanation import DiagnosisSettings, Windows, explain
 from monoforce_ros.discrepancy.hypothesis import Evidence, EvidenceWindows, window_starts
 from monoforce_ros.discrepancy.nominal import NominalModel
@@ -77,6 +77,26 @@ def test_ice_that_a_whole_drive_does_not_show_is_found_where_it_is(icy):
     assert (found.part.acting == truly).mean() > 0.9
     assert "within" in found.part.remark and "once" not in found.part.remark
     assert len(found.windows.data.starts) == found.part.acting.sum()
+
+
+def test_the_place_with_the_largest_losses_is_found_whatever_acts_there(icy):
+    losses = Search(load_robot("husky"), icy, RESIDUAL, nominal=_healthy()).loss_of(())
+    place = worst_place(icy, losses, 0.05)
+    truly = np.linalg.norm(window_places(icy) - CENTRE, axis=1) < RADIUS
+    assert place is not None and place.visits > 1
+    assert (place.inside & truly).sum() > 0.8 * truly.sum()
+    # The same losses at another time lie elsewhere, and everywhere.
+    assert worst_place(icy, np.roll(losses, len(losses) // 3), 0.02) is None
+
+
+def test_losses_that_have_nothing_to_do_with_the_ground_show_a_place_as_often_as_stated(icy):
+    random, found = np.random.default_rng(0), 0
+    for _ in range(200):
+        # Manoeuvres of some seconds, of which some are predicted far worse than others.
+        manoeuvres = np.exp(random.standard_normal(1 + len(icy.starts) // 5))
+        losses = np.repeat(manoeuvres, 5)[: len(icy.starts)] * random.uniform(0.8, 1.2, len(icy.starts))
+        found += worst_place(icy, losses, 0.05) is not None
+    assert 2 <= found <= 20
 
 
 def test_an_effect_that_acts_everywhere_has_no_region():

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.cluster.vq import kmeans2
+from scipy.stats import rankdata
 
 from monoforce_ros.core import transform_points
 from monoforce_ros.discrepancy.hypothesis import EvidenceWindows, sample_motion
 from monoforce_ros.discrepancy.preflight import FEWEST_WINDOWS
-from monoforce_ros.discrepancy.trial import blocks_of
+from monoforce_ros.discrepancy.trial import BLOCK, blocks_of
 
 _FEWEST_BLOCKS = 3
 """Half blocks within and outside an area: fewer do not show that anything differs."""
@@ -140,6 +141,32 @@ def clusters(data: EvidenceWindows) -> list[Area]:
         radius = float(np.quantile(np.linalg.norm(places[label == number] - centre, axis=1), 0.9))
         listed.append(_circle(places, centre, radius))
     return [*ground_classes(data), *(area for area in listed if _large_enough(area, data))]
+
+
+def worst_place(data: EvidenceWindows, losses: np.ndarray, rate: float) -> Area | None:
+    """The place with the largest losses, to which the robot came at least twice; None where none stands out.
+
+    Losses are compared by their ranks, and with how they would lie on the ground if they had occurred earlier or later
+    in the drive: shifts in time keep how losses follow one another, and how places do.
+
+    Args:
+        data: the windows.
+        losses: of each window, ``[W]``.
+        rate: error rate, for all places together.
+    """
+    areas = [area for area in circles(data) if area.visits > 1]
+    if not areas:
+        return None
+    masks = np.array([area.inside for area in areas], float)
+    counts = masks.sum(axis=1)
+    ranks = rankdata(losses) - 0.5 * (len(losses) + 1)
+    nearest = round(BLOCK / max(float(np.median(np.diff(data.starts))) * 1e-9, 1e-3))
+    shifts = [0, *range(nearest, len(losses) - nearest + 1)]
+    shifted = np.stack([np.roll(ranks, shift) for shift in shifts])
+    statistics = (shifted @ masks.T) / np.sqrt(counts * (1.0 - counts / len(losses)))
+    largest = statistics.max(axis=1)
+    p = float((largest >= largest[0]).mean())
+    return areas[int(np.argmax(statistics[0]))] if p <= rate else None
 
 
 def _circle(places: np.ndarray, centre: np.ndarray, radius: float) -> Area:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from monoforce_ros.discrepancy.areas import Area
+from monoforce_ros.discrepancy.areas import Area, worst_place
 from monoforce_ros.discrepancy.attitude import changed_lean, lean_of
 from monoforce_ros.discrepancy.comparable_windows import comparable_starts, windows_of
 from monoforce_ros.discrepancy.comparison import (
@@ -234,15 +234,26 @@ def diagnose(
     at_horizon = next((comparison for comparison in compared if comparison.horizon == settings.horizon), None)
     expected = floor if nominal is None else np.sqrt(floor**2 + (nominal.residual_in(data) ** 2).mean(axis=0))
     paths = tuple(measured_paths(robot, data, judged))
+    regimes = find_regimes(data)
+    hints = advice(decision.verdict, effects)
+    place = None
+    if part is None and decision.verdict == Verdict.UNKNOWN_EFFECT:
+        place = worst_place(data, search.loss_of(()), settings.thresholds.comparison_rate)
+    if place is not None:
+        regimes[place.place.words] = place.inside
+        hints = (
+            f"look at the ground {place.place.words}: there errors are largest whenever the robot comes by",
+            *hints,
+        )
     progress(1.0, "done")
     return Diagnosis(
         verdict=decision.verdict,
         effects=effects,
         known_parts=known_parts,
-        localisation=localise(before, expected, data, find_regimes(data)),
+        localisation=localise(before, expected, data, regimes),
         gap=gap,
         noise_floor=NoiseFloor(float(samples[-1]), *(float(value) for value in floor[-1, : len(MOTION)])),
-        advice=advice(decision.verdict, effects),
+        advice=hints,
         candidates=outcome.tried,
         regimes=() if at_horizon is None else tuple(regime_table(at_horizon)),
         fitted=fitted,

@@ -142,16 +142,24 @@ def _scanned(search: Search, trials: Sequence[Trial], areas: Sequence[Area]) -> 
 
 
 def _candidates(search: Search, trials: Sequence[Trial], masks: np.ndarray) -> list[Effects]:
-    """The effects of trials, and those that pull most in any area."""
-    fixed = len(search.known)
-    found = search.screening.candidates(search.known, fixed, "1: ")
-    changes = {entry.name: entry.columns.sum(axis=0) for entry in found.influences}
-    gains = [
-        (float(_Pull.of(search, changes[entry.name]).gains(masks).max()), entry.effects) for entry in found.screened
-    ]
-    gains = sorted(gains, key=lambda entry: -entry[0])[:_TRIED]
-    listed = [trial.effects for trial in trials if len(trial.effects) > fixed]
-    return [*listed, *(effects for gain, effects in gains if gain > _PROMISING * gains[0][0])]
+    """The effects of trials, and those that pull most in any area at one of their initial values.
+
+    What an effect does is not linear: low friction changes nothing until the tyres slip. Where it acts in a small part
+    of a recording, its value for the whole says nothing of it.
+    """
+    known = search.known
+    nominal = search.directions.scaled(known)
+    best: list[tuple[float, Effects]] = []
+    for effect in search.screening.possible([name for name, _ in known]):
+        starts = [known + start for start in search.screening.starts(effect)]
+        gains = [
+            float(_Pull.of(search, residuals - nominal).gains(masks).max())
+            for residuals in search.predictions.residuals(starts) / search.scale
+        ]
+        best.append((max(gains), starts[int(np.argmax(gains))]))
+    best = sorted(best, key=lambda entry: -entry[0])[:_TRIED]
+    listed = [trial.effects for trial in trials if len(trial.effects) > len(known)]
+    return [*listed, *(effects for gain, effects in best if gain > _PROMISING * best[0][0])]
 
 
 def _located(search: Search, effects: Effects, masks: np.ndarray) -> tuple[int, Effects]:

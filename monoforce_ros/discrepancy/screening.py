@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -146,6 +146,12 @@ class Screening:
             )
         return self.tested(base, len(base), self._directions.scaled(base), influences)
 
+    def possible(self, names: Collection[str]) -> Iterator[Effect]:
+        """The candidates in addition to effects with these names."""
+        for effect in identifiable_effects(self._robot):
+            if effect.name not in names and effect.name not in self._excluded:
+                yield effect
+
     def candidates(self, base: Effects, fixed: int, number: str, *, incomplete: bool = False) -> Candidates:
         """A quick fit and a test of every effect in addition to a base; kept, for it is asked for again.
 
@@ -166,9 +172,7 @@ class Screening:
         residual = self._sparse.residuals([base])[0] / self._sparse_scale
         names = {name for name, _ in base}
         tried: list[tuple[float, Effect, Effects]] = []
-        for effect in identifiable_effects(self._robot):
-            if effect.name in names or effect.name in self._excluded:
-                continue
+        for effect in self.possible(names):
             self._progress(f"{number}{effect.name}")
             tried.append(self._tried(effect, base, residual))
         tried.sort(key=lambda entry: entry[0])
@@ -196,7 +200,7 @@ class Screening:
 
         The promised loss is the smallest at an initial value, or along the straight line from ``base`` to one.
         """
-        starts = [base + start for start in self._starts(effect)]
+        starts = [base + start for start in self.starts(effect)]
         scaled = np.nan_to_num(self._sparse.residuals(starts) / self._sparse_scale)
         losses = robust(scaled).mean(axis=1)
         weights = robust_weights(residual)
@@ -206,7 +210,8 @@ class Screening:
         promised = robust(residual).mean() - 0.5 * slopes**2 / curvatures / motion_count(residual)
         return float(min(promised.min(), losses.min())), effect, starts[int(np.argmin(losses))]
 
-    def _starts(self, effect: Effect) -> list[Effects]:
+    def starts(self, effect: Effect) -> list[Effects]:
+        """Initial values of an effect's fits: over its range, from the robot's file, and what a sensor suggests."""
         name = effect.name
         own = dict(self._robot.effects)
         starts = first_values(effect)
