@@ -70,7 +70,9 @@ class Details:
     compared: tuple[Comparison, ...]
     paths: tuple[PathComparison, ...]
     area: Area | None = None
-    """Where the effects act, if only there."""
+    """Where the effects act, if only there; of an unknown effect where errors are largest at every visit."""
+    area_meaning: str = "acts here"
+    """Of ``area``, in a legend."""
 
 
 @dataclass(frozen=True)
@@ -158,7 +160,7 @@ def diagnose(
     windows = windows_of(evidence, robot, starts, samples, noisy)
     explanation = explain(evidence, robot, windows, nominal, settings, _Steps(progress, 0.05, 0.6))
     part = explanation.part
-    area = part.area if isinstance(part, Region) else None
+    area, meaning = (part.area if isinstance(part, Region) else None), "acts here"
     aside = None
     if ground_explains(explanation.decision):
         by_sensors = explanation.by_sensors(settings.thresholds)
@@ -260,7 +262,7 @@ def diagnose(
         remarks=decision.remarks,
         losses=decision.losses,
         commissioned=search.commissioned,
-        details=Details(data, before, floor, tuple(compared), paths, area),
+        details=Details(data, before, floor, tuple(compared), paths, area, meaning),
         part="" if part is None or decision.verdict in _NOTHING_ADDED else part.remark,
         set_aside=None if aside is None else aside.verdict,
     )

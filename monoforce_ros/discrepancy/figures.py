@@ -99,7 +99,7 @@ def map_figure(details: Details) -> Figure:
                     facecolor="#0b84a51f",
                     edgecolor=_AFTER,
                     ls="--",
-                    label="acts here",
+                    label=details.area_meaning,
                 )
             )
             ax.legend(frameon=False, loc="best", fontsize=9)
