@@ -243,6 +243,7 @@ def diagnose(
         place = worst_place(data, search.loss_of(()), settings.thresholds.comparison_rate)
     if place is not None:
         regimes[place.place.words] = place.inside
+        area, meaning = place, "largest errors"
         hints = (
             f"look at the ground {place.place.words}: there errors are largest whenever the robot comes by",
             *hints,

@@ -84,7 +84,7 @@ def map_figure(details: Details) -> Figure:
         sets.append((_WITH_EFFECTS, compared.after))
     errors = [compared.errors("position", values) for _, values in sets]
     top = max(float(np.quantile(errors[0], 0.95)), 0.02)
-    figure = Figure(figsize=(11.0, 4.2), layout="constrained", dpi=110)
+    figure = Figure(figsize=(5.5 * len(sets) + (1.5 if len(sets) == 1 else 0.0), 4.2), layout="constrained", dpi=110)
     axes = np.atleast_1d(figure.subplots(1, len(sets), sharex=True, sharey=True))
     track = data.motion.positions[:, :2]
     for ax, (name, _), error in zip(axes, sets, errors, strict=True):
