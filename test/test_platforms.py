@@ -340,9 +340,11 @@ def test_the_true_effect_explains_most_of_what_it_does_in_the_other_engine(tmp_p
     ratios = row["loss_ratios"]
     assert ratios[0] >= ratios[1] >= ratios[2] > 0.0 and (row["harder"] <= 0.0 or ratios[2] < ratios[0])
     # The more healthy drives vary, the less significant is the same drive.
-    row = null_rates.measured(case, CaseFiles.of(case, tmp_path), nominal, (0.0, 1.0, 1e5))
+    shares, spreads = (0.0, 1.0, 1e5), (0.1, 50.0)
+    row = null_rates.measured(case, CaseFiles.of(case, tmp_path), nominal, shares, spreads)
     (_, alone), (name, usual), (_, hopeless) = row["smallest"]
     assert name == "drive_loss" and alone <= usual <= 0.025 < hopeless
-    assert "of 1 drives with an effect below 0.025: 1 at 0, 1 at 1, 0 at 100000" in null_rates.summary(
-        "single", [row], (0.0, 1.0, 1e5)
-    )
+    text = null_rates.summary("single", [row], shares, spreads)
+    assert "of 1 drives with an effect below 0.025: 1 at 0, 1 at 1, 0 at 100000" in text
+    # So with their losses: the drive is too large beside those that hardly differ.
+    assert "too large at 0.0125: 1 at 0.1, 0 at 50" in text
