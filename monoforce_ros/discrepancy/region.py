@@ -107,23 +107,28 @@ def find_region(search: Search, trials: Sequence[Trial]) -> Region | None:
         search: search on the whole recording.
         trials: effects that were found on it and on parts of it.
     """
-    classes = _scanned(search, trials, ground_classes(search.data))
-    circle = _scanned(search, trials, circles(search.data))
-    if classes is None or circle is None:
-        return classes or circle
+    kinds = [areas for areas in (ground_classes(search.data), circles(search.data)) if areas]
+    if not kinds:
+        return None
+    pulls = _pulls(search)
+    scanned = [_scanned(search, trials, pulls, areas) for areas in kinds]
+    found = [region for region in scanned if region is not None]
+    if len(found) < 2:
+        return found[0] if found else None
+    classes, circle = found
     # A class of ground says why an effect acts where it does: a circle must predict better beyond chance.
     _, low = paired(classes.losses, circle.losses, search.data.starts, search.thresholds.comparison_rate)
     return circle if low > 0 else classes
 
 
-def _scanned(search: Search, trials: Sequence[Trial], areas: Sequence[Area]) -> Region | None:
+def _scanned(
+    search: Search, trials: Sequence[Trial], pulls: Sequence[tuple[Effects, _Pull]], areas: Sequence[Area]
+) -> Region | None:
     """The best region of some areas, if any is better than effects everywhere."""
-    if not areas:
-        return None
     masks = np.array([area.inside for area in areas], float)
     starts, before = search.data.starts, search.loss_of(search.known)
     tried = []
-    for effects in _candidates(search, trials, masks):
+    for effects in _candidates(search, trials, pulls, masks):
         chosen, fitted = _located(search, effects, masks)
         losses = np.where(areas[chosen].inside, search.loss_of(fitted), before)
         tried.append((float(losses.mean()), chosen, fitted, losses, effects))
@@ -141,25 +146,33 @@ def _scanned(search: Search, trials: Sequence[Trial], areas: Sequence[Area]) -> 
     return Region(areas[chosen], losses) if p <= thresholds.effect_rate else None
 
 
-def _candidates(search: Search, trials: Sequence[Trial], masks: np.ndarray) -> list[Effects]:
-    """The effects of trials, and those that pull most in any area at one of their initial values.
+def _pulls(search: Search) -> list[tuple[Effects, _Pull]]:
+    """What every effect of the catalogue would change at each of its initial values.
 
     What an effect does is not linear: low friction changes nothing until the tyres slip. Where it acts in a small part
     of a recording, its value for the whole says nothing of it.
     """
-    known = search.known
-    nominal = search.directions.scaled(known)
-    best: list[tuple[float, Effects]] = []
+    known, nominal = search.known, search.directions.scaled(search.known)
+    pulls = []
     for effect in search.screening.possible([name for name, _ in known]):
         starts = [known + start for start in search.screening.starts(effect)]
-        gains = [
-            float(_Pull.of(search, residuals - nominal).gains(masks).max())
-            for residuals in search.predictions.residuals(starts) / search.scale
-        ]
-        best.append((max(gains), starts[int(np.argmax(gains))]))
-    best = sorted(best, key=lambda entry: -entry[0])[:_TRIED]
-    listed = [trial.effects for trial in trials if len(trial.effects) > len(known)]
-    return [*listed, *(effects for gain, effects in best if gain > _PROMISING * best[0][0])]
+        scaled = search.predictions.residuals(starts) / search.scale
+        pulls += [(start, _Pull.of(search, own - nominal)) for start, own in zip(starts, scaled, strict=True)]
+    return pulls
+
+
+def _candidates(
+    search: Search, trials: Sequence[Trial], pulls: Sequence[tuple[Effects, _Pull]], masks: np.ndarray
+) -> list[Effects]:
+    """The effects of trials, and those that pull most in any area at one of their initial values."""
+    best: dict[str, tuple[float, Effects]] = {}
+    for effects, pull in pulls:
+        gain, name = float(pull.gains(masks).max()), effects[-1][0]
+        if name not in best or gain > best[name][0]:
+            best[name] = gain, effects
+    strongest = sorted(best.values(), key=lambda entry: -entry[0])[:_TRIED]
+    listed = [trial.effects for trial in trials if len(trial.effects) > len(search.known)]
+    return [*listed, *(effects for gain, effects in strongest if gain > _PROMISING * strongest[0][0])]
 
 
 def _located(search: Search, effects: Effects, masks: np.ndarray) -> tuple[int, Effects]:

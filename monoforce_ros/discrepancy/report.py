@@ -63,7 +63,8 @@ def report_content(
 
 
 def _area_entry(area: Area | None) -> dict | None:
-    """Where the effects act alone: a circle in the odometry frame, or a class of ground."""
+    """Where effects act alone, or errors of an unknown one are largest: a circle in the odometry frame, or a class of
+    ground."""
     return None if area is None else {"circle" if isinstance(area.place, Circle) else "ground": asdict(area.place)}
 
 

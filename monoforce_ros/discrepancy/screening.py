@@ -12,7 +12,7 @@ from monoforce_ros.discrepancy.fit import first_values, fit_effects, jacobian, r
 from monoforce_ros.discrepancy.hypothesis import Effects, EvidenceWindows, Predictions, values_key
 from monoforce_ros.discrepancy.score_test import Direction, ScoreResult, block_numbers, motion_count, score_tests
 from monoforce_ros.discrepancy.thresholds import Thresholds
-from monoforce_ros.effects import CATALOGUE, Effect, identifiable_effects
+from monoforce_ros.effects import Effect, identifiable_effects
 from monoforce_ros.robots import RobotModel
 
 _FITTED = 8
@@ -93,9 +93,7 @@ class Screening:
         progress: Callable[[str], None] = lambda step: None,
     ):
         self._robot, self._directions, self._thresholds = robot, directions, thresholds
-        self._hints, self._excluded = dict(hints), set(excluded)
-        if not of_time:
-            self._excluded |= {effect.name for effect in CATALOGUE.values() if effect.clock} - self._hints.keys()
+        self._hints, self._excluded, self._of_time = dict(hints), set(excluded), of_time
         self._seed, self._progress = seed, progress
         starts, scale = data.starts, directions.scale
         self._coarse, self._coarse_scale = Predictions(robot, replace(data, starts=starts[::2])), scale[::2]
@@ -148,6 +146,15 @@ class Screening:
 
     def possible(self, names: Collection[str]) -> Iterator[Effect]:
         """The candidates in addition to effects with these names."""
+        for effect in self._not_ruled_out(names):
+            if self._of_time or not effect.clock or effect.name in self._hints:
+                yield effect
+
+    def growing(self, names: Collection[str]) -> Iterator[Effect]:
+        """Effects that grow with time, in addition to those with these names, candidates or not."""
+        return (effect for effect in self._not_ruled_out(names) if effect.clock)
+
+    def _not_ruled_out(self, names: Collection[str]) -> Iterator[Effect]:
         for effect in identifiable_effects(self._robot):
             if effect.name not in names and effect.name not in self._excluded:
                 yield effect

@@ -55,7 +55,7 @@ from monoforce_ros.discrepancy.trial import (
     folds_of,
     paired,
 )
-from monoforce_ros.effects import CATALOGUE, identifiable_effects, separating_sensor
+from monoforce_ros.effects import CATALOGUE, separating_sensor
 from monoforce_ros.robots import RobotModel
 
 _JUDGED = 6
@@ -174,8 +174,8 @@ class Search:
         """Whether an effect that grows with time is significant beside those of a trial."""
         base = self.refit(best.effects).effects if best.effects else ()
         fixed, residual = self.fixed_count(base), self.directions.scaled(base)
-        entries = [first_values(effect)[0][0] for effect in identifiable_effects(self.robot) if effect.clock]
-        directions = [self.directions.influence(base, entry) for entry in entries if entry[0] not in best.names]
+        entries = [first_values(effect)[0][0] for effect in self.screening.growing(best.names)]
+        directions = [self.directions.influence(base, entry) for entry in entries]
         tests = self.screening.tested(base, fixed, residual, directions) if directions else []
         return any(test.adjusted <= self.thresholds.further_rate for test in tests)
 

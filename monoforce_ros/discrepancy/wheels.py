@@ -192,10 +192,11 @@ def best_of(
     What the wheels of one recording show need not predict another.
     """
     cut = [WheelBlocks.of(commands, wheels, robot, _STEP) for commands, wheels in recordings]
+    recorded = [blocks for blocks in cut if blocks is not None]
     judged: list[tuple[float, HealthyWheels]] = []
     for model in models:
         parts = []
-        for blocks in (blocks for blocks in cut if blocks is not None):
+        for blocks in recorded:
             used = replace(blocks, measured=blocks.measured / model.ratio)
             known = _as_known(model, used)
             parts.append((known.losses, *_sizes(known.values, known.names, used)))
