@@ -86,13 +86,13 @@ def with_baselines(result: dict, bag: Path, robot: Path, row: Path) -> dict:
 
     from monoforce_ros.discrepancy import read_evidence
     from monoforce_ros.discrepancy.gap import noise_floor, noisy_motions, residual_scale
-    from monoforce_ros.discrepancy.hypothesis import window_starts
+    from monoforce_ros.discrepancy.hypothesis import MOTION, window_starts
     from monoforce_ros.discrepancy.nominal import NominalModel
     from monoforce_ros.robots import load_robot
 
     model = load_robot(robot)
     evidence, _ = read_evidence(bag, model, "lidar" if result["ground"] == "hills" else "flat")
-    evidence = replace(evidence, with_attitude=False)
+    evidence = replace(evidence, components=MOTION)
     smoothed = evidence.smoothed
     starts = window_starts(smoothed.motion, smoothed.stretches, 2.0, 1.0)
     data = evidence.cut(starts, np.array([0.5, 1.0, 1.5, 2.0]))

@@ -1,4 +1,4 @@
-"""Roll, pitch and height are residuals, too, where the ground is known and commissioning knows the healthy robot's."""
+"""Attitude, height and their rates are residuals, too, where ground and healthy robot are known."""
 
 from dataclasses import replace
 
@@ -13,8 +13,8 @@ from monoforce_ros.core import CommandTrack
 from monoforce_ros.discrepancy import DiagnosisSettings, commission, diagnose
 from monoforce_ros.discrepancy.attitude import Lean, changed_lean, lean_of, vertical
 from monoforce_ros.discrepancy.fit import fit_effects, robust
-from monoforce_ros.discrepancy.hypothesis import COMPONENTS, MOTION, Evidence, Predictions, window_starts
-from monoforce_ros.discrepancy.nominal import NominalModel, with_known_components
+from monoforce_ros.discrepancy.hypothesis import ATTITUDE, COMPONENTS, MOTION, Evidence, Predictions, window_starts
+from monoforce_ros.discrepancy.nominal import NominalModel, smallest_of, with_known_components
 from monoforce_ros.discrepancy.report import effect_entry
 from monoforce_ros.effects import drive_speeds
 from monoforce_ros.physics import State, rollout
@@ -24,6 +24,7 @@ from monoforce_ros.terrain import Grid, TerrainMap
 pytestmark = pytest.mark.usefixtures("one_thread")
 SAMPLES = np.array([0.5, 1.0, 1.5, 2.0])
 ROLL, PITCH, HEIGHT = (COMPONENTS.index(name) for name in ("roll", "pitch", "height"))
+RATES = [COMPONENTS.index(name) for name in ("roll rate", "pitch rate", "climb rate")]
 
 
 def drive(robot, *, seed=4, turned=None, tilted=None, count=20):
@@ -54,7 +55,20 @@ def drive(robot, *, seed=4, turned=None, tilted=None, count=20):
         )
     commands = CommandTrack(10**9 + np.arange(len(commanded)) * 10_000_000, commanded)
     smoothed = SmoothedMotion(motion, 0.001, 0.0005, (slice(0, len(motion)),))
-    return Evidence(smoothed, commands, with_attitude=True)
+    return Evidence(smoothed, commands, components=COMPONENTS)
+
+
+def over_bumps(robot):
+    """Evidence of a drive straight over waves of 5 cm and 1.5 m."""
+    grid = Grid(40, 400, 0.1, (-2.0, -2.0))
+    along = grid.origin[0] + (torch.arange(grid.columns) + 0.5) * grid.resolution
+    terrain = TerrainMap.from_height((0.05 * torch.sin(2.0 * np.pi * along / 1.5)).expand(grid.rows, -1).clone(), grid)
+    commanded = np.tile([0.8, 0.0], (3000, 1))
+    speeds = drive_speeds(robot, torch.as_tensor(commanded[None], dtype=torch.float32), 0.01)
+    motion = recorded(rollout(terrain, robot, speeds, State.at_rest(0.2), with_forces=False), 10**9)
+    commands = CommandTrack(10**9 + np.arange(len(commanded)) * 10_000_000, commanded)
+    smoothed = SmoothedMotion(motion, 0.001, 0.0005, (slice(0, len(motion)),))
+    return Evidence(smoothed, commands, terrain, np.eye(4), components=COMPONENTS)
 
 
 def windows(evidence):
@@ -81,10 +95,12 @@ def test_a_perfect_model_leaves_no_attitude_and_a_tilted_localisation_neither():
     assert straight.shape[-1] == len(COMPONENTS)
     assert np.abs(straight[..., [ROLL, PITCH]]).max() < np.radians(0.05)
     assert np.abs(straight[..., HEIGHT]).max() < 0.001
+    assert np.abs(straight[..., RATES]).max() < 0.02
     # As seen from a frame that leans by 2°: the ground carries the robot as before.
     leaning = residuals(husky, drive(husky, turned=Rotation.from_euler("xy", [2.0, -1.0], degrees=True)))
     assert np.abs(leaning[..., [ROLL, PITCH]]).max() < np.radians(0.1)
     assert np.abs(leaning[..., HEIGHT]).max() < 0.002
+    assert np.abs(leaning[..., RATES]).max() < 0.02
 
 
 def test_what_a_robot_always_leans_is_no_residual():
@@ -92,6 +108,8 @@ def test_what_a_robot_always_leans_is_no_residual():
     husky = load_robot("husky")
     leaning = residuals(husky, drive(husky, tilted=Rotation.from_euler("xy", [1.0, 2.0], degrees=True)))
     assert np.abs(leaning[..., [ROLL, PITCH]]).max() < np.radians(0.2)
+    # A sensor that leans by 2° takes 0.04 rad/s of a turn at 1 rad/s for pitching: on level ground its lean is known.
+    assert np.abs(leaning[..., RATES]).max() < 0.02
 
 
 @pytest.mark.parametrize("how", ["tilted", "turned"])
@@ -118,16 +136,24 @@ def test_soft_ground_shows_in_pitch_where_the_path_hardly_shows_it():
     husky = load_robot("husky")
     soft = replace(husky, effects=(("terrain_softness", {"factor": 15.0}),))
     data = windows(drive(soft))
-    scale = np.tile([0.01, 0.01, *np.radians([0.3, 0.3, 0.3]), 0.01], (len(SAMPLES), 1))
+    scale = np.tile(smallest_of(np.zeros(len(COMPONENTS))), (len(SAMPLES), 1))
     start = [(("terrain_softness", {"factor": 4.0}),)]
     found = {}
-    for attitude in (True, False):
-        part = replace(data, with_attitude=attitude)
-        fit = fit_effects(Predictions(husky, part), start, scale[:, : len(part.components)])
-        found[attitude] = fit
-    assert dict(found[True].effects)["terrain_softness"]["factor"] == pytest.approx(15.0, rel=0.15)
+    for components in (MOTION, ATTITUDE, COMPONENTS):
+        part = replace(data, components=components)
+        found[components] = fit_effects(Predictions(husky, part), start, scale[:, : len(components)])
+    assert dict(found[COMPONENTS].effects)["terrain_softness"]["factor"] == pytest.approx(15.0, rel=0.15)
     # The interval is a small part of the one from the path alone.
-    assert found[True].covariance[0, 0] < 0.25 * found[False].covariance[0, 0]
+    assert found[ATTITUDE].covariance[0, 0] < 0.25 * found[MOTION].covariance[0, 0]
+
+
+def test_softness_over_bumps_shows_in_the_rates_more_than_in_the_attitude():
+    husky = load_robot("husky")
+    data = windows(over_bumps(husky))
+    predictions = Predictions(husky, data)
+    change = predictions.residuals([(("terrain_softness", {"factor": 4.0}),)])[0] - predictions.residuals([()])[0]
+    information = ((change / smallest_of(change)) ** 2).sum(axis=(0, 1))
+    assert information[RATES].sum() > information[[ROLL, PITCH, HEIGHT]].sum()
 
 
 def test_attitude_adds_to_the_loss_of_the_motion_and_does_not_dilute_it():
@@ -175,14 +201,17 @@ def test_without_commissioning_or_on_unknown_ground_the_motion_counts_alone():
     evidence = drive(husky)
     known, nominal = with_known_components(evidence, None)
     assert windows(known).components == MOTION and nominal is None
-    terms = np.arange(36.0).reshape(6, 6)
-    of_six = NominalModel(np.ones((4, 6)), loss=0.8, motion_loss=0.5, terms=terms)
-    known, nominal = with_known_components(replace(evidence, with_attitude=False), of_six)
+    terms = np.arange(54.0).reshape(9, 6)
+    of_all = NominalModel(np.ones((4, 9)), loss=0.8, motion_loss=0.5, terms=terms)
+    known, nominal = with_known_components(replace(evidence, components=MOTION), of_all)
     assert windows(known).components == MOTION
     assert nominal.residual.shape == (4, 3) and nominal.loss == 0.5 and nominal.terms.shape == (3, 6)
+    known, nominal = with_known_components(evidence, of_all)
+    assert windows(known).components == COMPONENTS and nominal is of_all
+    # Files of earlier releases.
+    of_six = NominalModel(np.ones((4, 6)), loss=0.8, motion_loss=0.5, terms=terms[:6])
     known, nominal = with_known_components(evidence, of_six)
-    assert windows(known).components == COMPONENTS and nominal is of_six
-    # A file of an earlier release.
+    assert windows(known).components == COMPONENTS[:6] and nominal is of_six
     of_three = NominalModel(np.ones((4, 3)), loss=0.5)
     known, nominal = with_known_components(evidence, of_three)
     assert windows(known).components == MOTION and nominal is of_three

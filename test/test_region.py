@@ -1,7 +1,6 @@
 """Region: an effect that acts on a part of the ground is found and placed; one that acts everywhere is not."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +9,16 @@ from recorded_rollout import recorded
 
 from monoforce_ros.bags import SmoothedMotion
 from monoforce_ros.core import CommandTrack
-from monoforce_ros.discrepancy.areas import Area, circles, ground_classes, window_places, worst_place
+from monoforce_ros.discrepancy.areas import (
+    Area,
+    Circle,
+    circles,
+    ground_classes,
+    reach_of,
+    touching,
+    window_places,
+    worst_place,
+)
 from monoforce_ros.discrepancy.explanation import DiagnosisSettings, Windows, explain
 from monoforce_ros.discrepancy.hypothesis import Evidence, EvidenceWindows, window_starts
 from monoforce_ros.discrepancy.nominal import NominalModel
@@ -30,24 +38,22 @@ ICE = (("friction_scale", {"factor": 0.15}),)
 """Friction of wet ice."""
 
 
-def _drive(effects, seconds=90.0, seed=2) -> EvidenceWindows:
-    """Speeds and yaw rates at random, several times through a circle in which a Husky has effects."""
+def _drive(effects, seconds=90.0, seed=2, centre=CENTRE, radius=RADIUS) -> EvidenceWindows:
+    """Speeds and yaw rates at random, several times through a circle in which a Husky has effects.
+
+    Friction is that of each wheel's ground.
+    """
     husky = load_robot("husky")
     random, steps = np.random.default_rng(seed), round(seconds / 0.01)
     commanded = np.repeat(random.uniform([-0.2, -0.2], [1.0, 0.9], (round(seconds / 1.5), 2)), 150, axis=0)[:steps]
     speeds = drive_speeds(husky, torch.as_tensor(commanded[None], dtype=torch.float32), 0.01)
-    level, state = TerrainMap.flat(Grid.square(2.0, 1.0)), State.at_rest(0.13)
-    robots = {False: husky, True: replace(husky, effects=effects)}
-    parts = []
-    for first in range(0, steps, 10):
-        inside = bool(np.linalg.norm(state.position[0, :2].numpy() - CENTRE) < RADIUS)
-        result = rollout(level, robots[inside], speeds[:, first : first + 10], state, with_forces=False)
-        states = (result.position, result.rotation, result.velocity, result.angular_velocity)
-        parts.append([values[:, bool(first) :] for values in states])
-        state = State(*(values[:, -1] for values in states))
-    names = ("position", "rotation", "velocity", "angular_velocity")
-    whole = {name: torch.cat([part[i] for part in parts], dim=1) for i, name in enumerate(names)}
-    motion = recorded(SimpleNamespace(**whole))
+    grid = Grid.square(60.0, 0.1)
+    x, y = np.meshgrid(grid.x - centre[0], grid.y - centre[1])
+    ground = TerrainMap.flat(grid)
+    factor = dict(effects).get("friction_scale", {"factor": 1.0})["factor"]
+    icy = torch.from_numpy(np.hypot(x, y) <= radius)
+    ground = replace(ground, friction=torch.where(icy, factor * ground.friction, ground.friction))
+    motion = recorded(rollout(ground, husky, speeds, State.at_rest(0.13), with_forces=False))
     commands = CommandTrack(np.arange(steps, dtype=np.int64) * 10_000_000, commanded)
     return EvidenceWindows(motion, commands, window_starts(motion, [slice(0, len(motion))], 2.0, 1.0), 2.0, SAMPLES)
 
@@ -72,9 +78,9 @@ def test_ice_that_a_whole_drive_does_not_show_is_found_where_it_is(icy):
     assert isinstance(found.part, Region)
     ((name, values),) = found.decision.trial.effects
     assert name == "friction_scale" and values["factor"] == pytest.approx(0.15, abs=0.05)
-    truly = np.linalg.norm(window_places(icy) - CENTRE, axis=1) < RADIUS
-    # Windows of 2 s at the edge are partly on the ice.
+    truly = touching(Circle(*CENTRE, RADIUS), icy, reach_of(load_robot("husky")))
     assert (found.part.acting == truly).mean() > 0.9
+    assert (found.part.acting_in(icy) == found.part.acting).all()
     assert "within" in found.part.remark and "once" not in found.part.remark
     assert len(found.windows.data.starts) == found.part.acting.sum()
 

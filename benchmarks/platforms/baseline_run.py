@@ -18,7 +18,7 @@ import torch
 from monoforce_ros.core import write_text
 from monoforce_ros.discrepancy import read_evidence
 from monoforce_ros.discrepancy.gap import noise_floor, noisy_motions, residual_scale
-from monoforce_ros.discrepancy.hypothesis import window_starts
+from monoforce_ros.discrepancy.hypothesis import MOTION, window_starts
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.robots import load_robot
 
@@ -35,7 +35,7 @@ def main() -> None:
     torch.set_num_threads(1)
     model = load_robot(robot)
     evidence, _ = read_evidence(Path(bag), model, terrain)
-    evidence = replace(evidence, with_attitude=False)
+    evidence = replace(evidence, components=MOTION)
     smoothed = evidence.smoothed
     data = evidence.cut(window_starts(smoothed.motion, smoothed.stretches, 2.0, 1.0), SAMPLES)
     floor = noise_floor(smoothed.motion, noisy_motions(smoothed), data)

@@ -9,9 +9,10 @@ from scipy.cluster.vq import kmeans2
 from scipy.stats import rankdata
 
 from monoforce_ros.core import transform_points
-from monoforce_ros.discrepancy.hypothesis import EvidenceWindows, sample_motion
+from monoforce_ros.discrepancy.hypothesis import EvidenceWindows, Place, sample_motion
 from monoforce_ros.discrepancy.preflight import FEWEST_WINDOWS
 from monoforce_ros.discrepancy.trial import BLOCK, blocks_of
+from monoforce_ros.robots import RobotModel
 
 _FEWEST_BLOCKS = 3
 """Half blocks within and outside an area: fewer do not show that anything differs."""
@@ -38,12 +39,17 @@ class Circle:
         """Where it is, after "it acts"."""
         return f"within {self.radius:.1f} m of ({self.x:.1f}, {self.y:.1f}) in the odometry frame"
 
+    @property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Its lowest and highest corner, ``[2]`` each [m]."""
+        return np.array([self.x, self.y]) - self.radius, np.array([self.x, self.y]) + self.radius
+
     def contains(self, data: EvidenceWindows) -> np.ndarray:
         """Windows of any length whose middle lies in it, ``[W]`` bool."""
-        return self.holds(window_places(data))
+        return self.holds(window_places(data), data)
 
-    def holds(self, places: np.ndarray) -> np.ndarray:
-        """Places ``[W, 2]`` [m] in it, ``[W]`` bool."""
+    def holds(self, places: np.ndarray, data: EvidenceWindows) -> np.ndarray:
+        """Places ``[N, 2]`` [m] in it, ``[N]`` bool."""
         return np.linalg.norm(places - np.array([self.x, self.y]), axis=1) <= self.radius
 
 
@@ -62,9 +68,19 @@ class GroundClass:
         words, unit, _ = _CHANNELS[self.channel]
         return f"{'where' if self.above else 'except where'} {words} {self.cut:.2f}{unit}"
 
+    @property
+    def bounds(self) -> None:
+        """It is as large as the map."""
+        return None
+
     def contains(self, data: EvidenceWindows) -> np.ndarray:
         """Windows of any length that lie on it by their mean, ``[W]`` bool."""
         return (_along(data, self.channel) > self.cut) == self.above
+
+    def holds(self, places: np.ndarray, data: EvidenceWindows) -> np.ndarray:
+        """Places ``[N, 2]`` [m] in the odometry frame on it, ``[N]`` bool; heights of the robot do not matter."""
+        at_height = np.c_[places, np.full(len(places), float(data.motion.positions[:, 2].mean()))]
+        return (_values_at(data, self.channel, at_height) > self.cut) == self.above
 
 
 _CHANNELS = {
@@ -108,15 +124,49 @@ def ground_classes(data: EvidenceWindows) -> list[Area]:
 
 def _along(data: EvidenceWindows, channel: str) -> np.ndarray:
     """Mean of a channel of the map along the path of each window, ``[W]``."""
+    positions = paths_of(data)
+    return _values_at(data, channel, positions.reshape(-1, 3)).reshape(positions.shape[:2]).mean(axis=1)
+
+
+def _values_at(data: EvidenceWindows, channel: str, positions: np.ndarray) -> np.ndarray:
+    """A channel of the map at positions ``[N, 3]`` in the odometry frame, ``[N]``."""
     if data.terrain is None or data.odometry_from_terrain is None:
         raise ValueError("classes of ground: got no terrain map, expected one with its pose in the odometry frame")
-    times = data.starts[:, None] + np.rint(np.linspace(0.0, data.horizon, 5) * 1e9).astype(np.int64)
-    positions = sample_motion(data.motion, times)[0].reshape(-1, 3)
     on_map = transform_points(np.linalg.inv(data.odometry_from_terrain), positions)
     terrain = data.terrain
     rows, columns, _ = terrain.grid.cells(on_map[:, :2])
     values = terrain.friction if channel == "friction" else terrain.geometric_height - terrain.height
-    return values.double().numpy()[rows, columns].reshape(times.shape).mean(axis=1)
+    return values.double().numpy()[rows, columns]
+
+
+def paths_of(data: EvidenceWindows) -> np.ndarray:
+    """Positions in the odometry frame during each window, ``[W, 11, 3]`` [m]."""
+    times = data.starts[:, None] + np.rint(np.linspace(0.0, data.horizon, 11) * 1e9).astype(np.int64)
+    return sample_motion(data.motion, times)[0]
+
+
+def touching(place: Place, data: EvidenceWindows, reach: float) -> np.ndarray:
+    """Windows of any length in which a robot is on a part of the ground with any of its wheels, ``[W]`` bool.
+
+    Args:
+        place: the part.
+        data: the windows.
+        reach: distance of the robot's farthest point from its base [m].
+    """
+    points = swept(data, reach)
+    return place.holds(points.reshape(-1, 2), data).reshape(len(points), -1).any(axis=1)
+
+
+def swept(data: EvidenceWindows, reach: float) -> np.ndarray:
+    """Places in the odometry frame where any of a robot's wheels may be in each window, ``[W, N, 2]`` [m]."""
+    angles = np.linspace(0.0, 2.0 * np.pi, 8, endpoint=False)
+    around = np.concatenate([np.zeros((1, 2)), reach * np.column_stack([np.cos(angles), np.sin(angles)])])
+    return (paths_of(data)[:, :, None, :2] + around).reshape(len(data.starts), -1, 2)
+
+
+def reach_of(robot: RobotModel) -> float:
+    """Distance of a robot's farthest point from its base, as seen from above [m]."""
+    return float(robot.points[:, :2].norm(dim=1).max())
 
 
 def circles(data: EvidenceWindows) -> list[Area]:
@@ -127,7 +177,7 @@ def circles(data: EvidenceWindows) -> list[Area]:
     for centre in places[picked]:
         distance = np.linalg.norm(places - centre, axis=1)
         for radius in np.quantile(distance, _SHARES):
-            listed.append(_circle(places, centre, float(radius)))
+            listed.append(_circle(places, centre, float(radius), data))
     return [area for area in listed if _large_enough(area, data)]
 
 
@@ -139,7 +189,7 @@ def clusters(data: EvidenceWindows) -> list[Area]:
     for number in np.unique(label):
         centre = places[label == number].mean(axis=0)
         radius = float(np.quantile(np.linalg.norm(places[label == number] - centre, axis=1), 0.9))
-        listed.append(_circle(places, centre, radius))
+        listed.append(_circle(places, centre, radius, data))
     return [*ground_classes(data), *(area for area in listed if _large_enough(area, data))]
 
 
@@ -169,9 +219,9 @@ def worst_place(data: EvidenceWindows, losses: np.ndarray, rate: float) -> Area 
     return areas[int(np.argmax(statistics[0]))] if p <= rate else None
 
 
-def _circle(places: np.ndarray, centre: np.ndarray, radius: float) -> Area:
+def _circle(places: np.ndarray, centre: np.ndarray, radius: float, data: EvidenceWindows) -> Area:
     circle = Circle(float(centre[0]), float(centre[1]), radius)
-    return Area(circle.holds(places), circle)
+    return Area(circle.holds(places, data), circle)
 
 
 def _large_enough(area: Area, data: EvidenceWindows) -> bool:

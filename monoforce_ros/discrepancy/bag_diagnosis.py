@@ -16,7 +16,15 @@ from monoforce_ros.discrepancy.credibility import complaint
 from monoforce_ros.discrepancy.diagnosis import Diagnosis, DiagnosisSettings, diagnose
 from monoforce_ros.discrepancy.gap import noisy_motions
 from monoforce_ros.discrepancy.ground import Ground, beyond_commissioning, choose_ground
-from monoforce_ros.discrepancy.hypothesis import Effects, Evidence, corrected_evidence, own_values, window_starts
+from monoforce_ros.discrepancy.hypothesis import (
+    COMPONENTS,
+    MOTION,
+    Effects,
+    Evidence,
+    corrected_evidence,
+    own_values,
+    window_starts,
+)
 from monoforce_ros.discrepancy.motion_check import motion_faults
 from monoforce_ros.discrepancy.nominal import NominalModel, with_known_components
 from monoforce_ros.discrepancy.nominal_residual import residual_complaint
@@ -91,10 +99,10 @@ def read_with_ground(
     )
     ground = choose_ground(terrain, recording, smoothed, robot)
     if ground.source == "flat":
-        return replace(evidence, with_attitude=not ground.unknown), recording, ground
+        return replace(evidence, components=MOTION if ground.unknown else COMPONENTS), recording, ground
     if ground.source not in ("lidar", "traced"):
         terrain_map, pose = load_terrain(Path(ground.source))
-        evidence = replace(evidence, terrain=terrain_map, odometry_from_terrain=pose, with_attitude=True)
+        evidence = replace(evidence, terrain=terrain_map, odometry_from_terrain=pose, components=COMPONENTS)
         return evidence, recording, ground
     if ground.apart:
         smoothed = laid_apart(smoothed, _MARGIN)
@@ -109,7 +117,7 @@ def read_with_ground(
     maps, parts = split_maps(recording, motion, robot, grid)
     whole, even, odd = (supporting_terrain(part, motion, robot) for part in (maps, *parts))
     evidence = replace(evidence, terrain=whole, odometry_from_terrain=np.eye(4), split_maps=(even, odd))
-    evidence = replace(evidence, with_attitude=True)
+    evidence = replace(evidence, components=COMPONENTS)
     return evidence, recording, ground
 
 

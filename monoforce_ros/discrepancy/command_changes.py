@@ -37,7 +37,7 @@ def covered_changes(recordings: Sequence[EvidenceWindows]) -> np.ndarray:
 
 
 def uncovered_residual(data: EvidenceWindows, covered: np.ndarray) -> np.ndarray:
-    """RMS residual of a healthy robot by changes harder than covered, ``[W, K, C]``; none in roll, pitch and height.
+    """RMS residual of a healthy robot by changes harder than covered, ``[W, K, C]``; none in those of the attitude.
 
     The robot is where it would be up to :data:`RESPONSE_TIME` earlier or later: along by the change of speed, in
     heading by that of the yaw rate, and by the yaw rate itself where the speed changes. A heading error grows over the

@@ -92,8 +92,8 @@ def commission(
         ValueError: a recording is not sufficient; the message says why.
     """
     # What some recordings lack nothing can be learned of.
-    with_attitude = all(evidence.with_attitude for evidence in recordings)
-    recordings = [replace(evidence, with_attitude=with_attitude) for evidence in recordings]
+    components = min((evidence.components for evidence in recordings), key=len)
+    recordings = [replace(evidence, components=components) for evidence in recordings]
     prepared = []
     for number, evidence in enumerate(recordings):
         progress(0.3 * number / len(recordings), "reading the noise")
@@ -123,7 +123,7 @@ def commission(
         slope=max(slopes_of(evidence.smoothed).total for evidence in recordings),
         changes=covered_changes([entry.data for entry in prepared]),
         lean=np.mean([lean_of(evidence.smoothed.motion).own for evidence in recordings], axis=0)
-        if with_attitude
+        if recordings[0].with_attitude
         else None,
         wheels=_healthy_wheels(recordings, drives, replace(robot, effects=_together(robot, merged.effects))),
     )

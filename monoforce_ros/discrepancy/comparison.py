@@ -15,6 +15,7 @@ from monoforce_ros.bags import SmoothedMotion
 from monoforce_ros.core import MotionTrack
 from monoforce_ros.discrepancy.gap import find_regimes, noise_residuals, relative_motion
 from monoforce_ros.discrepancy.hypothesis import (
+    MOTION,
     Effects,
     EvidenceWindows,
     Predictions,
@@ -254,7 +255,7 @@ def measured_paths(
     if not len(starts):
         return []
     times = np.arange(0.25, horizon + 0.01, 0.25)
-    windows = replace(data, starts=starts, horizon=horizon, samples=times, with_attitude=False)
+    windows = replace(data, starts=starts, horizon=horizon, samples=times, components=MOTION)
     measured = relative_motion(windows.motion, windows)
     predictions = Predictions(robot, windows)
     before = predictions.residuals([()])[0]

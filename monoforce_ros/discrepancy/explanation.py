@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from monoforce_ros.discrepancy.gap import residual_scale
-from monoforce_ros.discrepancy.hypothesis import Evidence, EvidenceWindows, Predictions
+from monoforce_ros.discrepancy.hypothesis import Evidence, EvidenceWindows, Place, Predictions
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.onset import find_onset
 from monoforce_ros.discrepancy.preflight import FEWEST_WINDOWS
@@ -62,6 +62,11 @@ class Part(Protocol):
         ...
 
     @property
+    def place(self) -> Place | None:
+        """The ground on which they act while such a window lasts; None: they act in the whole of it."""
+        ...
+
+    @property
     def remark(self) -> str:
         """When or where, in words."""
         ...
@@ -77,6 +82,10 @@ class Windows:
 
     def __getitem__(self, chosen: np.ndarray) -> Windows:
         return Windows(replace(self.data, starts=self.data.starts[chosen]), self.uncertainty[chosen])
+
+    def on(self, place: Place | None) -> Windows:
+        """The same windows, with effects that act on a part of the ground."""
+        return replace(self, data=replace(self.data, place=place))
 
 
 @dataclass(frozen=True)
@@ -164,7 +173,7 @@ def explain(
             trials.append(search.judge(found_late.best.effects))
         found_part = _part(search, trials)
         if found_part is not None and found_part.acting.sum() >= FEWEST_WINDOWS:
-            acting = windows[found_part.acting]
+            acting = windows[found_part.acting].on(found_part.place)
             there = searched(acting)
             after = there.run(settings.max_effects, missing=partly)
             # What a whole recording does not show, and no effect explains in a part of it, is nothing.

@@ -48,8 +48,8 @@ class Fit:
 def robust(scaled: np.ndarray) -> np.ndarray:
     """Huber loss of scaled residuals ``[..., W, K, C]``, averaged over each window, ``[..., W]``.
 
-    It is a mean over the components of the motion. Roll, pitch and height add to it, so that they do not dilute what
-    the motion shows. A prediction that is not finite gets a large residual.
+    It is a mean over the components of the motion. Roll, pitch, height and their rates add to it, so that they do not
+    dilute what the motion shows. A prediction that is not finite gets a large residual.
     """
     losses = np.minimum(huber(np.nan_to_num(scaled, nan=_NOT_FINITE), OUTLIER), 1e6)
     return losses.mean(axis=-2).sum(axis=-1) / len(MOTION)

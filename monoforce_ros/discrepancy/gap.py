@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from monoforce_ros.bags import SmoothedMotion, smooth
 from monoforce_ros.core import MotionTrack, motion_regimes, wrap_angle
 from monoforce_ros.discrepancy.attitude import vertical
-from monoforce_ros.discrepancy.hypothesis import EvidenceWindows, sample_motion
+from monoforce_ros.discrepancy.hypothesis import ATTITUDE, EvidenceWindows, rate_means, rate_stamps, sample_motion
 from monoforce_ros.discrepancy.nominal import NominalModel, smallest_of
 
 _NOISE_DRAWS = 3
@@ -22,6 +22,9 @@ _ERRORS = (
     ("roll error", "rad"),
     ("pitch error", "rad"),
     ("height error", "m"),
+    ("roll rate error", "rad/s"),
+    ("pitch rate error", "rad/s"),
+    ("climb rate error", "m/s"),
 )
 """Names and units of the components of a residual."""
 
@@ -116,7 +119,8 @@ def noise_floor(motion: MotionTrack, noisy: Sequence[MotionTrack], data: Evidenc
 def relative_motion(motion: MotionTrack, data: EvidenceWindows) -> np.ndarray:
     """Motion since the start of each window, in the frame of the start pose, ``[W, K, C]`` [m, m, rad].
 
-    With attitude: roll and pitch themselves [rad], and the height since the start [m], too.
+    With attitude: roll and pitch themselves [rad], the height since the start [m], and how fast they change, as means
+    [rad/s, m/s], too.
     """
     stamps = data.starts[:, None] + np.rint(np.r_[0.0, data.samples] * 1e9).astype(np.int64)
     positions, rotations, _, _ = sample_motion(motion, stamps)
@@ -128,6 +132,10 @@ def relative_motion(motion: MotionTrack, data: EvidenceWindows) -> np.ndarray:
     if data.with_attitude:
         lean = vertical(rotations[:, 1:])
         parts += [lean[..., 1:], -lean[..., :1], moved[..., 2:]]
+    if len(data.components) > len(ATTITUDE):
+        _, rotations, linear, angular = sample_motion(motion, rate_stamps(data))
+        climbing = np.einsum("wtj,wtj->wt", rotations[..., 2, :], linear)
+        parts.append(rate_means(np.concatenate([angular[..., :2], climbing[..., None]], axis=-1), data.samples))
     return np.concatenate(parts, axis=-1)
 
 

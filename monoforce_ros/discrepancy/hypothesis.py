@@ -7,28 +7,43 @@ out at once: finite-difference derivatives cost one rollout of a larger batch.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation, Slerp
 
 from monoforce_ros.bags import JointRecord, SmoothedMotion
-from monoforce_ros.core import AngularVelocityTrack, CommandTrack, MotionTrack, WheelTrack, wrap_angle
+from monoforce_ros.core import AngularVelocityTrack, CommandTrack, MotionTrack, WheelTrack, transform_points, wrap_angle
 from monoforce_ros.discrepancy.attitude import Lean, lean_of, vertical
+from monoforce_ros.discrepancy.local_rollout import (
+    Driven,
+    Effects,
+    GroundPart,
+    local_rollout,
+    moves_rigidly,
+    outside_values,
+)
 from monoforce_ros.effects import CATALOGUE, applied_setup, controls, corrected_commands, corrected_motion
 from monoforce_ros.physics import PhysicsOptions, State, TerrainLookup, rest_depth, rollout
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import Grid, TerrainMap
 
-Effects = tuple[tuple[str, Mapping[str, float]], ...]
-"""Names of effects with the values of their parameters."""
 MOTION = ("along", "across", "heading")
 """Components of a residual: position in the frame of the window's start pose [m], heading [rad]."""
-COMPONENTS = (*MOTION, "roll", "pitch", "height")
-"""Those where the ground is known: roll and pitch beside what the recording always leans [rad], and the height since
-the start of the window [m], too."""
+ATTITUDE = (*MOTION, "roll", "pitch", "height")
+"""Those where the ground is known, too: roll and pitch beside what the recording always leans [rad], and the height
+since the start of the window [m]."""
+COMPONENTS = (*ATTITUDE, "roll rate", "pitch rate", "climb rate")
+"""And how fast these three change: root mean squares, since the sample before, of the angular velocity about the
+base's x and y axes [rad/s] and of the vertical velocity [m/s]. Softness of ground and tyres shows in them more than in
+the attitude itself. Not their values at an instant: over bumps these follow from where the robot is within centimetres,
+and small errors of its timing, which every model has, would count most."""
+RATE_TIME = 0.05
+"""Between angular and vertical velocities in such a mean [s]."""
 HISTORY = 4.0
 """Length of the commands before a window, for delays, lags and the integral part of drives [s]."""
 _MARGIN = 1.3
@@ -38,6 +53,19 @@ _SHORT = 12.0
 _LARGEST_BATCH = 1024
 _LEVEL_REACH, _HILLY_REACH = 0.1, 0.3
 """Height above a robot's lowest point up to which contact points are kept [m]."""
+
+
+class Place(Protocol):
+    """A part of the ground."""
+
+    def holds(self, places: np.ndarray, data: EvidenceWindows) -> np.ndarray:
+        """Places ``[N, 2]`` [m] in the odometry frame that are on it, ``[N]`` bool."""
+        ...
+
+    @property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Its lowest and highest corner, ``[2]`` each [m] in the odometry frame; None: it is as large as the map."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -58,8 +86,14 @@ class Evidence:
     """Measured wheel speeds."""
     joints: JointRecord | None = None
     """Measured joints and commands to flippers."""
-    with_attitude: bool = False
-    """Whether roll, pitch and height are residuals, too: the ground is known from something else than they."""
+    components: tuple[str, ...] = MOTION
+    """Names of the ``C`` components of a residual: :data:`COMPONENTS` where the ground is known from something else
+    than roll, pitch and height."""
+
+    @property
+    def with_attitude(self) -> bool:
+        """Whether roll, pitch and height are residuals, too."""
+        return len(self.components) > len(MOTION)
 
     def cut(self, starts: np.ndarray, samples: np.ndarray) -> EvidenceWindows:
         """Windows from ``starts`` [ns] to the last of ``samples`` [s]."""
@@ -72,7 +106,7 @@ class Evidence:
             self.terrain,
             self.odometry_from_terrain,
             self.joints,
-            self.with_attitude,
+            self.components,
         )
 
 
@@ -94,13 +128,15 @@ class EvidenceWindows:
     odometry_from_terrain: np.ndarray | None = None
     joints: JointRecord | None = None
     """Measured joints and commands to flippers."""
-    with_attitude: bool = False
-    """Whether roll, pitch and height are residuals, too."""
+    components: tuple[str, ...] = MOTION
+    """Names of the ``C`` components of a residual: a beginning of :data:`COMPONENTS`."""
+    place: Place | None = None
+    """The part of the ground on which the contact and body effects of hypotheses act; None: everywhere."""
 
     @property
-    def components(self) -> tuple[str, ...]:
-        """Names of the ``C`` components of a residual."""
-        return COMPONENTS if self.with_attitude else MOTION
+    def with_attitude(self) -> bool:
+        """Whether roll, pitch and height are residuals, too."""
+        return len(self.components) > len(MOTION)
 
 
 def window_starts(motion: MotionTrack, stretches: Sequence[slice], horizon: float, stride: float) -> np.ndarray:
@@ -137,6 +173,25 @@ def sample_motion(motion: MotionTrack, stamps: np.ndarray) -> tuple[np.ndarray, 
 
     rotations = Slerp(times, Rotation.from_quat(motion.quaternions))(at).as_matrix().reshape(*shape, 3, 3)
     return blend(motion.positions), rotations, blend(motion.linear_velocities), blend(motion.angular_velocities)
+
+
+def rate_means(rates: np.ndarray, samples: np.ndarray) -> np.ndarray:
+    """Root mean squares of rates since the sample before, ``[..., K, R]``.
+
+    Args:
+        rates: every :data:`RATE_TIME` after the start of a window, up to the last sample, ``[..., T, R]``.
+        samples: times of the samples [s], ``[K]``.
+    """
+    ends = np.maximum(np.rint(samples / RATE_TIME).astype(int), 1)
+    begins = np.minimum(np.r_[0, ends[:-1]], ends - 1)
+    means = [(rates[..., low:high, :] ** 2).mean(axis=-2) for low, high in zip(begins, ends, strict=True)]
+    return np.sqrt(np.stack(means, axis=-2))
+
+
+def rate_stamps(data: EvidenceWindows) -> np.ndarray:
+    """Times of the rates in each window, ``[W, T]`` [ns]."""
+    count = max(round(float(data.samples[-1]) / RATE_TIME), 1)
+    return data.starts[:, None] + np.rint(RATE_TIME * 1e9 * np.arange(1, count + 1)).astype(np.int64)
 
 
 def residuals_by_part(
@@ -204,6 +259,12 @@ class _Prepared:
     """Measured vertical in the base frame, that of level ground's plane or of the map, ``[W, K, 2]``."""
     risen: np.ndarray
     """Measured change of height above that plane, or on the map, ``[W, K]`` [m]."""
+    rates: np.ndarray
+    """Measured roll and pitch rates [rad/s], and climb rate [m/s], ``[W, K, 3]``; see :data:`COMPONENTS`."""
+    origins: np.ndarray
+    """Start positions in the odometry frame, ``[W, 3]`` [m]."""
+    to_terrain: np.ndarray
+    """Rotation from the odometry frame, ``[3, 3]``."""
     frames: np.ndarray
     """Rotation of the start headings, ``[W, 1, 3, 3]``."""
     places: np.ndarray
@@ -231,7 +292,6 @@ class Predictions:
     """
 
     def __init__(self, robot: RobotModel, data: EvidenceWindows):
-        self.data = data
         self.options = PhysicsOptions()
         if data.terrain is None:
             self._terrain = TerrainMap.flat(Grid.square(2.0, 1.0))
@@ -246,11 +306,22 @@ class Predictions:
         if self._moves_flippers and robot.point_flippers is not None:
             touching = touching | (robot.point_flippers >= 0)
         self.robot = robot.with_points(touching)
-        self._prepared: dict[_MeasurementKey, _Prepared] = {}
         self._index = np.rint(data.samples / self.options.time_step).astype(int)
+        self._set_windows(data)
+
+    def _set_windows(self, data: EvidenceWindows) -> None:
+        self.data = data
+        self._part = self._ground_part()
+        self._prepared: dict[_MeasurementKey, _Prepared] = {}
         # Of the windows, since the recording's start [s].
         middles = (data.starts - data.motion.stamps[0]) * 1e-9 + 0.5 * data.horizon
         self._middles = torch.as_tensor(np.maximum(middles, 0.0), dtype=torch.float32)
+
+    def on(self, place: Place | None, chosen: np.ndarray) -> Predictions:
+        """Predictions of some windows ``[W]`` bool with effects that act on a part of the ground."""
+        result = copy(self)
+        result._set_windows(replace(self.data, starts=self.data.starts[chosen], place=place))
+        return result
 
     def residuals(self, hypotheses: Sequence[Effects]) -> np.ndarray:
         """Predicted minus measured, ``[H, W, K, C]``, with the robot's own effects and each hypothesis."""
@@ -291,16 +362,19 @@ class Predictions:
         # Level ground is the plane of the recording, whichever way the localisation's z axis points.
         lean = lean_of(motion) if data.terrain is None else _LEVEL
         turned_level = lean.onto_plane
+        origins = positions[:, 0]
         positions, rotations = positions @ turned_level.T, turned_level @ rotations
         headings = np.arctan2(rotations[..., 1, 0], rotations[..., 0, 0])
         turn = Rotation.from_euler("z", headings[:, 0, None]).as_matrix()
         moved = np.einsum("wji,wkj->wki", turn, positions[:, 1:] - positions[:, :1])
         turned = wrap_angle(headings[:, 1:] - headings[:, :1])
+        upright = np.eye(3)
         steps = np.arange(-round(HISTORY / self.options.time_step), self._index[-1] + 1)
         command_stamps = data.starts[:, None] + np.rint(steps * self.options.time_step * 1e9).astype(np.int64)
         if data.terrain is None:
             # On level ground every window starts at the origin, with the wheels on the ground.
             leaned, risen = vertical(rotations[:, 1:]), moved[..., 2]
+            up, to_terrain = np.array([0.0, 0.0, 1.0]), turned_level
             frame_rotation = measured_rotation = rotations[:, 0]
             if self._moves_flippers:
                 lowest = self._lowest(np.einsum("wij,wnj->wni", frame_rotation, self._posed())[..., 2]).mean(axis=1)
@@ -308,17 +382,28 @@ class Predictions:
                 # In truth the robot does not tumble from a tilted sensor's attitude to its own in each window.
                 # Flippers, however, lift it for good.
                 frame_rotation = measured_rotation @ lean.upright
+                upright = lean.upright
                 lowest = np.einsum("wij,nj->wni", frame_rotation, self._underside())[..., 2].mean(axis=1)
             place = np.stack([0 * lowest, 0 * lowest, -lowest - self._depth], axis=1)
+            if self._part is not None:
+                place[:, :2] = positions[:, 0, :2]
         else:
             if data.odometry_from_terrain is None:
                 raise ValueError("a terrain map needs its pose: odometry_from_terrain is None")
             pose = np.linalg.inv(data.odometry_from_terrain)
             leaned = vertical(pose[:3, :3] @ rotations[:, 1:])
             risen = (positions[:, 1:] - positions[:, :1]) @ pose[2, :3]
+            up, to_terrain = pose[2, :3], pose[:3, :3]
             frame_rotation = measured_rotation = pose[:3, :3] @ rotations[:, 0]
             place = positions[:, 0] @ pose[:3, :3].T + pose[:3, 3]
             place[:, 2] += self._settling(place, frame_rotation)
+        rates = np.zeros((*risen.shape, 3))
+        if len(data.components) > len(ATTITUDE):
+            _, turned_to, moving, turning = sample_motion(motion, rate_stamps(data))
+            climbing = np.einsum("i,wtij,wtj->wt", up, turned_level @ turned_to, moving)
+            rates = rate_means(
+                np.concatenate([(turning @ upright)[..., :2], climbing[..., None]], axis=-1), data.samples
+            )
         heading = np.arctan2(frame_rotation[:, 1, 0], frame_rotation[:, 0, 0])
         frames = Rotation.from_euler("z", heading[:, None]).as_matrix()
 
@@ -333,6 +418,9 @@ class Predictions:
             turned=turned,
             leaned=leaned,
             risen=risen,
+            rates=rates,
+            origins=origins,
+            to_terrain=to_terrain,
             frames=frames,
             places=place,
             twists=tensor(commands.sample(command_stamps)),
@@ -385,27 +473,56 @@ class Predictions:
         return self.robot.underside.double().numpy()
 
     def _roll_out(self, windows: _Prepared, hypotheses: list[Effects]) -> list[np.ndarray]:
+        if self._part is None:
+            return self._residuals_on(self._terrain, windows, hypotheses, hypotheses)
+        # Hypotheses that change the ground alike share a map.
+        results: dict[int, np.ndarray] = {}
+        shared: dict[tuple[tuple[object, ...], ...], list[int]] = {}
+        split = [self._part.with_effects(effects, self._usual(effects)) for effects in hypotheses]
+        for number, (effects, (_, others)) in enumerate(zip(hypotheses, split, strict=True)):
+            left = dict(others)
+            ground = tuple(entry for entry in effects if entry[0] not in left)
+            shared.setdefault(values_key(ground), []).append(number)
+        for numbers in shared.values():
+            whole = [hypotheses[number] for number in numbers]
+            on_robot = [split[number][1] for number in numbers]
+            found = self._residuals_on(split[numbers[0]][0], windows, whole, on_robot)
+            results.update(zip(numbers, found, strict=True))
+        return [results[number] for number in range(len(hypotheses))]
+
+    def _residuals_on(
+        self, terrain: TerrainMap, windows: _Prepared, hypotheses: list[Effects], on_robot: list[Effects]
+    ) -> list[np.ndarray]:
+        """Residuals ``[W, K, C]`` of hypotheses on a map.
+
+        Args:
+            terrain: map with those effects that are properties of the ground.
+            windows: the windows.
+            hypotheses: with all their effects.
+            on_robot: with the others alone.
+        """
         count, width = len(hypotheses), len(self.data.starts)
-        robot = replace(self.robot, effects=self._joined(hypotheses, width))
         with torch.no_grad():
-            given = controls(
-                robot,
-                windows.twists.repeat(count, 1, 1),
-                self.options.time_step,
-                history=windows.history,
-                joint_start=None if windows.joint_start is None else windows.joint_start.repeat(count, 1),
-                flippers=None if windows.flippers is None else windows.flippers.repeat(count, 1, 1),
-            )
-            sunk = self._sunk(hypotheses)
+            sunk = np.repeat(self._sunk(hypotheses)[:, None], width, axis=1)
+            if self._part is not None:
+                sunk = np.where(self._on_place(windows, torch.zeros(width, 3)), sunk, 0.0)
             position = windows.position.repeat(count, 1)
-            position[:, 2] -= torch.from_numpy(np.repeat(sunk, width)).to(position)
             state = State(
-                position,
+                position - torch.from_numpy(sunk.ravel()).to(position)[:, None] * position.new_tensor([0.0, 0.0, 1.0]),
                 windows.rotation.repeat(count, 1, 1),
                 windows.velocity.repeat(count, 1),
                 windows.angular_velocity.repeat(count, 1),
             )
-            result = rollout(self._terrain, robot, given, state, options=self.options, with_forces=False)
+            here = self._driven(windows, on_robot)
+            if self._part is not None and any(on_robot):
+                elsewhere = self._driven(windows, [self._elsewhere(effects) for effects in on_robot])
+
+                def on_part(reached: torch.Tensor) -> torch.Tensor:
+                    return torch.from_numpy(self._on_place(windows, reached - position))
+
+                result = local_rollout(terrain, here, elsewhere, state, on_part, self.options)
+            else:
+                result = rollout(terrain, here.robot, here.controls, state, options=self.options, with_forces=False)
         positions = result.position[:, self._index].double().numpy().reshape(count, width, -1, 3)
         rotations = result.rotation[:, self._index].double().numpy().reshape(count, width, -1, 3, 3)
         displacement = np.einsum("wji,hwkj->hwki", windows.frames, positions - windows.places[None, :, None])
@@ -421,9 +538,68 @@ class Predictions:
             # What the robot always leans may be the sensor's mounting, or its accelerometer's bias.
             diverged = np.isnan(lean).all(axis=(1, 2), keepdims=True)
             lean = lean - np.nanmedian(np.where(diverged, 0.0, lean), axis=(1, 2), keepdims=True)
-            risen = displacement[..., 2] + sunk[:, None, None]
+            risen = displacement[..., 2] + sunk[..., None]
             errors += [lean[..., 1], -lean[..., 0], risen - windows.risen]
+        if len(self.data.components) > len(ATTITUDE):
+            every = round(RATE_TIME / self.options.time_step)
+            part = slice(every, int(self._index[-1]) + 1, every)
+            turning = torch.einsum("bkji,bkj->bki", result.rotation[:, part], result.angular_velocity[:, part])
+            rates = torch.cat([turning[..., :2], result.velocity[:, part, 2:]], dim=-1).double().numpy()
+            means = rate_means(rates, self.data.samples).reshape(count, width, -1, 3) - windows.rates
+            errors += [means[..., axis] for axis in range(3)]
         return list(np.stack(errors, axis=-1))
+
+    def _driven(self, windows: _Prepared, hypotheses: list[Effects]) -> Driven:
+        """The robot with each hypothesis in all windows, and its controls."""
+        count, width = len(hypotheses), len(self.data.starts)
+        robot = replace(self.robot, effects=self._joined(hypotheses, width))
+        given = controls(
+            robot,
+            windows.twists.repeat(count, 1, 1),
+            self.options.time_step,
+            history=windows.history,
+            joint_start=None if windows.joint_start is None else windows.joint_start.repeat(count, 1),
+            flippers=None if windows.flippers is None else windows.flippers.repeat(count, 1, 1),
+        )
+        return Driven(robot, given)
+
+    def _ground_part(self) -> GroundPart | None:
+        """The part of the ground on which hypotheses act; None: everywhere, or in the whole of each window."""
+        data = self.data
+        if data.place is None or not moves_rigidly(self.robot):
+            return None
+        from_terrain = np.eye(4) if data.odometry_from_terrain is None else data.odometry_from_terrain
+        if data.terrain is None:
+            from_terrain[:3, :3] = lean_of(data.motion).onto_plane.T
+        place, to_terrain = data.place, np.linalg.inv(from_terrain)
+        usual = transform_points(to_terrain, data.motion.positions.mean(axis=0, keepdims=True))[0, 2]
+
+        def holds(points: np.ndarray) -> np.ndarray:
+            in_odometry = transform_points(from_terrain, np.c_[points, np.full(len(points), usual)])
+            return place.holds(in_odometry[:, :2], data)
+
+        corners = np.zeros((2, 2)) if place.bounds is None else np.array(place.bounds)
+        low, high = transform_points(to_terrain, np.c_[corners, np.full(2, data.motion.positions[:, 2].mean())])[:, :2]
+        return GroundPart.of(data.terrain, (low, high), holds)
+
+    def _usual(self, effects: Effects) -> Callable[[str], Mapping[str, float]]:
+        """Values of effects where they do not act."""
+        return dict(self._elsewhere(effects)).__getitem__
+
+    def _elsewhere(self, effects: Effects) -> Effects:
+        """A hypothesis off the part of the ground; what happens to commands has nothing to do with the ground."""
+        return tuple(
+            (name, values)
+            if CATALOGUE[name].stage in ("command", "measurement")
+            else (name, outside_values(name, values, own_values(self.robot, name)))
+            for name, values in effects
+        )
+
+    def _on_place(self, windows: _Prepared, moved: torch.Tensor) -> np.ndarray:
+        """Whether windows that moved by ``[H W, 3]`` since their start are on the place of the data, ``[H W]`` bool."""
+        assert self.data.place is not None
+        travelled = moved.double().numpy().reshape(-1, len(self.data.starts), 3) @ windows.to_terrain
+        return self.data.place.holds((windows.origins + travelled)[..., :2].reshape(-1, 2), self.data)
 
     def _sunk(self, hypotheses: list[Effects]) -> np.ndarray:
         """How much deeper than the plain robot each hypothesis rests in its ground, ``[H]`` [m].

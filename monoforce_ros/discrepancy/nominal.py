@@ -21,7 +21,8 @@ from monoforce_ros.robots import RobotFileError, read_commissioning, read_nomina
 SEGMENT = 16.0
 """Length of the segments between which the healthy robot varies [s]: two blocks of cross-validation, so that most kinds
 of motion occur in each."""
-_SMALLEST = np.array([0.01, 0.01, *np.radians([0.3, 0.3, 0.3]), 0.01])
+# Of the rates those by which attitude and height change as much within the first half second.
+_SMALLEST = np.array([0.01, 0.01, *np.radians([0.3, 0.3, 0.3]), 0.01, *np.radians([0.6, 0.6]), 0.02])
 _CHANGES = ("speed_m_s", "yaw_rate_rad_s")
 
 
@@ -39,7 +40,7 @@ class NominalModel:
     loss: float = 0.5
     """Mean robust loss of the healthy robot; 0.5 if its residuals are normal and of the motion alone."""
     motion_loss: float | None = None
-    """The same without roll, pitch and height; None where they are no part of ``residual``."""
+    """The same without roll, pitch, height and their rates; None where they are no part of ``residual``."""
     loss_spread: float = 0.0
     """Standard deviation of the logarithm of a segment's mean loss."""
     terms: np.ndarray | None = None
@@ -58,11 +59,12 @@ class NominalModel:
 
     @property
     def with_attitude(self) -> bool:
-        """Whether roll, pitch and height of the healthy robot are known."""
+        """Whether roll, pitch and height of the healthy robot are known, and their rates unless an earlier release
+        commissioned it."""
         return self.residual.shape[-1] > len(MOTION)
 
     def of_motion(self) -> NominalModel:
-        """The model of the motion alone, without roll, pitch and height."""
+        """The model of the motion alone, without roll, pitch, height and their rates."""
         if not self.with_attitude:
             return self
         count = len(MOTION)
@@ -208,15 +210,16 @@ class NominalModel:
 def with_known_components(evidence: Evidence, nominal: NominalModel | None) -> tuple[Evidence, NominalModel | None]:
     """A recording and the healthy robot with the components of residuals that both know.
 
-    How a healthy robot leans is known from commissioning only.
+    How a healthy robot leans, and how fast that changes, is known from commissioning only.
     """
-    known = evidence.with_attitude and nominal is not None and nominal.with_attitude
-    evidence = replace(evidence, with_attitude=known)
-    return evidence, nominal if known or nominal is None else nominal.of_motion()
+    count = len(MOTION) if nominal is None else min(len(evidence.components), nominal.residual.shape[-1])
+    evidence = replace(evidence, components=COMPONENTS[:count])
+    return evidence, nominal if nominal is None or evidence.with_attitude else nominal.of_motion()
 
 
 def smallest_of(residuals: np.ndarray) -> np.ndarray:
-    """Residuals below this are insignificant even on noise-free data [m, m, rad, rad, rad, m], for ``[..., C]``."""
+    """Residuals below this are insignificant even on noise-free data [m, m, rad, rad, rad, m, rad/s, rad/s, m/s], for
+    ``[..., C]``."""
     return _SMALLEST[: residuals.shape[-1]]
 
 

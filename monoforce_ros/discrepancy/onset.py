@@ -27,6 +27,8 @@ class Onset:
     """Of each window, ``[W]``."""
     acting: np.ndarray
     """Windows after it, ``[W]`` bool."""
+    place: None = None
+    """They act everywhere."""
 
     def acting_in(self, data: EvidenceWindows) -> np.ndarray:
         """Windows of any length in which the effects act, ``[W]`` bool."""

@@ -12,9 +12,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from monoforce_ros.discrepancy.areas import Area, circles, ground_classes
+from monoforce_ros.discrepancy.areas import Area, circles, ground_classes, reach_of, touching
 from monoforce_ros.discrepancy.fit import fit_effects, robust_weights
-from monoforce_ros.discrepancy.hypothesis import Effects, EvidenceWindows, Predictions
+from monoforce_ros.discrepancy.hypothesis import Effects, EvidenceWindows, Place, Predictions
+from monoforce_ros.discrepancy.local_rollout import moves_rigidly
+from monoforce_ros.discrepancy.patch import find_patch
 from monoforce_ros.discrepancy.selection import Search
 from monoforce_ros.discrepancy.trial import Trial, blocks_of, paired
 
@@ -30,23 +32,27 @@ class Region:
     """A recording that is healthy outside an area and has effects within it."""
 
     area: Area
+    acting: np.ndarray
+    """Windows in which the effects act, ``[W]`` bool."""
     losses: np.ndarray
     """Of each window, ``[W]``."""
-
-    @property
-    def acting(self) -> np.ndarray:
-        """Windows in which the effects act, ``[W]`` bool."""
-        return self.area.inside
+    place: Place | None
+    """The ground on which they act while such a window lasts; None: they act in the whole of it."""
+    reach: float
+    """Distance of the robot's farthest point from its base [m]."""
 
     def acting_in(self, data: EvidenceWindows) -> np.ndarray:
         """Windows of any length in which the effects act, ``[W]`` bool."""
-        return self.area.place.contains(data)
+        return _acting(self.area, self.place, data, self.reach)
 
     @property
     def remark(self) -> str:
         """Where, in words."""
-        count, number = int(self.area.inside.sum()), len(self.area.inside)
-        text = f"It acts {self.area.place.words} ({count} of {number} windows); these figures are of the robot there."
+        count, number = int(self.acting.sum()), len(self.acting)
+        text = (
+            f"It acts {self.area.place.words} ({count} of {number} windows), which follows from all of them; these "
+            "figures are of the robot there."
+        )
         if self.area.visits == 1:
             text += " The robot was there once: the time may be the cause, not the place."
         return text
@@ -112,13 +118,17 @@ def find_region(search: Search, trials: Sequence[Trial]) -> Region | None:
         return None
     pulls = _pulls(search)
     scanned = [_scanned(search, trials, pulls, areas) for areas in kinds]
-    found = [region for region in scanned if region is not None]
-    if len(found) < 2:
-        return found[0] if found else None
-    classes, circle = found
+    patch = find_patch(search)
+    placed = None
+    if patch is not None:
+        placed = Region(patch.area, patch.area.inside, patch.losses, patch.area.place, reach_of(search.robot))
+    found = [region for region in (*scanned, placed) if region is not None]
+    if not found:
+        return None
     # A class of ground says why an effect acts where it does: a circle must predict better beyond chance.
-    _, low = paired(classes.losses, circle.losses, search.data.starts, search.thresholds.comparison_rate)
-    return circle if low > 0 else classes
+    first, best = found[0], min(found, key=lambda region: region.losses.mean())
+    _, low = paired(first.losses, best.losses, search.data.starts, search.thresholds.comparison_rate)
+    return best if low > 0 else first
 
 
 def _scanned(
@@ -130,20 +140,48 @@ def _scanned(
     tried = []
     for effects in _candidates(search, trials, pulls, masks):
         chosen, fitted = _located(search, effects, masks)
-        losses = np.where(areas[chosen].inside, search.loss_of(fitted), before)
-        tried.append((float(losses.mean()), chosen, fitted, losses, effects))
+        region, fitted = _region(search, areas[chosen], effects, fitted, before)
+        tried.append((float(region.losses.mean()), region, fitted, effects))
     if not tried:
         return None
-    _, chosen, fitted, losses, effects = min(tried, key=lambda entry: entry[0])
+    _, region, fitted, effects = min(tried, key=lambda entry: entry[0])
     whole = search.loss_of(search.refit(effects).effects)
     thresholds = search.thresholds
     least = thresholds.smallest_share * max(float(before.mean()), search.healthy_loss)
-    gains = [paired(other, losses, starts, thresholds.comparison_rate) for other in (whole, before)]
+    gains = [paired(other, region.losses, starts, thresholds.comparison_rate) for other in (whole, before)]
     if any(low <= 0 or gain < least for gain, low in gains):
         return None
     pull = _Pull.of(search, search.directions.scaled(fitted) - search.directions.scaled(search.known))
     p = pull.scan_p(masks, blocks_of(starts), thresholds.draws, search.seed)
-    return Region(areas[chosen], losses) if p <= thresholds.effect_rate else None
+    return region if p <= thresholds.effect_rate else None
+
+
+def _region(
+    search: Search, area: Area, effects: Effects, fitted: Effects, before: np.ndarray
+) -> tuple[Region, Effects]:
+    """The region of an area, and the effects fitted to it.
+
+    Args:
+        search: search on the whole recording.
+        area: in which they act.
+        effects: with initial values.
+        fitted: with those that fit windows in the area.
+        before: losses of the windows without them, ``[W]``.
+    """
+    place = area.place if moves_rigidly(search.robot) else None
+    reach = reach_of(search.robot)
+    acting = _acting(area, place, search.data, reach)
+    there = search.predictions.on(place, acting)
+    scale = search.scale[acting]
+    fit = fit_effects(there, [fitted, effects], scale, iterations=6, free=search.fixed_count(effects))
+    losses = before.copy()
+    losses[acting] = fit.loss
+    return Region(area, acting, losses, place, reach), fit.effects
+
+
+def _acting(area: Area, place: Place | None, data: EvidenceWindows, reach: float) -> np.ndarray:
+    """Windows in which effects on an area act, ``[W]`` bool."""
+    return area.place.contains(data) if place is None else touching(place, data, reach)
 
 
 def _pulls(search: Search) -> list[tuple[Effects, _Pull]]:

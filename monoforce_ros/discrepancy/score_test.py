@@ -132,7 +132,7 @@ class _Scores:
 def motion_count(residuals: np.ndarray) -> int:
     """Number of residuals of the motion among ``[..., C]``: what means over residuals are taken over.
 
-    Roll, pitch and height add to what the motion shows and do not dilute it.
+    Roll, pitch, height and their rates add to what the motion shows and do not dilute it.
     """
     return residuals[..., : len(MOTION)].size
 

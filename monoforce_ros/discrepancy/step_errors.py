@@ -8,7 +8,14 @@ import numpy as np
 
 from monoforce_ros.discrepancy.fit import fit_effects
 from monoforce_ros.discrepancy.gap import residual_scale
-from monoforce_ros.discrepancy.hypothesis import Effects, Evidence, Predictions, corrected_evidence, window_starts
+from monoforce_ros.discrepancy.hypothesis import (
+    MOTION,
+    Effects,
+    Evidence,
+    Predictions,
+    corrected_evidence,
+    window_starts,
+)
 from monoforce_ros.discrepancy.kinematic_baseline import HORIZON, StepComparison, compare_on_steps, step_starts
 from monoforce_ros.discrepancy.trial import folds_of
 from monoforce_ros.robots import RobotModel
@@ -30,7 +37,7 @@ def compare_after_steps(evidence: Evidence, robot: RobotModel, effects: Effects)
     Returns:
         None where there are too few steps.
     """
-    evidence = replace(corrected_evidence(evidence, robot), with_attitude=False)
+    evidence = replace(corrected_evidence(evidence, robot), components=MOTION)
     motion = evidence.smoothed.motion
     starts = step_starts(
         evidence.commands, np.sort(window_starts(motion, evidence.smoothed.stretches, HORIZON, _SPACING))

@@ -14,6 +14,7 @@ from torch import Tensor
 from monoforce_ros.core import CommandTrack, MotionTrack
 from monoforce_ros.effects.setup import Setup
 from monoforce_ros.robots import Flipper, RobotModel
+from monoforce_ros.terrain import TerrainMap
 
 STAGES = ("command", "contact", "body", "measurement")
 Values = Mapping[str, Tensor]
@@ -185,6 +186,22 @@ class Effect(ABC):
     def setup(self, setup: Setup, values: Values) -> Setup:
         """The setup with this effect applied."""
         return setup
+
+    def ground(self, terrain: TerrainMap, values: Values, usual: Values, part: Tensor) -> TerrainMap | None:
+        """The map under this effect on a part of the ground; None for an effect that is no property of the ground.
+
+        Args:
+            terrain: one map.
+            values: parameter values on the part, scalars.
+            usual: those that the robot has everywhere.
+            part: cells of it, ``[rows, columns]`` bool.
+        """
+        return None
+
+    @property
+    def of_ground(self) -> bool:
+        """Whether it is a property of the ground, so that :meth:`ground` can change it on a part."""
+        return type(self).ground is not Effect.ground
 
     def turned(self, values: Mapping[str, float | Tensor], heading: Tensor) -> Mapping[str, float | Tensor]:
         """Odometry-frame parameters expressed in frames yawed by ``heading`` ``[B]`` [rad]."""

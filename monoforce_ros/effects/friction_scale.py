@@ -5,8 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import ClassVar
 
+import torch
+from torch import Tensor
+
 from monoforce_ros.effects.effect import Effect, Parameter, Values
 from monoforce_ros.effects.setup import Setup
+from monoforce_ros.terrain import TerrainMap
 
 
 class FrictionScale(Effect):
@@ -27,6 +31,11 @@ class FrictionScale(Effect):
         """Initial values for a fit. Friction acts only where more of it is asked for: what is far lower looks like no
         change at all from values near 1."""
         return [{"factor": factor} for factor in (0.1, 0.2, 0.4, 0.7, 1.4)]
+
+    def ground(self, terrain: TerrainMap, values: Values, usual: Values, part: Tensor) -> TerrainMap:
+        """The map with another friction on a part of the ground."""
+        ratio = values["factor"] / usual["factor"]
+        return replace(terrain, friction=torch.where(part, terrain.friction * ratio, terrain.friction))
 
     def setup(self, setup: Setup, values: Values) -> Setup:
         """The setup with this effect applied."""

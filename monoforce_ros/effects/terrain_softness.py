@@ -5,8 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import ClassVar
 
+import torch
+from torch import Tensor
+
 from monoforce_ros.effects.effect import Effect, Parameter, Values
 from monoforce_ros.effects.setup import Setup
+from monoforce_ros.terrain import TerrainMap
 
 
 class TerrainSoftness(Effect):
@@ -29,6 +33,15 @@ class TerrainSoftness(Effect):
     def first_values(self) -> list[dict[str, float]]:
         """From hard ground to mud, by equal ratios: stiffness varies by orders of magnitude."""
         return [{"factor": value} for value in (0.2, 0.5, 2.0, 5.0, 15.0, 50.0)]
+
+    def ground(self, terrain: TerrainMap, values: Values, usual: Values, part: Tensor) -> TerrainMap:
+        """The map with a part of the ground softer or stiffer."""
+        ratio = values["factor"] / usual["factor"]
+        return replace(
+            terrain,
+            stiffness=torch.where(part, terrain.stiffness / ratio, terrain.stiffness),
+            damping=torch.where(part, terrain.damping / ratio, terrain.damping),
+        )
 
     def setup(self, setup: Setup, values: Values) -> Setup:
         """The setup with this effect applied."""

@@ -91,7 +91,7 @@ def read_commissioning(robot: str | Path) -> Mapping[str, Any] | None:
 
 def read_nominal_residual(robot: str | Path, samples: Sequence[float]) -> np.ndarray | None:
     """RMS residual of the healthy robot from its file, ``[K, 3]`` [m, m, rad], or ``[K, 6]`` with roll, pitch [rad] and
-    height [m]; None without commissioning.
+    height [m], or ``[K, 9]`` with their rates [rad/s, m/s], too; None without commissioning.
 
     Args:
         robot: name or file.
@@ -108,10 +108,10 @@ def read_nominal_residual(robot: str | Path, samples: Sequence[float]) -> np.nda
         times, rows = np.array(entry["samples_s"], float), np.array(entry["residual_rms"], float)
     except (KeyError, TypeError, ValueError) as error:
         raise RobotFileError(f"{path}: commissioning: expected samples_s and residual_rms, got {error!r}") from error
-    known = rows.shape in ((len(samples), 3), (len(samples), 6))
+    known = rows.shape in tuple((len(samples), count) for count in (3, 6, 9))
     if not known or times.shape != (len(samples),) or not np.allclose(times, samples):
         raise RobotFileError(
-            f"{path}: commissioning: got residuals {rows.shape} at {times.tolist()} s, expected three or six each at "
+            f"{path}: commissioning: got residuals {rows.shape} at {times.tolist()} s, expected 3, 6 or 9 each at "
             f"{list(samples)} s; commission the robot again"
         )
     if not (np.isfinite(rows).all() and (rows >= 0).all()):
