@@ -18,9 +18,9 @@ from monoforce_ros.physics import PhysicsOptions, Rollout, State, rollout
 from monoforce_ros.robots import Controls, RobotModel
 from monoforce_ros.terrain import Grid, TerrainMap
 
-STEPS = 20
-"""Steps between questions whether a robot is on the part [-]: 0.2 s, in which a robot at 1 m/s moves by two cells of a
-map."""
+STEPS = 40
+"""Steps between questions whether a robot is on the part [-]: 0.4 s, in which most robots move by less than half their
+length."""
 
 Effects = tuple[tuple[str, Mapping[str, float]], ...]
 """Effects with their values."""

@@ -23,6 +23,9 @@ from monoforce_ros.effects import CATALOGUE
 
 _LARGEST = 8
 """Windows with the largest losses: the first guesses touch the path of one of them."""
+_WINDOWS = (16, 24)
+"""Windows with the largest losses, and of the others, spread over the recording, by which circles are compared: all of
+a longer drive would say no more of the place, and cost more."""
 _DRAWS, _POPULATION = 1024, 40
 """Circles that are drawn, and those of them with which the search begins."""
 _TOUCHED = 0.8
@@ -84,6 +87,7 @@ class _Fit:
         self.search, self.before = search, search.loss_of(search.known)
         self._reach = reach_of(search.robot)
         self._swept = swept(search.data, self._reach)
+        self._weights = _weights(self.before)
 
     def guesses(self, name: str) -> np.ndarray:
         """Points on the paths with the largest losses that touch most of what is unexplained, ``[N, 4]``."""
@@ -145,14 +149,14 @@ class _Fit:
         return held.reshape(len(self._swept), -1).any(axis=1)
 
     def loss(self, name: str, point: np.ndarray) -> float:
-        """Mean loss with a patch."""
+        """Mean loss with a patch, from some of the windows."""
         circle, effects = _unpacked(name, point)
-        touched = self._touched(circle)
+        touched = self._touched(circle) & (self._weights > 0)
         losses = self.before.copy()
         if touched.any():
             scaled = self._predictions(circle, touched).residuals([(*self.search.known, *effects)])[0]
             losses[touched] = robust(scaled / self.search.scale[touched])
-        return float(losses.mean())
+        return float((self._weights * losses).mean())
 
     def patch(self, name: str, point: np.ndarray) -> Patch:
         """The patch at a point, its value fitted once more."""
@@ -166,6 +170,18 @@ class _Fit:
 
     def _predictions(self, circle: Circle, touched: np.ndarray) -> Predictions:
         return self.search.predictions.on(circle, touched)
+
+
+def _weights(losses: np.ndarray) -> np.ndarray:
+    """Weights ``[W]`` of windows by which a mean over a few of them stands for the mean over all; 0 for the others."""
+    largest, others = np.split(np.argsort(-losses), [_WINDOWS[0]])
+    picked = np.sort(others)[
+        np.unique(np.linspace(0, max(len(others) - 1, 0), _WINDOWS[1]).round().astype(int))[: len(others)]
+    ]
+    weights = np.zeros(len(losses))
+    weights[largest] = 1.0
+    weights[picked] = len(others) / max(len(picked), 1)
+    return weights
 
 
 def _unpacked(name: str, point: np.ndarray) -> tuple[Circle, Effects]:
