@@ -17,9 +17,10 @@ import numpy as np
 import torch
 
 from monoforce_ros.discrepancy.commissioning import COMMISSIONED
+from monoforce_ros.discrepancy.evidence import Evidence, EvidenceWindows, sample_motion
 from monoforce_ros.discrepancy.fit import fit_effects
 from monoforce_ros.discrepancy.gap import relative_motion
-from monoforce_ros.discrepancy.hypothesis import Evidence, EvidenceWindows, Predictions, sample_motion
+from monoforce_ros.discrepancy.hypothesis import Predictions
 from monoforce_ros.discrepancy.trial import folds_of
 from monoforce_ros.robots import RobotModel
 

@@ -12,8 +12,9 @@ from monoforce_ros.bags import SmoothedMotion
 from monoforce_ros.core import CommandTrack
 from monoforce_ros.discrepancy import DiagnosisSettings, commission, diagnose
 from monoforce_ros.discrepancy.attitude import Lean, changed_lean, lean_of, vertical
+from monoforce_ros.discrepancy.evidence import ATTITUDE, COMPONENTS, MOTION, Evidence, window_starts
 from monoforce_ros.discrepancy.fit import fit_effects, robust
-from monoforce_ros.discrepancy.hypothesis import ATTITUDE, COMPONENTS, MOTION, Evidence, Predictions, window_starts
+from monoforce_ros.discrepancy.hypothesis import Predictions
 from monoforce_ros.discrepancy.nominal import NominalModel, smallest_of, with_known_components
 from monoforce_ros.discrepancy.report import effect_entry
 from monoforce_ros.effects import drive_speeds

@@ -30,15 +30,10 @@ from monoforce_ros.discrepancy import (
 from monoforce_ros.discrepancy import diagnosis as diagnosis_module
 from monoforce_ros.discrepancy.clocks import compare_with_gyro
 from monoforce_ros.discrepancy.comparison import GapRow, compare, gets_worse
+from monoforce_ros.discrepancy.evidence import EvidenceWindows, subsampled, window_starts
 from monoforce_ros.discrepancy.fit import first_values, fit_effects
 from monoforce_ros.discrepancy.gap import noise_floor, noisy_motions, relative_motion
-from monoforce_ros.discrepancy.hypothesis import (
-    EvidenceWindows,
-    Predictions,
-    correct_measurements,
-    subsampled,
-    window_starts,
-)
+from monoforce_ros.discrepancy.hypothesis import Predictions, correct_measurements
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.report import effect_entry, report_content
 from monoforce_ros.discrepancy.selection import Search

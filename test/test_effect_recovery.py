@@ -8,8 +8,9 @@ import torch
 from recorded_rollout import recorded
 
 from monoforce_ros.core import CommandTrack
+from monoforce_ros.discrepancy.evidence import EvidenceWindows, window_starts
 from monoforce_ros.discrepancy.fit import first_values, fit_effects
-from monoforce_ros.discrepancy.hypothesis import EvidenceWindows, Predictions, window_starts
+from monoforce_ros.discrepancy.hypothesis import Predictions
 from monoforce_ros.discrepancy.selection import Search
 from monoforce_ros.effects import CATALOGUE, drive_speeds
 from monoforce_ros.physics import State, rollout

@@ -8,8 +8,9 @@ import torch
 from recorded_rollout import recorded
 
 from monoforce_ros.core import CommandTrack
+from monoforce_ros.discrepancy.evidence import EvidenceWindows, window_starts
 from monoforce_ros.discrepancy.fit import fit_effects, flat, jacobian, robust
-from monoforce_ros.discrepancy.hypothesis import EvidenceWindows, Predictions, residuals_by_part, window_starts
+from monoforce_ros.discrepancy.hypothesis import Predictions, residuals_by_part
 from monoforce_ros.discrepancy.left_out import values_without_parts
 from monoforce_ros.discrepancy.selection import Search
 from monoforce_ros.discrepancy.trial import FOLDS, folds_of

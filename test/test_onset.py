@@ -9,8 +9,8 @@ from recorded_rollout import recorded
 
 from monoforce_ros.bags import SmoothedMotion
 from monoforce_ros.core import CommandTrack, WheelTrack
+from monoforce_ros.discrepancy.evidence import Evidence, EvidenceWindows, window_starts
 from monoforce_ros.discrepancy.explanation import DiagnosisSettings, Explanation, Windows, explain
-from monoforce_ros.discrepancy.hypothesis import Evidence, EvidenceWindows, window_starts
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.onset import Onset, find_onset
 from monoforce_ros.discrepancy.selection import Search

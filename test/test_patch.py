@@ -8,7 +8,8 @@ import torch
 from test_region import CENTRE, ICE, RADIUS, RESIDUAL, _drive, _healthy
 
 from monoforce_ros.discrepancy.areas import Circle, GroundClass, reach_of, touching
-from monoforce_ros.discrepancy.hypothesis import COMPONENTS, Predictions
+from monoforce_ros.discrepancy.evidence import COMPONENTS
+from monoforce_ros.discrepancy.hypothesis import Predictions
 from monoforce_ros.discrepancy.patch import find_patch
 from monoforce_ros.discrepancy.selection import Search
 from monoforce_ros.robots import load_robot

@@ -19,8 +19,8 @@ from monoforce_ros.discrepancy.areas import (
     window_places,
     worst_place,
 )
+from monoforce_ros.discrepancy.evidence import Evidence, EvidenceWindows, window_starts
 from monoforce_ros.discrepancy.explanation import DiagnosisSettings, Windows, explain
-from monoforce_ros.discrepancy.hypothesis import Evidence, EvidenceWindows, window_starts
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.region import Region, _Pull, find_region
 from monoforce_ros.discrepancy.selection import Search

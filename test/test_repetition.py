@@ -11,8 +11,8 @@ from monoforce_ros.core import WheelTrack
 from monoforce_ros.discrepancy import DiagnosisSettings, Evidence
 from monoforce_ros.discrepancy.comparison import HeldOut
 from monoforce_ros.discrepancy.estimates import EffectEstimate
+from monoforce_ros.discrepancy.evidence import window_starts
 from monoforce_ros.discrepancy.explanation import Windows, explain
-from monoforce_ros.discrepancy.hypothesis import window_starts
 from monoforce_ros.discrepancy.repetition import LENGTH, Repeated, Repetition, repeat, without_part
 from monoforce_ros.discrepancy.sensor_findings import SensorFindings
 from monoforce_ros.discrepancy.verdict import Verdict

@@ -15,7 +15,8 @@ from monoforce_ros.datasets.drive import DriveRun
 from monoforce_ros.discrepancy import diagnose_bag
 from monoforce_ros.discrepancy.bag_diagnosis import read_with_ground
 from monoforce_ros.discrepancy.diagnosis import DiagnosisSettings, diagnose
-from monoforce_ros.discrepancy.hypothesis import Predictions, window_starts
+from monoforce_ros.discrepancy.evidence import window_starts
+from monoforce_ros.discrepancy.hypothesis import Predictions
 from monoforce_ros.discrepancy.separate_stretches import height_agreement, laid_apart, starts_anew
 from monoforce_ros.discrepancy.verdict import Verdict
 from monoforce_ros.effects import drive_speeds

@@ -17,8 +17,8 @@ import torch
 
 from monoforce_ros.core import write_text
 from monoforce_ros.discrepancy import read_evidence
+from monoforce_ros.discrepancy.evidence import MOTION, window_starts
 from monoforce_ros.discrepancy.gap import noise_floor, noisy_motions, residual_scale
-from monoforce_ros.discrepancy.hypothesis import MOTION, window_starts
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.robots import load_robot
 

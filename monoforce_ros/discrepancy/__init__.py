@@ -5,9 +5,9 @@ from monoforce_ros.discrepancy.commissioning import commission
 from monoforce_ros.discrepancy.credibility import complaint
 from monoforce_ros.discrepancy.diagnosis import Diagnosis, DiagnosisSettings, diagnose
 from monoforce_ros.discrepancy.estimates import EffectEstimate, ParameterEstimate
+from monoforce_ros.discrepancy.evidence import Evidence
 from monoforce_ros.discrepancy.export import Exported, ExportKind, export_effects
 from monoforce_ros.discrepancy.ground import Ground, choose_ground
-from monoforce_ros.discrepancy.hypothesis import Evidence
 from monoforce_ros.discrepancy.motion_check import command_delay, motion_faults
 from monoforce_ros.discrepancy.verdict import Verdict
 

@@ -9,7 +9,7 @@ from scipy.cluster.vq import kmeans2
 from scipy.stats import rankdata
 
 from monoforce_ros.core import transform_points
-from monoforce_ros.discrepancy.hypothesis import EvidenceWindows, Place, sample_motion
+from monoforce_ros.discrepancy.evidence import EvidenceWindows, Place, sample_motion
 from monoforce_ros.discrepancy.preflight import FEWEST_WINDOWS
 from monoforce_ros.discrepancy.trial import BLOCK, blocks_of
 from monoforce_ros.robots import RobotModel
@@ -153,7 +153,11 @@ def touching(place: Place, data: EvidenceWindows, reach: float) -> np.ndarray:
         data: the windows.
         reach: distance of the robot's farthest point from its base [m].
     """
-    points = swept(data, reach)
+    return touched(place, swept(data, reach), data)
+
+
+def touched(place: Place, points: np.ndarray, data: EvidenceWindows) -> np.ndarray:
+    """Windows with any of their points ``[W, N, 2]`` [m] on a part of the ground, ``[W]`` bool."""
     return place.holds(points.reshape(-1, 2), data).reshape(len(points), -1).any(axis=1)
 
 

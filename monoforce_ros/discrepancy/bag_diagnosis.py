@@ -14,17 +14,10 @@ from monoforce_ros.discrepancy.command_changes import uncovered_doubt
 from monoforce_ros.discrepancy.comparison import GapRow, HeldOut, compare, gap_table
 from monoforce_ros.discrepancy.credibility import complaint
 from monoforce_ros.discrepancy.diagnosis import Diagnosis, DiagnosisSettings, diagnose
+from monoforce_ros.discrepancy.evidence import COMPONENTS, MOTION, Evidence, window_starts
 from monoforce_ros.discrepancy.gap import noisy_motions
 from monoforce_ros.discrepancy.ground import Ground, beyond_commissioning, choose_ground
-from monoforce_ros.discrepancy.hypothesis import (
-    COMPONENTS,
-    MOTION,
-    Effects,
-    Evidence,
-    corrected_evidence,
-    own_values,
-    window_starts,
-)
+from monoforce_ros.discrepancy.hypothesis import Effects, corrected_evidence, own_values
 from monoforce_ros.discrepancy.motion_check import motion_faults
 from monoforce_ros.discrepancy.nominal import NominalModel, with_known_components
 from monoforce_ros.discrepancy.nominal_residual import residual_complaint

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from monoforce_ros.discrepancy.hypothesis import MOTION, Evidence, EvidenceWindows, window_starts
+from monoforce_ros.discrepancy.evidence import MOTION, Evidence, EvidenceWindows, window_starts
 from monoforce_ros.discrepancy.residual_model import BEFORE, STEP, window_commands
 
 RESPONSE_TIME = 0.06

@@ -12,6 +12,7 @@ from monoforce_ros.discrepancy.attitude import lean_of
 from monoforce_ros.discrepancy.command_changes import covered_changes
 from monoforce_ros.discrepancy.directions import Directions
 from monoforce_ros.discrepancy.estimates import EffectEstimate
+from monoforce_ros.discrepancy.evidence import MOTION, Evidence, EvidenceWindows, window_starts
 from monoforce_ros.discrepancy.fit import (
     Fit,
     estimate_effects,
@@ -26,7 +27,7 @@ from monoforce_ros.discrepancy.fit import (
 from monoforce_ros.discrepancy.gap import noise_floor, noisy_motions, residual_scale
 from monoforce_ros.discrepancy.ground import slopes_of
 from monoforce_ros.discrepancy.healthy_wheels import HealthyWheels, drives_of
-from monoforce_ros.discrepancy.hypothesis import MOTION, Effects, Evidence, EvidenceWindows, Predictions, window_starts
+from monoforce_ros.discrepancy.hypothesis import Effects, Predictions
 from monoforce_ros.discrepancy.nominal import SEGMENT, NominalModel
 from monoforce_ros.discrepancy.preflight import complaints
 from monoforce_ros.discrepancy.residual_model import fit_terms, motion_terms

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from monoforce_ros.core import MotionTrack
+from monoforce_ros.discrepancy.evidence import Evidence, subsampled, window_starts
 from monoforce_ros.discrepancy.explanation import DiagnosisSettings, Windows
 from monoforce_ros.discrepancy.gap import noise_floor
-from monoforce_ros.discrepancy.hypothesis import Evidence, subsampled, window_starts
 from monoforce_ros.discrepancy.terrain_evidence import terrain_uncertainty
 from monoforce_ros.discrepancy.trial import BLOCK
 from monoforce_ros.discrepancy.wheel_motion import undriven_stretches, wheels_without_motion

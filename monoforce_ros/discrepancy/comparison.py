@@ -13,15 +13,9 @@ import numpy as np
 
 from monoforce_ros.bags import SmoothedMotion
 from monoforce_ros.core import MotionTrack
+from monoforce_ros.discrepancy.evidence import MOTION, EvidenceWindows, window_starts
 from monoforce_ros.discrepancy.gap import find_regimes, noise_residuals, relative_motion
-from monoforce_ros.discrepancy.hypothesis import (
-    MOTION,
-    Effects,
-    EvidenceWindows,
-    Predictions,
-    residuals_by_part,
-    window_starts,
-)
+from monoforce_ros.discrepancy.hypothesis import Effects, Predictions, residuals_by_part
 from monoforce_ros.discrepancy.trial import BLOCK, blocks_of
 from monoforce_ros.robots import RobotModel
 

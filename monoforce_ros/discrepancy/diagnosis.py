@@ -24,6 +24,7 @@ from monoforce_ros.discrepancy.comparison import (
     regime_table,
 )
 from monoforce_ros.discrepancy.estimates import EffectEstimate
+from monoforce_ros.discrepancy.evidence import MOTION, Evidence, EvidenceWindows
 from monoforce_ros.discrepancy.explanation import DiagnosisSettings, explain
 from monoforce_ros.discrepancy.fit import Fit
 from monoforce_ros.discrepancy.flippers import BLOCKED
@@ -34,13 +35,7 @@ from monoforce_ros.discrepancy.gap import (
     localise,
     noisy_motions,
 )
-from monoforce_ros.discrepancy.hypothesis import (
-    MOTION,
-    Effects,
-    Evidence,
-    EvidenceWindows,
-    corrected_evidence,
-)
+from monoforce_ros.discrepancy.hypothesis import Effects, corrected_evidence
 from monoforce_ros.discrepancy.kinematic_baseline import StepComparison
 from monoforce_ros.discrepancy.nominal import NominalModel, with_known_components
 from monoforce_ros.discrepancy.preflight import advice, complaints

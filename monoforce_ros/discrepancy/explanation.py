@@ -8,8 +8,9 @@ from typing import Protocol
 
 import numpy as np
 
+from monoforce_ros.discrepancy.evidence import Evidence, EvidenceWindows, Place
 from monoforce_ros.discrepancy.gap import residual_scale
-from monoforce_ros.discrepancy.hypothesis import Evidence, EvidenceWindows, Place, Predictions
+from monoforce_ros.discrepancy.hypothesis import Predictions
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.onset import find_onset
 from monoforce_ros.discrepancy.preflight import FEWEST_WINDOWS

@@ -10,7 +10,8 @@ from scipy.stats import t as student_distribution
 
 from monoforce_ros.core import huber
 from monoforce_ros.discrepancy.estimates import EffectEstimate, ParameterEstimate
-from monoforce_ros.discrepancy.hypothesis import MOTION, Effects, EvidenceWindows, Predictions
+from monoforce_ros.discrepancy.evidence import MOTION, EvidenceWindows
+from monoforce_ros.discrepancy.hypothesis import Effects, Predictions
 from monoforce_ros.discrepancy.score_test import block_numbers, motion_count
 from monoforce_ros.effects import CATALOGUE, Effect
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from monoforce_ros.bags import SmoothedMotion, smooth
 from monoforce_ros.core import MotionTrack, motion_regimes, wrap_angle
 from monoforce_ros.discrepancy.attitude import vertical
-from monoforce_ros.discrepancy.hypothesis import ATTITUDE, EvidenceWindows, rate_means, rate_stamps, sample_motion
+from monoforce_ros.discrepancy.evidence import ATTITUDE, EvidenceWindows, rate_means, rate_stamps, sample_motion
 from monoforce_ros.discrepancy.nominal import NominalModel, smallest_of
 
 _NOISE_DRAWS = 3

@@ -14,8 +14,8 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from monoforce_ros.core import CommandTrack, MotionTrack
+from monoforce_ros.discrepancy.evidence import EvidenceWindows, sample_motion
 from monoforce_ros.discrepancy.gap import relative_motion
-from monoforce_ros.discrepancy.hypothesis import EvidenceWindows, sample_motion
 
 HORIZON = 2.0
 """Length of the windows [s]."""

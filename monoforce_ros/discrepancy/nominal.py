@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from monoforce_ros.discrepancy.command_changes import uncovered_residual
+from monoforce_ros.discrepancy.evidence import COMPONENTS, MOTION, Evidence, EvidenceWindows
 from monoforce_ros.discrepancy.healthy_wheels import HealthyWheels
-from monoforce_ros.discrepancy.hypothesis import COMPONENTS, MOTION, Evidence, EvidenceWindows
 from monoforce_ros.discrepancy.moderation import VariancePrior
 from monoforce_ros.discrepancy.residual_model import TERMS, motion_terms
 from monoforce_ros.effects import CATALOGUE

@@ -6,8 +6,8 @@ import numpy as np
 
 from monoforce_ros.bags import SmoothedMotion
 from monoforce_ros.core import CommandTrack
+from monoforce_ros.discrepancy.evidence import MOTION, EvidenceWindows, window_starts
 from monoforce_ros.discrepancy.gap import relative_motion
-from monoforce_ros.discrepancy.hypothesis import MOTION, EvidenceWindows, window_starts
 
 LARGEST_SHARE = 0.1
 """Share of the motion in 2 s above which a nominal residual is reported: effects that change the motion by less than a

@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from monoforce_ros.discrepancy.evidence import EvidenceWindows
 from monoforce_ros.discrepancy.fit import fit_effects, robust
-from monoforce_ros.discrepancy.hypothesis import EvidenceWindows, Predictions
+from monoforce_ros.discrepancy.hypothesis import Predictions
 from monoforce_ros.discrepancy.selection import Search
 from monoforce_ros.discrepancy.trial import BLOCK, Trial, paired
 

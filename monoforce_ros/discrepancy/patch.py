@@ -13,9 +13,9 @@ import numpy as np
 from scipy.optimize import OptimizeResult, differential_evolution, minimize
 from scipy.stats import qmc
 
-from monoforce_ros.discrepancy.areas import Area, Circle, paths_of, reach_of, swept
+from monoforce_ros.discrepancy.areas import Area, Circle, paths_of, reach_of, swept, touched
 from monoforce_ros.discrepancy.fit import fit_effects, robust
-from monoforce_ros.discrepancy.hypothesis import Effects, Predictions
+from monoforce_ros.discrepancy.hypothesis import Effects
 from monoforce_ros.discrepancy.local_rollout import moves_rigidly
 from monoforce_ros.discrepancy.selection import Search
 from monoforce_ros.discrepancy.trial import paired
@@ -102,8 +102,8 @@ class _Fit:
         away = (radii * np.sqrt(draws[:, 2]))[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
         centres = places[(draws[:, 0] * len(places)).astype(int)] + away
         points = np.column_stack([centres, np.log(radii), low + draws[:, 4] * (high - low)])
-        touched = [excess[self._touched(_unpacked(name, point)[0])].sum() for point in points]
-        most = np.argsort(-np.minimum(touched, _TOUCHED * excess.sum()), kind="stable")
+        covered = [excess[self._touched(_unpacked(name, point)[0])].sum() for point in points]
+        most = np.argsort(-np.minimum(covered, _TOUCHED * excess.sum()), kind="stable")
         return points[most[:_POPULATION]]
 
     def best(self, name: str, least: float) -> tuple[float, str, np.ndarray] | None:
@@ -145,31 +145,28 @@ class _Fit:
 
     def _touched(self, circle: Circle) -> np.ndarray:
         """Windows in which any wheel touches a circle, ``[W]`` bool."""
-        held = circle.holds(self._swept.reshape(-1, 2), self.search.data)
-        return held.reshape(len(self._swept), -1).any(axis=1)
+        return touched(circle, self._swept, self.search.data)
 
     def loss(self, name: str, point: np.ndarray) -> float:
         """Mean loss with a patch, from some of the windows."""
         circle, effects = _unpacked(name, point)
-        touched = self._touched(circle) & (self._weights > 0)
+        chosen = self._touched(circle) & (self._weights > 0)
         losses = self.before.copy()
-        if touched.any():
-            scaled = self._predictions(circle, touched).residuals([(*self.search.known, *effects)])[0]
-            losses[touched] = robust(scaled / self.search.scale[touched])
+        if chosen.any():
+            there = self.search.predictions.on(circle, chosen)
+            scaled = there.residuals([(*self.search.known, *effects)])[0]
+            losses[chosen] = robust(scaled / self.search.scale[chosen])
         return float((self._weights * losses).mean())
 
     def patch(self, name: str, point: np.ndarray) -> Patch:
         """The patch at a point, its value fitted once more."""
         circle, effects = _unpacked(name, point)
-        touched = self._touched(circle)
+        inside = self._touched(circle)
         start, losses = (*self.search.known, *effects), self.before.copy()
-        there = self._predictions(circle, touched)
-        fit = fit_effects(there, [start], self.search.scale[touched], free=len(self.search.known))
-        losses[touched] = fit.loss
-        return Patch(Area(touched, circle), fit.effects, losses)
-
-    def _predictions(self, circle: Circle, touched: np.ndarray) -> Predictions:
-        return self.search.predictions.on(circle, touched)
+        there = self.search.predictions.on(circle, inside)
+        fit = fit_effects(there, [start], self.search.scale[inside], free=len(self.search.known))
+        losses[inside] = fit.loss
+        return Patch(Area(inside, circle), fit.effects, losses)
 
 
 def _weights(losses: np.ndarray) -> np.ndarray:

@@ -13,8 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from monoforce_ros.discrepancy.areas import Area, circles, ground_classes, reach_of, touching
+from monoforce_ros.discrepancy.evidence import EvidenceWindows, Place
 from monoforce_ros.discrepancy.fit import fit_effects, robust_weights
-from monoforce_ros.discrepancy.hypothesis import Effects, EvidenceWindows, Place, Predictions
+from monoforce_ros.discrepancy.hypothesis import Effects, Predictions
 from monoforce_ros.discrepancy.local_rollout import moves_rigidly
 from monoforce_ros.discrepancy.patch import find_patch
 from monoforce_ros.discrepancy.selection import Search

@@ -19,8 +19,9 @@ import torch
 from monoforce_ros.core import WheelTrack
 from monoforce_ros.discrepancy.comparison import HeldOut
 from monoforce_ros.discrepancy.estimates import EffectEstimate
+from monoforce_ros.discrepancy.evidence import Evidence
 from monoforce_ros.discrepancy.explanation import DiagnosisSettings, Explanation, Windows, explain
-from monoforce_ros.discrepancy.hypothesis import Effects, Evidence
+from monoforce_ros.discrepancy.hypothesis import Effects
 from monoforce_ros.discrepancy.learned import LEARNED
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.thresholds import Thresholds

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from monoforce_ros.discrepancy.hypothesis import EvidenceWindows
+from monoforce_ros.discrepancy.evidence import EvidenceWindows
 
 TERMS = ("time", "distance", "turn", "sideways", "speed_change", "yaw_rate_change")
 """Commanded motion whose squares add up to the variance: elapsed time [s], distance [m], turn [rad], integral of the

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import f as f_distribution
 
-from monoforce_ros.discrepancy.hypothesis import MOTION
+from monoforce_ros.discrepancy.evidence import MOTION
 
 _RIDGE = 1e-6
 """Relative size of a ridge that keeps singular directions finite."""

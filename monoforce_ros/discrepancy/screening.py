@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from monoforce_ros.discrepancy.directions import Directions
+from monoforce_ros.discrepancy.evidence import EvidenceWindows
 from monoforce_ros.discrepancy.fit import first_values, fit_effects, jacobian, robust, robust_weights
-from monoforce_ros.discrepancy.hypothesis import Effects, EvidenceWindows, Predictions, values_key
+from monoforce_ros.discrepancy.hypothesis import Effects, Predictions, values_key
 from monoforce_ros.discrepancy.score_test import Direction, ScoreResult, block_numbers, motion_count, score_tests
 from monoforce_ros.discrepancy.thresholds import Thresholds
 from monoforce_ros.effects import Effect, identifiable_effects

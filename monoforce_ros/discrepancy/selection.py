@@ -18,6 +18,7 @@ from monoforce_ros.discrepancy.areas import clusters
 from monoforce_ros.discrepancy.credibility import complaint
 from monoforce_ros.discrepancy.directions import Directions
 from monoforce_ros.discrepancy.estimates import EffectEstimate, effect_sizes
+from monoforce_ros.discrepancy.evidence import EvidenceWindows
 from monoforce_ros.discrepancy.fit import (
     Fit,
     estimate_effects,
@@ -29,13 +30,7 @@ from monoforce_ros.discrepancy.fit import (
     scales,
     without,
 )
-from monoforce_ros.discrepancy.hypothesis import (
-    Effects,
-    EvidenceWindows,
-    Predictions,
-    own_values,
-    residuals_by_part,
-)
+from monoforce_ros.discrepancy.hypothesis import Effects, Predictions, own_values, residuals_by_part
 from monoforce_ros.discrepancy.learned import learned_terms
 from monoforce_ros.discrepancy.left_out import values_without_parts
 from monoforce_ros.discrepancy.nominal import NominalModel

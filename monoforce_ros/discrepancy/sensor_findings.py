@@ -10,10 +10,11 @@ import numpy as np
 from monoforce_ros.discrepancy.clocks import GyroFinding, compare_with_gyro
 from monoforce_ros.discrepancy.comparison import GapRow
 from monoforce_ros.discrepancy.estimates import EffectEstimate, ParameterEstimate
+from monoforce_ros.discrepancy.evidence import Evidence
 from monoforce_ros.discrepancy.fit import robust
 from monoforce_ros.discrepancy.flippers import BLOCKED, FlipperFinding, compare_with_commands
 from monoforce_ros.discrepancy.healthy_wheels import HealthyWheels
-from monoforce_ros.discrepancy.hypothesis import Effects, Evidence, Predictions
+from monoforce_ros.discrepancy.hypothesis import Effects, Predictions
 from monoforce_ros.discrepancy.selection import Search
 from monoforce_ros.discrepancy.thresholds import Thresholds
 from monoforce_ros.discrepancy.verdict import Decision, Verdict

@@ -6,16 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from monoforce_ros.discrepancy.evidence import MOTION, Evidence, window_starts
 from monoforce_ros.discrepancy.fit import fit_effects
 from monoforce_ros.discrepancy.gap import residual_scale
-from monoforce_ros.discrepancy.hypothesis import (
-    MOTION,
-    Effects,
-    Evidence,
-    Predictions,
-    corrected_evidence,
-    window_starts,
-)
+from monoforce_ros.discrepancy.hypothesis import Effects, Predictions, corrected_evidence
 from monoforce_ros.discrepancy.kinematic_baseline import HORIZON, StepComparison, compare_on_steps, step_starts
 from monoforce_ros.discrepancy.trial import folds_of
 from monoforce_ros.robots import RobotModel

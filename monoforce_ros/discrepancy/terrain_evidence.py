@@ -9,7 +9,8 @@ import torch
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from monoforce_ros.core import MotionTrack
-from monoforce_ros.discrepancy.hypothesis import EvidenceWindows, Predictions
+from monoforce_ros.discrepancy.evidence import EvidenceWindows
+from monoforce_ros.discrepancy.hypothesis import Predictions
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import Grid, TerrainMap
 from monoforce_ros.training import traced_heights
