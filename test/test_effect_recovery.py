@@ -11,8 +11,10 @@ from monoforce_ros.core import CommandTrack
 from monoforce_ros.discrepancy.evidence import EvidenceWindows, window_starts
 from monoforce_ros.discrepancy.fit import first_values, fit_effects
 from monoforce_ros.discrepancy.hypothesis import Predictions
+from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.selection import Search
-from monoforce_ros.effects import CATALOGUE, drive_speeds
+from monoforce_ros.discrepancy.trial import Trial
+from monoforce_ros.effects import CATALOGUE, drive_speeds, identifiable_effects
 from monoforce_ros.physics import State, rollout
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainMap
@@ -121,6 +123,31 @@ def test_what_is_no_more_than_the_error_of_a_formula_is_no_further_effect(differ
     assert list(found.best.names) == names
     second = [candidate for candidate in found.tried if candidate.round == 2 and candidate.judged]
     assert any(candidate.name == "drive_loss" and candidate.p < 0.025 for candidate in second)
+
+
+def test_beside_a_further_effect_the_values_of_the_first_one_are_fitted_once_more():
+    """Compliance alone makes up for low friction, too: with its value as it is, delays promise more than friction."""
+    hidden = (("friction_scale", {"factor": 0.25}), ("drive_compliance", {"speed_loss": 0.42}))
+    husky = load_robot("husky")
+    names = [effect.name for effect in identifiable_effects(husky)]
+    healthy = NominalModel(SCALE, dict.fromkeys(names, 0.25), segments=5, loss=0.4, loss_spread=0.2)
+    search = Search(husky, driven(replace(husky, effects=hidden)), SCALE, nominal=healthy)
+    found = search.run(2, exchange=False)
+    assert set(found.best.names) == {"friction_scale", "drive_compliance"}
+
+
+@pytest.mark.parametrize(("worse", "name"), [(0.05, "sensor_lever_arm"), (0.2, "payload")])
+def test_fewer_parameters_are_preferred_only_within_the_error_of_a_formula(worse, name):
+    """Few blocks make large differences insignificant: what predicts much worse is not preferred for that."""
+    husky = load_robot("husky")
+    payload, arm = (("payload", {"mass": 15.0, "x": 0.2, "y": 0.0}),), (("sensor_lever_arm", {"x": 0.1, "y": 0.0}),)
+    search = Search(husky, driven(replace(husky, effects=payload)), SCALE)
+    before = search.loss_of(())
+    explained = np.zeros(len(before))
+    # A single block of some makes the difference, which is therefore not significant.
+    explained[:4] = worse * before.sum() / 4.0
+    trials = [Trial(payload, (payload,) * 2, 0.0 * before), Trial(arm, (arm,) * 2, explained)]
+    assert search._preferred(trials).names == (name,)
 
 
 def hilly():

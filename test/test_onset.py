@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from recorded_rollout import recorded
+from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import SmoothedMotion
 from monoforce_ros.core import CommandTrack, WheelTrack
@@ -94,6 +95,33 @@ def test_a_weak_effect_that_begins_late_is_significant_from_its_onset_on(gain):
     whole = min(entry.test.adjusted for entry in search.screening.candidates((), 0, "").screened)
     assert whole > rate
     assert search.part_p() <= rate if gain < 1.0 else search.part_p() > rate
+
+
+def _compass(data: EvidenceWindows, deviations: np.ndarray) -> EvidenceWindows:
+    """The same drive by a localisation whose heading deviates, ``[N]`` [rad]."""
+    turns = Rotation.from_rotvec(deviations[:, None] * [0.0, 0.0, 1.0])
+    motion = data.motion
+    turned = replace(
+        motion,
+        quaternions=(turns * Rotation.from_quat(motion.quaternions)).as_quat(),
+        linear_velocities=turns.inv().apply(motion.linear_velocities),
+    )
+    return replace(data, motion=turned)
+
+
+def test_a_compass_near_iron_deviates_with_the_heading_and_a_sensor_that_was_turned_from_then_on():
+    data, husky = _recording(SECONDS), load_robot("husky")
+    late = np.arange(len(data.motion)) * SECONDS / len(data.motion) >= ONSET
+    headings = Rotation.from_quat(data.motion.quaternions).as_euler("zyx")[:, 0]
+    starts = np.searchsorted(data.motion.stamps, data.starts)
+    offset = (("sensor_yaw_offset", {"angle": 0.1}),)
+    for deviations, acting, follows in (
+        (0.2 * np.sin(headings), np.sin(headings[starts]) > 0.3, True),
+        (0.2 * late, late[starts], False),
+    ):
+        recording = _compass(data, deviations)
+        scale = np.tile([0.01, 0.01, 0.005], (4, 1))
+        assert Search(husky, recording, scale).follows_heading(offset, acting) == follows
 
 
 def test_wheels_that_confirm_the_file_show_no_change():

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from monoforce_ros.discrepancy.evidence import sample_motion
 from monoforce_ros.discrepancy.fit import without
 from monoforce_ros.discrepancy.hypothesis import Effects, Predictions, own_values, values_key
 from monoforce_ros.discrepancy.learned import LEARNED, FormulaTerms
@@ -111,22 +112,42 @@ class Directions:
         ]
 
     def of_changes(self, base: Effects, fixed: int = 0) -> list[Direction]:
-        """A change of each effect of a base over the recording, with the speed and with the direction of turning."""
+        """A change of each effect of a base over the recording, with the speed, the direction of turning and the
+        heading."""
         data = self.predictions.data
-        time = (data.starts - data.starts.mean()) / max(float(np.ptp(data.starts)), 1.0)
         twists = data.commands.sample(data.starts + round(0.5 * data.horizon * 1e9))
-        speed, turning = np.abs(twists[:, 0]), np.sign(twists[:, 1])
+        turning = np.sign(twists[:, 1])
         regimes = {
-            "over the recording": time / max(float(time.std()), 1e-9),
-            "with the speed": (speed - speed.mean()) / max(float(speed.std()), 1e-9),
-            "with the direction of turning": turning - turning.mean(),
+            "over the recording": _standardised(data.starts * 1e-9)[None],
+            "with the speed": _standardised(np.abs(twists[:, 0]))[None],
+            "with the direction of turning": (turning - turning.mean())[None],
+            "with the heading": self._forward().T,
         }
+        return self._changed(base, fixed, regimes)
+
+    def of_heading(self, base: Effects, fixed: int = 0) -> list[Direction]:
+        """A change of each effect of a base with the heading: it comes from outside, from iron near a compass, wind, or
+        a slope."""
+        return self._changed(base, fixed, {"with the heading": self._forward().T})
+
+    def of_part(self, base: Effects, fixed: int, acting: np.ndarray) -> list[Direction]:
+        """A change of each effect of a base in some windows, a mask ``[W]``."""
+        return self._changed(base, fixed, {"in a part": acting.astype(float)[None]})
+
+    def _forward(self) -> np.ndarray:
+        """Forward axes in the middle of the windows less their mean, ``[W, 2]``."""
+        data = self.predictions.data
+        forward = sample_motion(data.motion, data.starts + round(0.5 * data.horizon * 1e9))[1][:, :2, 0]
+        return forward - forward.mean(axis=0)
+
+    def _changed(self, base: Effects, fixed: int, regimes: Mapping[str, np.ndarray]) -> list[Direction]:
+        """Changes of each effect of a base in proportion to factors ``[q, W]``."""
         directions = []
         error = self.mean_square(base, fixed, self.metric)
         for name, _ in base[fixed:]:
             change = self.scaled(base) - self.predictions.residuals([without(base, name)])[0] / self.scale
-            for regime, factor in regimes.items():
-                direction = self.direction(name, (factor[:, None, None] * change)[None], error)
+            for regime, factors in regimes.items():
+                direction = self.direction(name, factors[..., None, None] * change, error)
                 directions.append(replace(direction, name=f"{name} changes {regime}"))
         return directions
 
@@ -150,3 +171,9 @@ class Directions:
             return 0.0
         change = self.scaled(base) - self.scaled(base[:fixed])
         return float(np.sum((np.nan_to_num(change) * metric) ** 2)) / motion_count(change)
+
+
+def _standardised(values: np.ndarray) -> np.ndarray:
+    """Values less their mean, in units of their standard deviation."""
+    away = values - values.mean()
+    return away / max(float(away.std()), 1e-9)

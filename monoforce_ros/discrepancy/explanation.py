@@ -178,7 +178,9 @@ def explain(
             there = searched(acting)
             after = there.run(settings.max_effects, missing=partly)
             # What a whole recording does not show, and no effect explains in a part of it, is nothing.
-            if after.best.effects or not partly:
+            named = len(after.best.effects) > len(search.known)
+            doubted = named and search.follows_heading(after.best.effects, found_part.acting)
+            if not doubted and (after.best.effects or not partly):
                 part, windows, search, outcome = found_part, acting, there, after
     if (partly or not passed) and search.grows_with_time(first):
         # From one block to the next, like a supply that drains, rather than from some time on.

@@ -112,7 +112,13 @@ class Screening:
         return float(robust(self._coarse.residuals([effects])[0] / self._coarse_scale).mean())
 
     def tested(
-        self, base: Effects, fixed: int, residual: np.ndarray, directions: Sequence[Direction]
+        self,
+        base: Effects,
+        fixed: int,
+        residual: np.ndarray,
+        directions: Sequence[Direction],
+        *,
+        beside: Sequence[Direction] = (),
     ) -> list[ScoreResult]:
         """Tests of directions in addition to a base, of which the first ``fixed`` effects were measured.
 
@@ -121,15 +127,17 @@ class Screening:
             fixed: number of those whose values are not fitted.
             residual: that ``base`` leaves, scaled, ``[W, K, 3]``.
             directions: to be tested.
+            beside: what else may explain the residuals.
         """
         free = sum(len(values) for _, values in base[fixed:])
-        fitted = None
+        fitted = [direction.columns for direction in beside]
         if free:
             skipped = sum(len(values) for _, values in base[:fixed])
             rows = jacobian(self._directions.predictions, base, residual, self._directions.scale, skipped)
-            fitted = rows.reshape(free, *residual.shape)
+            fitted.append(rows.reshape(free, *residual.shape))
         return score_tests(
-            residual, robust_weights(residual), self._blocks, directions, fitted=fitted,
+            residual, robust_weights(residual), self._blocks, directions,
+            fitted=np.concatenate(fitted) if fitted else None,
             metric=self._directions.metric, draws=self._thresholds.draws, seed=self._seed,
         )  # fmt: skip
 

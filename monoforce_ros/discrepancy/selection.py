@@ -10,6 +10,7 @@ again, and may be dropped or replaced.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -36,7 +37,7 @@ from monoforce_ros.discrepancy.left_out import values_without_parts
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.residual_size import ResidualSize, residual_size
 from monoforce_ros.discrepancy.score_test import motion_count
-from monoforce_ros.discrepancy.screening import Screening, admitted
+from monoforce_ros.discrepancy.screening import Candidates, Screened, Screening, admitted
 from monoforce_ros.discrepancy.thresholds import Thresholds
 from monoforce_ros.discrepancy.trial import (
     FOLDS,
@@ -58,6 +59,8 @@ _JUDGED = 6
 _PROMISING = 0.5
 """Share of the best gain on held-out windows that an effect must promise on those of its quick fit to be judged. It
 only saves time: effects that promise half as much hardly predict more."""
+_JOINT_ITERATIONS = 2
+"""Of the fits of effects beside a further one: two show how much it promises."""
 _SMALL_SHARE = 0.5
 """Effects that explain less than this share of what an explanation must explain (``explained_share``) are neither
 exchanged nor replaced by combinations with another beginning: it only saves time on what is unknown anyway."""
@@ -173,6 +176,18 @@ class Search:
         directions = [self.directions.influence(base, entry) for entry in entries]
         tests = self.screening.tested(base, fixed, residual, directions) if directions else []
         return any(test.adjusted <= self.thresholds.further_rate for test in tests)
+
+    def follows_heading(self, effects: Effects, acting: np.ndarray) -> bool:
+        """Whether effects change with the heading, and that explains why they act in some windows ``[W]`` more."""
+        base = self.refit(effects).effects
+        fixed, residual = self.fixed_count(base), self.directions.scaled(base)
+        headings = self.directions.of_heading(base, fixed)
+        tests = self.screening.tested(base, fixed, residual, headings)
+        if all(test.adjusted > self.thresholds.fit_rate for test in tests):
+            return False
+        part = self.directions.of_part(base, fixed, acting)
+        tests = self.screening.tested(base, fixed, residual, part, beside=headings)
+        return all(test.adjusted > self.thresholds.effect_rate for test in tests)
 
     def measured(self) -> Outcome:
         """The effects that another sensor measured, unless the motion contradicts them."""
@@ -368,7 +383,8 @@ class Search:
         size = self._size(best) if number == 1 else None
         incomplete = missing or (size is not None and 2.0 * size.p <= self.thresholds.fit_rate)
         found = self.screening.candidates(base, self.fixed_count(base), f"{number}: ", incomplete=incomplete)
-        entries = admitted(found.screened, found.before, rate, incomplete=incomplete)
+        screened = self._beside(base, found, rate)
+        entries = admitted(screened, found.before, rate, incomplete=incomplete)
         if not self.commissioned:
             # Nothing tells whether an effect explains enough: it must be significant by itself.
             entries = [entry for entry in entries if entry.test.p <= rate]
@@ -379,7 +395,7 @@ class Search:
             self._progress(f"{number}: {entry.name}, judged")
             judged.append(self.judge(entry.effects))
         listed = []
-        for entry in found.screened:
+        for entry in screened:
             trial = next((trial for trial in judged if trial.names[-1] == entry.name), None)
             gain = found.before - entry.loss if trial is None else self._gain(best, trial)[0]
             listed.append(
@@ -387,6 +403,22 @@ class Search:
             )
         kept = [trial for trial in judged if self._adds(best, trial) and self._credible(trial)]
         return sorted(kept, key=lambda trial: trial.loss), listed
+
+    def _beside(self, base: Effects, found: Candidates, rate: float) -> Sequence[Screened]:
+        """Screened candidates; beside those that are significant the effects of ``base`` are fitted once more.
+
+        Without an effect that is missing the values of others make up for it, and with these it promises little.
+        """
+        fixed = self.fixed_count(base)
+        if len(base) == fixed or all(entry.test.adjusted > rate for entry in found.screened):
+            return found.screened
+        screened = []
+        for entry in found.screened:
+            if entry.test.p <= rate:
+                effects, loss = self.screening.quick_fit(entry.effects, fixed, _JOINT_ITERATIONS)
+                entry = replace(entry, effects=effects, loss=loss)
+            screened.append(entry)
+        return sorted(screened, key=lambda entry: entry.loss)
 
     def _pays(self, before: Trial, after: Trial, *, least: float = 0.0) -> bool:
         """Whether a significant effect predicts held-out blocks better.
@@ -413,13 +445,18 @@ class Search:
         return paired(before.held_out_loss, after.held_out_loss, self.data.starts, rate)
 
     def _preferred(self, judged: list[Trial]) -> Trial:
-        """The best trial, or one that is not significantly worse with fewer parameters."""
-        best = judged[0]
+        """The best trial, or one with fewer parameters that is as good.
+
+        As good is what is not significantly worse, nor by more than the error of a formula.
+        """
+        top, least = judged[0], _parameter_count(judged[0])
+        error = self.thresholds.model_error**2 * (self._without_effects.loss - top.loss)
+        simpler = []
         for trial in judged[1:]:
-            _, low = self._gain(trial, best)
-            if _parameter_count(trial) < _parameter_count(best) and low <= 0:
-                best = trial
-        return best
+            gain, low = self._gain(trial, top)
+            if _parameter_count(trial) < least and low <= 0 and gain <= error:
+                simpler.append(trial)
+        return min(simpler, key=lambda trial: (_parameter_count(trial), trial.loss), default=top)
 
     def refined(self, best: Trial) -> Trial:
         """The trial with further parameters of its effects, such as a payload's height, that the recording shows."""
