@@ -35,6 +35,7 @@ from monoforce_ros.discrepancy.hypothesis import Effects, Predictions, own_value
 from monoforce_ros.discrepancy.learned import learned_terms
 from monoforce_ros.discrepancy.left_out import values_without_parts
 from monoforce_ros.discrepancy.nominal import NominalModel
+from monoforce_ros.discrepancy.pairing import promising_pairs
 from monoforce_ros.discrepancy.residual_size import ResidualSize, residual_size
 from monoforce_ros.discrepancy.score_test import motion_count
 from monoforce_ros.discrepancy.screening import Candidates, Screened, Screening, admitted
@@ -64,6 +65,9 @@ _JOINT_ITERATIONS = 2
 _SMALL_SHARE = 0.5
 """Effects that explain less than this share of what an explanation must explain (``explained_share``) are neither
 exchanged nor replaced by combinations with another beginning: it only saves time on what is unknown anyway."""
+_PAIRS, _PAIR_ITERATIONS = 3, 4
+"""Pairs of effects that are fitted where single ones explain little, those that promise most to first order, and
+iterations of these fits, which begin at that promise."""
 _ALTERNATIVES = 1
 """Combinations that do not begin with the best single effect and are tried where that one leads to no good fit."""
 
@@ -136,14 +140,19 @@ class Search:
             # The effect that explains most alone need not be part of the best combination.
             if fit.passed(self.thresholds) or most_effects < 2:
                 break
-            if fit.explained < _SMALL_SHARE * self.thresholds.explained_share:
+            if self._hopeless(fit):
                 break
             extended, listed = self._extended(other, most_effects)
             tried += listed
             gain, low = self._gain(best, extended)
             if low > 0 and gain > self.thresholds.smallest_share * nominal.loss:
                 best, fit = extended, self.fit_test(extended, nominal)
-        hopeless = fit.explained < _SMALL_SHARE * self.thresholds.explained_share
+        if self._hopeless(fit) and most_effects > 1:
+            pair = self._together(best)
+            if pair is not None:
+                best, listed = self._extended(pair, most_effects)
+                tried, fit = [*tried, *listed], self.fit_test(best, nominal)
+        hopeless = self._hopeless(fit)
         exchanged, indistinguishable = self._exchanged(best) if exchange and not hopeless else (best, {})
         if exchanged is not best:
             best, fit = exchanged, self.fit_test(exchanged, nominal)
@@ -209,6 +218,48 @@ class Search:
                 break
             best = self._pruned(self._preferred(judged))
         return best, tried
+
+    def _hopeless(self, fit: FitTest) -> bool:
+        """Whether effects explain so little that improving them is of no use."""
+        return fit.explained < _SMALL_SHARE * self.thresholds.explained_share
+
+    def _together(self, best: Trial) -> Trial | None:
+        """Two effects that explain together what neither does alone, if they predict better than ``best``."""
+        self._progress("testing pairs of effects")
+        fixed = len(self.known)
+        found = self.screening.candidates(self.known, fixed, "1: ")
+        fits = []
+        for pair in promising_pairs(self.directions.scaled(self.known), found.influences, _PAIRS):
+            effects = self.known
+            for index, coefficients in zip((pair.first, pair.second), pair.coefficients, strict=True):
+                entry = next(e.effects[-1] for e in found.screened if e.name == found.influences[index].name)
+                effects = (*effects, self._moved(entry, coefficients))
+            fits.append(self.screening.quick_fit(effects, fixed, _PAIR_ITERATIONS))
+        if not fits:
+            return None
+        effects, _ = min(fits, key=lambda fit: fit[1])
+        trial = self.judge(effects)
+        gain, low = self._gain(best, trial)
+        if low <= 0 or gain <= self.thresholds.smallest_share * self._without_effects.loss:
+            return None
+        for other in trial.effects[fixed:]:
+            if not self._adds(self.judge((*trial.effects[:fixed], other)), trial):
+                return None
+        estimates = self.estimates(self.refit(trial.effects))[fixed:]
+        if any(complaint(estimate, own_values(self.robot, estimate.name)) for estimate in estimates):
+            return None
+        return trial
+
+    def _moved(self, entry: tuple[str, Mapping[str, float]], coefficients: np.ndarray) -> tuple[str, dict[str, float]]:
+        """An effect whose values are multiples of those that it has, as distances from the nominal robot's."""
+        name, values = entry
+        bounds = {parameter.name: parameter for parameter in CATALOGUE[name].parameters}
+        moved, nominal = {}, self._without(name, values)
+        for (key, value), own, coefficient in zip(values.items(), nominal, coefficients, strict=True):
+            away = float(coefficient) * (value - own)
+            # Limits are no multiples: without one there is no distance.
+            moved[key] = float(np.clip(own + away, bounds[key].low, bounds[key].high)) if np.isfinite(away) else value
+        return name, moved
 
     def learn(self, base: Effects = (), most: int = 3) -> Trial:
         """The sparse formula that best explains the residuals left by ``base``, with one to ``most`` terms.
