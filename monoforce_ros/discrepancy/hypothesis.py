@@ -449,10 +449,10 @@ class Predictions:
         return dict(self._elsewhere(effects)).__getitem__
 
     def _elsewhere(self, effects: Effects) -> Effects:
-        """A hypothesis off the part of the ground; what happens to commands has nothing to do with the ground."""
+        """A hypothesis off the part of the ground."""
         return tuple(
             (name, values)
-            if CATALOGUE[name].stage in ("command", "measurement")
+            if CATALOGUE[name].everywhere
             else (name, outside_values(name, values, own_values(self.robot, name)))
             for name, values in effects
         )

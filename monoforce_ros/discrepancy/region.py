@@ -20,6 +20,7 @@ from monoforce_ros.discrepancy.local_rollout import moves_rigidly
 from monoforce_ros.discrepancy.patch import find_patch
 from monoforce_ros.discrepancy.selection import Search
 from monoforce_ros.discrepancy.trial import Trial, blocks_of, paired
+from monoforce_ros.effects import CATALOGUE
 
 _TRIED = 3
 """Effects of the catalogue whose region is sought with fitted values: those that pull most in any area. It only saves
@@ -186,14 +187,15 @@ def _acting(area: Area, place: Place | None, data: EvidenceWindows, reach: float
 
 
 def _pulls(search: Search) -> list[tuple[Effects, _Pull]]:
-    """What every effect of the catalogue would change at each of its initial values.
+    """What every effect that may act on a part of the ground would change at each of its initial values.
 
     What an effect does is not linear: low friction changes nothing until the tyres slip. Where it acts in a small part
     of a recording, its value for the whole says nothing of it.
     """
     known, nominal = search.known, search.directions.scaled(search.known)
     pulls = []
-    for effect in search.screening.possible([name for name, _ in known]):
+    possible = search.screening.possible([name for name, _ in known])
+    for effect in (effect for effect in possible if not effect.everywhere):
         starts = [known + start for start in search.screening.starts(effect)]
         scaled = search.predictions.residuals(starts) / search.scale
         pulls += [(start, _Pull.of(search, own - nominal)) for start, own in zip(starts, scaled, strict=True)]
@@ -210,7 +212,12 @@ def _candidates(
         if name not in best or gain > best[name][0]:
             best[name] = gain, effects
     strongest = sorted(best.values(), key=lambda entry: -entry[0])[:_TRIED]
-    listed = [trial.effects for trial in trials if len(trial.effects) > len(search.known)]
+    fixed = len(search.known)
+    listed = [
+        trial.effects
+        for trial in trials
+        if len(trial.effects) > fixed and not any(CATALOGUE[name].everywhere for name in trial.names[fixed:])
+    ]
     return [*listed, *(effects for gain, effects in strongest if gain > _PROMISING * strongest[0][0])]
 
 

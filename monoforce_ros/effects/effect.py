@@ -199,6 +199,12 @@ class Effect(ABC):
         return None
 
     @property
+    def everywhere(self) -> bool:
+        """Whether it acts wherever the robot is: what happens to commands and measurements has nothing to do with the
+        ground."""
+        return self.stage in ("command", "measurement")
+
+    @property
     def of_ground(self) -> bool:
         """Whether it is a property of the ground, so that :meth:`ground` can change it on a part."""
         return type(self).ground is not Effect.ground
