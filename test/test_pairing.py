@@ -24,7 +24,8 @@ SCALE = np.tile([0.01, 0.01, 0.005], (4, 1))
 
 
 def _directions(random, *columns):
-    return [Direction(str(number), np.atleast_2d(column).reshape(-1, 30, 4, 3)) for number, column in enumerate(columns)]
+    shaped = [np.atleast_2d(column).reshape(-1, 30, 4, 3) for column in columns]
+    return [Direction(str(number), column) for number, column in enumerate(shaped)]
 
 
 def test_what_two_directions_explain_together_is_promised_whatever_their_units():
