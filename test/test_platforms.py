@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import uncovered_changes
 from benchmark_case import SETS, Case, all_cases
-from benchmark_score import closed_share, covered, found_all, scores
+from benchmark_score import closed_share, covered, found_all, scores, true_value
 from case_recording import CaseFiles, displacement, hidden_job, record_platform, record_together
 from command_faults import DeadBand, Delay, DriveFactors, Lag, TwistLimits
 from diagnosis_run import Judged, commission_platform
@@ -222,6 +222,21 @@ def hidden_entry(name, **values):
 def found_entry(name, indistinguishable=(), **values):
     parameters = {key: {"value": v, "low": v - 0.1, "high": v + 0.1} for key, v in values.items()}
     return {"name": name, "parameters": parameters, "indistinguishable": list(indistinguishable)}
+
+
+def test_what_is_injected_adds_to_what_the_healthy_robot_has():
+    healthy = {"drive_gain": {"gain": 1.05}, "command_delay": {"delay": 0.08}, "actuator_saturation": {"limit": 0.9}}
+    for name, key, injected, truth in (
+        ("drive_gain", "gain", 0.8, 0.84),
+        ("command_delay", "delay", 0.2, 0.28),
+        ("actuator_saturation", "limit", 0.5, 0.5),
+        ("actuator_saturation", "limit", 1.2, 0.9),
+        ("sensor_yaw_offset", "angle", 0.3, 0.3),
+    ):
+        assert true_value({"healthy": healthy}, name, key, injected) == pytest.approx(truth)
+    entry = {"name": "command_delay", "parameters": {"delay": {"value": 0.27, "low": 0.25, "high": 0.3}}}
+    late = report_row("single", [hidden_entry("command_delay", delay=0.2)], [entry], healthy=healthy)
+    assert covered(late) == [True]
 
 
 def test_scores_count_names_classes_pairs_extras_and_intervals():

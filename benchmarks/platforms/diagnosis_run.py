@@ -13,6 +13,7 @@ import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import yaml
 from benchmark_case import Case
 from case_recording import CaseFiles
 
@@ -81,8 +82,18 @@ def diagnose_case(case: Case, work: Path, judged: Judged) -> dict | None:
             row |= {key: content[key] for key in keys if key in content}
         else:
             row |= {"verdict": "error", "message": message}
+        row["healthy"] = healthy_values(nominal)
     write_text(result, json.dumps(row, indent=1) + "\n")
     return row
+
+
+def healthy_values(robot_file: Path) -> dict[str, dict[str, float]]:
+    """Effects with their values in a commissioned robot file."""
+    effects = yaml.safe_load(robot_file.read_text(encoding="utf-8")).get("effects", [])
+    return {
+        effect["name"]: {key: float(entry["value"]) for key, entry in effect["parameters"].items()}
+        for effect in effects
+    }
 
 
 def commission_platform(case: Case, work: Path, judged: Judged) -> None:

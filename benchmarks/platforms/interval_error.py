@@ -15,6 +15,8 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from benchmark_score import true_value
+from diagnosis_run import healthy_values
 
 from monoforce_ros.core import write_text
 from monoforce_ros.discrepancy.estimates import effect_sizes
@@ -35,7 +37,7 @@ def main() -> int:
     parser.add_argument("--json", type=Path, help="write the values to this file")
     options = parser.parse_args()
     cases = {
-        file.name: json.loads(file.read_text())
+        file.name: _row(file, folder)
         for folder in options.results
         for file in sorted((folder / "cases").glob("*.json"))
     }
@@ -53,6 +55,15 @@ def main() -> int:
     return 0
 
 
+def _row(file: Path, folder: Path) -> dict:
+    """A row, with the values of the healthy robot also where an earlier version of run.py wrote it."""
+    row = json.loads(file.read_text())
+    nominal = folder / "nominal" / "-".join(row["case"].split("-")[:3]) / "platform.yaml"
+    if "healthy" not in row and nominal.exists():
+        row["healthy"] = healthy_values(nominal)
+    return row
+
+
 def values_of(case: dict, included: float) -> list[dict]:
     """Values that were named rightly, with half widths of their intervals without the error that is included."""
     rows = []
@@ -61,7 +72,10 @@ def values_of(case: dict, included: float) -> list[dict]:
             if effect["name"] != hidden["name"]:
                 continue
             values = {key: found["value"] for key, found in effect["parameters"].items()}
-            sizes = effect_sizes(effect["name"], values, neutral_values(((effect["name"], values),)))
+            healthy = case.get("healthy", {}).get(effect["name"], {})
+            neutral = neutral_values(((effect["name"], values),))
+            own = np.array([healthy.get(key, none) for key, none in zip(values, neutral, strict=True)])
+            sizes = effect_sizes(effect["name"], values, own)
             for key, size in zip(values, sizes, strict=True):
                 if key not in hidden["estimated"]:
                     continue
@@ -71,7 +85,7 @@ def values_of(case: dict, included: float) -> list[dict]:
                     {
                         "case": case["case"],
                         "parameter": f"{effect['name']} {key}",
-                        "truth": hidden["values"][key],
+                        "truth": true_value(case, effect["name"], key, hidden["values"][key]),
                         "value": found["value"],
                         "half_width": float(np.sqrt(max(half_width**2 - (2.0 * included * size) ** 2, 0.0))),
                         "size": float(size),
