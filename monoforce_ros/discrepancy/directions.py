@@ -125,14 +125,14 @@ class Directions:
         }
         return self._changed(base, fixed, regimes)
 
-    def of_heading(self, base: Effects, fixed: int = 0) -> list[Direction]:
-        """A change of each effect of a base with the heading: it comes from outside, from iron near a compass, wind, or
-        a slope."""
-        return self._changed(base, fixed, {"with the heading": self._forward().T})
+    def of_heading(self, base: Effects, fixed: int, acting: np.ndarray) -> tuple[list[Direction], list[Direction]]:
+        """Changes of each effect of a base with the heading, and in some windows, a mask ``[W]``.
 
-    def of_part(self, base: Effects, fixed: int, acting: np.ndarray) -> list[Direction]:
-        """A change of each effect of a base in some windows, a mask ``[W]``."""
-        return self._changed(base, fixed, {"in a part": acting.astype(float)[None]})
+        What changes with the heading comes from outside, from iron near a compass, wind, or a slope.
+        """
+        regimes = {"with the heading": self._forward().T, "in a part": acting.astype(float)[None]}
+        found = self._changed(base, fixed, regimes)
+        return found[0::2], found[1::2]
 
     def _forward(self) -> np.ndarray:
         """Forward axes in the middle of the windows less their mean, ``[W, 2]``."""
@@ -141,7 +141,7 @@ class Directions:
         return forward - forward.mean(axis=0)
 
     def _changed(self, base: Effects, fixed: int, regimes: Mapping[str, np.ndarray]) -> list[Direction]:
-        """Changes of each effect of a base in proportion to factors ``[q, W]``."""
+        """Changes of each effect of a base in proportion to each of some factors ``[q, W]``."""
         directions = []
         error = self.mean_square(base, fixed, self.metric)
         for name, _ in base[fixed:]:

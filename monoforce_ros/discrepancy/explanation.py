@@ -139,9 +139,9 @@ def explain(
 
     def searched(part: Windows, *, of_time: bool = False) -> Search:
         scale, known = residual_scale(part.uncertainty, part.data, nominal), sensors.known
-        excluded = set(sensors.excluded)
+        excluded = sensors.excluded
         if part.data.place is not None:
-            excluded |= {effect.name for effect in CATALOGUE.values() if effect.everywhere}
+            excluded = (*excluded, *(effect.name for effect in CATALOGUE.values() if effect.everywhere))
         if sensors.gyro is not None:
             known = refined_clock(known, sensors.gyro, Predictions(robot, part.data), scale)
         return Search(
@@ -151,7 +151,7 @@ def explain(
             nominal=nominal,
             known=known,
             hints=sensors.hints,
-            excluded=sorted(excluded),
+            excluded=excluded,
             of_time=of_time,
             thresholds=thresholds,
             seed=settings.seed,

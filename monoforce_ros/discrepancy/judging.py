@@ -167,10 +167,10 @@ class Judging:
             confidence=self.thresholds.confidence,
         )
 
-    def _credible(self, trial: Trial) -> bool:
-        """Whether the effect that was added last is a measurement."""
-        estimate = self.estimates(self.refit(trial.effects))[-1]
-        return not complaint(estimate, own_values(self.robot, estimate.name))
+    def _credible(self, trial: Trial, added: int = 1) -> bool:
+        """Whether the effects that were added last are measurements."""
+        estimates = self.estimates(self.refit(trial.effects))[-added:]
+        return not any(complaint(estimate, own_values(self.robot, estimate.name)) for estimate in estimates)
 
     def ranked(self, fit: Fit) -> list[int]:
         """Indices of a fit's effects, ranked by leave-one-out loss: the loss of the others, fitted again without it."""

@@ -194,8 +194,9 @@ def _pulls(search: Search) -> list[tuple[Effects, _Pull]]:
     """
     known, nominal = search.known, search.directions.scaled(search.known)
     pulls = []
-    possible = search.screening.possible([name for name, _ in known])
-    for effect in (effect for effect in possible if not effect.everywhere):
+    for effect in search.screening.possible([name for name, _ in known]):
+        if effect.everywhere:
+            continue
         starts = [known + start for start in search.screening.starts(effect)]
         scaled = search.predictions.residuals(starts) / search.scale
         pulls += [(start, _Pull.of(search, own - nominal)) for start, own in zip(starts, scaled, strict=True)]

@@ -15,9 +15,8 @@ from dataclasses import replace
 import numpy as np
 
 from monoforce_ros.discrepancy.areas import clusters
-from monoforce_ros.discrepancy.credibility import complaint
 from monoforce_ros.discrepancy.fit import first_values, without
-from monoforce_ros.discrepancy.hypothesis import Effects, own_values
+from monoforce_ros.discrepancy.hypothesis import Effects
 from monoforce_ros.discrepancy.judging import Judging
 from monoforce_ros.discrepancy.learned import learned_terms
 from monoforce_ros.discrepancy.pairing import promising_pairs
@@ -65,9 +64,7 @@ class Search(Judging):
         fit = self.fit_test(best, nominal)
         for other in [trial for trial in judged if trial.names[-1] not in best.names][:_ALTERNATIVES]:
             # The effect that explains most alone need not be part of the best combination.
-            if fit.passed(self.thresholds) or most_effects < 2:
-                break
-            if self._hopeless(fit):
+            if fit.passed(self.thresholds) or most_effects < 2 or self._hopeless(fit):
                 break
             extended, listed = self._extended(other, most_effects)
             tried += listed
@@ -117,11 +114,10 @@ class Search(Judging):
         """Whether effects change with the heading, and that explains why they act in some windows ``[W]`` more."""
         base = self.refit(effects).effects
         fixed, residual = self.fixed_count(base), self.directions.scaled(base)
-        headings = self.directions.of_heading(base, fixed)
+        headings, part = self.directions.of_heading(base, fixed, acting)
         tests = self.screening.tested(base, fixed, residual, headings)
         if all(test.adjusted > self.thresholds.fit_rate for test in tests):
             return False
-        part = self.directions.of_part(base, fixed, acting)
         tests = self.screening.tested(base, fixed, residual, part, beside=headings)
         return all(test.adjusted > self.thresholds.effect_rate for test in tests)
 
@@ -155,12 +151,12 @@ class Search(Judging):
         self._progress("testing pairs of effects")
         fixed = len(self.known)
         found = self.screening.candidates(self.known, fixed, "1: ")
+        entries = {entry.name: entry.effects[-1] for entry in found.screened}
         fits = []
         for pair in promising_pairs(self.directions.scaled(self.known), found.influences, _PAIRS):
             effects = self.known
             for index, coefficients in zip((pair.first, pair.second), pair.coefficients, strict=True):
-                entry = next(e.effects[-1] for e in found.screened if e.name == found.influences[index].name)
-                effects = (*effects, self._moved(entry, coefficients))
+                effects = (*effects, self._moved(entries[found.influences[index].name], coefficients))
             fits.append(self.screening.quick_fit(effects, fixed, _PAIR_ITERATIONS))
         if not fits:
             return None
@@ -172,10 +168,7 @@ class Search(Judging):
         for other in trial.effects[fixed:]:
             if not self._adds(self.judge((*trial.effects[:fixed], other)), trial):
                 return None
-        estimates = self.estimates(self.refit(trial.effects))[fixed:]
-        if any(complaint(estimate, own_values(self.robot, estimate.name)) for estimate in estimates):
-            return None
-        return trial
+        return trial if self._credible(trial, added=2) else None
 
     def _moved(self, entry: tuple[str, Mapping[str, float]], coefficients: np.ndarray) -> tuple[str, dict[str, float]]:
         """An effect whose values are multiples of those that it has, as distances from the nominal robot's."""
