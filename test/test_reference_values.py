@@ -124,8 +124,12 @@ def diagnosis() -> dict:
     found = diagnose(Evidence(smoothed, commands), husky, settings=DiagnosisSettings(max_effects=2))
     return {
         "verdict": found.verdict,
+        # The class of a dead time has three members; which one comes first is decided far below any sensor's noise.
         "effects": {
-            entry.name: {key: estimate.value for key, estimate in entry.parameters.items()} for entry in found.effects
+            " or ".join(sorted((entry.name, *entry.indistinguishable))): [
+                abs(estimate.value) for estimate in entry.parameters.values()
+            ]
+            for entry in found.effects
         },
         "gap": {metric: [row.before, row.after] for metric, row in found.gap.items()},
     }
