@@ -60,6 +60,7 @@ def driven(robot, terrain=None, factor=1.0):
         ("supply_sag", {"sag": 0.3}, 0.08),
         ("rotation_centre", {"x": 0.06}, 0.1),
         ("drive_compliance", {"speed_loss": 0.15}, 0.1),
+        ("tyre_slip", {"ratio": 0.3}, 0.1),
         ("friction_anisotropy", {"factor": 0.6}, 0.1),
         ("terrain_softness", {"factor": 6.0}, 0.25),
         ("vegetation_drag", {"coefficient": 2.5e4}, 0.25),
@@ -68,7 +69,7 @@ def driven(robot, terrain=None, factor=1.0):
 def test_injected_values_are_recovered_from_motion(name, parameters, tolerance):
     husky, terrain = load_robot("husky"), None
     injected = dict(parameters)
-    if CATALOGUE[name].stage == "contact" and name not in ("friction_anisotropy", "drive_compliance"):
+    if CATALOGUE[name].stage == "contact" and name not in ("friction_anisotropy", "drive_compliance", "tyre_slip"):
         terrain = rough_and_grassy()
     if name == "vegetation_drag":
         injected["yield_speed"] = 0.5

@@ -67,6 +67,7 @@ def test_neutral_values_change_nothing_bit_for_bit(husky, name, backend):
 STRONG = {
     "rolling_resistance": {"coefficient": 0.1},
     "drive_compliance": {"speed_loss": 0.2},
+    "tyre_slip": {"ratio": 0.3},
     "vegetation_drag": {"coefficient": 3e4, "yield_speed": 0.4},
     "viscous_drag": {"coefficient": 40.0},
     "quadratic_drag": {"coefficient": 30.0},
@@ -507,7 +508,7 @@ def test_drives_lose_speed_in_proportion_to_their_traction(husky, backend):
 def test_the_slip_that_a_soft_drive_leaves_solves_its_equation(giving, error):
     grid = torch.meshgrid(torch.linspace(-1, 1, 41), torch.linspace(0, 1, 21), indexing="ij")
     slip = torch.stack(grid).reshape(2, -1).double()
-    kept = held_slip(slip[None], torch.tensor(giving).double(), 0.02)[0]
+    kept = held_slip(slip[None], torch.tensor(giving).double(), 0.02**2)[0]
 
     def solved(along, across):
         def excess(left):

@@ -32,6 +32,7 @@ _NOT_IN_MUJOCO = {
     "drive_compliance": "set the gain of each wheel's servo to N r² / speed_loss, for a wheel of load N and radius r",
     "turning_scrub": "no element of a model: divide the difference of both sides' commands by the factor",
     "friction_anisotropy": "friction of a geometry is equal in both directions: use a contact pair",
+    "tyre_slip": "MuJoCo's friction does not depend on how fast a wheel rolls",
     "rolling_resistance": "a resistance on the wheels' joints would be overcome by their servos",
     "quadratic_drag": "MuJoCo's drag follows from density and shapes, not from a coefficient",
     "vegetation_drag": "a MuJoCo model has no vegetation",

@@ -164,6 +164,10 @@ _FINDINGS: dict[str, Callable[[_Values], str]] = {
     "turning_scrub": _scrub,
     "friction_scale": _friction,
     "friction_anisotropy": lambda v: f"Sideways, tyres grip {_change(v['factor'], 'less', 'more')} than lengthways.",
+    "tyre_slip": lambda v: (
+        f"The tyres give way: rolling with {100 * v['ratio']:.0f} % of slip they have 71 % of the grip that the ground "
+        "offers."
+    ),
     "rotation_centre": lambda v: (
         f"The robot turns about a point {abs(v['x']):.2f} m {'ahead of' if v['x'] > 0 else 'behind'} the one that its "
         "model turns about."
@@ -223,6 +227,7 @@ _REMEDIES = {
     "acceleration_limit": "look at the base controller's limit of the acceleration; plan with it",
     "yaw_acceleration_limit": "look at the base controller's limit of the yaw acceleration; plan with it",
     "friction_anisotropy": "look at the tread of the tyres, and for ruts that guide them",
+    "tyre_slip": "look at the tyres' pressure and tread; plan fast turns with the new robot file",
     "terrain_softness": "look at the tyres' pressure, and for mud, sand or snow",
     "vegetation_drag": "look at how high and how dense the plants are; record a lidar so that the map shows them",
     "rotation_centre": "look for a load ahead or behind, and for tyres of unequal grip or pressure",
@@ -264,6 +269,7 @@ _CAUSES = {
     "yaw_acceleration_limit": "a limit of the yaw acceleration",
     "rotation_centre": "turning about another point",
     "terrain_softness": "soft ground or tyres",
+    "tyre_slip": "tyres that give way",
     "vegetation_drag": "plants",
     "drive_droop": "drives that droop when a turn begins",
     "turning_scrub": "turning less than the wheels ask for",

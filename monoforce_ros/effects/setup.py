@@ -40,6 +40,9 @@ class Loads:
     drive_compliance: Tensor | None = None
     """Surface speed that a drive loses when it pulls with as much as the load on its wheel [m/s]; None: drives hold
     their speed, which takes less computing than a loss of zero."""
+    tyre_slip: Tensor | None = None
+    """Slip over rolling speed at which 71 % of the friction is mobilised [-]; None: friction does not depend on the
+    rolling speed."""
 
     @classmethod
     def none(cls, like: Tensor) -> Loads:

@@ -43,8 +43,7 @@ class BodyContact:
     drives: Tensor
     """Drive index of each point, ``[N]`` int64; -1 on the hull."""
     friction_factors: Tensor
-    """Longitudinal and lateral factor on the ground's friction and, of drives that give way, their compliance [m/s],
-    ``[B, 2 or 3]``."""
+    """As of :class:`Problem`, ``[B, 2, 3 or 4]``."""
     ground_factors: Tensor
     """Divisor of the ground's stiffness and damping, and vegetation drag [N s/m⁴], ``[B, 2]``."""
     rolling_resistance: Tensor

@@ -42,7 +42,7 @@ def tread(belt: Tensor, along: Tensor) -> Tensor:
     return ((belt * along).sum(1) / FLAT_TREAD).clamp(-fastest, fastest)
 
 
-def held_slip(slip: Tensor, giving: Tensor, regularisation: float) -> Tensor:
+def held_slip(slip: Tensor, giving: Tensor, square: float | Tensor) -> Tensor:
     """Share of the longitudinal slip that is left when drives give way under their load, ``[B, N]``.
 
     A speed controller without integral action loses speed in proportion to its torque. A drive that loses ``c`` when
@@ -54,9 +54,9 @@ def held_slip(slip: Tensor, giving: Tensor, regularisation: float) -> Tensor:
     Args:
         slip: longitudinal and lateral slip at the commanded speed, ``[B, 2, N]`` [m/s].
         giving: speed ``c μ`` that a drive loses at the limit of friction, ``[B, N]`` [m/s].
-        regularisation: slip ε at which friction is no longer proportional to slip [m/s].
+        square: of the slip ε at which friction is no longer proportional to slip, a number or ``[B, N]`` [m²/s²].
     """
-    along, across = slip[:, 0].abs(), slip[:, 1] * slip[:, 1] + regularisation**2
+    along, across = slip[:, 0].abs(), slip[:, 1] * slip[:, 1] + square
     least = torch.sqrt(across)
     share = torch.maximum(least / (least + giving), 1.0 - giving / (along + SMALLEST_SLIP))
     per_slip = torch.rsqrt((share * along) ** 2 + across)
@@ -142,8 +142,9 @@ def contact(
     """Forces on body points (paper III-C and III-D).
 
     The normal force is a spring and a damper at the penetration, per area, and never pulls. Tangential forces are
-    regularised Coulomb friction with a friction ellipse, ``-N diag(μ) s / sqrt(|s|² + ε²)`` at slip ``s``, or the
-    paper's ``μ m g (σ(-s) - ½)``. Faces of the hull meet steep ground stiffly, see :func:`against_hull`. On soft soil
+    regularised Coulomb friction with a friction ellipse, ``-N diag(μ) s / sqrt(|s|² + ε²)`` at slip ``s``, where tyres
+    slip with ε² larger by the square of their slip ratio times their rolling speed, or the paper's
+    ``μ m g (σ(-s) - ½)``. Faces of the hull meet steep ground stiffly, see :func:`against_hull`. On soft soil
     pressure and shear are those of :class:`SoilContact`.
 
     Args:
@@ -156,8 +157,8 @@ def contact(
         areas: area of each point, ``[N]`` [m²].
         masses: of the robots, ``[B]`` [kg].
         weights: share of the robot's weight m g per point, ``[B, N]`` or ``[N]`` [N] (``sigmoid`` only).
-        friction_factors: longitudinal and lateral factor on the ground's friction and, of drives that give way, their
-            compliance, see :func:`held_slip`, ``[B, 2 or 3]``.
+        friction_factors: longitudinal and lateral factor on the ground's friction, the compliance of drives that give
+            way, see :func:`held_slip`, and the slip ratio of tyres, which soft soil replaces; ``[B, 2, 3 or 4]``.
         ground_factors: divisor of the ground's stiffness and damping [-], and force of vegetation per area, height and
             speed [N s/m⁴], ``[B, 2]``.
         rolling_resistance: force against rolling as a fraction of the load, ``[B]``.
@@ -202,11 +203,16 @@ def contact(
     if grip is not None:
         held = torch.stack([grip, torch.ones_like(grip)])
         slip, friction = slip * held, friction * held
+    slip_square: float | Tensor = options.slip_regularisation**2
+    if friction_factors.shape[1] == 4 and soil is None:
+        # The hull does not roll; the tread of a free wheel moves as fast as the robot.
+        rolling = belt_speeds[:, 0] if grip is None else grip * belt_speeds[:, 0] + (1.0 - grip) * point_velocity[:, 1]
+        slip_square = slip_square + (friction_factors[:, 3, None] * rolling) ** 2
     kept = None
-    if friction_factors.shape[1] == 3:
+    if friction_factors.shape[1] >= 3:
         # The hull has no drive that could give way.
         giving = friction_factors[:, 2, None] * friction[:, 0] * (1.0 - (outward * outward).sum(1))
-        kept = held_slip(slip, giving, options.slip_regularisation)
+        kept = held_slip(slip, giving, slip_square)
         slip = torch.stack([kept * slip[:, 0], slip[:, 1]], dim=1)
     if soil is not None:
         slip_speed = torch.sqrt((slip * slip).sum(1) + options.slip_regularisation**2)
@@ -225,7 +231,7 @@ def contact(
         tangential_gain = factors * (held_by / slip_speed)[:, None]
         tangential_force = -tangential_gain * slip
     elif options.tangential_force == "coulomb":
-        per_speed = load * torch.rsqrt((slip * slip).sum(1) + options.slip_regularisation**2)
+        per_speed = load * torch.rsqrt((slip * slip).sum(1) + slip_square)
         tangential_gain = friction * per_speed[:, None]
         tangential_force = -tangential_gain * slip
     elif options.tangential_force == "sigmoid":

@@ -52,8 +52,8 @@ class Problem:
     inertia: Tensor
     """About the centre of mass in base axes [kg m²], ``[B, 3, 3]``."""
     friction_factors: Tensor
-    """Longitudinal and lateral factor on the ground's friction and, of drives that give way, their compliance [m/s],
-    ``[B, 2 or 3]``."""
+    """Longitudinal and lateral factor on the ground's friction and, of drives that give way or tyres that slip, the
+    compliance of the drives [m/s] and the slip ratio of the tyres [-], ``[B, 2, 3 or 4]``."""
     gravity_tilt: Tensor
     """Tilt of gravity about x and y [rad], ``[B, 2]``."""
     resistance: Tensor
@@ -119,8 +119,9 @@ class Problem:
         resistance = (loads.rolling_resistance, loads.linear_drag, loads.quadratic_drag, loads.vegetation_yield)
         vegetation = (terrain.geometric_height - terrain.height).clamp_min(0.0)
         factors = [robot.friction_longitudinal, robot.friction_lateral]
-        if loads.drive_compliance is not None:
-            factors.append(loads.drive_compliance.to(dtype))
+        yielding = (loads.drive_compliance, loads.tyre_slip)
+        last = max((index for index, value in enumerate(yielding, 1) if value is not None), default=0)
+        factors += [torch.zeros_like(robot.mass) if value is None else value.to(dtype) for value in yielding[:last]]
         problem = cls(
             terrain=terrain,
             centre=position + offset,

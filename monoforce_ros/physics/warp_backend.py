@@ -52,8 +52,8 @@ def integrate(
     pages = max(len(height), len(material))
     height, material = height.expand(pages, -1, -1), material.expand(pages, -1, -1, -1)
     moving = problem.articulation
-    compliant = problem.friction_factors.shape[1] == 3
-    friction = problem.friction_factors if compliant else pad(problem.friction_factors, (0, 1))
+    given = problem.friction_factors.shape[1]
+    compliant, friction = given >= 3, pad(problem.friction_factors, (0, 4 - given))
     plain, ordered = _sampled_bodies(problem)
 
     def inputs(body: SampledBody) -> tuple[Tensor, ...]:

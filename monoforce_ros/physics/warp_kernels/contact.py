@@ -211,16 +211,22 @@ def contact_functions(double: bool, soft: bool) -> ContactFunctions:
             along = wp.cross(across, normal)
             velocity_along = wp.dot(velocity, along)
             velocity_across = wp.dot(velocity, across)
-            slip_along = grip * (velocity_along + tread(belt, along))
+            rolling_speed = tread(belt, along)
+            slip_along = grip * (velocity_along + rolling_speed)
             slip_across = velocity_across + wp.dot(belt, across)
             friction_along = grip * material[2] * factors[0]
             friction_across = material[2] * factors[1]
+            # The hull does not roll; the tread of a free wheel moves as fast as the robot.
+            slip_square = options.slip_square
+            if wp.static(not soft):
+                sliding_at = factors[3] * (grip * rolling_speed + (scalar(1.0) - grip) * velocity_along)
+                slip_square = slip_square + sliding_at * sliding_at
             # Drives give way under their load; the hull has none.
             kept = scalar(1.0)
             if options.compliant == 1 and body.drives[i] >= 0:
                 giving = factors[2] * friction_along
                 sliding = wp.abs(slip_along)
-                square_across = slip_across * slip_across + options.slip_square
+                square_across = slip_across * slip_across + slip_square
                 least = wp.sqrt(square_across)
                 kept = wp.max(least / (least + giving), scalar(1.0) - giving / (sliding + scalar(SMALLEST_SLIP)))
                 per_slip = scalar(1.0) / wp.sqrt(kept * kept * sliding * sliding + square_across)
@@ -254,9 +260,7 @@ def contact_functions(double: bool, soft: bool) -> ContactFunctions:
                 force_across = -gain_across * slip_across
             if wp.static(not soft):
                 if options.tangential == 1:
-                    per_speed = load / wp.sqrt(
-                        slip_along * slip_along + slip_across * slip_across + options.slip_square
-                    )
+                    per_speed = load / wp.sqrt(slip_along * slip_along + slip_across * slip_across + slip_square)
                     gain_along = friction_along * per_speed
                     gain_across = friction_across * per_speed
                     force_along = -gain_along * slip_along

@@ -84,7 +84,7 @@ def types(double: bool) -> Types:
         mass: wp.array(dtype=scalar)
         centre_of_mass: wp.array(dtype=vec3)
         inertia: wp.array(dtype=mat33)
-        friction: wp.array(dtype=vec3)  # longitudinal and lateral factor, compliance of the drives
+        friction: wp.array(dtype=vec4)  # longitudinal and lateral factor, compliance of drives, slip ratio of tyres
         ground_factors: wp.array(dtype=vec2)  # divisor of stiffness and damping, drag of vegetation
         tilt: wp.array(dtype=vec2)  # of gravity
         resistance: wp.array(dtype=vec4)  # rolling, linear drag, quadratic drag, yield speed of vegetation
