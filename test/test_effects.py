@@ -504,6 +504,38 @@ def test_drives_lose_speed_in_proportion_to_their_traction(husky, backend):
     assert starts[1] == pytest.approx(starts[0], rel=0.02)
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_tyres_slip_in_proportion_to_how_fast_they_roll(husky, backend):
+    """Against a force F on a load of M g they lose κ u F / sqrt((μ M g)² - F²); a locked wheel has all its friction."""
+    friction, weight = TerrainDefaults().friction, float(husky.mass) * 9.81
+    for speed in (0.5, 1.0):
+        speeds = []
+        for force in (0.0, -0.4 * friction * weight):
+            robot = having(husky, tyre_slip={"ratio": 0.2}, constant_force={"x": force, "y": 0.0})
+            speeds.append(float(run(robot, (speed, 0.0), 3.0, backend=backend).velocity[0, -1, 0]))
+        expected = speed * 0.2 * 0.4 / math.sqrt(1.0 - 0.4**2)
+        assert speeds[0] - speeds[1] == pytest.approx(expected, rel=0.1)
+    moving = State.at_rest(husky.ground_clearance, dtype=torch.float64)
+    moving = dataclasses.replace(moving, velocity=torch.tensor([[2.0, 0.0, 0.0]], dtype=torch.float64))
+    stops = [
+        float(run(having(husky, **slipping), (0.0, 0.0), 0.3, state=moving, backend=backend).position[0, -1, 0])
+        for slipping in ({}, {"tyre_slip": {"ratio": 0.5}})
+    ]
+    assert stops[1] == pytest.approx(stops[0], abs=1e-9)
+
+
+def test_a_fast_robot_whose_tyres_slip_turns_as_it_does_when_slow():
+    """With Coulomb's law alone sideways grip vanishes where the tyres scrub, and a fast robot turns further."""
+    warthog = load_robot("warthog").to(torch.float64)
+    changes = []
+    for slipping in ({}, {"tyre_slip": {"ratio": 0.3}}):
+        robot = having(warthog, **slipping)
+        slow, fast = (float(run(robot, (speed, 1.5), 3.0).angular_velocity[0, -1, 2]) for speed in (1.0, 3.0))
+        changes.append(abs(fast / slow - 1.0))
+    assert changes[0] > 0.15
+    assert changes[1] < 0.5 * changes[0]
+
+
 @pytest.mark.parametrize(("giving", "error"), [(0.01, 1e-4), (0.05, 2e-3), (0.2, 3e-3), (1.0, 0.02), (2.0, 1e-3)])
 def test_the_slip_that_a_soft_drive_leaves_solves_its_equation(giving, error):
     grid = torch.meshgrid(torch.linspace(-1, 1, 41), torch.linspace(0, 1, 21), indexing="ij")

@@ -113,8 +113,9 @@ def test_both_backends_solve_springs_rockers_and_motors_alike(tmp_path):
     check_backends_agree(robot, rover_controls(robot))
 
 
-def test_both_backends_turn_casters_alike(tmp_path):
-    robot = written(tmp_path, with_caster())
+@pytest.mark.parametrize("effects", [(), (("tyre_slip", {"ratio": 0.3}),)])
+def test_both_backends_turn_casters_alike(tmp_path, effects):
+    robot = dataclasses.replace(written(tmp_path, with_caster()), effects=effects)
     start = torch.tensor([[0.9], [-0.4]]).double()
     speeds = torch.tensor([0.4, 0.3, 0.35]).double().expand(2, 30, 3).clone()
     check_backends_agree(robot, Controls(speeds, start[:, None].expand(2, 30, 1).clone(), None, start))
