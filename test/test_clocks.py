@@ -7,19 +7,22 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import SmoothedMotion
-from monoforce_ros.core import AngularVelocityTrack, MotionTrack
-from monoforce_ros.discrepancy.clocks import compare_with_gyro
+from monoforce_ros.core import AngularVelocityTrack, CommandTrack, MotionTrack
+from monoforce_ros.discrepancy.clocks import compare_with_gyro, heading_disagreement
+from monoforce_ros.discrepancy.comparison import Comparison, gap_table
+from monoforce_ros.discrepancy.evidence import EvidenceWindows
+
+
+def yaw_rate(times):
+    return 0.6 * np.sin(0.9 * times) + 0.4 * np.sin(2.3 * times + 1.0)
+
+
+def heading(times):
+    return -0.6 / 0.9 * np.cos(0.9 * times) - 0.4 / 2.3 * np.cos(2.3 * times + 1.0)
 
 
 def turning(rate, seconds=60.0):
     """Poses at ``rate`` [Hz] and a gyro at 100 Hz of a robot that turns both ways."""
-
-    def yaw_rate(times):
-        return 0.6 * np.sin(0.9 * times) + 0.4 * np.sin(2.3 * times + 1.0)
-
-    def heading(times):
-        return -0.6 / 0.9 * np.cos(0.9 * times) - 0.4 / 2.3 * np.cos(2.3 * times + 1.0)
-
     random = np.random.default_rng(0)
     times, fast = np.arange(0.0, seconds, 1.0 / rate), np.arange(0.0, seconds, 0.01)
     zeros = np.zeros((len(times), 3))
@@ -48,3 +51,56 @@ def test_a_gyro_is_biased_beyond_what_a_healthy_one_is(bias, biased):
     assert found.bias == pytest.approx(bias, abs=0.003)
     assert abs(found.bias - bias) < max(found.bias_half_width, 0.002)
     assert found.biased == biased
+
+
+def disagreement(motion, gyro, seconds=2.0):
+    smoothed = SmoothedMotion(motion, 0.003, 0.002, (slice(0, len(motion)),))
+    return np.degrees(heading_disagreement(smoothed, gyro, compare_with_gyro(smoothed, gyro), seconds))
+
+
+def test_poses_that_follow_the_gyro_with_a_constant_delay_err_by_nothing():
+    motion, gyro = turning(20.0)
+    late = replace(motion, stamps=motion.stamps + 250_000_000)
+    # Neither a delay nor a bias nor a calibration of the gyro is an error of the localisation.
+    changed = replace(gyro, rates=1.1 * gyro.rates + np.array([0.0, 0.0, 0.02]))
+    assert disagreement(late, changed) < 0.6
+
+
+def test_a_localisation_whose_delay_varies_errs_by_what_the_gyro_shows():
+    motion, gyro = turning(20.0)
+    seconds = (motion.stamps - motion.stamps[0]) * 1e-9
+    delay = np.where((seconds // 5.0).astype(int) % 2, 0.5, 0.0)
+    late = Rotation.from_rotvec(heading(seconds - delay)[:, None] * [0, 0, 1]).as_quat()
+    random = np.random.default_rng(1)
+    turns = yaw_rate(seconds - delay)[:, None] * [0, 0, 1] + 0.01 * random.standard_normal((len(seconds), 3))
+    motion = replace(motion, quaternions=late, angular_velocities=turns)
+    starts = np.arange(0.0, 57.0, 0.05)
+    at = [np.interp(starts + shift, seconds, heading(seconds - delay)) for shift in (0.0, 2.0)]
+    apart = (at[1] - at[0]) - (heading(starts + 2.0 - 0.25) - heading(starts - 0.25))
+    expected = np.degrees(np.median(np.abs(apart)))
+    assert expected > 4.0
+    assert disagreement(motion, gyro) == pytest.approx(expected, rel=0.35)
+
+
+def test_a_gyro_that_paused_says_nothing_of_that_time():
+    motion, gyro = turning(20.0)
+    times = (gyro.stamps - gyro.stamps[0]) * 1e-9
+    kept = (times < 20.0) | (times > 40.0)
+    paused = replace(gyro, stamps=gyro.stamps[kept], rates=gyro.rates[kept])
+    assert disagreement(motion, paused) < 0.6
+    smoothed = SmoothedMotion(motion, 0.003, 0.002, (slice(0, len(motion)),))
+    found, kept = compare_with_gyro(smoothed, gyro), times < 8.0
+    short = replace(gyro, stamps=gyro.stamps[kept], rates=gyro.rates[kept])
+    assert heading_disagreement(smoothed, short, found, 2.0) is None
+
+
+def test_a_heading_error_is_reducible_down_to_what_the_gyro_shows_of_the_localisation():
+    motion, _ = turning(20.0)
+    commands = CommandTrack(motion.stamps, np.zeros((len(motion), 2)))
+    starts = motion.stamps[:800:40]
+    data = EvidenceWindows(motion, commands, starts, 2.0, np.array([2.0]))
+    before, after, floor = (np.tile([0.3, 0.0, np.radians(error)], (len(starts), 1)) for error in (20.0, 8.0, 1.0))
+    rows = [gap_table([Comparison(2.0, starts, before, after, floor, data)], heading_noise=n) for n in (None, {2.0: 5})]
+    assert [row["heading_2s"].noise for row in rows] == pytest.approx([1.0, 5.0])
+    assert [row["heading_2s"].closed for row in rows] == pytest.approx([12 / 19, 12 / 15])
+    assert rows[0]["position_2s"] == rows[1]["position_2s"]

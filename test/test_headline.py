@@ -10,6 +10,7 @@ from monoforce_ros.discrepancy import Diagnosis, EffectEstimate, ParameterEstima
 from monoforce_ros.discrepancy.bag_diagnosis import without_blame_for_ground
 from monoforce_ros.discrepancy.comparison import GapRow
 from monoforce_ros.discrepancy.credibility import complaint
+from monoforce_ros.discrepancy.gap import NoiseFloor
 from monoforce_ros.discrepancy.ground import beyond_commissioning
 from monoforce_ros.discrepancy.headline import Tone, explained, headline
 from monoforce_ros.discrepancy.page import diagnosis_page
@@ -48,6 +49,15 @@ def test_an_explained_error_is_good_and_what_is_left_is_said_first():
     assert any("0.28 to 0.32 s" in text for text in top.confidence)
     lines = summary_lines(diagnosed((0.5, 0.06), (8.0, 1.0)))
     assert lines[0].startswith("effect_found: ") and "Unexplained" in lines[1]
+
+
+def test_what_the_localisation_errs_by_itself_is_said_beside_what_is_unexplained():
+    floor = NoiseFloor(2.0, 0.01, 0.01, 0.02)
+    found = diagnosed((0.5, 0.06), (20.0, 8.0), localisation_error=7.3, noise_floor=floor)
+    assert "Poses and gyro turn 7.3° apart within 2 s" in headline(found).unexplained
+    assert "7.3°" in diagnosis_page(found, {}, None)
+    assert report_content(found, {}, None)["localisation_error_deg"] == 7.3
+    assert "gyro" not in headline(diagnosed((0.5, 0.06), (20.0, 8.0), noise_floor=floor)).unexplained
 
 
 def test_a_part_of_the_recording_is_said_beside_what_acts_there():

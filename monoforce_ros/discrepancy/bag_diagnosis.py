@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from monoforce_ros.bags import DETECTED, ReadOptions, Recording, smooth
+from monoforce_ros.discrepancy.clocks import compare_with_gyro
 from monoforce_ros.discrepancy.command_changes import uncovered_doubt
 from monoforce_ros.discrepancy.comparison import GapRow, HeldOut, compare, gap_table
 from monoforce_ros.discrepancy.credibility import complaint
@@ -22,6 +23,7 @@ from monoforce_ros.discrepancy.motion_check import motion_faults
 from monoforce_ros.discrepancy.nominal import NominalModel, with_known_components
 from monoforce_ros.discrepancy.nominal_residual import residual_complaint
 from monoforce_ros.discrepancy.report import effect_entry, write_diagnosis
+from monoforce_ros.discrepancy.sensor_findings import heading_noise
 from monoforce_ros.discrepancy.separate_stretches import laid_apart
 from monoforce_ros.discrepancy.step_errors import compare_after_steps
 from monoforce_ros.discrepancy.terrain_evidence import supporting_terrain, traced_terrain
@@ -297,4 +299,6 @@ def _held_out_table(
         raise ValueError(f"{bag}: no gap-free window of 2 s, expected at least one for the comparison")
     data = evidence.cut(starts, np.array([2.0]))
     everywhere = HeldOut.everywhere(effects) if effects else None
-    return gap_table(compare(robot, data, smoothed, everywhere, noisy_motions(smoothed)))
+    compared = compare(robot, data, smoothed, everywhere, noisy_motions(smoothed))
+    by_gyro = heading_noise(evidence, compare_with_gyro(smoothed, evidence.gyro))
+    return gap_table(compared, heading_noise=by_gyro)

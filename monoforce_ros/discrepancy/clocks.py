@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
+from scipy.spatial.transform import Rotation
 from scipy.stats import t as student
 
 from monoforce_ros.bags import SmoothedMotion
@@ -16,10 +18,15 @@ _LAGS = np.arange(-50, 81) * _STEP
 """Delays of the poses that are tested [s]."""
 _PIECE = 8.0
 """Length of the pieces into which a recording is cut [s]."""
+_APART, _LONGEST_GAP, _FEWEST_WINDOWS = 1.0, 0.2, 10
+"""Time between windows in which headings are compared [s], longest one between measurements of the gyro inside of one
+[s], and fewest of these windows."""
 _WEAKEST = np.sqrt(0.5)
 """Smallest correlation of the two yaw rates for a conclusion: they share at least half of their variance."""
 _LEAST_TURNING = 0.08
 """Smallest standard deviation of the yaw rate in a piece that is used for the delay [rad/s]."""
+_SCALES = np.arange(0.7, 1.301, 0.02)
+"""Factors on the gyro's rate that are tried when headings are compared."""
 _HEALTHY_BIAS = np.radians(0.5)
 """Largest bias of a healthy gyro [rad/s]: data sheets of robots' MEMS gyros allow 0.2 to 0.5 °/s after switching on."""
 
@@ -112,6 +119,37 @@ def compare_with_gyro(smoothed: SmoothedMotion, gyro: AngularVelocityTrack | Non
         sign=sign,
         resolution=0.5e-9 * float(np.median(np.diff(smoothed.motion.stamps)) + np.median(np.diff(gyro.stamps))),
     )
+
+
+def heading_disagreement(
+    smoothed: SmoothedMotion, gyro: AngularVelocityTrack, found: GyroFinding, horizon: float
+) -> float | None:
+    """By how much poses and gyro turn apart within ``horizon`` [s]: the median over windows [rad]; None without any.
+
+    Delay and bias are corrected, and the factor on the gyro's rate is that of the best agreement, so that neither clock
+    nor calibration counts. No model predicts headings better than the localisation that measured them: its lag may vary
+    from turn to turn, which the scatter of its poses does not show.
+    """
+    clock, rates = (gyro.stamps - gyro.stamps[0]) * 1e-9, found.sign * gyro.rates[:, found.axis] - found.bias
+    turned = cumulative_trapezoid(rates, clock, initial=0.0)
+    apart, gaps = [], np.r_[0, np.cumsum(np.diff(clock) > _LONGEST_GAP)]
+    for stretch in smoothed.stretches:
+        motion = smoothed.motion
+        times = (motion.stamps[stretch] - gyro.stamps[0]) * 1e-9
+        starts = np.arange(times[0], times[-1] - horizon, _APART) if len(times) > 1 else np.zeros(0)
+        yaw = np.unwrap(Rotation.from_quat(motion.quaternions[stretch]).as_euler("ZYX")[:, 0])
+        ends = np.stack([starts, starts + horizon])
+        poses = np.diff(np.interp(ends, times, yaw), axis=0)[0]
+        place = np.searchsorted(clock, ends - found.offset)
+        inside = (place > 0) & (place < len(clock))
+        same = gaps[np.clip(place[0] - 1, 0, None)] == gaps[np.clip(place[1], 0, len(clock) - 1)]
+        known = inside.all(axis=0) & same
+        measured = np.diff(np.interp(ends - found.offset, clock, turned), axis=0)[0]
+        apart.append(np.stack([poses, measured])[:, known])
+    poses, measured = np.concatenate(apart, axis=1) if apart else np.zeros((2, 0))
+    if len(poses) < _FEWEST_WINDOWS:
+        return None
+    return float(min(np.median(np.abs(poses - scale * measured)) for scale in _SCALES))
 
 
 def _mean_half_width(values: list[float]) -> float:

@@ -20,6 +20,8 @@ from monoforce_ros.discrepancy.trial import BLOCK, blocks_of
 from monoforce_ros.robots import RobotModel
 
 HORIZONS = (1.0, 2.0, 5.0)
+ABOVE_NOISE = 2.0
+"""An error counts if it is at least so many times the noise floor: the noise is then the smaller part of it."""
 _METRICS = (("position", "m"), ("heading", "deg"), ("lean", "deg"), ("height", "m"))
 """Errors and their units; the last two where the ground is known."""
 
@@ -94,7 +96,7 @@ class GapRow:
     gain_high: float | None
     unit: str
     noise: float
-    """Median error due to pose noise alone."""
+    """Median error due to pose noise alone; of headings the difference of poses and gyro, if that is larger."""
     closed: float | None = None
     """Share of the reducible gap, the error above the noise, that is closed."""
 
@@ -160,14 +162,24 @@ def compare(
     return results
 
 
-def gap_table(comparisons: Sequence[Comparison], seed: int = 0) -> dict[str, GapRow]:
-    """By metric and horizon, such as ``position_2s``: median errors, noise, and the confidence interval of the gain."""
+def gap_table(
+    comparisons: Sequence[Comparison], seed: int = 0, heading_noise: Mapping[float, float] | None = None
+) -> dict[str, GapRow]:
+    """By metric and horizon, such as ``position_2s``: median errors, noise, and the confidence interval of the gain.
+
+    Args:
+        comparisons: by horizon.
+        seed: of the bootstrap.
+        heading_noise: what the gyro shows of the error of the poses' headings, by horizon [deg].
+    """
     random = np.random.default_rng(seed)
     table: dict[str, GapRow] = {}
     for found in comparisons:
         for metric, unit in _METRICS if found.data.with_attitude else _METRICS[:2]:
             before = found.errors(metric, found.before)
             noise = float(np.median(found.errors(metric, found.floor)))
+            if metric == "heading":
+                noise = max(noise, (heading_noise or {}).get(found.horizon, 0.0))
             row = GapRow(found.horizon, float(np.median(before)), None, None, None, unit, noise)
             blocks = blocks_of(found.starts)
             numbers = np.unique(blocks)

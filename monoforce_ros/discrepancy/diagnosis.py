@@ -11,6 +11,7 @@ from monoforce_ros.discrepancy.areas import Area, worst_place
 from monoforce_ros.discrepancy.attitude import changed_lean, lean_of
 from monoforce_ros.discrepancy.comparable_windows import comparable_starts, windows_of
 from monoforce_ros.discrepancy.comparison import (
+    ABOVE_NOISE,
     Comparison,
     GapRow,
     HeldOut,
@@ -46,6 +47,7 @@ from monoforce_ros.discrepancy.sensor_findings import (
     accepts_bias,
     bias_estimate,
     bias_row,
+    heading_noise,
 )
 from monoforce_ros.discrepancy.trial import CandidateScore, Outcome
 from monoforce_ros.discrepancy.verdict import Decision, Losses, Verdict
@@ -98,6 +100,8 @@ class Diagnosis:
     """The reasons for the verdict."""
     losses: Losses | None = None
     details: Details | None = None
+    localisation_error: float | None = None
+    """By how much poses and gyro turn apart within the windows, where that is beyond the noise of the poses [deg]."""
     steps: StepComparison | None = None
     """Errors after steps of the command beside those of a kinematic fit."""
     part: str = ""
@@ -174,6 +178,7 @@ def diagnose(
     def compared_with(judged: HeldOut | None) -> list[Comparison]:
         return compare(robot, data, smoothed, judged, noisy, None if part is None else part.acting_in)
 
+    by_gyro = heading_noise(evidence, sensors.gyro)
     # Whether an effect is added follows from the folds on which it was selected. How much it helps does not.
     judged = held_out(decision)
     compared = compared_with(judged)
@@ -189,12 +194,12 @@ def diagnose(
             decision = repetition.confirmed(explanation, decision, settings.thresholds)
             judged = None if decision.trial is None else repetition.held_out
             compared = compared_with(judged)
-    gap = gap_table(compared, settings.seed)
+    gap = gap_table(compared, settings.seed, by_gyro)
     if judged is not None and gets_worse(gap):
         # Searches that never saw the judged windows contradict what was found.
         decision, judged = decision.without_improvement("increase"), None
         compared = _without_effects(compared)
-        gap = gap_table(compared, settings.seed)
+        gap = gap_table(compared, settings.seed, by_gyro)
     known_parts: tuple[EffectEstimate, ...] = ()
     parts = decision.parts
     if aside is not None:
@@ -243,6 +248,7 @@ def diagnose(
             f"look at the ground {place.place.words}: there errors are largest whenever the robot comes by",
             *hints,
         )
+    apart, noise = by_gyro.get(settings.horizon, 0.0), float(np.degrees(floor[-1, 2]))
     progress(1.0, "done")
     return Diagnosis(
         verdict=decision.verdict,
@@ -257,6 +263,7 @@ def diagnose(
         fitted=fitted,
         remarks=decision.remarks,
         losses=decision.losses,
+        localisation_error=apart if apart > ABOVE_NOISE * noise else None,
         commissioned=search.commissioned,
         details=Details(data, before, floor, tuple(compared), paths, area, meaning),
         part="" if part is None or decision.verdict in _NOTHING_ADDED else part.remark,

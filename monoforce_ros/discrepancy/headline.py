@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-from monoforce_ros.discrepancy.comparison import JUDGED, GapRow
+from monoforce_ros.discrepancy.comparison import ABOVE_NOISE, JUDGED, GapRow
 from monoforce_ros.discrepancy.credibility import complaint
 from monoforce_ros.discrepancy.diagnosis import Diagnosis
 from monoforce_ros.discrepancy.estimates import EffectEstimate
@@ -16,8 +16,6 @@ from monoforce_ros.discrepancy.wording import cause, finding, remedy
 
 MOST = 0.5
 """Share of an error above which most of it is explained: by the meaning of "most"."""
-ABOVE_NOISE = 2.0
-"""An error counts if it is at least so many times the noise floor: the noise is then the smaller part of it."""
 
 
 class Tone(StrEnum):
@@ -138,7 +136,7 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
         )
     named = [effect for effect in effects if effect.name != LEARNED]
     rows = explained(diagnosis)
-    left = _left(rows) or "Unexplained: all of the error."
+    left = (_left(rows) or "Unexplained: all of the error.") + _of_localisation(diagnosis)
     confidence = [*_sizes(diagnosis), *_intervals(effects)]
     for effect in named:
         if effect.indistinguishable:
@@ -209,6 +207,16 @@ def _left(rows: Sequence[Explained]) -> str:
         else:
             texts.append(f"{100 * (1 - max(row.share, 0.0)):.0f} % of the {row.metric} error{where}")
     return f"Unexplained after {rows[0].row.horizon:g} s: {'; '.join(texts)}." if texts else ""
+
+
+def _of_localisation(diagnosis: Diagnosis) -> str:
+    """What the localisation itself errs by, in one sentence; empty where nothing shows it."""
+    if diagnosis.localisation_error is None or diagnosis.noise_floor is None:
+        return ""
+    return (
+        f" Poses and gyro turn {diagnosis.localisation_error:.2g}° apart within {diagnosis.noise_floor.horizon:g} s: "
+        "by so much the localisation itself errs, whatever the model."
+    )
 
 
 def _growth(row: Explained) -> str:

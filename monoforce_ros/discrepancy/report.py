@@ -48,6 +48,7 @@ def report_content(
         "localisation": [_localisation_entry(entry) for entry in diagnosis.localisation],
         "gap": _gap_entries(diagnosis.gap),
         "noise_floor": _noise_entries(diagnosis.noise_floor),
+        "localisation_error_deg": diagnosis.localisation_error,
         "robot_file": None if robot_file is None else str(robot_file),
         "inputs": dict(inputs),
         "advice": list(diagnosis.advice),

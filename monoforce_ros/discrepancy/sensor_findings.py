@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from monoforce_ros.discrepancy.clocks import GyroFinding, compare_with_gyro
-from monoforce_ros.discrepancy.comparison import GapRow
+from monoforce_ros.discrepancy.clocks import GyroFinding, compare_with_gyro, heading_disagreement
+from monoforce_ros.discrepancy.comparison import HORIZONS, GapRow
 from monoforce_ros.discrepancy.estimates import EffectEstimate, ParameterEstimate
 from monoforce_ros.discrepancy.evidence import Evidence
 from monoforce_ros.discrepancy.fit import robust
@@ -119,6 +119,14 @@ def refined_clock(known: Effects, gyro: GyroFinding, predictions: Predictions, s
     offsets = gyro.offset + gyro.offset_half_width * np.linspace(-1.5, 1.5, 13)
     tried: Sequence[Effects] = [(("pose_clock_offset", {"offset": float(offset)}), *known[1:]) for offset in offsets]
     return min(tried, key=lambda effects: float(robust(predictions.residuals([effects])[0] / scale).mean()))
+
+
+def heading_noise(evidence: Evidence, gyro: GyroFinding | None) -> dict[float, float]:
+    """By how much poses and gyro turn apart, by horizon of a comparison [deg]; empty without a gyro."""
+    if gyro is None or evidence.gyro is None:
+        return {}
+    found = {horizon: heading_disagreement(evidence.smoothed, evidence.gyro, gyro, horizon) for horizon in HORIZONS}
+    return {horizon: float(np.degrees(apart)) for horizon, apart in found.items() if apart is not None}
 
 
 def accepts_bias(decision: Decision, robot: RobotModel) -> bool:
