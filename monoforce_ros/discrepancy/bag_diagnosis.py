@@ -232,13 +232,14 @@ def may_be_the_ground(verdict: Verdict, names: Sequence[str], *, named: bool) ->
     Args:
         verdict: an error without a name may be theirs.
         names: of effects that were found; slopes neither delay a command nor turn a sensor.
-        named: whether forces that slopes exert may pass for effects, too: those of contact and body.
+        named: whether forces that slopes exert may pass for effects, too.
     """
     return verdict == Verdict.UNKNOWN_EFFECT or (named and any(_is_force(name) for name in names))
 
 
 def _is_force(name: str) -> bool:
-    return CATALOGUE[name].stage in ("contact", "body")
+    effect = CATALOGUE[name]
+    return effect.stage in ("contact", "body") and effect.like_a_slope
 
 
 def without_blame_for_ground(diagnosis: Diagnosis, unexplained: str, *, named: bool) -> Diagnosis:

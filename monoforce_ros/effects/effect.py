@@ -105,6 +105,9 @@ class Effect(ABC):
     order: ClassVar[int | None] = None
     """Position among the effects on commands, smallest first: the base controller, electronics, mechanics, ground.
     Required for every effect that overrides :meth:`twists` or :meth:`drive_speeds`; all twists change first."""
+    like_a_slope: ClassVar[bool] = True
+    """Whether a contact or body effect may be the pull of slopes that no map shows. One that only changes how the robot
+    turns is none: a slope pulls whichever way the robot turns."""
     acts_on_steering: ClassVar[bool] = False
     """Whether :meth:`drive_speeds` also acts on steering angles, as a delay of all commands does."""
     clock: ClassVar[str] = ""

@@ -20,6 +20,7 @@ class FrictionAnisotropy(Effect):
     parameters = (Parameter("factor", "-", 1.0, 0.05, 3.0, 0.3, "lateral over longitudinal friction"),)
     identified = ("factor",)
     commissioning_start: ClassVar = {"factor": 1.0}
+    like_a_slope = False
     manoeuvre = "turns on the spot, wide arcs and hard starts straight ahead"
     separated_by: ClassVar = {
         "friction_scale": "hard starts straight ahead, which need longitudinal friction only",

@@ -25,6 +25,7 @@ class RotationCentre(Effect):
     source = "lateral friction in proportion to load; instantaneous centre of rotation (Mandow et al. 2007)"
     parameters = (Parameter("x", "m", 0.0, -0.5, 0.5, 0.1, "centre of mass forward of the modelled one"),)
     identified = ("x",)
+    like_a_slope = False
     manoeuvre = "turns on the spot to both sides"
     commissioning_start: ClassVar = {"x": 0.0}
     separated_by: ClassVar = {

@@ -21,6 +21,7 @@ class TurningScrub(Effect):
     parameters = (Parameter("track_width_factor", "-", 1.0, 0.3, 4.0, 0.3, "effective over modelled track width"),)
     order = 70
     identified = ("track_width_factor",)
+    like_a_slope = False
     manoeuvre = "turns on the spot and wide arcs"
     commissioning_start: ClassVar = {"track_width_factor": 1.05}
 

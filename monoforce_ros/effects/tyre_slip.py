@@ -26,6 +26,7 @@ class TyreSlip(Effect):
     # Cornering stiffness of off-road tyres: 2 to 10 times the load per radian, κ of 0.4 to 0.08 at a friction of 0.8.
     parameters = (Parameter("ratio", "-", 0.0, 0.0, 2.0, 0.2, "slip over rolling speed at 71 % of full friction"),)
     identified = ("ratio",)
+    like_a_slope = False
     manoeuvre = "wide turns at slow and high speed"
     separated_by: ClassVar = {
         "friction_scale": "hard braking on a straight, and turns at slow and high speed",
