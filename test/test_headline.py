@@ -170,8 +170,8 @@ def test_an_error_without_a_name_on_hills_without_a_map_is_not_called_an_effect(
     # What has a name stands, and so does a healthy robot.
     for kept in (diagnosed((0.5, 0.06), (8.0, 1.0)), Diagnosis(Verdict.NO_DISCREPANCY)):
         assert without_blame_for_ground(kept, reason, named=True) is kept
-    # Forces that slopes exert may pass for effects, where the robot is not known on slopes; delays may not, nor may what
-    # changes how the robot turns: a slope pulls whichever way it turns.
+    # Forces that slopes exert may pass for effects, where the robot is not known on slopes. Delays may not, nor may what
+    # changes how the robot turns: a slope pulls whichever way that is.
     scrub = effect("turning_scrub", track_width_factor=(1.23, 1.16, 1.31))
     turns = diagnosed((0.5, 0.06), (8.0, 1.0), effects=(scrub, DELAY))
     assert without_blame_for_ground(turns, reason, named=True) is turns
@@ -180,7 +180,8 @@ def test_an_error_without_a_name_on_hills_without_a_map_is_not_called_an_effect(
     assert without_blame_for_ground(pulled, reason, named=False) is pulled
     judged = without_blame_for_ground(pulled, reason, named=True)
     assert judged.verdict is Verdict.NOT_IDENTIFIABLE and judged.known_parts == (pull, DELAY) and not judged.fitted
-    assert judged.advice[0] == reason and judged.advice[1].startswith("on known ground this would mean: Something pulls")
+    assert judged.advice[0] == reason
+    assert judged.advice[1].startswith("on known ground this would mean: Something pulls the robot")
 
 
 def test_ground_that_is_steeper_than_where_the_robot_was_commissioned_gets_a_doubt():

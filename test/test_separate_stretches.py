@@ -26,6 +26,7 @@ from monoforce_ros.terrain import Grid, TerrainMap
 
 STEP = 0.01
 DELAY = ("command_delay", {"delay": 0.4})
+SLIPPING = ("tyre_slip", {"ratio": 0.3})
 PULLED = ("constant_force", {"x": -300.0, "y": 0.0})
 
 
@@ -77,9 +78,10 @@ def runs_on_hills(robot, count):
 
 @pytest.fixture(scope="module")
 def bags(tmp_path_factory):
-    """Recordings with a dead time, without and with a force that no sensor measures."""
+    """Recordings with a dead time, without and with a force that no sensor measures, and with tyres that slip."""
     folder, warthog, made = tmp_path_factory.mktemp("runs"), load_robot("warthog"), []
-    for name, effects, count in (("late", (DELAY,), 14), ("pulled", (DELAY, PULLED), 7)):
+    recorded = (("late", (DELAY,), 14), ("pulled", (DELAY, PULLED), 7), ("slipping", (DELAY, SLIPPING), 12))
+    for name, effects, count in recorded:
         runs = runs_on_hills(replace(warthog, effects=effects), count)
         drive_to_bag(DriveRecording(Path(name), runs), folder / name)
         made.append(folder / name)
@@ -149,6 +151,17 @@ def test_what_wheels_measure_stays_where_the_ground_may_be_the_cause_of_the_rest
     # It goes into the robot's file; nothing of the force does.
     assert found.robot_file is not None
     assert [name for name, _ in load_robot(found.robot_file).effects] == ["command_delay"]
+
+
+def test_what_only_changes_how_the_robot_turns_is_not_blamed_on_slopes(bags, tmp_path):
+    """A slope pulls whichever way the robot turns."""
+    found = diagnose_bag(bags[2], "warthog", tmp_path, settings=DiagnosisSettings(max_effects=1))
+    diagnosis = found.diagnosis
+    assert found.ground.source == "traced" and found.ground.uneven
+    assert diagnosis.verdict is Verdict.EFFECT_FOUND, diagnosis.remarks
+    assert {effect.name for effect in diagnosis.effects} == {"command_delay", "tyre_slip"}
+    slip = next(effect for effect in diagnosis.effects if effect.name == "tyre_slip")
+    assert slip.parameters["ratio"].value == pytest.approx(0.3, abs=0.06)
 
 
 def test_only_sensors_says_nothing_where_they_measure_nothing(bags):
