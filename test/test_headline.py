@@ -170,8 +170,8 @@ def test_an_error_without_a_name_on_hills_without_a_map_is_not_called_an_effect(
     # What has a name stands, and so does a healthy robot.
     for kept in (diagnosed((0.5, 0.06), (8.0, 1.0)), Diagnosis(Verdict.NO_DISCREPANCY)):
         assert without_blame_for_ground(kept, reason, named=True) is kept
-    # Forces that slopes exert may pass for effects, where the robot is not known on slopes. Delays may not, nor may what
-    # changes how the robot turns: a slope pulls whichever way that is.
+    # Forces that slopes exert may pass for effects, where the robot is not known on slopes. Delays may not, nor what
+    # only changes how the robot turns: a slope pulls whichever way that is.
     scrub = effect("turning_scrub", track_width_factor=(1.23, 1.16, 1.31))
     turns = diagnosed((0.5, 0.06), (8.0, 1.0), effects=(scrub, DELAY))
     assert without_blame_for_ground(turns, reason, named=True) is turns
