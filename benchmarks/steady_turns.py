@@ -83,9 +83,8 @@ def predicted_rates(robot: RobotModel, wheels: np.ndarray, step: float, friction
     return np.array([_body_rates(p, y, seconds) for p, y in zip(positions, yaw, strict=True)])
 
 
-def compared(path: Path, robot: RobotModel) -> list[dict]:
-    """A row for each friction and slip ratio: median errors over the turns of a recording."""
-    recording = DriveRecording.open(path)
+def compared(recording: DriveRecording, robot: RobotModel) -> list[dict]:
+    """A row for each friction and slip ratio: median errors over the turns; none where they are too few."""
     wheels, measured, step = [], [], 0.05
     for run in recording.runs:
         for window in steady_windows(run):
@@ -104,7 +103,7 @@ def compared(path: Path, robot: RobotModel) -> list[dict]:
             forward, sideways, turn = np.median(errors, axis=0)
             rows.append(
                 {
-                    "recording": path.name, "windows": len(wheels), "friction": friction, "tyre_slip": ratio,
+                    "recording": recording.path.name, "windows": len(wheels), "friction": friction, "tyre_slip": ratio,
                     "forward": float(forward), "sideways": float(sideways), "yaw_rate": float(turn),
                 }
             )  # fmt: skip
@@ -135,7 +134,7 @@ def main() -> None:
     robot = load_robot(options.robot)
     rows = []
     for path in options.files:
-        found = compared(path, robot)
+        found = compared(DriveRecording.open(path), robot)
         if not found:
             print(f"{path.name}: fewer than {LEAST_WINDOWS} steady turns, left out")
         rows += found
