@@ -4,7 +4,7 @@
 # make interfaces build monoforce_msgs, the typed message for planners, into install/ (takes a C++ compiler)
 # make bench  run the benchmarks
 # make diagnosis  measure diagnose on drawn platforms in two engines (up to six hours, resumable), on hidden effects and
-#                 real drives (an hour), write the tables of docs/discrepancy.md
+#                 real drives (an hour), write the tables of docs/discrepancy.md and docs/physics.md
 # make diagnosis-quick  measure diagnose on six drawn platforms (about 15 minutes), write nothing to the documents
 # make checkpoint train the shipped terrain encoder on randomised worlds, from nothing (a night)
 # make tables     compare terrain sources on worlds that no training saw, as the paper's tables do (three hours, resumable)
@@ -82,7 +82,9 @@ diagnosis: build graphics engines
 	@scripts/run.sh python benchmarks/platforms/run.py --set reporting --baselines --json out/platforms.json --docs docs/discrepancy.md
 	@scripts/run.sh python benchmarks/hidden_effects.py --baselines --json out/hidden_effects.json --docs docs/discrepancy.md
 	@if [ -d "$(DRIVES)" ]; then scripts/run.sh python benchmarks/warthog_reports.py "$(DRIVES)" \
-	  --json out/warthog.json --docs docs/discrepancy.md; else echo "[diagnosis] no real drives at $(DRIVES)"; fi
+	  --json out/warthog.json --docs docs/discrepancy.md && \
+	  scripts/run.sh python benchmarks/steady_turns.py "$(DRIVES)"/*.npz --json out/steady_turns.json --docs docs/physics.md; \
+	  else echo "[diagnosis] no real drives at $(DRIVES)"; fi
 
 checkpoint: build graphics
 	@scripts/train_checkpoint.sh

@@ -18,12 +18,13 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from monoforce_ros.core import write_text
 from monoforce_ros.datasets import DriveRecording
 from monoforce_ros.datasets.drive import TRACK_WIDTH, WHEEL_RADIUS, DriveRun
 from monoforce_ros.physics import State, rollout
 from monoforce_ros.reporting import write_between
 from monoforce_ros.robots import RobotModel, load_robot
-from monoforce_ros.terrain import Grid, TerrainMap
+from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap
 
 RATIOS = (0.0, 0.1, 0.2, 0.4, 0.8)
 FRICTIONS = (0.5, 0.8, 1.1)
@@ -65,17 +66,16 @@ def predicted_rates(robot: RobotModel, wheels: np.ndarray, step: float, friction
         friction: of the ground.
         ratio: at which tyres slip; 0 is Coulomb's law alone.
     """
+    first = round(LENGTH / STEP)
     repeated = np.repeat(wheels, round(step / STEP), axis=1)
-    before = np.repeat(wheels[:, :1], round(LENGTH / STEP), axis=1)
+    before = np.repeat(wheels[:, :1], first, axis=1)
     speeds = torch.as_tensor(np.concatenate([before, repeated], axis=1), dtype=torch.float32)
-    ground = TerrainMap.flat(Grid.square(4.0, 1.0))
-    ground = replace(ground, friction=torch.full_like(ground.friction, friction))
+    ground = TerrainMap.flat(Grid.square(4.0, 1.0), material=TerrainDefaults(friction=friction))
     if ratio:
         robot = replace(robot, effects=(*robot.effects, ("tyre_slip", {"ratio": ratio})))
     start = State.at_rest(robot.ground_clearance, batch=len(speeds))
     with torch.no_grad():
         result = rollout(ground, robot, speeds, start, with_forces=False)
-    first = round(LENGTH / STEP)
     rotation = result.rotation[:, first:].numpy()
     yaw = np.unwrap(np.arctan2(rotation[..., 1, 0], rotation[..., 0, 0]), axis=1)
     positions = result.position[:, first:, :2].numpy()
@@ -141,8 +141,7 @@ def main() -> None:
     text = section(rows)
     print("median errors of yaw rate [rad/s] and forward speed [m/s]\n\n" + text)
     if options.json:
-        options.json.parent.mkdir(parents=True, exist_ok=True)
-        options.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+        write_text(options.json, json.dumps(rows, indent=1) + "\n")
     if options.docs:
         write_between(options.docs, "steady turns", text)
 

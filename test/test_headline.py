@@ -180,8 +180,9 @@ def test_an_error_without_a_name_on_hills_without_a_map_is_not_called_an_effect(
     assert without_blame_for_ground(pulled, reason, named=False) is pulled
     judged = without_blame_for_ground(pulled, reason, named=True)
     assert judged.verdict is Verdict.NOT_IDENTIFIABLE and judged.known_parts == (pull, DELAY) and not judged.fitted
-    assert judged.advice[0] == reason
-    assert judged.advice[1].startswith("on known ground this would mean: Something pulls the robot")
+    assert judged.advice == (
+        reason, "on known ground this would mean: Something pulls the robot with 40 N backward all the time.",
+    )  # fmt: skip
 
 
 def test_ground_that_is_steeper_than_where_the_robot_was_commissioned_gets_a_doubt():

@@ -129,6 +129,8 @@ def diagnosis() -> dict:
             " or ".join(sorted((entry.name, *entry.indistinguishable))): [
                 abs(estimate.value) for estimate in entry.parameters.values()
             ]
+            if entry.indistinguishable
+            else {key: estimate.value for key, estimate in entry.parameters.items()}
             for entry in found.effects
         },
         "gap": {metric: [row.before, row.after] for metric, row in found.gap.items()},

@@ -133,8 +133,8 @@ def heading_disagreement(
     clock, rates = (gyro.stamps - gyro.stamps[0]) * 1e-9, found.sign * gyro.rates[:, found.axis] - found.bias
     turned = cumulative_trapezoid(rates, clock, initial=0.0)
     apart, gaps = [], np.r_[0, np.cumsum(np.diff(clock) > _LONGEST_GAP)]
+    motion = smoothed.motion
     for stretch in smoothed.stretches:
-        motion = smoothed.motion
         times = (motion.stamps[stretch] - gyro.stamps[0]) * 1e-9
         starts = np.arange(times[0], times[-1] - horizon, _APART) if len(times) > 1 else np.zeros(0)
         yaw = np.unwrap(Rotation.from_quat(motion.quaternions[stretch]).as_euler("ZYX")[:, 0])

@@ -14,8 +14,8 @@ class TyreSlip(Effect):
 
     The tread of a rolling tyre deforms on its way through the contact, and slides only where the deformation exceeds
     what friction holds. A force below the limit of friction therefore costs slip in proportion to the rolling speed,
-    along and across alike: a fast robot turns as it does at walking speed and drifts little, where Coulomb's law alone
-    lets its sideways grip vanish as soon as the tyres scrub.
+    along and across alike: a fast robot turns nearly as it does at walking speed. Coulomb's law alone lets it turn
+    further, because tyres that scrub hold little sideways.
     """
 
     name = "tyre_slip"

@@ -119,9 +119,11 @@ class Problem:
         resistance = (loads.rolling_resistance, loads.linear_drag, loads.quadratic_drag, loads.vegetation_yield)
         vegetation = (terrain.geometric_height - terrain.height).clamp_min(0.0)
         factors = [robot.friction_longitudinal, robot.friction_lateral]
-        yielding = (loads.drive_compliance, loads.tyre_slip)
-        last = max((index for index, value in enumerate(yielding, 1) if value is not None), default=0)
-        factors += [torch.zeros_like(robot.mass) if value is None else value.to(dtype) for value in yielding[:last]]
+        compliance, slip = loads.drive_compliance, loads.tyre_slip
+        if compliance is not None or slip is not None:
+            factors.append(torch.zeros_like(robot.mass) if compliance is None else compliance.to(dtype))
+        if slip is not None:
+            factors.append(slip.to(dtype))
         problem = cls(
             terrain=terrain,
             centre=position + offset,
