@@ -234,7 +234,7 @@ def test_a_robot_that_drives_is_stopped_when_the_selector_ends(robot, how):
     robot.send_goal(50.0, 0.0)
     assert robot.live(10.0, until=lambda: robot.driven), robot.status()
     assert robot.process.stop(how) == 0
-    assert robot.peer.until(lambda: not robot.driven, 2.0)
+    assert robot.peer.until(lambda: not robot.driven, 10.0)
 
 
 LISTENER = """
@@ -256,7 +256,10 @@ def test_a_base_is_stopped_before_another_type_is_published(robot, ros_environme
     listener = subprocess.Popen([sys.executable, "-c", code], env=ros_environment)
     try:
         assert robot.live(20.0, until=lambda: "no longer hears the commands" in robot.process.output)
-        assert robot.peer.until(lambda: not robot.driven, 2.0), "the base keeps the last command"
+        assert robot.peer.until(lambda: not robot.driven, 10.0), "the base keeps the last command"
+        # One message may be lost on its way to a base that listens with best effort.
+        stops = [command for command in robot.commands if command.twist.linear.x == 0.0]
+        assert len(stops) > 1 and stops[-1] is robot.commands[-1]
     finally:
         listener.kill()
         listener.wait()

@@ -50,6 +50,8 @@ class CommandOutput:
         self._publisher: Publisher | None = None
         self._moves = False
         """Whether the last command was to move."""
+        self._leaving = False
+        """Whether listeners of the present type are being stopped, for another type comes next."""
         # Fully qualified node names with the types that they expect.
         self._listened: set[tuple[str, str]] = set()
         self._bystanders: list[str] = []
@@ -92,9 +94,14 @@ class CommandOutput:
         return ", ".join(sorted(self._rivals))
 
     def publish(self, command: Sequence[float], frame_id: str) -> None:
-        """Publish forward speed [m/s], yaw rate [rad/s] and, if there are three, the speed to the left [m/s]."""
+        """Publish forward speed [m/s], yaw rate [rad/s] and, if there are three, the speed to the left [m/s].
+
+        Shortly before the type changes, it is a stop whatever is given.
+        """
         if self._publisher is None:
             return
+        if self._leaving:
+            command = (0.0, 0.0)
         self._moves = any(command)
         twist = Twist()
         twist.linear.x, twist.angular.z = command[:2]
@@ -137,9 +144,12 @@ class CommandOutput:
         wanted = next((kind for kind in (PLAIN, STAMPED) if kind in expected), self.type or STAMPED)
         wanted = self._fixed or wanted
         if wanted == self.type:
+            self._leaving = False
             return
         if self._publisher is not None:
-            self._leave(wanted)
+            if self._stops_first():
+                return
+            self._report_change(wanted)
             self._node.destroy_publisher(self._publisher)
         self.type, self._publisher = "", None
         try:
@@ -158,13 +168,21 @@ class CommandOutput:
             self._node.get_logger().warning(f"{self.topic} is heard by {self.listeners}, but not by {text}: {advice}")
         self._reported = self.unreached if hears else ""
 
-    def _leave(self, wanted: str) -> None:
-        """Stop a base that the present type moves, before another type is published: it may hold its last command."""
-        hearing = ", ".join(sorted(name for name, kind in self._listened if kind == self.type))
-        if self._moves:
+    def _stops_first(self) -> bool:
+        """Whether a base that the present type moves must be stopped before another is published.
+
+        It may hold its last command. One that listens with best effort acknowledges nothing, and what this process
+        still holds when the publisher is destroyed is lost: stops are published until the next call.
+        """
+        first = self._moves and not self._leaving
+        self._leaving = first
+        if first:
             self.publish((0.0, 0.0), "")
-            self.flush(0.2)
-        if hearing:
+        return first
+
+    def _report_change(self, wanted: str) -> None:
+        """Warn of nodes that hear the present type: from now on another one is published."""
+        if hearing := ", ".join(sorted(name for name, kind in self._listened if kind == self.type)):
             self._node.get_logger().warning(
                 f"{self.topic}: from now on {wanted} is published, for a node listens to it; {hearing} expects "
                 f"{self.type} and no longer hears the commands: set `command_type` to choose"
