@@ -1,5 +1,6 @@
 """Attitude, height and their rates are residuals, too, where ground and healthy robot are known."""
 
+import subprocess
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +21,10 @@ from monoforce_ros.discrepancy.report import effect_entry
 from monoforce_ros.effects import drive_speeds
 from monoforce_ros.physics import State, rollout
 from monoforce_ros.robots import load_robot, write_robot
-from monoforce_ros.terrain import Grid, TerrainMap
+from monoforce_ros.synthetic.odometry import OdometrySettings
+from monoforce_ros.synthetic.recording import RecordingSettings, record
+from monoforce_ros.synthetic.terrain_shape import TerrainSettings
+from monoforce_ros.terrain import Grid, TerrainMap, save_terrain
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 SAMPLES = np.array([0.5, 1.0, 1.5, 2.0])
@@ -175,6 +179,8 @@ def test_commissioning_learns_the_attitude_of_the_healthy_robot_and_soft_ground_
     read = NominalModel.read(file, settings.samples)
     np.testing.assert_allclose(read.residual, nominal.residual, rtol=1e-3)
     assert read.motion_loss == pytest.approx(nominal.motion_loss, rel=1e-3)
+    assert all(part in nominal.summary(2.0) for part in ("after 2 s", "cm across", "° in roll", "cm in height"))
+    assert nominal.of_motion().summary(2.0).endswith("° in heading")
     robot = load_robot(file)
     same = diagnose(drive(husky, seed=7, tilted=mounted), robot, nominal=read, settings=settings)
     assert not same.effects
@@ -185,6 +191,21 @@ def test_commissioning_learns_the_attitude_of_the_healthy_robot_and_soft_ground_
     assert found.gap["lean_2s"].after < 0.5 * found.gap["lean_2s"].before
     bumped = lean_of(drive(husky, tilted=mounted * Rotation.from_rotvec([0.0, 0.05, 0.0])).smoothed.motion)
     assert "the robot leans 2.9° nose down:" in changed_lean(bumped, read.lean)
+
+
+def test_the_installed_tool_commissions_on_ground_that_a_map_shows(tmp_path, executables, ros_environment):
+    bag, ground = tmp_path / "drive", tmp_path / "ground.npz"
+    settings = RecordingSettings(
+        duration=30.0, seed=5, terrain=TerrainSettings(flat=True), camera=None, lidar=None, commands="steps",
+        odometry=OdometrySettings.slam(),
+    )  # fmt: skip
+    record(bag, settings)
+    save_terrain(ground, TerrainMap.flat(Grid.square(40.0, 0.2)))
+    command = [executables / "diagnose", "--commission", bag, "--terrain", ground, "--out", tmp_path / "out", "--quiet"]
+    done = subprocess.run(command, env=ros_environment, capture_output=True, text=True, timeout=400, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "cm in height" in done.stdout
+    assert NominalModel.read(tmp_path / "out" / "husky.yaml", DiagnosisSettings().samples).with_attitude
 
 
 def test_a_change_of_the_lean_is_said_where_it_is_certain():

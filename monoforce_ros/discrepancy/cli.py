@@ -10,7 +10,6 @@ from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from monoforce_ros.bags import BagError, add_read_options, read_options
@@ -243,15 +242,7 @@ def _commission(options: argparse.Namespace) -> int:
     for effect in effects:
         for key, parameter in effect.parameters.items():
             print(f"{effect.name}: {key} {parameter.value:.3g} {parameter.unit}")
-    along, across, heading, *attitude = nominal.residual[-1]
-    lean = ""
-    if attitude:
-        roll, pitch, height = attitude
-        lean = f", {np.degrees(roll):.2f}° in roll, {np.degrees(pitch):.2f}° in pitch, {100 * height:.1f} cm in height"
-    print(
-        f"nominal residual RMS of the healthy robot after {settings.horizon:g} s: {100 * along:.1f} cm along, "
-        f"{100 * across:.1f} cm across, {np.degrees(heading):.2f}° in heading{lean}"
-    )
+    print(nominal.summary(settings.horizon))
     print(f"robot file: {out}")
     for bag, evidence in zip(options.bags, recordings, strict=True):
         large = residual_complaint(nominal.residual, evidence.smoothed, evidence.commands)

@@ -63,6 +63,18 @@ class NominalModel:
         commissioned it."""
         return self.residual.shape[-1] > len(MOTION)
 
+    def summary(self, horizon: float) -> str:
+        """One sentence on the residual at the last sample of a window, which is after ``horizon`` [s]."""
+        along, across, heading, *attitude = self.residual[-1]
+        text = f"nominal residual RMS of the healthy robot after {horizon:g} s: {100 * along:.1f} cm along, "
+        text += f"{100 * across:.1f} cm across, {np.degrees(heading):.2f}° in heading"
+        if not attitude:
+            return text
+        # Their rates follow, unless an earlier release commissioned the robot.
+        roll, pitch, height = attitude[:3]
+        text += f", {np.degrees(roll):.2f}° in roll, {np.degrees(pitch):.2f}° in pitch"
+        return f"{text}, {100 * height:.1f} cm in height"
+
     def of_motion(self) -> NominalModel:
         """The model of the motion alone, without roll, pitch, height and their rates."""
         if not self.with_attitude:
