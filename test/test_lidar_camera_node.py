@@ -78,7 +78,7 @@ def predicted(peer, **how):
 
 def silent(peer, part):
     said = lambda: peer.status(part) or (0, "")  # noqa: E731
-    assert peer.until(lambda: said()[0] == ERROR and "no messages for" in said()[1], 10.0), said()
+    assert peer.until(lambda: said()[0] == ERROR and "no messages for" in said()[1], 3.0), said()
 
 
 def test_grass_measured_by_the_lidar_is_lowered_and_a_wall_is_kept(peer, predictor):

@@ -167,7 +167,7 @@ def test_commands_of_another_clock_are_reported(peer, predictor, offset, text):
     stated = float(message.removeprefix("commands are stamped ").split()[0])
     assert level == WARN and stated == pytest.approx(abs(offset), abs=0.7)
     healthy(peer, predictor)
-    assert peer.until(lambda: peer.status("commands") == (OK, "receiving commands"), 10.0)
+    assert peer.until(lambda: peer.status("commands") == (OK, "receiving commands"), 3.0)
 
 
 def test_clouds_in_the_odometry_frame_are_used(peer, predictor):
@@ -222,7 +222,7 @@ def test_commands_of_nan_are_ignored(peer, predictor):
     peer.begin()
     peer.drive(1.6, command=lambda stamp: builders.twist_stamped(stamp, "base_link", np.nan, 0.0))
     reported = lambda: peer.status("commands") or (OK, "")  # noqa: E731
-    assert peer.until(lambda: reported()[0] == ERROR, 10.0) and "expected finite numbers" in reported()[1], reported()
+    assert peer.until(lambda: reported()[0] == ERROR, 3.0) and "expected finite numbers" in reported()[1], reported()
     peer.settle()
     # The last good command has expired by then: the robot is predicted to stop.
     path = peer.received["/predicted/path"][-1]
@@ -234,13 +234,13 @@ def test_without_commands_zero_velocity_is_assumed_with_a_warning(peer, predicto
     peer.begin()
     peer.drive(2.0, command=lambda stamp: None)
     silent = lambda: peer.status("commands") or (OK, "")  # noqa: E731
-    assert peer.until(lambda: silent()[0] == WARN, 10.0), silent()
+    assert peer.until(lambda: silent()[0] == WARN, 3.0), silent()
     assert "assuming zero velocity" in silent()[1]
 
     def end() -> float:
         return peer.received["/predicted/path"][-1].poses[-1].pose.position.x
 
-    assert peer.until(lambda: end() == pytest.approx(1.0, abs=0.05), 10.0), end()
+    assert peer.until(lambda: end() == pytest.approx(1.0, abs=0.05), 3.0), end()
 
 
 def test_time_that_jumps_back(peer, predictor):

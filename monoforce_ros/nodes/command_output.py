@@ -150,6 +150,7 @@ class CommandOutput:
             if self._stops_first():
                 return
             self._report_change(wanted)
+            self.flush(0.2)
             self._node.destroy_publisher(self._publisher)
         self.type, self._publisher = "", None
         try:
@@ -174,11 +175,10 @@ class CommandOutput:
         It may hold its last command. One that listens with best effort acknowledges nothing, and what this process
         still holds when the publisher is destroyed is lost: stops are published until the next call.
         """
-        first = self._moves and not self._leaving
-        self._leaving = first
-        if first:
+        self._leaving = self._moves
+        if self._leaving:
             self.publish((0.0, 0.0), "")
-        return first
+        return self._leaving
 
     def _report_change(self, wanted: str) -> None:
         """Warn of nodes that hear the present type: from now on another one is published."""
