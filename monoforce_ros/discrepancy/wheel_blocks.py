@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
@@ -41,9 +42,6 @@ class WheelBlocks:
     """Time between commands [s]."""
     robot: RobotModel
     """Its kinematics make wheel speeds of twists."""
-    reached: dict[tuple[tuple[str, tuple[float, ...]], ...], np.ndarray] = field(default_factory=dict, init=False)
-    """What the commands become under the first effects of a model, by these and their values: a fit that changes one
-    value computes the effects before it once."""
 
     @classmethod
     def of(cls, commands: CommandTrack, wheels: WheelTrack, robot: RobotModel, step: float) -> WheelBlocks | None:
@@ -90,7 +88,7 @@ class WheelBlocks:
         moving = np.flatnonzero((np.abs(self.commanded()).max(axis=(1, 2)) > 0) | (self.measured != 0).any(axis=(1, 2)))
         return moving[np.unique(np.linspace(0, len(moving) - 1, min(most, len(moving))).round().astype(int))]
 
-    @property
+    @cached_property
     def fastest(self) -> Fastest:
         """Fastest commands: 99.5 % quantiles."""
         speeds = np.abs(self.commanded()).max(axis=1)
@@ -107,15 +105,24 @@ class WheelBlocks:
         return np.broadcast_to(self.known[:, None], self.measured.shape)
 
     def commanded(self, twists: np.ndarray | None = None) -> np.ndarray:
-        """Wheel speeds ``[n, 2, T]`` [m/s] of commanded or given twists."""
+        """Wheel speeds ``[..., n, 2, T]`` [m/s] of commanded or given twists."""
         given = self.twists if twists is None else twists
-        return np.moveaxis(side_speeds(self.robot, np.moveaxis(given, 1, -1)), -1, 1)
+        return np.moveaxis(side_speeds(self.robot, np.moveaxis(given, -2, -1)), -1, -2)
 
     def at_samples(self, speeds: np.ndarray) -> np.ndarray:
-        """Speeds ``[n, 2, T]`` at the samples, ``[n, 2, K]``."""
-        index = np.minimum(self.place.astype(int), speeds.shape[2] - 2)[:, None]
-        before, after = (np.take_along_axis(speeds, index + shift, axis=2) for shift in (0, 1))
-        return before + (self.place[:, None] - index) * (after - before)
+        """Speeds ``[..., n, 2, T]`` at the samples, ``[..., n, 2, K]``."""
+        place, share = self._samples
+        flat = speeds.reshape(*speeds.shape[:-3], -1)
+        before, after = (flat.take(place + shift, axis=-1) for shift in (0, 1))
+        return before + share * (after - before)
+
+    @cached_property
+    def _samples(self) -> tuple[np.ndarray, np.ndarray]:
+        """The command before each sample among those of all blocks and sides ``[n, 2, K]``, and the share of a step that
+        has passed since, ``[n, 1, K]``."""
+        count, length = len(self), self.twists.shape[-1]
+        index = np.minimum(self.place.astype(int), length - 2)[:, None]
+        return index + length * np.arange(2 * count).reshape(count, 2, 1), self.place[:, None] - index
 
     def ratio(self) -> float | None:
         """Measured [rad/s] over commanded speed [m/s] where a command of medium size was constant for a while."""

@@ -7,8 +7,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.optimize import least_squares
-from scipy.stats import t as student
 from scipy.stats import wilcoxon
 
 from monoforce_ros.core import CommandTrack, WheelTrack
@@ -17,7 +15,19 @@ from monoforce_ros.discrepancy.hypothesis import Effects
 from monoforce_ros.discrepancy.residual_size import relative_error
 from monoforce_ros.discrepancy.thresholds import Thresholds
 from monoforce_ros.discrepancy.wheel_blocks import BLOCK, WheelBlocks
-from monoforce_ros.effects import CATALOGUE, Fastest, WheelResponse, wheel_effects
+from monoforce_ros.discrepancy.wheel_fit import fit, half_widths, starts
+from monoforce_ros.discrepancy.wheel_model import (
+    WheelModel,
+    block_losses,
+    by_effect,
+    in_order,
+    keys_of,
+    modelled,
+    named,
+    neutral_of,
+    response_of,
+)
+from monoforce_ros.effects import wheel_effects
 from monoforce_ros.robots import RobotModel
 
 _STEP, _FINE_STEP = 0.04, 0.01
@@ -26,12 +36,10 @@ _MOST_BLOCKS = 60
 """Blocks that are used at most: whole ones, spread evenly over the recording."""
 _ALPHA = 0.05
 """Probability that a step of the selection adds an effect that the wheels do not show, over all candidates."""
-_MOST_REACHED = 24
-"""Signals that are kept of a fit [-]: a base point and what each value of the largest model changes."""
 _LARGEST_MODEL = 5
 """Largest number of effects in a wheel model: dead time, three limits of the twist and a lag."""
-_EVALUATIONS = 8
-"""Of a fit: it starts from the values of a similar model."""
+_MOST_EXCHANGES = 3
+"""Of a model that are fitted in full."""
 _GAIN = "drive_gain"
 """Stands for a fitted ratio among what effects exclude."""
 _SAME_RATIO = 0.02
@@ -70,7 +78,7 @@ class WheelFinding:
 
     def summary(self) -> str:
         """One sentence for reports."""
-        parts = [_response(name).wording.format(*values.values()) for name, values in self.effects]
+        parts = [response_of(name).wording.format(*values.values()) for name, values in self.effects]
         if self.gain != 1.0:
             parts.append(f"at {self.gain:.2f} times their speed")
         text = "the measured wheel speeds follow the commands "
@@ -123,23 +131,23 @@ def compare_with_wheels(
     if weak:
         # Too small to matter: fitted again without them.
         best = selection.scored(tuple(name for name in best.names if name not in weak), best)
-    values, half_widths = best.values, np.zeros(0)
+    values, widths_95 = best.values, np.zeros(0)
     if best.names:
         fine = WheelBlocks.of(commands, wheels, robot, _FINE_STEP)
         assert fine is not None
         fine = replace(fine, measured=fine.measured / ratio)[chosen]
-        values = _fit(best.names, fine, [best.values])
-        half_widths = _half_widths(values, best.names, fine)
+        values = fit(best.names, fine, [best.values])[0]
+        widths_95 = half_widths(best.names, values, fine)
     baseline = selection.scored((), None)
     count = float(blocks.known.sum()) * 2
     spreads = [float(np.var(part[blocks.pairs])) for part in (blocks.measured, blocks.at_samples(blocks.commanded()))]
     if best.loss / count > 0.5 * min(spreads):
         # The wheels do not follow the commands.
         return None
-    effects = _named(best.names, values)
+    effects = named(best.names, values)
     return WheelFinding(
         effects,
-        tuple(widths for _, widths in _named(best.names, half_widths)),
+        tuple(widths for _, widths in named(best.names, widths_95)),
         float(np.sqrt(baseline.loss / count)),
         float(np.sqrt(best.loss / count)),
         ratio,
@@ -174,7 +182,7 @@ def _still_healthy(blocks: WheelBlocks, measured: float, healthy: HealthyWheels,
         return None
     return WheelFinding(
         healthy.effects,
-        tuple(widths for _, widths in _named(names, _half_widths(values, names, blocks) if names else values)),
+        tuple(widths for _, widths in named(names, half_widths(names, values, blocks))),
         float(np.sqrt(selection.scored((), None).loss / samples.sum())),
         float(np.sqrt(before.loss / samples.sum())),
         healthy.ratio,
@@ -206,17 +214,17 @@ def best_of(
     return min(judged, key=lambda entry: entry[0])[1] if judged else None
 
 
-def _as_known(healthy: HealthyWheels, blocks: WheelBlocks) -> _Model:
+def _as_known(healthy: HealthyWheels, blocks: WheelBlocks) -> WheelModel:
     """What commissioning learned, judged on blocks of the speeds of the wheels' rims."""
     known = dict(healthy.effects)
-    names = _in_order(tuple(known))
-    values = np.array([known[name][key] for name in names for key in _keys(name)])
-    return _Model(names, values, _block_losses(values, names, blocks, blocks.fastest.speed))
+    names = in_order(tuple(known))
+    values = np.array([known[name][key] for name in names for key in keys_of(name)])
+    return WheelModel(names, values, block_losses(names, values, blocks, blocks.fastest.speed))
 
 
 def _sizes(values: np.ndarray, names: tuple[str, ...], blocks: WheelBlocks) -> tuple[np.ndarray, np.ndarray]:
     """Samples of each block, of both sides, and the sum of squared changes of the commands by effects, ``[n]``."""
-    changes = blocks.at_samples(_modelled(values, names, blocks) - blocks.commanded()) * blocks.pairs
+    changes = blocks.at_samples(modelled(names, values, blocks)[0] - blocks.commanded()) * blocks.pairs
     return blocks.pairs.sum(axis=(1, 2)), (changes**2).sum(axis=(1, 2))
 
 
@@ -234,7 +242,7 @@ def _selected(blocks: WheelBlocks, measured: float, healthy: HealthyWheels | Non
     known, gain = _Selection(replace(blocks, measured=blocks.measured * radius)), measured * radius
     if abs(gain - 1.0) > _SAME_RATIO:
         other = free.best
-        alike = any(_GAIN in _response(name).excludes for name in other.names)
+        alike = any(_GAIN in response_of(name).excludes for name in other.names)
         if not alike and _better(known.best, replace(other, losses=other.losses * gain**2), 1):
             return free, measured, gain
     return known, 1.0 / radius, 1.0
@@ -252,19 +260,19 @@ def changed_drives(
     if wheels.unchanged:
         return (), (*(name for name, _ in wheels.effects), *wheels.ruled_out)
     in_file, shown = dict(robot.effects if healthy is None else healthy.effects), dict(wheels.effects)
-    half_widths = {
-        name: widths[_response(name).parameter] for name, widths in zip(shown, wheels.half_widths, strict=True)
+    uncertain = {
+        name: widths[response_of(name).parameter] for name, widths in zip(shown, wheels.half_widths, strict=True)
     }
-    largest = max(half_widths.values(), default=0.0)
+    largest = max(uncertain.values(), default=0.0)
     changed: list[tuple[str, Mapping[str, float]]] = []
     unchanged = []
     for effect in wheel_effects():
-        response = _response(effect.name)
-        neutral = _neutral(effect.name)
+        response = response_of(effect.name)
+        neutral = neutral_of(effect.name)
         expected = float(in_file.get(effect.name, {}).get(response.parameter, neutral))
         value = float(shown[effect.name][response.parameter]) if effect.name in shown else neutral
         # Of an effect that the wheels do not show the half-width is unknown: the largest one stands for it.
-        half_width = half_widths.get(effect.name, largest)
+        half_width = uncertain.get(effect.name, largest)
         if effect.name not in shown and expected == neutral and effect.name not in wheels.ruled_out:
             # The wheels neither show it nor rule it out.
             continue
@@ -275,36 +283,19 @@ def changed_drives(
     return tuple(changed), tuple(unchanged)
 
 
-@dataclass(frozen=True)
-class _Model:
-    """Effects of the drives, fitted and judged on held-out blocks."""
-
-    names: tuple[str, ...]
-    values: np.ndarray
-    """Of all parameters, mean over the folds, ``[P]``."""
-    losses: np.ndarray
-    """Sum of squared errors of each block with the values fitted without its fold, ``[n]`` [m²/s²]."""
-
-    @property
-    def loss(self) -> float:
-        """Sum over the blocks."""
-        return float(self.losses.sum())
-
-
 class _Selection:
     """Selection of the effects that measured wheel speeds show."""
 
     def __init__(self, blocks: WheelBlocks):
         self.blocks = blocks
         self._fold = np.arange(len(blocks)) % 2
-        self._parts = [blocks[self._fold == number] for number in (0, 1)]
-        self._known: dict[tuple[str, ...], _Model] = {}
+        self._known: dict[tuple[str, ...], WheelModel] = {}
         names = [effect.name for effect in wheel_effects() if effect.applies_to(blocks.robot)]
-        self._order = [name for name in names if not _response(name).of_time]
-        self._of_time = [name for name in names if _response(name).of_time]
+        self._order = [name for name in names if not response_of(name).of_time]
+        self._of_time = [name for name in names if response_of(name).of_time]
 
     @cached_property
-    def best(self) -> _Model:
+    def best(self) -> WheelModel:
         """The smallest model that no larger one improves.
 
         The best model of each size is found by a floating search (Pudil et al. 1994): one more effect, exchanges, and
@@ -327,19 +318,20 @@ class _Selection:
                 best = model
         return self._with_time(self._pruned(best))
 
-    def _with_time(self, best: _Model) -> _Model:
+    def _with_time(self, best: WheelModel) -> WheelModel:
         """The model with an effect that grows with time, if that is better than a change at some time."""
         for name in self._of_time:
-            further = self.scored(_in_order((*best.names, name)), best)
+            further = self.scored(in_order((*best.names, name)), best)
             if _better(best, further, len(self._order)) and further.loss < self._stepped_loss(best):
                 best = further
         return best
 
-    def _stepped_loss(self, model: _Model) -> float:
+    def _stepped_loss(self, model: WheelModel) -> float:
         """Smallest held-out loss if the wheels follow the model at another ratio from some block on."""
         blocks, top = self.blocks, self.blocks.fastest.speed
-        modelled = blocks.at_samples(_modelled(model.values, model.names, blocks)) * blocks.pairs
-        products, squares = ((part * modelled).sum(axis=(1, 2)) for part in (blocks.measured * blocks.pairs, modelled))
+        predicted = blocks.at_samples(modelled(model.names, model.values, blocks)[0]) * blocks.pairs
+        measured = blocks.measured * blocks.pairs
+        products, squares = ((part * predicted).sum(axis=(1, 2)) for part in (measured, predicted))
         losses = []
         for first in range(1, len(blocks)):
             ratio = np.ones(len(blocks))
@@ -347,42 +339,48 @@ class _Selection:
                 fitted = (np.arange(len(blocks)) >= first) & (self._fold != held_out)
                 judged = (np.arange(len(blocks)) >= first) & (self._fold == held_out)
                 ratio[judged] = products[fitted].sum() / max(float(squares[fitted].sum()), 1e-12)
-            rest = (blocks.measured - ratio[:, None, None] * modelled) * blocks.pairs
+            rest = (blocks.measured - ratio[:, None, None] * predicted) * blocks.pairs
             losses.append(float(np.minimum(rest**2, (0.5 * top) ** 2).sum()))
         return min(losses)
 
-    def scored(self, names: tuple[str, ...], start: _Model | None) -> _Model:
+    def scored(self, names: tuple[str, ...], start: WheelModel | None) -> WheelModel:
         """A model fitted to each fold and judged on the other, from the values of a similar one."""
         if names not in self._known:
-            losses, values = np.zeros(len(self.blocks)), []
-            starts = _starts(names, self.blocks.fastest, start)
-            for held_out in (0, 1):
-                fit = _fit(names, self._parts[1 - held_out], starts)
-                values.append(fit)
-                judged = _block_losses(fit, names, self._parts[held_out], self.blocks.fastest.speed)
-                losses[self._fold == held_out] = judged
-            self._known[names] = _Model(names, np.mean(values, axis=0), losses)
+            self._known[names] = self._fitted(names, start)
         return self._known[names]
+
+    def _fitted(self, names: tuple[str, ...], start: WheelModel | None, *, rough: bool = False) -> WheelModel:
+        top = self.blocks.fastest
+        values = fit(names, self.blocks, starts(names, top, start), self._fold, rough=rough)
+        losses = block_losses(names, values[1 - self._fold], self.blocks, top.speed)
+        return WheelModel(names, values.mean(axis=0), losses)
 
     def larger(self, names: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
         """Models with one more effect."""
         for name in self._order:
-            excluded = any(other in _response(name).excludes or name in _response(other).excludes for other in names)
+            excluded = any(
+                other in response_of(name).excludes or name in response_of(other).excludes for other in names
+            )
             if name not in names and not excluded:
-                yield _in_order((*names, name))
+                yield in_order((*names, name))
 
-    def _exchanged(self, best: _Model) -> _Model:
+    def _exchanged(self, best: WheelModel) -> WheelModel:
         """The best model with one effect replaced by another, or ``best``; a first effect may stand in for a later."""
-        tried = [best]
+        others = set()
         for name in best.names:
             rest = tuple(other for other in best.names if other != name)
-            tried += [self.scored(names, best) for names in self.larger(rest) if name not in names]
+            others |= {names for names in self.larger(rest) if name not in names}
+        known = [self._known[names] for names in others & self._known.keys()]
+        # Most stand in badly, as a few steps of a fit show.
+        rough = [self._fitted(names, best, rough=True) for names in sorted(others - self._known.keys())]
+        rough.sort(key=lambda model: model.loss)
+        tried = [best, *known, *(self.scored(model.names, best) for model in rough[:_MOST_EXCHANGES])]
         return min(tried, key=lambda model: model.loss)
 
-    def _smaller(self, model: _Model) -> list[_Model]:
+    def _smaller(self, model: WheelModel) -> list[WheelModel]:
         return [self.scored(tuple(other for other in model.names if other != name), model) for name in model.names]
 
-    def _pruned(self, best: _Model) -> _Model:
+    def _pruned(self, best: WheelModel) -> WheelModel:
         """The model without effects that do not improve it."""
         for fewer in sorted(self._smaller(best), key=lambda model: model.loss):
             if not _better(fewer, best, 1):
@@ -390,7 +388,7 @@ class _Selection:
         return best
 
 
-def _better(smaller: _Model, larger: _Model, candidates: int) -> bool:
+def _better(smaller: WheelModel, larger: WheelModel, candidates: int) -> bool:
     """Whether the larger model's held-out error is smaller beyond chance, given how many models it is the best of."""
     gains = smaller.losses - larger.losses
     if larger.loss >= smaller.loss or not gains.any():
@@ -399,12 +397,12 @@ def _better(smaller: _Model, larger: _Model, candidates: int) -> bool:
     return bool(wilcoxon(gains, alternative="greater").pvalue * candidates < _ALPHA)
 
 
-def _weak(model: _Model, blocks: WheelBlocks) -> list[str]:
+def _weak(model: WheelModel, blocks: WheelBlocks) -> list[str]:
     """Effects of a model whose values are too small to count."""
     return [
         name
-        for name, (value, *_) in _by_effect(model.names, model.values)
-        if not _response(name).counts(value, blocks.fastest)
+        for name, (value, *_) in by_effect(model.names, model.values)
+        if not response_of(name).counts(value, blocks.fastest)
     ]
 
 
@@ -421,12 +419,12 @@ def _ruled_out(
     for effect in wheel_effects():
         if effect.name in names or not effect.applies_to(blocks.robot):
             continue
-        together = _in_order((*names, effect.name))
-        known = _Model(names, values, np.zeros(0))
-        fitted = _fit(together, blocks, _starts(together, blocks.fastest, known))
-        value, *_ = dict(_by_effect(together, fitted))[effect.name]
-        half_width, *_ = dict(_by_effect(together, _half_widths(fitted, together, blocks)))[effect.name]
-        response, neutral = _response(effect.name), _neutral(effect.name)
+        together = in_order((*names, effect.name))
+        known = WheelModel(names, values, np.zeros(0))
+        fitted = fit(together, blocks, starts(together, blocks.fastest, known))[0]
+        value, *_ = dict(by_effect(together, fitted))[effect.name]
+        half_width, *_ = dict(by_effect(together, half_widths(together, fitted, blocks)))[effect.name]
+        response, neutral = response_of(effect.name), neutral_of(effect.name)
         intervals = [(value - half_width, value + half_width)]
         if unchanged and np.isfinite(neutral):
             intervals.append((neutral - half_width, neutral + half_width))
@@ -434,129 +432,3 @@ def _ruled_out(
             if np.isfinite(ends).all() and not any(response.counts(end, blocks.fastest) for end in ends):
                 yield effect.name
                 break
-
-
-def _keys(name: str) -> tuple[str, ...]:
-    """Parameters of an effect that a fit changes, the one that says how large it is first."""
-    response = _response(name)
-    return (response.parameter, *response.further)
-
-
-def _by_effect(names: Sequence[str], values: np.ndarray) -> Iterator[tuple[str, tuple[float, ...]]]:
-    """Values ``[P]`` of the parameters of each effect."""
-    at = 0
-    for name in names:
-        count = len(_keys(name))
-        yield name, tuple(float(value) for value in values[at : at + count])
-        at += count
-
-
-def _named(names: Sequence[str], values: np.ndarray) -> Effects:
-    """Values ``[P]`` of the parameters of each effect, by their names."""
-    return tuple((name, dict(zip(_keys(name), own, strict=True))) for name, own in _by_effect(names, values))
-
-
-def _neutral(name: str) -> float:
-    """Value without effect of the parameter that says how large an effect is."""
-    return next(p.neutral for p in CATALOGUE[name].parameters if p.name == _response(name).parameter)
-
-
-def _bounds(names: Sequence[str], fastest: Fastest) -> np.ndarray:
-    """Bounds of a fit ``[P, 2]``: values that the catalogue allows, for they become initial values of other fits."""
-    bounds = []
-    for name in names:
-        response, known = _response(name), {parameter.name: parameter for parameter in CATALOGUE[name].parameters}
-        main = known[response.parameter]
-        low, high = (float(np.clip(end, main.low, main.high)) for end in response.bounds(fastest))
-        bounds.append((low, max(high, low + 1e-3)))
-        bounds += [(known[key].low, known[key].high) for key in response.further]
-    return np.array(bounds).reshape(-1, 2)
-
-
-def _in_order(names: Sequence[str]) -> tuple[str, ...]:
-    """Names of effects in the order in which they act on a command."""
-    return tuple(effect.name for effect in wheel_effects() if effect.name in names)
-
-
-def _response(name: str) -> WheelResponse:
-    response = CATALOGUE[name].wheel_response
-    assert response is not None, name
-    return response
-
-
-def _modelled(values: np.ndarray, names: tuple[str, ...], blocks: WheelBlocks) -> np.ndarray:
-    """Speeds ``[n, 2, T]`` [m/s] of wheels that follow the commands under effects: those on the twist act first."""
-    ordered = sorted(_by_effect(names, values), key=lambda entry: not _response(entry[0]).of_twist)
-    signal, sides = blocks.twists, False
-    for count, (name, own) in enumerate(ordered):
-        response, first = _response(name), tuple(ordered[: count + 1])
-        known = blocks.reached.get(first)
-        if known is None:
-            further = (blocks.step, blocks.times) if response.of_time else (blocks.step,)
-            if response.of_twist:
-                changed = response.speeds(signal[:, :2], *own, *further)
-                known = np.concatenate([changed, signal[:, 2:]], axis=1) if signal.shape[1] > 2 else changed
-            else:
-                known = response.speeds(signal if sides else blocks.commanded(signal), *own, *further)
-            if len(blocks.reached) >= _MOST_REACHED:
-                blocks.reached.clear()
-            blocks.reached[first] = known
-        signal, sides = known, not response.of_twist
-    return signal if sides else blocks.commanded(signal)
-
-
-def _residuals(values: np.ndarray, names: tuple[str, ...], blocks: WheelBlocks) -> np.ndarray:
-    """Measured minus modelled speed ``[n, 2, K]`` [m/s]; zero where there is no sample."""
-    return (blocks.measured - blocks.at_samples(_modelled(values, names, blocks))) * blocks.pairs
-
-
-def _block_losses(values: np.ndarray, names: tuple[str, ...], blocks: WheelBlocks, top: float) -> np.ndarray:
-    """Sum of squared errors of each block ``[n]``, each clipped so that a few outliers do not decide."""
-    return np.minimum(_residuals(values, names, blocks) ** 2, (0.5 * top) ** 2).sum(axis=(1, 2))
-
-
-def _starts(names: tuple[str, ...], fastest: Fastest, similar: _Model | None) -> list[np.ndarray]:
-    """Initial values: those of a similar model, with each initial value of what it does not hold."""
-    known = {} if similar is None else dict(_by_effect(similar.names, similar.values))
-    listed = []
-    for name in names:
-        neutral = {parameter.name: parameter.neutral for parameter in CATALOGUE[name].parameters}
-        further = tuple(float(neutral[key]) for key in _response(name).further)
-        listed.append([known[name]] if name in known else [(v, *further) for v in _response(name).starts(fastest)])
-    count = max(map(len, listed), default=0)
-    return [np.concatenate([values[i % len(values)] for values in listed]) for i in range(count)]
-
-
-def _fit(names: tuple[str, ...], blocks: WheelBlocks, starts: Sequence[np.ndarray]) -> np.ndarray:
-    """Parameters by robust least squares from the best of a few starts."""
-    if not names:
-        return np.zeros(0)
-    fastest = blocks.fastest
-    bounds = _bounds(names, fastest)
-    inside = [np.clip(start, bounds[:, 0] + 1e-6, bounds[:, 1] - 1e-6) for start in starts]
-    start = min(inside, key=lambda values: _block_losses(values, names, blocks, fastest.speed).sum())
-    return least_squares(
-        lambda values: _residuals(values, names, blocks).ravel(), start, loss="soft_l1", f_scale=0.05 * fastest.speed,
-        diff_step=1e-2, max_nfev=_EVALUATIONS, bounds=(bounds[:, 0], bounds[:, 1]), x_scale=np.ptp(bounds, axis=1),
-    ).x  # fmt: skip
-
-
-def _half_widths(values: np.ndarray, names: tuple[str, ...], blocks: WheelBlocks) -> np.ndarray:
-    """Half-widths of 95 % intervals from the scores of each block (sandwich estimate, White 1980), ``[P]``."""
-    base, bounds = _residuals(values, names, blocks), _bounds(names, blocks.fastest)
-    derivatives = []
-    for i, value in enumerate(values):
-        step = max(0.01 * abs(value), 1e-3)
-        # A dead time of less than none is not defined.
-        ends = np.clip((value - step, value + step), *bounds[i])
-        shifted = [_residuals(values + (end - value) * np.eye(len(values))[i], names, blocks) for end in ends]
-        derivatives.append((shifted[1] - shifted[0]) / (ends[1] - ends[0]))
-    jacobian = np.array(derivatives)
-    top = blocks.fastest.speed
-    weight = 1.0 / np.sqrt(1.0 + (base / (0.05 * top)) ** 2)
-    scores = np.einsum("pnsk,nsk->np", jacobian, weight * base)
-    information = np.einsum("pnsk,nsk,qnsk->pq", jacobian, weight, jacobian)
-    inverse = np.linalg.pinv(information)
-    freedom = max(1, len(blocks) - len(values))
-    covariance = len(blocks) / freedom * inverse @ (scores.T @ scores) @ inverse
-    return student.ppf(0.975, freedom) * np.sqrt(np.maximum(np.diag(covariance), 0.0))

@@ -13,8 +13,8 @@ from monoforce_ros.effects.effect import Effect, Parameter, Values, WheelRespons
 from monoforce_ros.effects.ramp import ramped, ramped_array
 
 
-def _ramped(twists: np.ndarray, value: float, step: float) -> np.ndarray:
-    return np.stack([ramped_array(twists[..., 0, :], value, step), twists[..., 1, :]], axis=-2)
+def _ramped(twists: np.ndarray, value: np.ndarray | float, step: float) -> np.ndarray:
+    return np.concatenate([ramped_array(twists[..., :1, :], value, step), twists[..., 1:, :]], axis=-2)
 
 
 class AccelerationLimit(Effect):

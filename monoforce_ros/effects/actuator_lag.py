@@ -13,11 +13,15 @@ from monoforce_ros.effects.first_order import lagged
 from monoforce_ros.effects.ramp import at_stamps
 
 
-def _lagging(speeds: np.ndarray, value: float, step: float) -> np.ndarray:
-    if value <= 1e-4:
-        return speeds
-    decay = np.exp(-step / value)
-    return at_stamps(lfilter([1.0 - decay], [1.0, -decay], speeds, axis=-1, zi=decay * speeds[..., :1])[0])
+def _lagging(speeds: np.ndarray, value: np.ndarray | float, step: float) -> np.ndarray:
+    values = np.broadcast_to(value, (*speeds.shape[:-2], 1, 1))[..., 0, 0]
+    lagging = speeds.copy()
+    # Of a batch only a few differ.
+    for constant in np.unique(values[values > 1e-4]):
+        part, decay = speeds[values == constant], np.exp(-step / constant)
+        filtered, _ = lfilter([1.0 - decay], [1.0, -decay], part, axis=-1, zi=decay * part[..., :1])
+        lagging[values == constant] = at_stamps(filtered)
+    return lagging
 
 
 class ActuatorLag(Effect):

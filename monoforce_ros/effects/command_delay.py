@@ -11,11 +11,12 @@ from torch import Tensor
 from monoforce_ros.effects.effect import Effect, Parameter, Values, WheelResponse
 
 
-def _delayed(speeds: np.ndarray, value: float, step: float) -> np.ndarray:
-    whole, fraction = divmod(value / step, 1.0)
+def _delayed(speeds: np.ndarray, value: np.ndarray | float, step: float) -> np.ndarray:
+    whole, fraction = np.divmod(np.asarray(value) / step, 1.0)
     # The first command is assumed to have been active before its stamp.
-    index = np.arange(speeds.shape[-1]) - int(whole)
-    later, earlier = speeds[..., np.maximum(index, 0)], speeds[..., np.maximum(index - 1, 0)]
+    index = np.arange(speeds.shape[-1]) - whole.astype(int)
+    first = speeds.shape[-1] * np.arange(speeds.size // speeds.shape[-1]).reshape(*speeds.shape[:-1], 1)
+    later, earlier = (speeds.take(first + np.maximum(index - back, 0)) for back in (0, 1))
     return later + fraction * (earlier - later)
 
 

@@ -13,13 +13,14 @@ from monoforce_ros.effects.recurrence import droop
 from monoforce_ros.robots import RobotModel
 
 
-def _drooped(speeds: np.ndarray, loss: float, recovery: float, step: float) -> np.ndarray:
-    turning = 0.5 * (speeds[..., 1, :] - speeds[..., 0, :])
+def _drooped(speeds: np.ndarray, loss: np.ndarray | float, recovery: np.ndarray | float, step: float) -> np.ndarray:
+    turning = 0.5 * (speeds[..., 1:, :] - speeds[..., :1, :])
+    share = 1.0 - np.exp(-step / np.asarray(recovery))
+    factors = (np.broadcast_to(factor, (*turning.shape[:-1], 1)).ravel() for factor in (loss, share))
     rows = torch.from_numpy(turning.reshape(-1, turning.shape[-1]))
-    share = 1.0 - np.exp(-step / recovery)
-    lost = droop(rows, torch.tensor(loss, dtype=rows.dtype), torch.tensor(share, dtype=rows.dtype))
+    lost = droop(rows, *(torch.tensor(factor, dtype=rows.dtype) for factor in factors))
     change = lost.numpy().reshape(turning.shape)
-    return speeds + np.stack([change, -change], axis=-2)
+    return speeds + np.concatenate([change, -change], axis=-2)
 
 
 class DriveDroop(Effect):

@@ -10,8 +10,9 @@ from torch import Tensor
 from monoforce_ros.effects.effect import Effect, Parameter, Values, WheelResponse, per_trajectory
 
 
-def _weakened(speeds: np.ndarray, value: float, step: float) -> np.ndarray:
-    return speeds * (1.0 - np.array([[max(value, 0.0)], [max(-value, 0.0)]]))
+def _weakened(speeds: np.ndarray, value: np.ndarray | float, step: float) -> np.ndarray:
+    left = np.atleast_2d(value)
+    return speeds * (1.0 - np.maximum(np.concatenate([left, -left], axis=-2), 0.0))
 
 
 class DriveLoss(Effect):

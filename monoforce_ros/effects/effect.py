@@ -68,7 +68,8 @@ class WheelResponse:
     """That says how large the effect is."""
     speeds: Callable[..., np.ndarray]
     """(commands, parameter value, those of ``further``, time step [s]) → changed commands. Commands are wheel speeds
-    ``[..., 2, T]`` [m/s], left and right, or, with ``of_twist``, forward speed [m/s] and yaw rate [rad/s]."""
+    ``[..., 2, T]`` [m/s], left and right, or, with ``of_twist``, forward speed [m/s], yaw rate [rad/s] and, of a robot
+    that crabs, lateral speed [m/s], ``[..., 2 or 3, T]``. Values are scalars, or ``[..., 1, 1]``."""
     starts: Callable[[Fastest], tuple[float, ...]]
     """Initial values of a fit."""
     bounds: Callable[[Fastest], tuple[float, float]]

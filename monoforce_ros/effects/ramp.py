@@ -21,10 +21,17 @@ def ramped(target: Tensor, rate: Tensor, time_step: float) -> Tensor:
     return follow(target, per_trajectory(rate, 1) * time_step)
 
 
-def ramped_array(target: np.ndarray, rate: float, time_step: float) -> np.ndarray:
-    """The same for arrays ``[..., T]``, at the stamps of the targets (:func:`at_stamps`)."""
+def ramped_array(target: np.ndarray, rate: np.ndarray | float, time_step: float) -> np.ndarray:
+    """The same for arrays ``[..., T]``, at the stamps of the targets (:func:`at_stamps`).
+
+    Args:
+        target: see :func:`ramped`.
+        rate: a scalar, or ``[..., 1]``.
+        time_step: time between values [s].
+    """
     rows = torch.from_numpy(np.ascontiguousarray(target).reshape(-1, target.shape[-1]))
-    followed = follow(rows, torch.tensor(rate * time_step, dtype=rows.dtype))
+    rates = np.broadcast_to(rate, (*target.shape[:-1], 1)).ravel()
+    followed = follow(rows, torch.tensor(rates * time_step, dtype=rows.dtype))
     return at_stamps(followed.numpy().reshape(target.shape))
 
 

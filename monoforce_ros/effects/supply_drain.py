@@ -13,7 +13,7 @@ _LEAST = 0.1
 """Share of the speed that is always left: a drive that has nearly stopped is no matter of its supply."""
 
 
-def _drained(speeds: np.ndarray, drain: float, step: float, times: np.ndarray) -> np.ndarray:
+def _drained(speeds: np.ndarray, drain: np.ndarray | float, step: float, times: np.ndarray) -> np.ndarray:
     return speeds * np.maximum(1.0 - drain * times / 60.0, _LEAST)
 
 

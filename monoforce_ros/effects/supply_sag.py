@@ -10,7 +10,7 @@ from torch import Tensor
 from monoforce_ros.effects.effect import Effect, Parameter, Values, WheelResponse, per_trajectory
 
 
-def _sagging(speeds: np.ndarray, value: float, step: float) -> np.ndarray:
+def _sagging(speeds: np.ndarray, value: np.ndarray | float, step: float) -> np.ndarray:
     return speeds / (1.0 + value * np.abs(speeds).mean(axis=-2, keepdims=True))
 
 

@@ -13,8 +13,9 @@ from monoforce_ros.effects.effect import Effect, Parameter, Values, WheelRespons
 from monoforce_ros.effects.ramp import ramped, ramped_array
 
 
-def _ramped(twists: np.ndarray, value: float, step: float) -> np.ndarray:
-    return np.stack([twists[..., 0, :], ramped_array(twists[..., 1, :], value, step)], axis=-2)
+def _ramped(twists: np.ndarray, value: np.ndarray | float, step: float) -> np.ndarray:
+    turning = ramped_array(twists[..., 1:2, :], value, step)
+    return np.concatenate([twists[..., :1, :], turning, twists[..., 2:, :]], axis=-2)
 
 
 class YawAccelerationLimit(Effect):

@@ -12,9 +12,9 @@ from torch import Tensor
 from monoforce_ros.effects.effect import Effect, Parameter, Values, WheelResponse, per_trajectory
 
 
-def _clamped(twists: np.ndarray, value: float, step: float) -> np.ndarray:
-    forward, yaw_rate = twists[..., 0, :], twists[..., 1, :]
-    return np.stack([forward, np.clip(yaw_rate, -value, value)], axis=-2)
+def _clamped(twists: np.ndarray, value: np.ndarray | float, step: float) -> np.ndarray:
+    turning = np.clip(twists[..., 1:2, :], -value, value)
+    return np.concatenate([twists[..., :1, :], turning, twists[..., 2:, :]], axis=-2)
 
 
 class YawRateLimit(Effect):
