@@ -118,8 +118,8 @@ class WheelBlocks:
 
     @cached_property
     def _samples(self) -> tuple[np.ndarray, np.ndarray]:
-        """The command before each sample among those of all blocks and sides ``[n, 2, K]``, and the share of a step that
-        has passed since, ``[n, 1, K]``."""
+        """The command before each sample among those of all blocks and sides ``[n, 2, K]``, and the share of a step
+        that has passed since, ``[n, 1, K]``."""
         count, length = len(self), self.twists.shape[-1]
         index = np.minimum(self.place.astype(int), length - 2)[:, None]
         return index + length * np.arange(2 * count).reshape(count, 2, 1), self.place[:, None] - index

@@ -111,7 +111,7 @@ def modelled(
 def residuals(
     names: Sequence[str], values: np.ndarray, blocks: WheelBlocks, changes: np.ndarray | None = None
 ) -> np.ndarray:
-    """Measured minus modelled speed ``[1 or 1 + P, n, 2, K]`` [m/s]; zero where there is no sample (:func:`modelled`)."""
+    """Measured minus modelled speed ``[1 or 1 + P, n, 2, K]`` [m/s], see :func:`modelled`; zero without sample."""
     return (blocks.measured - blocks.at_samples(modelled(names, values, blocks, changes))) * blocks.pairs
 
 

@@ -358,9 +358,8 @@ class _Selection:
     def larger(self, names: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
         """Models with one more effect."""
         for name in self._order:
-            excluded = any(
-                other in response_of(name).excludes or name in response_of(other).excludes for other in names
-            )
+            own = response_of(name).excludes
+            excluded = any(other in own or name in response_of(other).excludes for other in names)
             if name not in names and not excluded:
                 yield in_order((*names, name))
 
