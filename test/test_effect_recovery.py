@@ -126,6 +126,17 @@ def test_what_is_no_more_than_the_error_of_a_formula_is_no_further_effect(differ
     assert any(candidate.name == "drive_loss" and candidate.p < 0.025 for candidate in second)
 
 
+@pytest.mark.parametrize(("difference", "names"), [(0.012, ["drive_gain"]), (0.02, ["drive_gain", "drive_loss"])])
+def test_a_further_effect_is_added_only_while_residuals_are_larger_than_a_healthy_robots(difference, names):
+    """What formulas that are not exact leave has directions that are significant, too, but is small."""
+    hidden = (("drive_gain", {"gain": 0.85}), ("drive_asymmetry", {"difference": difference}))
+    husky = load_robot("husky")
+    varying = dict.fromkeys((effect.name for effect in identifiable_effects(husky)), 0.1)
+    healthy = NominalModel(SCALE, varying, segments=5, loss=0.4, loss_spread=0.2)
+    search = Search(husky, driven(replace(husky, effects=hidden)), SCALE, nominal=healthy)
+    assert list(search.run(2, exchange=False).best.names) == names
+
+
 def test_beside_a_further_effect_the_values_of_the_first_one_are_fitted_once_more():
     """Compliance alone makes up for low friction, too: with its value as it is, delays promise more than friction."""
     hidden = (("friction_scale", {"factor": 0.25}), ("drive_compliance", {"speed_loss": 0.42}))

@@ -20,6 +20,7 @@ from monoforce_ros.discrepancy.hypothesis import Effects
 from monoforce_ros.discrepancy.judging import Judging
 from monoforce_ros.discrepancy.learned import learned_terms
 from monoforce_ros.discrepancy.pairing import promising_pairs
+from monoforce_ros.discrepancy.residual_size import residual_size
 from monoforce_ros.discrepancy.screening import Candidates, Screened, admitted
 from monoforce_ros.discrepancy.trial import FOLDS, CandidateScore, FitTest, Outcome, Trial
 from monoforce_ros.effects import CATALOGUE, separating_sensor
@@ -132,15 +133,31 @@ class Search(Judging):
         return Outcome(nominal, start, FitTest(1.0, ""))
 
     def _extended(self, best: Trial, most_effects: int) -> tuple[Trial, list[CandidateScore]]:
-        """Add effects one at a time while a further one is significant."""
+        """Add effects one at a time while something is missing and a further one is significant."""
         tried: list[CandidateScore] = []
         for step in range(1, most_effects):
+            if self._sufficient(best):
+                break
             judged, listed = self._round(best, step + 1, self.thresholds.further_rate)
             tried += listed
             if not judged:
                 break
             best = self._pruned(self._preferred(judged))
         return best, tried
+
+    def _sufficient(self, best: Trial) -> bool:
+        """Whether effects are the explanation, and what they leave is as small as on a healthy robot.
+
+        The size is judged as that of the nominal model's residuals is. Directions that are significant in residuals of
+        that size show that the formulas of the effects are not exact.
+        """
+        healthy = self.nominal
+        if healthy is None or healthy.segments < 2 or len(best.effects) == len(self.known):
+            return False
+        size = residual_size(best.held_out_loss, self.data.starts, healthy.loss, healthy, self.thresholds)
+        return 2.0 * size.p > self.thresholds.fit_rate and self.fit_test(best, self._without_effects).passed(
+            self.thresholds
+        )
 
     def _hopeless(self, fit: FitTest) -> bool:
         """Whether effects explain so little that improving them is of no use."""
