@@ -133,31 +133,33 @@ class Search(Judging):
         return Outcome(nominal, start, FitTest(1.0, ""))
 
     def _extended(self, best: Trial, most_effects: int) -> tuple[Trial, list[CandidateScore]]:
-        """Add effects one at a time while something is missing and a further one is significant."""
+        """Add effects one at a time while a further one is significant and no error of a formula."""
         tried: list[CandidateScore] = []
         for step in range(1, most_effects):
-            if self._sufficient(best):
-                break
             judged, listed = self._round(best, step + 1, self.thresholds.further_rate)
             tried += listed
             if not judged:
                 break
-            best = self._pruned(self._preferred(judged))
+            further = self._pruned(self._preferred(judged))
+            if self._makes_up(best, further):
+                break
+            best = further
         return best, tried
 
-    def _sufficient(self, best: Trial) -> bool:
-        """Whether effects are the explanation, and what they leave is as small as on a healthy robot.
+    def _makes_up(self, best: Trial, further: Trial) -> bool:
+        """Whether a further effect makes up for formulas that are not exact.
 
-        The size is judged as that of the nominal model's residuals is. Directions that are significant in residuals of
-        that size show that the formulas of the effects are not exact.
+        Effects that are the explanation may leave residuals as small as a healthy robot's, judged as the nominal
+        model's are. What is there beside them then explains most of what is left, as all must of the whole.
         """
         healthy = self.nominal
         if healthy is None or healthy.segments < 2 or len(best.effects) == len(self.known):
             return False
+        if best.loss - further.loss >= self.thresholds.explained_share * (best.loss - healthy.loss):
+            return False
         size = residual_size(best.held_out_loss, self.data.starts, healthy.loss, healthy, self.thresholds)
-        return 2.0 * size.p > self.thresholds.fit_rate and self.fit_test(best, self._without_effects).passed(
-            self.thresholds
-        )
+        small = 2.0 * size.p > self.thresholds.fit_rate
+        return small and self.fit_test(best, self._without_effects).passed(self.thresholds)
 
     def _hopeless(self, fit: FitTest) -> bool:
         """Whether effects explain so little that improving them is of no use."""
