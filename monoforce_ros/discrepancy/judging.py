@@ -214,15 +214,20 @@ class Judging:
             explained = excess_share(nominal.loss, trial.loss, self.healthy_loss)
         return FitTest(p, name, tuple(tests), explained)
 
-    def _size(self, trial: Trial) -> ResidualSize | None:
-        """How much larger a trial's residuals are than a healthy robot's; None where these are unknown."""
+    def _size(self, trial: Trial, *, exact: bool = False) -> ResidualSize | None:
+        """How much larger a trial's residuals are than a healthy robot's; None where these are unknown.
+
+        An effect of the right kind leaves some of what it does, for no formula is exact: that is expected, too, unless
+        formulas count as ``exact``.
+        """
         healthy = self.nominal
         if healthy is None or healthy.segments < 2:
             return None
-        base = self.refit(trial.effects).effects if trial.effects else ()
-        # An effect of the right kind leaves some of what it does: no formula is exact.
-        change = self.directions.scaled(base) - self.directions.scaled(base[: self.fixed_count(base)])
-        expected = expected_loss(healthy.loss, change, self.thresholds.model_error)
+        expected = healthy.loss
+        if not exact:
+            base = self.refit(trial.effects).effects if trial.effects else ()
+            change = self.directions.scaled(base) - self.directions.scaled(base[: self.fixed_count(base)])
+            expected = expected_loss(healthy.loss, change, self.thresholds.model_error)
         return residual_size(trial.held_out_loss, self.data.starts, expected, healthy, self.thresholds)
 
     def _pays(self, before: Trial, after: Trial, *, least: float = 0.0) -> bool:

@@ -20,7 +20,6 @@ from monoforce_ros.discrepancy.hypothesis import Effects
 from monoforce_ros.discrepancy.judging import Judging
 from monoforce_ros.discrepancy.learned import learned_terms
 from monoforce_ros.discrepancy.pairing import promising_pairs
-from monoforce_ros.discrepancy.residual_size import residual_size
 from monoforce_ros.discrepancy.screening import Candidates, Screened, admitted
 from monoforce_ros.discrepancy.trial import FOLDS, CandidateScore, FitTest, Outcome, Trial
 from monoforce_ros.effects import CATALOGUE, separating_sensor
@@ -152,12 +151,11 @@ class Search(Judging):
         Effects that are the explanation may leave residuals as small as a healthy robot's, judged as the nominal
         model's are. What is there beside them then explains most of what is left, as all must of the whole.
         """
-        healthy = self.nominal
-        if healthy is None or healthy.segments < 2 or len(best.effects) == len(self.known):
+        size = self._size(best, exact=True)
+        if size is None or len(best.effects) == len(self.known):
             return False
-        if best.loss - further.loss >= self.thresholds.explained_share * (best.loss - healthy.loss):
+        if best.loss - further.loss >= self.thresholds.explained_share * (best.loss - self.healthy_loss):
             return False
-        size = residual_size(best.held_out_loss, self.data.starts, healthy.loss, healthy, self.thresholds)
         small = 2.0 * size.p > self.thresholds.fit_rate
         return small and self.fit_test(best, self._without_effects).passed(self.thresholds)
 

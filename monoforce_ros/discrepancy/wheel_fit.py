@@ -8,13 +8,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from monoforce_ros.discrepancy.wheel_blocks import WheelBlocks
-from monoforce_ros.discrepancy.wheel_model import (
-    WheelModel,
-    bounds_of,
-    by_effect,
-    residuals,
-    response_of,
-)
+from monoforce_ros.discrepancy.wheel_model import WheelModel, bounds_of, by_effect, residuals, response_of
 from monoforce_ros.effects import CATALOGUE, Fastest
 
 _FIRST_ITERATIONS, _ITERATIONS = 3, 8
@@ -63,21 +57,26 @@ def fit(
         # Each start is a group of its own: a call of an effect costs more than its values.
         repeated = blocks[np.tile(np.arange(len(blocks)), number)]
         every = (members + count * np.arange(number)[:, None]).ravel()
-        values, cost = _fitted(names, repeated, values, every, _FIRST_ITERATIONS)
+        values, cost = _fitted(names, repeated, blocks.fastest, values, every, _FIRST_ITERATIONS)
         best = cost.reshape(number, count).argmin(axis=0)
         values = values.reshape(number, count, -1)[best, np.arange(count)]
-    return values if rough else _fitted(names, blocks, values, members, _ITERATIONS)[0]
+    return values if rough else _fitted(names, blocks, blocks.fastest, values, members, _ITERATIONS)[0]
 
 
 def _fitted(
-    names: tuple[str, ...], blocks: WheelBlocks, initial: np.ndarray, members: np.ndarray, iterations: int
+    names: tuple[str, ...],
+    blocks: WheelBlocks,
+    fastest: Fastest,
+    initial: np.ndarray,
+    members: np.ndarray,
+    iterations: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Parameters ``[G, P]`` and costs ``[G]`` of groups of blocks from one start ``[G, P]`` each.
 
     Levenberg's and Marquardt's method with the weights of the soft L1 loss, within bounds: a parameter at its bound
     that the cost would carry across it stays there. All groups and all derivatives are computed together.
     """
-    fastest, count = blocks.fastest, len(initial)
+    count = len(initial)
     low, high = bounds_of(names, fastest).T
     values, scale = np.clip(initial, low, high), 0.05 * fastest.speed
     rest, jacobian = _linearised(names, values[members], blocks, low, high)
@@ -154,7 +153,7 @@ def half_widths(names: tuple[str, ...], values: np.ndarray, blocks: WheelBlocks)
     step = np.maximum(0.01 * np.abs(values), 1e-3)
     # A dead time of less than none is not defined.
     ends = [np.clip(values + side * step, low, high) - values for side in (-1.0, 1.0)]
-    before, after = (residuals(names, values, blocks, np.broadcast_to(end, (len(blocks), len(end)))) for end in ends)
+    before, after = (residuals(names, values, blocks, end) for end in ends)
     base, jacobian = before[0], (after[1:] - before[1:]) / (ends[1] - ends[0])[:, None, None, None]
     weight = _weights(base, 0.05 * blocks.fastest.speed)
     scores = np.einsum("pnsk,nsk->np", jacobian, weight * base)

@@ -83,8 +83,8 @@ def modelled(
         names: effects.
         values: of their parameters, ``[P]``, or ``[n, P]`` where those of the blocks differ.
         blocks: the commands.
-        changes: of the values, like them. With these the result is ``[1 + P, n, 2, T]``: first without any, then with
-            each of the parameters changed alone. One call of an effect serves all of them.
+        changes: of the values, ``[P]`` or ``[n, P]``. With these the result is ``[1 + P, n, 2, T]``: first without
+            any, then with each of the parameters changed alone. One call of an effect serves all of them.
     """
     own = np.broadcast_to(values, (len(blocks), np.shape(values)[-1]))
     ordered = sorted(_columns(names), key=lambda entry: not response_of(entry[0]).of_twist)
@@ -97,8 +97,8 @@ def modelled(
         rows = np.repeat(own[None, :, columns], len(signal), axis=0)
         if changes is not None:
             changed = np.repeat(own[None, :, columns], len(parameters), axis=0)
-            for number in range(len(parameters)):
-                changed[number, :, number] += changes[..., columns][..., number]
+            for number, parameter in enumerate(parameters):
+                changed[number, :, number] += changes[..., parameter]
             rows = np.concatenate([rows, changed])
             signal = np.concatenate([signal, np.repeat(signal[:1], len(parameters), axis=0)])
             computed += [1 + parameter for parameter in parameters]

@@ -369,9 +369,9 @@ class _Selection:
         for name in best.names:
             rest = tuple(other for other in best.names if other != name)
             others |= {names for names in self.larger(rest) if name not in names}
-        known = [self._known[names] for names in others & self._known.keys()]
+        known = [self._known[names] for names in sorted(others) if names in self._known]
         # Most stand in badly, as a few steps of a fit show.
-        rough = [self._fitted(names, best, rough=True) for names in sorted(others - self._known.keys())]
+        rough = [self._fitted(names, best, rough=True) for names in sorted(others) if names not in self._known]
         rough.sort(key=lambda model: model.loss)
         tried = [best, *known, *(self.scored(model.names, best) for model in rough[:_MOST_EXCHANGES])]
         return min(tried, key=lambda model: model.loss)
