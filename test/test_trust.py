@@ -1,5 +1,7 @@
 """Trust: predictions are compared with the ground found later, and a harmful encoder is not used."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -16,6 +18,7 @@ from monoforce_ros.perception import (
     TrustedTerrain,
     support_points,
 )
+from monoforce_ros.perception.trust import blended
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap
 
@@ -33,12 +36,14 @@ def at(x, z=0.0, stamp=None):
     return MotionState(stamp, np.array([x, 0.0, z]), np.eye(3), np.array([1.0, 0, 0]), np.zeros(3))
 
 
-def drive(trust, said, *, length=8.0, step=0.1, start_error=0.0):
+def drive(trust, said, *, length=8.0, step=0.1, start_error=0.0, spread=None):
     """Reports along a drive over the hill; ``said(ahead, x)`` is the predicted height ``ahead`` metres away."""
     reports = []
     for x in np.arange(0.0, length, step):
         height = said(np.broadcast_to(GRID.x, (GRID.rows, GRID.columns)), x)
         terrain = TerrainMap.from_height(torch.from_numpy(height.astype(np.float32)), GRID)
+        if spread is not None:
+            terrain = replace(terrain, geometric_spread=torch.full_like(terrain.height, spread))
         support = np.column_stack([WHEELS, hill(x + WHEELS[:, 0]) - hill(x)])
         motion = at(x, hill(x))
         reports.append(trust.update(motion, support, terrain, {"front": 0.0, "rear": np.pi}, start_error))
@@ -108,6 +113,56 @@ def test_half_of_the_ground_is_used_by_half():
     assert 0.35 < report.share < 0.6 or not report.trusted
 
 
+def test_spreads_that_are_too_small_are_widened_by_what_the_ground_shows():
+    errors = np.random.default_rng(3).laplace(0.0, 0.1, 200)
+
+    def factors(spread):
+        said = lambda ahead, x: hill(ahead + x) - hill(x) + errors[round(10 * x)]  # noqa: E731
+        return [report.spread_factor for report in drive(TerrainTrust(GRID), said, spread=spread)]
+
+    assert factors(0.1)[0] == 1.0 and factors(0.1)[-1] < 1.6
+    assert 1.8 < factors(0.033)[-1] < 4.0
+    # Where it drives errors are smaller than elsewhere: spreads that are too large stay.
+    assert factors(0.5)[-1] == 1.0 and factors(None)[-1] == 1.0
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.8, 1.0])
+@pytest.mark.parametrize("bump", [0.0, 0.1, 0.6])
+def test_bands_of_what_is_used_hold_what_those_of_the_prediction_hold(share, bump):
+    """Of surfaces that are distributed as the encoder says, 90 % lie in the band about what is used of it."""
+    random = np.random.default_rng(7)
+    flat = TerrainMap.flat(GRID)
+    predicted = replace(
+        flat,
+        height=flat.height + 0.75 * bump,
+        geometric_height=flat.height + bump,
+        geometric_spread=torch.full_like(flat.height, 0.1),
+        decrease_spread=torch.full_like(flat.height, 0.02),
+    )
+    used = blended(flat, predicted, share)
+    surface = predicted.geometric_height.numpy() + random.laplace(0.0, 0.1, flat.height.shape)
+    depth = 0.25 * bump + random.laplace(0.0, 0.02, flat.height.shape)
+    for actual, height, spread in (
+        (surface, used.geometric_height, used.geometric_spread),
+        (depth, used.geometric_height - used.height, used.decrease_spread),
+    ):
+        inside = np.abs(actual - height.numpy()) < np.log(10.0) * spread.numpy()
+        assert inside.mean() == pytest.approx(0.9, abs=0.015)
+    wider = blended(flat, predicted, share, spread_factor=3.0)
+    assert (wider.geometric_spread > used.geometric_spread).all() and torch.equal(wider.height, used.height)
+
+
+def test_a_fallback_s_own_spread_counts_and_maps_without_any_tell_none():
+    flat = TerrainMap.flat(GRID)
+    predicted = replace(flat, height=flat.height + 0.3, geometric_spread=torch.full_like(flat.height, 0.1))
+    measured = replace(flat, geometric_spread=torch.full_like(flat.height, 0.02))
+    assert float(blended(measured, predicted, 0.0, 2.0).geometric_spread.mean()) == pytest.approx(0.02)
+    assert float(blended(measured, predicted, 0.5).geometric_spread.mean()) == pytest.approx(0.06)
+    assert float(blended(measured, predicted, 1.0, 2.0).geometric_spread.mean()) == pytest.approx(0.2)
+    assert blended(flat, flat, 0.0).spreads == () and blended(measured, flat, 0.5).spreads == ()
+    assert blended(measured, flat, 0.0).spreads == ("geometric_spread",)
+
+
 def test_trust_returns_when_predictions_become_right_again():
     trust = TerrainTrust(GRID)
     wrong = drive(trust, lambda ahead, x: np.full(ahead.shape, -0.7))
@@ -157,6 +212,7 @@ def test_the_fallback_replaces_the_maps_of_a_harmful_encoder(robot):
             encoder.heads.bias[[7, 9]] = -3.0 if x > 1.0 else 3.0
         maps.append(trusted.terrain(Observation(int(1e9 * x), cloud=cloud), at(x)))
     assert trusted.report is not None and not trusted.report.trusted
+    assert all(entry.spreads == ("geometric_spread", "decrease_spread") for entry in maps)
     flat = FlatTerrain(robot, config.grid, material).terrain(Observation(0), at(0.0))
     assert torch.equal(maps[-1].height, flat.height) and torch.equal(maps[0].height, flat.height)
     # Right again: the encoder is used again.

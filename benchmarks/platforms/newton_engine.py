@@ -26,6 +26,9 @@ _WHEEL_SHARE = 0.12
 """Share of a robot's mass in its wheels."""
 _DAMPING_RATIO = 0.5
 """Of the tyres."""
+_HILL_STRIDE = 2
+"""Every second node of the height field: contacts cost by the triangles under a wheel. Robots end up 3 mm elsewhere after
+3 s on six grounds, less than the map is wrong."""
 _SOFT_TYRES = 0.25
 """Factor on the tyres' stiffness on soft ground: contacts of this engine are rigid."""
 
@@ -243,9 +246,10 @@ def _chassis(platform: Platform, build: Build, wheel_mass: float) -> tuple[float
 
 def _add_hills(builder: newton.ModelBuilder, ground: Ground, config: newton.ModelBuilder.ShapeConfig) -> None:
     assert ground.heights is not None
-    low, high = float(ground.heights.min()), float(ground.heights.max())
-    rows, columns = ground.heights.shape
+    heights = ground.heights[::_HILL_STRIDE, ::_HILL_STRIDE]
+    low, high = float(heights.min()), float(heights.max())
+    rows, columns = heights.shape
     field = newton.Heightfield(
-        data=ground.heights, nrow=rows, ncol=columns, hx=HALF_SIZE, hy=HALF_SIZE, min_z=low, max_z=high
+        data=heights, nrow=rows, ncol=columns, hx=HALF_SIZE, hy=HALF_SIZE, min_z=low, max_z=high
     )
     builder.add_shape_heightfield(heightfield=field, cfg=config)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -30,6 +31,8 @@ TOLERANCE = 0.01
 _FEWEST_BLOCKS = 3
 _SMALLEST_SQUARE = 1e-9
 """Of differences of heights: where there are none the share is what was expected [m²]."""
+_SMALLEST_SPREAD = 1e-4
+"""Below which a spread is none [m]."""
 _NEAREST, _FARTHEST = 0.8, 5.0
 """Distances from the robot between which predictions are compared [m]: nearer cells are fitted to the wheels."""
 DISTANCES = (0.8, 2.0, 3.5, 5.0)
@@ -58,6 +61,8 @@ class TrustReport:
     """Camera that looked at the places with the largest mean error; empty before any comparison."""
     by_distance: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Mean error of prediction and of level ground [m], by the distance from which a place was predicted."""
+    spread_factor: float = 1.0
+    """How much larger errors of predicted heights were than the predicted spreads; at least 1."""
     remedy: str = "adapt the encoder to this robot (train --adapt BAG)"
     """What to do if the encoder is not trusted."""
 
@@ -95,6 +100,8 @@ class _Said:
     """Height of level ground in that frame [m]."""
     fallback: np.ndarray
     """Heights of the fallback's map ``[rows, columns]`` [m]."""
+    spread: np.ndarray | None
+    """Expected errors of the predicted heights ``[rows, columns]`` [m]."""
     cameras: Mapping[str, float]
     """Direction of each camera's optical axis in that frame [rad]."""
 
@@ -115,6 +122,11 @@ class TerrainTrust:
     encoder is right on average wherever robots drove in simulation (docs/training.md): w0 = 1 until the ground
     says otherwise. After three blocks of ground that it put as far off as it differs from the fallback, 1/4 is left.
 
+    Whether errors are as large as the predicted spreads say follows from the same comparisons: errors are Laplace
+    distributed with the spreads times s as their scales. With the conjugate prior that weighs as much as three blocks,
+    s is about (3 + Σ mean |error| / spread) / (3 + blocks). It only widens spreads: robots drive where ground is
+    easiest to predict.
+
     Args:
         grid: cells of the maps.
         expected: prior mean w0 of the share, 0 to 1.
@@ -131,6 +143,9 @@ class TerrainTrust:
         self._moments: deque[tuple[float, float, float]] = deque(maxlen=round(LENGTH / BLOCK))
         """Means of d g, d² and g² in each block."""
         self._pending_moments: list[tuple[float, float, float]] = []
+        self._ratios: deque[float] = deque(maxlen=round(LENGTH / BLOCK))
+        """Mean error of the prediction in units of its spread, in each block."""
+        self._pending_ratios: list[float] = []
         self._pending: list[tuple[float, float, float, str]] = []
         """Error, error of level ground, distance and camera of each comparison of the current block."""
         self._compared: deque[tuple[float, float, float, str]] = deque(maxlen=2000)
@@ -180,12 +195,16 @@ class TerrainTrust:
                     )
                 )
                 self._compared.extend(self._pending)
-                self._pending, self._pending_moments = [], []
+                if self._pending_ratios:
+                    self._ratios.append(float(np.mean(self._pending_ratios)))
+                self._pending, self._pending_moments, self._pending_ratios = [], [], []
                 self._judge()
             level = float(support[:, 2].mean())
             height = predicted.height.numpy().copy()
             other = np.full_like(height, level) if fallback is None else fallback.height.numpy().copy()
-            self._said.append(_Said(motion, height, predicted.observed.numpy().copy(), level, other, dict(cameras)))
+            spread = None if predicted.height_spread is None else predicted.height_spread.numpy().copy()
+            observed = predicted.observed.numpy().copy()
+            self._said.append(_Said(motion, height, observed, level, other, spread, dict(cameras)))
         return self._report(start_error)
 
     def _compare(self, points: np.ndarray) -> None:
@@ -205,6 +224,9 @@ class TerrainTrust:
             away = {name: abs((axis - towards + np.pi) % (2 * np.pi) - np.pi) for name, axis in said.cameras.items()}
             camera = min(away, key=lambda name: away[name]) if away else ""
             self._pending.append((error, level, float(distance[usable].mean()), camera))
+            if said.spread is not None:
+                expected = np.maximum(said.spread[rows, columns][usable], TOLERANCE)
+                self._pending_ratios.append(float((np.abs(height - local[usable, 2]) / expected).mean()))
             other = said.fallback[rows, columns][usable]
             said_more, was_more = height - other, local[usable, 2] - other
             self._pending_moments.append(
@@ -242,6 +264,9 @@ class TerrainTrust:
         doubt = (1.0 - expected) * np.sqrt(noise(share) / precision)
         return float(np.clip(share - doubt, 0.0, 1.0))
 
+    def _spread_factor(self) -> float:
+        return max(1.0, (_FEWEST_BLOCKS + sum(self._ratios)) / (_FEWEST_BLOCKS + len(self._ratios)))
+
     def _report(self, start_error: float) -> TrustReport:
         own, level = (float(np.mean([b[i] for b in self._blocks])) if self._blocks else float("nan") for i in (0, 1))
         entries = list(self._compared)
@@ -263,6 +288,7 @@ class TerrainTrust:
             start_error=start_error,
             worst_camera=worst,
             by_distance=by_distance,
+            spread_factor=self._spread_factor(),
         )
 
 
@@ -314,7 +340,7 @@ class TrustedTerrain:
         # Adaptation needs images.
         without = replace(report, remedy="use terrain_source lidar_interpolation")
         self.report = report if "camera" in self.sensors else without
-        return blended(other, predicted, report.share)
+        return blended(other, predicted, report.share, report.spread_factor)
 
     def _fallback(self, observation: Observation, motion: MotionState) -> TerrainMap:
         """Map of the first fallback whose sensors have measured enough; the last one's error if there is none."""
@@ -328,16 +354,52 @@ class TrustedTerrain:
         return usable[-1].terrain(observation, motion)
 
 
-def blended(fallback: TerrainMap, predicted: TerrainMap, share: float) -> TerrainMap:
+def blended(
+    fallback: TerrainMap, predicted: TerrainMap, share: float, spread_factor: float = 1.0
+) -> TerrainMap:
     """The fallback's map with a share of its difference to a predicted one.
 
-    Stiffness, damping and friction are interpolated in their logarithms. What the predicted map says of its heights'
-    spread, and which cells were observed, stays; level ground alone would count as observed everywhere.
+    Stiffness, damping and friction are interpolated in their logarithms. Cells count as observed where the predicted
+    map says so; level ground alone would count as observed everywhere.
+
+    Where the predicted map tells spreads, the result does. A fallback with spreads of its own: those of a mean of two
+    heights are at most their mean. A fallback without: if the surface is Laplace distributed about the predicted
+    height with scale b, 90 % of it lie within b (ln 10 + ln cosh(m / b)) of a height that is m apart from that.
+
+    Args:
+        fallback: what is used of share 0.
+        predicted: what is used of share 1.
+        share: 0 to 1.
+        spread_factor: on the predicted spreads.
     """
-    if share <= 0.0:
-        return replace(fallback, observed=predicted.observed)
-    changed: dict[str, Any] = {name: torch.lerp(getattr(fallback, name), getattr(predicted, name), share)
-               for name in ("height", "geometric_height")}  # fmt: skip
-    for name in ("stiffness", "damping", "friction"):
-        changed[name] = torch.lerp(getattr(fallback, name).log(), getattr(predicted, name).log(), share).exp()
-    return replace(predicted, **changed)
+    changed: dict[str, Any] = {"observed": predicted.observed}
+    if share > 0.0:
+        for name in ("height", "geometric_height"):
+            changed[name] = torch.lerp(getattr(fallback, name), getattr(predicted, name), share)
+        for name in ("stiffness", "damping", "friction"):
+            changed[name] = torch.lerp(getattr(fallback, name).log(), getattr(predicted, name).log(), share).exp()
+    apart = {
+        "geometric_spread": predicted.geometric_height - fallback.geometric_height,
+        "decrease_spread": _decrease(predicted) - _decrease(fallback),
+    }
+    for name, difference in apart.items():
+        own, other = getattr(predicted, name), getattr(fallback, name)
+        if own is None:
+            changed[name] = other if share <= 0.0 else None
+            continue
+        own = spread_factor * own
+        changed[name] = _spread_about(own, (1.0 - share) * difference) if other is None else other.lerp(own, share)
+    return replace(fallback, **changed)
+
+
+def _spread_about(spread: torch.Tensor, apart: torch.Tensor) -> torch.Tensor:
+    """Scale of the Laplace distribution about a height ``apart`` from the predicted one with the same 90 % band [m]."""
+    ratio = apart.abs() / spread.clamp_min(_SMALLEST_SPREAD)
+    # ln cosh, which overflows.
+    beyond = ratio + torch.log1p(torch.exp(-2.0 * ratio)) - math.log(2.0)
+    return spread.clamp_min(_SMALLEST_SPREAD) * (1.0 + beyond / math.log(10.0))
+
+
+def _decrease(terrain: TerrainMap) -> torch.Tensor:
+    """Height of the visible surface above the supporting ground (H_d) [m]."""
+    return terrain.geometric_height - terrain.height
