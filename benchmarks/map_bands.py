@@ -111,22 +111,27 @@ def coverage(recording: Recording, robot: RobotModel, seed: int, name: str, bag:
 
 def table(rows: Sequence[Coverage]) -> str:
     """Markdown table: means over worlds, with the smallest and the largest."""
-    lines = ["| terrain | worlds | 90 % bands hold | in the first metre | half-width | encoder's own | half-width | error |"]
+    lines = ["| terrain | worlds | bands hold | in the first metre | half-width | encoder's own | half-width | error |"]
     lines += ["|---" * 8 + "|"]
     for name in SOURCES:
         of = [row for row in rows if row.source == name]
         if not of:
             continue
-        shares = np.array([row.published for row in of])
-        own = np.array([row.encoder for row in of])
         lines.append(
-            f"| {name} | {len(of)} | {100 * shares.mean():.0f} % ({100 * shares.min():.0f} – {100 * shares.max():.0f}) "
-            f"| {100 * np.mean([row.start for row in of]):.0f} % | ±{100 * np.median([row.width for row in of]):.0f} cm "
-            f"| {100 * own.mean():.0f} % ({100 * own.min():.0f} – {100 * own.max():.0f}) "
-            f"| ±{100 * np.median([row.encoder_width for row in of]):.0f} cm "
+            f"| {name} | {len(of)} | {_shares([row.published for row in of])} "
+            f"| {100 * np.mean([row.start for row in of]):.0f} % | {_width([row.width for row in of])} "
+            f"| {_shares([row.encoder for row in of])} | {_width([row.encoder_width for row in of])} "
             f"| {100 * np.median([row.error for row in of]):.1f} cm |"
         )
     return "\n".join(lines)
+
+
+def _shares(values: Sequence[float]) -> str:
+    return f"{100 * np.mean(values):.0f} % ({100 * min(values):.0f} – {100 * max(values):.0f})"
+
+
+def _width(values: Sequence[float]) -> str:
+    return f"±{100 * np.median(values):.0f} cm"
 
 
 def main() -> None:

@@ -27,8 +27,8 @@ _WHEEL_SHARE = 0.12
 _DAMPING_RATIO = 0.5
 """Of the tyres."""
 _HILL_STRIDE = 2
-"""Every second node of the height field: contacts cost by the triangles under a wheel. Robots end up 3 mm elsewhere after
-3 s on six grounds, less than the map is wrong."""
+"""Every second node of the height field: contacts cost by the triangles under a wheel. After 3 s on six grounds robots
+are 3 mm elsewhere, less than the map is wrong."""
 _SOFT_TYRES = 0.25
 """Factor on the tyres' stiffness on soft ground: contacts of this engine are rigid."""
 
