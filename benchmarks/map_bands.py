@@ -82,7 +82,8 @@ def coverage(recording: Recording, robot: RobotModel, seed: int, name: str, bag:
             continue
         start = motion.position if start is None else start
         predicted, actual = source.predicted, truth.terrain(observation, motion)
-        assert predicted is not None and predicted.geometric_spread is not None
+        assert predicted is not None
+        assert predicted.geometric_spread is not None
         known = published.observed
         ground = float(actual.height[actual.height.shape[0] // 2, actual.height.shape[1] // 2])
 
