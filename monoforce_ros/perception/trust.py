@@ -354,9 +354,7 @@ class TrustedTerrain:
         return usable[-1].terrain(observation, motion)
 
 
-def blended(
-    fallback: TerrainMap, predicted: TerrainMap, share: float, spread_factor: float = 1.0
-) -> TerrainMap:
+def blended(fallback: TerrainMap, predicted: TerrainMap, share: float, spread_factor: float = 1.0) -> TerrainMap:
     """The fallback's map with a share of its difference to a predicted one.
 
     Stiffness, damping and friction are interpolated in their logarithms. Cells count as observed where the predicted
