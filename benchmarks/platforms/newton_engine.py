@@ -249,7 +249,5 @@ def _add_hills(builder: newton.ModelBuilder, ground: Ground, config: newton.Mode
     heights = ground.heights[::_HILL_STRIDE, ::_HILL_STRIDE]
     low, high = float(heights.min()), float(heights.max())
     rows, columns = heights.shape
-    field = newton.Heightfield(
-        data=heights, nrow=rows, ncol=columns, hx=HALF_SIZE, hy=HALF_SIZE, min_z=low, max_z=high
-    )
+    field = newton.Heightfield(data=heights, nrow=rows, ncol=columns, hx=HALF_SIZE, hy=HALF_SIZE, min_z=low, max_z=high)
     builder.add_shape_heightfield(heightfield=field, cfg=config)
