@@ -153,6 +153,22 @@ def test_beside_a_further_effect_the_values_of_the_first_one_are_fitted_once_mor
     assert set(found.best.names) == {"friction_scale", "drive_compliance"}
 
 
+@pytest.mark.parametrize("late", [0.0, 0.4])
+def test_a_lag_that_is_added_to_that_of_the_healthy_drives_is_no_dead_time(late):
+    """One lag in series with another one is later than a single one, but not as late as a dead time."""
+    own, added = 0.12, 0.6 if late else 0.32
+    file = replace(load_robot("husky"), effects=(("actuator_lag", {"time_constant": own}),))
+    hidden = {"time_constant": added, "second_time_constant": own}
+    robot = replace(file, effects=(("actuator_lag", hidden), ("command_delay", {"delay": late})))
+    candidates = [effect.name for effect in identifiable_effects(file)]
+    healthy = NominalModel(SCALE, dict.fromkeys(candidates, 0.1), segments=5, loss=0.4, loss_spread=0.2)
+    found = Search(file, driven(robot), SCALE, nominal=healthy).run(3, exchange=False).best
+    assert "actuator_lag" in found.names
+    assert len(found.names) == (2 if late else 1)
+    if not late:
+        assert sorted(dict(found.effects)["actuator_lag"].values()) == pytest.approx([own, added], abs=0.03)
+
+
 @pytest.mark.parametrize(("worse", "name"), [(0.05, "sensor_lever_arm"), (0.2, "payload")])
 def test_fewer_parameters_are_preferred_only_within_the_error_of_a_formula(worse, name):
     """Few blocks make large differences insignificant: what predicts much worse is not preferred for that."""

@@ -109,7 +109,7 @@ def test_both_backends_agree_on_effects_and_their_gradients(husky, name):
 ALL_STAGES = {
     **STRONG,
     "command_delay": {"delay": 0.123},
-    "actuator_lag": {"time_constant": 0.21},
+    "actuator_lag": {"time_constant": 0.21, "second_time_constant": 0.08},
     "actuator_saturation": {"limit": 0.63},
     "actuator_deadband": {"width": 0.04},
     "drive_gain": {"gain": 0.93},

@@ -127,8 +127,9 @@ def test_unequal_sides_and_a_gain_do_the_same_in_mujoco(husky, tmp_path):
         assert there[name] == pytest.approx(float(here[0 if "left" in name else 1]), rel=0.02)
 
 
-def test_delay_and_lag_do_the_same_in_mujoco(husky, tmp_path):
-    effects = (estimate("command_delay", delay=0.3), estimate("actuator_lag", time_constant=0.25))
+@pytest.mark.parametrize("lags", [{"time_constant": 0.25}, {"time_constant": 0.08, "second_time_constant": 0.3}])
+def test_delay_and_lag_do_the_same_in_mujoco(lags, husky, tmp_path):
+    effects = (estimate("command_delay", delay=0.3), estimate("actuator_lag", **lags))
     model, _ = model_with(tmp_path, husky, *effects)
     # Wheels off the ground, as the drives of the rollout know no inertia.
     model.opt.gravity[:] = 0.0

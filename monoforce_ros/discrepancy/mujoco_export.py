@@ -144,7 +144,10 @@ def _drive_classes(robot: RobotModel, effects: Mapping[str, EffectEstimate]) -> 
     difference = _value(effects, "drive_asymmetry", "difference")
     gain = _value(effects, "drive_gain", "gain")
     limit = _value(effects, "actuator_saturation", "limit") / radius
-    delay, lag = _value(effects, "command_delay", "delay"), _value(effects, "actuator_lag", "time_constant")
+    delay = _value(effects, "command_delay", "delay")
+    second, lag = sorted(_value(effects, "actuator_lag", key) for key in ("second_time_constant", "time_constant"))
+    # MuJoCo's drives have one lag: half of a smaller one is lag, half dead time (Skogestad 2003, "half rule").
+    delay, lag = delay + 0.5 * second, lag + 0.5 * second
     shared = f'biastype="affine" biasprm="0 0 {-SERVO_GAIN:g}"'
     if math.isfinite(limit):
         shared += f' ctrllimited="true" ctrlrange="{-limit:.6g} {limit:.6g}"'

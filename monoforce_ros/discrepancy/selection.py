@@ -132,18 +132,33 @@ class Search(Judging):
         return Outcome(nominal, start, FitTest(1.0, ""))
 
     def _extended(self, best: Trial, most_effects: int) -> tuple[Trial, list[CandidateScore]]:
-        """Add effects one at a time while a further one is significant and no error of a formula."""
+        """Add effects one at a time while a further one is significant and no error of a formula.
+
+        An effect's own further parameters come first: another effect must predict better than these do.
+        """
         tried: list[CandidateScore] = []
-        for step in range(1, most_effects):
-            judged, listed = self._round(best, step + 1, self.thresholds.further_rate)
+        for number in range(2, most_effects + 1):
+            further, listed = self._further(best, number)
             tried += listed
-            if not judged:
+            if further is None:
                 break
-            further = self._pruned(self._preferred(judged))
-            if self._makes_up(best, further):
-                break
+            refined = self.refined(best)
+            if refined is not best and self._gain(refined, further)[1] <= 0.0:
+                best = refined
+                further, listed = self._further(best, number)
+                tried += listed
+                if further is None:
+                    break
             best = further
         return best, tried
+
+    def _further(self, best: Trial, number: int) -> tuple[Trial | None, list[CandidateScore]]:
+        """The trial with a further effect in a round, None if there is no such effect, and the scores of all."""
+        judged, listed = self._round(best, number, self.thresholds.further_rate)
+        if not judged:
+            return None, listed
+        further = self._pruned(self._preferred(judged))
+        return None if self._makes_up(best, further) else further, listed
 
     def _makes_up(self, best: Trial, further: Trial) -> bool:
         """Whether a further effect makes up for formulas that are not exact.

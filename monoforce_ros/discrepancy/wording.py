@@ -133,7 +133,8 @@ def _flippers(values: _Values) -> str:
 _FINDINGS: dict[str, Callable[[_Values], str]] = {
     "command_delay": lambda v: f"The drives react {v['delay']:.2f} s late to every command.",
     "actuator_lag": lambda v: (
-        f"The drives are sluggish: {v['time_constant']:.2f} s after a change of the command a third is still missing."
+        f"The drives are sluggish: {v['time_constant'] + v.get('second_time_constant', 0.0):.2f} s after a change of"
+        " the command a third is still missing."
     ),
     "actuator_saturation": lambda v: f"The drives run no faster than {v['limit']:.2f} m/s, whatever is commanded.",
     "actuator_deadband": lambda v: (

@@ -25,16 +25,20 @@ def _lagging(speeds: np.ndarray, value: np.ndarray | float, step: float) -> np.n
 
 
 class ActuatorLag(Effect):
-    """First-order lag of the drives."""
+    """First-order lag of the drives, or two in series: a lag that is added to that of the healthy drives."""
 
     name = "actuator_lag"
     stage = "command"
     summary = "The drives approach the commanded speed exponentially."
-    formula = "du/dt = (u_cmd - u) / τ"
-    source = "first-order servo response"
-    parameters = (Parameter("time_constant", "s", 0.0, 0.0, 3.0, 0.2, "time to reach 63 % of a step"),)
+    formula = "du/dt = (u_1 - u) / τ, du_1/dt = (u_cmd - u_1) / τ_2"
+    source = "first-order servo response; two in series where a filter or a slow controller precedes the servo"
+    parameters = (
+        Parameter("time_constant", "s", 0.0, 0.0, 3.0, 0.2, "time to reach 63 % of a step"),
+        Parameter("second_time_constant", "s", 0.0, 0.0, 3.0, 0.2, "that of a second lag in series with the first"),
+    )
     order = 40
     identified = ("time_constant",)
+    refined = ("second_time_constant",)
     manoeuvre = "steps of the speed from standing"
     commissioning_start: ClassVar = {"time_constant": 0.03}
     wheel_response = WheelResponse(
@@ -48,4 +52,6 @@ class ActuatorLag(Effect):
 
     def drive_speeds(self, speeds: Tensor, values: Values, time_step: float, offsets: Tensor) -> Tensor:
         """Drive speeds with this effect applied; see :class:`Effect`."""
-        return lagged(speeds, values["time_constant"], time_step)
+        slower, second = lagged(speeds, values["time_constant"], time_step), values["second_time_constant"]
+        # Most robots have none, and there its gradient is zero.
+        return lagged(slower, second, time_step) if bool(second.any()) else slower
