@@ -34,7 +34,8 @@ class Thresholds:
             a commissioning drive.
         model_error: error of an effect's formula as a share of what the effect changes, root mean square in any one
             direction: no formula holds exactly on another engine or robot. What the true effects leave, beside what
-            they change, is 0.30 (root mean square; median 0.08) on the 75 singles and pairs of these platforms
+            they change, is 0.30 (root mean square; median 0.08) on the 75 singles and pairs of the 30 MuJoCo platforms
+            for choosing, and 0.29 (median 0.14) on 23 of ten Newton platforms, with which it was not chosen
             (``benchmarks/platforms/true_effects.py``).
         formula_error: standard deviation of an effect's value because its formula is not exact, as a share of the
             value's distance from no effect. With 0, 0.05, 0.1, 0.15, 0.2 and 0.3 of it 37, 88, 95, 95, 95 and 95 % of
