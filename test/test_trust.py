@@ -213,7 +213,11 @@ def test_the_fallback_replaces_the_maps_of_a_harmful_encoder(robot):
         maps.append(trusted.terrain(Observation(int(1e9 * x), cloud=cloud), at(x)))
     assert trusted.report is not None and not trusted.report.trusted
     assert all(entry.spreads == ("geometric_spread", "decrease_spread") for entry in maps)
+    # What is not trusted says little of level ground, which the wheels found to be right.
+    assert trusted.report.fallback_error < 0.01
     flat = FlatTerrain(robot, config.grid, material).terrain(Observation(0), at(0.0))
+    implied = blended(flat, trusted.predicted, 0.0)
+    assert float(maps[-1].height_spread.median()) < 0.5 * float(implied.height_spread.median())
     assert torch.equal(maps[-1].height, flat.height) and torch.equal(maps[0].height, flat.height)
     # Right again: the encoder is used again.
     with torch.no_grad():

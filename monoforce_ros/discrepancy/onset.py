@@ -12,8 +12,9 @@ from monoforce_ros.discrepancy.hypothesis import Predictions
 from monoforce_ros.discrepancy.selection import Search
 from monoforce_ros.discrepancy.trial import BLOCK, Trial, paired
 
-_FEWEST_BLOCKS = 3
-"""Blocks before and after an onset: fewer do not show that anything changed."""
+_FEWEST_BLOCKS = 2
+"""Blocks before and after an onset: four half blocks on each side count as independent, and differences that all have
+one sign do so by chance in one of sixteen cases with four of them."""
 
 
 @dataclass(frozen=True)

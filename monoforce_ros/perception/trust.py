@@ -63,6 +63,8 @@ class TrustReport:
     """Mean error of prediction and of level ground [m], by the distance from which a place was predicted."""
     spread_factor: float = 1.0
     """How much larger errors of predicted heights were than the predicted spreads; at least 1."""
+    fallback_error: float = float("nan")
+    """Mean error of the fallback's heights at the same places [m]."""
     remedy: str = "adapt the encoder to this robot (train --adapt BAG)"
     """What to do if the encoder is not trusted."""
 
@@ -140,9 +142,9 @@ class TerrainTrust:
         self._said: deque[_Said] = deque(maxlen=round((LENGTH + _FARTHEST) / BLOCK))
         self._blocks: deque[tuple[float, float]] = deque(maxlen=round(LENGTH / BLOCK))
         """Mean error of the prediction and of level ground in each block."""
-        self._moments: deque[tuple[float, float, float]] = deque(maxlen=round(LENGTH / BLOCK))
-        """Means of d g, d² and g² in each block."""
-        self._pending_moments: list[tuple[float, float, float]] = []
+        self._moments: deque[tuple[float, float, float, float]] = deque(maxlen=round(LENGTH / BLOCK))
+        """Means of d g, d², g² and |g| in each block."""
+        self._pending_moments: list[tuple[float, float, float, float]] = []
         self._ratios: deque[float] = deque(maxlen=round(LENGTH / BLOCK))
         """Mean error of the prediction in units of its spread, in each block."""
         self._pending_ratios: list[float] = []
@@ -187,13 +189,8 @@ class TerrainTrust:
                 self._blocks.append(
                     (float(np.mean([e[0] for e in self._pending])), float(np.mean([e[1] for e in self._pending])))
                 )
-                self._moments.append(
-                    (
-                        float(np.mean([m[0] for m in self._pending_moments])),
-                        float(np.mean([m[1] for m in self._pending_moments])),
-                        float(np.mean([m[2] for m in self._pending_moments])),
-                    )
-                )
+                product, square, ground, off = np.mean(self._pending_moments, axis=0).tolist()
+                self._moments.append((product, square, ground, off))
                 self._compared.extend(self._pending)
                 if self._pending_ratios:
                     self._ratios.append(float(np.mean(self._pending_ratios)))
@@ -234,6 +231,7 @@ class TerrainTrust:
                     float((said_more * was_more).mean()),
                     float((said_more**2).mean()),
                     float((was_more**2).mean()),
+                    float(np.abs(was_more).mean()),
                 )
             )
 
@@ -254,7 +252,7 @@ class TerrainTrust:
         expected, count = self._expected, len(self._moments)
         if count < _FEWEST_BLOCKS:
             return expected
-        product, square, ground = np.array(self._moments).T.sum(axis=1)
+        product, square, ground, _ = np.array(self._moments).T.sum(axis=1)
 
         def noise(share: float) -> float:
             return max(ground - 2.0 * share * product + share**2 * square, _SMALLEST_SQUARE) / count
@@ -289,6 +287,7 @@ class TerrainTrust:
             worst_camera=worst,
             by_distance=by_distance,
             spread_factor=self._spread_factor(),
+            fallback_error=float(np.mean([m[3] for m in self._moments])) if self._moments else float("nan"),
         )
 
 
@@ -340,7 +339,8 @@ class TrustedTerrain:
         # Adaptation needs images.
         without = replace(report, remedy="use terrain_source lidar_interpolation")
         self.report = report if "camera" in self.sensors else without
-        return blended(other, predicted, report.share, report.spread_factor)
+        used = blended(other, predicted, report.share, report.spread_factor)
+        return used if report.trusted or other.spreads else _with_measured_error(used, report)
 
     def _fallback(self, observation: Observation, motion: MotionState) -> TerrainMap:
         """Map of the first fallback whose sensors have measured enough; the last one's error if there is none."""
@@ -388,6 +388,24 @@ def blended(fallback: TerrainMap, predicted: TerrainMap, share: float, spread_fa
         own = spread_factor * own
         changed[name] = _spread_about(own, (1.0 - share) * difference) if other is None else other.lerp(own, share)
     return replace(fallback, **changed)
+
+
+def _with_measured_error(terrain: TerrainMap, report: TrustReport) -> TerrainMap:
+    """The fallback's map beside a prediction that is not trusted, which then says as little of the fallback's errors.
+
+    Spreads are those that the prediction implies, weighing as much as three blocks, and the error of the supporting
+    ground that the wheels measured.
+    """
+    blocks = report.travelled / BLOCK
+    if not blocks or terrain.geometric_spread is None:
+        return terrain
+    weight = blocks / (blocks + _FEWEST_BLOCKS)
+    own, decrease = terrain.geometric_spread, terrain.decrease_spread
+    return replace(
+        terrain,
+        geometric_spread=own.lerp(torch.full_like(own, report.fallback_error), weight),
+        decrease_spread=None if decrease is None else (1.0 - weight) * decrease,
+    )
 
 
 def _spread_about(spread: torch.Tensor, apart: torch.Tensor) -> torch.Tensor:
