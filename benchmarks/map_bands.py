@@ -84,6 +84,7 @@ def coverage(recording: Recording, robot: RobotModel, seed: int, name: str, bag:
         predicted, actual = source.predicted, truth.terrain(observation, motion)
         assert predicted is not None
         assert predicted.geometric_spread is not None
+        assert published.geometric_spread is not None
         known = published.observed
         ground = float(actual.height[actual.height.shape[0] // 2, actual.height.shape[1] // 2])
 
@@ -91,9 +92,8 @@ def coverage(recording: Recording, robot: RobotModel, seed: int, name: str, bag:
             return (terrain.geometric_height - ground).clamp(LOWEST, HIGHEST)
 
         error = (above(published) - above(actual)).abs()[known]
-        told = torch.zeros_like(published.height) if published.geometric_spread is None else published.geometric_spread
         columns["error"].append(error.numpy())
-        columns["band"].append(BAND * told[known].numpy())
+        columns["band"].append(BAND * published.geometric_spread[known].numpy())
         columns["own"].append(BAND * predicted.geometric_spread[known].numpy())
         columns["start"].append(np.full(len(error), np.linalg.norm((motion.position - start)[:2]) < 1.0))
     joined = {key: np.concatenate(parts) for key, parts in columns.items()}

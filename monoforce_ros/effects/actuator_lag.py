@@ -52,6 +52,4 @@ class ActuatorLag(Effect):
 
     def drive_speeds(self, speeds: Tensor, values: Values, time_step: float, offsets: Tensor) -> Tensor:
         """Drive speeds with this effect applied; see :class:`Effect`."""
-        slower, second = lagged(speeds, values["time_constant"], time_step), values["second_time_constant"]
-        # Most robots have none, and there its gradient is zero.
-        return lagged(slower, second, time_step) if bool(second.any()) else slower
+        return lagged(lagged(speeds, values["time_constant"], time_step), values["second_time_constant"], time_step)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -90,6 +90,29 @@ class TrustReport:
         return f"{compared}{camera}: {self.remedy}"
 
 
+class _Comparison(NamedTuple):
+    """Means over points of the ground under the wheels, of which one earlier prediction had said something."""
+
+    error: float
+    """Of the prediction [m]."""
+    level: float
+    """Error of level ground [m]."""
+    product: float
+    """d g of :class:`TerrainTrust` [m²]."""
+    square: float
+    """d² [m²]."""
+    ground: float
+    """g² [m²]."""
+    off: float
+    """|g|, the error of the fallback [m]."""
+    ratio: float
+    """Error of the prediction in units of its spread; NaN where it tells none."""
+    distance: float
+    """From which the prediction was made [m]."""
+    camera: str
+    """That looked at the place."""
+
+
 @dataclass(frozen=True)
 class _Said:
     """A prediction made earlier."""
@@ -140,17 +163,11 @@ class TerrainTrust:
 
     def _start_over(self) -> None:
         self._said: deque[_Said] = deque(maxlen=round((LENGTH + _FARTHEST) / BLOCK))
-        self._blocks: deque[tuple[float, float]] = deque(maxlen=round(LENGTH / BLOCK))
-        """Mean error of the prediction and of level ground in each block."""
-        self._moments: deque[tuple[float, float, float, float]] = deque(maxlen=round(LENGTH / BLOCK))
-        """Means of d g, d², g² and |g| in each block."""
-        self._pending_moments: list[tuple[float, float, float, float]] = []
-        self._ratios: deque[float] = deque(maxlen=round(LENGTH / BLOCK))
-        """Mean error of the prediction in units of its spread, in each block."""
-        self._pending_ratios: list[float] = []
-        self._pending: list[tuple[float, float, float, str]] = []
-        """Error, error of level ground, distance and camera of each comparison of the current block."""
-        self._compared: deque[tuple[float, float, float, str]] = deque(maxlen=2000)
+        self._blocks: deque[_Comparison] = deque(maxlen=round(LENGTH / BLOCK))
+        """Means over the comparisons of each block."""
+        self._pending: list[_Comparison] = []
+        """Comparisons of the current block."""
+        self._compared: deque[_Comparison] = deque(maxlen=2000)
         self._travelled = 0.0
         self._previous: MotionState | None = None
         self._trusted = True
@@ -186,15 +203,9 @@ class TerrainTrust:
         if self._travelled >= BLOCK:
             self._travelled = 0.0
             if self._pending:
-                self._blocks.append(
-                    (float(np.mean([e[0] for e in self._pending])), float(np.mean([e[1] for e in self._pending])))
-                )
-                product, square, ground, off = np.mean(self._pending_moments, axis=0).tolist()
-                self._moments.append((product, square, ground, off))
+                self._blocks.append(_mean(self._pending))
                 self._compared.extend(self._pending)
-                if self._pending_ratios:
-                    self._ratios.append(float(np.mean(self._pending_ratios)))
-                self._pending, self._pending_moments, self._pending_ratios = [], [], []
+                self._pending = []
                 self._judge()
             level = float(support[:, 2].mean())
             height = predicted.height.numpy().copy()
@@ -220,25 +231,30 @@ class TerrainTrust:
             towards = float(np.arctan2(middle[1], middle[0]))
             away = {name: abs((axis - towards + np.pi) % (2 * np.pi) - np.pi) for name, axis in said.cameras.items()}
             camera = min(away, key=lambda name: away[name]) if away else ""
-            self._pending.append((error, level, float(distance[usable].mean()), camera))
+            ratio = float("nan")
             if said.spread is not None:
                 expected = np.maximum(said.spread[rows, columns][usable], TOLERANCE)
-                self._pending_ratios.append(float((np.abs(height - local[usable, 2]) / expected).mean()))
+                ratio = float((np.abs(height - local[usable, 2]) / expected).mean())
             other = said.fallback[rows, columns][usable]
             said_more, was_more = height - other, local[usable, 2] - other
-            self._pending_moments.append(
-                (
-                    float((said_more * was_more).mean()),
-                    float((said_more**2).mean()),
-                    float((was_more**2).mean()),
-                    float(np.abs(was_more).mean()),
+            self._pending.append(
+                _Comparison(
+                    error=error,
+                    level=level,
+                    product=float((said_more * was_more).mean()),
+                    square=float((said_more**2).mean()),
+                    ground=float((was_more**2).mean()),
+                    off=float(np.abs(was_more).mean()),
+                    ratio=ratio,
+                    distance=float(distance[usable].mean()),
+                    camera=camera,
                 )
             )
 
     def _judge(self) -> None:
         if len(self._blocks) < _FEWEST_BLOCKS:
             return
-        difference = np.array([own - level for own, level in self._blocks])
+        difference = np.array([block.error - block.level for block in self._blocks])
         if self._trusted:
             # Without any variation the test has no answer.
             spread = max(float(difference.std(ddof=1)), 1e-6)
@@ -249,10 +265,10 @@ class TerrainTrust:
 
     def _share(self) -> float:
         """The posterior mean of the share w, less its standard deviation where nothing is expected of it."""
-        expected, count = self._expected, len(self._moments)
+        expected, count = self._expected, len(self._blocks)
         if count < _FEWEST_BLOCKS:
             return expected
-        product, square, ground, _ = np.array(self._moments).T.sum(axis=1)
+        product, square, ground = np.array([(b.product, b.square, b.ground) for b in self._blocks]).T.sum(axis=1)
 
         def noise(share: float) -> float:
             return max(ground - 2.0 * share * product + share**2 * square, _SMALLEST_SQUARE) / count
@@ -263,32 +279,42 @@ class TerrainTrust:
         return float(np.clip(share - doubt, 0.0, 1.0))
 
     def _spread_factor(self) -> float:
-        return max(1.0, (_FEWEST_BLOCKS + sum(self._ratios)) / (_FEWEST_BLOCKS + len(self._ratios)))
+        ratios = [block.ratio for block in self._blocks if not math.isnan(block.ratio)]
+        return max(1.0, (_FEWEST_BLOCKS + sum(ratios)) / (_FEWEST_BLOCKS + len(ratios)))
 
     def _report(self, start_error: float) -> TrustReport:
-        own, level = (float(np.mean([b[i] for b in self._blocks])) if self._blocks else float("nan") for i in (0, 1))
+        last = _mean(self._blocks) if self._blocks else None
+        nothing = float("nan")
         entries = list(self._compared)
         by_distance = {}
         for low, high in pairwise(DISTANCES):
-            within = [entry for entry in entries if low <= entry[2] < high]
+            within = [entry for entry in entries if low <= entry.distance < high]
             if within:
-                means = float(np.mean([e[0] for e in within])), float(np.mean([e[1] for e in within]))
+                means = float(np.mean([e.error for e in within])), float(np.mean([e.level for e in within]))
                 by_distance[f"{low:g} to {high:g} m"] = means
-        cameras = {entry[3] for entry in entries}
-        worst = max(cameras, key=lambda name: float(np.mean([e[0] for e in entries if e[3] == name])), default="")
+        cameras = {entry.camera for entry in entries}
+        worst = max(
+            cameras, key=lambda name: float(np.mean([e.error for e in entries if e.camera == name])), default=""
+        )
         trusted = self._trusted and start_error <= START_TOLERANCE
         return TrustReport(
             trusted=trusted,
             share=self._share() if trusted else 0.0,
             travelled=BLOCK * len(self._blocks),
-            error=own,
-            level_error=level,
+            error=nothing if last is None else last.error,
+            level_error=nothing if last is None else last.level,
             start_error=start_error,
             worst_camera=worst,
             by_distance=by_distance,
             spread_factor=self._spread_factor(),
-            fallback_error=float(np.mean([m[3] for m in self._moments])) if self._moments else float("nan"),
+            fallback_error=nothing if last is None else last.off,
         )
+
+
+def _mean(comparisons: Iterable[_Comparison]) -> _Comparison:
+    """Mean of all numbers; of the camera the last one."""
+    rows = list(comparisons)
+    return _Comparison._make([*np.mean([row[:-1] for row in rows], axis=0).tolist(), rows[-1].camera])
 
 
 class TrustedTerrain:
