@@ -312,6 +312,30 @@ def test_what_does_not_improve_held_out_windows_is_not_added(husky, monkeypatch,
     assert any("drive_gain" in row.values() for row in report["candidates"])
 
 
+@pytest.mark.parametrize(("as_healthy", "verdict"), [(True, "no_discrepancy"), (False, "no_improvement")])
+def test_an_effect_that_predicts_nothing_is_no_discrepancy_where_errors_are_a_healthy_robots(
+    husky, monkeypatch, as_healthy, verdict
+):
+    def useless(*arguments, **named):
+        compared = compare(*arguments, **named)
+        return [c if c.after is None else replace(c, after=1.1 * c.before) for c in compared]
+
+    monkeypatch.setattr(diagnosis_module, "compare", useless)
+    motion, commands = simulated_recording(husky, (("drive_gain", {"gain": 0.97}),), seconds=40.0)
+    evidence = Evidence(SmoothedMotion(motion, 0.003, 0.002, (slice(0, len(motion)),)), commands)
+    settings = DiagnosisSettings(max_effects=1)
+    residual = np.array([[0.001, 0.001, 0.001]]) * np.arange(1, 5)[:, None]
+    varying = dict.fromkeys(CATALOGUE, 0.01)
+    before = diagnose(evidence, husky, settings=settings, nominal=NominalModel(residual, varying, segments=5, loss=0.5))
+    # By its size the error is either what this robot always has, or a tenth of it is.
+    loss = before.losses.before * (1.0 if as_healthy else 0.1)
+    healthy = NominalModel(residual, varying, segments=5, loss=loss, loss_spread=0.2)
+    diagnosis = diagnose(evidence, husky, settings=settings, nominal=healthy)
+    assert diagnosis.verdict == verdict, diagnosis.remarks
+    assert any("on held-out windows do not decrease beyond chance" in remark for remark in diagnosis.remarks)
+    assert diagnosis.effects == () and diagnosis.fitted == ()
+
+
 def test_what_makes_windows_worse_that_no_search_saw_is_not_added(husky, monkeypatch):
     compared = []
 

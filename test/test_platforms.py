@@ -14,7 +14,7 @@ from benchmark_case import SETS, Case, all_cases
 from benchmark_score import closed_share, covered, found_all, scores, true_value
 from case_recording import CaseFiles, displacement, hidden_job, record_platform, record_together
 from command_faults import DeadBand, Delay, DriveFactors, Lag, TwistLimits
-from diagnosis_run import Judged, commission_platform
+from diagnosis_run import Judged, commission_platform, commissioned_file
 from drawn_platform import draw_platform, write_robot_file
 from drive_commands import FollowingDriver, LeadingDriver, ManoeuvreDriver, ReplayedCommands
 from drive_session import DriveJob
@@ -237,6 +237,13 @@ def test_what_is_injected_adds_to_what_the_healthy_robot_has():
     entry = {"name": "command_delay", "parameters": {"delay": {"value": 0.27, "low": 0.25, "high": 0.3}}}
     late = report_row("single", [hidden_entry("command_delay", delay=0.2)], [entry], healthy=healthy)
     assert covered(late) == [True]
+
+
+def test_the_commissioned_file_is_found_whatever_the_robot_is_called(tmp_path):
+    assert commissioned_file(tmp_path) is None
+    (tmp_path / "seconds.txt").write_text("3.0\n")
+    (tmp_path / "husky.yaml").write_text("name: husky\n")
+    assert commissioned_file(tmp_path) == tmp_path / "husky.yaml"
 
 
 def test_scores_count_names_classes_pairs_extras_and_intervals():

@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 from benchmark_case import SETS, Case, all_cases
 from case_recording import CaseFiles
+from diagnosis_run import commissioned_file
 from tqdm import tqdm
 
 
@@ -45,8 +46,8 @@ def measured_rows(
     ]
     for case in tqdm(cases, unit="drive"):
         files = CaseFiles.of(case, options.work)
-        nominal = options.work / "results" / options.label / "nominal" / case.platform_name / "platform.yaml"
-        row = measured(case, files, nominal) if files.truth.exists() and nominal.exists() else None
+        nominal = commissioned_file(options.work / "results" / options.label / "nominal" / case.platform_name)
+        row = measured(case, files, nominal) if files.truth.exists() and nominal is not None else None
         if row is not None:
             rows.append(row)
             tqdm.write(line(row))

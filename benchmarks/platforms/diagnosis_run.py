@@ -107,8 +107,8 @@ def commission_platform(case: Case, work: Path, judged: Judged) -> None:
 def _nominal(case: Case, files: CaseFiles, judged: Judged) -> Path | None:
     """The commissioned robot file of a platform by this code, made once; None where commissioning failed."""
     folder = judged.results / "nominal" / case.platform_name
-    robot, failure = folder / "platform.yaml", folder / "failure.txt"
-    if not robot.exists() and not failure.exists():
+    failure = folder / "failure.txt"
+    if commissioned_file(folder) is None and not failure.exists():
         bag = files.commissioning
         arguments = ["--commission", str(_bag(bag, judged)), "--robot", str(files.robot), *_terrain(case, files, bag)]
         # A failure costs all drives of the platform, and the bag is up to twice as long.
@@ -118,7 +118,12 @@ def _nominal(case: Case, files: CaseFiles, judged: Judged) -> Path | None:
             write_text(folder / "seconds.txt", f"{seconds:.1f}\n")
         else:
             write_text(failure, message)
-    return robot if robot.exists() else None
+    return commissioned_file(folder)
+
+
+def commissioned_file(folder: Path) -> Path | None:
+    """The robot file that ``diagnose --commission`` wrote, which bears the robot's name; None without one."""
+    return next(iter(sorted(folder.glob("*.yaml"))), None)
 
 
 def _terrain(case: Case, files: CaseFiles, bag: Path) -> list[str]:
@@ -145,8 +150,8 @@ def add_baselines(case: Case, work: Path, judged: Judged) -> dict:
     """The row of a diagnosed case with the median position errors of other methods after 2 s [m]."""
     files, result = CaseFiles.of(case, work), judged.results / "cases" / f"{case.name}.json"
     row = json.loads(result.read_text())
-    if "baselines" not in row:
-        robot = judged.results / "nominal" / case.platform_name / "platform.yaml"
+    robot = commissioned_file(judged.results / "nominal" / case.platform_name)
+    if "baselines" not in row and robot is not None:
         terrain = (_terrain(case, files, files.bag) or ["--terrain", "flat"])[1]
         out = judged.results / "reports" / case.name / "baselines.json"
         out.parent.mkdir(parents=True, exist_ok=True)

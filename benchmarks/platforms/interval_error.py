@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 from benchmark_score import true_value
-from diagnosis_run import healthy_values
+from diagnosis_run import commissioned_file, healthy_values
 
 from monoforce_ros.core import write_text
 from monoforce_ros.discrepancy.estimates import effect_sizes
@@ -58,8 +58,8 @@ def main() -> int:
 def _row(file: Path, folder: Path) -> dict:
     """A row, with the values of the healthy robot also where an earlier version of run.py wrote it."""
     row = json.loads(file.read_text())
-    nominal = folder / "nominal" / "-".join(row["case"].split("-")[:3]) / "platform.yaml"
-    if "healthy" not in row and nominal.exists():
+    nominal = commissioned_file(folder / "nominal" / "-".join(row["case"].split("-")[:3]))
+    if "healthy" not in row and nominal is not None:
         row["healthy"] = healthy_values(nominal)
     return row
 

@@ -183,7 +183,7 @@ def diagnose(
     judged = held_out(decision)
     compared = compared_with(judged)
     if judged is not None and not improves(gap_table(compared, settings.seed)):
-        decision = decision.without_improvement()
+        decision = decision.without_improvement(dispensable=explanation.dispensable)
         judged = held_out(decision)
         # Without the rejected effects; the same windows, where nothing is left.
         compared = _without_effects(compared) if judged is None else compared_with(judged)
@@ -197,7 +197,7 @@ def diagnose(
     gap = gap_table(compared, settings.seed, by_gyro)
     if judged is not None and gets_worse(gap):
         # Searches that never saw the judged windows contradict what was found.
-        decision, judged = decision.without_improvement("increase"), None
+        decision, judged = decision.without_improvement("increase", dispensable=explanation.dispensable), None
         compared = _without_effects(compared)
         gap = gap_table(compared, settings.seed, by_gyro)
     known_parts: tuple[EffectEstimate, ...] = ()

@@ -104,6 +104,18 @@ class Explanation:
     part: Part | None = None
     """The part in which the effects act; None if that is the whole recording."""
 
+    @property
+    def dispensable(self) -> bool:
+        """Whether without the effects a recording would look like the healthy robot's: no sensor measured them, they
+        act in all of it, and it has no errors larger than that robot's."""
+        search = self.search
+        return (
+            self.part is None
+            and not search.known
+            and search.commissioned
+            and not search.too_large(self.findings.nominal)
+        )
+
     def by_sensors(self, thresholds: Thresholds) -> Explanation:
         """What gyro, wheel speeds and joints measured, without the effects that the motion showed in addition."""
         return _measured(self.windows, self.sensors, self.search, thresholds)

@@ -234,10 +234,8 @@ class Search(Judging):
     ) -> tuple[list[Trial], list[CandidateScore]]:
         """Trials with one more effect that is significant, smallest held-out loss first, and the scores of all."""
         base = self.refit(best.effects).effects if best.effects else ()
-        # Two tests of the nominal model: the size of its residuals, and their directions. Beside effects that were
-        # found the size only shows that these are not exact.
-        size = self._size(best) if number == 1 else None
-        incomplete = missing or (size is not None and 2.0 * size.p <= self.thresholds.fit_rate)
+        # Beside effects that were found the size only shows that these are not exact.
+        incomplete = missing or (number == 1 and self.too_large(best))
         found = self.screening.candidates(base, self.fixed_count(base), f"{number}: ", incomplete=incomplete)
         screened = self._beside(base, found, rate)
         entries = admitted(screened, found.before, rate, incomplete=incomplete)

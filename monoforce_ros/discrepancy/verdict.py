@@ -76,15 +76,20 @@ class Decision:
     parts: Trial | None = None
     """Known effects that explain a part of an ``unknown_effect``."""
 
-    def without_improvement(self, errors: str = "do not decrease") -> Decision:
+    def without_improvement(self, errors: str = "do not decrease", *, dispensable: bool = False) -> Decision:
         """The decision after held-out windows did not improve: an effect is not added, nor is a formula.
 
         Args:
             errors: what the errors do, beyond chance.
+            dispensable: whether the recording looks like the healthy robot's without the effects, too. Then all that
+                speaks for these is a test that healthy robots fail at its stated rate.
         """
         if self.verdict == Verdict.EFFECT_FOUND:
             remarks = (*self.remarks, f"errors on held-out windows {errors} beyond chance")
-            return replace(self, verdict=Verdict.NO_IMPROVEMENT, trial=None, remarks=remarks)
+            if dispensable:
+                remarks += ("without them the errors are no larger than a healthy robot's",)
+            verdict = Verdict.NO_DISCREPANCY if dispensable else Verdict.NO_IMPROVEMENT
+            return replace(self, verdict=verdict, trial=None, remarks=remarks)
         if self.verdict == Verdict.UNKNOWN_EFFECT and self.trial is not None:
             remarks = (*self.remarks, f"the formula is not added: held-out errors {errors} beyond chance")
             return replace(self, trial=None, remarks=remarks)
