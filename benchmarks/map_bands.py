@@ -22,9 +22,9 @@ import torch
 from terrain import CHOOSING, record_world, true_support
 from tqdm import tqdm
 
-from monoforce_ros.bags import Recording
+from monoforce_ros.bags import Recording, observe
 from monoforce_ros.core import StaleDataError, write_text
-from monoforce_ros.evaluation import corrected_recording, observe
+from monoforce_ros.evaluation import corrected_recording
 from monoforce_ros.perception import TrustedTerrain, choose_terrain_source
 from monoforce_ros.robots import RobotModel, load_robot
 from monoforce_ros.synthetic import WorldSettings

@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from monoforce_ros.bags import Recording
+from monoforce_ros.bags import Recording, observe
 from monoforce_ros.core import StaleDataError, write_text
-from monoforce_ros.evaluation import corrected_recording, observe
+from monoforce_ros.evaluation import corrected_recording
 from monoforce_ros.perception import SOURCES, choose_terrain_source
 from monoforce_ros.prediction import COVERAGE, EnsembleSettings, Prediction, Predictor, spread
 from monoforce_ros.reporting import progress

@@ -11,13 +11,14 @@ from matplotlib.collections import PathCollection
 from scipy.integrate import trapezoid
 from scipy.spatial.transform import Rotation
 
-from monoforce_ros.bags import BagWriter, Recording, builders
+from monoforce_ros.bags import BagWriter, Recording, builders, observe
+from monoforce_ros.bags.recorded_observation import MAXIMUM_SPREAD
 from monoforce_ros.core import MotionState
-from monoforce_ros.evaluation import evaluate_recording, observe
+from monoforce_ros.evaluation import evaluate_recording
 from monoforce_ros.evaluation.cli import main
 from monoforce_ros.evaluation.figures import prediction_figure
 from monoforce_ros.evaluation.metrics import Poses, bootstrap_interval, position_errors, rotation_errors, summarise
-from monoforce_ros.evaluation.recording_evaluation import MAXIMUM_SPREAD, constant_velocity
+from monoforce_ros.evaluation.recording_evaluation import constant_velocity
 from monoforce_ros.evaluation.report import summary_table
 from monoforce_ros.evaluation.view import LARGEST_DRAWN_FORCE, PredictionView
 from monoforce_ros.perception import choose_terrain_source

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from monoforce_ros.bags import Recording
+from monoforce_ros.bags import Recording, observe
 from monoforce_ros.core import MotionState
 from monoforce_ros.encoder import EncoderConfig, load_encoder, new_encoder, save_encoder
-from monoforce_ros.evaluation import evaluate_recording, observe
+from monoforce_ros.evaluation import evaluate_recording
 from monoforce_ros.evaluation.tables import PHYSICS
 from monoforce_ros.perception import (
     EncoderTerrain,

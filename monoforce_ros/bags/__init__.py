@@ -4,6 +4,7 @@ from monoforce_ros.bags import builders
 from monoforce_ros.bags.joint_record import JointRecord
 from monoforce_ros.bags.read_options import DETECTED, ReadOptions, add_read_options, read_options
 from monoforce_ros.bags.reader import BagError, BagMessage, BagReader
+from monoforce_ros.bags.recorded_observation import flippers_at, observe
 from monoforce_ros.bags.recording import (
     CAMERA_INFO,
     CLOUD,
@@ -45,7 +46,9 @@ __all__ = [
     "camera_info_topics",
     "cut_windows",
     "find_transform",
+    "flippers_at",
     "nearest_frame",
+    "observe",
     "read_options",
     "smooth",
     "type_store",

@@ -15,6 +15,7 @@ from monoforce_ros.discrepancy.command_changes import uncovered_doubt
 from monoforce_ros.discrepancy.comparison import GapRow, HeldOut, compare, gap_table
 from monoforce_ros.discrepancy.credibility import complaint
 from monoforce_ros.discrepancy.diagnosis import Diagnosis, DiagnosisSettings, diagnose
+from monoforce_ros.discrepancy.encoder_ground import EncoderGround, encoder_maps
 from monoforce_ros.discrepancy.evidence import COMPONENTS, MOTION, Evidence, window_starts
 from monoforce_ros.discrepancy.gap import noisy_motions
 from monoforce_ros.discrepancy.ground import Ground, beyond_commissioning, choose_ground
@@ -72,7 +73,8 @@ def read_evidence(
         bag: the recording.
         robot: its own body is removed from the lidar's sweeps.
         terrain: ``auto`` (see :func:`choose_ground`), ``flat``, ``lidar`` (all sweeps of the recording as one map),
-            ``traced`` (by the wheels along the poses) or a file of ``fit_terrain``.
+            ``traced`` (by the wheels along the poses), ``camera`` or ``lidar_camera`` (by the terrain encoder along the
+            drive; ``camera:FILE`` with other weights) or a file of ``fit_terrain``.
         reading: topics and frames that replace those that the bag says.
 
     Raises:
@@ -95,7 +97,8 @@ def read_with_ground(
     ground = choose_ground(terrain, recording, smoothed, robot)
     if ground.source == "flat":
         return replace(evidence, components=MOTION if ground.unknown else COMPONENTS), recording, ground
-    if ground.source not in ("lidar", "traced"):
+    encoder = EncoderGround.named(ground.source)
+    if ground.source not in ("lidar", "traced") and encoder is None:
         terrain_map, pose = load_terrain(Path(ground.source))
         evidence = replace(evidence, terrain=terrain_map, odometry_from_terrain=pose, components=COMPONENTS)
         return evidence, recording, ground
@@ -109,7 +112,11 @@ def read_with_ground(
     if ground.source == "traced":
         terrain_map = traced_terrain(motion, robot, grid)
         return replace(evidence, terrain=terrain_map, odometry_from_terrain=np.eye(4)), recording, ground
-    maps, parts = split_maps(recording, motion, robot, grid)
+    if encoder is None:
+        maps, parts = split_maps(recording, motion, robot, grid)
+    else:
+        maps, parts, count = encoder_maps(recording, motion, robot, grid, encoder)
+        ground = replace(ground, description=f"{ground.description}: {count} predictions along the drive")
     whole, even, odd = (supporting_terrain(part, motion, robot) for part in (maps, *parts))
     evidence = replace(evidence, terrain=whole, odometry_from_terrain=np.eye(4), split_maps=(even, odd))
     evidence = replace(evidence, components=COMPONENTS)

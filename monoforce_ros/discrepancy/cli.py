@@ -22,13 +22,14 @@ from monoforce_ros.discrepancy.nominal_residual import residual_complaint
 from monoforce_ros.discrepancy.report import effect_entry, summary_lines
 from monoforce_ros.discrepancy.verdict import Verdict
 from monoforce_ros.effects import EffectError
+from monoforce_ros.encoder import CheckpointError
 from monoforce_ros.reporting import progress_bar
 from monoforce_ros.robots import RobotFileError, fingerprint, load_robot, shipped_robots, write_robot
 from monoforce_ros.terrain import TerrainError, TerrainFileError
 
 NOT_IDENTIFIABLE_STATUS = 3
 """Exit status where a recording cannot be diagnosed; 1 is an error, 2 a wrong option."""
-_ERRORS = (BagError, EffectError, RobotFileError, TerrainFileError, TerrainError, ValueError, OSError)
+_ERRORS = (BagError, CheckpointError, EffectError, RobotFileError, TerrainFileError, TerrainError, ValueError, OSError)
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -45,10 +46,11 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--terrain",
         default="auto",
-        metavar="auto|flat|lidar|traced|FILE",
-        help="ground of the recording: level (flat), mapped from the lidar, traced by the wheels along the poses, a "
-        "file of fit_terrain, or what the bag holds (auto): clouds, else poses where they show slopes, else level "
-        "(%(default)s)",
+        metavar="auto|flat|lidar|traced|camera|lidar_camera|FILE",
+        help="ground of the recording: level (flat), mapped from the lidar, traced by the wheels along the poses, "
+        "predicted by the terrain encoder from images (camera, lidar_camera; camera:WEIGHTS for other weights than the "
+        "shipped ones), a file of fit_terrain, or what the bag holds (auto): clouds, else poses where they show "
+        "slopes, else level (%(default)s)",
     )
     parser.add_argument("--out", type=Path, required=True, help="folder for the reports")
     parser.add_argument(

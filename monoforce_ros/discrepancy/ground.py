@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from monoforce_ros.bags import BagError, Recording, SmoothedMotion
 from monoforce_ros.core import NANOSECOND
 from monoforce_ros.discrepancy.attitude import Lean, vertical
+from monoforce_ros.discrepancy.encoder_ground import EncoderGround
 from monoforce_ros.discrepancy.separate_stretches import starts_anew
 from monoforce_ros.robots import RobotModel
 
@@ -32,7 +33,7 @@ class Ground:
     """The terrain that a recording is compared on."""
 
     source: str
-    """``flat``, ``lidar``, ``traced`` or a file."""
+    """``flat``, ``lidar``, ``traced``, ``camera``, ``lidar_camera`` or a file."""
     description: str
     """For reports: what was taken and why."""
     slope: float
@@ -57,7 +58,8 @@ def choose_ground(terrain: str, recording: Recording, smoothed: SmoothedMotion, 
     """The terrain of a recording: as asked for, or for ``auto`` from what the bag holds.
 
     Args:
-        terrain: ``auto``, ``flat``, ``lidar``, ``traced`` or a file of ``fit_terrain``.
+        terrain: ``auto``, ``flat``, ``lidar``, ``traced``, a source of :class:`EncoderGround` or a file of
+            ``fit_terrain``.
         recording: its clouds serve as map where there are any and their sensor's pose is known.
         smoothed: the measured motion, whose roll, pitch and heights show whether ground is level.
         robot: its file may know the pose of the lidar.
@@ -68,6 +70,9 @@ def choose_ground(terrain: str, recording: Recording, smoothed: SmoothedMotion, 
         return Ground(terrain, f"lidar map of {len(recording.clouds)} sweeps", slope)
     if terrain == "traced":
         return _traced("along the measured poses", smoothed, slope, "as asked for", uneven)
+    encoder = EncoderGround.named(terrain)
+    if encoder is not None:
+        return Ground(terrain, f"map of the terrain encoder ({encoder.kind})", slope)
     if terrain not in ("auto", "flat"):
         return Ground(terrain, f"map {Path(terrain).name}", slope)
     reason = "no clouds in the bag"

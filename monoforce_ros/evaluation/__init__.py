@@ -5,7 +5,6 @@ from monoforce_ros.evaluation.recording_evaluation import (
     RecordingEvaluation,
     corrected_recording,
     evaluate_recording,
-    observe,
     predict_at,
 )
 
@@ -14,6 +13,5 @@ __all__ = [
     "RecordingEvaluation",
     "corrected_recording",
     "evaluate_recording",
-    "observe",
     "predict_at",
 ]

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from monoforce_ros.bags import Recording, nearest_frame
+from monoforce_ros.bags import Recording, flippers_at, observe
 from monoforce_ros.core import MotionState, StaleDataError, transform_points
 from monoforce_ros.effects import corrected_commands, corrected_motion
 from monoforce_ros.evaluation.metrics import Poses, Summary, position_errors, rotation_errors, summarise
@@ -27,8 +27,6 @@ CONFIRMED_PHYSICS = "physics, confirmed terrain"
 """The prediction on an encoder's terrain as far as the ground has confirmed it, as ``predictor`` publishes it."""
 BATCH = 16
 """Number of windows that are rolled out together."""
-MAXIMUM_SPREAD = 0.1
-"""Largest time between the sensor data of one observation [s]."""
 MAXIMUM_GAP = 0.3
 """Largest time between a compared pose and the nearest odometry [s]."""
 
@@ -126,7 +124,7 @@ def evaluate_recording(
         compared = {method: batch_maps for method, batch_maps in maps.items() if batch_maps}
         if sensors and baselines:
             compared[FLAT_PHYSICS] = [
-                flat.terrain(Observation(0, flipper_angles=_flippers_at(recording, m.stamp)), m) for m in batch
+                flat.terrain(Observation(0, flipper_angles=flippers_at(recording, m.stamp)), m) for m in batch
             ]
         for method, batch_maps in compared.items():
             result = predictor.roll_out(TerrainMap.stack(batch_maps), batch, twists, joints=joints)
@@ -221,46 +219,6 @@ def corrected_recording(recording: Recording, robot: RobotModel) -> Recording:
         motion=corrected_motion(recording.motion, robot.effects),
         commands=corrected_commands(recording.commands, robot.effects),
     )
-
-
-def observe(
-    recording: Recording, robot: RobotModel, stamp: int, sensors: Sequence[str], image_topics: Sequence[str] = ()
-) -> Observation:
-    """The data of ``sensors`` (``lidar``, ``camera``) nearest to a stamp [ns], moved to the robot's pose at that stamp.
-
-    Images more than :data:`MAXIMUM_SPREAD` away from the stamp are left out; so are clouds used together with images.
-    """
-    cloud, images, cameras, poses = None, {}, {}, {}
-    if "lidar" in sensors:
-        frame = nearest_frame(recording.clouds, stamp, limit=MAXIMUM_SPREAD if "camera" in sensors else np.inf)
-        if frame is not None:
-            points, frame_id = recording.cloud(frame)
-            pose = recording.sensor_pose(frame_id, robot.base_frame, robot.sensors)
-            cloud = transform_points(_base_motion(recording, frame.stamp, stamp) @ pose, points).astype(np.float32)
-    for topic in image_topics if "camera" in sensors else ():
-        frame = nearest_frame(recording.images[topic], stamp, limit=MAXIMUM_SPREAD)
-        if frame is None:
-            continue
-        if topic not in recording.cameras:
-            raise EvaluationError(f"{recording.path}: no CameraInfo for the images on {topic}")
-        images[topic] = recording.image(frame)
-        cameras[topic] = recording.cameras[topic]
-        pose = recording.sensor_pose(cameras[topic].frame_id, robot.base_frame, robot.sensors)
-        poses[topic] = _base_motion(recording, frame.stamp, stamp) @ pose
-    return Observation(stamp, cloud, images, cameras, poses, _flippers_at(recording, stamp), recording.motion)
-
-
-def _flippers_at(recording: Recording, stamp: int) -> np.ndarray | None:
-    """Measured angles of the flippers ``[F]`` [rad] at a stamp [ns]; None where none were measured."""
-    if recording.joints is None or not recording.joints.flippers:
-        return None
-    measured = recording.joints.start(np.array([stamp]))
-    return None if measured is None else measured[0, -recording.joints.flippers :]
-
-
-def _base_motion(recording: Recording, start: int, end: int) -> np.ndarray:
-    """Pose ``[4, 4]`` of the base at ``start`` [ns] relative to the base at ``end`` [ns]."""
-    return recording.motion.base_between(start, end, maximum_gap=MAXIMUM_GAP)
 
 
 def measured_poses(recording: Recording, motions: list[MotionState], times: np.ndarray) -> Poses:
