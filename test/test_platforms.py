@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import uncovered_changes
 from benchmark_case import SETS, Case, all_cases
-from benchmark_score import closed_share, covered, found_all, scores, true_value
+from benchmark_score import closed_share, covered, found_all, healthy_errors, scores, true_value
 from case_recording import CaseFiles, displacement, hidden_job, record_platform, record_together
 from command_faults import DeadBand, Delay, DriveFactors, Lag, TwistLimits
 from diagnosis_run import Judged, commission_platform, commissioned_file
@@ -284,6 +284,18 @@ def test_the_gap_counts_drives_on_which_nothing_was_added():
     assert closed_share({"position_2s": entry}) == pytest.approx(0.9)
     assert closed_share({"position_2s": entry | {"after": None}}) == 0.0
     assert closed_share({"position_2s": entry | {"before": 0.105}}) is None
+    # What the healthy robot errs by, too, is nothing that an effect could close.
+    assert closed_share({"position_2s": entry}, {"position_2s": 0.12}) == pytest.approx(0.36 / 0.38)
+    assert closed_share({"position_2s": entry}, {"position_2s": 0.01}) == pytest.approx(0.9)
+    assert closed_share({"position_2s": entry}, {"position_2s": 0.47}) is None
+    assert closed_share({"position_2s": entry}, {}) is None
+    empty = [
+        {"case": f"newton-hills-7-0{n}-empty", "kind": "empty", "gap": {"position_2s": entry | {"before": b}}}
+        for n, b in ((1, 0.1), (2, 0.2))
+    ]
+    assert healthy_errors([*empty, empty[0] | {"kind": "single"}]) == {
+        "newton-hills-7": {"position_2s": pytest.approx(0.15)}
+    }
 
 
 def test_newton_drives_side_by_side_on_level_ground_and_hills():

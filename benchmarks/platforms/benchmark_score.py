@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.stats import binomtest
@@ -75,18 +75,50 @@ def covered(row: Row) -> list[bool]:
     return results
 
 
-def closed_share(gap: dict[str, dict]) -> float | None:
+METRICS = ("position_2s", "heading_2s")
+
+
+def closed_share(gap: dict[str, dict], healthy: Mapping[str, float] | None = None) -> float | None:
     """Closed share of the reducible gap after 2 s in the metric with the largest error over its noise.
 
     0 where nothing was added to the model; None where the error is within 10 % of its noise, so that there is no gap.
+
+    Args:
+        gap: errors by metric.
+        healthy: error of the healthy robot by metric, which no effect reduces, to be taken for the noise where it is
+            larger; None where its metric is unknown.
     """
-    entries = [gap[key] for key in ("position_2s", "heading_2s") if key in gap]
-    entries = [entry for entry in entries if entry["before"] > 1.1 * entry["noise"]]
+    entries = {key: gap[key] for key in METRICS if key in gap and gap[key]["before"] > 1.1 * gap[key]["noise"]}
     if not entries:
         return None
-    worst = max(entries, key=lambda entry: entry["before"] / max(entry["noise"], 1e-6))
+    metric = max(entries, key=lambda key: entries[key]["before"] / max(entries[key]["noise"], 1e-6))
+    worst, least = entries[metric], entries[metric]["noise"]
+    if healthy is not None:
+        if metric not in healthy:
+            return None
+        least = max(least, healthy[metric])
+        if worst["before"] <= 1.1 * least:
+            return None
     after = worst["before"] if worst["after"] is None else worst["after"]
-    return (worst["before"] - after) / (worst["before"] - worst["noise"])
+    return (worst["before"] - after) / (worst["before"] - least)
+
+
+def healthy_errors(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
+    """Errors of each platform's healthy robot by metric: the mean over its empty drives, as the model is without
+    effects."""
+    found: dict[str, dict[str, list[float]]] = {}
+    for row in rows:
+        if row["kind"] == "empty":
+            for metric in METRICS:
+                if metric in row.get("gap", {}):
+                    errors = found.setdefault(platform_of(row), {}).setdefault(metric, [])
+                    errors.append(row["gap"][metric]["before"])
+    return {name: {metric: float(np.mean(part)) for metric, part in errors.items()} for name, errors in found.items()}
+
+
+def platform_of(row: Row) -> str:
+    """Name of a row's platform: engine, ground and seed."""
+    return "-".join(row["case"].split("-")[:3])
 
 
 def share(part: Sequence[object], whole: Sequence[object]) -> dict:
@@ -113,6 +145,12 @@ def scores(rows: Sequence[Row]) -> dict[str, dict]:
     right = [row for row in (*singles, *pairs) if found_all(row)]
     inside = [hit for row in rows for hit in covered(row)]
     closed = [value for row in hidden if (value := closed_share(row.get("gap", {}))) is not None]
+    errors = healthy_errors(empty)
+    above = [
+        value
+        for row in hidden
+        if (value := closed_share(row.get("gap", {}), errors.get(platform_of(row), {}))) is not None
+    ]
     checked = [
         value
         for row in hidden
@@ -139,6 +177,7 @@ def scores(rows: Sequence[Row]) -> dict[str, dict]:
         "extra_effects": share([row for row in right if len(named(row)) > len(row["hidden"])], right),
         "intervals_with_truth": share([hit for hit in inside if hit], inside),
         "gap_closed": _median(closed),
+        "gap_closed_above_healthy": _median(above),
         "gap_closed_on_second_drive": _median(checked),
         "not_diagnosed": share([row for row in rows if row["verdict"] in ("error", "not_identifiable")], rows),
         "seconds": _median([row["seconds"] for row in rows]) | {"mean": None},
@@ -162,6 +201,7 @@ TITLES = {
     "extra_effects": "more effects than hidden ones, of the rightly named",
     "intervals_with_truth": "95 % intervals that contain the truth",
     "gap_closed": "reducible gap closed, cross-validated, median over all drives with something hidden",
+    "gap_closed_above_healthy": "… of the part above the healthy robot's error on its empty drives",
     "gap_closed_on_second_drive": "… on a second drive with the same effect",
     "not_diagnosed": "no diagnosis (counts as missed)",
     "seconds": "time of a diagnosis of 60 s, median",

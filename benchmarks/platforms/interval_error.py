@@ -15,7 +15,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from benchmark_score import true_value
+from benchmark_score import platform_of, true_value
 from diagnosis_run import commissioned_file, healthy_values
 
 from monoforce_ros.core import write_text
@@ -58,7 +58,7 @@ def main() -> int:
 def _row(file: Path, folder: Path) -> dict:
     """A row, with the values of the healthy robot also where an earlier version of run.py wrote it."""
     row = json.loads(file.read_text())
-    nominal = commissioned_file(folder / "nominal" / "-".join(row["case"].split("-")[:3]))
+    nominal = commissioned_file(folder / "nominal" / platform_of(row))
     if "healthy" not in row and nominal is not None:
         row["healthy"] = healthy_values(nominal)
     return row
