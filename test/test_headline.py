@@ -103,6 +103,19 @@ def test_an_effect_that_one_part_of_the_recording_shows_is_not_good():
 def test_a_robot_that_was_never_commissioned_is_a_doubt():
     known, unknown = (headline(diagnosed((0.5, 0.06), (8.0, 1.0), commissioned=it)) for it in (True, False))
     assert not known.doubts and "never commissioned" in unknown.doubts[0]
+    assert not known.of_file and unknown.of_file
+    assert any("commission the robot" in text for text in unknown.actions)
+    assert not any("commission" in text for text in known.actions)
+    # How a robot differs from a file that nobody fitted to it need not be wrong.
+    pages = [diagnosis_page(diagnosed((0.5, 0.06), (8.0, 1.0), commissioned=it), {}, None) for it in (True, False)]
+    assert ["What is wrong" in page for page in pages] == [True, False]
+    assert "What differs from the robot file" in pages[1]
+
+
+def test_names_of_effects_keep_their_letters_in_a_report():
+    remarks = ("drive_gain explains 93 % of the excess loss", "the rest is as a healthy robot's")
+    page = diagnosis_page(replace(diagnosed((0.5, 0.06), (8.0, 1.0)), remarks=remarks), {}, None)
+    assert "<li>drive_gain explains 93 %" in page and "<li>The rest is as" in page
 
 
 def test_held_out_recordings_go_before_blocks_of_the_diagnosed_one():

@@ -74,6 +74,8 @@ class Headline:
     confidence: tuple[str, ...]
     """How sure the findings are."""
     actions: tuple[str, ...]
+    of_file: bool = False
+    """Whether the findings are differences from a file that nobody commissioned, so that they need be no faults."""
     helps: bool = False
     """Whether the added effects improve predictions: no error after 2 s grew, and one at least shrank."""
 
@@ -153,6 +155,8 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
     elif grew:
         remedies = ["do not use what was found yet: drive longer, with more kinds of motion, and run diagnose again"]
     actions = [*remedies, *diagnosis.advice]
+    if not diagnosis.commissioned:
+        actions.append("commission the robot while it is healthy: later reports then say what changed")
     doubts += [_growth(row) for row in grew]
     enough = bool(counted) and all(row.share >= MOST for row in counted)
     findings = tuple(finding(effect) for effect in effects)
@@ -170,8 +174,9 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
 
     def result(tone: Tone, sentence: str) -> Headline:
         return Headline(
-            tone, sentence, left, findings, tuple(doubts), tuple(confidence), tuple(dict.fromkeys(actions)), helps
-        )
+            tone, sentence, left, findings, tuple(doubts), tuple(confidence), tuple(dict.fromkeys(actions)),
+            of_file=not diagnosis.commissioned, helps=helps,
+        )  # fmt: skip
 
     if diagnosis.verdict == Verdict.UNKNOWN_EFFECT:
         sentence = "Something is wrong that no known effect explains."

@@ -126,7 +126,7 @@ def _result(top: Headline, robot_file: Path | None) -> str:
     columns = "".join(
         f"<div><h3>{heading}</h3>{content}</div>"
         for heading, content in (
-            ("What is wrong", wrong),
+            ("What differs from the robot file" if top.of_file else "What is wrong", wrong),
             ("How sure", sure),
             ("What to do", f"<ul>{_list_items(actions[:_MOST_LISTED])}</ul>"),
         )
@@ -235,7 +235,13 @@ def _steps_card(steps: StepComparison) -> str:
 
 def _list_items(texts: Iterable[str], kind: str = "") -> str:
     attribute = f" class='{kind}'" if kind else ""
-    return "".join(f"<li{attribute}>{html.escape(text[:1].upper() + text[1:])}</li>" for text in texts)
+    return "".join(f"<li{attribute}>{html.escape(_sentence(text))}</li>" for text in texts)
+
+
+def _sentence(text: str) -> str:
+    """A text with a capital letter first, unless it begins with the name of an effect."""
+    name = text.split(" ", 1)[0]
+    return text if "_" in name else text[:1].upper() + text[1:]
 
 
 def _image(figure: Figure, alt: str) -> str:

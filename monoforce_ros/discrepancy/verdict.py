@@ -85,11 +85,12 @@ class Decision:
                 speaks for these is a test that healthy robots fail at its stated rate.
         """
         if self.verdict == Verdict.EFFECT_FOUND:
-            remarks = (*self.remarks, f"errors on held-out windows {errors} beyond chance")
             if dispensable:
-                remarks += ("without them the errors are no larger than a healthy robot's",)
-            verdict = Verdict.NO_DISCREPANCY if dispensable else Verdict.NO_IMPROVEMENT
-            return replace(self, verdict=verdict, trial=None, remarks=remarks)
+                names = "" if self.trial is None else f" with {' and '.join(self.trial.names)}"
+                found = f"the errors are no larger than a healthy robot's; on held-out windows they {errors}{names}"
+                return replace(self, verdict=Verdict.NO_DISCREPANCY, trial=None, remarks=(f"{found} beyond chance",))
+            remarks = (*self.remarks, f"errors on held-out windows {errors} beyond chance")
+            return replace(self, verdict=Verdict.NO_IMPROVEMENT, trial=None, remarks=remarks)
         if self.verdict == Verdict.UNKNOWN_EFFECT and self.trial is not None:
             remarks = (*self.remarks, f"the formula is not added: held-out errors {errors} beyond chance")
             return replace(self, trial=None, remarks=remarks)
