@@ -150,6 +150,36 @@ def test_wheels_that_turn_while_the_robot_does_not_are_said():
     assert "motors off" in text
 
 
+def blocked(motion, commands, after=6.0):
+    """The robot stands from some time on, with a trembling body, and its wheels turn as commanded."""
+    index = np.minimum(np.arange(len(motion)), round(after / STEP))
+    tremble = 0.02 * np.random.default_rng(4).standard_normal((len(motion), 3))
+    stays = (index == index[-1])[:, None]
+    stopped = replace(
+        motion,
+        positions=motion.positions[index],
+        quaternions=motion.quaternions[index],
+        linear_velocities=np.where(stays, tremble, motion.linear_velocities),
+        angular_velocities=np.where(stays, tremble, motion.angular_velocities),
+    )
+    speeds = commands.twists[:, :1] + np.outer(commands.twists[:, 1], [-0.3, 0.3])
+    return stopped, commands, WheelTrack(commands.stamps, speeds / 0.165)
+
+
+def test_a_robot_that_is_blocked_after_a_few_metres_has_no_wrong_topic():
+    motion, commands, wheels = blocked(*recorded())
+    (text,) = motion_faults(smooth(motion), commands, wheels)
+    assert text.startswith("the wheels follow the commands") and "blocked" in text and "topic" not in text
+    # Without wheel speeds the commands may as well be another robot's, and so they may if the wheels follow others.
+    for track in (None, WheelTrack(wheels.stamps, np.roll(wheels.speeds, 333, axis=0))):
+        (text,) = motion_faults(smooth(motion), commands, track)
+        assert "wrong topic" in text
+    found = diagnose(Evidence(smooth(motion), commands, wheels=wheels), load_robot("husky"))
+    assert found.verdict == "not_identifiable" and found.advice[0].startswith("the wheels follow the commands")
+    assert any("the robot stays where it is" in text for text in found.remarks)
+    assert len(found.advice) == 1
+
+
 def test_a_pulled_robot_is_not_unrelated_to_its_commands():
     motion, commands = recorded()
     # The yaw rate has nothing to do with its command, the speed has.

@@ -20,7 +20,6 @@ from monoforce_ros.discrepancy.evidence import COMPONENTS, MOTION, Evidence, win
 from monoforce_ros.discrepancy.gap import noisy_motions
 from monoforce_ros.discrepancy.ground import Ground, beyond_commissioning, choose_ground
 from monoforce_ros.discrepancy.hypothesis import Effects, corrected_evidence, own_values
-from monoforce_ros.discrepancy.motion_check import motion_faults
 from monoforce_ros.discrepancy.nominal import NominalModel, with_known_components
 from monoforce_ros.discrepancy.nominal_residual import residual_complaint
 from monoforce_ros.discrepancy.report import effect_entry, write_diagnosis
@@ -274,11 +273,10 @@ def without_blame_for_ground(diagnosis: Diagnosis, unexplained: str, *, named: b
 
 
 def _with_wheels(diagnosis: Diagnosis, evidence: Evidence, robot: RobotModel) -> Diagnosis:
-    """A refused diagnosis with what the wheels say of the robot, and of the drives alone."""
-    faults = motion_faults(evidence.smoothed, evidence.commands, evidence.wheels)
+    """A refused diagnosis with what the wheels say of the drives alone."""
     wheels = compare_with_wheels(evidence.commands, evidence.wheels, robot)
     remarks = diagnosis.remarks if wheels is None else (*diagnosis.remarks, wheels.summary())
-    return replace(diagnosis, advice=faults or diagnosis.advice, remarks=remarks)
+    return replace(diagnosis, remarks=remarks)
 
 
 def _distinct_names(bags: Sequence[Path]) -> dict[str, Path]:

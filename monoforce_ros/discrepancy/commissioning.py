@@ -135,7 +135,7 @@ def commission(
 def _prepare(evidence: Evidence, robot: RobotModel, samples: np.ndarray, stride: float) -> _Prepared:
     smoothed = evidence.smoothed
     starts = window_starts(smoothed.motion, smoothed.stretches, float(samples[-1]), stride)
-    found = complaints(smoothed, evidence.commands, starts)
+    found = complaints(evidence, starts)
     if found:
         raise ValueError("; ".join(found))
     data = evidence.cut(starts, samples)

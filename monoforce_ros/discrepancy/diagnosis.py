@@ -38,6 +38,7 @@ from monoforce_ros.discrepancy.gap import (
 )
 from monoforce_ros.discrepancy.hypothesis import Effects, corrected_evidence
 from monoforce_ros.discrepancy.kinematic_baseline import StepComparison
+from monoforce_ros.discrepancy.motion_check import motion_faults
 from monoforce_ros.discrepancy.nominal import NominalModel, with_known_components
 from monoforce_ros.discrepancy.preflight import advice, complaints
 from monoforce_ros.discrepancy.region import Region
@@ -150,7 +151,9 @@ def diagnose(
     leans = (
         changed_lean(lean_of(smoothed.motion), nominal.lean) if nominal is not None and evidence.with_attitude else ""
     )
-    found = complaints(smoothed, evidence.commands, starts)
+    found = complaints(evidence, starts)
+    if found and motion_faults(smoothed, evidence.commands, evidence.wheels):
+        return Diagnosis(Verdict.NOT_IDENTIFIABLE, advice=tuple(found), remarks=left_out)
     if found:
         return Diagnosis(Verdict.NOT_IDENTIFIABLE, advice=(*left_out, *found))
     samples = np.array(settings.samples)

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -68,28 +69,48 @@ def motion_faults(
     # Speeds of wrong poses are wrong, too: whether they follow the commands says nothing then.
     crabs = commands.twists.shape[-1] > 2 and float(np.abs(commands.twists[:, 2]).max()) >= _COMMANDED
     faults = tuple(_pose_faults(smoothed, crabs=crabs))
-    other = "" if faults else _unrelated(smoothed, commands)
+    other = "" if faults else _unrelated(smoothed, commands, wheels)
     return (other,) if other else faults
 
 
 def command_delay(motion: MotionTrack, commands: CommandTrack) -> tuple[float, float]:
     """Delay from command to motion [s], and the correlation of both at that delay, 0 to 1; NaN and 0 if unknown."""
-    return _correlated(motion, commands, _LAGS, (0, 1))
+    return _correlated(_Followed.by_motion(motion), commands, _LAGS, (0, 1))
+
+
+@dataclass(frozen=True)
+class _Followed:
+    """What may follow commands: speeds and yaw rates in any unit."""
+
+    stamps: np.ndarray
+    """``[n]`` [ns]."""
+    values: np.ndarray
+    """``[n, 2]``."""
+
+    @classmethod
+    def by_motion(cls, motion: MotionTrack) -> _Followed:
+        """Those of the base."""
+        return cls(motion.stamps, np.stack([motion.linear_velocities[:, 0], motion.angular_velocities[:, 2]], axis=1))
+
+    @classmethod
+    def by_wheels(cls, wheels: WheelTrack) -> _Followed:
+        """Those that the wheels ask for."""
+        left, right = wheels.speeds.T
+        return cls(wheels.stamps, np.stack([left + right, right - left], axis=1))
 
 
 def _correlated(
-    motion: MotionTrack, commands: CommandTrack, lags: np.ndarray, axes: Sequence[int]
+    followed: _Followed, commands: CommandTrack, lags: np.ndarray, axes: Sequence[int]
 ) -> tuple[float, float]:
     """The best of the lags [s] and the correlation there, of speed (axis 0), yaw rate (axis 1) or both."""
-    first, last = int(motion.stamps[0]), int(motion.stamps[-1])
+    first, last = int(followed.stamps[0]), int(followed.stamps[-1])
     stamps = np.arange(first, last, 25_000_000, dtype=np.int64)
     if len(stamps) < 80:
         return float("nan"), 0.0
-    seconds, times = (stamps - first) * NANOSECOND, (motion.stamps - first) * NANOSECOND
+    seconds, times = (stamps - first) * NANOSECOND, (followed.stamps - first) * NANOSECOND
     pieces = []
     for axis in axes:
-        values = motion.linear_velocities[:, 0] if axis == 0 else motion.angular_velocities[:, 2]
-        measured = np.interp(seconds, times, values)
+        measured = np.interp(seconds, times, followed.values[:, axis])
         spread = float(measured.std())
         # Both signals in units of one scale: a robot that turns at a third of what is commanded follows all the same,
         # and an axis counts by how much it moves and is commanded to.
@@ -200,19 +221,20 @@ def _pose_faults(smoothed: SmoothedMotion, *, crabs: bool = False) -> Iterator[s
         )
 
 
-def _unrelated(smoothed: SmoothedMotion, commands: CommandTrack) -> str:
+def _unrelated(smoothed: SmoothedMotion, commands: CommandTrack, wheels: WheelTrack | None) -> str:
     """That motion does not follow the commands at any plausible delay; empty if it does, or if that is unknown."""
     motion = smoothed.motion
     largest = np.abs(commands.twists).max(axis=0)
     if (largest < _COMMANDED).all():
         return "the robot moves, but nothing is commanded: another topic drives it, such as a joystick; record that one"
     span = (int(motion.stamps[-1]) - int(motion.stamps[0])) * NANOSECOND
-    correlation = _follows(motion, commands)
+    followed = _Followed.by_motion(motion)
+    correlation = _follows(followed, commands)
     if correlation >= _UNRELATED or correlation <= 0.0 or span < 20.0:
         return ""
     # The clocks may be apart by more than a base can be late.
     wide = np.arange(-min(60.0, 0.5 * span), min(60.0, 0.5 * span), 0.1)
-    offset, best = _correlated(motion, commands, wide, (0, 1))
+    offset, best = _correlated(followed, commands, wide, (0, 1))
     if best > max(0.7, 1.5 * correlation):
         if abs(offset) <= _IDENTIFIED:
             return ""
@@ -226,18 +248,25 @@ def _unrelated(smoothed: SmoothedMotion, commands: CommandTrack) -> str:
     for number in range(1, _SHIFTS + 1):
         moved = (commands.stamps - first + number * length // (_SHIFTS + 1)) % length + first
         order = np.argsort(moved, kind="stable")
-        chance.append(_follows(motion, CommandTrack(moved[order], commands.twists[order])))
+        chance.append(_follows(followed, CommandTrack(moved[order], commands.twists[order])))
     if correlation > float(np.quantile(chance, 0.95)):
         return ""
+    by_wheels = _follows(_Followed.by_wheels(wheels), commands) if wheels is not None and len(wheels) > 1 else 0.0
+    if by_wheels >= _UNRELATED:
+        return (
+            f"the wheels follow the commands (correlation {by_wheels:.2f}) and the robot does not ({correlation:.2f}): "
+            "it is blocked, dug in or off the ground for most of the time, or the poses are of something else; record "
+            "again where it can drive"
+        )
     return (
         f"motion does not follow the commands (correlation {correlation:.2f}, no larger than with the commands of "
         "other times): wrong topic, another source of commands such as a joystick, or other clocks"
     )
 
 
-def _follows(motion: MotionTrack, commands: CommandTrack) -> float:
+def _follows(followed: _Followed, commands: CommandTrack) -> float:
     """The larger correlation of speed and of yaw rate with their commands.
 
     A fault may spoil one of them: a robot that is pulled aside still drives forward as commanded.
     """
-    return max(_correlated(motion, commands, _LAGS, (axis,))[1] for axis in (0, 1))
+    return max(_correlated(followed, commands, _LAGS, (axis,))[1] for axis in (0, 1))

@@ -6,9 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from monoforce_ros.bags import SmoothedMotion
-from monoforce_ros.core import CommandTrack
 from monoforce_ros.discrepancy.estimates import EffectEstimate
+from monoforce_ros.discrepancy.evidence import Evidence
 from monoforce_ros.discrepancy.motion_check import motion_faults
 from monoforce_ros.discrepancy.verdict import Verdict
 from monoforce_ros.effects import separating_manoeuvre, separating_sensor
@@ -17,9 +16,10 @@ FEWEST_WINDOWS = 12
 """A diagnosis needs at least as many."""
 
 
-def complaints(smoothed: SmoothedMotion, commands: CommandTrack, starts: np.ndarray) -> list[str]:
+def complaints(evidence: Evidence, starts: np.ndarray) -> list[str]:
     """Why a recording is not sufficient, each with a remedy; empty where it is."""
-    found = list(motion_faults(smoothed, commands))
+    commands = evidence.commands
+    found = list(motion_faults(evidence.smoothed, commands, evidence.wheels))
     if found:
         return found
     if len(starts) < FEWEST_WINDOWS:
