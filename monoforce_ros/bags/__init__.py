@@ -4,7 +4,7 @@ from monoforce_ros.bags import builders
 from monoforce_ros.bags.joint_record import JointRecord
 from monoforce_ros.bags.read_options import DETECTED, ReadOptions, add_read_options, read_options
 from monoforce_ros.bags.reader import BagError, BagMessage, BagReader
-from monoforce_ros.bags.recorded_observation import flippers_at, observe
+from monoforce_ros.bags.recorded_observation import MAXIMUM_GAP, flippers_at, observe
 from monoforce_ros.bags.recording import (
     CAMERA_INFO,
     CLOUD,
@@ -30,6 +30,7 @@ __all__ = [
     "DETECTED",
     "FIXED",
     "IMAGES",
+    "MAXIMUM_GAP",
     "ODOMETRY",
     "BagError",
     "BagMessage",

@@ -15,7 +15,7 @@ from monoforce_ros.robots import RobotModel
 MAXIMUM_SPREAD = 0.1
 """Largest time between the sensor data of one observation [s]."""
 MAXIMUM_GAP = 0.3
-"""Largest time between sensor data and the nearest odometry [s]."""
+"""Largest time between sensor data, or a compared pose, and the nearest odometry [s]."""
 
 
 def observe(

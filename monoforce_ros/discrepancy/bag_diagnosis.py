@@ -15,7 +15,7 @@ from monoforce_ros.discrepancy.command_changes import uncovered_doubt
 from monoforce_ros.discrepancy.comparison import GapRow, HeldOut, compare, gap_table
 from monoforce_ros.discrepancy.credibility import complaint
 from monoforce_ros.discrepancy.diagnosis import Diagnosis, DiagnosisSettings, diagnose
-from monoforce_ros.discrepancy.encoder_ground import EncoderGround, encoder_maps
+from monoforce_ros.discrepancy.encoder_ground import encoder_maps
 from monoforce_ros.discrepancy.evidence import COMPONENTS, MOTION, Evidence, window_starts
 from monoforce_ros.discrepancy.gap import noisy_motions
 from monoforce_ros.discrepancy.ground import Ground, beyond_commissioning, choose_ground
@@ -96,8 +96,7 @@ def read_with_ground(
     ground = choose_ground(terrain, recording, smoothed, robot)
     if ground.source == "flat":
         return replace(evidence, components=MOTION if ground.unknown else COMPONENTS), recording, ground
-    encoder = EncoderGround.named(ground.source)
-    if ground.source not in ("lidar", "traced") and encoder is None:
+    if ground.source not in ("lidar", "traced") and ground.encoder is None:
         terrain_map, pose = load_terrain(Path(ground.source))
         evidence = replace(evidence, terrain=terrain_map, odometry_from_terrain=pose, components=COMPONENTS)
         return evidence, recording, ground
@@ -111,10 +110,10 @@ def read_with_ground(
     if ground.source == "traced":
         terrain_map = traced_terrain(motion, robot, grid)
         return replace(evidence, terrain=terrain_map, odometry_from_terrain=np.eye(4)), recording, ground
-    if encoder is None:
+    if ground.encoder is None:
         maps, parts = split_maps(recording, motion, robot, grid)
     else:
-        maps, parts, count = encoder_maps(recording, motion, robot, grid, encoder)
+        maps, parts, count = encoder_maps(recording, motion, robot, grid, ground.encoder)
         ground = replace(ground, description=f"{ground.description}: {count} predictions along the drive")
     whole, even, odd = (supporting_terrain(part, motion, robot) for part in (maps, *parts))
     evidence = replace(evidence, terrain=whole, odometry_from_terrain=np.eye(4), split_maps=(even, odd))

@@ -28,6 +28,7 @@ from monoforce_ros.discrepancy.gap import noise_floor, noisy_motions, residual_s
 from monoforce_ros.discrepancy.ground import slopes_of
 from monoforce_ros.discrepancy.healthy_wheels import HealthyWheels, drives_of
 from monoforce_ros.discrepancy.hypothesis import Effects, Predictions
+from monoforce_ros.discrepancy.motion_check import motion_faults
 from monoforce_ros.discrepancy.nominal import SEGMENT, NominalModel
 from monoforce_ros.discrepancy.preflight import complaints
 from monoforce_ros.discrepancy.residual_model import fit_terms, motion_terms
@@ -135,7 +136,7 @@ def commission(
 def _prepare(evidence: Evidence, robot: RobotModel, samples: np.ndarray, stride: float) -> _Prepared:
     smoothed = evidence.smoothed
     starts = window_starts(smoothed.motion, smoothed.stretches, float(samples[-1]), stride)
-    found = complaints(evidence, starts)
+    found = motion_faults(smoothed, evidence.commands, evidence.wheels) or complaints(evidence, starts)
     if found:
         raise ValueError("; ".join(found))
     data = evidence.cut(starts, samples)

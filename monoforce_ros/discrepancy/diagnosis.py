@@ -151,9 +151,10 @@ def diagnose(
     leans = (
         changed_lean(lean_of(smoothed.motion), nominal.lean) if nominal is not None and evidence.with_attitude else ""
     )
+    faults = motion_faults(smoothed, evidence.commands, evidence.wheels)
+    if faults:
+        return Diagnosis(Verdict.NOT_IDENTIFIABLE, advice=faults, remarks=left_out)
     found = complaints(evidence, starts)
-    if found and motion_faults(smoothed, evidence.commands, evidence.wheels):
-        return Diagnosis(Verdict.NOT_IDENTIFIABLE, advice=tuple(found), remarks=left_out)
     if found:
         return Diagnosis(Verdict.NOT_IDENTIFIABLE, advice=(*left_out, *found))
     samples = np.array(settings.samples)

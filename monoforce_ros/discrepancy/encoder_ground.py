@@ -6,24 +6,20 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-import cv2
 import numpy as np
 import torch
-from scipy.ndimage import distance_transform_edt
 
-from monoforce_ros.bags import BagError, Recording, observe
+from monoforce_ros.bags import MAXIMUM_GAP, BagError, Recording, observe
 from monoforce_ros.core import MotionState, MotionTrack, StaleDataError
 from monoforce_ros.messages import MessageError
 from monoforce_ros.perception import CAMERA_SOURCES, choose_terrain_source
 from monoforce_ros.robots import RobotModel
-from monoforce_ros.terrain import Grid, TerrainMap
+from monoforce_ros.terrain import Grid, TerrainMap, fill_holes, interpolated
 
 SPACING: Final = 0.25
 """Distance between the places of which maps are made [m]: a tenth of the first metres that a camera sees well."""
 _TURN: Final = np.radians(20.0)
 """A turn after which a map is made, too [rad]: a third of the view of a usual lens."""
-_LARGEST_GAP: Final = 0.3
-"""Between an image or a sweep and the nearest pose [s]."""
 _SMALLEST_SPREAD: Final = 0.02
 """Spread that no cell falls below [m], so that one map does not decide alone: a fifth of a cell."""
 
@@ -96,7 +92,7 @@ def _places(recording: Recording, motion: MotionTrack, topics: Sequence[str]) ->
     previous: MotionState | None = None
     for frame in recording.images[topics[0]]:
         try:
-            state = motion.at(frame.stamp, maximum_gap=_LARGEST_GAP)
+            state = motion.at(frame.stamp, maximum_gap=MAXIMUM_GAP)
         except StaleDataError:
             continue
         if previous is not None:
@@ -131,7 +127,7 @@ class _Mosaic:
             return
         columns, rows = np.arange(low[0], high[0]), np.arange(low[1], high[1])
         places = np.stack(np.meshgrid(grid.x[columns], grid.y[rows]), axis=-1)
-        cells = (((places - pose[:2, 3]) @ pose[:2, :2] - np.array(local.origin)) / local.resolution).astype(np.float32)
+        cells = ((places - pose[:2, 3]) @ pose[:2, :2] - np.array(local.origin)) / local.resolution
         spread = terrain.geometric_spread
         weight = (
             np.ones(terrain.height.shape)
@@ -141,12 +137,14 @@ class _Mosaic:
         weight = np.where(terrain.observed.numpy(), weight, 0.0)
         part = np.s_[low[1] : high[1], low[0] : high[0]]
         # Between cells of which one was not seen nothing is known of the slope.
-        seen = _at(terrain.observed.numpy(), cells) > _ALL_SEEN
-        weights = np.where(seen, _at(weight, cells), 0.0)
+        seen = interpolated(terrain.observed.numpy(), cells) > _ALL_SEEN
+        weights = np.where(seen, interpolated(weight, cells), 0.0)
         self._weights[part] += weights
         for number, channel in enumerate((terrain.height, terrain.geometric_height)):
             heights = channel.double().numpy()
-            self._sums[number][part] += np.where(seen, _at(weight * heights, cells), 0.0) + weights * pose[2, 3]
+            self._sums[number][part] += (
+                np.where(seen, interpolated(weight * heights, cells), 0.0) + weights * pose[2, 3]
+            )
 
     def joined(self, other: _Mosaic) -> _Mosaic:
         """Both together."""
@@ -155,21 +153,10 @@ class _Mosaic:
         return result
 
     def terrain(self) -> TerrainMap:
-        """The map; cells that no prediction observed have the height of the nearest one that is."""
+        """The map; cells that no prediction observed are interpolated."""
         known = self._weights > 0.0
         heights = self._sums / np.where(known, self._weights, 1.0)
-        if known.any():
-            nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
-            heights = heights[:, nearest[0], nearest[1]]
-        support, visible = (torch.from_numpy(height.astype(np.float32)) for height in heights)
+        support, visible = (torch.from_numpy(fill_holes(height, known).astype(np.float32)) for height in heights)
         return TerrainMap.from_height(
             support, self._grid, geometric_height=torch.maximum(visible, support), observed=torch.from_numpy(known)
         )
-
-
-def _at(values: np.ndarray, cells: np.ndarray) -> np.ndarray:
-    """Values interpolated at fractional columns and rows ``[h, w, 2]``; 0 beyond the map."""
-    return cv2.remap(
-        values.astype(np.float32), cells[..., 0], cells[..., 1], cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_CONSTANT, borderValue=0.0,
-    )  # fmt: skip

@@ -108,13 +108,10 @@ class Explanation:
     def dispensable(self) -> bool:
         """Whether without the effects a recording would look like the healthy robot's: no sensor measured them, they
         act in all of it, and it has no errors larger than that robot's."""
-        search = self.search
-        return (
-            self.part is None
-            and not search.known
-            and search.commissioned
-            and not search.too_large(self.findings.nominal)
-        )
+        if self.part is not None or self.search.known:
+            return False
+        size_p = self.search.size_p(self.findings.nominal)
+        return size_p is not None and size_p > self.search.thresholds.fit_rate
 
     def by_sensors(self, thresholds: Thresholds) -> Explanation:
         """What gyro, wheel speeds and joints measured, without the effects that the motion showed in addition."""

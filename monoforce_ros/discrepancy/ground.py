@@ -47,6 +47,8 @@ class Ground:
     """Whether no map shows slopes that differ from place to place: forces that these exert may pass for effects."""
     apart: bool = False
     """Whether each stretch of the recording is traced for itself, since the localisation starts anew in each."""
+    encoder: EncoderGround | None = None
+    """The encoder that predicts it; None where none does."""
 
     @property
     def unknown(self) -> bool:
@@ -72,7 +74,7 @@ def choose_ground(terrain: str, recording: Recording, smoothed: SmoothedMotion, 
         return _traced("along the measured poses", smoothed, slope, "as asked for", uneven)
     encoder = EncoderGround.named(terrain)
     if encoder is not None:
-        return Ground(terrain, f"map of the terrain encoder ({encoder.kind})", slope)
+        return Ground(terrain, f"map of the terrain encoder ({encoder.kind})", slope, encoder=encoder)
     if terrain not in ("auto", "flat"):
         return Ground(terrain, f"map {Path(terrain).name}", slope)
     reason = "no clouds in the bag"

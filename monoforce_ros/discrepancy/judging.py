@@ -214,11 +214,11 @@ class Judging:
             explained = excess_share(nominal.loss, trial.loss, self.healthy_loss)
         return FitTest(p, name, tuple(tests), explained)
 
-    def too_large(self, trial: Trial) -> bool:
-        """Whether a trial's residuals are larger than a healthy robot's; no where these are unknown."""
+    def size_p(self, trial: Trial) -> float | None:
+        """p-value of a healthy robot's residuals as large as a trial's; None where these are unknown."""
         size = self._size(trial)
         # Two tests of a trial: the size of its residuals, and their directions.
-        return size is not None and 2.0 * size.p <= self.thresholds.fit_rate
+        return None if size is None else 2.0 * size.p
 
     def _size(self, trial: Trial, *, exact: bool = False) -> ResidualSize | None:
         """How much larger a trial's residuals are than a healthy robot's; None where these are unknown.

@@ -235,7 +235,8 @@ class Search(Judging):
         """Trials with one more effect that is significant, smallest held-out loss first, and the scores of all."""
         base = self.refit(best.effects).effects if best.effects else ()
         # Beside effects that were found the size only shows that these are not exact.
-        incomplete = missing or (number == 1 and self.too_large(best))
+        size_p = self.size_p(best) if number == 1 else None
+        incomplete = missing or (size_p is not None and size_p <= self.thresholds.fit_rate)
         found = self.screening.candidates(base, self.fixed_count(base), f"{number}: ", incomplete=incomplete)
         screened = self._beside(base, found, rate)
         entries = admitted(screened, found.before, rate, incomplete=incomplete)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from monoforce_ros.bags import Recording, flippers_at, observe
+from monoforce_ros.bags import MAXIMUM_GAP, Recording, flippers_at, observe
 from monoforce_ros.core import MotionState, StaleDataError, transform_points
 from monoforce_ros.effects import corrected_commands, corrected_motion
 from monoforce_ros.evaluation.metrics import Poses, Summary, position_errors, rotation_errors, summarise
@@ -27,8 +27,6 @@ CONFIRMED_PHYSICS = "physics, confirmed terrain"
 """The prediction on an encoder's terrain as far as the ground has confirmed it, as ``predictor`` publishes it."""
 BATCH = 16
 """Number of windows that are rolled out together."""
-MAXIMUM_GAP = 0.3
-"""Largest time between a compared pose and the nearest odometry [s]."""
 
 
 class EvaluationError(ValueError):

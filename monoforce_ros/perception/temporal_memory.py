@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import torch
 
@@ -14,7 +13,7 @@ from monoforce_ros.perception.ground_alignment import align_to_ground, support_p
 from monoforce_ros.perception.observation import Observation, TerrainSource
 from monoforce_ros.perception.trace import continues
 from monoforce_ros.robots import RobotModel
-from monoforce_ros.terrain import CHANNELS, Grid, TerrainMap
+from monoforce_ros.terrain import CHANNELS, Grid, TerrainMap, interpolated
 
 _KEPT_WITHIN, _OBSTACLE_HEIGHT = 2.0, 0.25
 """An obstacle at least this high [m] that disappears within this distance of the robot [m] is kept: an encoder that
@@ -176,12 +175,6 @@ class _Memory:
 def _sampled(channels: np.ndarray, known: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Channels ``[C, H, W]`` interpolated between ``known`` cells at fractional columns and rows ``[h, w, 2]``, and the
     weight of known cells ``[h, w]``."""
-
-    def at(values: np.ndarray) -> np.ndarray:
-        return cv2.remap(
-            values.astype(np.float32), cells[..., 0], cells[..., 1], cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_CONSTANT, borderValue=0.0,
-        )  # fmt: skip
-
-    weight = at(known)
-    return np.stack([at(np.where(known, values, 0.0)) / np.maximum(weight, 0.5) for values in channels]), weight
+    weight = interpolated(known, cells)
+    found = [interpolated(np.where(known, values, 0.0), cells) / np.maximum(weight, 0.5) for values in channels]
+    return np.stack(found), weight

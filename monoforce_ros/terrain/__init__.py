@@ -3,6 +3,7 @@
 from monoforce_ros.terrain.accumulation import accumulate
 from monoforce_ros.terrain.files import TerrainFileError, load_terrain, save_terrain
 from monoforce_ros.terrain.grid import Grid
+from monoforce_ros.terrain.interpolation import interpolated
 from monoforce_ros.terrain.lidar import (
     LidarSettings,
     TerrainError,
@@ -28,6 +29,7 @@ __all__ = [
     "cell_heights",
     "cell_quantiles",
     "fill_holes",
+    "interpolated",
     "interpolated_ground",
     "load_terrain",
     "require_cells",
