@@ -13,8 +13,7 @@ import torch
 from matplotlib import colormaps
 from matplotlib.figure import Figure
 
-from monoforce_ros.bags import Recording
-from monoforce_ros.evaluation import observe
+from monoforce_ros.bags import Recording, observe
 from monoforce_ros.perception import LidarTerrain
 from monoforce_ros.planning import CandidateSettings, assess, fan_of_arcs, force_every, occupancy, over_horizon, refine
 from monoforce_ros.prediction import EnsembleSettings, Prediction, Predictor, spread

@@ -67,6 +67,16 @@ def test_a_file_imports_only_public_names_of_rooms_above_its_own(path):
         assert not name.startswith("_"), f"{module}.{name} is private"
 
 
+def test_scripts_and_benchmarks_import_names_that_are_there():
+    files = [path for folder in ("scripts", "benchmarks") for path in sorted((ROOT / folder).rglob("*.py"))]
+    assert len(files) > 20
+    for path in files:
+        for module, name in imports(path):
+            parts = module.split(".")
+            if len(parts) == 2 and exported(parts[1]) and not (PACKAGE / parts[1] / f"{name}.py").is_file():
+                assert name in exported(parts[1]), f"{path}: {name} is not exported by {module}"
+
+
 def test_no_modules_import_each_other_in_a_circle():
     known = {module_of(path) for path in FILES}
     graph: dict[str, set[str]] = {}

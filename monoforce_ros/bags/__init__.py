@@ -1,10 +1,11 @@
 """Read and write rosbag files of ROS 2 (sqlite3, mcap) and read those of ROS 1, without a ROS installation."""
 
+from typing import TYPE_CHECKING
+
 from monoforce_ros.bags import builders
 from monoforce_ros.bags.joint_record import JointRecord
 from monoforce_ros.bags.read_options import DETECTED, ReadOptions, add_read_options, read_options
 from monoforce_ros.bags.reader import BagError, BagMessage, BagReader
-from monoforce_ros.bags.recorded_observation import MAXIMUM_GAP, flippers_at, observe
 from monoforce_ros.bags.recording import (
     CAMERA_INFO,
     CLOUD,
@@ -22,6 +23,12 @@ from monoforce_ros.bags.smoothing import SmoothedMotion, smooth
 from monoforce_ros.bags.types import type_store
 from monoforce_ros.bags.windows import Windows, cut_windows
 from monoforce_ros.bags.writer import BagWriter
+from monoforce_ros.core import lazy_exports
+
+if TYPE_CHECKING:
+    from monoforce_ros.bags.recorded_observation import MAXIMUM_GAP, flippers_at, observe
+else:  # observations are of perception, which starts torch: players and recorders of bags do without
+    __getattr__ = lazy_exports(__name__, {"recorded_observation": ("MAXIMUM_GAP", "flippers_at", "observe")})
 
 __all__ = [
     "CAMERA_INFO",
