@@ -122,6 +122,16 @@ def ground_classes(data: EvidenceWindows) -> list[Area]:
     return [area for area in found if _large_enough(area, data)]
 
 
+def shows_vegetation(data: EvidenceWindows) -> bool:
+    """Whether the robot drove through vegetation that the map holds: in as many windows as a class of ground needs."""
+    if data.terrain is None:
+        return False
+    least = _CHANNELS["vegetation"][2]
+    numbers = blocks_of(data.starts)
+    covered = _along(data, "vegetation") > least
+    return len(np.unique(numbers[covered])) >= _FEWEST_BLOCKS and int(covered.sum()) >= FEWEST_WINDOWS
+
+
 def _along(data: EvidenceWindows, channel: str) -> np.ndarray:
     """Mean of a channel of the map along the path of each window, ``[W]``."""
     positions = paths_of(data)

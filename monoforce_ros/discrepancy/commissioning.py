@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from monoforce_ros.discrepancy.areas import shows_vegetation
 from monoforce_ros.discrepancy.attitude import lean_of
 from monoforce_ros.discrepancy.command_changes import covered_changes
 from monoforce_ros.discrepancy.directions import Directions
@@ -42,9 +43,17 @@ from monoforce_ros.effects import CATALOGUE, identifiable_effects
 from monoforce_ros.robots import RobotModel
 
 COMMISSIONED: Effects = tuple(
-    (effect.name, dict(effect.commissioning_start)) for effect in CATALOGUE.values() if effect.commissioning_start
+    (effect.name, dict(effect.commissioning_start))
+    for effect in CATALOGUE.values()
+    if effect.commissioning_start and not effect.commissioned_over
 )
 """Effects that every robot needs, with the values at which their fit starts."""
+COMMISSIONED_IN_VEGETATION: Effects = tuple(
+    (effect.name, dict(effect.commissioning_start))
+    for effect in CATALOGUE.values()
+    if effect.commissioned_over == "vegetation"
+)
+"""Effects that every robot needs in addition where a recording leads through vegetation."""
 _FEWEST_SEGMENTS = 3
 _PARTS = 3
 """Parts of a single recording that take turns in being predicted by the others."""
@@ -76,8 +85,9 @@ def commission(
 ) -> tuple[tuple[EffectEstimate, ...], NominalModel]:
     """Fit to recordings of a healthy robot all that it takes to predict them.
 
-    What every robot has is always fitted (:data:`COMMISSIONED`), each value drawn towards neutral by a prior that
-    weighs as much as one block; of the other effects those that are significant in more than half of the recordings.
+    What every robot has is always fitted (:data:`COMMISSIONED`, and :data:`COMMISSIONED_IN_VEGETATION` to recordings
+    that lead through it), each value drawn towards neutral by a prior that weighs as much as one block; of the other
+    effects those that are significant in more than half of the recordings.
     They are no faults: they become the nominal model, with which later recordings are compared.
 
     Args:
@@ -100,8 +110,9 @@ def commission(
     for number, evidence in enumerate(recordings):
         progress(0.3 * number / len(recordings), "reading the noise")
         prepared.append(_prepare(evidence, robot, np.array(samples), stride))
-    fits = [_fitted(entry, COMMISSIONED) for entry in prepared]
-    chosen = COMMISSIONED
+    overgrown = [shows_vegetation(entry.data) for entry in prepared]
+    chosen = (*COMMISSIONED, *COMMISSIONED_IN_VEGETATION) if any(overgrown) else COMMISSIONED
+    fits = [_fitted(entry, chosen) for entry in prepared]
     found: list[tuple[str, Mapping[str, float]]] = []
     drives: list[WheelFinding] = []
     for number, (entry, fit) in enumerate(zip(prepared, fits, strict=True)):
@@ -114,10 +125,11 @@ def commission(
     if further:
         chosen = (*chosen, *further.items())
         fits = [_fitted(entry, chosen) for entry in prepared]
-    values = np.median([flat(fit.effects) for fit in fits], axis=0)
-    merged = replace(fits[0], effects=with_values(fits[0].effects, values))
+    # Whose covariance tells the intervals: one that saw everything.
+    first = fits[overgrown.index(True)] if any(overgrown) else fits[0]
+    merged = replace(first, effects=_merged([fit.effects for fit in fits], overgrown))
     progress(0.75, "held-out residuals")
-    residuals = _held_out_residuals(prepared, fits, merged.effects)
+    residuals = _held_out_residuals(prepared, fits, merged.effects, overgrown)
     progress(0.85, "variation between segments")
     nominal = _nominal(prepared, merged.effects, residuals)
     nominal = replace(
@@ -153,6 +165,16 @@ def _fitted(entry: _Prepared, effects: Effects, iterations: int = 12) -> Fit:
     return fit_effects(
         entry.predictions, [effects], residual_scale(entry.floor, entry.data, None), iterations=iterations, prior=prior
     )
+
+
+def _merged(fitted: Sequence[Effects], overgrown: Sequence[bool]) -> Effects:
+    """Medians of what was fitted to each recording; of an effect of vegetation, to those that lead through it."""
+    rows = np.array([flat(effects) for effects in fitted])
+    in_vegetation = {name for name, _ in COMMISSIONED_IN_VEGETATION}
+    of_vegetation = np.array([name in in_vegetation for name, values in fitted[0] for _ in values])
+    if any(overgrown):
+        rows[np.ix_(~np.array(overgrown), of_vegetation)] = np.nan
+    return with_values(fitted[0], np.nanmedian(rows, axis=0))
 
 
 def _together(robot: RobotModel, effects: Effects) -> tuple[tuple[str, Mapping[str, Any]], ...]:
@@ -192,17 +214,19 @@ def _further(robot: RobotModel, entry: _Prepared, effects: Effects, wheels: Whee
     return search.refit(best.effects).effects if best.effects else ()
 
 
-def _held_out_residuals(prepared: Sequence[_Prepared], fits: Sequence[Fit], effects: Effects) -> list[np.ndarray]:
+def _held_out_residuals(
+    prepared: Sequence[_Prepared], fits: Sequence[Fit], effects: Effects, overgrown: Sequence[bool]
+) -> list[np.ndarray]:
     """Residuals ``[W, K, C]`` of each recording, predicted with values that were fitted without it.
 
     With the values that were fitted to it a recording looks better than the robot's next one will. Of several
     recordings each is predicted by the others; a single one is cut into segments that take turns in being left out.
     """
     if len(prepared) > 1:
-        values = np.array([flat(fit.effects) for fit in fits])
-        others = [np.median(np.delete(values, number, axis=0), axis=0) for number in range(len(fits))]
+        kept = [[other for other in range(len(fits)) if other != number] for number in range(len(fits))]
+        others = [_merged([fits[n].effects for n in rest], [overgrown[n] for n in rest]) for rest in kept]
         return [
-            np.nan_to_num(entry.predictions.residuals([with_values(effects, other)])[0])
+            np.nan_to_num(entry.predictions.residuals([other])[0])
             for entry, other in zip(prepared, others, strict=True)
         ]
     entry = prepared[0]

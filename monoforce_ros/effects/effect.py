@@ -133,6 +133,9 @@ class Effect(ABC):
     """Terms of ``learned_term`` that are equivalent to this effect."""
     commissioning_start: ClassVar[Mapping[str, float]] = {}
     """Initial values for commissioning on a healthy robot; empty if commissioning does not fit this effect."""
+    commissioned_over: ClassVar[str] = ""
+    """``vegetation`` for an effect that commissioning fits only to recordings with it on their map: elsewhere it does
+    nothing."""
     wheel_response: ClassVar[WheelResponse | None] = None
     """The effect in measured wheel speeds."""
     gyro_measures: ClassVar[str] = ""
@@ -245,6 +248,8 @@ class Effect(ABC):
         changes_speeds = kind.drive_speeds is not Effect.drive_speeds or kind.twists is not Effect.twists
         if self.needs not in ("", "steering", "flippers"):
             return f"needs: got {self.needs!r}, expected steering, flippers or nothing"
+        if self.commissioned_over not in ("", "vegetation"):
+            return f"commissioned_over: got {self.commissioned_over!r}, expected vegetation or nothing"
         if self.order is not None and not isinstance(self.order, int):
             return f"order: got {self.order!r}, expected a whole number"
         if (changes_speeds or self.stage == "command") and self.order is None:

@@ -31,6 +31,8 @@ class VegetationDrag(Effect):
         name: "inside and outside the vegetation, or at several heights of it"
         for name in ("viscous_drag", "quadratic_drag", "rolling_resistance", "drive_gain")
     }
+    commissioning_start: ClassVar = {"coefficient": 1e4, "yield_speed": 0.5}
+    commissioned_over = "vegetation"
 
     def first_values(self) -> list[dict[str, float]]:
         """From grass to brush; stems bend as much as they drag at walking speed."""
