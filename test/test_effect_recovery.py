@@ -7,8 +7,11 @@ import pytest
 import torch
 from recorded_rollout import recorded
 
+from monoforce_ros.bags import SmoothedMotion
 from monoforce_ros.core import CommandTrack
-from monoforce_ros.discrepancy.evidence import EvidenceWindows, window_starts
+from monoforce_ros.discrepancy.areas import shows_vegetation
+from monoforce_ros.discrepancy.commissioning import commission
+from monoforce_ros.discrepancy.evidence import Evidence, EvidenceWindows, window_starts
 from monoforce_ros.discrepancy.fit import first_values, fit_effects
 from monoforce_ros.discrepancy.hypothesis import Predictions
 from monoforce_ros.discrepancy.nominal import NominalModel
@@ -84,6 +87,36 @@ def test_injected_values_are_recovered_from_motion(name, parameters, tolerance):
     after = np.abs(predictions.residuals([fit.effects])[0]).mean()
     assert after < max(0.25 * before, 1.1 * floor)
     assert after < 0.9 * before
+
+
+def commissioned(robot, terrains):
+    """What commissioning finds on a drive of the robot over each terrain."""
+    recordings = []
+    for terrain in terrains:
+        data = driven(robot, terrain)
+        smoothed = SmoothedMotion(data.motion, 0.002, 0.001, (slice(0, len(data.motion)),))
+        recordings.append(Evidence(smoothed, data.commands, terrain, data.odometry_from_terrain))
+    effects, _ = commission(recordings, load_robot("husky"))
+    return {effect.name: {key: entry.value for key, entry in effect.parameters.items()} for effect in effects}
+
+
+def test_a_robot_commissioned_in_grass_knows_its_drag_and_not_a_gain_of_its_drives():
+    injected = {"coefficient": 1.5e4, "yield_speed": 0.5}
+    robot = replace(load_robot("husky"), effects=(("vegetation_drag", injected),))
+    found = commissioned(robot, [rough_and_grassy()])
+    assert found["vegetation_drag"]["coefficient"] == pytest.approx(injected["coefficient"], rel=0.25)
+    assert found["drive_gain"]["gain"] == pytest.approx(1.0, abs=0.015)
+    # A drive that met no grass says nothing about it, and takes nothing from what the other one says.
+    bare = replace(rough_and_grassy(), geometric_height=rough_and_grassy().height)
+    both = commissioned(robot, [bare, rough_and_grassy()])
+    assert both["vegetation_drag"]["coefficient"] == pytest.approx(found["vegetation_drag"]["coefficient"], rel=0.1)
+    assert not shows_vegetation(driven(robot, bare)) and not shows_vegetation(driven(robot))
+
+
+def test_a_robot_is_commissioned_whose_drives_have_a_limit():
+    """A limit does nothing at infinity, to which no prior can draw it."""
+    found = commissioned(replace(load_robot("husky"), effects=(("actuator_saturation", {"limit": 0.5}),)), [None])
+    assert found["actuator_saturation"]["limit"] == pytest.approx(0.5, rel=0.05)
 
 
 def test_a_supply_that_drains_is_no_supply_that_is_low():

@@ -92,13 +92,13 @@ def build_parser() -> argparse.ArgumentParser:
 
 def chosen_cases(options: argparse.Namespace) -> list[Case]:
     """The cases that the options select."""
-    first, count = SETS[options.set]
     platforms = QUICK_PLATFORMS if options.quick else options.platforms
-    last = first + (count + len(WORLD_GROUNDS) if platforms is None else platforms)
+    allowed = {case.platform_seed: None for case in all_cases(options.set)}
+    seeds = set(list(allowed)[:platforms])
     cases = [
         case
         for case in all_cases(options.set)
-        if case.platform_seed < last
+        if case.platform_seed in seeds
         and case.kind in options.kind
         and options.engine in (None, case.engine)
         and options.ground in (None, case.ground)

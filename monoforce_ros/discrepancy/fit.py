@@ -120,9 +120,13 @@ def fit_effects(
     """
     neutral = neutral_values(starts[0])
 
+    def distance(effects: Effects) -> np.ndarray:
+        # Limits are infinite where they do nothing: no value of theirs is nearer to that than another.
+        away = (flat(effects) - neutral) / scales(effects)
+        return np.where(np.isfinite(away), away, 0.0)
+
     def total(hypotheses: Sequence[Effects], scaled: np.ndarray) -> np.ndarray:
-        away = np.array([(flat(effects) - neutral) / scales(effects) for effects in hypotheses])
-        away = np.where(np.isfinite(away), away, 0.0)
+        away = np.array([distance(effects) for effects in hypotheses])
         return robust(scaled).mean(axis=1) + 0.5 * prior * (away**2).sum(axis=1)
 
     tried = predictions.residuals(list(starts)) / scale
@@ -141,8 +145,8 @@ def fit_effects(
         if prior:
             # The loss is a mean over residuals, the sums here are not.
             count = motion_count(residual)
-            gradient = gradient + prior * count * ((values - neutral) / typical)[fixed:]
-            curvature = curvature + prior * count * np.eye(len(curvature))
+            gradient = gradient + prior * count * distance(current)[fixed:]
+            curvature = curvature + prior * count * np.diag(np.isfinite(neutral[fixed:]).astype(float))
         diagonal = np.diag(np.diag(curvature) + 1e-6 * np.trace(curvature) + 1e-9)
         candidates = []
         for damping in _DAMPINGS:
