@@ -339,20 +339,21 @@ def test_an_effect_that_predicts_nothing_is_no_discrepancy_where_errors_are_a_he
     assert diagnosis.effects == () and diagnosis.fitted == ()
 
 
-def test_what_makes_windows_worse_that_no_search_saw_is_not_added(husky, monkeypatch):
+@pytest.mark.parametrize(("factor", "said"), [(1.1, "increase"), (1.0, "do not decrease")])
+def test_what_does_not_help_in_windows_that_no_search_saw_is_not_added(husky, monkeypatch, factor, said):
     compared = []
 
     def worse_when_repeated(*arguments, **named):
         found = compare(*arguments, **named)
         compared.append(found)
-        return found if len(compared) == 1 else [replace(c, after=1.1 * c.before) for c in found]
+        return found if len(compared) == 1 else [replace(c, after=factor * c.before) for c in found]
 
     monkeypatch.setattr(diagnosis_module, "compare", worse_when_repeated)
     motion, commands = simulated_recording(husky, (("drive_gain", {"gain": 0.8}),), seconds=40.0)
     smoothed = SmoothedMotion(motion, 0.003, 0.002, (slice(0, len(motion)),))
     diagnosis = diagnose(Evidence(smoothed, commands), husky, settings=DiagnosisSettings(max_effects=1))
     assert len(compared) == 2
-    assert diagnosis.verdict == Verdict.NO_IMPROVEMENT and "increase beyond chance" in diagnosis.remarks[-1]
+    assert diagnosis.verdict == Verdict.NO_IMPROVEMENT and f"{said} beyond chance" in diagnosis.remarks[-1]
     assert diagnosis.effects == () and all(row.after is None for row in diagnosis.gap.values())
 
 

@@ -199,9 +199,10 @@ def diagnose(
             judged = None if decision.trial is None else repetition.held_out
             compared = compared_with(judged)
     gap = gap_table(compared, settings.seed, by_gyro)
-    if judged is not None and gets_worse(gap):
-        # Searches that never saw the judged windows contradict what was found.
-        decision, judged = decision.without_improvement("increase", dispensable=explanation.dispensable), None
+    if judged is not None and not improves(gap):
+        # Searches that never saw the judged windows contradict what was found, or find nothing that helps.
+        errors = "increase" if gets_worse(gap) else "do not decrease"
+        decision, judged = decision.without_improvement(errors, dispensable=explanation.dispensable), None
         compared = _without_effects(compared)
         gap = gap_table(compared, settings.seed, by_gyro)
     known_parts: tuple[EffectEstimate, ...] = ()
