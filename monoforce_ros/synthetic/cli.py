@@ -69,9 +69,9 @@ def build_parser() -> OptionParser:
         "--commands",
         default="random",
         metavar="random|steps|sweep|straight|circle|spin|crab|FILE.csv",
-        help="command profile: random follows the world's track, steps covers all motion regimes near the start; crab "
-        "moves sideways; a file has the columns t,v,w in s, m/s, rad/s, or t,v,w,y with the speed to the left in m/s "
-        "(%(default)s)",
+        help="command profile: random follows the world's track and passes obstacles that stop it, steps covers all "
+        "motion regimes near the start; crab moves sideways; a file has the columns t,v,w in s, m/s, rad/s, or t,v,w,y "
+        "with the speed to the left in m/s (%(default)s)",
     )
     parser.add_argument(
         "--command-type",

@@ -100,6 +100,8 @@ class SteadyCommand:
 class WanderingDriver:
     """Follows the route loosely, with random steps and ramps of speed and yaw rate.
 
+    After an obstacle has stopped the robot, it reverses and goes around.
+
     Args:
         route: path to follow.
         random: draws speeds and deviations from the route.
@@ -111,6 +113,11 @@ class WanderingDriver:
     _SHARPEST_TURN = 1.3
     _SWAY = 0.45
     _ACCELERATION, _YAW_ACCELERATION = 0.8, 2.5
+    _STUCK_TIME, _STUCK_DISTANCE = 2.5, 0.12
+    """Time [s] within which the robot must move by a distance [m]; otherwise something stops it."""
+    _BACK_TIME = (1.2, 2.5)
+    _SKIPPED = 2.5
+    """Distance along the route by which the driver then looks ahead [m]."""
 
     def __init__(self, route: Route, random: np.random.Generator):
         self._route, self._random = route, random
@@ -120,6 +127,8 @@ class WanderingDriver:
         self._speed_target = self._sway = 0.0
         self._next_speed = self._next_sway = 0.0
         self._is_step = False
+        self._place, self._since = np.zeros(2), 0.0
+        self._until, self._turn = -math.inf, 0.0
 
     def command(self, time: float, position: np.ndarray, heading: float) -> tuple[float, float]:
         """The command at ``time``, continued from the previous call."""
@@ -140,7 +149,20 @@ class WanderingDriver:
         self._speed += float(np.clip(self._speed_target - self._speed, -change, change))
         turn = self._YAW_ACCELERATION * elapsed
         self._yaw_rate += float(np.clip(yaw_rate - self._yaw_rate, -turn, turn))
+        if time < self._until:
+            return -0.6 * self._FASTEST, self._turn
+        self._look_at_progress(time, position)
         return self._speed, self._yaw_rate
+
+    def _look_at_progress(self, time: float, position: np.ndarray) -> None:
+        """Reverse from the next command on where the robot has not moved."""
+        if float(np.linalg.norm(position - self._place)) > self._STUCK_DISTANCE:
+            self._place, self._since = position.copy(), time
+        elif time - self._since > self._STUCK_TIME:
+            self._until = time + self._random.uniform(*self._BACK_TIME)
+            self._turn = float(self._random.choice([-1.0, 1.0])) * self._random.uniform(0.2, 0.9)
+            self._station += self._SKIPPED
+            self._place, self._since = position.copy(), self._until
 
 
 class ExcitationDriver:
