@@ -211,7 +211,7 @@ class Judging:
             p = min(1.0, 2.0 * p)
         explained = 1.0
         if self.commissioned and trial.effects:
-            explained = excess_share(nominal.loss, trial.loss, self.healthy_loss)
+            explained = excess_share(nominal.loss, trial.loss, self.healthy_loss, self.thresholds.drive_spread)
         return FitTest(p, name, tuple(tests), explained)
 
     def size_p(self, trial: Trial) -> float | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -68,8 +69,8 @@ class FitTest:
     """What the residuals contain most significantly."""
     tests: tuple[ScoreResult, ...] = ()
     explained: float = 1.0
-    """Share of the excess loss, that above a healthy robot's, which the effects explain; 1 without effects, and where
-    a healthy robot's loss is unknown."""
+    """Share of the excess loss, that above what a healthy robot may well have, which the effects explain; 1 without
+    effects, and where a healthy robot's loss is unknown."""
 
     def passed(self, thresholds: Thresholds) -> bool:
         """Whether the effects are the explanation: they explain most, and the rest looks like a healthy robot's."""
@@ -92,9 +93,17 @@ class Outcome:
     """By selected effect: others that explain the recording about as well in its place."""
 
 
-def excess_share(before: float, after: float, healthy: float) -> float:
-    """Share of the loss above a healthy robot's that is gone afterwards, at most 1."""
-    return min((before - after) / max(before - healthy, 1e-6), 1.0)
+def excess_share(before: float, after: float, healthy: float, spread: float = 0.0) -> float:
+    """Share of the loss above a healthy robot's that is gone afterwards, at most 1.
+
+    Args:
+        before: loss without the effects.
+        after: loss with them.
+        healthy: mean loss of the healthy robot.
+        spread: standard deviation of its logarithm between drives. What a drive may well have by itself, the mean and
+            one of these, is no excess that effects would have to explain.
+    """
+    return min((before - after) / max(before - healthy * math.exp(spread), 1e-6), 1.0)
 
 
 def expected_loss(healthy: float, change: np.ndarray, model_error: float) -> float:

@@ -32,7 +32,7 @@ class Losses:
     healthy: float | None = None
     """Of the healthy robot."""
     share_explained: float | None = None
-    """Share of the excess loss, that above a healthy robot's, which the effects explain."""
+    """Share of the excess loss, that above what a healthy robot may well have, which the effects explain."""
     by_formula: float | None = None
     """Held-out loss of the best formula."""
     p_rest: float | None = None
@@ -125,7 +125,8 @@ def leaves_most(findings: Findings, thresholds: Thresholds) -> bool:
 def decide(findings: Findings, thresholds: Thresholds = Thresholds()) -> Decision:  # noqa: B008
     """The verdict on a recording."""
     nominal, best = findings.nominal, findings.best
-    share = excess_share(nominal.loss, best.loss, findings.healthy_loss) if best.effects else None
+    spread = thresholds.drive_spread if findings.commissioned else 0.0
+    share = excess_share(nominal.loss, best.loss, findings.healthy_loss, spread) if best.effects else None
     losses = Losses(nominal.loss, best.loss, findings.healthy_loss, share, p_rest=findings.fit.p)
     if fits(findings, thresholds):
         if not best.effects:
