@@ -17,7 +17,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 import torch
 import yaml
@@ -27,6 +26,7 @@ from monoforce_ros.core import write_text
 from monoforce_ros.effects import controls
 from monoforce_ros.physics import State, rollout
 from monoforce_ros.robots import Controls, RobotModel, load_robot, robot_file
+from monoforce_ros.synthetic.graphics import mujoco
 from monoforce_ros.synthetic.vehicle_parts import set_inertia
 from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap
 

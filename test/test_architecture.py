@@ -77,6 +77,18 @@ def test_scripts_and_benchmarks_import_names_that_are_there():
                 assert name in exported(parts[1]), f"{path}: {name} is not exported by {module}"
 
 
+def test_mujoco_is_imported_where_its_graphics_library_is_chosen():
+    """It selects one when it is first imported: any other file may come first, and then nothing can be drawn."""
+    folders = ("monoforce_ros", "benchmarks", "scripts", "test")
+    direct = {
+        path.relative_to(ROOT).as_posix()
+        for folder in folders
+        for path in (ROOT / folder).rglob("*.py")
+        if re.search(r"^\s*(import|from) mujoco\b", path.read_text(), re.MULTILINE)
+    }
+    assert direct == {"monoforce_ros/synthetic/graphics.py"}
+
+
 def test_no_modules_import_each_other_in_a_circle():
     known = {module_of(path) for path in FILES}
     graph: dict[str, set[str]] = {}

@@ -1,6 +1,5 @@
 """Simulated bodies have their centres of mass where they belong: wheels on their axles, payloads where mounted."""
 
-import mujoco
 import numpy as np
 import pytest
 from drawn_platform import draw_platform
@@ -12,6 +11,7 @@ from mujoco_engine import simulate
 from monoforce_ros.robots import shipped_robots
 from monoforce_ros.synthetic import TerrainSettings, Vehicle, build_model, build_scenery
 from monoforce_ros.synthetic.faults import Payload
+from monoforce_ros.synthetic.graphics import mujoco
 
 
 @pytest.fixture(scope="module")

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 
-import mujoco
 import numpy as np
 from drawn_platform import GRAVITY, Platform
 from drive_session import DriveJob, DriveSession, Trace, combined_build
 from ground_shape import HALF_SIZE, Ground
 from injection import TICK, BaseState, Build
+
+from monoforce_ros.synthetic.graphics import mujoco
 
 TIME_STEP = 0.002
 """[s]."""
