@@ -93,11 +93,11 @@ def build_parser() -> argparse.ArgumentParser:
 def chosen_cases(options: argparse.Namespace) -> list[Case]:
     """The cases that the options select."""
     platforms = QUICK_PLATFORMS if options.quick else options.platforms
-    allowed = {case.platform_seed: None for case in all_cases(options.set)}
-    seeds = set(list(allowed)[:platforms])
+    listed = all_cases(options.set)
+    seeds = list(dict.fromkeys(case.platform_seed for case in listed))[:platforms]
     cases = [
         case
-        for case in all_cases(options.set)
+        for case in listed
         if case.platform_seed in seeds
         and case.kind in options.kind
         and options.engine in (None, case.engine)

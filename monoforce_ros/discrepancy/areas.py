@@ -126,10 +126,7 @@ def shows_vegetation(data: EvidenceWindows) -> bool:
     """Whether the robot drove through vegetation that the map holds: in as many windows as a class of ground needs."""
     if data.terrain is None:
         return False
-    least = _CHANNELS["vegetation"][2]
-    numbers = blocks_of(data.starts)
-    covered = _along(data, "vegetation") > least
-    return len(np.unique(numbers[covered])) >= _FEWEST_BLOCKS and int(covered.sum()) >= FEWEST_WINDOWS
+    return _enough(_along(data, "vegetation") > _CHANNELS["vegetation"][2], data)
 
 
 def _along(data: EvidenceWindows, channel: str) -> np.ndarray:
@@ -239,9 +236,16 @@ def _circle(places: np.ndarray, centre: np.ndarray, radius: float, data: Evidenc
 
 
 def _large_enough(area: Area, data: EvidenceWindows) -> bool:
-    numbers = blocks_of(data.starts)
-    blocks = min(len(np.unique(numbers[mask])) for mask in (area.inside, ~area.inside)) if area.inside.any() else 0
-    return blocks >= _FEWEST_BLOCKS and int(area.inside.sum()) >= FEWEST_WINDOWS
+    return _enough(area.inside, data) and _block_count(~area.inside, data) >= _FEWEST_BLOCKS
+
+
+def _enough(chosen: np.ndarray, data: EvidenceWindows) -> bool:
+    """Whether windows ``[W]`` bool suffice to show what is special about them."""
+    return _block_count(chosen, data) >= _FEWEST_BLOCKS and int(chosen.sum()) >= FEWEST_WINDOWS
+
+
+def _block_count(chosen: np.ndarray, data: EvidenceWindows) -> int:
+    return len(np.unique(blocks_of(data.starts)[chosen]))
 
 
 def _cut(values: np.ndarray) -> tuple[float, float]:

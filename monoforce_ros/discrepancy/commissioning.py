@@ -42,17 +42,18 @@ from monoforce_ros.discrepancy.wheels import WheelFinding, best_of, changed_driv
 from monoforce_ros.effects import CATALOGUE, identifiable_effects
 from monoforce_ros.robots import RobotModel
 
-COMMISSIONED: Effects = tuple(
-    (effect.name, dict(effect.commissioning_start))
-    for effect in CATALOGUE.values()
-    if effect.commissioning_start and not effect.commissioned_over
-)
+
+def _commissioned(over: str) -> Effects:
+    return tuple(
+        (effect.name, dict(effect.commissioning_start))
+        for effect in CATALOGUE.values()
+        if effect.commissioning_start and effect.commissioned_over == over
+    )
+
+
+COMMISSIONED = _commissioned("")
 """Effects that every robot needs, with the values at which their fit starts."""
-COMMISSIONED_IN_VEGETATION: Effects = tuple(
-    (effect.name, dict(effect.commissioning_start))
-    for effect in CATALOGUE.values()
-    if effect.commissioned_over == "vegetation"
-)
+COMMISSIONED_IN_VEGETATION = _commissioned("vegetation")
 """Effects that every robot needs in addition where a recording leads through vegetation."""
 _FEWEST_SEGMENTS = 3
 _PARTS = 3
