@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 import torch
 from recorded_rollout import recorded
+from scipy.spatial.transform import Rotation
 
 from monoforce_ros.core import CommandTrack
-from monoforce_ros.discrepancy.evidence import EvidenceWindows, window_starts
+from monoforce_ros.discrepancy.evidence import COMPONENTS, EvidenceWindows, window_starts
 from monoforce_ros.discrepancy.fit import fit_effects, flat, jacobian, robust
 from monoforce_ros.discrepancy.hypothesis import Predictions, residuals_by_part
 from monoforce_ros.discrepancy.left_out import values_without_parts
 from monoforce_ros.discrepancy.selection import Search
 from monoforce_ros.discrepancy.trial import FOLDS, folds_of
-from monoforce_ros.effects import drive_speeds
+from monoforce_ros.effects import CATALOGUE, drive_speeds
 from monoforce_ros.physics import State, rollout
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainMap
@@ -105,6 +106,46 @@ def test_each_window_is_judged_with_the_values_without_its_part():
     assert trial.held_out_loss == pytest.approx(
         robust(residuals_by_part(husky, data, parts, trial.parts) / SCALE), abs=1e-6
     )
+
+
+@pytest.mark.parametrize("name", ["drive_gain", "pose_clock_offset"])
+def test_the_usual_lean_is_that_of_all_windows_whatever_part_they_are_in(name):
+    # A sensor that leans by 2°, on a robot whose pitch differs between the halves of the recording.
+    data = _recording(())
+    husky, parts = load_robot("husky"), folds_of(data.starts, FOLDS)
+    tilts = np.where(np.arange(len(data.motion)) < len(data.motion) // 2, 0.02, 0.05)
+    leaning = Rotation.from_quat(data.motion.quaternions) * Rotation.from_euler("y", tilts[:, None])
+    motion = replace(data.motion, quaternions=leaning.as_quat())
+    data = replace(data, motion=motion, components=COMPONENTS)
+    parameter = CATALOGUE[name].parameters[0]
+    values = parameter.neutral + 0.01 * np.arange(FOLDS)
+    effects = tuple(((name, {parameter.name: float(value)}),) for value in values)
+    found = residuals_by_part(husky, data, parts, effects)
+    everywhere = Predictions(husky, data).residuals([effects[parts[0]]])[0]
+    roll, pitch = COMPONENTS.index("roll"), COMPONENTS.index("pitch")
+    assert np.median(found[..., [roll, pitch]], axis=(0, 1)) == pytest.approx([0.0, 0.0], abs=1e-9)
+    # The halves differ by what they lean apart.
+    first = parts < FOLDS // 2
+    assert abs(np.median(found[first, :, pitch]) - np.median(found[~first, :, pitch])) == pytest.approx(0.03, abs=0.005)
+    assert found[parts == parts[0], ..., pitch] == pytest.approx(everywhere[parts == parts[0], ..., pitch], abs=0.005)
+
+
+def test_beside_an_effect_only_candidates_that_may_matter_are_rolled_out_again():
+    hidden = (("drive_gain", {"gain": 0.8}), ("command_delay", {"delay": 0.3}))
+    data = _recording(hidden)
+    search = Search(load_robot("husky"), data, SCALE)
+    first = search.screening.candidates((), 0, "1: ")
+    base = search.refit(hidden[:1]).effects
+    second = search.screening.candidates(base, 0, "2: ")
+    known = {direction.name: direction for direction in first.influences}
+    kept = [direction.name for direction in second.influences if direction is known[direction.name]]
+    assert kept and "command_delay" not in kept
+    # Nobody is forgotten, and those that are kept as they were promise nothing.
+    assert {entry.name for entry in second.screened} == set(known) - {"drive_gain"}
+    assert all(entry.loss == second.before and entry.test.p > 0.3 for entry in second.screened if entry.name in kept)
+    best = min(second.screened, key=lambda entry: entry.loss)
+    assert best.name in ("command_delay", "pose_clock_offset", "command_clock_offset")
+    assert best.test.adjusted < 0.01
 
 
 def test_a_fit_is_kept_by_the_parameters_that_it_holds_and_improved_from_better_values():

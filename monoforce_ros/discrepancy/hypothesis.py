@@ -20,6 +20,7 @@ from monoforce_ros.core import CommandTrack, MotionTrack, transform_points, wrap
 from monoforce_ros.discrepancy.attitude import Lean, lean_of, vertical
 from monoforce_ros.discrepancy.evidence import (
     ATTITUDE,
+    MOTION,
     RATE_TIME,
     Evidence,
     EvidenceWindows,
@@ -44,6 +45,8 @@ from monoforce_ros.terrain import Grid, TerrainMap
 HISTORY = 4.0
 """Length of the commands before a window, for delays, lags and the integral part of drives [s]."""
 _LARGEST_BATCH = 1024
+_LEAN = slice(len(MOTION), len(MOTION) + 2)
+"""Roll and pitch among the components of a residual."""
 _LEVEL_REACH, _HILLY_REACH = 0.1, 0.3
 """Height above a robot's lowest point up to which contact points are kept [m]."""
 
@@ -59,16 +62,7 @@ def residuals_by_part(
         parts: number of the part of each, ``[W]``.
         effects: by part.
     """
-    residuals = np.zeros((len(data.starts), len(data.samples), len(data.components)))
-    alike: dict[tuple[object, ...], list[int]] = {}
-    for part in np.unique(parts):
-        key = tuple((name, *values.items()) for name, values in effects[part])
-        alike.setdefault(key, []).append(int(part))
-    for numbers in alike.values():
-        here = np.isin(parts, numbers)
-        windows = Predictions(robot, replace(data, starts=data.starts[here]))
-        residuals[here] = windows.residuals([effects[numbers[0]]])[0]
-    return residuals
+    return Predictions(robot, data).residuals_by_part(parts, effects)
 
 
 def values_key(effects: Effects) -> tuple[tuple[object, ...], ...]:
@@ -99,6 +93,14 @@ def correct_measurements(
 _LEVEL = Lean(np.zeros(2), np.zeros(2), np.zeros(2))
 _MeasurementKey = tuple[tuple[str, tuple[tuple[str, float], ...]], ...]
 """Measurement effects with their parameters, hashable."""
+
+
+def _measurements(effects: Effects) -> _MeasurementKey:
+    return tuple(
+        (name, tuple(sorted(parameters.items())))
+        for name, parameters in effects
+        if CATALOGUE[name].stage == "measurement"
+    )
 
 
 @dataclass(frozen=True)
@@ -187,24 +189,57 @@ class Predictions:
 
     def residuals(self, hypotheses: Sequence[Effects]) -> np.ndarray:
         """Predicted minus measured, ``[H, W, K, C]``, with the robot's own effects and each hypothesis."""
+        return self._without_lean(self._raw(hypotheses))
+
+    def residuals_by_part(self, parts: np.ndarray, effects: Sequence[Effects]) -> np.ndarray:
+        """Predicted minus measured, ``[W, K, C]``, each window with the effects of its part; see the function."""
+        numbers = np.unique(parts)
+        used = [effects[number] for number in numbers]
+        if (
+            self._part is None
+            and len({(_measurements(entry), tuple(name for name, _ in entry)) for entry in used}) == 1
+        ):
+            # One batch, in which every window has values of its own.
+            windows = self._windows(_measurements(used[0]))
+            (found,) = self._roll_out(windows, [effects[part] for part in parts], each=1)
+            return self._without_lean(found)
+        residuals = np.zeros((len(parts), len(self.data.samples), len(self.data.components)))
+        alike: dict[tuple[object, ...], list[int]] = {}
+        for number in numbers:
+            alike.setdefault(values_key(effects[number]), []).append(int(number))
+        for same in alike.values():
+            here = np.isin(parts, same)
+            residuals[here] = self.on(self.data.place, here)._raw([effects[same[0]]])[0]
+        return self._without_lean(residuals)
+
+    def _without_lean(self, residuals: np.ndarray) -> np.ndarray:
+        """Residuals ``[..., W, K, C]`` without what the robot always leans.
+
+        It may be the sensor's mounting, or its accelerometer's bias.
+        """
+        if not self.data.with_attitude:
+            return residuals
+        lean = residuals[..., _LEAN]
+        diverged = np.isnan(lean).all(axis=(-3, -2), keepdims=True)
+        usual = np.nanmedian(np.where(diverged, 0.0, lean), axis=(-3, -2), keepdims=True)
+        return np.concatenate([residuals[..., : _LEAN.start], lean - usual, residuals[..., _LEAN.stop :]], axis=-1)
+
+    def _raw(self, hypotheses: Sequence[Effects]) -> np.ndarray:
+        """Predicted minus measured, ``[H, W, K, C]``, the usual lean included."""
         results: dict[int, np.ndarray] = {}
         # Other measurement effects mean other windows; hypotheses that share them share a batch.
         groups: dict[tuple[_MeasurementKey, tuple[str, ...]], list[int]] = {}
         for number, effects in enumerate(hypotheses):
-            key = tuple(
-                (name, tuple(sorted(parameters.items())))
-                for name, parameters in effects
-                if CATALOGUE[name].stage == "measurement"
-            )
             names = tuple(name for name, _ in effects)
-            groups.setdefault((key, names), []).append(number)
-        count = max(1, _LARGEST_BATCH // max(1, len(self.data.starts)))
+            groups.setdefault((_measurements(effects), names), []).append(number)
+        width = len(self.data.starts)
+        count = max(1, _LARGEST_BATCH // max(1, width))
         for (key, _), numbers in groups.items():
             windows = self._windows(key)
             for first in range(0, len(numbers), count):
                 part = numbers[first : first + count]
-                for number, result in zip(part, self._roll_out(windows, [hypotheses[n] for n in part]), strict=True):
-                    results[number] = result
+                found = self._roll_out(windows, [hypotheses[n] for n in part], each=width)
+                results.update(zip(part, found, strict=True))
         return np.stack([results[number] for number in range(len(hypotheses))])
 
     def _windows(self, key: _MeasurementKey) -> _Prepared:
@@ -334,9 +369,10 @@ class Predictions:
     def _underside(self) -> np.ndarray:
         return self.robot.underside.double().numpy()
 
-    def _roll_out(self, windows: _Prepared, hypotheses: list[Effects]) -> list[np.ndarray]:
+    def _roll_out(self, windows: _Prepared, hypotheses: list[Effects], each: int) -> list[np.ndarray]:
+        """Residuals ``[W, K, C]`` for all windows in turn, each hypothesis for as many of them as ``each`` says."""
         if self._part is None:
-            return self._residuals_on(self._terrain, windows, hypotheses, hypotheses)
+            return self._residuals_on(self._terrain, windows, hypotheses, hypotheses, each)
         # Hypotheses that change the ground alike share a map.
         results: dict[int, np.ndarray] = {}
         shared: dict[tuple[tuple[object, ...], ...], list[int]] = {}
@@ -348,24 +384,26 @@ class Predictions:
         for numbers in shared.values():
             whole = [hypotheses[number] for number in numbers]
             on_robot = [split[number][1] for number in numbers]
-            found = self._residuals_on(split[numbers[0]][0], windows, whole, on_robot)
+            found = self._residuals_on(split[numbers[0]][0], windows, whole, on_robot, each)
             results.update(zip(numbers, found, strict=True))
         return [results[number] for number in range(len(hypotheses))]
 
     def _residuals_on(
-        self, terrain: TerrainMap, windows: _Prepared, hypotheses: list[Effects], on_robot: list[Effects]
+        self, terrain: TerrainMap, windows: _Prepared, hypotheses: list[Effects], on_robot: list[Effects], each: int
     ) -> list[np.ndarray]:
-        """Residuals ``[W, K, C]`` of hypotheses on a map.
+        """Residuals ``[W, K, C]`` on a map, for all windows in turn.
 
         Args:
             terrain: map with those effects that are properties of the ground.
             windows: the windows.
             hypotheses: with all their effects.
             on_robot: with the others alone.
+            each: windows of each hypothesis.
         """
-        count, width = len(hypotheses), len(self.data.starts)
+        width = len(self.data.starts)
+        count = len(hypotheses) * each // width
         with torch.no_grad():
-            sunk = np.repeat(self._sunk(hypotheses)[:, None], width, axis=1)
+            sunk = np.repeat(self._sunk(hypotheses), each).reshape(count, width)
             if self._part is not None:
                 sunk = np.where(self._on_place(windows, torch.zeros(width, 3)), sunk, 0.0)
             position = windows.position.repeat(count, 1)
@@ -375,9 +413,9 @@ class Predictions:
                 windows.velocity.repeat(count, 1),
                 windows.angular_velocity.repeat(count, 1),
             )
-            here = self._driven(windows, on_robot)
+            here = self._driven(windows, on_robot, each)
             if self._part is not None and any(on_robot):
-                elsewhere = self._driven(windows, [self._elsewhere(effects) for effects in on_robot])
+                elsewhere = self._driven(windows, [self._elsewhere(effects) for effects in on_robot], each)
 
                 def on_part(reached: torch.Tensor) -> torch.Tensor:
                     return torch.from_numpy(self._on_place(windows, reached - position))
@@ -397,9 +435,6 @@ class Predictions:
         ]
         if self.data.with_attitude:
             lean = vertical(rotations) - windows.leaned
-            # What the robot always leans may be the sensor's mounting, or its accelerometer's bias.
-            diverged = np.isnan(lean).all(axis=(1, 2), keepdims=True)
-            lean = lean - np.nanmedian(np.where(diverged, 0.0, lean), axis=(1, 2), keepdims=True)
             risen = displacement[..., 2] + sunk[..., None]
             errors += [lean[..., 1], -lean[..., 0], risen - windows.risen]
         if len(self.data.components) > len(ATTITUDE):
@@ -411,10 +446,10 @@ class Predictions:
             errors += [means[..., axis] for axis in range(3)]
         return list(np.stack(errors, axis=-1))
 
-    def _driven(self, windows: _Prepared, hypotheses: list[Effects]) -> Driven:
-        """The robot with each hypothesis in all windows, and its controls."""
-        count, width = len(hypotheses), len(self.data.starts)
-        robot = replace(self.robot, effects=self._joined(hypotheses, width))
+    def _driven(self, windows: _Prepared, hypotheses: list[Effects], each: int) -> Driven:
+        """The robot with each hypothesis in some windows, and its controls."""
+        count = len(hypotheses) * each // len(self.data.starts)
+        robot = replace(self.robot, effects=self._joined(hypotheses, each))
         given = controls(
             robot,
             windows.twists.repeat(count, 1, 1),
@@ -468,6 +503,18 @@ class Predictions:
 
         A robot that starts above its place of rest drops into it, and pitches and slips as no measured one does.
         """
+        count = len(hypotheses)
+        if all(CATALOGUE[name].stage in ("measurement", "command") for name, _ in hypotheses[0]):
+            # Neither weighs on the ground nor changes it.
+            return np.full(count, self._own_sinking)
+        return self._sinking(hypotheses)
+
+    @cached_property
+    def _own_sinking(self) -> float:
+        """Of the robot with its own effects."""
+        return float(self._sinking([()])[0])
+
+    def _sinking(self, hypotheses: list[Effects]) -> np.ndarray:
         setup = applied_setup(self._terrain, replace(self.robot, effects=self._joined(hypotheses, 1)))
         count = len(hypotheses)
         softness, mass = (
@@ -490,5 +537,6 @@ class Predictions:
             }
         for name, parameters in joined.items():
             if clock := CATALOGUE[name].clock:
-                joined[name] = {**parameters, clock: self._middles.repeat(len(hypotheses))}
+                copies = max(1, len(hypotheses) * width // len(self._middles))
+                joined[name] = {**parameters, clock: self._middles.repeat(copies)}
         return tuple(joined.items())

@@ -12,7 +12,7 @@ from monoforce_ros.discrepancy.directions import Directions
 from monoforce_ros.discrepancy.estimates import EffectEstimate, effect_sizes
 from monoforce_ros.discrepancy.evidence import EvidenceWindows
 from monoforce_ros.discrepancy.fit import Fit, estimate_effects, fit_effects, flat, neutral_values, robust, scales
-from monoforce_ros.discrepancy.hypothesis import Effects, Predictions, own_values, residuals_by_part
+from monoforce_ros.discrepancy.hypothesis import Effects, Predictions, own_values
 from monoforce_ros.discrepancy.left_out import values_without_parts
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.residual_size import ResidualSize, residual_size
@@ -97,7 +97,7 @@ class Judging:
         fit = self.refit(effects)
         unchanged = np.concatenate([self._without(name, values) for name, values in fit.effects] or [np.zeros(0)])
         parts = values_without_parts(fit, self._folds, self._ends, FOLDS, unchanged)
-        residuals = residuals_by_part(self.robot, self.data, self._folds, parts)
+        residuals = self.predictions.residuals_by_part(self._folds, parts)
         return Trial(fit.effects, parts, robust(residuals / self.scale))
 
     def _without(self, name: str, values: Mapping[str, float]) -> np.ndarray:

@@ -101,6 +101,7 @@ class Screening:
         self._sparse, self._sparse_scale = Predictions(robot, replace(data, starts=starts[::4])), scale[::4]
         self._blocks = block_numbers(starts, thresholds.block)
         self._done: dict[tuple[tuple[object, ...], ...], Candidates] = {}
+        self._first: dict[str, tuple[Effects, Direction]] = {}
 
     def quick_fit(self, effects: Effects, fixed: int, iterations: int) -> tuple[Effects, float]:
         """Effects fitted to every second window, with the first ``fixed`` of them as they are, and their loss there."""
@@ -185,14 +186,16 @@ class Screening:
         return known
 
     def _screened(self, base: Effects, fixed: int, number: str, incomplete: bool) -> Candidates:
+        hopeless = {} if incomplete else self._hopeless(base, fixed)
         residual = self._sparse.residuals([base])[0] / self._sparse_scale
-        names = {name for name, _ in base}
         tried: list[tuple[float, Effect, Effects]] = []
-        for effect in self.possible(names):
+        for effect in self.possible({name for name, _ in base}):
+            if effect.name in hopeless:
+                continue
             self._progress(f"{number}{effect.name}")
             tried.append(self._tried(effect, base, residual))
         tried.sort(key=lambda entry: entry[0])
-        residual = self._directions.scaled(base)
+        residual, before = self._directions.scaled(base), self.quick_loss(base)
         possible = np.ones(len(tried), bool)
         if not incomplete:
             influences = [self._directions.influence(base, start[-1]) for _, _, start in tried]
@@ -206,10 +209,31 @@ class Screening:
             influences[rank] if not incomplete and fit == start else self._directions.influence(base, fit[-1])
             for rank, ((_, _, start), (fit, _)) in enumerate(zip(tried, fits, strict=True))
         ]
+        if not self._first:
+            self._first = {
+                effect.name: (start[len(base) :], influence)
+                for (_, effect, start), influence in zip(tried, influences, strict=True)
+            }
+        for start, influence in hopeless.values():
+            fits.append((base + start, before))
+            influences.append(influence)
         tests = self.tested(base, fixed, residual, influences)
         screened = [Screened(effects, loss, test) for (effects, loss), test in zip(fits, tests, strict=True)]
         ordered = tuple(sorted(screened, key=lambda entry: entry.loss))
-        return Candidates(self.quick_loss(base), ordered, tuple(influences), incomplete)
+        return Candidates(before, ordered, tuple(influences), incomplete)
+
+    def _hopeless(self, base: Effects, fixed: int) -> dict[str, tuple[Effects, Direction]]:
+        """Candidates that are not rolled out again, each with its initial value and its influence in the first round.
+
+        Beside other effects a candidate changes the residuals about as it did without them.
+        """
+        names = {effect.name for effect in self.possible({name for name, _ in base})}
+        listed = {name: entry for name, entry in self._first.items() if name in names}
+        if not listed:
+            return {}
+        directions = [direction for _, direction in listed.values()]
+        tests = self.tested(base, fixed, self._directions.scaled(base), directions)
+        return {name: listed[name] for name, test in zip(listed, tests, strict=True) if test.p > _HOPELESS}
 
     def _tried(self, effect: Effect, base: Effects, residual: np.ndarray) -> tuple[float, Effect, Effects]:
         """Loss that an effect promises on every fourth window, and the best of its initial values.

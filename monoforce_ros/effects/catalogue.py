@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import math
 import pkgutil
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -13,7 +14,7 @@ import torch
 from torch import Tensor
 
 from monoforce_ros.core import CommandTrack, MotionTrack
-from monoforce_ros.effects.effect import STAGES, Effect
+from monoforce_ros.effects.effect import STAGES, Effect, Parameter
 from monoforce_ros.effects.setup import Setup
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import TerrainMap
@@ -25,6 +26,8 @@ class EffectError(ValueError):
 
 _NO_EFFECTS = frozenset({"catalogue", "effect", "first_order", "joint_controls", "page", "ramp", "setup", "timing"})
 """Modules of this package without an effect."""
+_SINGLE = float(torch.finfo(torch.float32).eps)
+"""Relative spacing of single-precision numbers."""
 
 
 def _discover() -> dict[str, Effect]:
@@ -100,15 +103,24 @@ def effect_values(name: str, parameters: Mapping[str, float | Tensor], like: Ten
     device = like.device if like is not None else None
     values = {}
     for key, parameter in known.items():
-        value = torch.as_tensor(parameters.get(key, parameter.neutral), dtype=dtype, device=device)
-        inside = (value >= parameter.low) & (value <= parameter.high) | (value == parameter.neutral)
-        if not bool(inside.detach().all()):
+        given = parameters.get(key, parameter.neutral)
+        value = torch.as_tensor(given, dtype=dtype, device=device)
+        if not _inside(parameter, value.detach() if isinstance(given, Tensor) else given):
             raise EffectError(
                 f"effect {name}: {key} is {value.detach().tolist()}, expected {parameter.low:g} to {parameter.high:g} "
                 f"{parameter.unit}"
             )
         values[key] = value
     return values
+
+
+def _inside(parameter: Parameter, value: float | Tensor) -> bool:
+    """Whether a value, or each of several, is within its bounds or neutral; a number as if of single precision."""
+    if isinstance(value, Tensor):
+        return bool(((value >= parameter.low) & (value <= parameter.high) | (value == parameter.neutral)).all())
+    if parameter.low <= value <= parameter.high or value == parameter.neutral:
+        return True
+    return any(math.isclose(value, bound, rel_tol=_SINGLE) for bound in (parameter.low, parameter.high))
 
 
 def drive_speeds(robot: RobotModel, twists: Tensor, time_step: float, *, history: int = 0) -> Tensor:

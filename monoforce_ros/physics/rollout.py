@@ -161,7 +161,8 @@ def _result(problem: Problem, motion: Motion, finite: Tensor, options: PhysicsOp
         velocity = motion.velocity - torch.linalg.cross(motion.angular_velocity, offset) - drift
     position = motion.centre - offset
     states = (position, motion.rotation, velocity, motion.angular_velocity)
-    valid = finite & torch.stack([torch.isfinite(t.detach()).flatten(1).all(1) for t in states]).all(0)
+    # A sum is finite where all its terms are: far faster than asking each of them.
+    valid = finite & torch.isfinite(torch.stack([t.detach().flatten(1).sum(1) for t in states])).all(0)
 
     all_valid = bool(valid.all())
 

@@ -183,11 +183,12 @@ def _launch(
     device = str(inputs[0].device)
     double, kinds = precision(inputs[0])
     kernel = integrate_kernel(double, fixed.soft)
-    # Computed before the threads start; otherwise each would compute it.
+    # Computed before the threads start; otherwise each would compute it. Gradients are each thread's own.
     fixed.ceilings(inputs[0])
+    forward = None if backward else Arguments(fixed, inputs, states)
 
     def work(part: tuple[int, int]) -> list[Tensor]:
-        arguments = Arguments(fixed, inputs, states, gradients=backward, state_gradients=state_gradients)
+        arguments = forward or Arguments(fixed, inputs, states, gradients=True, state_gradients=state_gradients)
         for chunk, width in chunks(part, steps, inputs[0].device, backward=backward):
             # The adjoint reads the sums of every step. Storing them for a few trajectories at a time requires a second
             # forward launch, but saves most of the memory.
