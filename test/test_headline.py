@@ -60,6 +60,24 @@ def test_what_the_localisation_errs_by_itself_is_said_beside_what_is_unexplained
     assert "gyro" not in headline(diagnosed((0.5, 0.06), (20.0, 8.0), noise_floor=floor)).unexplained
 
 
+def test_what_a_sensor_measures_of_itself_leaves_nothing_of_the_motion_unexplained():
+    bias = effect("gyro_bias", bias=(0.041, 0.0405, 0.042))
+    found = replace(
+        diagnosed((0.018, None), (0.3, None), effects=(bias,)),
+        gap={
+            "position_2s": row(0.018, None),
+            "heading_2s": row(0.3, None, unit="deg", noise=0.3),
+            "yaw_rate_gyro": row(0.042, 0.003, unit="rad/s", noise=0.003, horizon=0.0),
+        },
+        commissioned=True,
+    )
+    top = headline(found)
+    assert top.tone is Tone.GOOD and top.unexplained == "" and "A sensor shows what is wrong" in top.sentence
+    assert any("gyro" in text for text in top.findings)
+    assert headline(found, ["the map ends"]).tone is Tone.PARTLY
+    assert "nexplained" not in "\n".join(summary_lines(found)) + diagnosis_page(found, {}, None)
+
+
 def test_a_part_of_the_recording_is_said_beside_what_acts_there():
     there = "It acts within 2.5 m of (7.3, 3.3) in the odometry frame (26 of 86 windows)."
     found = diagnosed((0.5, 0.06), (8.0, 1.0), part=there)

@@ -138,7 +138,10 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
         )
     named = [effect for effect in effects if effect.name != LEARNED]
     rows = explained(diagnosis)
-    left = (_left(rows) or "Unexplained: all of the error.") + _of_localisation(diagnosis)
+    # Where nothing was added to the motion, what was found is a sensor's own measurement.
+    by_sensors = diagnosis.verdict == Verdict.EFFECT_FOUND and bool(named) and not rows
+    left = _left(rows) or ("" if by_sensors else "Unexplained: all of the error.")
+    left += _of_localisation(diagnosis)
     confidence = [*_sizes(diagnosis), *_intervals(effects)]
     for effect in named:
         if effect.indistinguishable:
@@ -186,6 +189,10 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
     if diagnosis.verdict == Verdict.NO_IMPROVEMENT or not effects:
         sentence = "The robot does not move as predicted, and the cause is not established."
         return result(Tone.UNKNOWN, sentence)
+    if by_sensors:
+        doubtful = bool(refused or complaints)
+        sentence = "A sensor shows what is wrong; nothing had to be added to how the robot moves."
+        return result(Tone.PARTLY if doubtful else Tone.GOOD, sentence)
     if enough and not grew and not refused and not complaints and not unstable:
         sentence = "The cause was found." if len(effects) == 1 else f"{len(effects)} causes were found."
         return result(Tone.GOOD, sentence)
