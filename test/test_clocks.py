@@ -50,7 +50,13 @@ def test_a_gyro_is_biased_beyond_what_a_healthy_one_is(bias, biased):
     found = compare_with_gyro(SmoothedMotion(motion, 0.003, 0.002, (slice(0, len(motion)),)), gyro)
     assert found.bias == pytest.approx(bias, abs=0.003)
     assert abs(found.bias - bias) < max(found.bias_half_width, 0.002)
-    assert found.biased == biased
+    assert found.biased() == biased
+
+
+def test_a_gyro_that_is_too_slow_to_compare_says_nothing():
+    motion, gyro = turning(20.0)
+    slow = AngularVelocityTrack(gyro.stamps[::50], gyro.rates[::50])
+    assert compare_with_gyro(SmoothedMotion(motion, 0.003, 0.002, (slice(0, len(motion)),)), slow) is None
 
 
 def disagreement(motion, gyro, seconds=2.0):

@@ -500,14 +500,14 @@ def test_a_gyro_distinguishes_a_late_pose_clock_from_a_late_robot(husky):
     smoothed = SmoothedMotion(late, 0.003, 0.002, (slice(0, len(late)),))
     found = compare_with_gyro(smoothed, gyro_of(clean))
     assert found.poses_late and found.offset == pytest.approx(0.23, abs=0.01)
-    assert not found.biased
+    assert not found.biased()
     # The mounting of the IMU is estimated too.
     tilted = compare_with_gyro(smoothed, gyro_of(clean, sign=-1.0, axis=1))
     assert (tilted.axis, tilted.sign) == (1, -1) and tilted.offset == pytest.approx(0.23, abs=0.01)
     in_time = SmoothedMotion(clean, 0.003, 0.002, (slice(0, len(clean)),))
     biased = compare_with_gyro(in_time, gyro_of(clean, bias=0.04))
     assert not biased.poses_late
-    assert biased.biased and biased.bias == pytest.approx(0.04, abs=0.005)
+    assert biased.biased() and biased.bias == pytest.approx(0.04, abs=0.005)
     assert compare_with_gyro(in_time, None) is None
     noise = np.random.default_rng(0).standard_normal((len(clean), 3))
     assert compare_with_gyro(in_time, AngularVelocityTrack(clean.stamps, noise)) is None

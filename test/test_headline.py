@@ -64,6 +64,7 @@ def test_what_a_sensor_measures_of_itself_leaves_nothing_of_the_motion_unexplain
     bias = effect("gyro_bias", bias=(0.041, 0.0405, 0.042))
     found = replace(
         diagnosed((0.018, None), (0.3, None), effects=(bias,)),
+        fitted=(),
         gap={
             "position_2s": row(0.018, None),
             "heading_2s": row(0.3, None, unit="deg", noise=0.3),
@@ -76,6 +77,18 @@ def test_what_a_sensor_measures_of_itself_leaves_nothing_of_the_motion_unexplain
     assert any("gyro" in text for text in top.findings)
     assert headline(found, ["the map ends"]).tone is Tone.PARTLY
     assert "nexplained" not in "\n".join(summary_lines(found)) + diagnosis_page(found, {}, None)
+
+
+def test_a_short_held_out_recording_or_a_motion_that_stays_unexplained_is_no_sensor_fault_alone():
+    top = headline(replace(diagnosed((0.5, 0.4), (8.0, 7.0)), held_out={"short": {}}))
+    assert top.tone is Tone.PARTLY and "Most of the error is not explained" in top.sentence
+    assert "80 % of the position error" in top.unexplained
+    lost = effect("blocked_flipper", front_left=(0.9, 0.85, 0.95))
+    found = diagnosed((0.5, None), (20.0, None), effects=(lost,))
+    found = replace(found, fitted=(), motion_unexplained=True)
+    top = headline(found)
+    assert top.tone is Tone.PARTLY and "does not move as predicted" in top.sentence
+    assert top.unexplained == "Unexplained: all of the error."
 
 
 def test_a_part_of_the_recording_is_said_beside_what_acts_there():

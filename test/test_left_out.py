@@ -9,12 +9,12 @@ from recorded_rollout import recorded
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.core import CommandTrack
-from monoforce_ros.discrepancy.evidence import COMPONENTS, EvidenceWindows, window_starts
+from monoforce_ros.discrepancy.evidence import COMPONENTS, EvidenceWindows, subsampled, window_starts
 from monoforce_ros.discrepancy.fit import fit_effects, flat, jacobian, robust
 from monoforce_ros.discrepancy.hypothesis import Predictions, residuals_by_part
 from monoforce_ros.discrepancy.left_out import values_without_parts
 from monoforce_ros.discrepancy.selection import Search
-from monoforce_ros.discrepancy.trial import FOLDS, folds_of
+from monoforce_ros.discrepancy.trial import FOLDS, fold_count, folds_of
 from monoforce_ros.effects import CATALOGUE, drive_speeds
 from monoforce_ros.physics import State, rollout
 from monoforce_ros.robots import load_robot
@@ -146,6 +146,14 @@ def test_beside_an_effect_only_candidates_that_may_matter_are_rolled_out_again()
     best = min(second.screened, key=lambda entry: entry.loss)
     assert best.name in ("command_delay", "pose_clock_offset", "command_clock_offset")
     assert best.test.adjusted < 0.01
+
+
+@pytest.mark.parametrize("seconds", [60, 420, 700, 900, 1400])
+def test_of_long_recordings_too_a_small_part_is_left_out_at_a_time(seconds):
+    starts = subsampled(np.arange(seconds, dtype=np.int64) * 10**9, 8.0, 120)
+    folds = folds_of(starts, fold_count(starts))
+    counts = np.unique(folds, return_counts=True)[1]
+    assert len(counts) >= 6 and counts.max() <= 0.25 * len(starts)
 
 
 def test_a_fit_is_kept_by_the_parameters_that_it_holds_and_improved_from_better_values():

@@ -57,6 +57,16 @@ def test_an_effect_that_begins_is_dated(begins):
         assert onset is None
 
 
+def test_what_a_sensor_measured_acts_before_an_onset_too():
+    data, late = _recording(ONSET), 300_000_000
+    data = replace(data, motion=replace(data.motion, stamps=data.motion.stamps + late), starts=data.starts[2:-2])
+    known = (("pose_clock_offset", {"offset": 0.3}),)
+    search = Search(load_robot("husky"), data, np.tile([0.01, 0.01, 0.005], (4, 1)), known=known)
+    onset = find_onset(search, search.judge((*known, ("drive_gain", {"gain": 0.8}))))
+    assert onset is not None
+    assert (onset.stamp - data.motion.stamps[0]) * 1e-9 == pytest.approx(ONSET, abs=3.5)
+
+
 def _explained(data: EvidenceWindows) -> Explanation:
     """Of a commissioned robot whose healthy residuals are some centimetres."""
     residual = np.tile([0.01, 0.012, 0.007], (4, 1))

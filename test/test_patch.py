@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from test_region import CENTRE, ICE, RADIUS, RESIDUAL, _drive, _healthy
 
 from monoforce_ros.discrepancy.areas import Circle, GroundClass, reach_of, touching
@@ -39,6 +40,28 @@ def over_waves(icy):
 
 def _residuals(data, place, *hypotheses):
     return Predictions(load_robot("husky"), replace(data, place=place)).residuals(hypotheses)
+
+
+def test_a_robot_that_never_touches_a_part_moves_as_its_file_says(icy):
+    robot = replace(load_robot("husky"), effects=(("terrain_softness", {"factor": 5.0}),))
+    data = replace(icy, starts=icy.starts[:12], components=COMPONENTS)
+    (plain,) = Predictions(robot, data).residuals([()])
+    for effects in ((), DRAG):
+        (local,) = Predictions(robot, replace(data, place=NOWHERE)).residuals([effects])
+        np.testing.assert_allclose(local, plain, atol=2e-3)
+
+
+def test_what_the_robot_always_leans_is_that_of_the_whole_recording_on_a_part_of_it_too(icy):
+    # It pitches by 1° in a part of the drive, where nothing acts.
+    motion, data = icy.motion, replace(icy, components=COMPONENTS)
+    times = (motion.stamps - motion.stamps[0]) * 1e-9
+    tilt = np.where(times % 20.0 < 8.0, np.radians(1.0), 0.0)
+    leaning = Rotation.from_quat(motion.quaternions) * Rotation.from_euler("y", tilt[:, None])
+    data = replace(data, motion=replace(motion, quaternions=leaning.as_quat()))
+    predictions = Predictions(load_robot("husky"), data)
+    there = (data.starts - motion.stamps[0]) * 1e-9 % 20.0 < 6.0
+    (whole,), (part,) = predictions.residuals([()]), predictions.on(None, there).residuals([()])
+    np.testing.assert_allclose(part, whole[there], atol=1e-6)
 
 
 @pytest.mark.parametrize("effects", [FRICTION, SOFT, DRAG, SLOW, (*FRICTION, *DRAG, *SLOW)])

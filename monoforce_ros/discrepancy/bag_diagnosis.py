@@ -19,7 +19,7 @@ from monoforce_ros.discrepancy.encoder_ground import encoder_maps
 from monoforce_ros.discrepancy.evidence import COMPONENTS, MOTION, Evidence, window_starts
 from monoforce_ros.discrepancy.gap import noisy_motions
 from monoforce_ros.discrepancy.ground import Ground, beyond_commissioning, choose_ground
-from monoforce_ros.discrepancy.hypothesis import Effects, corrected_evidence, own_values
+from monoforce_ros.discrepancy.hypothesis import Effects, corrected_evidence
 from monoforce_ros.discrepancy.nominal import NominalModel, with_known_components
 from monoforce_ros.discrepancy.nominal_residual import residual_complaint
 from monoforce_ros.discrepancy.report import effect_entry, write_diagnosis
@@ -195,7 +195,7 @@ def diagnose_bag(
     robot_file = None
     # On ground that no map shows slopes pass for effects: of that only what sensors measured belongs into a robot file.
     credible = bool(diagnosis.effects) and (bool(rest) or not ground.unknown)
-    if credible and all(not complaint(effect, own_values(model, effect.name)) for effect in diagnosis.effects):
+    if credible and not any(map(complaint, diagnosis.effects)):
         effects = [effect_entry(effect) for effect in diagnosis.effects]
         robot_file = write_robot(robot, found_file, effects, [bag], data)
     elif found_file.exists():

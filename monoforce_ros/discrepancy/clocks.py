@@ -61,10 +61,9 @@ class GyroFinding:
         """Whether the offset is significant."""
         return abs(self.offset) > max(self.resolution, self.offset_half_width)
 
-    @property
-    def biased(self) -> bool:
-        """Whether the bias is significant, and larger than that of a healthy gyro."""
-        return abs(self.bias) > max(_HEALTHY_BIAS, self.bias_half_width)
+    def biased(self, known: float = 0.0) -> bool:
+        """Whether the bias differs significantly from a known one [rad/s], by more than that of a healthy gyro."""
+        return abs(self.bias - known) > max(_HEALTHY_BIAS, self.bias_half_width)
 
 
 def compare_with_gyro(smoothed: SmoothedMotion, gyro: AngularVelocityTrack | None) -> GyroFinding | None:
@@ -105,8 +104,11 @@ def compare_with_gyro(smoothed: SmoothedMotion, gyro: AngularVelocityTrack | Non
         if known.mean() > 0.5:
             differences.append((measured - rate)[known])
             medians.append(float(np.median(differences[-1])))
-    bias = float(np.median(np.concatenate(differences)))
+    if not differences:
+        # Too few measurements for their mean.
+        return None
     everything = np.concatenate(differences)
+    bias = float(np.median(everything))
     return GyroFinding(
         offset=float(offset),
         offset_half_width=float(max(1.96 * spread, 0.01)),

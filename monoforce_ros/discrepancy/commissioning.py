@@ -12,7 +12,7 @@ from monoforce_ros.discrepancy.areas import shows_vegetation
 from monoforce_ros.discrepancy.attitude import lean_of
 from monoforce_ros.discrepancy.command_changes import covered_changes
 from monoforce_ros.discrepancy.directions import Directions
-from monoforce_ros.discrepancy.estimates import EffectEstimate
+from monoforce_ros.discrepancy.estimates import EffectEstimate, beyond_file
 from monoforce_ros.discrepancy.evidence import MOTION, Evidence, EvidenceWindows, window_starts
 from monoforce_ros.discrepancy.fit import (
     Fit,
@@ -28,7 +28,7 @@ from monoforce_ros.discrepancy.fit import (
 from monoforce_ros.discrepancy.gap import noise_floor, noisy_motions, residual_scale
 from monoforce_ros.discrepancy.ground import slopes_of
 from monoforce_ros.discrepancy.healthy_wheels import HealthyWheels, drives_of
-from monoforce_ros.discrepancy.hypothesis import Effects, Predictions
+from monoforce_ros.discrepancy.hypothesis import Effects, Predictions, corrected_evidence
 from monoforce_ros.discrepancy.motion_check import motion_faults
 from monoforce_ros.discrepancy.nominal import SEGMENT, NominalModel
 from monoforce_ros.discrepancy.preflight import complaints
@@ -55,6 +55,7 @@ COMMISSIONED = _commissioned("")
 """Effects that every robot needs, with the values at which their fit starts."""
 COMMISSIONED_IN_VEGETATION = _commissioned("vegetation")
 """Effects that every robot needs in addition where a recording leads through vegetation."""
+_VEGETATION = frozenset(name for name, _ in COMMISSIONED_IN_VEGETATION)
 _FEWEST_SEGMENTS = 3
 _PARTS = 3
 """Parts of a single recording that take turns in being predicted by the others."""
@@ -106,7 +107,8 @@ def commission(
     """
     # What some recordings lack nothing can be learned of.
     components = min((evidence.components for evidence in recordings), key=len)
-    recordings = [replace(evidence, components=components) for evidence in recordings]
+    # As later recordings are: what the file says of sensors and clocks is known.
+    recordings = [replace(corrected_evidence(evidence, robot), components=components) for evidence in recordings]
     prepared = []
     for number, evidence in enumerate(recordings):
         progress(0.3 * number / len(recordings), "reading the noise")
@@ -143,7 +145,7 @@ def commission(
         wheels=_healthy_wheels(recordings, drives, replace(robot, effects=_together(robot, merged.effects))),
     )
     progress(1.0, "done")
-    return estimate_effects(merged, {}), nominal
+    return beyond_file(estimate_effects(merged, {}), robot), nominal
 
 
 def _prepare(evidence: Evidence, robot: RobotModel, samples: np.ndarray, stride: float) -> _Prepared:
@@ -171,8 +173,7 @@ def _fitted(entry: _Prepared, effects: Effects, iterations: int = 12) -> Fit:
 def _merged(fitted: Sequence[Effects], overgrown: Sequence[bool]) -> Effects:
     """Medians of what was fitted to each recording; of an effect of vegetation, to those that lead through it."""
     rows = np.array([flat(effects) for effects in fitted])
-    in_vegetation = {name for name, _ in COMMISSIONED_IN_VEGETATION}
-    of_vegetation = np.array([name in in_vegetation for name, values in fitted[0] for _ in values])
+    of_vegetation = np.array([name in _VEGETATION for name, values in fitted[0] for _ in values])
     if any(overgrown):
         rows[np.ix_(~np.array(overgrown), of_vegetation)] = np.nan
     return with_values(fitted[0], np.nanmedian(rows, axis=0))
@@ -224,19 +225,24 @@ def _held_out_residuals(
     recordings each is predicted by the others; a single one is cut into segments that take turns in being left out.
     """
     if len(prepared) > 1:
-        kept = [[other for other in range(len(fits)) if other != number] for number in range(len(fits))]
-        others = [_merged([fits[n].effects for n in rest], [overgrown[n] for n in rest]) for rest in kept]
-        return [
-            np.nan_to_num(entry.predictions.residuals([other])[0])
-            for entry, other in zip(prepared, others, strict=True)
-        ]
+        predicted = []
+        for number, entry in enumerate(prepared):
+            rest = [other for other in range(len(fits)) if other != number]
+            others = _merged([fits[other].effects for other in rest], [overgrown[other] for other in rest])
+            if overgrown[number] and not any(overgrown[other] for other in rest):
+                # Bare ground says nothing of vegetation.
+                own = dict(effects)
+                others = tuple((name, own[name] if name in _VEGETATION else values) for name, values in others)
+            predicted.append(np.nan_to_num(entry.predictions.residuals([others])[0]))
+        return predicted
     entry = prepared[0]
     data, starts = entry.data, entry.data.starts
-    held_out = _segments(entry) % _PARTS
+    # Segments in a gap hold no windows.
+    held_out = np.unique(_segments(entry), return_inverse=True)[1] % _PARTS
     # A window that reaches into the next segment shares motion with it.
     ends = held_out[np.searchsorted(starts, np.minimum(starts + round(data.horizon * 1e9), starts[-1]))]
     residuals = np.zeros((len(starts), len(data.samples), len(data.components)))
-    for part in range(_PARTS):
+    for part in np.unique(held_out):
         fitted, judged = (held_out != part) & (ends != part), held_out == part
         fit = _fitted(entry[fitted], effects, iterations=6)
         residuals[judged] = entry[judged].predictions.residuals([fit.effects])[0]

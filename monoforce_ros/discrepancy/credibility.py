@@ -27,7 +27,8 @@ def complaint(estimate: EffectEstimate, nominal: Mapping[str, float] | None = No
 
     Args:
         estimate: values and intervals.
-        nominal: values of the same effect in the robot's file, which take the place of the neutral ones.
+        nominal: values of the same effect in the robot's file, which take the place of the neutral ones; by default
+            those that the estimate knows of.
 
     Raises:
         ValueError: the effect or a parameter is not in the catalogue.
@@ -36,6 +37,7 @@ def complaint(estimate: EffectEstimate, nominal: Mapping[str, float] | None = No
     if effect is None:
         raise ValueError(f"got the effect {estimate.name!r}, expected one of the catalogue: {', '.join(CATALOGUE)}")
     known = {parameter.name: parameter for parameter in effect.parameters}
+    nominal = estimate.in_file if nominal is None else nominal
     if nominal:
         known |= {key: replace(known[key], neutral=float(value)) for key, value in nominal.items() if key in known}
     unknown = sorted(set(estimate.parameters) - set(known))

@@ -24,7 +24,7 @@ from monoforce_ros.discrepancy.comparison import (
     measured_paths,
     regime_table,
 )
-from monoforce_ros.discrepancy.estimates import EffectEstimate
+from monoforce_ros.discrepancy.estimates import EffectEstimate, beyond_file
 from monoforce_ros.discrepancy.evidence import MOTION, Evidence, EvidenceWindows
 from monoforce_ros.discrepancy.explanation import DiagnosisSettings, explain
 from monoforce_ros.discrepancy.fit import Fit
@@ -45,14 +45,12 @@ from monoforce_ros.discrepancy.region import Region
 from monoforce_ros.discrepancy.repetition import prepare_processes, repeat
 from monoforce_ros.discrepancy.selection import Search
 from monoforce_ros.discrepancy.sensor_findings import (
-    accepts_bias,
-    bias_estimate,
     bias_row,
+    changed_bias,
     heading_noise,
 )
 from monoforce_ros.discrepancy.trial import CandidateScore, Outcome
 from monoforce_ros.discrepancy.verdict import Decision, Losses, Verdict
-from monoforce_ros.effects import CATALOGUE
 from monoforce_ros.robots import RobotModel
 
 
@@ -110,6 +108,8 @@ class Diagnosis:
     set_aside: Verdict | None = None
     """Verdict on all effects where only those that sensors measured are kept, since the ground may be the cause of the
     rest, which is listed in ``known_parts``; None where nothing was set aside."""
+    motion_unexplained: bool = False
+    """Whether, besides what a sensor measured, the motion is not as predicted, and no effect improves it."""
 
     def __post_init__(self):
         if self.verdict in _NOTHING_ADDED:
@@ -222,9 +222,10 @@ def diagnose(
         effects = tuple(sensors.with_interval(estimates[i], search) for i in search.ranked(whole))
         if repetition is not None:
             effects = repetition.judged(effects)
-    gyro = sensors.gyro
-    if gyro is not None and gyro.biased and accepts_bias(decision, robot):
-        effects, gap = (*effects, bias_estimate(gyro)), {**gap, "yaw_rate_gyro": bias_row(gyro)}
+    motion_unexplained = False
+    gyro, bias = sensors.gyro, changed_bias(sensors.gyro, robot)
+    if gyro is not None and bias is not None and decision.verdict in (Verdict.NO_DISCREPANCY, Verdict.EFFECT_FOUND):
+        effects, gap = (*effects, bias), {**gap, "yaw_rate_gyro": bias_row(gyro)}
         remarks = (*decision.remarks, "the gyro measures a rotation that the poses do not show")
         decision = replace(decision, verdict=Verdict.EFFECT_FOUND, remarks=remarks)
     if sensors.flippers is not None:
@@ -232,6 +233,7 @@ def diagnose(
             # How the flippers move is measured, whatever it does to the path.
             others = tuple(effect for effect in effects if effect.name != BLOCKED)
             effects, gap = (*others, sensors.flippers.estimate), {**gap, "flippers": sensors.flippers.row}
+            motion_unexplained = decision.verdict == Verdict.NO_IMPROVEMENT
             decision = replace(decision, verdict=Verdict.EFFECT_FOUND)
         decision = replace(decision, remarks=(*decision.remarks, sensors.flippers.summary()))
     if left_out or leans:
@@ -273,6 +275,7 @@ def diagnose(
         details=Details(data, before, floor, tuple(compared), paths, area, meaning),
         part="" if part is None or decision.verdict in _NOTHING_ADDED else part.remark,
         set_aside=None if aside is None else aside.verdict,
+        motion_unexplained=motion_unexplained,
     )
 
 
@@ -283,17 +286,7 @@ def _without_effects(compared: Sequence[Comparison]) -> list[Comparison]:
 
 def _estimated(search: Search, fit: Fit, outcome: Outcome) -> tuple[EffectEstimate, ...]:
     """Estimates of a fit; those of sensors and clocks include what the robot's file says already."""
-    estimates = search.estimates(fit, outcome.indistinguishable)
-    in_file = dict(search.robot.effects)
-    result = []
-    for estimate in estimates:
-        if CATALOGUE[estimate.name].stage == "measurement" and estimate.name in in_file:
-            # The recording was corrected by these values before the search.
-            added = {key: float(value) for key, value in in_file[estimate.name].items()}
-            shifted = {key: value.shifted(added.get(key, 0.0)) for key, value in estimate.parameters.items()}
-            estimate = replace(estimate, parameters=shifted)
-        result.append(estimate)
-    return tuple(result)
+    return beyond_file(search.estimates(fit, outcome.indistinguishable), search.robot)
 
 
 class _Steps:

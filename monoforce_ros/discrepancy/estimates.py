@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from monoforce_ros.effects import CATALOGUE
+from monoforce_ros.robots import RobotModel
 
 
 @dataclass(frozen=True)
@@ -46,10 +47,29 @@ class EffectEstimate:
     """In how many of how many repetitions, each without another part of the recording, it or one of these others is
     found; None for a recording too short for that, and for a formula."""
 
+    in_file: Mapping[str, float] = field(default_factory=dict)
+    """Values of the same effect in the robot's file, which take the place of the neutral ones."""
+
     @property
     def shown(self) -> Mapping[str, ParameterEstimate]:
         """What people are shown: parameters, then products."""
         return {**self.parameters, **self.products}
+
+
+def beyond_file(estimates: Sequence[EffectEstimate], robot: RobotModel) -> tuple[EffectEstimate, ...]:
+    """Estimates beside what the robot's file says of the same effects.
+
+    Recordings are corrected for the file's sensor and clock errors before a search: what it finds adds to them. Values
+    of other effects replace the file's.
+    """
+    own, result = dict(robot.effects), []
+    for estimate in estimates:
+        in_file = {key: float(value) for key, value in own.get(estimate.name, {}).items()}
+        if in_file and CATALOGUE[estimate.name].stage == "measurement":
+            shifted = {key: value.shifted(in_file.get(key, 0.0)) for key, value in estimate.parameters.items()}
+            estimate = replace(estimate, parameters=shifted)
+        result.append(replace(estimate, in_file=in_file))
+    return tuple(result)
 
 
 def effect_sizes(name: str, values: Mapping[str, float], without: np.ndarray) -> np.ndarray:

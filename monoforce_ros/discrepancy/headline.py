@@ -91,7 +91,8 @@ def explained(diagnosis: Diagnosis) -> tuple[Explained, ...]:
 
     Recordings shorter than the windows of 2 s have those at the longest shorter time.
     """
-    tables: Mapping[str, Mapping[str, GapRow]] = diagnosis.held_out or {"": diagnosis.gap}
+    shown = {recording: table for recording, table in (diagnosis.held_out or {}).items() if table}
+    tables: Mapping[str, Mapping[str, GapRow]] = shown or {"": diagnosis.gap}
     found = []
     for recording, table in tables.items():
         for metric in ("position", "heading"):
@@ -139,8 +140,9 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
     named = [effect for effect in effects if effect.name != LEARNED]
     rows = explained(diagnosis)
     # Where nothing was added to the motion, what was found is a sensor's own measurement.
-    by_sensors = diagnosis.verdict == Verdict.EFFECT_FOUND and bool(named) and not rows
-    left = _left(rows) or ("" if by_sensors else "Unexplained: all of the error.")
+    by_sensors = diagnosis.verdict == Verdict.EFFECT_FOUND and bool(named) and not diagnosis.fitted
+    complete = by_sensors and not diagnosis.motion_unexplained
+    left = _left(rows) or ("" if complete else "Unexplained: all of the error.")
     left += _of_localisation(diagnosis)
     confidence = [*_sizes(diagnosis), *_intervals(effects)]
     for effect in named:
@@ -190,9 +192,10 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
         sentence = "The robot does not move as predicted, and the cause is not established."
         return result(Tone.UNKNOWN, sentence)
     if by_sensors:
-        doubtful = bool(refused or complaints)
         sentence = "A sensor shows what is wrong; nothing had to be added to how the robot moves."
-        return result(Tone.PARTLY if doubtful else Tone.GOOD, sentence)
+        if not complete:
+            sentence = "A sensor shows a fault; besides, the robot does not move as predicted."
+        return result(Tone.GOOD if complete and not refused and not complaints else Tone.PARTLY, sentence)
     if enough and not grew and not refused and not complaints and not unstable:
         sentence = "The cause was found." if len(effects) == 1 else f"{len(effects)} causes were found."
         return result(Tone.GOOD, sentence)

@@ -77,8 +77,15 @@ def own_values(robot: RobotModel, name: str) -> dict[str, float]:
 
 
 def corrected_evidence(evidence: Evidence, robot: RobotModel) -> Evidence:
-    """The evidence corrected for the sensor and clock errors in a robot's file."""
-    effects = tuple((name, {key: float(value) for key, value in values.items()}) for name, values in robot.effects)
+    """The evidence corrected for the sensor and clock errors in a robot's file.
+
+    The motion comes from poses: what the gyro measures beside them does not change it.
+    """
+    effects = tuple(
+        (name, {key: float(value) for key, value in values.items()})
+        for name, values in robot.effects
+        if CATALOGUE[name].gyro_measures != "bias"
+    )
     motion, commands = correct_measurements(evidence.smoothed.motion, evidence.commands, effects)
     return replace(evidence, smoothed=replace(evidence.smoothed, motion=motion), commands=commands)
 
@@ -101,6 +108,13 @@ def _measurements(effects: Effects) -> _MeasurementKey:
         for name, parameters in effects
         if CATALOGUE[name].stage == "measurement"
     )
+
+
+def _median_lean(residuals: np.ndarray) -> np.ndarray:
+    """Median of roll and pitch among residuals ``[..., W, K, C]`` over windows and times, ``[..., 1, 1, 2]``."""
+    lean = residuals[..., _LEAN]
+    diverged = np.isnan(lean).all(axis=(-3, -2), keepdims=True)
+    return np.nanmedian(np.where(diverged, 0.0, lean), axis=(-3, -2), keepdims=True)
 
 
 @dataclass(frozen=True)
@@ -163,7 +177,15 @@ class Predictions:
             touching = touching | (robot.point_flippers >= 0)
         self.robot = robot.with_points(touching)
         self._index = np.rint(data.samples / self.options.time_step).astype(int)
+        self._usual_lean: np.ndarray | None = None
         self._set_windows(data)
+
+    @cached_property
+    def _own_lean(self) -> np.ndarray | None:
+        """What the robot always leans beyond its own prediction, ``[1, 1, 2]``; None without attitude."""
+        if self._usual_lean is not None or not self.data.with_attitude:
+            return self._usual_lean
+        return _median_lean(self._raw([()])[0])
 
     def _set_windows(self, data: EvidenceWindows) -> None:
         self.data = data
@@ -174,7 +196,15 @@ class Predictions:
         self._middles = torch.as_tensor(np.maximum(middles, 0.0), dtype=torch.float32)
 
     def on(self, place: Place | None, chosen: np.ndarray) -> Predictions:
-        """Predictions of some windows ``[W]`` bool with effects that act on a part of the ground."""
+        """Predictions of some windows ``[W]`` bool with effects that act on a part of the ground.
+
+        What the robot always leans is that of all windows.
+        """
+        result = self._restricted(place, chosen)
+        result._usual_lean = self._own_lean
+        return result
+
+    def _restricted(self, place: Place | None, chosen: np.ndarray) -> Predictions:
         result = copy(self)
         result._set_windows(replace(self.data, starts=self.data.starts[chosen], place=place))
         return result
@@ -209,7 +239,7 @@ class Predictions:
             alike.setdefault(values_key(effects[number]), []).append(int(number))
         for same in alike.values():
             here = np.isin(parts, same)
-            residuals[here] = self.on(self.data.place, here)._raw([effects[same[0]]])[0]
+            residuals[here] = self._restricted(self.data.place, here)._raw([effects[same[0]]])[0]
         return self._without_lean(residuals)
 
     def _without_lean(self, residuals: np.ndarray) -> np.ndarray:
@@ -219,10 +249,9 @@ class Predictions:
         """
         if not self.data.with_attitude:
             return residuals
-        lean = residuals[..., _LEAN]
-        diverged = np.isnan(lean).all(axis=(-3, -2), keepdims=True)
-        usual = np.nanmedian(np.where(diverged, 0.0, lean), axis=(-3, -2), keepdims=True)
-        return np.concatenate([residuals[..., : _LEAN.start], lean - usual, residuals[..., _LEAN.stop :]], axis=-1)
+        usual = _median_lean(residuals) if self._usual_lean is None else self._usual_lean
+        lean = residuals[..., _LEAN] - usual
+        return np.concatenate([residuals[..., : _LEAN.start], lean, residuals[..., _LEAN.stop :]], axis=-1)
 
     def _raw(self, hypotheses: Sequence[Effects]) -> np.ndarray:
         """Predicted minus measured, ``[H, W, K, C]``, the usual lean included."""
@@ -405,7 +434,7 @@ class Predictions:
         with torch.no_grad():
             sunk = np.repeat(self._sunk(hypotheses), each).reshape(count, width)
             if self._part is not None:
-                sunk = np.where(self._on_place(windows, torch.zeros(width, 3)), sunk, 0.0)
+                sunk = np.where(self._on_place(windows, torch.zeros(width, 3)), sunk, self._own_sinking)
             position = windows.position.repeat(count, 1)
             state = State(
                 position - torch.from_numpy(sunk.ravel()).to(position)[:, None] * position.new_tensor([0.0, 0.0, 1.0]),

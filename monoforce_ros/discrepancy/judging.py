@@ -20,12 +20,12 @@ from monoforce_ros.discrepancy.score_test import motion_count
 from monoforce_ros.discrepancy.screening import Screening
 from monoforce_ros.discrepancy.thresholds import Thresholds
 from monoforce_ros.discrepancy.trial import (
-    FOLDS,
     HEALTHY_LOSS,
     FitTest,
     Trial,
     excess_share,
     expected_loss,
+    fold_count,
     folds_of,
     paired,
 )
@@ -74,8 +74,9 @@ class Judging:
             thresholds=thresholds, seed=seed, progress=progress,
         )  # fmt: skip
         starts = data.starts
-        self._folds = folds_of(starts, FOLDS)
-        self._ends = folds_of(np.r_[starts[0], starts + round(data.horizon * 1e9)], FOLDS)[1:]
+        self.fold_count = fold_count(starts)
+        self._folds = folds_of(starts, self.fold_count)
+        self._ends = folds_of(np.r_[starts[0], starts + round(data.horizon * 1e9)], self.fold_count)[1:]
         self._fits: dict[tuple[tuple[str, ...], ...], Fit] = {}
 
     @property
@@ -96,7 +97,7 @@ class Judging:
         """Cross-validate: judge each fold with the values that the effects have without it."""
         fit = self.refit(effects)
         unchanged = np.concatenate([self._without(name, values) for name, values in fit.effects] or [np.zeros(0)])
-        parts = values_without_parts(fit, self._folds, self._ends, FOLDS, unchanged)
+        parts = values_without_parts(fit, self._folds, self._ends, self.fold_count, unchanged)
         residuals = self.predictions.residuals_by_part(self._folds, parts)
         return Trial(fit.effects, parts, robust(residuals / self.scale))
 
@@ -254,7 +255,7 @@ class Judging:
 
     @cached_property
     def _without_effects(self) -> Trial:
-        return Trial((), ((),) * FOLDS, self.loss_of(()))
+        return Trial((), ((),) * self.fold_count, self.loss_of(()))
 
     def _gain(self, before: Trial, after: Trial) -> tuple[float, float]:
         rate = self.thresholds.comparison_rate

@@ -45,8 +45,9 @@ class Onset:
 def find_onset(search: Search, trial: Trial) -> Onset | None:
     """The time from which effects act, if that explains a recording better than effects that always act.
 
-    The effects are fitted to the last third of the recording. Before the onset the nominal residuals count, after
-    it those with the effects; the onset with the smallest loss is taken, and must gain beyond chance over blocks.
+    The effects are fitted to the last third of the recording. Before the onset the residuals with what sensors measured
+    count, which always acts, after it those with the effects; the onset with the smallest loss is taken, and must gain
+    beyond chance over blocks.
 
     Args:
         search: search on the whole recording.
@@ -63,7 +64,7 @@ def find_onset(search: Search, trial: Trial) -> Onset | None:
     last = Predictions(search.robot, replace(search.data, starts=starts[late]))
     whole = search.refit(trial.effects).effects
     fit = fit_effects(last, [whole, trial.effects], search.scale[late], iterations=6, free=fixed)
-    before, after = search.loss_of(()), search.loss_of(fit.effects)
+    before, after = search.loss_of(search.known), search.loss_of(fit.effects)
     times = (starts - begin) * 1e-9
     # Half a window before the onset belongs to neither.
     losses = [float(np.where(times < edge - 0.5 * search.data.horizon, before, after).mean()) for edge in edges]

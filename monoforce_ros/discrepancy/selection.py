@@ -21,7 +21,7 @@ from monoforce_ros.discrepancy.judging import Judging
 from monoforce_ros.discrepancy.learned import learned_terms
 from monoforce_ros.discrepancy.pairing import promising_pairs
 from monoforce_ros.discrepancy.screening import Candidates, Screened, admitted
-from monoforce_ros.discrepancy.trial import FOLDS, CandidateScore, FitTest, Outcome, Trial
+from monoforce_ros.discrepancy.trial import CandidateScore, FitTest, Outcome, Trial
 from monoforce_ros.effects import CATALOGUE, separating_sensor
 
 _JUDGED = 6
@@ -125,7 +125,7 @@ class Search(Judging):
         """The effects that another sensor measured, unless the motion contradicts them."""
         nominal = start = self._without_effects
         if self.known:
-            start = Trial(self.known, (self.known,) * FOLDS, self.loss_of(self.known))
+            start = Trial(self.known, (self.known,) * self.fold_count, self.loss_of(self.known))
             _, low = self._gain(start, nominal)
             if low > 0:
                 self.known, start = (), nominal

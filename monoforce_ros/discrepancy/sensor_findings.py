@@ -17,7 +17,6 @@ from monoforce_ros.discrepancy.healthy_wheels import HealthyWheels
 from monoforce_ros.discrepancy.hypothesis import Effects, Predictions
 from monoforce_ros.discrepancy.selection import Search
 from monoforce_ros.discrepancy.thresholds import Thresholds
-from monoforce_ros.discrepancy.verdict import Decision, Verdict
 from monoforce_ros.discrepancy.wheels import WheelFinding, changed_drives, compare_with_wheels
 from monoforce_ros.effects import CATALOGUE
 from monoforce_ros.robots import RobotModel
@@ -67,10 +66,10 @@ class SensorFindings:
         excluded: tuple[str, ...] = () if gyro is None else ("pose_clock_offset",)
         flippers = compare_with_commands(evidence.joints, robot, evidence.smoothed.motion.stamps)
         if not commissioned and not any(CATALOGUE[name].stage == "command" for name, _ in robot.effects):
-            known = measured_effects(gyro, wheels, flippers, robot)
+            known = measured_effects(gyro, wheels, flippers)
             return cls(gyro, wheels, known, excluded=excluded, flippers=flippers)
         hints, unchanged = ((), ()) if wheels is None else changed_drives(wheels, robot, healthy)
-        known = measured_effects(gyro, None, flippers, robot)
+        known = measured_effects(gyro, None, flippers)
         return cls(gyro, wheels, known, hints, excluded + unchanged, flippers)
 
     def with_interval(self, estimate: EffectEstimate, search: Search) -> EffectEstimate:
@@ -88,15 +87,13 @@ class SensorFindings:
         else:
             return estimate
         parameters = {key: value.with_half_width(half_widths[key]) for key, value in estimate.parameters.items()}
-        return EffectEstimate(estimate.name, parameters)
+        return EffectEstimate(estimate.name, parameters, in_file=estimate.in_file)
 
 
-def measured_effects(
-    gyro: GyroFinding | None, wheels: WheelFinding | None, flippers: FlipperFinding | None, robot: RobotModel
-) -> Effects:
+def measured_effects(gyro: GyroFinding | None, wheels: WheelFinding | None, flippers: FlipperFinding | None) -> Effects:
     """Effects that the gyro, the wheel speeds and the joint angles measure, that of the gyro first."""
     measured: Effects = ()
-    if gyro is not None and gyro.poses_late and "pose_clock_offset" not in dict(robot.effects):
+    if gyro is not None and gyro.poses_late:
         measured = (("pose_clock_offset", {"offset": gyro.offset}),)
     if wheels is not None:
         measured += wheels.effects
@@ -129,16 +126,13 @@ def heading_noise(evidence: Evidence, gyro: GyroFinding | None) -> dict[float, f
     return {horizon: float(np.degrees(apart)) for horizon, apart in found.items() if apart is not None}
 
 
-def accepts_bias(decision: Decision, robot: RobotModel) -> bool:
-    """Whether a gyro bias can be added to the decision."""
-    accepting = (Verdict.NO_DISCREPANCY, Verdict.EFFECT_FOUND)
-    return decision.verdict in accepting and "gyro_bias" not in dict(robot.effects)
-
-
-def bias_estimate(gyro: GyroFinding) -> EffectEstimate:
-    """The gyro's bias with its interval."""
+def changed_bias(gyro: GyroFinding | None, robot: RobotModel) -> EffectEstimate | None:
+    """The gyro's bias with its interval; None where it is what the robot's file says, or that of a healthy gyro."""
+    in_file = {key: float(value) for key, value in dict(robot.effects).get("gyro_bias", {}).items()}
+    if gyro is None or not gyro.biased(in_file.get("bias", 0.0)):
+        return None
     bias = ParameterEstimate(gyro.bias, gyro.bias, gyro.bias, "rad/s").with_half_width(gyro.bias_half_width)
-    return EffectEstimate("gyro_bias", {"bias": bias})
+    return EffectEstimate("gyro_bias", {"bias": bias}, in_file=in_file)
 
 
 def bias_row(gyro: GyroFinding) -> GapRow:

@@ -18,6 +18,10 @@ HEALTHY_LOSS = 0.5
 FOLDS = 8
 """Parts that are held out in turn: each block of a recording of a minute. Half of a recording shows an effect in half
 as many manoeuvres, and its values scatter twice as much."""
+_OTHER_FOLDS = (7, 9, 11, 5)
+"""Numbers of parts for long recordings of which only every so many blocks are used: of eight these would fill a few."""
+_FILLED = 6
+"""Parts that hold windows, at least."""
 BLOCK = 8.0
 """Length of the blocks that are held out together [s]: longer than a window."""
 
@@ -94,7 +98,7 @@ class Outcome:
 
 
 def excess_share(before: float, after: float, healthy: float, spread: float = 0.0) -> float:
-    """Share of the loss above a healthy robot's that is gone afterwards, at most 1.
+    """Share of the loss above a healthy robot's that is gone afterwards, at most 1; all of it where there is none.
 
     Args:
         before: loss without the effects.
@@ -103,7 +107,10 @@ def excess_share(before: float, after: float, healthy: float, spread: float = 0.
         spread: standard deviation of its logarithm between drives. What a drive may well have by itself, the mean and
             one of these, is no excess that effects would have to explain.
     """
-    return min((before - after) / max(before - healthy * math.exp(spread), 1e-6), 1.0)
+    usual = healthy * math.exp(spread)
+    if before <= usual:
+        return 1.0 if after <= usual else 0.0
+    return min((before - after) / (before - usual), 1.0)
 
 
 def expected_loss(healthy: float, change: np.ndarray, model_error: float) -> float:
@@ -123,6 +130,14 @@ def expected_loss(healthy: float, change: np.ndarray, model_error: float) -> flo
 def folds_of(starts: np.ndarray, count: int) -> np.ndarray:
     """Fold of each window, of ``count``: blocks take turns."""
     return ((starts - starts[0]) // round(BLOCK * 1e9)).astype(int) % count
+
+
+def fold_count(starts: np.ndarray) -> int:
+    """Number of parts into which the blocks of windows are dealt: the first of several of which enough hold windows."""
+    blocks = np.unique((starts - starts[0]) // round(BLOCK * 1e9))
+    wanted = min(_FILLED, len(blocks))
+    filled = {count: len(np.unique(blocks % count)) for count in (FOLDS, *_OTHER_FOLDS)}
+    return next((count for count, parts in filled.items() if parts >= wanted), FOLDS)
 
 
 def blocks_of(starts: np.ndarray) -> np.ndarray:

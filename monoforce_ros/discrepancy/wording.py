@@ -17,19 +17,47 @@ def finding(estimate: EffectEstimate) -> str:
 
     An effect without a sentence of its own here is described by the summary in its file.
     """
-    values = {key: parameter.value for key, parameter in estimate.parameters.items()}
+    values = _beyond_model(estimate)
     if estimate.name == LEARNED:
         return f"An unnamed force or torque acts on the robot: {formula(values)} [N, N m]."
     described = _FINDINGS.get(estimate.name)
     try:
         if described is not None:
-            return described(values) + _determined(estimate)
+            return described(values) + _determined(estimate) + _in_file(estimate)
     except KeyError:
         # An estimate with other parameters than this sentence expects.
         pass
     summary = CATALOGUE[estimate.name].summary if estimate.name in CATALOGUE else estimate.name
     listed = ", ".join(f"{key} {value.value:.3g} {value.unit}" for key, value in estimate.parameters.items())
-    return f"{summary.rstrip('.')}: {listed}."
+    return f"{summary.rstrip('.')}: {listed}." + _in_file(estimate)
+
+
+def _beyond_model(estimate: EffectEstimate) -> dict[str, float]:
+    """Values as a sentence states them: of effects that it compares with the model, beyond what the file says."""
+    values = {key: parameter.value for key, parameter in estimate.parameters.items()}
+    for key, file_value in estimate.in_file.items():
+        if key in values and estimate.name in _FACTORS_ON_MODEL:
+            values[key] /= file_value
+        elif key == "mass" and key in values:
+            values[key] -= file_value
+    return values
+
+
+def _in_file(estimate: EffectEstimate) -> str:
+    """A sentence on what the robot's file says of the same effect; empty where it says nothing."""
+    if not estimate.in_file:
+        return ""
+    known = {parameter.name: parameter for parameter in CATALOGUE[estimate.name].parameters}
+    said = [
+        f"{key.replace('_', ' ')} {value:.3g}{'' if known[key].unit == '-' else ' ' + known[key].unit}"
+        for key, value in estimate.in_file.items()
+        if key in known and value != known[key].neutral
+    ]
+    return f" Its file says {', '.join(said)}." if said else ""
+
+
+_FACTORS_ON_MODEL = frozenset({"friction_scale", "terrain_softness"})
+"""Effects whose sentence compares a factor with what the model assumes."""
 
 
 def _determined(estimate: EffectEstimate) -> str:

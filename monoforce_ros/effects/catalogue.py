@@ -184,8 +184,11 @@ def turned_effects(robot: RobotModel, heading: Tensor) -> RobotModel:
 
 
 def recorded_motion(motion: MotionTrack, robot: RobotModel) -> MotionTrack:
-    """Motion as recorded under the robot's measurement effects."""
-    for name, parameters in robot.effects:
+    """Motion as recorded under the robot's measurement effects.
+
+    The catalogue's order is that in which they act: a sensor's place on the robot before its heading there.
+    """
+    for name, parameters in _in_order(robot.effects):
         values = {key: float(value) for key, value in effect_values(name, parameters).items()}
         motion = CATALOGUE[name].motion(motion, values)
     return motion
@@ -193,15 +196,15 @@ def recorded_motion(motion: MotionTrack, robot: RobotModel) -> MotionTrack:
 
 def recorded_commands(commands: CommandTrack, robot: RobotModel) -> CommandTrack:
     """Commands as recorded under the robot's measurement effects."""
-    for name, parameters in robot.effects:
+    for name, parameters in _in_order(robot.effects):
         values = {key: float(value) for key, value in effect_values(name, parameters).items()}
         commands = CATALOGUE[name].commands(commands, values)
     return commands
 
 
 def corrected_motion(motion: MotionTrack, effects: Iterable[tuple[str, Mapping[str, float | Tensor]]]) -> MotionTrack:
-    """Recorded motion with measurement effects removed, by applying each with the opposite sign."""
-    for name, parameters in effects:
+    """Recorded motion with measurement effects removed, by applying each with the opposite sign, the last one first."""
+    for name, parameters in reversed(_in_order(effects)):
         if _catalogued(name).stage == "measurement":
             motion = CATALOGUE[name].motion(motion, {key: -float(value) for key, value in _full(name, parameters)})
     return motion
@@ -211,12 +214,18 @@ def corrected_commands(
     commands: CommandTrack, effects: Iterable[tuple[str, Mapping[str, float | Tensor]]]
 ) -> CommandTrack:
     """Recorded commands with measurement effects removed."""
-    for name, parameters in effects:
+    for name, parameters in reversed(_in_order(effects)):
         if _catalogued(name).stage == "measurement":
             commands = CATALOGUE[name].commands(
                 commands, {key: -float(value) for key, value in _full(name, parameters)}
             )
     return commands
+
+
+def _in_order[Values](effects: Iterable[tuple[str, Values]]) -> list[tuple[str, Values]]:
+    """Effects in the order of the catalogue."""
+    order = list(CATALOGUE)
+    return sorted(effects, key=lambda entry: order.index(_catalogued(entry[0]).name))
 
 
 def _catalogued(name: str) -> Effect:
