@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from monoforce_ros.bags import BagWriter, ReadOptions, builders
 from monoforce_ros.core import CommandTrack, MotionTrack, pose_matrix
 from monoforce_ros.evaluation.check import BagCheck, check_bag, check_text, command_delay
+from monoforce_ros.evaluation.cli import main
 from monoforce_ros.evaluation.findings import Level
 from monoforce_ros.robots import load_robot
 
@@ -43,12 +44,17 @@ def write(
     heading = np.cumsum(commanded(times - delay)[1]) * 0.05
     speed = commanded(times - delay)[0]
     place = np.cumsum(np.stack([speed * np.cos(heading), speed * np.sin(heading)], axis=1), axis=0) * 0.05
+    place = place * extra.get("unit", 1.0)
+    per_turn = np.degrees(1.0) if extra.get("degrees") else 1.0
     with BagWriter(path) as bag:
         bag.write(
             "/tf_static", builders.transforms(START, "base_link", {"lidar": np.eye(4)} | extra.get("extra", {})), START
         )
         for i, time in enumerate(times):
             at = START + round(1e9 * time)
+            if time > 10.0:
+                at -= round(1e9 * extra.get("set_back", 0.0))
+            at += round(1e9 * extra.get("pause", 0.0)) * bool(time > 10.0)
             if not (gap and 8.0 < time < 11.0):
                 # A height that a sine of the place gives; the pitch follows from it.
                 slope = extra.get("slope", 0.0) * np.cos(place[i, 0] / 0.8)
@@ -68,9 +74,13 @@ def write(
                 if extra.get("wheel_odometry") and i % 2:
                     bag.write("/platform/odom", odometry, at)
             if commands:
-                bag.write("/cmd_vel", builders.twist_stamped(at, "base_link", *commanded(time)), at)
+                bag.write(
+                    "/cmd_vel",
+                    builders.twist_stamped(at, "base_link", *(commanded(time) * np.array([1.0, per_turn]))),
+                    at,
+                )
             if i % 4 == 0 and extra.get("clouds", True):
-                bag.write("/points", builders.point_cloud(at, "lidar", np.ones((5, 3))), at)
+                bag.write("/points", builders.point_cloud(at, "lidar", extra.get("points", np.ones((5, 3)))), at)
             if i % 4 == 0:
                 if camera:
                     image = builders.image(at, "camera_front", np.full((4, 6, 3), 9, np.uint8))
@@ -116,12 +126,33 @@ def test_a_good_bag_is_complete_and_its_rates_are_reported(tmp_path, husky):
             "between them is unknown: no transform has 'imu'",
         ),
         ({"sign": -1.0}, Level.WARNING, "the opposite sign of its poses"),
+        ({"unit": 1000.0}, Level.MISSING, r"jumps or pauses \d+ times in 400 poses, .* not in metres"),
+        ({"set_back": 5.0125}, Level.MISSING, "a clock was set back"),
+        ({"degrees": True}, Level.WARNING, "turns in a second: are they in degrees?"),
+        ({"points": np.full((5, 3), 4000.0)}, Level.WARNING, "are they in millimetres?"),
+        ({"points": np.zeros((0, 3))}, Level.WARNING, "the first cloud cannot be used: point cloud size: got 0 points"),
     ],
 )
 def test_each_fault_is_reported(tmp_path, husky, fault, level, message):
     check = check_bag(write(tmp_path / "drive", **fault), husky)
     assert re.search(message, texts(check, level))
     assert check.usable == (level is not Level.MISSING)
+
+
+@pytest.mark.parametrize("pause", [60.0, 3600.0])
+def test_a_long_pause_does_not_unrelate_motion_and_commands(tmp_path, husky, pause):
+    check = check_bag(write(tmp_path / "drive", pause=pause), husky)
+    assert check.usable and not texts(check, Level.MISSING)
+    assert "does not follow" not in texts(check, Level.WARNING)
+    assert re.search(r"motion follows commands 0\.(15|18|2.) s later \(correlation 0.9", texts(check, Level.NOTE))
+
+
+def test_an_evaluation_without_anything_to_compare_fails(tmp_path, husky, capsys):
+    bag = write(tmp_path / "drive", unit=1000.0)
+    assert main([str(bag), "--terrain", "flat", "--stride", "2", "--out", str(tmp_path / "out"), "--quiet"]) == 1
+    said = capsys.readouterr().err
+    assert "not in metres" in said and "nothing can be compared" in said and "evaluate --check" in said
+    assert not (tmp_path / "out").exists()
 
 
 def test_an_offset_that_the_bag_knows_is_reported_and_applied(tmp_path, husky):

@@ -441,3 +441,15 @@ def test_a_number_with_a_comma_is_named_with_its_place(tmp_path):
     path.write_text(path.read_text().replace('<mass value="4.0"/>', '<mass value="4,0"/>'))
     with pytest.raises(UrdfError, match="link base_link: mass: value: got '4,0', expected numbers with a decimal"):
         read_description(path)
+
+
+def test_wheels_that_roll_sideways_are_said_to_be_imported_as_plain_ones(tmp_path):
+    wheels = [
+        wheel(f"{name}_{i}", f"{x} {y} 0")
+        for i, (name, x, y) in enumerate(
+            [("mecanum_fl", 0.2, 0.2), ("mecanum_fr", 0.2, -0.2), ("rear_left", -0.2, 0.2), ("rear_right", -0.2, -0.2)]
+        )
+    ]
+    path = robot(tmp_path, link("base_link", box("0.5 0.3 0.1"), mass=20.0), *wheels)
+    (warning,) = [text for text in convert(path).warnings if "sideways" in text]
+    assert "mecanum_fl_0_link, mecanum_fr_1_link" in warning and "rear" not in warning

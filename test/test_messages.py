@@ -167,6 +167,7 @@ def test_any_point_cloud_is_decoded_or_refused(width, height, point_step, row_st
         ([0, 0, 0, 2], [0, 0, 0], "unit quaternion"),
         ([0, 0, 0, np.nan], [0, 0, 0], "norm nan"),
         ([0, 0, 0, 1], [np.nan, 0, 0], "not finite"),
+        ([0, 0, 0, 1], [500.0, 0, 0], "expected at most 100"),
     ],
 )
 def test_unusable_odometry_is_refused_with_the_reason(quaternion, velocity, text):

@@ -213,6 +213,35 @@ def test_odometry_with_a_zero_quaternion(peer, predictor):
     refused(peer, predictor, "odometry", "expected a unit quaternion", odometry=bad)
 
 
+@pytest.mark.parametrize("quaternion", [[1.0, 0, 0, 0], [-0.5, 0.5, -0.5, 0.5]])
+def test_odometry_of_a_robot_upside_down_or_of_an_optical_frame(peer, predictor, quaternion):
+    def bad(stamp):
+        return builders.odometry(stamp, "odom", "base_link", [1, 2, 0.3], quaternion, [0.5, 0, 0], [0] * 3)
+
+    refused(peer, predictor, "odometry", "the robot lies on its side or upside down", odometry=bad)
+
+
+def test_odometry_with_a_speed_that_no_robot_has(peer, predictor):
+    def bad(stamp):
+        return builders.odometry(stamp, "odom", "base_link", [1, 2, 0.3], [0, 0, 0, 1], [500.0, 0, 0], [0] * 3)
+
+    refused(peer, predictor, "odometry", "expected at most 100", odometry=bad)
+
+
+@pytest.mark.parametrize(
+    ("moved", "text"), [([1, 1, -1, 0.0], "above its wheels"), ([1, 1, 1, -3.0], "below its wheels")]
+)
+def test_a_lidar_that_is_mounted_otherwise_than_the_transforms_say(peer, predictor, moved, text):
+    cloud = ground_cloud() * np.float32(moved[:3]) + np.float32([0, 0, moved[3]])
+    healthy(peer, predictor)
+    peer.begin()
+    peer.drive(1.4, cloud=lambda stamp: builders.point_cloud(stamp, "lidar", cloud))
+    assert peer.until(lambda: text in (peer.status("ground") or (0, ""))[1], 5.0), peer.status("ground")
+    assert peer.status("ground")[0] == WARN
+    healthy(peer, predictor)
+    assert peer.until(lambda: peer.status("ground")[0] == OK, 5.0)
+
+
 def test_a_lidar_that_falls_silent(peer, predictor):
     refused(peer, predictor, "lidar", "no messages for", seconds=2.5, cloud=lambda stamp: None)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from monoforce_ros.bags import DETECTED, ReadOptions, Recording, smooth
+from monoforce_ros.bags import DETECTED, BagError, ReadOptions, Recording, smooth
 from monoforce_ros.discrepancy.clocks import compare_with_gyro
 from monoforce_ros.discrepancy.command_changes import uncovered_doubt
 from monoforce_ros.discrepancy.comparison import GapRow, HeldOut, compare, gap_table
@@ -106,7 +106,14 @@ def read_with_ground(
     motion = smoothed.motion
     low, high = motion.positions.min(axis=0)[:2] - _MARGIN, motion.positions.max(axis=0)[:2] + _MARGIN
     columns, rows = np.ceil((high - low) / 0.1).astype(int) + 1
-    grid = Grid(int(rows), int(columns), 0.1, (float(low[0]), float(low[1])))
+    try:
+        grid = Grid(int(rows), int(columns), 0.1, (float(low[0]), float(low[1])))
+    except ValueError as error:
+        raise BagError(
+            f"{bag}: the poses reach over {high[0] - low[0]:.0f} × {high[1] - low[1]:.0f} m, more than one map holds: "
+            "are the odometry's positions in metres, and without jumps? Otherwise cut the recording, or use --terrain "
+            f"flat ({error})"
+        ) from error
     if ground.source == "traced":
         terrain_map = traced_terrain(motion, robot, grid)
         return replace(evidence, terrain=terrain_map, odometry_from_terrain=np.eye(4)), recording, ground

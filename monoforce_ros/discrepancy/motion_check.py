@@ -35,6 +35,11 @@ _UNRELATED = 0.5
 """Largest correlation of commands and motion at which they may be unrelated."""
 _IDENTIFIED = 2.0
 """Largest offset of a clock that ``diagnose`` identifies as an effect: the bound of the catalogue [s]."""
+_BROKEN = 0.1
+"""Share of poses before a jump or a pause from which on these are no motion: stretches of ten poses are too short for a
+window at any rate of odometry above 5 Hz."""
+_GAP = 0.5
+"""Time without a pose in which motion is unknown [s]."""
 _SHIFTS = 19
 """Shifts of the commands against which the correlation is tested: it must exceed 95 % of them."""
 
@@ -57,6 +62,12 @@ def motion_faults(
     motion = smoothed.motion
     if len(motion) < 2:
         return (f"{len(motion)} poses, expected a recording of them: record nav_msgs/Odometry",)
+    jumps = len(smoothed.stretches) - 1
+    if jumps > _BROKEN * len(motion):
+        return (
+            f"the odometry jumps or pauses {jumps} times in {len(motion)} poses, which is no motion of one robot: two "
+            "sources publish on the topic, a clock was set back while it was recorded, or positions are not in metres",
+        )
     apart = max(int(motion.stamps[0] - commands.stamps[-1]), int(commands.stamps[0] - motion.stamps[-1])) * NANOSECOND
     if apart > 0:
         return (
@@ -103,8 +114,10 @@ def _correlated(
     followed: _Followed, commands: CommandTrack, lags: np.ndarray, axes: Sequence[int]
 ) -> tuple[float, float]:
     """The best of the lags [s] and the correlation there, of speed (axis 0), yaw rate (axis 1) or both."""
-    first, last = int(followed.stamps[0]), int(followed.stamps[-1])
-    stamps = np.arange(first, last, 25_000_000, dtype=np.int64)
+    first = int(followed.stamps[0])
+    stamps = np.concatenate(
+        [np.arange(low, high, 25_000_000, dtype=np.int64) for low, high in _without_gaps(followed.stamps)]
+    )
     if len(stamps) < 80:
         return float("nan"), 0.0
     seconds, times = (stamps - first) * NANOSECOND, (followed.stamps - first) * NANOSECOND
@@ -128,6 +141,13 @@ def _correlated(
         return float("nan"), 0.0
     best = int(np.argmax(correlation.values))
     return float(lags[best]), float(correlation.values[best])
+
+
+def _without_gaps(stamps: np.ndarray) -> list[tuple[int, int]]:
+    """First and last stamp [ns] of each part of a track without gaps."""
+    ends = np.flatnonzero(np.diff(stamps) * NANOSECOND > _GAP)
+    firsts, lasts = np.r_[0, ends + 1], np.r_[ends, len(stamps) - 1]
+    return [(int(stamps[low]), int(stamps[high])) for low, high in zip(firsts, lasts, strict=True)]
 
 
 def _sampled(smoothed: SmoothedMotion) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:

@@ -26,6 +26,11 @@ from monoforce_ros.evaluation.findings import Finding, Level, missing, note, ok,
 from monoforce_ros.evaluation.topic_check import IMU, TopicCheck
 from monoforce_ros.robots import RobotModel
 
+_FASTEST_TURN = 2.0 * np.pi
+"""Yaw rate of a turn in a second [rad/s], faster than any base on wheels or tracks is driven."""
+_FARTHEST = 300.0
+"""Range of lidars for robots and cars [m]."""
+
 
 @dataclass(frozen=True)
 class BagCheck:
@@ -133,7 +138,17 @@ def _offset_findings(measured: MotionTrack, base: MotionTrack) -> Iterator[Findi
 def _cloud_findings(recording: Recording, robot: RobotModel) -> Iterator[Finding]:
     if not recording.clouds:
         return
-    points, frame = recording.cloud(recording.clouds[0])
+    try:
+        points, frame = recording.cloud(recording.clouds[0])
+    except ValueError as error:
+        yield warning(f"{recording.topics['cloud']}: the first cloud cannot be used: {error}")
+        return
+    distance = float(np.median(np.linalg.norm(points, axis=1))) if len(points) else 0.0
+    if distance > _FARTHEST:
+        yield warning(
+            f"{recording.topics['cloud']}: half of the points of the first cloud are {distance:.0f} m away or more, "
+            "farther than a lidar sees: are they in millimetres?"
+        )
     try:
         recording.sensor_pose(frame, robot.base_frame, robot.sensors)
         yield ok(f"clouds {recording.topics['cloud']}: {len(recording.clouds)}, frame {frame}")
@@ -202,6 +217,11 @@ def _command_findings(
     if largest_speed > 1.5 * robot.maximum_speed:
         yield warning(
             f"commands far exceed the maximum speed of {robot.name}, {robot.maximum_speed:g} m/s: wrong robot or unit?"
+        )
+    if largest_yaw_rate > _FASTEST_TURN:
+        yield warning(
+            f"commands reach {largest_yaw_rate:.1f} rad/s, {largest_yaw_rate / (2.0 * np.pi):.1f} turns in a second: "
+            "are they in degrees?"
         )
     if not follows:
         return

@@ -12,8 +12,9 @@ from typing import override
 import numpy as np
 import torch
 
-from monoforce_ros.bags import BagError, add_read_options, read_options
+from monoforce_ros.bags import BagError, add_read_options, read_options, smooth
 from monoforce_ros.core import OptionParser, share_directory
+from monoforce_ros.discrepancy import motion_faults
 from monoforce_ros.effects import EffectError
 from monoforce_ros.encoder import CheckpointError
 from monoforce_ros.evaluation import figures
@@ -169,6 +170,8 @@ def run(options: argparse.Namespace) -> None:
     robot = load_robot(options.robot)
     recording = reading.open(bag, robot)
     robot = reading.robot_in_bag(robot)
+    for text in motion_faults(smooth(recording.motion), recording.commands, recording.wheels):
+        print(f"warning: {text}", file=sys.stderr)
     material = TerrainDefaults(friction=options.friction)
     source = choose_terrain_source(
         options.terrain,
@@ -191,6 +194,11 @@ def run(options: argparse.Namespace) -> None:
         stride=options.stride,
         quiet=options.quiet,
     )
+    if not any(position.windows for position, _ in evaluation.summary(PHYSICS).values()):
+        raise EvaluationError(
+            f"{bag}: after the start of every window the odometry jumps or pauses, or leaves the map, so that nothing "
+            f"can be compared; see `evaluate --check {bag}`"
+        )
     folder = Path(options.out)
     pictures = [
         Picture(

@@ -224,7 +224,8 @@ def decode_fields(message: Any, names: tuple[str, ...] | None = None) -> dict[st
 
 
 def decode_odometry(message: Any) -> tuple[MotionState, str, str]:
-    """``nav_msgs/Odometry`` → state, frame, child frame; raises ``MessageError`` for NaN or an invalid quaternion."""
+    """``nav_msgs/Odometry`` → state, frame, child frame; raises ``MessageError`` for NaN, an invalid quaternion,
+    or velocities that no ground robot has."""
     pose, twist = message.pose.pose, message.twist.twist
     quaternion = np.array([pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w], float)
     vectors = [
@@ -232,6 +233,11 @@ def decode_odometry(message: Any) -> tuple[MotionState, str, str]:
     ]  # position, linear and angular velocity
     if not all(np.isfinite(v).all() and (np.abs(v) < 1e7).all() for v in vectors):
         raise MessageError("odometry: position or velocity is not finite")
+    if max(float(np.abs(v).max()) for v in vectors[1:]) > LARGEST_COMMAND:
+        raise MessageError(
+            f"odometry: got the velocities {vectors[1].tolist()} m/s and {vectors[2].tolist()} rad/s, expected at most "
+            f"{LARGEST_COMMAND:g}"
+        )
     norm = float(np.linalg.norm(quaternion))
     if not abs(norm - 1.0) < 0.05:
         raise MessageError(f"odometry: orientation has norm {norm:.3g}, expected a unit quaternion x, y, z, w")

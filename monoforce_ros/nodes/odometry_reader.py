@@ -15,6 +15,9 @@ from monoforce_ros.nodes.health import ERROR, Health
 
 PART = "odometry"
 """Part of the node's health."""
+_LYING = 0.5
+"""Vertical component of the base's z axis below which a robot lies rather than stands: a slope of 60°, beyond which
+ground counts as a wall, and steeper than wheels or tracks hold."""
 ZERO_STAMPS = "the stamps are zero: the {} does not set them"
 
 
@@ -69,8 +72,19 @@ class OdometryReader:
             patient = not self._transforms.unavailable and time.monotonic() - self.first_arrival <= TRANSFORMS_PATIENCE
             self._refuse(self._transforms.explained(error), "frame", silent=patient)
             return None
+        motion = state.of_base(offset)
+        upright = float(motion.rotation[2, 2])
+        if upright < _LYING:
+            self._refuse(
+                "by its odometry the robot lies on its side or upside down, "
+                f"{np.degrees(np.arccos(upright)):.0f}° from upright in {self.frame!r}: expected the pose of "
+                f"{child or 'the base'}, x forward and z up, in a frame whose z axis points up (REP 103, REP 105); "
+                "poses in NED or of an optical frame have to be converted",
+                "lies",
+            )
+            return None
         self.problem = ""
-        return BaseOdometry(state.of_base(offset), frame_id, child, offset)
+        return BaseOdometry(motion, frame_id, child, offset)
 
     def _refuse(self, problem: str, reason: str, *, silent: bool = False) -> None:
         self.problem = problem

@@ -20,7 +20,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState, Poin
 from visualization_msgs.msg import MarkerArray
 
 from monoforce_ros.bags import camera_info_topics
-from monoforce_ros.core import NANOSECOND, CommandTrack, RobotFrames, pose_matrix
+from monoforce_ros.core import NANOSECOND, CommandTrack, MotionState, RobotFrames, pose_matrix
 from monoforce_ros.effects import corrected_commands, corrected_motion
 from monoforce_ros.messages import decoding
 from monoforce_ros.nodes import prediction_messages as encoders
@@ -42,7 +42,7 @@ from monoforce_ros.nodes.rate_limiter import RateLimiter
 from monoforce_ros.nodes.schema import read_schema, schema_path
 from monoforce_ros.nodes.sensor_decoder import LIDAR, SensorDecoder
 from monoforce_ros.nodes.subscriptions import AdaptiveSubscription, command_types
-from monoforce_ros.perception import TerrainSource, TrustReport, choose_terrain_source
+from monoforce_ros.perception import Observation, TerrainSource, TrustReport, choose_terrain_source, ground_around
 from monoforce_ros.physics import PhysicsOptions, read_soil
 from monoforce_ros.prediction import FORCE_INTERVAL, Prediction, Predictor
 from monoforce_ros.robots import load_robot
@@ -463,6 +463,7 @@ class PredictorNode(ManagedNode):
             self.health.report("prediction", ERROR, f"nothing published: {text}", reason=type(error).__name__)
             return
         self._report_trust()
+        self._report_ground(observation, motion)
         self._predictions += 1
         if self._predictions == 1:
             topic = self.resolve_topic_name("predicted/path")
@@ -489,6 +490,21 @@ class PredictorNode(ManagedNode):
             text = f"falling back, the encoder is not used: {report.explanation}"
             self.health.report("terrain", WARN, text, reason="not trusted")
         self.health.report_values("terrain", values)
+
+    def _report_ground(self, observation: Observation, motion: MotionState) -> None:
+        """Report whether the ground that a lidar sees around the robot is that on which it stands."""
+        if observation.cloud is None:
+            return
+        apart = ground_around(observation.cloud, self.robot, motion, TerrainDefaults().stiffness)
+        if apart:
+            where = f"{abs(apart):.1f} m {'above' if apart > 0 else 'below'} its wheels on all sides"
+            message = (
+                f"the ground around the robot lies {where}: check how the sensors are mounted (the transforms from the "
+                "base frame), and that their axes and units are right"
+            )
+            self.health.report("ground", WARN, message, reason="apart")
+        else:
+            self.health.report("ground", OK, "the ground around the robot is as high as its wheels")
 
     def _compare(self, job: ComparisonJob) -> None:
         """Publish candidates, ensemble and costmap of a prediction while the next one is made."""

@@ -4,7 +4,7 @@ from monoforce_ros.perception.clearance import with_clear_start
 from monoforce_ros.perception.encoder_terrain import EncoderTerrain
 from monoforce_ros.perception.flat import FlatTerrain
 from monoforce_ros.perception.fusion import LidarCameraTerrain
-from monoforce_ros.perception.ground_alignment import support_points
+from monoforce_ros.perception.ground_alignment import ground_around, support_points
 from monoforce_ros.perception.lidar import LidarTerrain
 from monoforce_ros.perception.observation import Observation, TerrainSource
 from monoforce_ros.perception.sources import CAMERA_SOURCES, SOURCES, choose_terrain_source
@@ -25,6 +25,7 @@ __all__ = [
     "TrustReport",
     "TrustedTerrain",
     "choose_terrain_source",
+    "ground_around",
     "support_points",
     "traced_ground",
     "with_clear_start",

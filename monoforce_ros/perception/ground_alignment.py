@@ -15,6 +15,14 @@ from monoforce_ros.terrain import TerrainMap
 _FULL_WITHIN, _NONE_BEYOND = 0.15, 0.7
 """Distances from the support points up to which heights are fully corrected, and beyond which not at all [m]."""
 
+_AROUND = (0.8, 2.5)
+"""Distances of the ground around the robot that is compared with the ground under its wheels [m]: beyond what is
+corrected, and within twice the length of most robots."""
+_APART = 0.6
+"""Height difference on three of four sides beyond which the ground around a robot is none that it stands on [m]: on a
+mound with sides of 23° it is as much, in a ditch only on two sides."""
+_FEWEST_RETURNS = 20
+"""Returns that say something of one side: their fifth is four."""
 _AT_THE_BOTTOM = -0.97
 """Largest forward component of the surface's direction of motion at the bottom of a wheel, which rolls backwards."""
 
@@ -30,6 +38,33 @@ def support_points(robot: RobotModel, motion: MotionState, stiffness: float) -> 
     points = transform_points(motion.terrain_from_base, _lowest_points(robot))
     points[:, 2] += rest_depth(robot, stiffness)
     return points
+
+
+def ground_around(cloud: np.ndarray, robot: RobotModel, motion: MotionState, stiffness: float) -> float:
+    """How far the ground around a robot lies above (positive) or below its wheels on three or four sides [m].
+
+    0.0 where it is about as high, or where the lidar sees fewer sides. What stands on the ground, such as grass, has
+    gaps: the lower fifth of the returns counts where they are above the wheels, the upper fifth where they are below.
+
+    Args:
+        cloud: returns in the base frame ``[n, 3]`` [m].
+        robot: its wheels or tracks.
+        motion: its pose.
+        stiffness: of the ground [N/m³].
+    """
+    support = support_points(robot, motion, stiffness)
+    middle = support.mean(axis=0)
+    near = cloud[np.hypot(cloud[:, 0], cloud[:, 1]) < 2.0 * _AROUND[1]]
+    away = transform_points(motion.terrain_from_base, near.astype(np.float64)) - middle
+    distance = np.hypot(away[:, 0], away[:, 1])
+    away = away[(distance > _AROUND[0]) & (distance < _AROUND[1])]
+    side = np.floor(np.arctan2(away[:, 1], away[:, 0]) / (0.5 * np.pi) + 0.5).astype(int) % 4
+    sides = [away[side == number, 2] for number in range(4) if (side == number).sum() >= _FEWEST_RETURNS]
+    for sign in (1.0, -1.0):
+        least = sorted((float(np.quantile(sign * heights, 0.2)) for heights in sides), reverse=True)
+        if len(least) >= 3 and least[2] > _APART:
+            return sign * least[1]
+    return 0.0
 
 
 def _lowest_points(robot: RobotModel) -> np.ndarray:

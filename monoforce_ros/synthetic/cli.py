@@ -140,7 +140,11 @@ def build_parser() -> OptionParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
     parser = build_parser()
-    options = parser.parse_args(arguments)
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if words in (["--hide", "list"], ["--set", "list"]):
+        # Lists need no folder.
+        words.append("unused")
+    options = parser.parse_args(words)
     if options.hide == ["list"]:
         return _list_faults()
     if options.set == ["list"]:

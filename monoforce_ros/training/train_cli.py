@@ -225,8 +225,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
     elif options.all_sensors:
         parser.refuse_without_effect(options, ("sensor_shares",), "with --all-sensors")
-    if options.samples_only and options.samples is None:
-        parser.error("--samples-only: expected a folder with --samples")
+    if options.samples_only and options.samples is None and options.out is None:
+        parser.error("--samples-only: expected a folder with --samples, or --out")
     if options.out is None and not options.samples_only:
         parser.error("the following arguments are required: --out")
     process = None

@@ -22,6 +22,8 @@ from monoforce_ros.robots.urdf.supports import find_supports
 DRIVES = ("skid", "differential", "ackermann", "four_wheel_steering", "independent")
 _FASTEST = 100.0
 """Velocity limits from this on [rad/s] are placeholders: URDF requires a number even where there is no limit."""
+_SIDEWAYS_WHEELS = ("mecanum", "omni")
+"""Parts of names of wheels with rollers on their rims."""
 _LARGEST_STEERING = 1.4
 """Steering limits above this [rad] are placeholders; beyond it a wheel is nearly across."""
 _TILTED = 3.0
@@ -249,6 +251,17 @@ class _Converter:
             else:
                 kind, reason = "ackermann", f"{len(steered)} of {len(wheels)} wheels are steered"
         self.guess(f"drive {kind}: {reason}")
+        names = [f"{wheel.joint.name} {wheel.joint.child}".lower() for wheel in wheels]
+        rolling = [
+            wheel.joint.child
+            for wheel, name in zip(wheels, names, strict=True)
+            if any(word in name for word in _SIDEWAYS_WHEELS)
+        ]
+        if rolling:
+            self.warnings.append(
+                f"wheels {', '.join(rolling)}: by their names they have rollers and move sideways, too; here they have "
+                "the grip of plain wheels, so that only driving straight is predicted as it is"
+            )
         return kind
 
     def _driven(self, kind: str) -> set[str]:
