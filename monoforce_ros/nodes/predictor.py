@@ -435,6 +435,7 @@ class PredictorNode(ManagedNode):
                 )
                 return
             motion = track.at(stamp, maximum_gap=self.settings.odometry_timeout)
+            self._report_ground(observation, motion)
             # The newest command is held over the horizon, unless it has expired.
             stamps = np.minimum(self.predictor.command_stamps(stamp), stamp)
             commands = corrected_commands(self.inputs.commands(), self.robot.effects)
@@ -463,7 +464,6 @@ class PredictorNode(ManagedNode):
             self.health.report("prediction", ERROR, f"nothing published: {text}", reason=type(error).__name__)
             return
         self._report_trust()
-        self._report_ground(observation, motion)
         self._predictions += 1
         if self._predictions == 1:
             topic = self.resolve_topic_name("predicted/path")
