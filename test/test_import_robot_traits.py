@@ -453,3 +453,14 @@ def test_wheels_that_roll_sideways_are_said_to_be_imported_as_plain_ones(tmp_pat
     path = robot(tmp_path, link("base_link", box("0.5 0.3 0.1"), mass=20.0), *wheels)
     (warning,) = [text for text in convert(path).warnings if "sideways" in text]
     assert "mecanum_fl_0_link, mecanum_fr_1_link" in warning and "rear" not in warning
+
+
+def test_lidars_are_known_by_their_usual_names_and_their_absence_is_said(tmp_path):
+    wheels = [wheel(f"wheel_{i}", f"{x} {y} 0") for i, (x, y) in enumerate([(0.2, 0.2), (0.2, -0.2), (-0.2, 0.2)])]
+    body = link("base_link", box("0.5 0.3 0.1"), mass=20.0)
+    for name in ("os0_sensor", "pandar", "front_laser"):
+        mounted = link(name) + joint("mount", "fixed", "base_link", name, "0.1 0 0.4")
+        conversion = convert(robot(tmp_path, body, *wheels, mounted))
+        assert conversion.content["sensors"][name]["translation"] == [0.1, 0.0, 0.4]
+        assert not any("no camera or lidar" in text for text in conversion.guesses)
+    assert any("no camera or lidar" in text for text in convert(robot(tmp_path, body, *wheels)).guesses)

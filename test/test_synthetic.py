@@ -280,6 +280,25 @@ def test_a_robot_without_the_sensor_is_named(tmp_path, husky):
         record(tmp_path / "bag", RecordingSettings(robot=str(tmp_path / "bare.yaml"), camera=None))
 
 
+def test_the_lidar_of_an_imported_robot_may_have_another_name(tmp_path):
+    text = (
+        "name: scout\nmass: 20.0\ninertia_box: [0.5, 0.4, 0.2]\ncommand: {track_width: 0.5}\nwheels:\n"
+        + "".join(
+            f"  - {{name: {side}_{end}, drive: {side}, centre: [{x}, {y}, 0.0], radius: 0.15, width: 0.1}}\n"
+            for side, y in (("left", 0.25), ("right", -0.25))
+            for end, x in (("front", 0.25), ("rear", -0.25))
+        )
+        + "sensors:\n  imu_link: {translation: [0.0, 0.0, 0.1], quaternion: [0, 0, 0, 1]}\n"
+        "  velodyne: {translation: [0.0, 0.0, 0.5], quaternion: [0, 0, 0, 1]}\n"
+    )
+    (tmp_path / "scout.yaml").write_text(text)
+    settings = RecordingSettings(robot=str(tmp_path / "scout.yaml"), camera=None, duration=0.5)
+    record(tmp_path / "bag", settings)
+    recording = Recording.open(tmp_path / "bag")
+    points, frame = recording.cloud(recording.clouds[0])
+    assert frame == "velodyne" and len(points) > 1000
+
+
 def test_command_files(tmp_path):
     file = tmp_path / "commands.csv"
     file.write_text("t,v,w\n0.0,0.5,0.0\n1.0,0.2,-0.3\n")

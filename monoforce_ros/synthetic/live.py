@@ -11,7 +11,7 @@ from monoforce_ros.bags import builders
 from monoforce_ros.synthetic.course import CourseSettings, build_course
 from monoforce_ros.synthetic.odometry import Odometry, OdometrySettings
 from monoforce_ros.synthetic.random_streams import DEFAULT_SEED, random_stream
-from monoforce_ros.synthetic.recording import CAMERA_PREFIX, LIDAR_FRAME, ODOM_FRAME
+from monoforce_ros.synthetic.recording import CAMERA_PREFIX, ODOM_FRAME
 from monoforce_ros.synthetic.scenery import Scenery, build_scenery
 from monoforce_ros.synthetic.sensors import Camera, CameraSettings, Lidar, LidarSettings, encode_jpeg
 from monoforce_ros.synthetic.simulation import Simulation
@@ -65,7 +65,7 @@ class LiveWorld:
         self._odometry = Odometry(settings.odometry, random_stream(settings.seed, "odometry"), ())
         self._lidar = None
         if settings.lidar is not None:
-            pose = self.robot.sensor(LIDAR_FRAME, "--lidar none")
+            pose = self.robot.sensor(self.robot.lidar_frame, "--lidar none")
             self._lidar = Lidar(model, pose, settings.lidar, random_stream(settings.seed, "lidar"))
         self._cameras: list[Camera] = []
         if settings.camera is not None:
@@ -104,7 +104,7 @@ class LiveWorld:
             return None
         self.simulation.update_kinematics()
         points = self._lidar.start(self.simulation.data, self.simulation.world_pose())()
-        return builders.point_cloud(stamp, LIDAR_FRAME, np.asarray(points))
+        return builders.point_cloud(stamp, self.robot.lidar_frame, np.asarray(points))
 
     def images(self, stamp: int) -> Iterator[tuple[str, object, object]]:
         """Frame, current image and ``CameraInfo`` of every camera."""

@@ -37,7 +37,6 @@ from monoforce_ros.synthetic.world import TIME_STEP, build_model
 START_STAMP = 1_700_000_000 * 10**9
 """Stamp of the first message [ns]."""
 ODOM_FRAME = "odom"
-LIDAR_FRAME = "lidar"
 IMU_FRAME = "imu_link"
 CAMERA_PREFIX = "camera"
 
@@ -218,7 +217,7 @@ class _Session:
     ):
         self._bag, self._settings, self._robot, self._profile = bag, settings, robot, profile
         fields_of_view = {camera.frame: camera.settings.vertical_field_of_view for camera in rig}
-        lidar_pose = None if settings.lidar is None else robot.sensor(LIDAR_FRAME, "--lidar none")
+        lidar_pose = None if settings.lidar is None else robot.sensor(robot.lidar_frame, "--lidar none")
         hidden = settings.hidden or ()
         model = build_model(scenery, robot, settings.seed, fields_of_view, hidden)
         self.simulation = Simulation(model, scenery, robot, hidden)
@@ -365,7 +364,8 @@ class _Session:
             self._scan.result()
         self.simulation.update_kinematics()
         points, stamp = self._lidar.start(self.simulation.data, self.simulation.world_pose()), self._stamp
-        self._scan = self._workers.submit(lambda: builders.point_cloud(stamp, LIDAR_FRAME, points()))
+        frame = self._robot.lidar_frame
+        self._scan = self._workers.submit(lambda: builders.point_cloud(stamp, frame, points()))
         self._write("/points", self._scan)
 
     def _write_images(self) -> None:

@@ -18,7 +18,6 @@ from monoforce_ros.synthetic.graphics import mujoco
 from monoforce_ros.synthetic.labels import world_labels
 from monoforce_ros.synthetic.random_streams import random_stream
 from monoforce_ros.synthetic.recorded_camera import RecordedCamera
-from monoforce_ros.synthetic.recording import LIDAR_FRAME
 from monoforce_ros.synthetic.sensors import Camera, Lidar, LidarSettings, encode_jpeg
 from monoforce_ros.synthetic.terrain_shape import HeightField
 from monoforce_ros.synthetic.varied.settings import WorldSettings
@@ -126,7 +125,7 @@ def take_snapshots(
                 images.append(_compressed(camera.capture(data), entry.settings.quality))
         finally:
             camera.close()
-    pose = robot.sensors.get(LIDAR_FRAME)
+    pose = robot.sensors.get(robot.lidar_frame)
     scanner = None if pose is None else Lidar(model, pose, lidar, random_stream(seed, "lidar"))
     snapshots = []
     for images, place in zip(views, places, strict=True):

@@ -12,6 +12,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.robots import RobotFileError, RobotModel, load_robot, robot_file
+from monoforce_ros.robots.sensor_names import LIDAR
 from monoforce_ros.synthetic.graphics import mujoco
 from monoforce_ros.synthetic.vehicle_file import read_arms, read_wheels
 from monoforce_ros.synthetic.vehicle_parts import (
@@ -28,6 +29,7 @@ from monoforce_ros.synthetic.vehicle_parts import (
     wheel_moments,
 )
 
+LIDAR_FRAME = "lidar"
 __all__ = ["BODY", "GROUP", "IMU_SITE", "Vehicle", "Wheel"]
 
 BODY = "base"
@@ -131,6 +133,12 @@ class Vehicle:
         """Servos of steering and flippers, in the order of the actuators after the drives'."""
         parts: list[Pivot | Arm] = [*self.steering, *self.flippers]
         return tuple(part.servo for part in parts if part.servo is not None)
+
+    @property
+    def lidar_frame(self) -> str:
+        """Frame of the lidar: the one of that name, or else the first that has the name of one."""
+        named = [frame for frame in self.sensors if LIDAR.search(frame)]
+        return named[0] if named and LIDAR_FRAME not in self.sensors else LIDAR_FRAME
 
     def sensor(self, frame: str, option: str) -> np.ndarray:
         """Pose ``[4, 4]`` of a sensor; raises a ``RobotFileError`` that names the option to run without it."""

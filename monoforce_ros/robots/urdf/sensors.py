@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import re
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from monoforce_ros.robots.sensor_names import CAMERA, IMU, LIDAR, OPTICAL
 from monoforce_ros.robots.urdf.geometry import Frames
 
-_KINDS = {
-    "camera": re.compile(r"optical", re.IGNORECASE),
-    "lidar": re.compile(r"lidar|laser|velodyne|vlp|ouster|os_sensor|hesai|livox|rslidar|(^|_)scan", re.IGNORECASE),
-    "imu": re.compile(r"(^|_)imu", re.IGNORECASE),
-}
-_CAMERA = re.compile(r"camera|(^|_)cam(_|$)|realsense|zed", re.IGNORECASE)
+_KINDS = {"camera": OPTICAL, "lidar": LIDAR, "imu": IMU}
 
 
 def find_sensors(frames: Frames) -> tuple[dict[str, dict], list[str]]:
@@ -36,12 +30,14 @@ def find_sensors(frames: Frames) -> tuple[dict[str, dict], list[str]]:
             notes.append(f"{kind} {name}: by its name")
     for name in description.links:
         below = list(description.subtree(name))
-        if _CAMERA.search(name) and not any(_KINDS["camera"].search(other) for other in below):
+        if CAMERA.search(name) and not any(_KINDS["camera"].search(other) for other in below):
             parent = description.parent_joint(name)
-            if parent is None or not _CAMERA.search(parent.parent):
+            if parent is None or not CAMERA.search(parent.parent):
                 notes.append(
                     f"camera {name}: left out, it has no optical frame (z forward, y down); add one to `sensors`"
                 )
+    if not any(_KINDS[kind].search(name) for kind in ("camera", "lidar") for name in entries):
+        notes.append("no camera or lidar: no frame has the name of one; add them to `sensors`")
     return entries, notes
 
 
