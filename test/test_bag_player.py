@@ -4,7 +4,7 @@ import time
 
 import numpy as np
 import pytest
-from nav_msgs.msg import OccupancyGrid
+from nav_msgs.msg import Goals, OccupancyGrid
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image
@@ -273,3 +273,24 @@ def test_the_recorder_writes_the_received_messages(start, peer, tmp_path):
     refused = start("bag_recorder", tmp_path / "out")
     assert refused.wait(30) == 1
     assert "exists already" in refused.output
+
+
+@pytest.mark.unhurried_nodes
+def test_a_type_that_jazzy_does_not_have_is_recorded_from_its_package(start, peer, tmp_path):
+    """A newer package's type ended the recording of all topics."""
+    recorder = start("bag_recorder", tmp_path / "out", "--topics", "/goals", "/cmd_vel")
+    goals = peer.node.create_publisher(Goals, "/goals", 10)
+    deadline = time.monotonic() + 30
+    while not all(f"recording {topic} " in recorder.output for topic in ("/goals", "/cmd_vel")):
+        assert time.monotonic() < deadline, recorder.output
+        goals.publish(Goals())
+        peer.publish("/cmd_vel", builders.twist_stamped(START, "base_link", 0.1, 0.0))
+        peer.spin(0.05)
+    for _ in range(20):
+        goals.publish(Goals())
+        peer.publish("/cmd_vel", builders.twist_stamped(START, "base_link", 0.1, 0.0))
+        peer.spin(0.05)
+    assert recorder.stop() == 0 and "Traceback" not in recorder.output
+    with BagReader(tmp_path / "out") as bag:
+        assert bag.topics["/goals"] == "nav_msgs/msg/Goals"
+        assert min(len(list(bag.messages([topic]))) for topic in ("/goals", "/cmd_vel")) >= 15

@@ -11,6 +11,7 @@ from rclpy.serialization import deserialize_message
 
 from monoforce_ros.bags import BagError, BagReader, BagWriter, Recording, builders
 from monoforce_ros.bags.recording import camera_info_topics, find_transform
+from monoforce_ros.core import unfinished_path
 
 START = 1_700_000_000_000_000_000
 
@@ -68,6 +69,41 @@ def test_an_existing_bag_is_kept_unless_overwriting_is_allowed(tmp_path):
     assert len(Recording.open(tmp_path / "drive").motion) == 5
     with pytest.raises(ValueError, match="storage: got 'csv'"):
         BagWriter(tmp_path / "other", storage="csv")
+
+
+def test_a_bag_that_somebody_else_finished_meanwhile_is_kept(tmp_path):
+    with pytest.raises(FileExistsError, match="made by somebody else meanwhile"), BagWriter(
+        tmp_path / "drive", keep=True
+    ) as bag:  # fmt: skip
+        bag.write("/cmd_vel", builders.twist(1, 0), START)
+        write(tmp_path / "other", count=3).rename(tmp_path / "drive")
+    assert len(Recording.open(tmp_path / "drive").motion) == 3
+    (left,) = BagWriter.unfinished(tmp_path / "drive")
+    with BagReader(left) as bag:
+        assert len(list(bag.messages(["/cmd_vel"]))) == 1
+
+
+def test_what_a_killed_writer_of_the_same_number_left_is_kept(tmp_path):
+    """In a container a recorder has the same number at every start."""
+    left = unfinished_path(tmp_path / "drive")
+    write(tmp_path / "other", count=3).rename(left)
+    write(tmp_path / "drive", count=5)
+    assert len(Recording.open(left).motion) == 3 and len(Recording.open(tmp_path / "drive").motion) == 5
+
+
+def test_types_of_installed_packages_are_learned_with_all_that_they_consist_of(tmp_path, monkeypatch):
+    with BagWriter(tmp_path / "drive") as bag:
+        assert bag.knows("geometry_msgs/msg/Twist") and not bag.knows("nobody_msgs/msg/Nothing")
+        folder = tmp_path / "prefix" / "share" / "farm_msgs" / "msg"
+        folder.mkdir(parents=True)
+        (folder / "Row.msg").write_text("std_msgs/Header header\nPlant[] plants\nfloat64[2] ends\n")
+        monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path / "prefix"))
+        assert not bag.knows("farm_msgs/msg/Row"), "Plant is missing"
+        (folder / "Plant.msg").write_text("geometry_msgs/Point place\nstring kind\n")
+        assert bag.knows("farm_msgs/msg/Row") and bag.knows("farm_msgs/msg/Plant")
+        (folder / "Odd.msg").write_text("this is : no definition\n")
+        assert not bag.knows("farm_msgs/msg/Odd")
+        bag.write("/cmd_vel", builders.twist(1, 0), START)
 
 
 def storage_file(path):

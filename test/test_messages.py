@@ -11,7 +11,7 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import Marker, MarkerArray
 
-from monoforce_ros.bags import builders
+from monoforce_ros.bags import builders, is_rectified
 from monoforce_ros.messages import decoding, encoding
 from monoforce_ros.messages.decoding import MessageError
 
@@ -219,3 +219,35 @@ def test_images_of_any_size_keep_it(name):
     for flags in ([], [cv2.IMWRITE_JPEG_PROGRESSIVE, 1] if name == "jpeg" else []):
         data = cv2.imencode(f".{name}", picture, flags)[1].tobytes()
         assert decoding.decode_image(builders.compressed_image(STAMP, "camera", name, data)).shape == (37, 53, 3)
+
+
+def test_joints_without_a_velocity_interface_are_measured():
+    """joint_state_broadcaster tells their rates as NaN."""
+    state = builders.joint_state(STAMP, ["left_steering", "right_steering"], [0.1, 0.2], [np.nan, np.nan])
+    angles, rates = decoding.decode_joints(state, ["left_steering", "right_steering"])
+    assert angles.tolist() == [0.1, 0.2] and np.isnan(rates).all()
+    infinite = builders.joint_state(STAMP, ["left_steering"], [0.1], [np.inf])
+    with pytest.raises(MessageError, match="no finite velocity"):
+        decoding.decode_joints(infinite, ["left_steering"])
+
+
+def test_joints_that_steer_or_spring_at_a_wheel_are_no_wheels():
+    names = ["front_left_wheel_steering_joint", "front_right_wheel_steering_joint", "left_wheel", "right_wheel"]
+    state = builders.joint_state(STAMP, [*names, "left_wheel_suspension"], [0.0] * 5, [0.0, 0.0, 10.0, 12.0, 3.0])
+    assert decoding.decode_wheel_speeds(state).tolist() == [10.0, 12.0]
+
+
+def test_rectified_images_are_projected_by_p_without_distortion():
+    matrix = np.array([[400.0, 0, 320], [0, 400, 240], [0, 0, 1]])
+    info = builders.camera_info(STAMP, "camera", 640, 480, matrix, [-0.3, 0.1, 0, 0, 0])
+    info.p[[0, 5]] = 330.0
+    raw, rectified = decoding.decode_camera_info(info), decoding.decode_camera_info(info, rectified=True)
+    assert raw.is_distorted and not rectified.is_distorted
+    pixels, _ = rectified.project(np.array([[0.5, 0.6, 1.5]]))
+    np.testing.assert_allclose(pixels, [[430.0, 372.0]])
+    info.p[:] = 0.0
+    with pytest.raises(MessageError, match="no projection P"):
+        decoding.decode_camera_info(info, rectified=True)
+    assert [is_rectified(f"/camera/{name}") for name in ("image_rect", "image_rect_color/compressed", "image_raw")] == [
+        True, True, False,
+    ]  # fmt: skip

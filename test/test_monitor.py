@@ -61,14 +61,14 @@ def drive(
     return motion, CommandTrack(START + np.arange(len(twists)) * 10_000_000, twists)
 
 
-def watched(robot, motion: MotionTrack, commands: CommandTrack) -> LiveGap:
+def watched(robot, motion: MotionTrack, commands: CommandTrack, timeout: float = np.inf) -> LiveGap:
     """The gap after a recording with two predictions a second."""
     predictor = predictor_of(robot)
-    gap = LiveGap(predictor)
+    gap = LiveGap(predictor, timeout)
     for stamp in range(START + 2_000_000_000, int(motion.stamps[-1]), 500_000_000):
         state = motion.at(stamp)
         # As the node does: the current command is held, whatever follows.
-        held = commands.sample(np.minimum(predictor.command_stamps(stamp), stamp))
+        held = commands.sample(np.minimum(predictor.command_stamps(stamp), stamp), timeout=timeout)
         gap.remember(predictor.predict(Observation(stamp), state, held))
         now = motion.stamps <= stamp
         known = replace(
@@ -124,6 +124,16 @@ def test_noise_is_recognised_as_noise(husky):
     found = watched(husky, motion, commands).summary()
     assert 0.5 < found.position[1] / found.floor[1] < 2.0
     assert not found.excessive
+
+
+def test_a_base_that_stops_without_new_commands_has_no_gap(husky):
+    twists = np.where(np.arange(1500)[:, None] < 350, [1.0, 0.0], [0.0, 0.0])
+    motion, commands = drive(husky, twists)
+    # The planner fell silent after 3 s, and the base stopped half a second later.
+    silent = CommandTrack(commands.stamps[:300], commands.twists[:300])
+    found = watched(husky, motion, silent, timeout=0.5).summary()
+    assert found.count > 10 and found.position[1] < 0.05 and not found.excessive
+    assert watched(husky, motion, silent).summary().position[1] > 0.5
 
 
 def test_nothing_is_compared_before_the_horizon_has_passed_or_after_a_time_jump(husky):

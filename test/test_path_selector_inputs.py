@@ -660,6 +660,41 @@ def test_it_follows_a_plan_instead_of_heading_for_its_end(robot):
     assert robot.live(10.0, until=lambda: not robot.driven) and "the plan is empty" in robot.status()[1]
 
 
+@pytest.mark.parametrize("robot", ["plan_topic:=plan"], indirect=True)
+def test_a_plan_that_the_robot_did_not_follow_does_not_set_it_in_motion_when_it_is_sent_again(robot):
+    """Planners repeat their plan every second: a robot with a wrong sign would drive the wrong way again and again."""
+    robot.listen(Twist)
+    robot.obeys, robot.signs = True, np.array([-1.0, 1.0])
+    plans = robot.peer.node.create_publisher(Path, f"/{robot.prefix}/plan", 1)
+    assert robot.peer.until(lambda: plans.get_subscription_count() > 1, 10.0)
+
+    def plan(end: float) -> Path:
+        message = Path()
+        message.header.frame_id = "odom"
+        for x in np.linspace(0.0, end, 5):
+            pose = PoseStamped()
+            pose.pose.position.x = float(x)
+            message.poses.append(pose)
+        return message
+
+    def live(seconds: float, end: float, until=None) -> bool:
+        for _ in range(round(seconds)):
+            plans.publish(plan(end))
+            if robot.live(1.0, until=until) and until is not None:
+                return True
+        return until is None
+
+    assert live(15.0, 30.0, robot.says("it moves against its commands")), robot.status()
+    assert "the same plan is ignored until" in robot.status()[1]
+    robot.live(1.5)
+    before = robot.travelled
+    live(6.0, 30.0)
+    assert robot.travelled == before and "dropped" in robot.status()[1]
+    # Another end is another plan; so is the same one after a pause.
+    robot.signs = np.ones(2)
+    assert live(4.0, 20.0, lambda: robot.driven), robot.status()
+
+
 def test_the_target_lies_ahead_on_the_plan():
     plan = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0], [0.0, 0.2]])
     target, remaining = plan_target(plan, np.array([1.0, 0.3]), 2.0)

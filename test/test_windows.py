@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import BagWriter, Frame, Recording, builders, cut_windows, nearest_frame, smooth
 from monoforce_ros.core import CommandTrack, MotionTrack, StaleDataError, nearest_stamp
+from monoforce_ros.messages.decoding import decode_cloud
 
 START = 1_700_000_000_000_000_000
 
@@ -187,3 +188,30 @@ def test_frames_of_several_topics_are_paired_within_the_limit_and_not_beyond(tmp
             return False
 
     assert [has_odometry(frame) for frame in left].count(False) == 2
+
+
+def test_windows_do_not_span_a_jump_of_the_localisation():
+    times = np.arange(0.0, 20.0, 0.05)
+    positions = np.c_[times + 3.0 * (times >= 10.0), np.zeros((len(times), 2))]
+    motion = track(times, positions, Rotation.identity(len(times)))
+    commands = CommandTrack(motion.stamps, np.tile([1.0, 0.0], (len(times), 1)))
+    smoothed = smooth(motion)
+    assert len(smoothed.stretches) == 2
+    windows = cut_windows(smoothed.motion, commands, length=5.0, stretches=smoothed.stretches)
+    moved = np.linalg.norm(windows.positions[:, -1] - windows.positions[:, 0], axis=1)
+    assert len(windows) >= 8 and moved.max() < 5.2
+    assert len(cut_windows(smoothed.motion, commands, length=5.0)) > len(windows)
+
+
+def test_clouds_received_at_one_time_keep_their_own_stamps(tmp_path):
+    with BagWriter(tmp_path / "bag") as bag:
+        for i in range(40):
+            stamp = START + i * 50_000_000
+            received = START + (i // 2) * 100_000_000
+            message = builders.odometry(stamp, "odom", "base_link", [0, 0, 0], [0, 0, 0, 1], [0] * 3, [0] * 3)
+            bag.write("/odom", message, received)
+            bag.write("/points", builders.point_cloud(stamp, "lidar", np.full((3, 3), 1.0 + i)), received)
+    recording = Recording.open(tmp_path / "bag")
+    found = {frame.stamp: decode_cloud(message) for frame, message in recording._decoded(recording.clouds)}
+    assert len(found) == 40
+    assert all(points[0, 0] == 1.0 + (stamp - START) // 50_000_000 for stamp, points in found.items())

@@ -17,6 +17,7 @@ from monoforce_ros.bags.recording import (
     Recording,
     camera_info_topics,
     find_transform,
+    is_rectified,
     nearest_frame,
 )
 from monoforce_ros.bags.smoothing import SmoothedMotion, smooth
@@ -55,6 +56,7 @@ __all__ = [
     "cut_windows",
     "find_transform",
     "flippers_at",
+    "is_rectified",
     "nearest_frame",
     "observe",
     "read_options",

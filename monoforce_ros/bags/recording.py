@@ -239,17 +239,21 @@ class Recording:
 
     def _decoded(self, frames: Sequence[Frame]) -> Iterator[tuple[Frame, Message]]:
         """Messages of frames of one topic, each once, in the order of the bag."""
-        by_reception = {frame.received: frame for frame in frames}
-        if not by_reception:
+        # Several messages may have been received at one time, by a clock that stands in between.
+        wanted = {(frame.received, frame.stamp): frame for frame in frames}
+        if not wanted:
             return
+        received = {frame.received for frame in frames}
         with opened(self.path) as bag:
-            for message in bag.messages([frames[0].topic], start=min(by_reception), stop=max(by_reception) + 1):
-                if message.received in by_reception:
+            for message in bag.messages([frames[0].topic], start=min(received), stop=max(received) + 1):
+                if message.received in received:
                     try:
                         decoded = message.decode()
                     except ValueError:
                         continue
-                    yield by_reception[message.received], decoded
+                    frame = wanted.pop((message.received, decoding.stamp_of(decoded)), None)
+                    if frame is not None:
+                        yield frame, decoded
 
     def _read(self, frame: Frame) -> Message:
         with opened(self.path) as bag:
@@ -283,6 +287,11 @@ def camera_info_topics(image_topic: str) -> tuple[str, str]:
     base = image_topic.removesuffix("/compressed")
     space, slash, _ = base.rpartition("/")
     return f"{space}{slash}camera_info", f"{base}/camera_info"
+
+
+def is_rectified(image_topic: str) -> bool:
+    """Whether the images of a topic are rectified, by the names of image_proc: ``image_rect``, ``image_rect_color``."""
+    return "rect" in image_topic.removesuffix("/compressed").rpartition("/")[2].lower()
 
 
 def _is_commanded(topic: str) -> bool:
@@ -340,6 +349,11 @@ class _Collector:
         self._unknown_joints: dict[str, list[str]] = {}
         self.indexed: dict[str, list[Frame]] = {}
         self.cameras: dict[str, CameraModel] = {}
+        self.rectified: dict[str, CameraModel] = {}
+        """Projections of rectified images, by the topic of their CameraInfo."""
+        self._of_rectified = {
+            info for topic in bag.of_type(*IMAGES) if is_rectified(topic) for info in camera_info_topics(topic)
+        }
         self.transforms: dict[tuple[str, str], np.ndarray] = {}
         self._moving: set[tuple[str, str]] = set()
         self._newest: dict[tuple[str, str], np.ndarray] = {}
@@ -375,6 +389,8 @@ class _Collector:
             elif message.topic == self.chosen.get("flipper_commands"):
                 self._take_joints(message.topic, stamp, decoded, self.flipper_commands)
             elif message.message_type == CAMERA_INFO:
+                if message.topic in self._of_rectified and message.topic not in self.rectified:
+                    self.rectified[message.topic] = decoding.decode_camera_info(decoded, rectified=True)
                 if message.topic not in self.cameras:
                     self.cameras[message.topic] = decoding.decode_camera_info(decoded)
             elif message.message_type == TRANSFORMS:
@@ -462,9 +478,10 @@ class _Collector:
                 for topic in image_topics
             },
             cameras={
-                topic: self.cameras[found[0]]
+                topic: cameras[found[0]]
                 for topic in image_topics
-                if (found := [info for info in camera_info_topics(topic) if info in self.cameras])
+                for cameras in [self.rectified if is_rectified(topic) else self.cameras]
+                if (found := [info for info in camera_info_topics(topic) if info in cameras])
             },
             static_transforms=self.transforms,
             moving={

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,6 +53,7 @@ def cut_windows(
     maximum_gap: float = 0.3,
     timeout: float = np.inf,
     joints: JointRecord | None = None,
+    stretches: Sequence[slice] | None = None,
 ) -> Windows:
     """Cut a recording into windows.
 
@@ -68,6 +70,8 @@ def cut_windows(
         maximum_gap: largest time between a sample and the odometry around it [s].
         timeout: age beyond which a command is ignored [s].
         joints: recorded joints of the robot.
+        stretches: of a smoothed motion (:class:`~monoforce_ros.bags.SmoothedMotion`): windows across a jump of the
+            localisation are left out.
 
     Raises:
         ValueError: no window is left; the message gives the duration of the odometry.
@@ -77,10 +81,14 @@ def cut_windows(
     starts, sampled = [], []
     if len(motion):
         first, last = int(motion.stamps[0]), int(motion.stamps[-1])
+        parts = [slice(0, len(motion))] if stretches is None else stretches
+        whole = [(int(motion.stamps[part.start]), int(motion.stamps[part.stop - 1])) for part in parts]
         for start in range(first, last - round(length * 1e9) + 1, round(stride * 1e9)):
             try:
                 states = [motion.at(start + round(1e9 * time), maximum_gap=maximum_gap) for time in times]
             except StaleDataError:
+                continue
+            if not any(low <= start and start + round(length * 1e9) <= high for low, high in whole):
                 continue
             starts.append(states[0])
             sampled.append(states)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import shutil
 import sqlite3
 from pathlib import Path
@@ -12,7 +13,7 @@ from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLi
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.rosbag2.storage_mcap import McapWriter
 
-from monoforce_ros.bags.types import type_store
+from monoforce_ros.bags.types import learn, type_store
 from monoforce_ros.core import unfinished_path
 
 _STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
@@ -28,6 +29,12 @@ _LATCHED = Qos(
     liveliness_lease_duration=_FOREVER,
     avoid_ros_namespace_conventions=False,
 )
+
+
+def _unused(path: Path) -> Path:
+    """The path, or one with a number where a writer that was killed has left its bag."""
+    numbered = (path.with_name(f"{path.name}-{number}") for number in itertools.count(2))
+    return path if not path.exists() else next(other for other in numbered if not other.exists())
 
 
 class BagWriter:
@@ -46,7 +53,8 @@ class BagWriter:
 
     Raises:
         ValueError: the storage is unknown.
-        FileExistsError: the target exists and ``overwrite`` is off.
+        FileExistsError: the target exists and ``overwrite`` is off, or appears while the bag is written: it is then
+            kept, and so is the new one in its hidden folder.
     """
 
     def __init__(self, path: str | Path, *, storage: str = "mcap", overwrite: bool = False, keep: bool = False):
@@ -55,8 +63,8 @@ class BagWriter:
         self.path = Path(path)
         if self.path.exists() and not overwrite:
             raise FileExistsError(f"{self.path} exists already: remove it, choose another name or allow overwriting")
-        self._unfinished = unfinished_path(self.path)
-        self._keep = keep
+        self._unfinished = _unused(unfinished_path(self.path))
+        self._keep, self._overwrite = keep, overwrite
         self._writer = Writer(self._unfinished, version=9, storage_plugin=_STORAGES[storage])
         if storage == "mcap":
             # Compressed chunks within the file, like the mcap presets of ros2 bag.
@@ -66,7 +74,6 @@ class BagWriter:
 
     def __enter__(self) -> BagWriter:
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        shutil.rmtree(self._unfinished, ignore_errors=True)
         self._writer.open()
         return self
 
@@ -80,6 +87,8 @@ class BagWriter:
             return
         try:
             self._finish()
+        except FileExistsError:
+            raise
         except (OSError, sqlite3.Error) as failure:
             if not self._keep:
                 raise
@@ -90,9 +99,18 @@ class BagWriter:
     def _finish(self) -> None:
         self._writer.close()
         if self.path.exists():
+            if not self._overwrite:
+                raise FileExistsError(
+                    f"{self.path} was made by somebody else meanwhile and is kept; this bag is complete in "
+                    f"{self._unfinished}: rename it"
+                )
             shutil.rmtree(self.path)
         self._name_storage_file()
         self._unfinished.rename(self.path)
+
+    def knows(self, message_type: str) -> bool:
+        """Whether messages of a type can be written: it is one of Jazzy, of the package, or its definition is found."""
+        return message_type in self._types.types or learn(self._types, message_type)
 
     def write(self, topic: str, message: Any, stamp: int) -> None:
         """Append a message (from :mod:`monoforce_ros.bags.builders`) received at ``stamp`` [ns]."""

@@ -148,16 +148,24 @@ def _binned(camera: CameraModel, message: Any) -> CameraModel:
     return camera.resized(max(1, camera.width // across), max(1, camera.height // down))
 
 
-def decode_camera_info(message: Any) -> CameraModel:
-    """``sensor_msgs/CameraInfo`` → CameraModel; raises ``MessageError`` if it is uncalibrated or inconsistent."""
+def decode_camera_info(message: Any, *, rectified: bool = False) -> CameraModel:
+    """``sensor_msgs/CameraInfo`` → CameraModel; raises ``MessageError`` if it is uncalibrated or inconsistent.
+
+    Images that were rectified share the CameraInfo of the raw ones: their projection is P, without distortion.
+    """
     model = message.distortion_model or "plumb_bob"
     coefficients = np.asarray(message.d, np.float64)
+    matrix = np.asarray(message.k, np.float64).reshape(3, 3)
+    if rectified:
+        model, coefficients, matrix = "plumb_bob", np.zeros(5), np.asarray(message.p, np.float64).reshape(3, 4)[:, :3]
+        if not matrix.any():
+            raise MessageError("CameraInfo: got no projection P, which rectified images need")
     # Drivers write "plumb_bob" with eight coefficients; OpenCV's rational model takes them as they are.
     try:
         camera = CameraModel(
             width=int(message.width),
             height=int(message.height),
-            matrix=np.asarray(message.k, np.float64).reshape(3, 3),
+            matrix=matrix,
             distortion=coefficients,
             distortion_model={"fisheye": "equidistant"}.get(model, model),
             frame_id=message.header.frame_id,
@@ -255,16 +263,20 @@ def decode_angular_velocity(message: Any) -> tuple[np.ndarray, str]:
     return values, message.header.frame_id
 
 
+_NOT_ROLLING = ("steer", "swivel", "caster", "castor", "suspension", "shock", "spring", "rocker", "bogie")
+"""Parts of names of joints at a wheel that do not drive it."""
+
+
 def decode_wheel_speeds(message: Any) -> np.ndarray | None:
     """``sensor_msgs/JointState`` → mean speed of the left and of the right wheels ``[2]`` [rad/s].
 
-    Wheels are joints whose names contain wheel or track, and left or right. None if a side has no wheels or no finite
-    speeds.
+    Wheels are joints whose names contain wheel or track, and left or right, but none that steers, swivels or springs.
+    None if a side has no wheels or no finite speeds.
     """
     sides: dict[str, list[float]] = {"left": [], "right": []}
     for name, speed in zip(message.name, np.asarray(message.velocity, np.float64).tolist(), strict=False):
         lowered = name.lower()
-        if "wheel" in lowered or "track" in lowered:
+        if ("wheel" in lowered or "track" in lowered) and not any(word in lowered for word in _NOT_ROLLING):
             for side, speeds in sides.items():
                 if side in lowered:
                     speeds.append(speed)
@@ -280,8 +292,10 @@ def decode_joints(message: Any, names: Sequence[str]) -> tuple[np.ndarray, np.nd
     Other joints are ignored. What the message does not contain is NaN: joints that it does not name, and rates or
     angles of a message without velocities or positions.
 
-    Raises ``MessageError`` if no joint is known, a list has another length than the names, or a value is not finite or
-    beyond two turns.
+    Joints without a velocity interface have rates of NaN (joint_state_broadcaster).
+
+    Raises ``MessageError`` if no joint is known, a list has another length than the names, an angle is not finite or
+    beyond two turns, or a rate is infinite.
     """
     index = {str(name): place for place, name in enumerate(message.name)}
     known = [name for name in names if name in index]
@@ -293,7 +307,8 @@ def decode_joints(message: Any, names: Sequence[str]) -> tuple[np.ndarray, np.nd
         if len(values) not in (0, len(message.name)):
             raise MessageError(f"joint states: got {len(values)} values of {label} for {len(message.name)} names")
         listed = np.array([values[index[name]] if name in index and len(values) else np.nan for name in names])
-        bad = [name for name in known if len(values) and not np.isfinite(values[index[name]])]
+        usable = np.isfinite(values) if label == "position" else ~np.isinf(values)
+        bad = [name for name in known if len(values) and not usable[index[name]]]
         if bad:
             raise MessageError(f"joint states: got no finite {label} of {bad}, expected finite numbers")
         if label == "position" and (far := [name for name in known if len(values) and _is_far(values[index[name]])]):

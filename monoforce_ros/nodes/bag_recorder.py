@@ -41,6 +41,7 @@ class BagRecorder(Node):
         self._bag = bag
         self._topics = None if topics is None else {self.resolve_topic_name(topic) for topic in topics}
         self._subscribed: set[str] = set()
+        self._failed: set[str] = set()
         self.recorded = 0
         self._timer = self.create_timer(0.2, self._subscribe_new, clock=STEADY)
         self._flusher = self.create_timer(1.0, bag.flush, clock=STEADY)
@@ -63,6 +64,13 @@ class BagRecorder(Node):
             if kind is None:
                 self.get_logger().warning(f"{topic} is not recorded: {missing_package(types[0])}")
                 continue
+            if not self._bag.knows(types[0]):
+                package = types[0].partition("/")[0]
+                self.get_logger().warning(
+                    f"{topic} is not recorded: no definition of {types[0]} is in share/{package}/msg of a prefix on "
+                    "AMENT_PREFIX_PATH"
+                )
+                continue
             # The strictest QoS that every publisher offers loses the fewest messages.
             reliable = all(p.qos_profile.reliability == ReliabilityPolicy.RELIABLE for p in publishers)
             latched = all(p.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in publishers)
@@ -81,7 +89,17 @@ class BagRecorder(Node):
             self.get_logger().info(f"recording {topic} ({types[0]})")
 
     def _write(self, topic: str, message_type: str, latched: bool, data: bytes) -> None:
-        self._bag.write_serialized(topic, message_type, data, time.time_ns(), latched=latched)
+        if topic in self._failed:
+            return
+        try:
+            self._bag.write_serialized(topic, message_type, data, time.time_ns(), latched=latched)
+        except OSError:
+            # The disk is full, or gone: nothing more can be recorded.
+            raise
+        except Exception as error:  # one topic must not end the recording of the others
+            self._failed.add(topic)
+            self.get_logger().error(f"{topic} is not recorded any more: {type(error).__name__}: {error}")
+            return
         self.recorded += 1
 
 

@@ -17,9 +17,9 @@ PART = "live gap"
 class MonitorOutput:
     """Compares past predictions with the measured motion, and publishes and reports the running error."""
 
-    def __init__(self, node: Node, predictor: Predictor, health: Health):
+    def __init__(self, node: Node, predictor: Predictor, health: Health, command_timeout: float):
         self._node, self._health = node, health
-        self._gap = LiveGap(predictor)
+        self._gap = LiveGap(predictor, command_timeout)
         self._clear_requested = False
         self._publisher = node.create_publisher(Float32MultiArray, "predicted/live_gap", 1)
 

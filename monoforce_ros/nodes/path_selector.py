@@ -27,7 +27,7 @@ from monoforce_ros.nodes.parameters import declare_parameters, settings_without_
 from monoforce_ros.nodes.process import run_schema_node
 from monoforce_ros.nodes.progress_check import PATIENCE, WINDOW, MeasuredVelocity, ProgressCheck
 from monoforce_ros.nodes.schema import read_schema, schema_path
-from monoforce_ros.nodes.stop import Refusal, Stop
+from monoforce_ros.nodes.stop import Refusal, Stop, Unfollowed
 from monoforce_ros.nodes.subscriptions import AdaptiveSubscription
 from monoforce_ros.planning import (
     COMMAND_FIELDS,
@@ -52,6 +52,8 @@ _JUMP = 1.0
 """Distance by which odometry may jump without being another one [m]; and it may move at three times the speed."""
 _PAUSE = 0.03
 """Time between the commands to stand at the end of the node [s]."""
+_PLANNING_ENDED = 5.0
+"""Time without a plan from which on a planner starts anew [s]: planners repeat theirs every second or two."""
 _TWICE = 0.2
 """Time within which the same goal from the other subscription arrives [s]."""
 
@@ -82,6 +84,8 @@ class PathSelectorNode(Node):
         self._course_frames = CourseFrames(self.transforms, history)
         self._course: Course | None = None
         self._received: Course | None = None
+        self._given_up: Course | None = None
+        """The last plan to an end that the robot did not follow."""
         self._started = time.monotonic()
         self._odometry = OdometryInput(self.frames, self.transforms, self.health, settings.timeout)
         self._candidates = CandidateInput(self.health, settings.timeout)
@@ -132,7 +136,7 @@ class PathSelectorNode(Node):
     def _on_plan(self, message: Path) -> None:
         places = [pose.pose.position for pose in message.poses]
         if not places:
-            self._course = self._received = None
+            self._course = self._received = self._given_up = None
             self.health.report(PART, OK, "the plan is empty: standing", reason="empty plan")
             return
         header = message.header if message.header.frame_id else message.poses[0].header
@@ -155,7 +159,10 @@ class PathSelectorNode(Node):
         course, previous = Course(kind, frame_id, stamp, points, time.monotonic()), self._received
         if course.repeats(previous) and previous is not None and course.received - previous.received < _TWICE:
             return
-        self._course = self._received = course
+        if self._repeats_given_up(course):
+            self._received = self._given_up = course
+            return
+        self._course, self._received, self._given_up = course, course, None
         # A plan is sent again and again; the same numbers in another frame are another goal.
         same = previous is not None and (previous.frame_id, *previous.points[-1]) == (frame_id, *points[-1])
         if not same:
@@ -167,6 +174,14 @@ class PathSelectorNode(Node):
         with contextlib.suppress(Stop, Refusal):
             self._odometry.usable("")
             self._in_odometry(course)
+
+    def _repeats_given_up(self, course: Course) -> bool:
+        """Whether a planner goes on sending a plan that the robot did not follow."""
+        former = self._given_up
+        if former is None or course.kind != "plan" or course.received - former.received > _PLANNING_ENDED:
+            return False
+        apart = float(np.linalg.norm(course.points[-1] - former.points[-1]))
+        return course.frame_id == former.frame_id and apart <= self.settings.goal_tolerance
 
     def _on_odometry(self, message: Odometry) -> None:
         before = self._odometry.motion
@@ -252,6 +267,11 @@ class PathSelectorNode(Node):
         except Stop as stop:
             self.health.report(PART, WARN, f"stopped: {stop}", reason=stop.reason)
             return None
+        except Unfollowed as refusal:
+            self._given_up = self._received
+            again = "; the same plan is ignored until the planner pauses or plans to another end"
+            self._drop(f"{refusal}{again if self._course is not None and self._course.kind == 'plan' else ''}")
+            return None
         except Refusal as refusal:
             self._drop(str(refusal))
             return None
@@ -331,7 +351,7 @@ class PathSelectorNode(Node):
         return found
 
     def _check_progress(self, course: Course, remaining: float) -> None:
-        """Raise ``Refusal`` for a robot that does not follow its commands, or comes no nearer to the goal.
+        """Raise ``Unfollowed`` for a robot that does not follow its commands, or comes no nearer to the goal.
 
         Args:
             course: what is driven to.
@@ -341,13 +361,13 @@ class PathSelectorNode(Node):
         if opposed := self._progress.opposed:
             sent = f"{self._sent(self._last_command)}, odometry shows the opposite {opposed}"
             advice = "does somebody else drive it, or has the base or the odometry a wrong sign?"
-            raise Refusal(f"{dropped}: it moves against its commands ({sent}): {advice}")
+            raise Unfollowed(f"{dropped}: it moves against its commands ({sent}): {advice}")
         if (seconds := self._progress.unfollowed) > PATIENCE:
             velocity = self._progress.velocity
             shown = "no motion" if velocity is None else _shown(velocity)
             sent = f"{self._sent(self._last_command)}, odometry shows {shown}"
             advice = "free it, or repair what commands or odometry pass through, then send it again"
-            raise Refusal(f"{dropped}: it has not followed its commands for {seconds:.0f} s ({sent}): {advice}")
+            raise Unfollowed(f"{dropped}: it has not followed its commands for {seconds:.0f} s ({sent}): {advice}")
         now = time.monotonic()
         nearest, since = self._nearest
         # A plan around an obstacle that was not known before is longer at once.
@@ -355,7 +375,7 @@ class PathSelectorNode(Node):
             self._nearest = nearest, since = remaining, now
         self._remaining = remaining
         if (limit := self.settings.progress_timeout) and now - since > limit:
-            raise Refusal(
+            raise Unfollowed(
                 f"{dropped}: it has come no nearer to its goal for {limit:g} s, {remaining:.1f} m are left: is it "
                 "within reach? (progress_timeout)"
             )

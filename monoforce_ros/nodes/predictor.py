@@ -19,7 +19,7 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState, PointCloud2
 from visualization_msgs.msg import MarkerArray
 
-from monoforce_ros.bags import camera_info_topics
+from monoforce_ros.bags import camera_info_topics, is_rectified
 from monoforce_ros.core import NANOSECOND, CommandTrack, MotionState, RobotFrames, pose_matrix
 from monoforce_ros.effects import corrected_commands, corrected_motion
 from monoforce_ros.messages import decoding
@@ -137,7 +137,7 @@ class PredictorNode(ManagedNode):
         self._predictions = 0
         self._last_prediction = self._started
         self._durations: list[float] = []
-        self.monitor = MonitorOutput(self, self.predictor, self.health)
+        self.monitor = MonitorOutput(self, self.predictor, self.health, settings.command_timeout)
         with_candidates = settings.candidates or settings.candidate_topic
         self.candidates = CandidateOutput(self, self.predictor, settings, self.health) if with_candidates else None
         self.ensemble = EnsembleOutput(self, self.predictor, settings) if settings.ensemble else None
@@ -273,7 +273,7 @@ class PredictorNode(ManagedNode):
                     )
                     for info_topic in ([given] if given else camera_info_topics(topic))
                 ]
-                self.decoder.add_camera(part, " or ".join(info.topic for info in infos))
+                self.decoder.add_camera(part, " or ".join(info.topic for info in infos), rectified=is_rectified(topic))
                 self._camera_info_subscriptions += infos
 
     @property

@@ -30,16 +30,19 @@ class SensorDecoder:
     def __init__(self, frames: RobotFrames, transforms: TransformTree, health: Health):
         self._frames, self._transforms, self._health = frames, transforms, health
         self._info_topics: dict[str, str] = {}
+        self._rectified: set[str] = set()
         self._cameras: dict[str, CameraModel | MessageError] = {}
 
-    def add_camera(self, part: str, info_topic: str) -> None:
-        """Name the CameraInfo topic of a camera, for error messages."""
+    def add_camera(self, part: str, info_topic: str, *, rectified: bool = False) -> None:
+        """Name the CameraInfo topic of a camera, for error messages, and say whether its images are rectified."""
         self._info_topics[part] = info_topic
+        if rectified:
+            self._rectified.add(part)
 
     def set_camera_info(self, part: str, message: CameraInfo) -> None:
         """Use a calibration from now on."""
         try:
-            self._cameras[part] = decoding.decode_camera_info(message)
+            self._cameras[part] = decoding.decode_camera_info(message, rectified=part in self._rectified)
         except MessageError as error:
             # Reported with the next image, which cannot be used.
             self._cameras[part] = error

@@ -13,3 +13,8 @@ class Stop(Exception):  # noqa: N818  (no error: the robot has to stand)
 
 class Refusal(Exception):  # noqa: N818  (as Stop)
     """The goal or plan cannot be driven to and is dropped; the message says why."""
+
+
+class Unfollowed(Refusal):
+    """The robot does not carry out its commands, or comes no nearer: a planner that sends the same plan again and again
+    must not set it in motion once more."""

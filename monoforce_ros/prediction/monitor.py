@@ -71,6 +71,8 @@ class LiveGap:
 
     predictor: Predictor
     """Robot and physics of the predictions."""
+    command_timeout: float = np.inf
+    """Age from which on a command no longer acts [s], as in the predictions: bases stop without new ones."""
     _waiting: deque[Prediction] = field(default_factory=deque)
     _samples: deque[GapSample] = field(default_factory=lambda: deque(maxlen=_MAXIMUM_SAMPLES))
     _noise: tuple[float, float] = (0.0, 0.0)
@@ -97,7 +99,8 @@ class LiveGap:
         if not self._waiting or not len(motion) or motion.stamps[-1] < self._waiting[0].stamp + round(last * 1e9):
             return None
         prediction = self._waiting.popleft()
-        twists = commands.sample(self.predictor.command_stamps(prediction.stamp))
+        stamps = self.predictor.command_stamps(prediction.stamp)
+        twists = commands.sample(stamps, timeout=self.command_timeout)
         rolled = self.predictor.roll_out(
             prediction.terrain, [prediction.motion], twists[None], with_forces=False, joints=prediction.joints
         )

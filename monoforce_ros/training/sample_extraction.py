@@ -104,11 +104,12 @@ def _samples(
         )
     if not len(recording.commands):
         raise SamplesError(f"{bag}: no commands (Twist or TwistStamped), which the physics needs")
-    motion = smooth(corrected_motion(recording.motion, robot.effects)).motion
+    smoothed = smooth(corrected_motion(recording.motion, robot.effects))
+    motion = smoothed.motion
     commands = corrected_commands(recording.commands, robot.effects)
     segments = _segments(recording, motion, commands, robot, settings)
     arrays = _read_images(recording, motion, robot, config, settings, topics, [start for start, _ in segments])
-    windows = cut_windows(motion, commands, length=CHUNK, stride=settings.chunk_period)
+    windows = cut_windows(motion, commands, length=CHUNK, stride=settings.chunk_period, stretches=smoothed.stretches)
     chunks = Chunks(
         stamps=np.array([state.stamp for state in windows.starts]),
         times=windows.times,
