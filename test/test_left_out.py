@@ -108,6 +108,21 @@ def test_each_window_is_judged_with_the_values_without_its_part():
     )
 
 
+def test_formulas_of_parts_may_have_other_terms():
+    data, husky = _recording(()), load_robot("husky")
+    parts = folds_of(data.starts, FOLDS)
+    terms = [
+        {"torque_z:vx": 5.0},
+        {"torque_z:vx|vx|": 5.0},
+        {"force_x:vx": -3.0, "torque_z:1": 1.0},
+        {"torque_z:1": 2.0},
+    ]
+    effects = tuple((("learned_term", terms[part % len(terms)]),) for part in range(FOLDS))
+    found = residuals_by_part(husky, data, parts, effects)
+    everywhere = np.stack([Predictions(husky, data).residuals([entry])[0] for entry in effects])
+    assert found == pytest.approx(everywhere[parts, np.arange(len(parts))], abs=1e-6)
+
+
 @pytest.mark.parametrize("name", ["drive_gain", "pose_clock_offset"])
 def test_the_usual_lean_is_that_of_all_windows_whatever_part_they_are_in(name):
     # A sensor that leans by 2°, on a robot whose pitch differs between the halves of the recording.

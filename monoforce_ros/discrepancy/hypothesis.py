@@ -66,8 +66,8 @@ def residuals_by_part(
 
 
 def values_key(effects: Effects) -> tuple[tuple[object, ...], ...]:
-    """Names and values of effects as a key."""
-    return tuple((name, *values.values()) for name, values in effects)
+    """Names, parameters and values of effects as a key."""
+    return tuple((name, *values.items()) for name, values in effects)
 
 
 def own_values(robot: RobotModel, name: str) -> dict[str, float]:
@@ -225,10 +225,9 @@ class Predictions:
         """Predicted minus measured, ``[W, K, C]``, each window with the effects of its part; see the function."""
         numbers = np.unique(parts)
         used = [effects[number] for number in numbers]
-        if (
-            self._part is None
-            and len({(_measurements(entry), tuple(name for name, _ in entry)) for entry in used}) == 1
-        ):
+        # Formulas of parts may have other terms.
+        kinds = {(_measurements(entry), tuple((name, *values) for name, values in entry)) for entry in used}
+        if self._part is None and len(kinds) == 1:
             # One batch, in which every window has values of its own.
             windows = self._windows(_measurements(used[0]))
             (found,) = self._roll_out(windows, [effects[part] for part in parts], each=1)

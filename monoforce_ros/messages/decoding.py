@@ -155,13 +155,14 @@ def decode_camera_info(message: Any, *, rectified: bool = False) -> CameraModel:
     """
     model = message.distortion_model or "plumb_bob"
     coefficients = np.asarray(message.d, np.float64)
-    matrix = np.asarray(message.k, np.float64).reshape(3, 3)
-    if rectified:
-        model, coefficients, matrix = "plumb_bob", np.zeros(5), np.asarray(message.p, np.float64).reshape(3, 4)[:, :3]
-        if not matrix.any():
-            raise MessageError("CameraInfo: got no projection P, which rectified images need")
     # Drivers write "plumb_bob" with eight coefficients; OpenCV's rational model takes them as they are.
     try:
+        matrix = np.asarray(message.k, np.float64).reshape(3, 3)
+        if rectified:
+            model, coefficients = "plumb_bob", np.zeros(5)
+            matrix = np.asarray(message.p, np.float64).reshape(3, 4)[:, :3]
+            if not matrix.any():
+                raise ValueError("got no projection P, which rectified images need")
         camera = CameraModel(
             width=int(message.width),
             height=int(message.height),
