@@ -41,6 +41,19 @@ def test_points_behind_or_far_to_the_side_of_the_camera_have_no_pixel(lens):
     assert not inside.any() and np.isnan(pixels).all()
 
 
+def test_points_beyond_where_a_distortion_folds_have_no_pixel():
+    """Of nearer ones they would get the pixels: here those at 60° from the axis the pixels of those at 45°."""
+    matrix = np.array([[400.0, 0, 320], [0, 400, 240], [0, 0, 1]])
+    camera = CameraModel(640, 480, matrix, np.array([-0.37, 0.12, 0, 0, -0.02]), "plumb_bob", "camera")
+    camera.check()
+    along = np.array([0.8, 0.6])
+    slopes = np.linspace(0.05, 2.5, 100)
+    pixels, inside = camera.project(np.c_[slopes[:, None] * along, np.ones(100)])
+    radii = np.linalg.norm(pixels - matrix[:2, 2], axis=1)[inside]
+    assert (np.diff(radii) > 0.0).all() and slopes[inside].max() > 0.9
+    assert not inside[slopes > 1.6].any()
+
+
 def test_a_resized_image_keeps_its_rays():
     model = camera("plumb_bob")
     half = model.resized(320, 240)

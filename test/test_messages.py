@@ -248,6 +248,6 @@ def test_rectified_images_are_projected_by_p_without_distortion():
     info.p[:] = 0.0
     with pytest.raises(MessageError, match="no projection P"):
         decoding.decode_camera_info(info, rectified=True)
-    assert [is_rectified(f"/camera/{name}") for name in ("image_rect", "image_rect_color/compressed", "image_raw")] == [
-        True, True, False,
-    ]  # fmt: skip
+    rectified_names = ("image_rect", "image_rect_color/compressed", "rectified")
+    assert all(is_rectified(f"/camera/{name}") for name in rectified_names)
+    assert not any(is_rectified(f"/camera/{name}") for name in ("image_raw", "direct"))

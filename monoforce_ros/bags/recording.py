@@ -239,7 +239,7 @@ class Recording:
 
     def _decoded(self, frames: Sequence[Frame]) -> Iterator[tuple[Frame, Message]]:
         """Messages of frames of one topic, each once, in the order of the bag."""
-        # Several messages may have been received at one time, by a clock that stands in between.
+        # Several messages may have been received at one time, by a clock with coarse steps.
         wanted = {(frame.received, frame.stamp): frame for frame in frames}
         if not wanted:
             return
@@ -291,7 +291,8 @@ def camera_info_topics(image_topic: str) -> tuple[str, str]:
 
 def is_rectified(image_topic: str) -> bool:
     """Whether the images of a topic are rectified, by the names of image_proc: ``image_rect``, ``image_rect_color``."""
-    return "rect" in image_topic.removesuffix("/compressed").rpartition("/")[2].lower()
+    name = image_topic.removesuffix("/compressed").rpartition("/")[2].lower()
+    return any(word.startswith("rect") for word in name.split("_"))
 
 
 def _is_commanded(topic: str) -> bool:

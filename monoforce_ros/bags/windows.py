@@ -84,11 +84,11 @@ def cut_windows(
         parts = [slice(0, len(motion))] if stretches is None else stretches
         whole = [(int(motion.stamps[part.start]), int(motion.stamps[part.stop - 1])) for part in parts]
         for start in range(first, last - round(length * 1e9) + 1, round(stride * 1e9)):
+            if not any(low <= start and start + round(length * 1e9) <= high for low, high in whole):
+                continue
             try:
                 states = [motion.at(start + round(1e9 * time), maximum_gap=maximum_gap) for time in times]
             except StaleDataError:
-                continue
-            if not any(low <= start and start + round(length * 1e9) <= high for low, high in whole):
                 continue
             starts.append(states[0])
             sampled.append(states)

@@ -161,7 +161,7 @@ class CameraModel:
         pixels = np.full((len(points), 2), np.nan)
         # Far outside the field of view the distortion polynomial folds back into the image, so only points within the
         # angle of the image's corners are projected.
-        visible = (points[:, 2] > 0.05) & (self._slope(points) <= self._corner_slope() * 1.05)
+        visible = (points[:, 2] > 0.05) & (self._slope(points) <= self._largest_slope())
         if visible.any():
             pixels[visible] = self._projected(points[visible])
         inside = (pixels >= -0.5).all(axis=1) & (pixels[:, 0] < self.width - 0.5) & (pixels[:, 1] < self.height - 0.5)
@@ -215,8 +215,22 @@ class CameraModel:
     def _slope(points: np.ndarray) -> np.ndarray:
         return np.linalg.norm(points[:, :2], axis=1) / np.maximum(points[:, 2], 1e-9)
 
-    def _corner_slope(self) -> float:
-        u, v = self.width - 1, self.height - 1
-        border = np.array([[0, 0], [u, 0], [0, v], [u, v], [u / 2, 0], [u / 2, v], [0, v / 2], [u, v / 2]], float)
-        slopes = self._slope(self.rays(border))
-        return float(slopes[np.isfinite(slopes)].max(initial=0.1))
+    def _largest_slope(self) -> float:
+        """Largest ratio of distance from the optical axis and depth that is seen, a little beyond the image's corners.
+
+        Where the distortion folds within the image no ray leads to its border. Beyond the largest that does, points
+        would get the pixels of nearer ones.
+        """
+        across, down = (np.linspace(0.0, size - 1.0, 9) for size in (self.width, self.height))
+        rows = [np.c_[across, np.full(9, v)] for v in down[[0, -1]]]
+        columns = [np.c_[np.full(9, u), down] for u in across[[0, -1]]]
+        border = np.concatenate([*rows, *columns])
+        with np.errstate(all="ignore"):
+            rays = self.rays(border)
+            slopes = self._slope(rays)
+            led_back = np.isfinite(slopes) & (slopes < 1e6)
+            led_back[led_back] = (
+                np.linalg.norm(self._projected(rays[led_back]) - border[led_back], axis=1) < _SAME_PIXEL
+            )
+        largest = float(slopes[led_back].max(initial=0.1))
+        return largest * 1.05 if led_back.all() else largest

@@ -16,7 +16,7 @@ Fits differentiate with steps of this size (``fit.py``): they cannot tell nearer
 """
 
 
-def complaint(estimate: EffectEstimate, nominal: Mapping[str, float] | None = None) -> str:
+def complaint(estimate: EffectEstimate) -> str:
     """Why an estimate is no finding, in one sentence; empty where it may be one.
 
     Two kinds are refused. A value at a bound of its parameter says where the search stopped, not what the robot does,
@@ -26,9 +26,8 @@ def complaint(estimate: EffectEstimate, nominal: Mapping[str, float] | None = No
     others of its unit, and the effect's products.
 
     Args:
-        estimate: values and intervals.
-        nominal: values of the same effect in the robot's file, which take the place of the neutral ones; by default
-            those that the estimate knows of.
+        estimate: values and intervals, and the values of the same effect in the robot's file, which take the place of
+            the neutral ones.
 
     Raises:
         ValueError: the effect or a parameter is not in the catalogue.
@@ -37,9 +36,7 @@ def complaint(estimate: EffectEstimate, nominal: Mapping[str, float] | None = No
     if effect is None:
         raise ValueError(f"got the effect {estimate.name!r}, expected one of the catalogue: {', '.join(CATALOGUE)}")
     known = {parameter.name: parameter for parameter in effect.parameters}
-    nominal = estimate.in_file if nominal is None else nominal
-    if nominal:
-        known |= {key: replace(known[key], neutral=float(value)) for key, value in nominal.items() if key in known}
+    known |= {key: replace(known[key], neutral=value) for key, value in estimate.in_file.items() if key in known}
     unknown = sorted(set(estimate.parameters) - set(known))
     if unknown or not estimate.parameters:
         raise ValueError(f"{estimate.name}: got the parameters {sorted(estimate.parameters)}, expected {sorted(known)}")

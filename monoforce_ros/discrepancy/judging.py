@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -171,7 +172,9 @@ class Judging:
     def _credible(self, trial: Trial, added: int = 1) -> bool:
         """Whether the effects that were added last are measurements."""
         estimates = self.estimates(self.refit(trial.effects))[-added:]
-        return not any(complaint(estimate, own_values(self.robot, estimate.name)) for estimate in estimates)
+        return not any(
+            complaint(replace(estimate, in_file=own_values(self.robot, estimate.name))) for estimate in estimates
+        )
 
     def ranked(self, fit: Fit) -> list[int]:
         """Indices of a fit's effects, ranked by leave-one-out loss: the loss of the others, fitted again without it."""

@@ -267,13 +267,12 @@ class PathSelectorNode(Node):
         except Stop as stop:
             self.health.report(PART, WARN, f"stopped: {stop}", reason=stop.reason)
             return None
-        except Unfollowed as refusal:
-            self._given_up = self._received
-            again = "; the same plan is ignored until the planner pauses or plans to another end"
-            self._drop(f"{refusal}{again if self._course is not None and self._course.kind == 'plan' else ''}")
-            return None
         except Refusal as refusal:
-            self._drop(str(refusal))
+            message = str(refusal)
+            if isinstance(refusal, Unfollowed) and self._course.kind == "plan":
+                self._given_up = self._received
+                message += "; the same plan is ignored until the planner pauses or plans to another end"
+            self._drop(message)
             return None
 
     def _drive(self, course: Course) -> tuple[float, ...] | None:

@@ -19,7 +19,7 @@ _AROUND = (0.8, 2.5)
 """Distances of the ground around the robot that is compared with the ground under its wheels [m]: beyond what is
 corrected, and within twice the length of most robots."""
 _APART = 0.6
-"""Height difference on three of four sides beyond which the ground around a robot is none that it stands on [m]: on a
+"""Height difference on three of four sides beyond which the ground around a robot is none that carries it [m]: on a
 mound with sides of 23° it is as much, in a ditch only on two sides."""
 _FEWEST_RETURNS = 20
 """Returns that say something of one side: their fifth is four."""
@@ -43,8 +43,8 @@ def support_points(robot: RobotModel, motion: MotionState, stiffness: float) -> 
 def ground_around(cloud: np.ndarray, robot: RobotModel, motion: MotionState, stiffness: float) -> float:
     """How far the ground around a robot lies above (positive) or below its wheels on three or four sides [m].
 
-    0.0 where it is about as high, or where the lidar sees fewer sides. What stands on the ground, such as grass, has
-    gaps: the lower fifth of the returns counts where they are above the wheels, the upper fifth where they are below.
+    0.0 where it is about as high, or where the lidar sees fewer sides. Grass and other things above it have gaps:
+    the lower fifth of the returns counts where they are above the wheels, the upper fifth where they are below.
 
     Args:
         cloud: returns in the base frame ``[n, 3]`` [m].
