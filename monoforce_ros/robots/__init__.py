@@ -8,6 +8,7 @@ from monoforce_ros.robots.loader import load_robot, robot_file, shipped_robots
 from monoforce_ros.robots.mass import add_point_mass
 from monoforce_ros.robots.robot_copy import fingerprint, read_commissioning, read_nominal_residual, write_robot
 from monoforce_ros.robots.robot_model import Flipper, RobotModel
+from monoforce_ros.robots.sensor_names import is_lidar
 from monoforce_ros.robots.servo import servo_response
 from monoforce_ros.robots.urdf import (
     Conversion,
@@ -33,6 +34,7 @@ __all__ = [
     "add_point_mass",
     "convert_description",
     "fingerprint",
+    "is_lidar",
     "load_robot",
     "read_commissioning",
     "read_description",

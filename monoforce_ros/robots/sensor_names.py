@@ -11,3 +11,8 @@ IMU = re.compile(r"(^|_)imu", re.IGNORECASE)
 OPTICAL = re.compile(r"optical", re.IGNORECASE)
 """Frames of images: z forward, y down."""
 CAMERA = re.compile(r"camera|(^|_)cam(_|$)|realsense|zed", re.IGNORECASE)
+
+
+def is_lidar(frame: str) -> bool:
+    """Whether a frame is called as lidars are."""
+    return LIDAR.search(frame) is not None

@@ -11,8 +11,7 @@ import torch
 import yaml
 from scipy.spatial.transform import Rotation
 
-from monoforce_ros.robots import RobotFileError, RobotModel, load_robot, robot_file
-from monoforce_ros.robots.sensor_names import LIDAR
+from monoforce_ros.robots import RobotFileError, RobotModel, is_lidar, load_robot, robot_file
 from monoforce_ros.synthetic.graphics import mujoco
 from monoforce_ros.synthetic.vehicle_file import read_arms, read_wheels
 from monoforce_ros.synthetic.vehicle_parts import (
@@ -137,7 +136,7 @@ class Vehicle:
     @property
     def lidar_frame(self) -> str:
         """Frame of the lidar: the one of that name, or else the first that has the name of one."""
-        named = [frame for frame in self.sensors if LIDAR.search(frame)]
+        named = [frame for frame in self.sensors if is_lidar(frame)]
         return named[0] if named and LIDAR_FRAME not in self.sensors else LIDAR_FRAME
 
     def sensor(self, frame: str, option: str) -> np.ndarray:
