@@ -5,8 +5,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import SmoothedMotion
-from monoforce_ros.core import CommandTrack, MotionTrack
+from monoforce_ros.core import AngularVelocityTrack, CommandTrack, MotionTrack, WheelTrack
 from monoforce_ros.discrepancy import Evidence
+from monoforce_ros.discrepancy.dead_reckoning import MeasuredDrive, dead_reckoning_errors
 from monoforce_ros.discrepancy.kinematic_baseline import (
     KinematicModel,
     compare_on_steps,
@@ -104,3 +105,63 @@ def test_effects_and_kinematic_fit_are_compared_on_the_same_windows():
     assert compare_after_steps(evidence, robot, ()).after is None
     still = CommandTrack(commands.stamps, np.tile([0.5, 0.1], (len(commands), 1)))
     assert compare_after_steps(Evidence(evidence.smoothed, still), robot, ()) is None
+
+
+def measured_drive(motion, *, late, gyro):
+    """Wheels that turn 1.2 times as fast against each other as the robot does, in poses that are late."""
+    robot = load_robot("husky")
+    half = 0.5 * float(robot.drive_offsets.max() - robot.drive_offsets.min())
+    speed, turning = motion.linear_velocities[:, 0], motion.angular_velocities[:, 2]
+    stamps = motion.stamps - round(late * 1e9)
+    wheels = np.stack([speed - 1.2 * half * turning, speed + 1.2 * half * turning], axis=1) / robot.wheel_radius
+    rates = AngularVelocityTrack(stamps, np.c_[turning, 0 * turning, -turning]) if gyro else None
+    return robot, WheelTrack(stamps, wheels), rates
+
+
+@pytest.mark.parametrize("gyro", [True, False])
+def test_dead_reckoning_fits_gains_and_the_delay_of_the_poses(gyro):
+    motion, commands = recording()
+    robot, wheels, rates = measured_drive(motion, late=0.35, gyro=gyro)
+    smoothed = SmoothedMotion(motion, 0.001, 0.001, (slice(0, len(motion)),))
+    evidence = Evidence(smoothed, commands, gyro=rates, wheels=wheels)
+    starts = step_starts(commands, possible(motion))
+    folds = ((starts - starts[0]) // (8 * 10**9)) % 2
+    errors = dead_reckoning_errors(evidence, robot, starts, np.array([0.5, 1.0, 1.5, 2.0]), folds)
+    assert np.median(errors) < 0.02
+    # Without the delay they would be decimetres.
+    drive = MeasuredDrive.of(evidence, robot)
+    punctual = drive.reckoned(starts, np.array([2.0]), np.array([1.0, 1.0 if gyro else 1 / 1.2, 0.0]))
+    late = drive.reckoned(starts, np.array([2.0]), np.array([1.0, 1.0 if gyro else 1 / 1.2, 0.35]))
+    assert np.median(np.hypot(*(punctual - late)[:, 0, :2].T)) > 0.1
+
+
+def test_dead_reckoning_needs_wheel_speeds_without_gaps():
+    motion, commands = recording()
+    robot, wheels, _ = measured_drive(motion, late=0.0, gyro=False)
+    smoothed = SmoothedMotion(motion, 0.001, 0.001, (slice(0, len(motion)),))
+    starts = step_starts(commands, possible(motion))
+    folds = ((starts - starts[0]) // (8 * 10**9)) % 2
+    samples = np.array([1.0, 2.0])
+    assert dead_reckoning_errors(Evidence(smoothed, commands), robot, starts, samples, folds) is None
+    kept = np.abs(wheels.stamps - starts[len(starts) // 2] - 10**9) > 10**9
+    broken = WheelTrack(wheels.stamps[kept], wheels.speeds[kept])
+    assert dead_reckoning_errors(Evidence(smoothed, commands, wheels=broken), robot, starts, samples, folds) is None
+
+
+def test_how_far_the_effects_are_ahead_has_an_interval():
+    motion, commands = recording()
+    starts = step_starts(commands, possible(motion))
+    folds = ((starts - starts[0]) // (8 * 10**9)) % 2
+    random = np.random.default_rng(3)
+
+    def compared(size):
+        def errors(at, _):
+            return np.full(len(at), 1.0), size * random.uniform(0.5, 1.5, len(at))
+
+        return compare_on_steps(motion, commands, starts, folds, errors)
+
+    # A kinematic robot: no effects of a rollout are ahead of the kinematic fit.
+    behind = compared(0.5)
+    assert behind.ahead[0] < behind.ahead[1] < 0.0
+    same = compared(behind.kinematic)
+    assert same.ahead[0] < 0.0 < same.ahead[1]

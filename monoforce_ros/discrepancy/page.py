@@ -219,6 +219,7 @@ def _steps_card(steps: StepComparison) -> str:
         ("with the added effects", steps.after),
     ]
     best = min(error for _, error in methods if error is not None)
+    methods.append(("measured wheel speeds and yaw rates, no prediction", steps.reckoned))
     rows = [
         f"<tr><td>{name}</td><td{' class=best' if error == best else ''}>{error:.3g} m</td></tr>"
         for name, error in methods
@@ -229,7 +230,29 @@ def _steps_card(steps: StepComparison) -> str:
         heading="Two seconds after a step of the command",
         caption=f"The measure of the literature, on {steps.windows} windows that begin with a step; all methods know "
         "the measured speed at the start. Kinematic fit and effects are fitted to every other block of 8 s, and tested "
-        "on the others.",
+        f"on the others.{_beside_kinematic(steps)}{_limit_of_the_poses(steps)}",
+    )
+
+
+def _beside_kinematic(steps: StepComparison) -> str:
+    """How sure the difference to the kinematic fit is."""
+    if steps.ahead is None:
+        return ""
+    low, high = steps.ahead
+    if low <= 0.0 <= high:
+        return f" Effects and kinematic fit differ by no more than chance ({low:+.2f} to {high:+.2f} m)."
+    ahead = "smaller" if low > 0.0 else "larger"
+    near, far = sorted((abs(low), abs(high)))
+    return f" The errors with effects are {ahead} than those of the kinematic fit, by {near:.2f} to {far:.2f} m (95 %)."
+
+
+def _limit_of_the_poses(steps: StepComparison) -> str:
+    """What measured wheel speeds and yaw rates leave, which is the poses' own error or slip."""
+    if steps.reckoned is None:
+        return ""
+    return (
+        " What measured wheel speeds and yaw rates leave is slip and errors of the poses: hardly a prediction from "
+        "commands can be expected to leave less."
     )
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from monoforce_ros.discrepancy.dead_reckoning import dead_reckoning_errors
 from monoforce_ros.discrepancy.evidence import MOTION, Evidence, window_starts
 from monoforce_ros.discrepancy.fit import fit_effects
 from monoforce_ros.discrepancy.gap import residual_scale
@@ -55,7 +56,9 @@ def compare_after_steps(evidence: Evidence, robot: RobotModel, effects: Effects)
             after[folds == fold] = _distance(predictions(at[folds == fold]), fit.effects)
         return before, after
 
-    return compare_on_steps(motion, evidence.commands, starts, folds_of(starts, 2), errors)
+    folds = folds_of(starts, 2)
+    reckoned = dead_reckoning_errors(evidence, robot, starts, samples, folds)
+    return compare_on_steps(motion, evidence.commands, starts, folds, errors, reckoned)
 
 
 def _distance(predictions: Predictions, effects: Effects) -> np.ndarray:
