@@ -149,3 +149,22 @@ def test_nothing_is_compared_before_the_horizon_has_passed_or_after_a_time_jump(
     gap.clear()
     later = replace(motion, stamps=motion.stamps + 10**10)
     assert gap.compare(later, commands) is None
+
+
+def test_a_prediction_from_before_a_jump_of_the_odometry_is_not_compared(husky):
+    motion, commands = drive(husky, np.tile([0.5, 0.0], (900, 1)))
+    later = motion.stamps > START + 3 * 10**9
+    moved = replace(motion, positions=motion.positions + np.where(later, 100.0, 0.0)[:, None])
+    # Another estimator: only its own poses are kept.
+    switched = replace(moved, **{name: getattr(moved, name)[later] for name in (
+        "stamps", "positions", "quaternions", "linear_velocities", "angular_velocities")})  # fmt: skip
+    for track in (moved, switched):
+        gap = LiveGap(predictor_of(husky))
+        start = motion.at(START + 10**9)
+        gap.remember(gap.predictor.predict(Observation(start.stamp), start, np.tile([0.5, 0.0], (900, 1))[: len(
+            gap.predictor.command_stamps(start.stamp))]))  # fmt: skip
+        assert gap.compare(track, commands) is None and not gap.summary().count
+    whole = LiveGap(predictor_of(husky))
+    whole.remember(whole.predictor.predict(Observation(start.stamp), start, np.tile([0.5, 0.0], (900, 1))[: len(
+        whole.predictor.command_stamps(start.stamp))]))  # fmt: skip
+    assert whole.compare(motion, commands) is not None

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from monoforce_ros.planning import (
     over_horizon,
     select_candidate,
 )
+from monoforce_ros.planning.costs import _unobserved
 from monoforce_ros.planning.selection import FIELDS
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainMap
@@ -247,7 +249,9 @@ def test_unobserved_ground_has_a_cost(husky):
 
 def test_ground_of_uncertain_height_is_unknown_by_degrees(husky):
     def term(spread):
-        terrain = terrain_of(np.zeros_like(X), observed=torch.zeros(X.shape, dtype=torch.bool))
+        # Rows of returns, between which an encoder predicts.
+        rows = torch.from_numpy(np.round(np.hypot(X, Y), 1) % 1.5 == 0.0)
+        terrain = terrain_of(np.zeros_like(X), observed=rows)
         spreads = {name: torch.full_like(terrain.height, spread) for name in ("geometric_spread", "decrease_spread")}
         found, _ = assessed(husky, replace(terrain, **spreads), [[0.9, 0.0]])
         return float(found.terms["unobserved"][0])
@@ -255,6 +259,43 @@ def test_ground_of_uncertain_height_is_unknown_by_degrees(husky):
     terms = [term(spread) for spread in (0.005, 0.05, 0.1, 1.0)]
     assert terms[0] < 1e-3 and terms[-1] > 0.8
     assert all(first < second for first, second in pairwise(terms))
+
+
+def test_ground_behind_which_nothing_was_measured_may_be_a_drop_however_sure_an_encoder_is(husky):
+    def term(observed):
+        terrain = terrain_of(np.zeros_like(X), observed=torch.from_numpy(observed))
+        spreads = {name: torch.full_like(terrain.height, 0.005) for name in ("geometric_spread", "decrease_spread")}
+        found, _ = assessed(husky, replace(terrain, **spreads), [[0.9, 0.0]])
+        return float(found.terms["unobserved"][0])
+
+    # An edge 1.2 m ahead, beyond which no pulse returns; and a gap, behind which there is ground again.
+    assert term(X < 1.2) > 0.5
+    assert term((X < 1.2) | (X > 4.5)) < 0.01
+
+
+def test_what_counts_as_unobserved_depends_on_the_way_driven_and_on_the_robot_s_length(husky):
+    unknown = terrain_of(np.zeros_like(X), observed=torch.zeros(X.shape, dtype=torch.bool))
+    small = replace(husky, points=0.2 * husky.points, wheel_radius=0.2 * husky.wheel_radius)
+    length = float((small.bounds[1] - small.bounds[0])[0])
+    assert 0.1 < length < 0.3
+
+    def term(robot, moved):
+        count = 1 + len(moved)
+        still = torch.zeros(1, count, 3)
+        place = still.clone()
+        place[0, 1:, 0] = torch.tensor(moved)
+        rollout = SimpleNamespace(position=place, inside=torch.ones(1, count, dtype=torch.bool))
+        return float(_unobserved(rollout, unknown, robot)[0])
+
+    assert term(small, [0.1, 0.3, 0.5]) == 1.0
+    assert term(husky, [0.1, 0.3, 0.5]) == 0.0
+    # A third of the way over unknown ground, though it takes only two of fifty steps.
+    half = replace(unknown, observed=torch.from_numpy(X < 2.0))
+    slow = [1.0 + 0.02 * i for i in range(1, 50)] + [2.5, 3.0]
+    still = torch.zeros(1, len(slow) + 1, 3)
+    still[0, 1:, 0] = torch.tensor(slow)
+    rollout = SimpleNamespace(position=still, inside=torch.ones(1, len(slow) + 1, dtype=torch.bool))
+    assert float(_unobserved(rollout, half, husky)[0]) == pytest.approx(0.35, abs=0.03)
 
 
 def test_weights_and_limits_scale_the_terms(husky):

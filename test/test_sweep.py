@@ -11,8 +11,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from monoforce_ros.encoder import EncoderConfig, extended, load_encoder, new_encoder, save_encoder
+from monoforce_ros.encoder import EncoderConfig, encoder_input, extended, load_encoder, new_encoder, save_encoder
 from monoforce_ros.encoder.config import SWEEP_CHANNELS
+from monoforce_ros.encoder.heads import terrain_maps
 from monoforce_ros.encoder.sweep import cell_extremes, sweep_features
 from monoforce_ros.terrain import LidarSettings, cell_heights, terrain_from_cloud
 
@@ -157,7 +158,9 @@ def test_encoders_without_the_interpolation_can_be_trained_further_with_it():
     points = ground_and(np.zeros((0, 3)), np.random.default_rng(7))
     with torch.no_grad():
         wider.heads.bias[9] = -20.0
-    before, after = (e.eval().terrain([], sweep=points) for e in (old, wider))
+    before, after = (
+        terrain_maps(e.eval()(encoder_input([], None, e.config, sweep=points)), e.config)[0] for e in (old, wider)
+    )
     unseen = ~before.observed
     assert before.height[unseen].std() > 0.0
     torch.testing.assert_close(before.height[unseen], after.height[unseen], rtol=0.0, atol=1e-5)
@@ -165,6 +168,26 @@ def test_encoders_without_the_interpolation_can_be_trained_further_with_it():
     assert float(after.geometric_height[before.observed].abs().mean()) < 0.7 * float(
         before.geometric_height[before.observed].abs().mean()
     )
+
+
+def test_a_measured_hillside_stays_where_it_is_whatever_the_network_says_and_grass_does_not():
+    torch.manual_seed(2)
+    encoder = new_encoder(EncoderConfig(sensor="lidar", map_features=8)).eval()
+    with torch.no_grad():
+        encoder.heads.bias[0] = -0.6
+        # Neither measured heights nor those between them are believed.
+        encoder.heads.bias[7] = encoder.heads.bias[9] = -20.0
+    random = np.random.default_rng(3)
+    xy = random.uniform(-6.4, 6.4, (60_000, 2))
+    support = np.array([[0.3, 0.3, 0.0], [0.3, -0.3, 0.0], [-0.3, 0.3, 0.0], [-0.3, -0.3, 0.0]])
+
+    def error(slope, roughness):
+        height = slope * xy[:, 0] + roughness * random.standard_normal(len(xy))
+        terrain = encoder.terrain([], support, sweep=np.column_stack([xy, height]))
+        return float((terrain.geometric_height.numpy() - slope * encoder.config.grid.x).mean())
+
+    assert abs(error(0.4, 0.01)) < 0.1
+    assert error(0.0, 0.2) < -0.3
 
 
 @settings(max_examples=30, deadline=None)

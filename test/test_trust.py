@@ -57,6 +57,21 @@ def test_a_true_map_is_trusted_and_its_error_is_small():
     assert "level ground by" in report.explanation
 
 
+def test_a_slow_robot_compares_as_much_as_a_fast_one():
+    # 8 mm between two maps: 0.08 m/s at ten maps a second.
+    report = drive(TerrainTrust(GRID), lambda ahead, x: hill(ahead + x) - hill(x), step=0.008)[-1]
+    assert report.travelled > 5.0 and report.share > 0.85
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_ground_without_friction_or_damping_is_blended(share):
+    height = torch.zeros(GRID.rows, GRID.columns)
+    slippery = TerrainMap.from_height(height, GRID, material=TerrainDefaults(damping=0.0, friction=0.0))
+    found = blended(slippery, TerrainMap.from_height(height, GRID), share)
+    assert bool(torch.isfinite(found.friction).all()) and bool(torch.isfinite(found.damping).all())
+    assert float(found.friction[0, 0]) == pytest.approx({0.0: 0.0, 0.5: 9e-4, 1.0: 0.8}[share], abs=1e-4)
+
+
 def test_holes_that_are_not_there_are_noticed_within_metres_and_named():
     reports = drive(TerrainTrust(GRID), lambda ahead, x: np.where(np.abs(ahead) > 0.7, -0.7, 0.0))
     first = next(i for i, report in enumerate(reports) if not report.trusted)

@@ -5,15 +5,16 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from monoforce_ros.encoder.config import EncoderConfig
 from monoforce_ros.encoder.edges import restore_edges
-from monoforce_ros.encoder.sweep import BETWEEN, STANDING, TOP
+from monoforce_ros.encoder.sweep import BETWEEN, LOWEST, STANDING, TOP
 from monoforce_ros.encoder.view import EncoderInput
-from monoforce_ros.terrain import TerrainMap
+from monoforce_ros.terrain import TerrainMap, fill_holes
 
 SMALLEST_DECREASE = 0.05
 """Smallest H_d that is used [m], and where the training's loss of heights turns from squared to linear: below, an
@@ -35,6 +36,12 @@ _SMALLEST_SPREAD, _LARGEST_SPREAD = 0.01, 3.0
 """Scales of the Laplace distribution of a height [m]: untrained, and limits."""
 _BELIEVED = 3.0
 """Initial output of the heads for measured heights, before the logistic function: 95 %."""
+_CELL_TOLERANCE = 0.05
+"""How far a surface may lie beyond the returns of its cell [m]: noise, and half of what a slope of 45° rises in it."""
+_PLANE, _PLANE_REACH, _FEWEST_CELLS, _LEAST_SPREAD = 0.04, 3, 8, 0.5
+"""Scatter of returns about a plane that is a surface [m], twice a lidar's noise; half-width of the squares in which it
+is sought [cells]; fewest of their cells with returns; and least determinant of their places [cells⁴]: returns on one
+line have no plane. Tops of grass scatter by a decimetre."""
 _OBSERVED = 0.05
 """Least summed depth probability of an observed cell."""
 
@@ -129,6 +136,58 @@ def maps_from_heads(
 def _spread(output: Tensor) -> Tensor:
     limits = math.log(_SMALLEST_SPREAD), math.log(_LARGEST_SPREAD)
     return (output + math.log(_INITIAL_SPREAD)).clamp(*limits).exp()
+
+
+def within_returns(maps: EncodedMaps, batch: EncoderInput) -> EncodedMaps:
+    """Maps whose surface is, where returns lie in a plane, between the lowest and the highest of each cell.
+
+    A network that has never seen a hillside of 20° puts it a metre too low, and is sure of it. What it is corrected by
+    is interpolated between these cells. Returns of vegetation lie in no plane: what its surface is, the network knows
+    better.
+    """
+    sweep = batch.sweep
+    solid = (sweep[:, STANDING] > 0) & (_roughness(sweep) < _PLANE)
+    low = sweep[:, LOWEST] - _CELL_TOLERANCE
+    high = torch.maximum(sweep[:, TOP], sweep[:, LOWEST]) + _CELL_TOLERANCE
+    relative = maps.geometric_height - batch.ground[:, None, None]
+    change = torch.where(solid, torch.minimum(torch.maximum(relative, low), high) - relative, 0.0)
+    if not bool((change.abs() > 1e-3).any()):
+        return maps
+    filled = [
+        fill_holes(values.cpu().numpy(), known.cpu().numpy()) if bool(known.any()) else values.cpu().numpy()
+        for values, known in zip(change, solid, strict=True)
+    ]
+    added = torch.as_tensor(np.stack(filled), dtype=change.dtype, device=change.device)
+    return replace(maps, geometric_height=maps.geometric_height + added)
+
+
+def _roughness(sweep: Tensor) -> Tensor:
+    """Standard deviation of the highest and lowest returns of cells about their plane in squares around each cell.
+
+    ``[B, rows, columns]`` [m]; infinite where fewer than :data:`_FEWEST_CELLS` cells have returns.
+    """
+    hit = sweep[:, STANDING].double()
+    rows, columns = hit.shape[-2:]
+    y, x = torch.meshgrid(
+        torch.arange(rows, dtype=hit.dtype, device=hit.device),
+        torch.arange(columns, dtype=hit.dtype, device=hit.device),
+        indexing="ij",
+    )
+    low, high = sweep[:, LOWEST].double(), sweep[:, TOP].double()
+    z = 0.5 * (low + high)
+    terms = [hit, hit * x, hit * y, hit * z, hit * x * x, hit * y * y, hit * x * y, hit * x * z, hit * y * z,
+             hit * z * z, hit * (0.5 * (high - low)) ** 2]  # fmt: skip
+    size = 2 * _PLANE_REACH + 1
+    means = functional.avg_pool2d(torch.stack(terms, dim=1), size, 1, _PLANE_REACH)
+    count = means[:, 0]
+    mx, my, mz, xx, yy, xy, xz, yz, zz, within = (means[:, i] / count.clamp_min(1e-9) for i in range(1, len(terms)))
+    xx, yy, zz = xx - mx**2, yy - my**2, zz - mz**2
+    xy, xz, yz = xy - mx * my, xz - mx * mz, yz - my * mz
+    determinant = xx * yy - xy**2
+    explained = (xz**2 * yy - 2 * xz * yz * xy + yz**2 * xx) / determinant.clamp_min(1e-9)
+    rough = ((zz - explained).clamp_min(0.0) + within).sqrt()
+    enough = (count * size**2 > _FEWEST_CELLS - 0.5) & (determinant > _LEAST_SPREAD)
+    return torch.where(enough, rough, torch.inf)
 
 
 def with_edges(maps: EncodedMaps, config: EncoderConfig) -> EncodedMaps:

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 
 from monoforce_ros.encoder.config import HEIGHT_CHANNELS, EncoderConfig
-from monoforce_ros.terrain import Grid, LidarSettings, cell_quantiles, interpolated_ground
+from monoforce_ros.terrain import Grid, LidarSettings, cell_quantiles, horizontal_scatter, interpolated_ground
 
-HIT, TOP, STANDING, BETWEEN = 2, 5, 6, 7
-"""Channels: the mask of cells with points; the height of the ground and of objects on it, and its mask; this height
-interpolated over the whole map."""
+LOWEST, HIT, TOP, STANDING, BETWEEN = 0, 2, 5, 6, 7
+"""Channels: the lowest point; the mask of cells with points; the height of the ground and of objects on it, and its
+mask; this height interpolated over the whole map."""
 _REACH = 0.25
 """Half-width of the square around a cell whose points tell a surface from leaves [m]: as deep as a lidar sees into a
 hedge."""
@@ -53,14 +53,8 @@ def sweep_features(
     window = (2 * reach + 1, 2 * reach + 1)
     floor = cv2.erode(lowest, np.ones(window, np.uint8), borderValue=np.inf).ravel()
     upper = placed[:, 2] > floor[flat] + _UPPER
-    # Relative to the map's centre, so that sums of squares keep their digits.
-    x, y, _ = placed[upper].T
-    sums = [_summed(flat[upper], values, window, grid) for values in (np.ones_like(x), x, y, x * x, y * y, x * y)]
-    count = sums[0]
-    mean_x, mean_y, xx, yy, xy = (values / np.maximum(count, 1.0) for values in sums[1:])
-    xx, yy, xy = xx - mean_x**2, yy - mean_y**2, xy - mean_x * mean_y
-    least = 0.5 * (xx + yy) - np.hypot(0.5 * (xx - yy), xy)
-    scatter = np.where(count >= _FEWEST, np.sqrt(np.maximum(least, 0.0)), 0.0) / _SCATTER_UNIT
+    thinnest, count = horizontal_scatter(placed[upper], flat[upper], reach, grid)
+    scatter = np.where(count >= _FEWEST, thinnest, 0.0) / _SCATTER_UNIT
     top, standing = _standing(placed, extremes, config)
     between = np.zeros_like(top)
     if standing.any():
@@ -97,9 +91,3 @@ def _extremes(placed: np.ndarray, flat: np.ndarray, grid: Grid) -> np.ndarray:
     hit = np.isfinite(low)
     stacked = np.stack([np.where(hit, low, 0.0), np.where(hit, high, 0.0), hit])
     return stacked.reshape(HEIGHT_CHANNELS, grid.rows, grid.columns)
-
-
-def _summed(flat: np.ndarray, values: np.ndarray, window: tuple[int, int], grid: Grid) -> np.ndarray:
-    """Sums over squares of cells, ``[rows, columns]``."""
-    cells = np.bincount(flat, values, grid.rows * grid.columns).reshape(grid.rows, grid.columns)
-    return cv2.boxFilter(cells, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)

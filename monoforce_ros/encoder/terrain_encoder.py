@@ -13,7 +13,14 @@ from torch.nn import functional
 from monoforce_ros.encoder.backbone import COARSE_CHANNELS, FINE_CHANNELS, Backbone
 from monoforce_ros.encoder.birds_eye import BirdsEyeNetwork
 from monoforce_ros.encoder.config import EncoderConfig
-from monoforce_ros.encoder.heads import EncodedMaps, map_heads, maps_from_heads, terrain_maps, with_edges
+from monoforce_ros.encoder.heads import (
+    EncodedMaps,
+    map_heads,
+    maps_from_heads,
+    terrain_maps,
+    with_edges,
+    within_returns,
+)
 from monoforce_ros.encoder.image_context import ImageContext, resized
 from monoforce_ros.encoder.lift import depth_values, lifted_points, map_cells, splat
 from monoforce_ros.encoder.sweep import HIT
@@ -226,4 +233,5 @@ class TerrainEncoder(nn.Module):
         if self.training:
             self.eval()
         batch = encoder_input(views, support, self.config, sweep=sweep, trace=trace).to(self.depths.device)
-        return terrain_maps(self(batch), self.config)[0]
+        maps = self(batch)
+        return terrain_maps(within_returns(maps, batch) if self.config.believes else maps, self.config)[0]

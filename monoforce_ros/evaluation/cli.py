@@ -30,7 +30,13 @@ from monoforce_ros.evaluation.recording_evaluation import (
 from monoforce_ros.evaluation.report import Picture, terminal_table, write_reports
 from monoforce_ros.evaluation.view import PredictionView
 from monoforce_ros.messages import MessageError
-from monoforce_ros.perception import CAMERA_SOURCES, SOURCES, TrustedTerrain, choose_terrain_source
+from monoforce_ros.perception import (
+    CAMERA_SOURCES,
+    LIDAR_RETENTION_TIME,
+    SOURCES,
+    TrustedTerrain,
+    choose_terrain_source,
+)
 from monoforce_ros.physics import SOILS, PhysicsOptions, SoilError, read_soil
 from monoforce_ros.prediction import Predictor
 from monoforce_ros.reporting import figure_png
@@ -179,6 +185,7 @@ def run(options: argparse.Namespace) -> None:
         material=material,
         checkpoint=options.checkpoint,
         retention_time=options.retention_time,
+        lidar_retention_time=LIDAR_RETENTION_TIME,
         fallback=True,
         warn=lambda message: print(f"warning: {message}", file=sys.stderr),
     )

@@ -7,14 +7,23 @@ from matplotlib import colormaps
 
 from monoforce_ros.core import quaternions
 from monoforce_ros.messages import encoding
+from monoforce_ros.planning import AlignedGrid
 from monoforce_ros.prediction import FORCE_LENGTH, Prediction, cell_points, contact_points, force_steps, usable_steps
 from monoforce_ros.robots import RobotModel
 
 
 def height_map(prediction: Prediction, frame_id: str) -> bytes:
-    """``nav_msgs/GridCells``: every cell of the predicted map at its height."""
-    points = cell_points(prediction.terrain, prediction.motion.odometry_from_terrain)
-    return encoding.grid_cells(prediction.stamp, frame_id, prediction.terrain.grid.resolution, points)
+    """``nav_msgs/GridCells``: the predicted map at its height, in cells along the axes of the odometry frame.
+
+    GridCells draws squares along these axes, whereas the map lies along the robot's heading.
+    """
+    terrain, pose = prediction.terrain, prediction.motion.odometry_from_terrain
+    aligned = AlignedGrid.around(terrain.grid, pose)
+    heights = aligned.resampled(terrain.height.double().numpy() + pose[2, 3], np.nan)
+    rows, columns = np.nonzero(aligned.inside)
+    places = np.stack([columns, rows], axis=1) + 0.5
+    points = np.column_stack([aligned.origin + places * aligned.resolution, heights[rows, columns]])
+    return encoding.grid_cells(prediction.stamp, frame_id, aligned.resolution, points)
 
 
 def terrain_cloud(prediction: Prediction, frame_id: str) -> bytes:

@@ -215,6 +215,7 @@ class PredictorNode(ManagedNode):
             precision=settings.encoder_precision,
             threads=min(settings.encoder_threads, os.cpu_count() or 1),
             retention_time=settings.camera_retention_time,
+            lidar_retention_time=settings.lidar_retention_time,
             fallback=settings.camera_fallback,
             warn=self.get_logger().warning,
         )

@@ -7,12 +7,18 @@ from monoforce_ros.perception.fusion import LidarCameraTerrain
 from monoforce_ros.perception.ground_alignment import ground_around, support_points
 from monoforce_ros.perception.lidar import LidarTerrain
 from monoforce_ros.perception.observation import Observation, TerrainSource
-from monoforce_ros.perception.sources import CAMERA_SOURCES, SOURCES, choose_terrain_source
-from monoforce_ros.perception.trace import DrivenGround, traced_ground
+from monoforce_ros.perception.sources import (
+    CAMERA_SOURCES,
+    LIDAR_RETENTION_TIME,
+    SOURCES,
+    choose_terrain_source,
+)
+from monoforce_ros.perception.trace import DrivenGround, traced_ground, unbroken
 from monoforce_ros.perception.trust import TerrainTrust, TrustedTerrain, TrustReport
 
 __all__ = [
     "CAMERA_SOURCES",
+    "LIDAR_RETENTION_TIME",
     "SOURCES",
     "DrivenGround",
     "EncoderTerrain",
@@ -28,5 +34,6 @@ __all__ = [
     "ground_around",
     "support_points",
     "traced_ground",
+    "unbroken",
     "with_clear_start",
 ]

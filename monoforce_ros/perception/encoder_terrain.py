@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 import torch
 
-from monoforce_ros.core import MotionState, transform_points
+from monoforce_ros.core import MotionState
 from monoforce_ros.encoder import CameraView, Encoder, EncoderConfig
 from monoforce_ros.perception.fusion import material_by_compliance
-from monoforce_ros.perception.ground_alignment import align_to_ground, support_points
+from monoforce_ros.perception.ground_alignment import align_to_ground, posed_robot, support_under
+from monoforce_ros.perception.lidar import usable_returns
 from monoforce_ros.perception.observation import Observation
 from monoforce_ros.perception.trace import DrivenGround
 from monoforce_ros.robots import RobotModel
-from monoforce_ros.terrain import Grid, LidarSettings, TerrainDefaults, TerrainMap, require_cells
+from monoforce_ros.terrain import Grid, LidarSettings, TerrainDefaults, TerrainMap, cell_heights, require_cells
 
 
 @contextmanager
@@ -87,13 +89,18 @@ class EncoderTerrain:
         them. Beside images such a sweep is left out.
         """
         views = _views(observation, motion) if "camera" in self.sensors else []
-        sweep = _sweep(observation, motion, self.robot) if "lidar" in self.sensors else None
-        if not views and sweep is None:
+        cloud = observation.cloud if "lidar" in self.sensors else None
+        if not views and cloud is None:
             wanted = {"camera": "an image", "lidar": "a point cloud"}
             names = " or ".join(wanted[name] for name in self.sensors)
             raise ValueError(f"the terrain encoder needs {names}, and the observation has none")
-        support = support_points(self.robot, motion, self.stiffness)
-        if sweep is not None:
+        posed = posed_robot(self.robot, observation.flipper_angles)
+        support = support_under(self.robot, posed, motion, self.stiffness)
+        sweep = None
+        if cloud is not None:
+            config = self.encoder.config
+            limits = LidarSettings(lowest=config.lowest, highest=config.highest)
+            sweep = usable_returns(cloud, posed, motion, support, self.grid, limits)
             cells = _measured_cells(sweep, float(support[:, 2].mean()), self.encoder.config)
             if not views:
                 require_cells(cells, len(sweep), self.grid)
@@ -103,11 +110,32 @@ class EncoderTerrain:
         with encoder_threads(self._threads):
             found = self.encoder.terrain(views, support, sweep=sweep, trace=trace)
         self.start_error = _error_under(found, support)
+        if sweep is not None and self.robot.headroom > LidarSettings.headroom:
+            found = _with_low_overhead(found, sweep, self.robot.headroom)
         aligned = align_to_ground(found, support)
         if self._material is None:
             return aligned
         rigid = aligned.with_material(self._material)
         return material_by_compliance(rigid, aligned) if views else rigid
+
+
+def _with_low_overhead(terrain: TerrainMap, sweep: np.ndarray, headroom: float) -> TerrainMap:
+    """The map, with what hangs too low for a robot that is taller than those for which the encoder was trained.
+
+    Args:
+        terrain: predicted map.
+        sweep: returns ``[n, 3]`` in its frame [m].
+        headroom: vertical gap that the robot passes under [m].
+    """
+    limits = LidarSettings(headroom=headroom)
+    heights, observed = cell_heights(sweep, terrain.grid, replace(limits, quantile=1.0))
+    usual, _ = cell_heights(sweep, terrain.grid, replace(limits, quantile=1.0, headroom=LidarSettings.headroom))
+    low = torch.from_numpy(observed & (heights > usual + LidarSettings.headroom))
+    if not bool(low.any()):
+        return terrain
+    raised = torch.from_numpy(heights).to(terrain.height)
+    surfaces = {name: torch.where(low, raised, getattr(terrain, name)) for name in ("height", "geometric_height")}
+    return replace(terrain, **surfaces)
 
 
 def _measured_cells(sweep: np.ndarray, ground: float, config: EncoderConfig) -> int:
@@ -134,11 +162,3 @@ def _views(observation: Observation, motion: MotionState) -> list[CameraView]:
         pose = motion.terrain_from_base @ observation.base_from_cameras[name]
         views.append(CameraView(image, observation.cameras[name], pose))
     return views
-
-
-def _sweep(observation: Observation, motion: MotionState, robot: RobotModel) -> np.ndarray | None:
-    """Points of the ground and of obstacles ``[n, 3]`` in the terrain frame [m]."""
-    if observation.cloud is None:
-        return None
-    cloud = observation.cloud[~robot.covers(observation.cloud)].astype(np.float64)
-    return transform_points(motion.terrain_from_base, cloud[np.isfinite(cloud).all(axis=1)])

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from scipy.spatial import ConvexHull
 
 from monoforce_ros.core import MotionState, transform_points
 from monoforce_ros.physics import rest_depth
@@ -23,6 +24,10 @@ _APART = 0.6
 mound with sides of 23° it is as much, in a ditch only on two sides."""
 _FEWEST_RETURNS = 20
 """Returns that say something of one side: their fifth is four."""
+_ON_THE_GROUND = 0.02
+"""How far above the lowest facet of its tracks a point of a robot on its flippers may be to touch the ground [m]."""
+_LEAST_DOWN = 0.2
+"""Vertical component of the normal of a facet that may carry a robot: steeper ones are its sides."""
 _AT_THE_BOTTOM = -0.97
 """Largest forward component of the surface's direction of motion at the bottom of a wheel, which rolls backwards."""
 
@@ -35,9 +40,43 @@ def support_points(robot: RobotModel, motion: MotionState, stiffness: float) -> 
         motion: the robot's pose.
         stiffness: stiffness of the ground [N/m³]; the wheels sink in by the rest depth.
     """
-    points = transform_points(motion.terrain_from_base, _lowest_points(robot))
+    points = transform_points(motion.terrain_from_base, lowest_points(robot))
     points[:, 2] += rest_depth(robot, stiffness)
     return points
+
+
+def posed_robot(robot: RobotModel, flipper_angles: np.ndarray | None) -> RobotModel:
+    """A robot with its flippers as measured ``[F]`` [rad]; NaN, or None: as in its file."""
+    if flipper_angles is None or not robot.flippers or robot.flipper_angles is None:
+        return robot
+    at_rest = robot.flipper_angles.double().cpu().numpy()
+    return robot.posed(torch.from_numpy(np.where(np.isfinite(flipper_angles), flipper_angles, at_rest)))
+
+
+def support_under(robot: RobotModel, posed: RobotModel, motion: MotionState, stiffness: float) -> np.ndarray:
+    """As :func:`support_points`, of a robot that may stand on its flippers.
+
+    What carries it then is the facet of the convex hull of its tracks that lies below its centre of mass.
+
+    Args:
+        robot: as in its file.
+        posed: the same with its flippers as measured, see :func:`posed_robot`.
+        motion: its pose.
+        stiffness: of the ground [N/m³].
+    """
+    if posed is robot:
+        return support_points(robot, motion, stiffness)
+    tracks = posed.points[posed.point_drives >= 0].double().cpu().numpy()
+    points = transform_points(motion.terrain_from_base, tracks)
+    centre = transform_points(motion.terrain_from_base, posed.centre_of_mass.double().cpu().numpy()[None])[0]
+    planes = ConvexHull(points).equations
+    planes = planes[planes[:, 2] < -_LEAST_DOWN]
+    # The lower hull is the largest of the planes of its facets.
+    heights = -(planes[:, :2] @ centre[:2] + planes[:, 3]) / planes[:, 2]
+    plane = planes[int(np.argmax(heights))]
+    carrying = points[points @ plane[:3] + plane[3] > -_ON_THE_GROUND]
+    carrying[:, 2] += rest_depth(robot, stiffness)
+    return carrying
 
 
 def ground_around(cloud: np.ndarray, robot: RobotModel, motion: MotionState, stiffness: float) -> float:
@@ -67,8 +106,8 @@ def ground_around(cloud: np.ndarray, robot: RobotModel, motion: MotionState, sti
     return 0.0
 
 
-def _lowest_points(robot: RobotModel) -> np.ndarray:
-    """Bottoms of the wheels and tracks in the base frame ``[m, 3]`` [m]."""
+def lowest_points(robot: RobotModel) -> np.ndarray:
+    """Bottoms of the wheels and tracks in the base frame ``[m, 3]`` [m]; of robots in the pose of their file."""
     backwards = robot.point_tangents[:, 0]
     # Small wheels have twelve samples, of which the lowest is up to 15° from the bottom.
     limit = _AT_THE_BOTTOM if bool((backwards < _AT_THE_BOTTOM).any()) else float(np.cos(np.radians(16.0)) * -1.0)
@@ -84,9 +123,7 @@ def lowest_support(robot: RobotModel, motion: MotionState, flipper_angles: np.nd
         flipper_angles: measured ``[F]`` [rad]; NaN: as in the file.
         stiffness: of the ground [N/m³].
     """
-    assert robot.flipper_angles is not None
-    at_rest = robot.flipper_angles.double().cpu().numpy()
-    posed = robot.posed(torch.from_numpy(np.where(np.isfinite(flipper_angles), flipper_angles, at_rest)))
+    posed = posed_robot(robot, flipper_angles)
     points = posed.points[posed.point_drives >= 0].double().cpu().numpy()
     heights = np.sort(transform_points(motion.terrain_from_base, points)[:, 2])
     return float(heights[: max(4, len(heights) // 20)].mean()) + rest_depth(robot, stiffness)

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
 
 from monoforce_ros.core import MotionState, transform_points
-from monoforce_ros.perception.ground_alignment import support_points
+from monoforce_ros.perception.ground_alignment import posed_robot, support_under
 from monoforce_ros.perception.observation import Observation
 from monoforce_ros.robots import RobotModel
-from monoforce_ros.terrain import Grid, LidarSettings, TerrainDefaults, TerrainMap, terrain_from_cloud
+from monoforce_ros.terrain import (
+    Grid,
+    LidarSettings,
+    TerrainDefaults,
+    TerrainMap,
+    terrain_from_cloud,
+    without_overhead,
+)
 
 
 @dataclass(frozen=True)
@@ -28,11 +35,39 @@ class LidarTerrain:
         """Interpolated map; raises ``TerrainError`` if too few returns lie on the grid."""
         if observation.cloud is None:
             raise ValueError("the lidar terrain source needs a point cloud, and the observation has none")
-        cloud = observation.cloud[~self.robot.covers(observation.cloud)].astype(np.float64)
+        posed = posed_robot(self.robot, observation.flipper_angles)
+        support = support_under(self.robot, posed, motion, self.material.stiffness)
+        settings = replace(self.settings, headroom=self.robot.headroom)
         return terrain_from_cloud(
-            transform_points(motion.terrain_from_base, cloud),
+            usable_returns(observation.cloud, posed, motion, support, self.grid, settings),
             self.grid,
-            settings=self.settings,
+            settings=settings,
             material=self.material,
-            support=support_points(self.robot, motion, self.material.stiffness),
+            support=support,
         )
+
+
+def usable_returns(
+    cloud: np.ndarray,
+    robot: RobotModel,
+    motion: MotionState,
+    support: np.ndarray,
+    grid: Grid,
+    settings: LidarSettings = LidarSettings(),  # noqa: B008  (frozen)
+) -> np.ndarray:
+    """Returns of the ground and of what stands on it: neither of the robot nor of what it passes under.
+
+    Args:
+        cloud: returns ``[n, 3]`` in the base frame [m].
+        robot: its body, with its flippers as measured, and headroom.
+        motion: its pose.
+        support: points of the ground under its wheels ``[m, 3]`` in the terrain frame [m].
+        grid: cells of the map.
+        settings: limits of the heights.
+
+    Returns:
+        ``[k, 3]`` float64 in the terrain frame [m].
+    """
+    cloud = cloud[~robot.covers(cloud)].astype(np.float64)
+    points = transform_points(motion.terrain_from_base, cloud[np.isfinite(cloud).all(axis=1)])
+    return without_overhead(points, grid, support, robot.headroom, lowest=settings.lowest, highest=settings.highest)

@@ -18,6 +18,9 @@ from monoforce_ros.terrain import Grid, TerrainDefaults
 
 SOURCES = ("lidar", "lidar_interpolation", "camera", "lidar_camera", "flat")
 """Names of the terrain sources."""
+LIDAR_RETENTION_TIME = 10.0
+"""How long the node keeps what the lidar measured before it came too near, by default [s]: a robot that drives slowly
+crosses the blind zone of its lidar, 1 to 3 m, in that time."""
 CAMERA_SOURCES = ("camera", "lidar_camera")
 """Those that use images."""
 
@@ -33,6 +36,7 @@ def choose_terrain_source(
     precision: str = "float32",
     threads: int | None = None,
     retention_time: float = 0.0,
+    lidar_retention_time: float = 0.0,
     fallback: bool = False,
     warn: Callable[[str], None] = lambda message: None,
 ) -> TerrainSource:
@@ -51,6 +55,8 @@ def choose_terrain_source(
         fallback: whether sources with an encoder fall back (to level ground, or to the lidar alone) while the encoder
             is worse than level ground; see :class:`monoforce_ros.perception.TrustedTerrain`.
         retention_time: how long terrain seen by cameras is kept after it leaves the images [s]; 0 disables it.
+        lidar_retention_time: how long terrain measured by the lidar is kept after it comes so near that the lidar looks
+            over it [s]; 0 disables it.
         warn: called with the reason if the source ``lidar`` only interpolates.
 
     Raises:
@@ -61,8 +67,21 @@ def choose_terrain_source(
         raise ValueError(f"terrain source: got {kind!r}, expected one of {SOURCES}")
     if kind == "flat":
         return FlatTerrain(robot, grid or Grid.square(), material)
+
+    def measured(grid: Grid) -> TerrainSource:
+        """Heights interpolated between returns, and remembered."""
+        return remembered(LidarTerrain(robot, grid, material), material.stiffness)
+
+    def remembered(source: TerrainSource, stiffness: float) -> TerrainSource:
+        """What the lidar looks over once it is near."""
+        if not lidar_retention_time or "lidar" not in source.sensors:
+            return source
+        return TemporalMemory(
+            source, robot, stiffness=stiffness, retention_time=lidar_retention_time, blind_zone_only=True
+        )
+
     if kind == "lidar_interpolation":
-        return LidarTerrain(robot, grid or Grid.square(), material)
+        return measured(grid or Grid.square())
     encoder = load_encoder(checkpoint, None if kind == "lidar" else "camera")
     sensors = tuple(name for name in kind.split("_") if name == "camera" or encoder.config.takes_sweeps)
     own_grid = encoder.config.grid
@@ -70,25 +89,27 @@ def choose_terrain_source(
         wanted = f"a map of {own_grid.columns * own_grid.resolution:g} m with cells of {own_grid.resolution:g} m"
         reason = f"its encoder makes {wanted} only" if sensors else f"the encoder {checkpoint} takes no sweeps"
         warn(f"terrain source lidar interpolates the point cloud like lidar_interpolation: {reason}")
-        return LidarTerrain(robot, grid or own_grid, material)
+        return measured(grid or own_grid)
     # Packed weights and half precision save time on the CPU only.
     encoder = packed(fused(encoder, precision)) if device == "cpu" else fused(encoder).to(device)
     own = EncoderTerrain(encoder, robot, sensors, threads=threads, material=material if "lidar" in sensors else None)
     learned: TerrainSource = own
     if retention_time and "camera" in sensors:
         learned = TemporalMemory(learned, robot, stiffness=encoder.config.stiffness, retention_time=retention_time)
-    level, lidar = FlatTerrain(robot, learned.grid, material), LidarTerrain(robot, learned.grid, material)
+    else:
+        learned = remembered(learned, own.stiffness)
+    level = FlatTerrain(robot, learned.grid, material)
     if kind == "lidar_camera" and "lidar" not in sensors:
-        learned = LidarCameraTerrain(lidar, learned)
+        learned = LidarCameraTerrain(LidarTerrain(robot, learned.grid, material), learned)
     if fallback:
         if kind == "lidar":
-            return TrustedTerrain(learned, own, [lidar], expected=1.0)
+            return TrustedTerrain(learned, own, [measured(own_grid)], expected=1.0)
         if kind == "camera":
             return TrustedTerrain(learned, own, [level])
-        without_images: TerrainSource = lidar
+        without_images = lidar = measured(own_grid)
         if "lidar" in sensors:
             # What images say has to be confirmed; what the encoder makes of the sweep is there from the start.
             sweep = EncoderTerrain(encoder, robot, ("lidar",), threads=threads, material=material)
-            without_images = TrustedTerrain(sweep, sweep, [lidar], expected=1.0)
+            without_images = TrustedTerrain(remembered(sweep, sweep.stiffness), sweep, [lidar], expected=1.0)
         return TrustedTerrain(learned, own, [without_images, level])
     return learned

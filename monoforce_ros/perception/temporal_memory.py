@@ -9,7 +9,7 @@ import torch
 
 from monoforce_ros.core import NANOSECOND, CameraModel, MotionState
 from monoforce_ros.perception.clearance import clear_of_robot
-from monoforce_ros.perception.ground_alignment import align_to_ground, support_points
+from monoforce_ros.perception.ground_alignment import align_to_ground, posed_robot, support_under
 from monoforce_ros.perception.observation import Observation, TerrainSource
 from monoforce_ros.perception.trace import continues
 from monoforce_ros.robots import RobotModel
@@ -33,6 +33,9 @@ class TemporalMemory:
         stiffness: stiffness of the ground under its wheels [N/m³].
         retention_time: how long a cell is kept after it was last observed [s].
         retention_distance: distance travelled after which a cell is forgotten, since odometry drifts [m].
+        blind_zone_only: fill only what lies nearer than all that is observed in its direction. A lidar looks all
+            around, and what it sees behind a place shows that nothing stands there any more; what it cannot see below
+            its lowest row of returns may still be there.
     """
 
     def __init__(
@@ -43,6 +46,7 @@ class TemporalMemory:
         stiffness: float,
         retention_time: float,
         retention_distance: float = 6.0,
+        blind_zone_only: bool = False,
     ):
         if not (retention_time > 0.0 and retention_distance > 0.0):
             raise ValueError(
@@ -51,6 +55,7 @@ class TemporalMemory:
             )
         self._source, self._robot, self._stiffness = source, robot, stiffness
         self._retention_time, self._retention_distance = retention_time, retention_distance
+        self._blind_zone_only = blind_zone_only
         self._near = np.hypot(*np.meshgrid(source.grid.x, source.grid.y)) < _KEPT_WITHIN
         self._memory = _Memory(source.grid)
         self._previous: MotionState | None = None
@@ -84,14 +89,23 @@ class TemporalMemory:
         values, age, distance = memory.read(motion)
         fresh = (age < self._retention_time) & (distance < self._retention_distance)
         disappeared = values[0] - now.height.numpy() > _OBSTACLE_HEIGHT
-        obstacle = fresh & now.observed.numpy() & self._near & disappeared
-        kept = (fresh & ~now.observed.numpy()) | obstacle
-        memory.write(replace(now, observed=now.observed & ~torch.from_numpy(obstacle)), motion)
+        if self._blind_zone_only:
+            obstacle = np.zeros_like(fresh)
+            kept = fresh & now.before_observed()
+        else:
+            obstacle = fresh & now.observed.numpy() & self._near & disappeared
+            kept = (fresh & ~now.observed.numpy()) | obstacle
+        seen = now.observed & ~torch.from_numpy(obstacle)
+        if self._blind_zone_only:
+            # A row of returns hits single cells, which would be lost between those of the memory.
+            seen = torch.from_numpy(now.measured_nearby(1.5 * now.grid.resolution))
+        memory.write(replace(now, observed=seen), motion)
         if not kept.any():
             return now
         joined = now.with_cells(torch.from_numpy(kept), dict(zip(CHANNELS, torch.from_numpy(values), strict=True)))
-        support = support_points(self._robot, motion, self._stiffness)
-        return clear_of_robot(align_to_ground(joined, support), self._robot, motion)
+        posed = posed_robot(self._robot, observation.flipper_angles)
+        support = support_under(self._robot, posed, motion, self._stiffness)
+        return clear_of_robot(align_to_ground(joined, support), posed, motion)
 
 
 def _equal(camera: CameraModel, other: CameraModel) -> bool:

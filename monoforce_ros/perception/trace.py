@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from monoforce_ros.core import NANOSECOND, MotionState, MotionTrack, transform_points
-from monoforce_ros.perception.ground_alignment import support_points
+from monoforce_ros.perception.ground_alignment import lowest_points, support_points
 from monoforce_ros.robots import RobotModel
 
 TRACE_LENGTH = 6.0
@@ -30,7 +30,7 @@ def traced_ground(robot: RobotModel, odometry_from_bases: np.ndarray, step: floa
     back = travelled[-1] - travelled
     wanted = np.arange(step, min(TRACE_LENGTH, back[0]) + 1e-9, step)
     index = np.unique(np.searchsorted(-back, -wanted))
-    lowest = robot.points[robot.point_tangents[:, 0] < -0.97].numpy().astype(np.float64)
+    lowest = lowest_points(robot)
     return np.concatenate([transform_points(odometry_from_bases[i], lowest) for i in index] or [np.zeros((0, 3))])
 
 
@@ -87,6 +87,8 @@ class DrivenGround:
         return transform_points(np.linalg.inv(motion.odometry_from_terrain), points)
 
 
+_LONGEST_BREAK = 1.0
+"""Time after which a track's first state no longer goes on from an earlier one [s]."""
 _JUMP = 1.0
 """Largest distance between the measured position and the one extrapolated from the last velocity [m]; beyond it, the
 robot was moved or its odometry jumped."""
@@ -97,3 +99,16 @@ def continues(motion: MotionState, previous: MotionState) -> bool:
     elapsed = (motion.stamp - previous.stamp) * NANOSECOND
     expected = previous.position + previous.rotation @ previous.linear_velocity * elapsed
     return elapsed >= 0.0 and float(np.linalg.norm(motion.position - expected)) < _JUMP * max(1.0, elapsed)
+
+
+def unbroken(track: MotionTrack, since: MotionState) -> bool:
+    """Whether a track goes on from a state without a jump of its poses.
+
+    Args:
+        track: measured motion that begins at the time of the state, or earlier.
+        since: a state measured earlier by the same odometry.
+    """
+    later = list(track.states(since.stamp - 1, int(track.stamps[-1])))
+    if not later or (later[0].stamp - since.stamp) * NANOSECOND > _LONGEST_BREAK:
+        return False
+    return all(continues(after, before) for before, after in zip([since, *later], later, strict=False))

@@ -15,7 +15,7 @@ from scipy import stats
 
 from monoforce_ros.core import MotionState, transform_points
 from monoforce_ros.perception.encoder_terrain import EncoderTerrain
-from monoforce_ros.perception.ground_alignment import support_points
+from monoforce_ros.perception.ground_alignment import posed_robot, support_under
 from monoforce_ros.perception.observation import Observation, TerrainSource
 from monoforce_ros.perception.trace import continues
 from monoforce_ros.terrain import Grid, TerrainError, TerrainMap
@@ -28,9 +28,13 @@ ERROR_RATE = 0.01
 """Rate at which an encoder as good as level ground is taken for a worse one, for each test; there are two per metre."""
 TOLERANCE = 0.01
 """Difference between two mean errors that does not matter [m]: wheels sink in by as much (8 mm on firm soil)."""
+_STEP = 0.01
+"""Distance between two comparisons [m]: a robot that stands still finds nothing new."""
 _FEWEST_BLOCKS = 3
 _SMALLEST_SQUARE = 1e-9
 """Of differences of heights: where there are none the share is what was expected [m²]."""
+_LEAST_MATERIAL = 1e-6
+"""Stiffness, damping and friction that count as none, in their units."""
 _SMALLEST_SPREAD = 1e-4
 """Below which a spread is none [m]."""
 _NEAREST, _FARTHEST = 0.8, 5.0
@@ -168,7 +172,7 @@ class TerrainTrust:
         self._pending: list[_Comparison] = []
         """Comparisons of the current block."""
         self._compared: deque[_Comparison] = deque(maxlen=2000)
-        self._travelled = 0.0
+        self._travelled = self._uncompared = 0.0
         self._previous: MotionState | None = None
         self._trusted = True
 
@@ -198,7 +202,10 @@ class TerrainTrust:
             moved = float(np.linalg.norm(motion.position[:2] - self._previous.position[:2]))
         self._previous = motion
         self._travelled += moved
-        if moved > 0.01:
+        self._uncompared += moved
+        # A slow robot moves by less between two predictions, and yet arrives.
+        if self._uncompared > _STEP:
+            self._uncompared = 0.0
             self._compare(transform_points(motion.odometry_from_terrain, support))
         if self._travelled >= BLOCK:
             self._travelled = 0.0
@@ -356,7 +363,9 @@ class TrustedTerrain:
         """The encoder's map or the fallback's; raises the source's errors."""
         self.predicted = predicted = self.source.terrain(observation, motion)
         other = self._fallback(observation, motion)
-        support = support_points(self._encoder.robot, motion, self._encoder.stiffness)
+        robot = self._encoder.robot
+        posed = posed_robot(robot, observation.flipper_angles)
+        support = support_under(robot, posed, motion, self._encoder.stiffness)
         cameras = {}
         for name, pose in observation.base_from_cameras.items():
             axis = (motion.terrain_from_base @ pose)[:3, 2]
@@ -401,7 +410,9 @@ def blended(fallback: TerrainMap, predicted: TerrainMap, share: float, spread_fa
         for name in ("height", "geometric_height"):
             changed[name] = torch.lerp(getattr(fallback, name), getattr(predicted, name), share)
         for name in ("stiffness", "damping", "friction"):
-            changed[name] = torch.lerp(getattr(fallback, name).log(), getattr(predicted, name).log(), share).exp()
+            # The defaults of damping and friction may be 0.
+            ends = (getattr(end, name).clamp_min(_LEAST_MATERIAL).log() for end in (fallback, predicted))
+            changed[name] = torch.lerp(*ends, share).exp()
     apart = {
         "geometric_spread": predicted.geometric_height - fallback.geometric_height,
         "decrease_spread": _decrease(predicted) - _decrease(fallback),

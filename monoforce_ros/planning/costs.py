@@ -242,7 +242,8 @@ def _unobserved(rollout: Rollout, terrain: TerrainMap, robot: RobotModel) -> Ten
 
     Off the map ground is unknown. Where the map tells the spread of its heights, a cell is unknown to the degree that
     its height may be off by more than the clearance below the hull: the probability of that for a Laplace distribution.
-    Elsewhere cells without a measurement nearby are.
+    Elsewhere cells without a measurement nearby are. So is ground that nothing was measured behind, whatever an encoder
+    makes of it: it may be a drop.
     """
     grid = terrain.grid
     place = rollout.position.detach()[..., :2]
@@ -252,11 +253,14 @@ def _unobserved(rollout: Rollout, terrain: TerrainMap, robot: RobotModel) -> Ten
         unknown = 1.0 - torch.from_numpy(terrain.measured_nearby()).to(place)
     else:
         unknown = torch.exp(-_hull_clearance(robot) / terrain.height_spread.to(place).clamp_min(1e-4))
+        unknown = torch.maximum(unknown, torch.from_numpy(terrain.extrapolated()).to(place))
     degree = torch.where(rollout.inside, unknown[row.long(), column.long()], 1.0)
     distance = (place - place[:, :1]).norm(dim=-1)
-    # No sensor sees the ground below the robot, but it is known to support it.
-    moved = distance > 1.0
-    return (degree * moved).sum(dim=1) / moved.sum(dim=1).clamp_min(1)
+    # No sensor sees the ground below the robot and close around it, but the first is known to support it.
+    low, high = robot.bounds
+    moved = (distance > float(high[0] - low[0])).to(degree)
+    driven = moved * functional.pad((place[:, 1:] - place[:, :-1]).norm(dim=-1), (1, 0))
+    return (degree * driven).sum(dim=1) / driven.sum(dim=1).clamp_min(1e-6)
 
 
 def _hull_clearance(robot: RobotModel) -> float:

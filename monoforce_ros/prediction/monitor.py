@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from monoforce_ros.core import FAST_SHARE, CommandTrack, MotionTrack, StaleDataError, motion_regimes, wrap_angle
+from monoforce_ros.perception import unbroken
 from monoforce_ros.prediction.predictor import Prediction, Predictor
 
 HORIZONS = (1.0, 2.0, 5.0)
@@ -99,6 +100,9 @@ class LiveGap:
         if not self._waiting or not len(motion) or motion.stamps[-1] < self._waiting[0].stamp + round(last * 1e9):
             return None
         prediction = self._waiting.popleft()
+        if not unbroken(motion, prediction.motion):
+            # Another estimator, or a jump of this one: its poses say nothing of where the robot was predicted to go.
+            return None
         stamps = self.predictor.command_stamps(prediction.stamp)
         twists = commands.sample(stamps, timeout=self.command_timeout)
         rolled = self.predictor.roll_out(

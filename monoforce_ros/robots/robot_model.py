@@ -14,6 +14,12 @@ from monoforce_ros.robots.joint import Coordinate, Joint
 from monoforce_ros.robots.kinematics import ACKERMANN, SteeredDrive
 from monoforce_ros.robots.mass import add_point_mass
 
+_ABOVE, _LEAST_HEADROOM = 0.2, 0.9
+"""Room that a robot needs above itself [m], and what it needs in any case: a mast that its file does not describe."""
+_SELF = 0.05
+"""How far beyond a robot's outermost points returns are taken for the robot [m]: half a cell of the maps. A lidar's
+noise is less, and what is nearer to a bumper than that has been hit."""
+
 
 @dataclass(frozen=True)
 class Flipper:
@@ -130,7 +136,7 @@ class RobotModel:
         Points on the ground below the body do not.
         """
         low, high = (bound.cpu().numpy() for bound in self.bounds)
-        across = ((points[:, :2] > low[:2] - 0.1) & (points[:, :2] < high[:2] + 0.1)).all(axis=1)
+        across = ((points[:, :2] > low[:2] - _SELF) & (points[:, :2] < high[:2] + _SELF)).all(axis=1)
         return across & (points[:, 2] > low[2] + 0.05)
 
     def with_points(self, keep: Tensor) -> RobotModel:
@@ -168,6 +174,13 @@ class RobotModel:
     def ground_clearance(self) -> float:
         """Height of the base frame above the lowest driven point [m]."""
         return -float(self.points[self.point_drives >= 0][:, 2].min())
+
+    @property
+    def headroom(self) -> float:
+        """Vertical gap that the robot passes under [m]: the height of its body and sensors above the ground and
+        :data:`_ABOVE`, but at least :data:`_LEAST_HEADROOM`."""
+        tops = [self.bounds[1][2], *(pose[2, 3] for pose in self.sensors.values())]
+        return max(_LEAST_HEADROOM, max(float(top) for top in tops) + self.ground_clearance + _ABOVE)
 
     @property
     def underside(self) -> Tensor:

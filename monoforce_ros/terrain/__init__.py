@@ -15,6 +15,8 @@ from monoforce_ros.terrain.lidar import (
     stands_on_ground,
     terrain_from_cloud,
 )
+from monoforce_ros.terrain.overhead import without_overhead
+from monoforce_ros.terrain.scatter import horizontal_scatter
 from monoforce_ros.terrain.terrain_map import CHANNELS, TerrainDefaults, TerrainMap
 
 __all__ = [
@@ -29,6 +31,7 @@ __all__ = [
     "cell_heights",
     "cell_quantiles",
     "fill_holes",
+    "horizontal_scatter",
     "interpolated",
     "interpolated_ground",
     "load_terrain",
@@ -36,4 +39,5 @@ __all__ = [
     "save_terrain",
     "stands_on_ground",
     "terrain_from_cloud",
+    "without_overhead",
 ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -15,6 +16,9 @@ from monoforce_ros.terrain.grid import Grid
 CHANNELS = ("height", "geometric_height", "stiffness", "damping", "friction")
 SPREADS = ("geometric_spread", "decrease_spread")
 """Optional channels: how uncertain the heights are."""
+
+_SECTORS = 120
+"""Directions around the robot in which it is known how far was measured: 3°, two cells of 0.1 m at 4 m."""
 
 
 @dataclass(frozen=True)
@@ -149,6 +153,36 @@ class TerrainMap:
         distance = cv2.distanceTransform((~observed).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
         return distance * self.grid.resolution <= reach + 1e-6
 
+    def extrapolated(self, reach: float = 0.3) -> np.ndarray:
+        """Whether a cell of a single map lies behind all that was measured in its direction, ``[rows, columns]`` bool.
+
+        Sensors see ground behind a gap between their rows of returns, but not behind an edge from which it drops, nor
+        behind a wall. The robot is at the origin of the map's frame.
+
+        Args:
+            reach: how far a measured cell speaks for cells behind it [m].
+        """
+        observed = self.observed.cpu().numpy()
+        distance, sector = _polar(self.grid)
+        farthest = np.full(_SECTORS, -np.inf)
+        np.maximum.at(farthest, sector[observed], distance[observed])
+        # Neighbouring sectors speak for it, too: a far row of returns has gaps.
+        farthest = np.max([np.roll(farthest, by) for by in (-1, 0, 1)], axis=0)
+        return ~observed & (distance > farthest[sector] + reach)
+
+    def before_observed(self) -> np.ndarray:
+        """Whether a cell of a single map lies nearer than all that was measured in its direction.
+
+        That is the blind zone of a lidar, below its lowest row of returns; ``[rows, columns]`` bool, False where
+        nothing was measured in a direction. The robot is at the origin of the map's frame.
+        """
+        observed = self.observed.cpu().numpy()
+        distance, sector = _polar(self.grid)
+        nearest = np.full(_SECTORS, np.inf)
+        np.minimum.at(nearest, sector[observed], distance[observed])
+        nearest[np.isinf(nearest)] = 0.0
+        return ~observed & (distance < nearest[sector])
+
     @property
     def spreads(self) -> tuple[str, ...]:
         """Those of :data:`SPREADS` that this map has."""
@@ -198,3 +232,11 @@ class TerrainMap:
         if observed is self.observed and all(channel is getattr(self, name) for name, channel in channels.items()):
             return self
         return TerrainMap(**channels, observed=observed, grid=self.grid)
+
+
+@lru_cache(maxsize=8)
+def _polar(grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+    """Distance of each cell from the origin [m], and the sector of its direction, ``[rows, columns]``."""
+    x, y = np.meshgrid(grid.x, grid.y)
+    sector = ((np.arctan2(y, x) / (2.0 * np.pi) + 0.5) * _SECTORS).astype(int) % _SECTORS
+    return np.hypot(x, y), sector

@@ -1,0 +1,117 @@
+"""Overhead: returns of ceilings, crowns and bridges, which a robot passes under; found from the ground under it."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from monoforce_ros.terrain.grid import Grid
+
+_SLOPES = (0.2, 0.5)
+"""Slopes across gaps between returns at which ground is sought, gentle first, so that ground behind a gap is found
+before the ceiling over it. The last one, 27°, is about what robots climb."""
+_ROUGHNESS = 0.2
+"""Height differences of ground besides its slope [m]."""
+_NEXT, _STEP = 0.25, 0.5
+"""Neighbouring returns at most so far apart [m] are ground together if the height differs by no more than that [m]:
+banks of up to 63° go on, ceilings over the foot of a wall do not."""
+_MOST_ROUNDS = 12
+
+
+class GroundReference:
+    """Height of the nearest ground of each cell, grown outwards from the ground under the robot.
+
+    Args:
+        lowest: lowest return of each cell ``[rows, columns]`` [m]; infinite without one.
+        support: points of the ground under the wheels ``[m, 3]`` [m].
+        grid: cells of the map.
+    """
+
+    def __init__(self, lowest: np.ndarray, support: np.ndarray, grid: Grid):
+        self._lowest, self._resolution = lowest, grid.resolution
+        self.known = np.zeros(lowest.shape, bool)
+        """Cells whose lowest return, or the wheels, are on the ground ``[rows, columns]``."""
+        self._heights = lowest.astype(np.float32)
+        rows, columns, inside = grid.cells(support[:, :2])
+        rows, columns = rows[inside], columns[inside]
+        self._heights[rows, columns] = np.inf
+        np.minimum.at(self._heights, (rows, columns), support[inside, 2].astype(np.float32))
+        self.known[rows, columns] = True
+        if inside.any():
+            self._grow()
+        else:
+            self.height, self.distance = np.full(lowest.shape, -np.inf, np.float32), np.zeros(lowest.shape, np.float32)
+
+    def _grow(self) -> None:
+        hit = np.isfinite(self._lowest)
+        for slope in _SLOPES:
+            for _ in range(_MOST_ROUNDS):
+                self._look_around()
+                rise = self._lowest - self.height
+                ground = rise <= slope * self.distance + _ROUGHNESS
+                ground |= (self.distance <= _NEXT) & (rise <= _STEP)
+                found = hit & ground & ~self.known
+                if not found.any():
+                    break
+                self.known |= found
+        self._look_around()
+
+    def _look_around(self) -> None:
+        """Height of the nearest ground [m] and how far away it is [m]."""
+        away, labels = cv2.distanceTransformWithLabels(
+            (~self.known).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+        )
+        heights = np.zeros(int(labels.max()) + 1, np.float32)
+        heights[labels[self.known]] = self._heights[self.known]
+        self.height, self.distance = heights[labels], away * self._resolution
+
+    def headroom(self, cells: np.ndarray, z: np.ndarray) -> np.ndarray:
+        """How far points at heights ``z`` [m] over flat indices of cells are above all that ground can reach [m]."""
+        return z - (self.height + _SLOPES[-1] * self.distance).ravel()[cells]
+
+
+def without_overhead(
+    points: np.ndarray, grid: Grid, support: np.ndarray, headroom: float, *, lowest: float, highest: float
+) -> np.ndarray:
+    """The points without those of what the robot passes under.
+
+    A cell's returns are overhead if even the lowest is further above the nearest ground than the robot needs, allowing
+    for a slope in between, and so are those above a gap of this height: a ceiling over a lidar's blind zone has no
+    returns of the floor below it, and would be taken for ground.
+
+    Args:
+        points: ``[n, 3]`` [m], z up.
+        grid: cells of the map; points off it are kept.
+        support: points of the ground under the wheels ``[m, 3]`` [m]; without any on the map all points are kept.
+        headroom: vertical gap that the robot passes under [m].
+        lowest, highest: limits of the heights that a map takes [m]; points beyond are kept, and do not matter here.
+    """
+    rows, columns, inside = grid.cells(points[:, :2])
+    inside &= (points[:, 2] > lowest) & (points[:, 2] < highest)
+    if not len(support) or not grid.cells(support[:, :2])[2].any() or not inside.any():
+        return points
+    flat, z = (rows * grid.columns + columns)[inside], points[inside, 2]
+    floor = np.full(grid.rows * grid.columns, np.inf)
+    np.minimum.at(floor, flat, z)
+    reference = GroundReference(floor.reshape(grid.rows, grid.columns), support, grid)
+    over = reference.headroom(flat, floor[flat]) > headroom
+    over |= _above_gaps(flat, z, floor, headroom)
+    keep = np.ones(len(points), bool)
+    keep[np.flatnonzero(inside)[over]] = False
+    return points[keep]
+
+
+def _above_gaps(cells: np.ndarray, z: np.ndarray, floor: np.ndarray, headroom: float) -> np.ndarray:
+    """Points above a gap of ``headroom`` in their cell, ``[n]`` bool."""
+    result = np.zeros(len(z), bool)
+    high = np.zeros(len(floor), bool)
+    high[cells[z > floor[cells] + headroom]] = True
+    index = np.flatnonzero(high[cells])
+    if not len(index):
+        return result
+    order = index[np.lexsort((z[index], cells[index]))]
+    cell, height = cells[order], z[order]
+    first = np.r_[True, cell[1:] != cell[:-1]]
+    gaps = np.cumsum(np.r_[False, ~first[1:] & (np.diff(height) > headroom)])
+    result[order] = gaps > gaps[np.flatnonzero(first)][np.cumsum(first) - 1]
+    return result

@@ -1,0 +1,139 @@
+"""What a robot passes under: ceilings, bars and crowns are no ground, and what is too low for a robot is an obstacle."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from monoforce_ros.core import MotionState
+from monoforce_ros.perception import Observation, choose_terrain_source
+from monoforce_ros.perception.lidar import usable_returns
+from monoforce_ros.robots import load_robot
+from monoforce_ros.terrain import Grid, without_overhead
+
+GRID = Grid.square(12.8, 0.1)
+LIMITS = {"lowest": -4.0, "highest": 3.0}
+LIDARS = {"Mid-360": np.linspace(-7, 52, 40), "VLP-16": np.linspace(-15, 15, 16), "OS0": np.linspace(-45, 45, 48)}
+STILL = MotionState(0, np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3))
+
+
+def room(elevations, ground, ceiling, mount=0.6, columns=360):
+    """Returns of an empty room of 20 m with a level floor."""
+    azimuth = np.linspace(-np.pi, np.pi, columns, endpoint=False)
+    turn, rise = (angles.ravel() for angles in np.meshgrid(azimuth, np.radians(elevations)))
+    rays = np.stack([np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)], axis=-1)
+    with np.errstate(divide="ignore"):
+        walls = 10.0 / np.abs(rays[:, :2]).max(axis=1)
+        floor, above = -mount / rays[:, 2], (ceiling - mount) / rays[:, 2]
+    reach = np.min([walls, np.where(floor > 0, floor, np.inf), np.where(above > 0, above, np.inf)], axis=0)
+    return rays * reach[:, None] + [0.0, 0.0, ground + mount]
+
+
+@pytest.fixture(scope="module")
+def husky():
+    return load_robot("husky")
+
+
+@pytest.mark.parametrize("kind", ["lidar", "lidar_interpolation"])
+@pytest.mark.parametrize("lidar", LIDARS)
+@pytest.mark.parametrize("ceiling", [2.3, 3.0])
+def test_an_empty_room_is_level_under_its_ceiling(husky, kind, lidar, ceiling):
+    ground = -husky.ground_clearance
+    cloud = room(LIDARS[lidar], ground, ceiling).astype(np.float32)
+    terrain = choose_terrain_source(kind, husky, fallback=True).terrain(Observation(0, cloud=cloud), STILL)
+    height = terrain.height.numpy() - ground
+    assert np.abs(height).max() < 0.1
+
+
+def test_hillsides_and_banks_are_ground(husky):
+    support = np.array([[0.3, 0.3, 0.0], [0.3, -0.3, 0.0], [-0.3, 0.3, 0.0], [-0.3, -0.3, 0.0]])
+    xy = np.random.default_rng(0).uniform(-6.4, 6.4, (40_000, 2))
+    # A slope of 30°, and a bank of 60° whose top is 2.5 m higher.
+    for height in (0.577 * xy[:, 0], np.clip(1.732 * (xy[:, 0] - 2.0), 0.0, 2.5)):
+        points = np.column_stack([xy, height])
+        inside = points[(points[:, 2] > -4.0) & (points[:, 2] < 3.0)]
+        assert len(without_overhead(inside, GRID, support, 0.9, **LIMITS)) == len(inside)
+
+
+def test_ground_behind_a_gap_is_found_before_the_ceiling_over_it(husky):
+    support = np.array([[0.3, 0.3, 0.0], [0.3, -0.3, 0.0], [-0.3, 0.3, 0.0], [-0.3, -0.3, 0.0]])
+    xy = np.random.default_rng(0).uniform(-6.4, 6.4, (20_000, 2))
+    away = np.hypot(*xy.T)
+    floor = np.column_stack([xy, 0.0 * away])[away > 4.5]
+    ceiling = np.column_stack([xy, 0.0 * away + 2.4])[away > 1.5]
+    kept = without_overhead(np.concatenate([floor, ceiling]), GRID, support, 0.9, **LIMITS)
+    assert len(kept) == len(floor) and kept[:, 2].max() == 0.0
+
+
+def test_without_a_support_on_the_map_nothing_is_left_out():
+    points = np.array([[1.0, 0.0, 2.5], [2.0, 0.0, 0.0]])
+    assert len(without_overhead(points, GRID, np.zeros((0, 3)), 0.9, **LIMITS)) == 2
+    assert len(without_overhead(points, GRID, np.array([[50.0, 0.0, 0.0]]), 0.9, **LIMITS)) == 2
+
+
+@pytest.mark.parametrize("kind", ["lidar", "lidar_interpolation"])
+def test_a_bar_is_an_obstacle_to_a_robot_that_is_taller(husky, kind):
+    car = load_robot("offroad_car")
+    assert 0.9 <= husky.headroom < 1.2 < 1.8 < car.headroom
+    random = np.random.default_rng(0)
+    heights = {}
+    for robot in (husky, car):
+        ground = -robot.ground_clearance
+        floor = np.column_stack([random.uniform(-6.4, 6.4, (60_000, 2)), np.full(60_000, ground)])
+        bar = np.column_stack([
+            random.uniform(3.0, 3.1, 3000), random.uniform(-2.0, 2.0, 3000), ground + random.uniform(1.3, 1.4, 3000),
+        ])  # fmt: skip
+        cloud = np.concatenate([floor, bar]).astype(np.float32)
+        terrain = choose_terrain_source(kind, robot, fallback=True).terrain(Observation(0, cloud=cloud), STILL)
+        under = (np.abs(GRID.x - 3.05) < 0.06)[None, :] & (np.abs(GRID.y) < 1.5)[:, None]
+        heights[robot.name] = float(np.median(terrain.height.numpy()[under])) - ground
+    assert heights["husky"] < 0.1 and heights["offroad_car"] > 0.8
+
+
+def test_obstacles_close_to_the_bumper_are_no_part_of_the_robot(husky):
+    front = float(husky.bounds[1][0])
+    support = np.array([[0.3, 0.3, -0.13], [-0.3, 0.3, -0.13], [-0.3, -0.3, -0.13]])
+    near, on = np.array([[front + 0.07, 0.0, 0.2]]), np.array([[front + 0.02, 0.0, 0.2]])
+    assert len(usable_returns(near, husky, STILL, support, GRID)) == 1
+    assert not len(usable_returns(on, husky, STILL, support, GRID))
+
+
+def wall_in_the_blind_zone(husky, distance, height, width=4.0, mount=0.7):
+    """Returns of a VLP-16, whose lowest ring meets the ground 2.6 m away, of level ground and a wall across the way."""
+    cloud = room(LIDARS["VLP-16"], -husky.ground_clearance, 50.0, mount, columns=1440)
+    origin = np.array([0.0, 0.0, -husky.ground_clearance + mount])
+    rays = cloud - origin
+    share = np.where(rays[:, 0] > 0, distance / np.maximum(rays[:, 0], 1e-9), np.inf)
+    hit = origin + rays * share[:, None]
+    blocked = (share < 1.0) & (np.abs(hit[:, 1]) < 0.5 * width) & (hit[:, 2] < -husky.ground_clearance + height)
+    return np.where(blocked[:, None], hit, cloud)
+
+
+@pytest.mark.parametrize("distance", [1.5, 2.1, 2.6, 3.4])
+def test_a_wall_whose_foot_the_lidar_does_not_see_is_no_ramp(husky, distance):
+    cloud = wall_in_the_blind_zone(husky, distance, 1.5).astype(np.float32)
+    source = choose_terrain_source("lidar_interpolation", husky)
+    height = source.terrain(Observation(0, cloud=cloud), STILL).height.numpy() + husky.ground_clearance
+    row = height[np.abs(GRID.y) < 1.0]
+    before = row[:, (GRID.x > 0.6) & (GRID.x < distance - 0.15)]
+    at = row[:, np.abs(GRID.x - distance) < 0.15].max(axis=1)
+    # The lowest ring meets a wall at 1.5 m 0.3 m above its foot.
+    assert before.max() < 0.3 and np.median(at) > 0.6
+
+
+@pytest.mark.parametrize("kind", ["lidar", "lidar_interpolation"])
+def test_what_the_lidar_looks_over_when_near_is_remembered(husky, kind):
+    ground = -husky.ground_clearance
+
+    def heights(retention):
+        source = choose_terrain_source(kind, husky, fallback=True, lidar_retention_time=retention)
+        for step in range(16):
+            x = 0.2 * step
+            cloud = wall_in_the_blind_zone(husky, 4.0 - x, 0.3, width=0.8).astype(np.float32)
+            motion = replace(STILL, stamp=step * 400_000_000, position=np.array([x, 0.0, 0.0]),
+                             linear_velocity=np.array([0.5, 0.0, 0.0]))  # fmt: skip
+            terrain = source.terrain(Observation(motion.stamp, cloud=cloud), motion)
+        near = (np.abs(GRID.x - 1.05) < 0.3)[None, :] & (np.abs(GRID.y) < 0.4)[:, None]
+        return float(terrain.height.numpy()[near].max()) - ground
+
+    assert heights(0.0) < 0.1 < heights(10.0)
