@@ -9,6 +9,7 @@ import yaml
 
 from monoforce_ros.discrepancy import EffectEstimate, ExportKind, ParameterEstimate, cli, export_effects
 from monoforce_ros.discrepancy.export import effects_to_export, export_target
+from monoforce_ros.discrepancy.turning_ratio import turning_ratio
 from monoforce_ros.effects import CATALOGUE, applied_setup, drive_speeds
 from monoforce_ros.physics import State, rollout
 from monoforce_ros.robots import load_robot
@@ -236,17 +237,17 @@ def test_what_mujoco_cannot_express_is_said(husky, tmp_path):
 
 def test_parameters_of_ros2_control_cancel_the_effects(husky, tmp_path):
     effects = (estimate("drive_gain", gain=0.9), estimate("drive_asymmetry", difference=0.1),
-               estimate("turning_scrub", track_width_factor=1.6), estimate("command_delay", delay=0.3))  # fmt: skip
+               estimate("command_delay", delay=0.3))  # fmt: skip
     target = tmp_path / "husky.diff_drive.yaml"
     (exported,) = export_effects([str(target)], husky, effects)
     parameters = yaml.safe_load(target.read_text())["diff_drive_controller"]["ros__parameters"]
     # The controller as documented: wheel speeds from a twist with both multipliers.
     speed, yaw_rate = 0.5, 0.6
-    separation = 0.5708 * parameters["wheel_separation_multiplier"]
+    separation = 0.5708
     left = (speed - yaw_rate * separation / 2) / parameters["left_wheel_radius_multiplier"]
     right = (speed + yaw_rate * separation / 2) / parameters["right_wheel_radius_multiplier"]
     # The effects, applied to these wheel speeds, give the twist that was asked for.
-    robot = replace(husky, effects=tuple((e.name, {k: p.value for k, p in e.parameters.items()}) for e in effects[:3]))
+    robot = replace(husky, effects=tuple((e.name, {k: p.value for k, p in e.parameters.items()}) for e in effects[:2]))
     half = 0.5 * 0.5708
     twist = torch.tensor([[[(left + right) / 2, (right - left) / (2 * half)]] * 10])
     done = drive_speeds(robot, twist, 0.01)[0, -1]
@@ -254,6 +255,19 @@ def test_parameters_of_ros2_control_cancel_the_effects(husky, tmp_path):
     assert float(done[1] - done[0]) / (2 * half) == pytest.approx(yaw_rate, rel=0.01)
     assert exported.not_exported[0].startswith("command_delay")
     assert "0.9, 0.81 to 0.99" in target.read_text() and "Not exported: command_delay" in target.read_text()
+
+
+@pytest.mark.parametrize("factor", [0.78, 1.2, 1.6])
+def test_the_exported_separation_makes_a_skid_steered_robot_turn_as_commanded(husky, tmp_path, factor):
+    target = tmp_path / "husky.diff_drive.yaml"
+    export_effects([str(target)], husky, (estimate("turning_scrub", track_width_factor=factor),))
+    exported = yaml.safe_load(target.read_text())["diff_drive_controller"]["ros__parameters"]
+    multiplier = exported["wheel_separation_multiplier"]
+    robot = replace(husky, effects=(("turning_scrub", {"track_width_factor": factor}),))
+    # A healthy one turns by 0.55 of the command; what turns less needs more.
+    before = turning_ratio(robot)
+    assert before < 0.75 and multiplier > 1.3
+    assert turning_ratio(robot, multiplier) == pytest.approx(1.0, abs=0.02)
 
 
 def test_parameters_of_nav2_respect_the_effects(husky, tmp_path):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -41,6 +41,9 @@ IMAGES = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 IMU, JOINTS = "sensor_msgs/msg/Imu", "sensor_msgs/msg/JointState"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
+_ANOTHER_CLOCK, _AROUND = 86_400 * 10**9, 60 * 10**9
+"""Pause of the poses from which on the clock was set rather than the robot left alone [ns], and how far beyond the
+poses of one clock other messages belong to it [ns]."""
 FIXED = 0.01
 """Largest change of a transform on /tf between frames that are fixed to each other [m, rad]: a joint that moves less
 displaces what is measured by less than odometry's own error."""
@@ -52,9 +55,16 @@ class Frame:
 
     topic: str
     stamp: int
-    """Header stamp [ns]."""
+    """Header stamp [ns]; the time of reception if the driver did not set one."""
     received: int
     """Time of reception [ns], by which the message is found."""
+    stamped: bool = True
+    """Whether the header has a stamp."""
+
+    @property
+    def header_stamp(self) -> int:
+        """Stamp in the message's header [ns]."""
+        return self.stamp if self.stamped else 0
 
 
 @dataclass(frozen=True)
@@ -240,7 +250,7 @@ class Recording:
     def _decoded(self, frames: Sequence[Frame]) -> Iterator[tuple[Frame, Message]]:
         """Messages of frames of one topic, each once, in the order of the bag."""
         # Several messages may have been received at one time, by a clock with coarse steps.
-        wanted = {(frame.received, frame.stamp): frame for frame in frames}
+        wanted = {(frame.received, frame.header_stamp): frame for frame in frames}
         if not wanted:
             return
         received = {frame.received for frame in frames}
@@ -259,7 +269,7 @@ class Recording:
         with opened(self.path) as bag:
             for message in bag.messages([frame.topic], start=frame.received, stop=frame.received + 1):
                 decoded = message.decode()
-                if decoding.stamp_of(decoded) == frame.stamp:
+                if decoding.stamp_of(decoded) == frame.header_stamp:
                     return decoded
         raise BagError(f"{self.path}: the message on {frame.topic} at {frame.received} ns is gone; the bag has changed")
 
@@ -348,6 +358,12 @@ class _Collector:
         self.joints: list[tuple[int, np.ndarray]] = []
         self.flipper_commands: list[tuple[int, np.ndarray]] = []
         self._unknown_joints: dict[str, list[str]] = {}
+        self._stamped: set[str] = set()
+        """Topics of which a header had a stamp."""
+        self._received: dict[int, int] = {}
+        """Time of reception of the odometry by its stamp [ns]."""
+        self._unstamped: dict[str, set[int]] = {}
+        """Times of reception of messages without one, by topic [ns]."""
         self.indexed: dict[str, list[Frame]] = {}
         self.cameras: dict[str, CameraModel] = {}
         self.rectified: dict[str, CameraModel] = {}
@@ -366,16 +382,22 @@ class _Collector:
         try:
             if message.message_type in (*IMAGES, CLOUD) and self.bag.is_ros2:
                 # Large messages are indexed by their headers and decoded on demand.
-                stamp = decoding.stamp_of_cdr(message.data)
-                self.indexed.setdefault(message.topic, []).append(Frame(message.topic, stamp, message.received))
+                self._index(message, decoding.stamp_of_cdr(message.data))
                 return
             decoded = message.decode()
-            # A header stamp of zero means that the driver did not set it.
-            stamp = decoding.stamp_of(decoded) or message.received
+            header = decoding.stamp_of(decoded)
+            if message.message_type in (CAMERA_INFO, TRANSFORMS):
+                stamp = header or message.received
+            elif message.message_type in (*IMAGES, CLOUD):
+                self._index(message, header)
+                return
+            elif (stamp := self._time(message, header)) is None:
+                return
             if message.topic == self.chosen["odometry"]:
                 state, frame_id, child_frame_id = decoding.decode_odometry(decoded)
                 self.frames = (frame_id, child_frame_id)
                 self.states.append((stamp, state))
+                self._received[stamp] = message.received
                 self._take_moving(stamp)
             elif message.topic == self.chosen["commands"]:
                 self.twists.append((stamp, self._command(decoded)))
@@ -396,13 +418,103 @@ class _Collector:
                     self.cameras[message.topic] = decoding.decode_camera_info(decoded)
             elif message.message_type == TRANSFORMS:
                 self._take_transforms(decoding.decode_transforms(decoded), message.topic.endswith("tf_static"))
-            else:
-                self.indexed.setdefault(message.topic, []).append(
-                    Frame(message.topic, decoding.stamp_of(decoded), message.received)
-                )
         except ValueError as error:
             if len(self.warnings) < 20:
                 self.warnings.append(f"{message.topic}: {error}")
+
+    def _index(self, message: BagMessage, header: int) -> None:
+        """Keep a reference to a cloud or image."""
+        stamp = self._time(message, header)
+        if stamp is not None:
+            frame = Frame(message.topic, stamp, message.received, stamped=header != 0)
+            self.indexed.setdefault(message.topic, []).append(frame)
+
+    def _time(self, message: BagMessage, header: int) -> int | None:
+        """Time of a message [ns]: its header's stamp or, where the topic has none, that of its reception.
+
+        A topic has one clock: messages without a stamp among others, as a simulation publishes before its clock runs,
+        are left out (None), for their times of reception may be those of another one.
+        """
+        topic = message.topic
+        if header:
+            if topic not in self._stamped and self._unstamped.get(topic):
+                self._forget_unstamped(topic)
+            self._stamped.add(topic)
+            return header
+        self._unstamped.setdefault(topic, set()).add(message.received)
+        return None if topic in self._stamped else message.received
+
+    def _forget_unstamped(self, topic: str) -> None:
+        received = self._unstamped[topic]
+        for track in self._tracks().get(topic, []):
+            track[:] = [entry for entry in track if entry[0] not in received]
+        self.indexed.pop(topic, None)
+
+    def _tracks(self) -> dict[str | None, list[list[Any]]]:
+        """What is kept of each topic: lists of stamps and values."""
+        chosen = self.chosen
+        return {
+            chosen["odometry"]: [self.states, *self._series.values()],
+            chosen["commands"]: [self.twists],
+            chosen["imu"]: [self.angular_velocities],
+            chosen["joints"]: [self.wheels, self.joints],
+            chosen.get("flipper_commands"): [self.flipper_commands],
+        }
+
+    def _translate_unstamped(self) -> None:
+        """Give messages without stamps the time of the poses' clock, where that is another one than the recorder's.
+
+        A simulation has its own time, and Twist has no stamp: received in 2026, the poses stamped from 0 on.
+        """
+        stamps = np.array(sorted(self._received), np.int64)
+        received = np.array([self._received[stamp] for stamp in stamps.tolist()], np.int64)
+        if len(stamps) < 2 or abs(float(np.median(received - stamps))) < _ANOTHER_CLOCK:
+            return
+        order = np.argsort(received, kind="stable")
+        received, stamps = received[order], stamps[order]
+        topics = sorted(set(self._unstamped) - self._stamped)
+
+        def translated(time: int) -> int:
+            before = int(np.clip(np.searchsorted(received, time, side="right") - 1, 0, len(received) - 2))
+            step = max(int(received[before + 1] - received[before]), 1)
+            share = (time - int(received[before])) / step
+            return int(stamps[before]) + round(share * int(stamps[before + 1] - stamps[before]))
+
+        tracks = self._tracks()
+        for topic in topics:
+            for track in tracks.get(topic, []):
+                track[:] = [(translated(entry[0]), *entry[1:]) for entry in track]
+            if topic in self.indexed:
+                self.indexed[topic] = [replace(frame, stamp=translated(frame.stamp)) for frame in self.indexed[topic]]
+        used = [topic for topic in topics if topic in self.indexed or any(tracks.get(topic, []))]
+        if used:
+            self.warnings.append(
+                f"{', '.join(used)}: no stamps, and the poses have another clock than the recorder (simulated time?): "
+                "times of reception are translated; record stamped messages, or ros2 bag record --use-sim-time"
+            )
+
+    def _keep_one_clock(self) -> None:
+        """Keep the longest part of a recording during which the clock was set forward by a day or more.
+
+        A computer without a battery for its clock starts in 1970, until the network tells it the time.
+        """
+        stamps = np.unique(np.array([stamp for stamp, _ in self.states], np.int64))
+        breaks = np.flatnonzero(np.diff(stamps) > _ANOTHER_CLOCK)
+        if not len(breaks):
+            return
+        parts = np.split(stamps, breaks + 1)
+        kept = max(parts, key=len)
+        start, stop = int(kept[0]) - _AROUND, int(kept[-1]) + _AROUND
+        for tracks in self._tracks().values():
+            for track in tracks:
+                track[:] = [entry for entry in track if start <= entry[0] <= stop]
+        for topic, frames in self.indexed.items():
+            self.indexed[topic] = [frame for frame in frames if start <= frame.stamp <= stop]
+        days = float(np.diff(stamps)[breaks].max()) * 1e-9 / 86400.0
+        self.warnings.append(
+            f"the clock was set forward by {days:.0f} days during the recording: of {len(parts)} parts the longest is "
+            f"used, {float(kept[-1] - kept[0]) * 1e-9:.0f} s; set the clock before recording (chrony)"
+        )
 
     def _command(self, message: Message) -> np.ndarray:
         if hasattr(message, "drive"):
@@ -449,6 +561,11 @@ class _Collector:
     def recording(self, image_topics: list[str]) -> Recording:
         if not self.states:
             raise BagError(f"{self.bag.path}: no usable message on {self.chosen['odometry']}: {self.warnings[:1]}")
+        self._translate_unstamped()
+        self._keep_one_clock()
+        for topic in sorted(self._stamped & set(self._unstamped)):
+            count = len(self._unstamped[topic])
+            self.warnings.append(f"{topic}: {count} messages without a stamp among others with one are left out")
         stamps, states = _in_order(self.states)
         for topic, names in self._unknown_joints.items():
             if not (self.joints if topic == self.chosen["joints"] else self.flipper_commands):

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 from monoforce_ros.discrepancy.estimates import EffectEstimate, ParameterEstimate
+from monoforce_ros.discrepancy.turning_ratio import separation_multiplier
 from monoforce_ros.effects import CATALOGUE
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import TerrainDefaults
@@ -31,8 +33,9 @@ _NOT_IN_NAV2 = {
 def diff_drive_text(robot: RobotModel, effects: Mapping[str, EffectEstimate]) -> tuple[str, tuple[str, ...]]:
     """Parameters of ``diff_drive_controller`` that make the robot drive as commanded, and what they lack.
 
-    The controller divides wheel speeds by the radius, and multiplies yaw rates by the separation: multipliers equal to
-    the effects cancel them, for commands and odometry alike. Limits are those of the twist.
+    The controller divides wheel speeds by the radius: multipliers equal to the effects cancel them, for commands and
+    odometry alike. It multiplies yaw rates by the separation: the multiplier makes up for the scrub of the model's
+    contact physics, too, of which the effect is a factor. Limits are those of the twist.
 
     Args:
         robot: the nominal model.
@@ -50,7 +53,13 @@ def diff_drive_text(robot: RobotModel, effects: Mapping[str, EffectEstimate]) ->
     ]
     if scrub is not None:
         value = scrub.parameters["track_width_factor"]
-        lines.append(f"    wheel_separation_multiplier: {value.value:.4f}  # {_interval(scrub, 'track_width_factor')}")
+        wanted = separation_multiplier(_turning_robot(robot, effects))
+        low, high = (wanted * end / value.value for end in (value.low, value.high))
+        lines += [
+            f"    # Beside the model's own scrub, {_interval(scrub, 'track_width_factor')}. With it the robot turns as",
+            "    # commanded:",
+            f"    wheel_separation_multiplier: {wanted:.4f}  # {low:.3g} to {high:.3g}",
+        ]
     if gain is not None or difference is not None:
         one = ParameterEstimate(1.0, 1.0, 1.0, "-")
         speed = one if gain is None else gain.parameters["gain"]
@@ -132,6 +141,15 @@ def nav2_text(robot: RobotModel, effects: Mapping[str, EffectEstimate]) -> tuple
     return _finished(
         lines, effects, {"actuator_saturation", "actuator_deadband", "friction_scale", "command_delay"}, _NOT_IN_NAV2
     )
+
+
+def _turning_robot(robot: RobotModel, effects: Mapping[str, EffectEstimate]) -> RobotModel:
+    """The robot with the effects that decide how fast it turns in the end; others are corrected by themselves."""
+    turning = ("turning_scrub", "friction_scale", "friction_anisotropy", "tyre_slip", "payload", "rotation_centre",
+               "terrain_softness")  # fmt: skip
+    values = {name: {key: entry.value for key, entry in effects[name].parameters.items()} for name in turning
+              if name in effects}  # fmt: skip
+    return replace(robot, effects=tuple(values.items()))
 
 
 def _heading(robot: RobotModel, tool: str) -> list[str]:

@@ -118,7 +118,7 @@ def _asymmetry(values: _Values) -> str:
 
 def _scrub(values: _Values) -> str:
     factor = values["track_width_factor"]
-    return f"The robot turns {_change(1 / factor, 'less', 'more')} than its wheels ask for."
+    return f"The robot turns {_change(1 / factor, 'less', 'more')} than its model does with these wheel speeds."
 
 
 def _friction(values: _Values) -> str:
@@ -301,7 +301,7 @@ _CAUSES = {
     "tyre_slip": "tyres that give way",
     "vegetation_drag": "plants",
     "drive_droop": "drives that droop when a turn begins",
-    "turning_scrub": "turning less than the wheels ask for",
+    "turning_scrub": "turning faster or slower than the model",
     "friction_scale": "slippery or grippy ground",
     "friction_anisotropy": "tyres that slip sideways",
     "rolling_resistance": "rolling heavily",

@@ -88,9 +88,14 @@ class TopicCheck:
                 self.bad += 1
                 self.error = self.error or str(error)
         if stamp:
+            if not self.offsets and self.unstamped:
+                # Times of reception may be those of another clock.
+                self.stamps.clear()
             self.offsets.append((message.received - stamp) * NANOSECOND)
         elif message.message_type in KNOWN_TYPES and message.message_type != "geometry_msgs/msg/Twist":
             self.unstamped += 1
+            if self.offsets:
+                return
         time = stamp or message.received
         if self.stamps and time < self.stamps[-1]:
             self.unordered += 1
@@ -103,9 +108,8 @@ class TopicCheck:
         if self.bad:
             yield warning(f"{self.topic}: {self.bad} of {self.count} messages cannot be used: {self.error}")
         if self.unstamped and self.message_type != CAMERA_INFO:
-            yield warning(
-                f"{self.topic}: {self.unstamped} headers have no stamp; the time of reception is used instead"
-            )
+            instead = "these are left out" if self.offsets else "the time of reception is used instead"
+            yield warning(f"{self.topic}: {self.unstamped} headers have no stamp; {instead}")
         if self.unordered:
             yield note(f"{self.topic}: {self.unordered} messages are out of order; they are sorted when read")
         if abs(self.clock_offset) > CLOCK_TOLERANCE:

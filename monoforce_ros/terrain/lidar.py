@@ -52,9 +52,9 @@ points 25° down, sees ground from there on."""
 _FACE = 0.2
 """Height of a cell's returns above its lowest from which they may be a wall, not a slope, which rises by no more than
 its cell is wide [m]."""
-_THIN, _THIN_WITHIN, _FEWEST_OF_A_FACE = 0.06, 0.25, 4
+_THIN, _THIN_WITHIN, _FEWEST_OF_A_FACE = 0.035, 0.25, 10
 """Scatter of surfaces that are thin seen from above [m], within such a distance [m], and returns that tell it. Leaves
-within it scatter by 0.14 m, and a lidar's noise and a post of 0.2 m by 0.03 m."""
+within it scatter by 0.14 m, and a lidar's noise by 0.02 to 0.03 m."""
 
 
 class TerrainError(ValueError):
