@@ -9,6 +9,7 @@ from recorded_rollout import recorded
 
 from monoforce_ros.bags import SmoothedMotion
 from monoforce_ros.core import CommandTrack
+from monoforce_ros.discrepancy import commissioning
 from monoforce_ros.discrepancy.areas import shows_vegetation
 from monoforce_ros.discrepancy.commissioning import commission
 from monoforce_ros.discrepancy.evidence import Evidence, EvidenceWindows, window_starts
@@ -117,6 +118,23 @@ def test_a_robot_is_commissioned_whose_drives_have_a_limit():
     """A limit does nothing at infinity, to which no prior can draw it."""
     found = commissioned(replace(load_robot("husky"), effects=(("actuator_saturation", {"limit": 0.5}),)), [None])
     assert found["actuator_saturation"]["limit"] == pytest.approx(0.5, rel=0.05)
+
+
+def test_further_effects_are_fitted_from_what_was_found_before_them(monkeypatch):
+    """From the usual values of a robot, on ground of a third of the usual friction, no step may lead down at once."""
+    began = []
+
+    def watched(predictions, starts, *arguments, **options):
+        fit = fit_effects(predictions, starts, *arguments, **options)
+        began.append((dict(starts[0]), dict(fit.effects)))
+        return fit
+
+    monkeypatch.setattr(commissioning, "fit_effects", watched)
+    effects = (("actuator_saturation", {"limit": 0.5}), ("friction_scale", {"factor": 0.35}))
+    found = commissioned(replace(load_robot("husky"), effects=effects), [None])
+    assert found["friction_scale"]["factor"] == pytest.approx(0.35, rel=0.2)
+    (_, first), (again, _) = began[0], next(entry for entry in began if "actuator_saturation" in entry[0])
+    assert again["friction_scale"] == first["friction_scale"] != dict(commissioning.COMMISSIONED)["friction_scale"]
 
 
 def test_a_supply_that_drains_is_no_supply_that_is_low():

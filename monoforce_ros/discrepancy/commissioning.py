@@ -126,8 +126,8 @@ def commission(
     counted = [name for name, _ in found]
     further = {name: values for name, values in found if counted.count(name) > 0.5 * len(prepared)}
     if further:
-        chosen = (*chosen, *further.items())
-        fits = [_fitted(entry, chosen) for entry in prepared]
+        # From what was found: from the starting values of all, no step may lead down.
+        fits = [_fitted(entry, (*fit.effects, *further.items())) for entry, fit in zip(prepared, fits, strict=True)]
     # Whose covariance tells the intervals: one that saw everything.
     first = fits[overgrown.index(True)] if any(overgrown) else fits[0]
     merged = replace(first, effects=_merged([fit.effects for fit in fits], overgrown))
