@@ -12,6 +12,7 @@ from monoforce_ros.core import CommandTrack, MotionTrack, pose_matrix
 from monoforce_ros.evaluation.check import BagCheck, check_bag, check_text, command_delay
 from monoforce_ros.evaluation.cli import main
 from monoforce_ros.evaluation.findings import Level
+from monoforce_ros.evaluation.twist_check import twist_fault, with_usable_twists
 from monoforce_ros.robots import load_robot
 
 START = 1_700_000_000_000_000_000
@@ -221,3 +222,38 @@ def test_slopes_that_no_map_shows_are_said_before_diagnose_meets_them(tmp_path, 
     said = texts(check, Level.WARNING)
     assert ("ground, for diagnose: the ground is not level" in said) is not clouds, said
     assert check.usable
+
+
+def turned_twists(motion, kind):
+    velocity = motion.linear_velocities
+    if kind == "zero":
+        velocity = 0.0 * velocity
+    elif kind == "of the odometry frame":
+        velocity = Rotation.from_quat(motion.quaternions).apply(velocity)
+    elif kind == "backwards":
+        velocity = -velocity
+    return MotionTrack(motion.stamps, motion.positions, motion.quaternions, velocity, motion.angular_velocities)
+
+
+@pytest.mark.parametrize(
+    ("kind", "text"),
+    [
+        ("right", ""),
+        ("zero", "twists are zero"),
+        ("of the odometry frame", "in the frame of its poses"),
+        ("backwards", "opposite sign"),
+    ],
+)
+def test_twists_that_are_not_those_of_the_poses_are_named_and_replaced(kind, text):
+    times = np.arange(0.0, 20.0, 0.05)
+    heading = 0.3 * times + 1.0
+    places = np.cumsum(0.5 * np.stack([np.cos(heading), np.sin(heading), 0 * heading], axis=1), axis=0) * 0.05
+    ahead = np.tile([0.5, 0.0, 0.0], (len(times), 1))
+    turning = np.tile([0.0, 0.0, 0.3], (len(times), 1))
+    stamps = START + np.rint(times * 1e9).astype(np.int64)
+    true = MotionTrack(stamps, places, Rotation.from_euler("z", heading[:, None]).as_quat(), ahead, turning)
+    stated = turned_twists(true, kind)
+    assert (text in twist_fault(stated, true)) and bool(twist_fault(stated, true)) == bool(text)
+    used, said = with_usable_twists(stated, true)
+    np.testing.assert_allclose(used.linear_velocities, ahead, atol=1e-9)
+    assert bool(said) == bool(text)

@@ -130,11 +130,9 @@ def test_further_effects_are_fitted_from_what_was_found_before_them(monkeypatch)
         return fit
 
     monkeypatch.setattr(commissioning, "fit_effects", watched)
-    effects = (("actuator_saturation", {"limit": 0.5}), ("friction_scale", {"factor": 0.35}))
-    found = commissioned(replace(load_robot("husky"), effects=effects), [None])
-    assert found["friction_scale"]["factor"] == pytest.approx(0.35, rel=0.2)
+    commissioned(replace(load_robot("husky"), effects=(("actuator_saturation", {"limit": 0.5}),)), [None])
     (_, first), (again, _) = began[0], next(entry for entry in began if "actuator_saturation" in entry[0])
-    assert again["friction_scale"] == first["friction_scale"] != dict(commissioning.COMMISSIONED)["friction_scale"]
+    assert {name: again[name] for name in first} == first != dict(commissioning.COMMISSIONED)
 
 
 def test_a_supply_that_drains_is_no_supply_that_is_low():

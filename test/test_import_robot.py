@@ -186,8 +186,8 @@ BAD = {
     "two roots": (lambda t: t.replace("</robot>", '<link name="alone"/></robot>'), "alone, base_link have no parent"),
     "unknown link": (lambda t: t.replace('<child link="imu_link"/>', '<child link="imu"/>'), "'imu' does not exist"),
     "mimic": (
-        lambda t: WHEEL.sub(lambda m: m.group(0).replace("</joint>", '<mimic joint="rear_left_wheel"/></joint>'), t),
-        "front_left_wheel mimics rear_left_wheel.*--hint front_left_wheel=fixed",
+        lambda t: WHEEL.sub(lambda m: m.group(0).replace("</joint>", '<mimic joint="rear_right_wheel"/></joint>'), t),
+        "front_left_wheel mimics rear_right_wheel.*except wheels that follow one of their side",
     ),
     "wrong axes": (
         lambda t: t.replace('axis xyz="0 1 0"', 'axis xyz="1 0 0"').replace('axis xyz="0 -1 0"', 'axis xyz="1 0 0"'),

@@ -464,3 +464,49 @@ def test_lidars_are_known_by_their_usual_names_and_their_absence_is_said(tmp_pat
         assert conversion.content["sensors"][name]["translation"] == [0.1, 0.0, 0.4]
         assert not any("no camera or lidar" in text for text in conversion.guesses)
     assert any("no camera or lidar" in text for text in convert(robot(tmp_path, body, *wheels)).guesses)
+
+
+def test_a_ball_of_the_root_link_itself_is_a_caster(tmp_path):
+    ball = '<collision><origin xyz="-0.12 0 -0.07"/><geometry><sphere radius="0.03"/></geometry></collision>'
+    base, *wheels = small_robot()
+    path = robot(tmp_path, base.replace("</link>", f"{ball}</link>"), *wheels)
+    found = convert(path)
+    assert len(found.content["casters"]) == 1 and found.content["drive"]["kind"] == "differential"
+    place = next(entry for entry in found.content["wheels"] if entry["drive"] is None)
+    np.testing.assert_allclose(place["centre"], [-0.12, 0.0, -0.07], atol=1e-5)
+    assert imported(path, tmp_path)[0] == 0
+
+
+def test_wheels_that_follow_one_of_their_side_are_driven_as_it_is(tmp_path):
+    parts = [link("base_link", box("0.9 0.4 0.1", "0 0 0.1"), mass=20.0)]
+    for y, side in ((0.3, "left"), (-0.3, "right")):
+        for x, place in ((0.35, "front"), (0.0, "middle"), (-0.35, "rear")):
+            follows = "" if place == "front" else f'<mimic joint="{side}_front"/>'
+            parts.append(wheel(f"{side}_{place}", f"{x} {y} 0", extra=follows))
+    path = robot(tmp_path, *parts)
+    assert len(convert(path).content["wheels"]) == 6
+    assert imported(path, tmp_path)[0] == 0
+
+
+def test_what_turns_about_a_lateral_axis_in_the_air_is_no_wheel(tmp_path):
+    elbow = (
+        link("fore_arm", box("0.05 0.3 0.05"), mass=0.1),
+        joint("elbow", "continuous", "base_link", "fore_arm", "0 0 0.5"),
+    )
+    path = robot(tmp_path, *small_robot(*elbow))
+    found = convert(path)
+    assert len(found.content["wheels"]) == 2
+    assert any("elbow" in guess and "--hint elbow=wheel" in guess for guess in found.guesses)
+    assert len(convert(path, hints={"elbow": "wheel"}).content["wheels"]) == 3
+
+
+def test_a_robot_whose_wheels_sink_into_firm_ground_is_told_so(tmp_path, capsys):
+    def heavy(mass):
+        base = link("base_link", box("0.9 0.4 0.1", "0 0 0.1"), mass=mass)
+        places = [(x, y) for x in (0.35, -0.35) for y in (0.3, -0.3)]
+        return robot(tmp_path, base, *(wheel(f"w{i}", f"{x} {y} 0") for i, (x, y) in enumerate(places)))
+
+    assert imported(heavy(30.0), tmp_path)[0] == 0
+    assert "sinks" in capsys.readouterr().out
+    assert imported(heavy(900.0), tmp_path)[0] != 0
+    assert "terrain_softness" in capsys.readouterr().out

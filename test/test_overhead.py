@@ -1,4 +1,4 @@
-"""What a robot passes under: ceilings, bars and crowns are no ground, and what is too low for a robot is an obstacle."""
+"""What a robot passes under: ceilings, bars and crowns are no ground, and what is too low for it is an obstacle."""
 
 from dataclasses import replace
 

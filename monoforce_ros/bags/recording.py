@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags.builders import Message
+from monoforce_ros.bags.command_timeout import TIMEOUT, expired
 from monoforce_ros.bags.joint_record import JointRecord
 from monoforce_ros.bags.open_bags import opened
 from monoforce_ros.bags.reader import BagError, BagMessage, BagReader
@@ -575,21 +576,29 @@ class _Collector:
                 )
         self.twists.sort(key=lambda entry: entry[0])
         cloud_topic = self.chosen["cloud"] or ""
+        motion = MotionTrack(
+            stamps=stamps,
+            positions=np.array([s.position for s in states]),
+            quaternions=Rotation.from_matrix(np.array([s.rotation for s in states])).as_quat(),
+            linear_velocities=np.array([s.linear_velocity for s in states]),
+            angular_velocities=np.array([s.angular_velocity for s in states]),
+            frame_id=self.frames[0],
+            child_frame_id=self.frames[1],
+        )
+        commands = CommandTrack(
+            stamps=np.array([stamp for stamp, _ in self.twists], np.int64),
+            twists=np.array([twist for _, twist in self.twists]).reshape(-1, 3 if self._crabs else 2),
+        )
+        commands, count = expired(commands, motion)
+        if count:
+            self.choices.append(
+                f"{self.chosen['commands']}: the base stops when commands fall silent; {count} commands before a "
+                f"silence expire after {TIMEOUT:g} s instead of being held"
+            )
         return Recording(
             path=self.bag.path,
-            motion=MotionTrack(
-                stamps=stamps,
-                positions=np.array([s.position for s in states]),
-                quaternions=Rotation.from_matrix(np.array([s.rotation for s in states])).as_quat(),
-                linear_velocities=np.array([s.linear_velocity for s in states]),
-                angular_velocities=np.array([s.angular_velocity for s in states]),
-                frame_id=self.frames[0],
-                child_frame_id=self.frames[1],
-            ),
-            commands=CommandTrack(
-                stamps=np.array([stamp for stamp, _ in self.twists], np.int64),
-                twists=np.array([twist for _, twist in self.twists]).reshape(-1, 3 if self._crabs else 2),
-            ),
+            motion=motion,
+            commands=commands,
             clouds=tuple(sorted(self.indexed.get(cloud_topic, ()), key=lambda frame: frame.stamp)),
             images={
                 topic: tuple(sorted(self.indexed.get(topic, ()), key=lambda frame: frame.stamp))

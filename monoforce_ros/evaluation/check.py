@@ -24,6 +24,7 @@ from monoforce_ros.core import NANOSECOND, MotionTrack
 from monoforce_ros.discrepancy import choose_ground, command_delay, motion_faults
 from monoforce_ros.evaluation.findings import Finding, Level, missing, note, ok, warning
 from monoforce_ros.evaluation.topic_check import IMU, TopicCheck
+from monoforce_ros.evaluation.twist_check import twist_fault
 from monoforce_ros.robots import RobotModel
 
 _FASTEST_TURN = 2.0 * np.pi
@@ -188,19 +189,8 @@ def _motion_findings(recording: Recording, smoothed: SmoothedMotion, span: float
         yield warning(f"the odometry jumps or pauses {len(smoothed.stretches) - 1} times")
     if distance < 2.0 or moving * span < 5.0:
         yield warning("the robot hardly moves: too little motion for training or comparison")
-    if len(motion) > 20:
-        yield from _twist_findings(motion.linear_velocities[:, 0], speeds)
-
-
-def _twist_findings(stated: np.ndarray, smoothed: np.ndarray) -> Iterator[Finding]:
-    """Compare the forward speeds in odometry messages with those of the smoothed poses, each ``[n]`` [m/s]."""
-    moving = np.abs(smoothed) > 0.1
-    if moving.sum() <= 20:
-        return
-    if np.abs(stated[moving]).max() < 1e-6:
-        yield note("the odometry's twists are zero; velocities are taken from the smoothed poses")
-    elif np.median(np.sign(stated[moving]) * np.sign(smoothed[moving])) < 0:
-        yield warning("the odometry's speed has the opposite sign of its poses' motion: wrong frame of the twist?")
+    if len(motion) > 20 and (fault := twist_fault(motion, smoothed.motion)):
+        yield warning(f"{fault}; offline, velocities are taken from the smoothed poses, but the node needs them")
 
 
 def _command_findings(

@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from monoforce_ros.bags import MAXIMUM_GAP, Recording, flippers_at, observe
+from monoforce_ros.bags import MAXIMUM_GAP, Recording, flippers_at, observe, smooth
 from monoforce_ros.core import MotionState, StaleDataError, transform_points
 from monoforce_ros.effects import corrected_commands, corrected_motion
 from monoforce_ros.evaluation.metrics import Poses, Summary, position_errors, rotation_errors, summarise
+from monoforce_ros.evaluation.twist_check import with_usable_twists
 from monoforce_ros.messages import MessageError
 from monoforce_ros.perception import FlatTerrain, Observation, TrustedTerrain
 from monoforce_ros.prediction import JointMotion, Prediction, Predictor
@@ -103,11 +104,13 @@ def evaluate_recording(
         EvaluationError: sensor data or commands are missing, or no window has enough odometry after it.
     """
     recording = corrected_recording(recording, predictor.robot)
+    motion, fault = with_usable_twists(recording.motion, smooth(recording.motion).motion)
+    recording = replace(recording, motion=motion)
     sensors = predictor.source.sensors
     stamps = _window_stamps(recording, sensors, image_topics, stride, minimum_duration or min(horizons))
     count = round(max(horizons) / SAMPLE_TIME) + 1
     times = np.arange(count) * SAMPLE_TIME
-    remarks: list[str] = []
+    remarks: list[str] = [fault] if fault else []
     motions: list[MotionState] = []
     terrains: list[TerrainMap] = []
     collected: dict[str, list[Poses]] = {
@@ -187,6 +190,7 @@ def evaluate_recording(
 def predict_at(recording: Recording, predictor: Predictor, stamp: int, image_topics: Sequence[str] = ()) -> Prediction:
     """A prediction with contact forces from the data at ``stamp`` [ns], under the commands recorded after it."""
     recording = corrected_recording(recording, predictor.robot)
+    recording = replace(recording, motion=with_usable_twists(recording.motion, smooth(recording.motion).motion)[0])
     return predictor.predict(
         observe(recording, predictor.robot, stamp, predictor.source.sensors, image_topics),
         recording.motion.at(stamp, maximum_gap=MAXIMUM_GAP),
@@ -236,12 +240,13 @@ def measured_poses(recording: Recording, motions: list[MotionState], times: np.n
 
 
 def constant_velocity(motion: MotionState, times: np.ndarray) -> Poses:
-    """Baseline: the forward speed and yaw rate of the start are held, as are its height, roll and pitch."""
-    speed, rate = motion.linear_velocity[0], motion.angular_velocity[2]
+    """Baseline: the horizontal velocity and yaw rate of the start are held, as are its height, roll and pitch."""
+    (speed, sideways), rate = motion.linear_velocity[:2], motion.angular_velocity[2]
     angles = rate * times
     # ∫ cos(ωt) and ∫ sin(ωt) without dividing by ω, so that ω = 0 is no special case.
-    along = speed * times * np.sinc(angles / np.pi)
-    across = speed * times * np.sin(angles / 2) * np.sinc(angles / 2 / np.pi)
+    cosine = times * np.sinc(angles / np.pi)
+    sine = times * np.sin(angles / 2) * np.sinc(angles / 2 / np.pi)
+    along, across = speed * cosine - sideways * sine, speed * sine + sideways * cosine
     heading = motion.heading
     positions = motion.position + np.stack(
         [

@@ -22,6 +22,8 @@ _TURNING_RADIUS = 3.0
 """Of the commanded turn of a robot that cannot turn on the spot, in lengths of its wheelbase."""
 _DRIFT, _LEAN, _WEIGHT = 5e-3, 8.0, 0.03
 """Largest motion at rest [m/s], largest inclination at rest [°], and relative error of the carried weight."""
+_SUNK, _USUALLY_SUNK = 0.15, 0.05
+"""Depth over the wheels' radius that is no longer firm ground; that of most shipped robots (a Husky: 6 of 165 mm)."""
 _COVERED, _SIDEWAYS, _HEADING = 0.75, 0.05, 2.0
 """Least share of the commanded distance, largest lateral share, largest change of heading [°] when driving straight."""
 _TURNED = 0.15
@@ -90,7 +92,31 @@ def _stands(robot: RobotModel, run: Rollout) -> Finding:
     )
     if lean > _LEAN:
         text += "; does it tip over, or are wheels at different heights?"
-    return Finding("stands still", drift < _DRIFT and lean < _LEAN and abs(carried / weight - 1) < _WEIGHT, text)
+    depth, most = _sunk(robot, run), _SUNK * (robot.wheel_radius or math.inf)
+    text += f", sinks {1000 * depth:.0f} mm"
+    if depth > most:
+        softness = max(0.1, float(f"{_usual_softness(robot, depth):.2g}"))
+        text += (
+            f", more than {100 * _SUNK:.0f} % of its wheels' radius: its wheels are too narrow for its mass on firm "
+            f"soil; on hard ground add effects: [{{name: terrain_softness, parameters: {{factor: {softness:g}}}}}] to "
+            "its file, or commission it"
+        )
+    stands = drift < _DRIFT and lean < _LEAN and abs(carried / weight - 1) < _WEIGHT and depth <= most
+    return Finding("stands still", stands, text)
+
+
+def _sunk(robot: RobotModel, run: Rollout) -> float:
+    """How far a robot at rest stands lower than on ground that does not yield [m]."""
+    return robot.ground_clearance - float(run.position[0, -1, 2])
+
+
+def _usual_softness(robot: RobotModel, depth: float) -> float:
+    """Factor on the ground's softness with which the wheels sink by :data:`_USUALLY_SUNK` of their radius.
+
+    A wheel's contact patch grows with the root of the depth, so that its load grows with the power 1.5 of it.
+    """
+    assert robot.wheel_radius is not None
+    return (_USUALLY_SUNK * robot.wheel_radius / depth) ** 1.5
 
 
 def _straight(run: Rollout, speed: float) -> Finding:

@@ -278,6 +278,7 @@ class _Finder:
                     candidates.append((joint, shape))
                 elif self.description.links[joint.child].without_meshes:
                     self.shapeless.append(joint.child)
+        candidates = self._on_the_ground(candidates)
         inner = {joint.child for joint, _ in candidates}
         # What carries another wheel is a rocker, not a wheel.
         return [
@@ -285,6 +286,25 @@ class _Finder:
             for joint, shape in candidates
             if not any(link in inner for link in list(self.description.subtree(joint.child))[1:])
         ]
+
+    def _on_the_ground(self, candidates: list[tuple[Joint, WheelShape]]) -> list[tuple[Joint, WheelShape]]:
+        """Those that reach down to about where the lowest one does: arms and tilting sensors turn about such axes, too.
+
+        What hangs higher by more than the smallest radius is no wheel, unless a hint says so.
+        """
+        bottoms = [float(shape.centre[2]) - shape.radius for _, shape in candidates]
+        ground, smallest = min(bottoms, default=0.0), min((shape.radius for _, shape in candidates), default=0.0)
+        kept = []
+        for (joint, shape), bottom in zip(candidates, bottoms, strict=True):
+            hinted = self.hint(joint, joint.child) in ("wheel", "free_wheel")
+            if hinted or bottom - ground <= smallest:
+                kept.append((joint, shape))
+            else:
+                self.notes.append(
+                    f"joint {joint.name} turns about a lateral axis, but {joint.child} hangs {bottom - ground:.2f} m "
+                    f"above the wheels' ground: it is part of the body; --hint {joint.name}=wheel makes it a wheel"
+                )
+        return kept
 
     def _wheel(self, name: str, joint: Joint, shape: WheelShape) -> WheelPart:
         part = WheelPart(
@@ -324,13 +344,21 @@ class _Finder:
         used = list(flippers)
         for wheel in wheels:
             used += [joint for joint in (wheel.joint, wheel.steering) if joint is not None]
+        sides = {wheel.joint.name: wheel.shape.centre[1] > 0 for wheel in wheels}
         for joint in used:
-            if joint.mimics is not None:
-                raise UrdfError(
-                    f"{self.description.path}: joint {joint.name} mimics {joint.mimics}: joints that follow others "
-                    f"are not supported; remove the mimic tag (the drive's kinematics couple the wheels), or pass "
-                    f"--hint {joint.name}=fixed"
+            if joint.mimics is None:
+                continue
+            if joint.name in sides and sides.get(joint.mimics) == sides[joint.name]:
+                self.notes.append(
+                    f"wheel {joint.name} turns as {joint.mimics} does: all wheels of a side have one speed anyway"
                 )
+                continue
+            fixed = "" if joint.name in sides else f", or pass --hint {joint.name}=fixed"
+            raise UrdfError(
+                f"{self.description.path}: joint {joint.name} mimics {joint.mimics}: joints that follow others "
+                f"are not supported, except wheels that follow one of their side; remove the mimic tag (the drive's "
+                f"kinematics couple the wheels){fixed}"
+            )
 
     def _merged_twins(self, wheels: tuple[WheelPart, ...]) -> tuple[WheelPart, ...]:
         """Wheels with those that run beside each other on one swivel joined: twin casters stand on one strip."""

@@ -7,6 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
+from monoforce_ros.robots.urdf.description import Joint
 from monoforce_ros.robots.urdf.geometry import Frames, WheelShape
 from monoforce_ros.robots.urdf.parts import WheelPart
 from monoforce_ros.robots.urdf.shapes import Shape
@@ -43,8 +44,15 @@ def find_supports(
         shapes = list(frames.shapes([link]))
         joint = frames.description.parent_joint(link)
         hint = hints.get(link) or hints.get("" if joint is None else joint.name)
-        if not shapes or joint is None or (hint is not None and hint != "caster"):
+        if not shapes or (hint is not None and hint != "caster"):
             continue
+        if joint is None:
+            # Tutorial robots have the ball of their caster in the root link itself.
+            joint = Joint(
+                f"{link}_support", "fixed", link, link, np.eye(4), np.array([0.0, 0.0, 1.0]), None, None, None
+            )
+            shapes = [entry for entry in shapes if entry[1].kind == "sphere"]
+            hint = None
         named = bool(_NAMED.search(link) or _NAMED.search(joint.name))
         groups = [shapes] if named or hint else [[entry] for entry in shapes if entry[1].kind == "sphere"]
         for number, group in enumerate(groups):
