@@ -467,11 +467,14 @@ def test_lidars_are_known_by_their_usual_names_and_their_absence_is_said(tmp_pat
 
 
 def test_a_ball_of_the_root_link_itself_is_a_caster(tmp_path):
-    ball = '<collision><origin xyz="-0.12 0 -0.07"/><geometry><sphere radius="0.03"/></geometry></collision>'
+    balls = "".join(
+        f'<collision><origin xyz="{x} 0 -0.07"/><geometry><sphere radius="0.03"/></geometry></collision>'
+        for x in (-0.12, 0.12)
+    )
     base, *wheels = small_robot()
-    path = robot(tmp_path, base.replace("</link>", f"{ball}</link>"), *wheels)
+    path = robot(tmp_path, base.replace("</link>", f"{balls}</link>"), *wheels)
     found = convert(path)
-    assert len(found.content["casters"]) == 1 and found.content["drive"]["kind"] == "differential"
+    assert len(found.content["casters"]) == 2 and found.content["drive"]["kind"] == "differential"
     place = next(entry for entry in found.content["wheels"] if entry["drive"] is None)
     np.testing.assert_allclose(place["centre"], [-0.12, 0.0, -0.07], atol=1e-5)
     assert imported(path, tmp_path)[0] == 0

@@ -387,12 +387,12 @@ class _Collector:
                 return
             decoded = message.decode()
             header = decoding.stamp_of(decoded)
-            if message.message_type in (CAMERA_INFO, TRANSFORMS):
-                stamp = header or message.received
-            elif message.message_type in (*IMAGES, CLOUD):
+            if message.message_type in (*IMAGES, CLOUD):
                 self._index(message, header)
                 return
-            elif (stamp := self._time(message, header)) is None:
+            timeless = message.message_type in (CAMERA_INFO, TRANSFORMS)
+            stamp = header or message.received if timeless else self._time(message, header)
+            if stamp is None:
                 return
             if message.topic == self.chosen["odometry"]:
                 state, frame_id, child_frame_id = decoding.decode_odometry(decoded)

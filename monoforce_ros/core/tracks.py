@@ -45,8 +45,8 @@ class MotionState:
         return float(np.spacing(np.float32(np.abs(self.position).max())))
 
     def onwards(self, seconds: float) -> MotionState:
-        """The state extrapolated at constant velocities in base axes, stamp unchanged; itself if ``seconds`` ≤ 0."""
-        if seconds <= 0.0:
+        """The state extrapolated at constant velocities in base axes, also backwards; stamp unchanged."""
+        if not seconds:
             return self
         turn = Rotation.from_rotvec(self.angular_velocity * seconds).as_matrix()
         half = Rotation.from_rotvec(self.angular_velocity * (0.5 * seconds)).as_matrix()
@@ -123,13 +123,16 @@ class MotionTrack:
         if after == before:  # before the first or after the last measurement
             gap = abs(int(self.stamps[after]) - stamp) * NANOSECOND
             self._refuse_gap(gap, maximum_gap)
-            return self._state(after, stamp).onwards((stamp - int(self.stamps[after])) * NANOSECOND)
+            # Before the first measurement it may have stood.
+            return self._state(after, stamp).onwards(max(0.0, (stamp - int(self.stamps[after])) * NANOSECOND))
         span = int(self.stamps[after] - self.stamps[before])
         gaps = (stamp - int(self.stamps[before])) * NANOSECOND, (int(self.stamps[after]) - stamp) * NANOSECOND
         if min(gaps) > maximum_gap:
             self._refuse_gap(min(gaps), maximum_gap)
         if max(gaps) > maximum_gap:
-            return self._state(before if gaps[0] < gaps[1] else after, stamp)
+            # Beside a pause the robot goes on moving: held, a pose at a tenth of a second would be centimetres off.
+            near, elapsed = (before, gaps[0]) if gaps[0] < gaps[1] else (after, -gaps[1])
+            return self._state(near, stamp).onwards(elapsed)
         fraction = (stamp - int(self.stamps[before])) / span
 
         def blend(values: np.ndarray) -> np.ndarray:

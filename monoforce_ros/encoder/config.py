@@ -83,11 +83,20 @@ class EncoderConfig:
             ("depth_maximum", 0.5, 500.0),
             ("image_features", 1, 512),
             ("map_features", 8, 512),
+            ("lowest", -100.0, -0.1),
+            ("highest", 0.1, 100.0),
+            ("stiffness", 1.0, 1e12),
+            ("damping", 0.0, 1e12),
+            ("friction", 0.0, 10.0),
             ("geometric_spread_factor", 0.01, 100.0),
             ("decrease_spread_factor", 0.01, 100.0),
         ):
             value = getattr(self, name)
-            if not isinstance(value, int | float) or isinstance(value, bool) or not low <= value <= high:
+            whole = isinstance(low, int)
+            if not isinstance(value, int if whole else int | float) or isinstance(value, bool):
+                kind = "a whole number" if whole else "a number"
+                raise ValueError(f"encoder {name}: got {value!r}, expected {kind} from {low} to {high}")
+            if not low <= value <= high:
                 raise ValueError(f"encoder {name}: got {value!r}, expected {low} to {high}")
         if self.sweep_channels not in (HEIGHT_CHANNELS, SCATTER_CHANNELS, SWEEP_CHANNELS):
             raise ValueError(

@@ -104,8 +104,8 @@ def evaluate_recording(
         EvaluationError: sensor data or commands are missing, or no window has enough odometry after it.
     """
     recording = corrected_recording(recording, predictor.robot)
-    motion, fault = with_usable_twists(recording.motion, smooth(recording.motion).motion)
-    recording = replace(recording, motion=motion)
+    usable, fault = with_usable_twists(recording.motion, smooth(recording.motion).motion)
+    recording = replace(recording, motion=usable)
     sensors = predictor.source.sensors
     stamps = _window_stamps(recording, sensors, image_topics, stride, minimum_duration or min(horizons))
     count = round(max(horizons) / SAMPLE_TIME) + 1

@@ -134,8 +134,8 @@ def _with_low_overhead(terrain: TerrainMap, sweep: np.ndarray, headroom: float) 
     if not bool(low.any()):
         return terrain
     raised = torch.from_numpy(heights).to(terrain.height)
-    surfaces = {name: torch.where(low, raised, getattr(terrain, name)) for name in ("height", "geometric_height")}
-    return replace(terrain, **surfaces)
+    height, surface = (torch.where(low, raised, values) for values in (terrain.height, terrain.geometric_height))
+    return replace(terrain, height=height, geometric_height=surface)
 
 
 def _measured_cells(sweep: np.ndarray, ground: float, config: EncoderConfig) -> int:

@@ -411,8 +411,8 @@ def blended(fallback: TerrainMap, predicted: TerrainMap, share: float, spread_fa
             changed[name] = torch.lerp(getattr(fallback, name), getattr(predicted, name), share)
         for name in ("stiffness", "damping", "friction"):
             # The defaults of damping and friction may be 0.
-            ends = (getattr(end, name).clamp_min(_LEAST_MATERIAL).log() for end in (fallback, predicted))
-            changed[name] = torch.lerp(*ends, share).exp()
+            start, end = (getattr(terrain, name).clamp_min(_LEAST_MATERIAL).log() for terrain in (fallback, predicted))
+            changed[name] = torch.lerp(start, end, share).exp()
     apart = {
         "geometric_spread": predicted.geometric_height - fallback.geometric_height,
         "decrease_spread": _decrease(predicted) - _decrease(fallback),

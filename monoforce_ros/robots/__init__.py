@@ -2,6 +2,7 @@
 
 from monoforce_ros.robots.checks import RobotFileError
 from monoforce_ros.robots.controls import Controls
+from monoforce_ros.robots.digest import robot_digest
 from monoforce_ros.robots.joint import Coordinate, Joint
 from monoforce_ros.robots.kinematics import SteeredDrive
 from monoforce_ros.robots.loader import load_robot, robot_file, shipped_robots
@@ -39,6 +40,7 @@ __all__ = [
     "read_commissioning",
     "read_description",
     "read_nominal_residual",
+    "robot_digest",
     "robot_file",
     "servo_response",
     "shipped_robots",

@@ -14,6 +14,7 @@ from monoforce_ros.robots import RobotModel
 from monoforce_ros.training.judgement import CAMERAS, SWEEP, Judgement, judge
 from monoforce_ros.training.losses import LossWeights
 from monoforce_ros.training.recording_samples import RecordingSamples, SamplesError
+from monoforce_ros.training.sample_extraction import TARGET_REACH
 from monoforce_ros.training.samples import Augmentation
 from monoforce_ros.training.trainer import Process, Trainer, TrainingSettings
 
@@ -84,7 +85,10 @@ def split_recording(recording: RecordingSamples) -> tuple[RecordingSamples, Reco
     """
     first, last = int(recording.stamps[0]), int(recording.stamps[-1])
     border = last - HELD_OUT_SHARE * (last - first)
-    training = np.flatnonzero(recording.stamps <= border - GAP * 1e9)
+    early = recording.stamps <= border - GAP * 1e9
+    apart = early & (_measured_until(recording) <= border)
+    # Of a recording of a few targets none would be left.
+    training = np.flatnonzero(apart if apart.any() else early)
     held_out = np.flatnonzero(recording.stamps > border)
     if not len(training) or not len(held_out):
         raise SamplesError(
@@ -92,6 +96,18 @@ def split_recording(recording: RecordingSamples) -> tuple[RecordingSamples, Reco
             f"{GAP / (1 - HELD_OUT_SHARE) + 1:.0f} s: a quarter is held out to judge the result"
         )
     return recording.subset(training.tolist()), recording.subset(held_out.tolist())
+
+
+def shares_targets(training: RecordingSamples, held_out: RecordingSamples) -> bool:
+    """Whether targets of the training part were partly measured in the held-out part, as of recordings below 30 s."""
+    return bool((_measured_until(training) > held_out.stamps[0]).any())
+
+
+def _measured_until(recording: RecordingSamples) -> np.ndarray:
+    """Up to when each sample's target may have been measured ``[n]`` [ns]: by later sweeps, and by the wheels."""
+    firsts = {segment: int(recording.stamps[recording.segment_of == segment].min())
+              for segment in set(recording.segment_of.tolist())}  # fmt: skip
+    return np.array([firsts[segment] + round(TARGET_REACH * 1e9) for segment in recording.segment_of.tolist()])
 
 
 def adapt(

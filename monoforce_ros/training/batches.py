@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -25,6 +26,7 @@ class Batches(Dataset):
         size: samples per step and process.
         seed: of the order and of the augmentation.
         augment: whether to augment samples.
+        mirror: whether augmented scenes may be mirrored; a robot that is not its own mirror image moves otherwise.
         sensor_shares: see :meth:`monoforce_ros.training.samples.Augmentation.draw`.
         rank, count: number of this process, and of processes that train together.
     """
@@ -37,24 +39,31 @@ class Batches(Dataset):
         size: int,
         seed: int,
         augment: bool = True,
+        mirror: bool = True,
         sensor_shares: Sequence[float] | None = None,
         rank: int = 0,
         count: int = 1,
     ):
         self.recordings, self.config = list(recordings), config
         self.size, self.seed, self.augment, self.sensor_shares = size, seed, augment, sensor_shares
-        self.rank, self.count = rank, count
+        self.mirror, self.rank, self.count = mirror, rank, count
         self.index = [(r, i) for r, recording in enumerate(self.recordings) for i in range(len(recording))]
 
     def __getitem__(self, step: int) -> tuple[EncoderInput, Targets]:
         total, first = self.size * self.count, self.rank * self.size
         random = np.random.default_rng([self.seed, step])
-        epoch, start = divmod(step * total, len(self.index))
-        order = np.random.default_rng([self.seed, 7, epoch]).permutation(len(self.index))
-        chosen = np.take(order, range(start + first, start + first + self.size), mode="wrap")
+        # A batch that an epoch ends in goes on with the next one: every sample is used as often as the others.
+        places = [divmod(step * total + first + number, len(self.index)) for number in range(self.size)]
+        orders = {
+            epoch: np.random.default_rng([self.seed, 7, epoch]).permutation(len(self.index))
+            for epoch in {epoch for epoch, _ in places}
+        }
+        chosen = [int(orders[epoch][place]) for epoch, place in places]
         drawn = [
             Augmentation.draw(random, self.sensor_shares) if self.augment else Augmentation() for _ in range(total)
         ]
+        if not self.mirror:
+            drawn = [replace(augmentation, mirrored=False) for augmentation in drawn]
         samples = [
             sample(self.recordings[self.index[i][0]], self.index[i][1], self.config, augmentation)
             for i, augmentation in zip(chosen, drawn[first:], strict=False)

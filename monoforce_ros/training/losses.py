@@ -77,7 +77,11 @@ def geometric_loss(
     """
     measured = _clamped(targets.geometric, ground)
     weight = targets.observed * _view_weight(maps) * (1.0 + prominence * _prominence(targets, ground))
-    return _huber(maps.geometric_height, measured, weight)
+    # What is measured beyond a limit must be predicted beyond it, no matter how far.
+    low, high = (ground[:, None, None] + limit for limit in (LOWEST, HIGHEST))
+    predicted = torch.where(targets.geometric > high, torch.minimum(maps.geometric_height, high), maps.geometric_height)
+    predicted = torch.where(targets.geometric < low, torch.maximum(predicted, low), predicted)
+    return _huber(predicted, measured, weight)
 
 
 def terrain_loss(

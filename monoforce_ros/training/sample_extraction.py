@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,8 +17,9 @@ from monoforce_ros.bags import DETECTED, BagError, ReadOptions, Recording, cut_w
 from monoforce_ros.core import CommandTrack, MotionTrack, StaleDataError, nearest_stamp, transform_points
 from monoforce_ros.effects import corrected_commands, corrected_motion
 from monoforce_ros.encoder import EncoderConfig, network_image
+from monoforce_ros.messages import MessageError
 from monoforce_ros.perception import support_points, traced_ground
-from monoforce_ros.robots import RobotModel
+from monoforce_ros.robots import RobotModel, robot_digest
 from monoforce_ros.terrain import TerrainError
 from monoforce_ros.training.recording_samples import (
     CHUNK,
@@ -35,6 +37,10 @@ _LENGTH, _STRIDE = 10.0, 5.0
 """Length of the trajectories to which terrain is fitted (paper IV-A), and interval between their starts [s]."""
 _SWEEPS_BEFORE, _SWEEPS_AFTER = 2.0, 2.0
 """Sweeps this long before and after a trajectory belong to its map too [s]."""
+TARGET_REACH = _LENGTH + _SWEEPS_AFTER
+"""How long after the first sample of a segment its target may have been measured [s], at most."""
+_FEWEST_MATCHED = 0.5
+"""Share of the images of the first topic to which another topic must have one of about the same time."""
 _MATCH = 0.1
 """Largest difference between stamps of images that belong to one sample [s]."""
 _TRACE_STEP, _TRACE_POSES = 0.1, 3000
@@ -102,6 +108,8 @@ def _samples(
             f"{bag}: no images with a CameraInfo on {unknown or 'any topic'}; images are on "
             f"{sorted(recording.images)}, CameraInfo is available for {sorted(recording.cameras)}"
         )
+    if not image_topics:
+        topics = _usable_topics(recording, topics)
     if not len(recording.commands):
         raise SamplesError(f"{bag}: no commands (Twist or TwistStamped), which the physics needs")
     smoothed = smooth(corrected_motion(recording.motion, robot.effects))
@@ -129,6 +137,38 @@ def _samples(
         file=None,
         **arrays,
     )
+
+
+def _usable_topics(recording: Recording, topics: Sequence[str]) -> tuple[str, ...]:
+    """Those image topics that can be decoded and have images of about the same times.
+
+    A sample has an image of each camera: one more that is slow, died early or holds depths would cost nearly all.
+
+    Raises:
+        SamplesError: none of them can be decoded.
+    """
+    reasons: dict[str, str] = {}
+    for topic in topics:
+        try:
+            recording.image(recording.images[topic][0])
+        except (MessageError, IndexError, ValueError) as error:
+            reasons[topic] = str(error) or "no image"
+    decoded = [topic for topic in topics if topic not in reasons]
+    if not decoded:
+        raise SamplesError(f"{recording.path}: no usable image: {'; '.join(f'{t}: {r}' for t, r in reasons.items())}")
+    stamps = {topic: np.array([frame.stamp for frame in recording.images[topic]], np.int64) for topic in decoded}
+    first = max(decoded, key=lambda topic: len(stamps[topic]))
+    kept = []
+    for topic in decoded:
+        matched = [nearest_stamp(stamps[topic], stamp, limit=_MATCH) is not None for stamp in stamps[first].tolist()]
+        share = float(np.mean(matched))
+        if share < _FEWEST_MATCHED:
+            reasons[topic] = f"images at {share:.0%} of the times of {first}"
+        else:
+            kept.append(topic)
+    for topic, reason in reasons.items():
+        print(f"{recording.path}: {topic} is left out: {reason}; --images chooses topics", file=sys.stderr)
+    return (first, *(topic for topic in kept if topic != first))
 
 
 def _segments(
@@ -283,7 +323,6 @@ def _fingerprint(
     if not bag.exists():
         raise BagError(f"{bag} does not exist")
     content = [SAMPLES_VERSION, [(p.name, p.stat().st_size, p.stat().st_mtime_ns) for p in files], robot.name]
-    shape = hashlib.sha256(robot.points.numpy().tobytes()).hexdigest()
-    content += [shape, robot.mass, robot.effects, asdict(settings), list(image_topics)]
-    content += [config.image_width, config.image_height]
+    content += [robot_digest(robot), asdict(settings), list(image_topics)]
+    content += [config.image_width, config.image_height, config.stiffness]
     return hashlib.sha256(json.dumps(content, default=str).encode()).hexdigest()

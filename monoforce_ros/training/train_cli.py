@@ -40,6 +40,7 @@ from monoforce_ros.training.adaptation import (
     adapt,
     compare,
     keep_obstacles,
+    shares_targets,
     split_recording,
 )
 from monoforce_ros.training.batches import use_one_thread
@@ -196,7 +197,7 @@ def build_parser() -> OptionParser:
                         "camera or ring of any sample. To compare with encoders of one sensor; such an encoder does "
                         "not expect that a sensor fails")  # fmt: skip
     parser.add_argument("--precision", choices=("auto", "float32", "bfloat16"), default="auto", help="(default: "
-                        "bfloat16 on CUDA)")  # fmt: skip
+                        "bfloat16 on CUDA, and on CPUs that multiply it)")  # fmt: skip
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="(default: CUDA if "
                         "available)")  # fmt: skip
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="bags from which samples are extracted, "
@@ -225,6 +226,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
     elif options.all_sensors:
         parser.refuse_without_effect(options, ("sensor_shares",), "with --all-sensors")
+    if options.adapt:
+        if not options.bags:
+            parser.error("--adapt: got no bag, expected some of the robot's own")
+        known = tuple(name for name in _NOT_FOR_ADAPTING if hasattr(options, name))
+        parser.refuse_without_effect(options, known, "with --adapt: the encoder that is adapted decides it")
     if options.samples_only and options.samples is None and options.out is None:
         parser.error("--samples-only: expected a folder with --samples, or --out")
     if options.out is None and not options.samples_only:
@@ -239,12 +245,30 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"train: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print(f"train: interrupted; the same command resumes from {options.out / 'state'}", file=sys.stderr)
+        print(f"train: interrupted{_what_is_kept(options)}", file=sys.stderr)
         return 130
     finally:
         if process is not None:
             process.close()
     return 0
+
+
+def _what_is_kept(options: argparse.Namespace) -> str:
+    """What the same command does after an interruption."""
+    if options.samples_only:
+        return "; the same command goes on with the samples that are missing"
+    if options.adapt:
+        return "; the same command adapts anew, with the samples that are there"
+    if not state_file(options.out).is_file():
+        return "; nothing was trained yet"
+    return f"; the same command resumes from {options.out / 'state'}"
+
+
+_NOT_FOR_ADAPTING = (
+    "held_out", "size", "losses", "relative_bins", "sensor", "no_depth", "places", "no_augmentation", "train_backbone",
+    "depth_steps", "depth_variants", "edges", "map_size", "resolution", "samples_only", "validate_every", "save_every",
+    "geometric", "prominence", "no_vegetation", "backbone_weights",
+)  # fmt: skip
 
 
 def _train(options: argparse.Namespace, process: Process) -> None:
@@ -260,7 +284,8 @@ def _train(options: argparse.Namespace, process: Process) -> None:
     config, settings = _config(options, start), _settings(options)
     robot = load_robot(options.robot)
     held_out = list(options.held_out)
-    bags = [bag for bag in options.bags if bag not in held_out]
+    named = {bag.resolve() for bag in held_out}
+    bags = [bag for bag in options.bags if bag.resolve() not in named]
     if not held_out and len(bags) >= 4:
         held_out = bags[7::8] or bags[-1:]
         bags = [bag for bag in bags if bag not in held_out]
@@ -349,7 +374,19 @@ def _adapt(options: argparse.Namespace) -> None:
     encoder = load_encoder(options.start_from or "")
     robot = load_robot(options.robot)
     recordings = _samples(options.bags, robot, encoder.config, options, "samples")
-    parts = [split_recording(recording) for recording in recordings]
+    parts = []
+    for recording in recordings:
+        try:
+            parts.append(split_recording(recording))
+            if shares_targets(*parts[-1]):
+                print(
+                    f"{recording.name}: too short for a held-out part of its own; what it says of the result is partly "
+                    "of the training: adapt to a recording of 30 s or more", file=sys.stderr,
+                )  # fmt: skip
+        except SamplesError as error:
+            print(f"train: skipped: {error}", file=sys.stderr)
+    if not parts:
+        raise SamplesError(f"none of {len(recordings)} recordings is long enough to adapt to")
     count = options.worlds or REPLAY_WORLDS
     first = REPLAY_WORLD if options.world_seed == FIRST_WORLD else options.world_seed
     replay = _world_samples(range(first, first + count), encoder.config, options)
@@ -359,6 +396,8 @@ def _adapt(options: argparse.Namespace) -> None:
     )
     defaults = AdaptationSettings()
     given = options.steps != TrainingSettings.steps, options.rate != TrainingSettings.rate
+    if options.device == "cuda":
+        print("train: --adapt runs on the CPU", file=sys.stderr)
     settings = AdaptationSettings(
         steps=options.steps if given[0] else defaults.steps, batch=options.batch,
         rate=options.rate if given[1] else defaults.rate, seed=options.seed, precision=options.precision,
@@ -396,7 +435,8 @@ def _with_vegetation(
     file = options.out / "robot.yaml"
     if process.first and not file.is_file():
         found = fit_vegetation(training, robot, config)
-        bags = [bag for bag in options.bags if bag not in options.held_out]
+        named = {bag.resolve() for bag in options.held_out}
+        bags = [bag for bag in options.bags if bag.resolve() not in named]
         write_robot(options.robot, file, [found.effect] if found else [], bags, fingerprint(bags), found_by="train")
         if found:
             print(
@@ -439,6 +479,9 @@ def _config(options: argparse.Namespace, start: Encoder | None) -> EncoderConfig
         relative_bins=given.relative_bins if options.relative_bins is None else options.relative_bins,
         decreases=options.losses != ["geometric"],
         edges=options.losses != ["geometric"] if options.edges is None else options.edges,
+        # Without held-out recordings nothing calibrates them anew.
+        geometric_spread_factor=given.geometric_spread_factor,
+        decrease_spread_factor=given.decrease_spread_factor,
     )
 
 
@@ -522,7 +565,7 @@ def _extract(task: tuple) -> tuple[Path | None, str]:
     bag, robot, config, folder, settings, topics = task
     try:
         return extract_samples(bag, robot, config, folder, settings=settings, image_topics=topics), ""
-    except SamplesError as error:
+    except (SamplesError, BagError, ValueError) as error:
         return None, str(error)
 
 
@@ -533,7 +576,7 @@ class _Log:
         from torch.utils.tensorboard import SummaryWriter
 
         self.trainer, self.logged = trainer, len(trainer.history)
-        self.writer = SummaryWriter(str(out / "log"), purge_step=trainer.step) if trainer.process.first else None
+        self.writer = SummaryWriter(str(out / "log"), purge_step=trainer.step + 1) if trainer.process.first else None
         self.bar = progress_bar(steps, initial=trainer.step, label="training", unit="step", quiet=quiet)
         # tqdm prints nothing without a terminal; log twenty lines instead.
         self.steps, self.lines = steps, 0 if quiet or sys.stderr.isatty() else max(1, steps // 20)

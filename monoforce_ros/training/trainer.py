@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -23,7 +24,7 @@ from monoforce_ros.encoder import (
     save_encoder,
 )
 from monoforce_ros.physics import PhysicsOptions
-from monoforce_ros.robots import RobotModel
+from monoforce_ros.robots import RobotModel, robot_digest
 from monoforce_ros.training.batches import Batches
 from monoforce_ros.training.judgement import BOTH, CAMERAS, SWEEP
 from monoforce_ros.training.losses import (
@@ -214,7 +215,7 @@ class Trainer:
         self.batches = Batches(
             recordings, encoder.config, size=settings.batch, seed=settings.seed, augment=settings.augment,
             sensor_shares=settings.sensor_shares if encoder.config.sensor == "camera_lidar" else None,
-            rank=process.rank, count=process.count,
+            rank=process.rank, count=process.count, mirror=not settings.weights.trajectory or is_symmetric(robot),
         )  # fmt: skip
         if not self.batches.index:
             raise TrainingError("no samples to train on")
@@ -235,6 +236,8 @@ class Trainer:
             {"params": [p for p in self.encoder.parameters() if p not in pretrained], "lr": settings.rate},
         ]
         self.optimiser = torch.optim.AdamW(groups, weight_decay=1e-2)
+        self.data = _fingerprint(robot, recordings, held_out)
+        """Of the samples and the robot: a training goes on with its own only."""
         self.step = 0
         self.best = float("inf")
         self.history: list[tuple[int, Validation]] = []
@@ -277,7 +280,13 @@ class Trainer:
         with self._cast():
             losses = self.losses(batch, targets)
         total = losses["total"]
-        if torch.isfinite(total.detach()):
+        finite = torch.isfinite(total.detach())
+        if self.process.count > 1:
+            # All processes or none: who waits for the gradients of one that has none waits for ever.
+            flag = finite.to(torch.int32)
+            torch.distributed.all_reduce(flag, op=torch.distributed.ReduceOp.MIN)
+            finite = flag > 0
+        if finite:
             total.backward()
             norm = nn.utils.clip_grad_norm_(self.encoder.parameters(), 2.0)
             # A single rollout in which the robot tumbles must not corrupt the weights.
@@ -310,7 +319,7 @@ class Trainer:
         """Save weights, the optimiser's moments and the step, from which :meth:`resume` continues."""
         description = {
             "step": self.step, "best": self.best, "history": self.described_history, "settings": asdict(self.settings),
-            "config": asdict(self.encoder.config), "written": time.time(),
+            "config": asdict(self.encoder.config), "written": time.time(), "data": self.data,
         }  # fmt: skip
         save_state(state_file(self.out), self.encoder, self.optimiser, description)
 
@@ -325,7 +334,7 @@ class Trainer:
         Raises:
             TrainingError: the state is damaged, or its network or settings differ.
         """
-        description = read_state(state_file(self.out), self.encoder, self.optimiser, asdict(self.settings))
+        description = read_state(state_file(self.out), self.encoder, self.optimiser, asdict(self.settings), self.data)
         if description is None:
             return False
         self.step, self.best = description["step"], description["best"]
@@ -333,6 +342,31 @@ class Trainer:
             (e["step"], Validation(e["geometric"], e["supporting"], e["loss"])) for e in description["history"]
         ]
         return True
+
+
+_LEANING = {"drive_asymmetry", "drive_loss"}
+"""Effects of one side."""
+_MIDDLE = 0.01
+"""How far the centre of mass of a robot may be beside its middle, and it still is its own mirror image [m]."""
+
+
+def is_symmetric(robot: RobotModel) -> bool:
+    """Whether a robot's mirror image moves as the robot does, mirrored."""
+    aside = any(
+        name in _LEANING or any(key == "y" and float(value) for key, value in values.items())
+        for name, values in robot.effects
+    )
+    return not aside and abs(float(robot.centre_of_mass[1])) < _MIDDLE
+
+
+def _fingerprint(robot: RobotModel, *parts: Sequence[RecordingSamples]) -> str:
+    content = hashlib.sha256(robot_digest(robot).encode())
+    for recordings in parts:
+        for recording in recordings:
+            content.update(recording.name.encode() + np.asarray(recording.stamps).tobytes())
+            content.update(np.asarray(recording.odometry_from_base).tobytes())
+        content.update(b"|")
+    return content.hexdigest()[:16]
 
 
 def _evenly(batch: EncoderInput, targets: Targets) -> tuple[EncoderInput, Targets]:
@@ -379,7 +413,8 @@ def validate(
             maps: EncodedMaps = encoder(batch)
             ground = batch.ground[:, None, None]
             measured = (targets.geometric - ground).clamp(LOWEST, HIGHEST) + ground
-            geometric.append((maps.geometric_height - measured).abs()[targets.observed & maps.covered].cpu())
+            predicted = (maps.geometric_height - ground).clamp(LOWEST, HIGHEST) + ground
+            geometric.append((predicted - measured).abs()[targets.observed & maps.covered].cpu())
             supporting.append((maps.height - targets.supporting).abs()[targets.contact_mask & maps.covered].cpu())
             losses.append(
                 float(terrain_loss(maps, targets, batch.ground) + geometric_loss(maps, targets, batch.ground))

@@ -40,7 +40,9 @@ def save_state(file: Path, encoder: Encoder, optimiser: torch.optim.Optimizer, d
         )  # fmt: skip
 
 
-def read_state(file: Path, encoder: Encoder, optimiser: torch.optim.Optimizer, settings: dict) -> dict | None:
+def read_state(
+    file: Path, encoder: Encoder, optimiser: torch.optim.Optimizer, settings: dict, data: str = ""
+) -> dict | None:
     """Load a state into an encoder and its optimiser.
 
     Args:
@@ -48,6 +50,7 @@ def read_state(file: Path, encoder: Encoder, optimiser: torch.optim.Optimizer, s
         encoder: receives the weights.
         optimiser: receives the moments.
         settings: that the state must have been saved with.
+        data: fingerprint of what is trained on, which must be that of the state.
 
     Returns:
         the description; None if there is no such file.
@@ -71,6 +74,9 @@ def read_state(file: Path, encoder: Encoder, optimiser: torch.optim.Optimizer, s
         config["sweep_channels"] = encoder.config.sweep_channels
     if config != asdict(encoder.config):
         different.append("network configuration")
+    # States of earlier releases do not say.
+    if data and description.get("data", data) != data:
+        different.append("samples or robot")
     if different:
         raise TrainingError(
             f"{file}: saved with different {', '.join(different)}; use the same options, or another --out"
