@@ -257,3 +257,50 @@ def test_twists_that_are_not_those_of_the_poses_are_named_and_replaced(kind, tex
     used, said = with_usable_twists(stated, true)
     np.testing.assert_allclose(used.linear_velocities, ahead, atol=1e-9)
     assert bool(said) == bool(text)
+
+
+def with_sensors(path, *, cloud_offset=0.0, optical=True, encoding="rgb8"):
+    """Twenty seconds with a lidar and a camera, whose stamps, frame or encoding may be wrong."""
+    mounted = np.eye(4)
+    mounted[:3, 3] = [0.3, 0.0, 0.4]
+    if optical:
+        mounted[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
+    frames = {"lidar": np.eye(4), "camera": mounted}
+    with BagWriter(path) as bag:
+        bag.write("/tf_static", builders.static_transforms(START, "base_link", frames), START)
+        for i in range(400):
+            at = START + i * 50_000_000
+            place = [0.02 * i, 0.0, 0.0]
+            bag.write(
+                "/odom", builders.odometry(at, "odom", "base_link", place, [0, 0, 0, 1], [0.4, 0, 0], [0] * 3), at
+            )
+            bag.write("/cmd_vel", builders.twist_stamped(at, "base_link", 0.4, 0.0), at)
+            if i % 10 == 0:
+                late = at + round(1e9 * cloud_offset)
+                bag.write("/points", builders.point_cloud(late, "lidar", np.full((30, 3), 2.0)), at)
+                image = builders.image(at, "camera", np.zeros((48, 64, 3), np.uint8))
+                image.encoding = encoding
+                bag.write("/cam/image_raw", image, at)
+                info = builders.camera_info(at, "camera", 64, 48, np.diag([50.0, 50, 1]), [0] * 5)
+                bag.write("/cam/camera_info", info, at)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("fault", "text"),
+    [
+        ({}, ""),
+        (
+            {"cloud_offset": 7200.0},
+            "0% of its messages have stamps within the odometry, the others are 7200 s after it",
+        ),
+        ({"optical": False}, "its frame camera looks up at the sky"),
+        ({"encoding": "rgb161"}, "the images cannot be used: image encoding: got 'rgb161'"),
+    ],
+)
+def test_sensors_that_cannot_be_used_are_not_called_ok(tmp_path, husky, fault, text):
+    check = check_bag(with_sensors(tmp_path / "drive", **fault), husky)
+    texts = check_text(check)
+    assert text in texts
+    assert ("clouds /points: 40" in texts) == ("cloud_offset" not in fault)
+    assert ("images /cam/image_raw: 40" in texts) == (not {"optical", "encoding"} & set(fault))

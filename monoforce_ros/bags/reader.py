@@ -91,6 +91,11 @@ class BagReader:
 
     def _salvage(self, reason: Exception) -> None:
         """Read a bag without an index as far as possible; raise ``BagError`` if no message can be read."""
+        if self.path.suffix in (".zst", ".zstd"):
+            raise BagError(
+                f"{self.path} is a compressed file of a bag: give the folder that holds it and its metadata.yaml, or "
+                f"decompress it (zstd -d {self.path.name})"
+            ) from reason
         files = storage_files(self.path)
         salvaged = SalvagedBag(files) if files else None
         if salvaged is None or not salvaged.message_count:

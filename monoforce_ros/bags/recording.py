@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 COMMANDS = ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist")
-ACKERMANN = "ackermann_msgs/msg/AckermannDriveStamped"
+ACKERMANN = ("ackermann_msgs/msg/AckermannDriveStamped", "ackermann_msgs/msg/AckermannDrive")
 CLOUD = "sensor_msgs/msg/PointCloud2"
 IMAGES = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
@@ -123,7 +123,7 @@ class Recording:
         Raises:
             BagError: the bag cannot be read, a named topic is absent or of another type, or there is no odometry.
         """
-        command_types = COMMANDS if robot is None or robot.steered is None else (*COMMANDS, ACKERMANN)
+        command_types = COMMANDS if robot is None or robot.steered is None else (*COMMANDS, *ACKERMANN)
         with BagReader(path) as bag:
             chosen = {
                 "odometry": _choose(bag, odometry, (ODOMETRY,)),
@@ -518,7 +518,7 @@ class _Collector:
         )
 
     def _command(self, message: Message) -> np.ndarray:
-        if hasattr(message, "drive"):
+        if hasattr(message, "drive") or hasattr(message, "steering_angle"):
             assert self.robot is not None
             assert self.robot.steered is not None
             twist = decoding.decode_ackermann(message, self.robot.steered.wheelbase)

@@ -17,20 +17,18 @@ from monoforce_ros.bags import (
     ReadOptions,
     Recording,
     SmoothedMotion,
-    camera_info_topics,
     smooth,
 )
 from monoforce_ros.core import NANOSECOND, MotionTrack
 from monoforce_ros.discrepancy import choose_ground, command_delay, motion_faults
 from monoforce_ros.evaluation.findings import Finding, Level, missing, note, ok, warning
+from monoforce_ros.evaluation.sensor_check import cloud_findings, image_findings
 from monoforce_ros.evaluation.topic_check import IMU, TopicCheck
 from monoforce_ros.evaluation.twist_check import twist_fault
 from monoforce_ros.robots import RobotModel
 
 _FASTEST_TURN = 2.0 * np.pi
 """Yaw rate of a turn in a second [rad/s], faster than any base on wheels or tracks is driven."""
-_FARTHEST = 300.0
-"""Range of lidars for robots and cars [m]."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +106,7 @@ def _contents(
     yield from _motion_findings(recording, smoothed, span)
     if len(recording.commands):
         yield from _command_findings(recording, smoothed.motion, robot, follows=not faults)
-    sensors = [*_cloud_findings(recording, robot), *_image_findings(recording, robot)]
+    sensors = [*cloud_findings(recording, robot), *image_findings(recording, robot)]
     yield from sensors
     if not any(finding.level is Level.OK for finding in sensors):
         yield note("neither clouds nor images can be used: only `--terrain flat` is possible")
@@ -134,44 +132,6 @@ def _offset_findings(measured: MotionTrack, base: MotionTrack) -> Iterator[Findi
         f"frames: {base.child_frame_id} is at ({x:.3f}, {y:.3f}, {z:.3f}) m and turned by {np.degrees(angle):.1f}° in "
         f"{measured.child_frame_id}{varies}; this offset is applied to the odometry"
     )
-
-
-def _cloud_findings(recording: Recording, robot: RobotModel) -> Iterator[Finding]:
-    if not recording.clouds:
-        return
-    try:
-        points, frame = recording.cloud(recording.clouds[0])
-    except ValueError as error:
-        yield warning(f"{recording.topics['cloud']}: the first cloud cannot be used: {error}")
-        return
-    distance = float(np.median(np.linalg.norm(points, axis=1))) if len(points) else 0.0
-    if distance > _FARTHEST:
-        yield warning(
-            f"{recording.topics['cloud']}: half of the points of the first cloud are {distance:.0f} m away or more, "
-            "farther than a lidar sees: are they in millimetres?"
-        )
-    try:
-        recording.sensor_pose(frame, robot.base_frame, robot.sensors)
-        yield ok(f"clouds {recording.topics['cloud']}: {len(recording.clouds)}, frame {frame}")
-    except BagError as error:
-        yield warning(f"clouds cannot be used: {error}")
-    if not len(points):
-        yield warning(f"{recording.topics['cloud']}: the first cloud is empty")
-
-
-def _image_findings(recording: Recording, robot: RobotModel) -> Iterator[Finding]:
-    for topic, frames in recording.images.items():
-        if topic not in recording.cameras:
-            expected = " or ".join(camera_info_topics(topic))
-            yield warning(f"{topic}: no CameraInfo on {expected}; images cannot be used without it")
-            continue
-        camera = recording.cameras[topic]
-        try:
-            recording.sensor_pose(camera.frame_id, robot.base_frame, robot.sensors)
-        except BagError as error:
-            yield warning(f"{topic}: {error}")
-            continue
-        yield ok(f"images {topic}: {len(frames)}, {camera.width} × {camera.height}, {camera.distortion_model}")
 
 
 def _motion_findings(recording: Recording, smoothed: SmoothedMotion, span: float) -> Iterator[Finding]:

@@ -279,6 +279,7 @@ def _window_stamps(
         )
     if not len(recording.commands):
         raise EvaluationError(f"{recording.path}: no commands (Twist or TwistStamped), which predictions need")
+    frame_stamps = candidates.tolist()
     end = recording.motion.stamps[-1] - int(minimum_duration * 1e9)
     candidates = candidates[(candidates >= recording.motion.stamps[0]) & (candidates <= end)]
     chosen: list[int] = []
@@ -286,7 +287,12 @@ def _window_stamps(
         if not chosen or stamp - chosen[-1] >= stride * 1e9 - 1e6:
             chosen.append(int(stamp))
     if not chosen:
-        raise EvaluationError(f"{recording.path}: no sensor data with {minimum_duration:g} s of odometry after it")
+        first, last = (int(recording.motion.stamps[i]) * 1e-9 for i in (0, -1))
+        times = f"{min(frame_stamps) * 1e-9:.1f} to {max(frame_stamps) * 1e-9:.1f} s"
+        raise EvaluationError(
+            f"{recording.path}: no sensor data with {minimum_duration:g} s of odometry after it: the data are of "
+            f"{times}, the odometry of {first:.1f} to {last:.1f} s; evaluate --check says more"
+        )
     return np.array(chosen, np.int64)
 
 
