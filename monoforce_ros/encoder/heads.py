@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -38,6 +39,8 @@ _BELIEVED = 3.0
 """Initial output of the heads for measured heights, before the logistic function: 95 %."""
 _CELL_TOLERANCE = 0.05
 """How far a surface may lie beyond the returns of its cell [m]: noise, and half of what a slope of 45° rises in it."""
+_WORTH_CORRECTING = 0.02
+"""Least correction by returns [m]: a lidar's noise."""
 _PLANE, _PLANE_REACH, _FEWEST_CELLS, _LEAST_SPREAD = 0.04, 3, 8, 0.5
 """Scatter of returns about a plane that is a surface [m], twice a lidar's noise; half-width of the squares in which it
 is sought [cells]; fewest of their cells with returns; and least determinant of their places [cells⁴]: returns on one
@@ -146,12 +149,16 @@ def within_returns(maps: EncodedMaps, batch: EncoderInput) -> EncodedMaps:
     better.
     """
     sweep = batch.sweep
-    solid = (sweep[:, STANDING] > 0) & (_roughness(sweep) < _PLANE)
+    standing = sweep[:, STANDING] > 0
     low = sweep[:, LOWEST] - _CELL_TOLERANCE
     high = torch.maximum(sweep[:, TOP], sweep[:, LOWEST]) + _CELL_TOLERANCE
     relative = maps.geometric_height - batch.ground[:, None, None]
-    change = torch.where(solid, torch.minimum(torch.maximum(relative, low), high) - relative, 0.0)
-    if not bool((change.abs() > 1e-3).any()):
+    beyond = torch.minimum(torch.maximum(relative, low), high) - relative
+    if not bool((standing & (beyond.abs() > _WORTH_CORRECTING)).any()):
+        return maps
+    solid = standing & (_roughness(sweep) < _PLANE)
+    change = torch.where(solid, beyond, 0.0)
+    if not bool((change.abs() > _WORTH_CORRECTING).any()):
         return maps
     filled = [
         fill_holes(values.cpu().numpy(), known.cpu().numpy()) if bool(known.any()) else values.cpu().numpy()
@@ -166,27 +173,26 @@ def _roughness(sweep: Tensor) -> Tensor:
 
     ``[B, rows, columns]`` [m]; infinite where fewer than :data:`_FEWEST_CELLS` cells have returns.
     """
-    hit = sweep[:, STANDING].double()
-    rows, columns = hit.shape[-2:]
-    y, x = torch.meshgrid(
-        torch.arange(rows, dtype=hit.dtype, device=hit.device),
-        torch.arange(columns, dtype=hit.dtype, device=hit.device),
-        indexing="ij",
-    )
-    low, high = sweep[:, LOWEST].double(), sweep[:, TOP].double()
-    z = 0.5 * (low + high)
-    terms = [hit, hit * x, hit * y, hit * z, hit * x * x, hit * y * y, hit * x * y, hit * x * z, hit * y * z,
-             hit * z * z, hit * (0.5 * (high - low)) ** 2]  # fmt: skip
+    device = sweep.device
+    values = sweep[:, [STANDING, LOWEST, TOP]].double().cpu().numpy()
+    rows, columns = values.shape[-2:]
+    y, x = np.meshgrid(np.arange(rows) / rows, np.arange(columns) / rows, indexing="ij")
     size = 2 * _PLANE_REACH + 1
-    means = functional.avg_pool2d(torch.stack(terms, dim=1), size, 1, _PLANE_REACH)
+    pages = []
+    for hit, low, high in values:
+        z = 0.5 * (low + high)
+        terms = (hit, hit * x, hit * y, hit * z, hit * x * x, hit * y * y, hit * x * y, hit * x * z, hit * y * z,
+                 hit * z * z, hit * (0.5 * (high - low)) ** 2)  # fmt: skip
+        pages.append([cv2.boxFilter(term, -1, (size, size), borderType=cv2.BORDER_CONSTANT) for term in terms])
+    means = torch.as_tensor(np.array(pages), device=device)
     count = means[:, 0]
-    mx, my, mz, xx, yy, xy, xz, yz, zz, within = (means[:, i] / count.clamp_min(1e-9) for i in range(1, len(terms)))
+    mx, my, mz, xx, yy, xy, xz, yz, zz, within = (means[:, i] / count.clamp_min(1e-9) for i in range(1, 11))
     xx, yy, zz = xx - mx**2, yy - my**2, zz - mz**2
     xy, xz, yz = xy - mx * my, xz - mx * mz, yz - my * mz
     determinant = xx * yy - xy**2
-    explained = (xz**2 * yy - 2 * xz * yz * xy + yz**2 * xx) / determinant.clamp_min(1e-9)
+    explained = (xz**2 * yy - 2 * xz * yz * xy + yz**2 * xx) / determinant.clamp_min(1e-15)
     rough = ((zz - explained).clamp_min(0.0) + within).sqrt()
-    enough = (count * size**2 > _FEWEST_CELLS - 0.5) & (determinant > _LEAST_SPREAD)
+    enough = (count * size**2 > _FEWEST_CELLS - 0.5) & (determinant * rows**4 > _LEAST_SPREAD)
     return torch.where(enough, rough, torch.inf)
 
 

@@ -17,7 +17,7 @@ from monoforce_ros.perception.lidar import usable_returns
 from monoforce_ros.perception.observation import Observation
 from monoforce_ros.perception.trace import DrivenGround
 from monoforce_ros.robots import RobotModel
-from monoforce_ros.terrain import Grid, LidarSettings, TerrainDefaults, TerrainMap, cell_heights, require_cells
+from monoforce_ros.terrain import Grid, LidarSettings, TerrainDefaults, TerrainMap, hanging_low, require_cells
 
 
 @contextmanager
@@ -98,9 +98,7 @@ class EncoderTerrain:
         support = support_under(self.robot, posed, motion, self.stiffness)
         sweep = None
         if cloud is not None:
-            config = self.encoder.config
-            limits = LidarSettings(lowest=config.lowest, highest=config.highest)
-            sweep = usable_returns(cloud, posed, motion, support, self.grid, limits)
+            sweep = usable_returns(cloud, posed, motion, support, self.grid)
             cells = _measured_cells(sweep, float(support[:, 2].mean()), self.encoder.config)
             if not views:
                 require_cells(cells, len(sweep), self.grid)
@@ -111,7 +109,7 @@ class EncoderTerrain:
             found = self.encoder.terrain(views, support, sweep=sweep, trace=trace)
         self.start_error = _error_under(found, support)
         if sweep is not None and self.robot.headroom > LidarSettings.headroom:
-            found = _with_low_overhead(found, sweep, self.robot.headroom)
+            found = _with_low_overhead(found, sweep)
         aligned = align_to_ground(found, support)
         if self._material is None:
             return aligned
@@ -119,22 +117,19 @@ class EncoderTerrain:
         return material_by_compliance(rigid, aligned) if views else rigid
 
 
-def _with_low_overhead(terrain: TerrainMap, sweep: np.ndarray, headroom: float) -> TerrainMap:
+def _with_low_overhead(terrain: TerrainMap, sweep: np.ndarray) -> TerrainMap:
     """The map, with what hangs too low for a robot that is taller than those for which the encoder was trained.
 
     Args:
         terrain: predicted map.
-        sweep: returns ``[n, 3]`` in its frame [m].
-        headroom: vertical gap that the robot passes under [m].
+        sweep: returns ``[n, 3]`` in its frame, without those that the robot passes under [m].
     """
-    limits = LidarSettings(headroom=headroom)
-    heights, observed = cell_heights(sweep, terrain.grid, replace(limits, quantile=1.0))
-    usual, _ = cell_heights(sweep, terrain.grid, replace(limits, quantile=1.0, headroom=LidarSettings.headroom))
-    low = torch.from_numpy(observed & (heights > usual + LidarSettings.headroom))
-    if not bool(low.any()):
+    limits = LidarSettings()
+    heights, low = hanging_low(sweep, terrain.grid, limits.headroom, lowest=limits.lowest, highest=limits.highest)
+    if not low.any():
         return terrain
-    raised = torch.from_numpy(heights).to(terrain.height)
-    height, surface = (torch.where(low, raised, values) for values in (terrain.height, terrain.geometric_height))
+    hangs, raised = torch.from_numpy(low), torch.from_numpy(heights).to(terrain.height)
+    height, surface = (torch.where(hangs, raised, values) for values in (terrain.height, terrain.geometric_height))
     return replace(terrain, height=height, geometric_height=surface)
 
 

@@ -68,17 +68,18 @@ def choose_terrain_source(
     if kind == "flat":
         return FlatTerrain(robot, grid or Grid.square(), material)
 
+    def memory(source: TerrainSource) -> TemporalMemory | None:
+        """Of what the lidar looks over once it is near."""
+        if not lidar_retention_time or "lidar" not in source.sensors:
+            return None
+        return TemporalMemory(
+            source, robot, stiffness=material.stiffness, retention_time=lidar_retention_time, blind_zone_only=True
+        )
+
     def measured(grid: Grid) -> TerrainSource:
         """Heights interpolated between returns, and remembered."""
-        return remembered(LidarTerrain(robot, grid, material), material.stiffness)
-
-    def remembered(source: TerrainSource, stiffness: float) -> TerrainSource:
-        """What the lidar looks over once it is near."""
-        if not lidar_retention_time or "lidar" not in source.sensors:
-            return source
-        return TemporalMemory(
-            source, robot, stiffness=stiffness, retention_time=lidar_retention_time, blind_zone_only=True
-        )
+        source = LidarTerrain(robot, grid, material)
+        return memory(source) or source
 
     if kind == "lidar_interpolation":
         return measured(grid or Grid.square())
@@ -96,20 +97,20 @@ def choose_terrain_source(
     learned: TerrainSource = own
     if retention_time and "camera" in sensors:
         learned = TemporalMemory(learned, robot, stiffness=encoder.config.stiffness, retention_time=retention_time)
-    else:
-        learned = remembered(learned, own.stiffness)
-    level = FlatTerrain(robot, learned.grid, material)
+    level, lidar = FlatTerrain(robot, learned.grid, material), LidarTerrain(robot, learned.grid, material)
     if kind == "lidar_camera" and "lidar" not in sensors:
-        learned = LidarCameraTerrain(LidarTerrain(robot, learned.grid, material), learned)
+        learned = LidarCameraTerrain(lidar, learned)
+    # With a memory of the images, that of the lidar has nothing to add.
+    recall = None if retention_time and "camera" in sensors else memory(learned)
     if fallback:
         if kind == "lidar":
-            return TrustedTerrain(learned, own, [measured(own_grid)], expected=1.0)
+            return TrustedTerrain(learned, own, [lidar], expected=1.0, memory=recall)
         if kind == "camera":
             return TrustedTerrain(learned, own, [level])
-        without_images = lidar = measured(own_grid)
+        without_images: TerrainSource = lidar
         if "lidar" in sensors:
             # What images say has to be confirmed; what the encoder makes of the sweep is there from the start.
             sweep = EncoderTerrain(encoder, robot, ("lidar",), threads=threads, material=material)
-            without_images = TrustedTerrain(remembered(sweep, sweep.stiffness), sweep, [lidar], expected=1.0)
-        return TrustedTerrain(learned, own, [without_images, level])
-    return learned
+            without_images = TrustedTerrain(sweep, sweep, [lidar], expected=1.0)
+        return TrustedTerrain(learned, own, [without_images, level], memory=recall)
+    return recall or learned

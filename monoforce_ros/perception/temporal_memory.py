@@ -15,6 +15,8 @@ from monoforce_ros.perception.trace import continues
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import CHANNELS, Grid, TerrainMap, interpolated
 
+_STORED_EVERY = 0.5
+"""Time after which what a lidar sees is stored again where the robot stands [s]."""
 _KEPT_WITHIN, _OBSTACLE_HEIGHT = 2.0, 0.25
 """An obstacle at least this high [m] that disappears within this distance of the robot [m] is kept: an encoder that
 sees only a part of a wall does not recognise it."""
@@ -73,7 +75,10 @@ class TemporalMemory:
 
     def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
         """The source's current map with earlier observations; raises the source's errors."""
-        now = self._source.terrain(observation, motion)
+        return self.recalled(self._source.terrain(observation, motion), observation, motion)
+
+    def recalled(self, now: TerrainMap, observation: Observation, motion: MotionState) -> TerrainMap:
+        """A current map of the source, or one made of it, with earlier observations."""
         recalibrated = any(
             not _equal(camera, self._cameras.get(name, camera)) for name, camera in observation.cameras.items()
         )
@@ -96,10 +101,12 @@ class TemporalMemory:
             obstacle = fresh & now.observed.numpy() & self._near & disappeared
             kept = (fresh & ~now.observed.numpy()) | obstacle
         seen = now.observed & ~torch.from_numpy(obstacle)
-        if self._blind_zone_only:
+        if not self._blind_zone_only:
+            memory.write(replace(now, observed=seen), motion)
+        elif memory.is_due(motion):
             # A row of returns hits single cells, which would be lost between those of the memory.
-            seen = torch.from_numpy(now.measured_nearby(1.5 * now.grid.resolution))
-        memory.write(replace(now, observed=seen), motion)
+            nearby = torch.from_numpy(now.measured_nearby(1.5 * now.grid.resolution))
+            memory.write(replace(now, observed=nearby), motion)
         if not kept.any():
             return now
         joined = now.with_cells(torch.from_numpy(kept), dict(zip(CHANNELS, torch.from_numpy(values), strict=True)))
@@ -133,6 +140,8 @@ class _Memory:
         self._corner = np.zeros(2, np.int64)
         """Column and row of the first cell in the odometry frame."""
         self._values = np.zeros((len(CHANNELS), self._size, self._size), np.float32)
+        self._written: tuple[int, float] | None = None
+        """When the last observation was stored [ns], and the distance travelled until then [m]."""
         self._observed_at = np.zeros((self._size, self._size), np.int64)
         """Time of the last observation of each cell [ns]; 0 without any."""
         self._odometer = np.zeros((self._size, self._size))
@@ -154,8 +163,20 @@ class _Memory:
             self._observed_at[unknown] = 0
         self._corner = corner
 
+    def is_due(self, motion: MotionState) -> bool:
+        """Whether the robot has moved by a cell, or some time has passed, since the last observation was stored."""
+        if self._written is None:
+            return True
+        stamp, travelled = self._written
+        return (
+            self.travelled - travelled >= self._grid.resolution
+            or (motion.stamp - stamp) * NANOSECOND >= _STORED_EVERY
+            or motion.stamp < stamp
+        )
+
     def write(self, terrain: TerrainMap, motion: MotionState) -> None:
         """Store the observed cells of a map in the terrain frame of a motion."""
+        self._written = motion.stamp, self.travelled
         grid, pose = terrain.grid, motion.odometry_from_terrain
         index = np.arange(self._size)
         places = (np.stack(np.meshgrid(index, index), axis=-1) + self._corner) * grid.resolution

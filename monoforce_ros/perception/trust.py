@@ -17,6 +17,7 @@ from monoforce_ros.core import MotionState, transform_points
 from monoforce_ros.perception.encoder_terrain import EncoderTerrain
 from monoforce_ros.perception.ground_alignment import posed_robot, support_under
 from monoforce_ros.perception.observation import Observation, TerrainSource
+from monoforce_ros.perception.temporal_memory import TemporalMemory
 from monoforce_ros.perception.trace import continues
 from monoforce_ros.terrain import Grid, TerrainError, TerrainMap
 
@@ -335,14 +336,20 @@ class TrustedTerrain:
         fallbacks: sources of the maps where the encoder is not trusted; the first one whose sensors have measured
             enough.
         expected: see :class:`TerrainTrust`.
+        memory: of earlier observations, which fill the map that results.
     """
 
     def __init__(
-        self, source: TerrainSource, encoder: EncoderTerrain, fallbacks: Sequence[TerrainSource], expected: float = 0.0
+        self,
+        source: TerrainSource,
+        encoder: EncoderTerrain,
+        fallbacks: Sequence[TerrainSource],
+        expected: float = 0.0,
+        memory: TemporalMemory | None = None,
     ):
         self.source = source
         """Source of the encoder's maps."""
-        self._encoder, self._fallbacks = encoder, tuple(fallbacks)
+        self._encoder, self._fallbacks, self._memory = encoder, tuple(fallbacks), memory
         self._trust = TerrainTrust(source.grid, expected)
         self.report: TrustReport | None = None
         """Result of the last comparison; None before the first map."""
@@ -375,7 +382,9 @@ class TrustedTerrain:
         without = replace(report, remedy="use terrain_source lidar_interpolation")
         self.report = report if "camera" in self.sensors else without
         used = blended(other, predicted, report.share, report.spread_factor)
-        return used if report.trusted or other.spreads else _with_measured_error(used, report)
+        if not (report.trusted or other.spreads):
+            used = _with_measured_error(used, report)
+        return used if self._memory is None else self._memory.recalled(used, observation, motion)
 
     def _fallback(self, observation: Observation, motion: MotionState) -> TerrainMap:
         """Map of the first fallback whose sensors have measured enough; the last one's error if there is none."""

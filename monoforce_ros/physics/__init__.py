@@ -1,5 +1,6 @@
 """Differentiable robot–terrain physics (paper III-B to III-E)."""
 
+from monoforce_ros.physics.identity_cache import IdentityCache
 from monoforce_ros.physics.lookup import TerrainLookup
 from monoforce_ros.physics.neural_ode import OdeOptions
 from monoforce_ros.physics.options import PhysicsOptions
@@ -10,6 +11,7 @@ from monoforce_ros.physics.state import Rollout, State
 
 __all__ = [
     "SOILS",
+    "IdentityCache",
     "OdeOptions",
     "PhysicsOptions",
     "Rollout",

@@ -15,7 +15,7 @@ from monoforce_ros.terrain.lidar import (
     stands_on_ground,
     terrain_from_cloud,
 )
-from monoforce_ros.terrain.overhead import without_overhead
+from monoforce_ros.terrain.overhead import hanging_low, without_overhead
 from monoforce_ros.terrain.scatter import horizontal_scatter
 from monoforce_ros.terrain.terrain_map import CHANNELS, TerrainDefaults, TerrainMap
 
@@ -31,6 +31,7 @@ __all__ = [
     "cell_heights",
     "cell_quantiles",
     "fill_holes",
+    "hanging_low",
     "horizontal_scatter",
     "interpolated",
     "interpolated_ground",

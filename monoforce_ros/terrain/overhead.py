@@ -70,6 +70,25 @@ class GroundReference:
         return z - (self.height + _SLOPES[-1] * self.distance).ravel()[cells]
 
 
+def hanging_low(
+    points: np.ndarray, grid: Grid, headroom: float, *, lowest: float, highest: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Heights [m] and mask of cells ``[rows, columns]`` with returns above a gap of ``headroom``, the highest of each.
+
+    Of points without overhead for a taller robot these are what it cannot pass under.
+    """
+    rows, columns, inside = grid.cells(points[:, :2])
+    inside &= (points[:, 2] > lowest) & (points[:, 2] < highest)
+    flat, z = (rows * grid.columns + columns)[inside], points[inside, 2]
+    floor = np.full(grid.rows * grid.columns, np.inf)
+    np.minimum.at(floor, flat, z)
+    over = _above_gaps(flat, z, floor, headroom)
+    heights = np.full(grid.rows * grid.columns, -np.inf)
+    np.maximum.at(heights, flat[over], z[over])
+    mask = np.isfinite(heights)
+    return np.where(mask, heights, 0.0).reshape(grid.rows, grid.columns), mask.reshape(grid.rows, grid.columns)
+
+
 def without_overhead(
     points: np.ndarray, grid: Grid, support: np.ndarray, headroom: float, *, lowest: float, highest: float
 ) -> np.ndarray:
