@@ -137,3 +137,62 @@ def test_what_the_lidar_looks_over_when_near_is_remembered(husky, kind):
         return float(terrain.height.numpy()[near].max()) - ground
 
     assert heights(0.0) < 0.1 < heights(10.0)
+
+
+def ray_cast(elevations, ground, mount, boxes, columns=1024):
+    """Returns of level ground and of boxes, each (x, y, z from, x, y, z to) [m], z above the ground; 1 cm noise."""
+    azimuth = np.linspace(-np.pi, np.pi, columns, endpoint=False)
+    turn, rise = (angles.ravel() for angles in np.meshgrid(azimuth, np.radians(elevations)))
+    rays = np.stack([np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)], axis=-1)
+    origin = np.array([0.0, 0.0, mount])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        reach = np.where(rays[:, 2] < 0, -mount / rays[:, 2], np.inf)
+        for low, high in boxes:
+            to_low, to_high = ((np.array(corner) - origin) / rays for corner in (low, high))
+            enters, leaves = np.minimum(to_low, to_high).max(axis=1), np.maximum(to_low, to_high).min(axis=1)
+            reach = np.where((enters < leaves) & (enters > 0), np.minimum(reach, enters), reach)
+    kept = reach < 30.0
+    reach = reach + 0.01 * np.random.default_rng(0).standard_normal(len(reach))
+    return ((rays * reach[:, None])[kept] + [0.0, 0.0, ground + mount]).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "least"),
+    [((2.1, -2.1, 0.2), (3.9, 2.1, 1.45), 1.0), ((2.45, -3.0, 0.35), (2.6, 3.0, 0.75), 0.45)],
+    ids=["car", "rail"],
+)
+def test_what_stands_there_with_a_gap_below_is_not_lowered_to_the_floor_seen_through_it(husky, low, high, least):
+    ground = -husky.ground_clearance
+    cloud = ray_cast(LIDARS["OS0"], ground, 0.75, [(low, high)])
+    terrain = choose_terrain_source("lidar", husky, fallback=True).terrain(Observation(0, cloud=cloud), STILL)
+    height = terrain.height.numpy() - ground
+    front = (GRID.x > low[0] - 0.06) & (GRID.x < low[0] + 0.45)
+    assert np.median(height[np.abs(GRID.y) < 1.5][:, front].max(axis=1)) > least
+    assert height.min() > -0.4
+
+
+@pytest.mark.parametrize("lidar", ["OS0", "VLP-16"])
+def test_behind_the_edge_of_a_step_the_plateau_goes_on(husky, lidar):
+    ground = -husky.ground_clearance
+    cloud = ray_cast(LIDARS[lidar], ground, 0.75, [((2.0, -8.0, 0.0), (9.0, 8.0, 0.4))])
+    source = choose_terrain_source("lidar_interpolation", husky)
+    height = source.terrain(Observation(0, cloud=cloud), STILL).height.numpy() - ground
+    row = height[np.abs(GRID.y) < 1.0]
+    before, behind = row[:, (GRID.x > 0.8) & (GRID.x < 1.8)], row[:, (GRID.x > 2.1) & (GRID.x < 3.0)]
+    # Three rings of the VLP-16 hit the face within 15 cm, which may be a ramp.
+    assert np.median(before) < {"OS0": 0.1, "VLP-16": 0.3}[lidar] and np.median(behind) > 0.25
+
+
+@pytest.mark.parametrize("kind", ["lidar", "lidar_interpolation"])
+def test_who_walked_by_is_forgotten_when_the_lidar_looks_over_the_place(husky, kind):
+    ground = -husky.ground_clearance
+    source = choose_terrain_source(kind, husky, fallback=True, lidar_retention_time=10.0)
+    for step in range(15):
+        y = -2.4 + 0.4 * step
+        person = [((1.4, y - 0.2, 0.0), (1.8, y + 0.2, 1.7))] if abs(y) < 2.3 else []
+        cloud = ray_cast(LIDARS["VLP-16"], ground, 0.65, person, columns=720)
+        motion = replace(STILL, stamp=step * 400_000_000)
+        terrain = source.terrain(Observation(motion.stamp, cloud=cloud), motion)
+    height = terrain.height.numpy() - ground
+    trail = (np.abs(GRID.x - 1.6) < 0.5)[None, :] & (np.abs(GRID.y) < 1.5)[:, None]
+    assert height[trail].max() < 0.45 and (height[trail] > 0.3).sum() < 15

@@ -41,6 +41,12 @@ _CELL_TOLERANCE = 0.05
 """How far a surface may lie beyond the returns of its cell [m]: noise, and half of what a slope of 45° rises in it."""
 _WORTH_CORRECTING = 0.02
 """Least correction by returns [m]: a lidar's noise."""
+_BESIDE = 10
+"""Distance [cells] within which returns that lie in no plane keep a surface from being lowered."""
+_CARRIED = 4.0, 10.0
+"""Distances from a corrected cell up to which its correction holds, and from which on there is none [cells]."""
+_AT_THE_WHEELS = 0.999
+"""Weight of the plane under the wheels above which the ground is that one, up to 1 m from the robot."""
 _PLANE, _PLANE_REACH, _FEWEST_CELLS, _LEAST_SPREAD = 0.04, 3, 8, 0.5
 """Scatter of returns about a plane that is a surface [m], twice a lidar's noise; half-width of the squares in which it
 is sought [cells]; fewest of their cells with returns; and least determinant of their places [cells⁴]: returns on one
@@ -144,9 +150,10 @@ def _spread(output: Tensor) -> Tensor:
 def within_returns(maps: EncodedMaps, batch: EncoderInput) -> EncodedMaps:
     """Maps whose surface is, where returns lie in a plane, between the lowest and the highest of each cell.
 
-    A network that has never seen a hillside of 20° puts it a metre too low, and is sure of it. What it is corrected by
-    is interpolated between these cells. Returns of vegetation lie in no plane: what its surface is, the network knows
-    better.
+    A network that has never seen a hillside of 20° puts it a metre too low, and is sure of it. Returns of vegetation
+    lie in no plane: what its surface is, the network knows better. So it does under what stands there with a gap below,
+    a car or a guard rail, whose floor a lidar sees: beside what is no plane nothing is lowered. Corrections are
+    interpolated between the cells with returns, but not far beyond them, and not into the ground at the wheels.
     """
     sweep = batch.sweep
     standing = sweep[:, STANDING] > 0
@@ -154,18 +161,35 @@ def within_returns(maps: EncodedMaps, batch: EncoderInput) -> EncodedMaps:
     high = torch.maximum(sweep[:, TOP], sweep[:, LOWEST]) + _CELL_TOLERANCE
     relative = maps.geometric_height - batch.ground[:, None, None]
     beyond = torch.minimum(torch.maximum(relative, low), high) - relative
-    if not bool((standing & (beyond.abs() > _WORTH_CORRECTING)).any()):
+    beyond = torch.where(standing & (beyond.abs() > _WORTH_CORRECTING), beyond, 0.0)
+    if not bool(beyond.any()):
         return maps
-    solid = standing & (_roughness(sweep) < _PLANE)
-    change = torch.where(solid, beyond, 0.0)
-    if not bool((change.abs() > _WORTH_CORRECTING).any()):
+    solid = _roughness(sweep) < _PLANE
+    other = (standing & ~solid).float()[:, None]
+    beside = functional.max_pool2d(other, 2 * _BESIDE + 1, 1, _BESIDE)[:, 0] > 0
+    change = torch.where(solid & ~(beside & (beyond < 0.0)), beyond, 0.0)
+    if not bool(change.any()):
         return maps
-    filled = [
-        fill_holes(values.cpu().numpy(), known.cpu().numpy()) if bool(known.any()) else values.cpu().numpy()
-        for values, known in zip(change, solid, strict=True)
-    ]
-    added = torch.as_tensor(np.stack(filled), dtype=change.dtype, device=change.device)
-    return replace(maps, geometric_height=maps.geometric_height + added)
+    plane = batch.support[:, 1].cpu().numpy() > _AT_THE_WHEELS
+    added = [_carried(values, known | wheels) for values, known, wheels in
+             zip(change.cpu().numpy(), standing.cpu().numpy(), plane, strict=True)]  # fmt: skip
+    correction = torch.as_tensor(np.stack(added), dtype=change.dtype, device=change.device)
+    return replace(maps, geometric_height=maps.geometric_height + correction)
+
+
+def _spread_from(changed: np.ndarray) -> np.ndarray:
+    """How far a correction carries: 1 within :data:`_CARRIED` of a cell that is corrected, down to 0."""
+    full, none = _CARRIED
+    away = cv2.distanceTransform((~changed).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return np.clip((none - away) / (none - full), 0.0, 1.0)
+
+
+def _carried(change: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Corrections ``[rows, columns]`` between cells where they are known [m]."""
+    changed = known & (change != 0.0)
+    if not changed.any():
+        return np.zeros_like(change)
+    return fill_holes(change, known) * np.where(known, 1.0, _spread_from(changed))
 
 
 def _roughness(sweep: Tensor) -> Tensor:

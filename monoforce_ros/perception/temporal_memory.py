@@ -12,9 +12,11 @@ from monoforce_ros.perception.clearance import clear_of_robot
 from monoforce_ros.perception.ground_alignment import align_to_ground, posed_robot, support_under
 from monoforce_ros.perception.observation import Observation, TerrainSource
 from monoforce_ros.perception.trace import continues
-from monoforce_ros.robots import RobotModel
+from monoforce_ros.robots import RobotModel, is_lidar
 from monoforce_ros.terrain import CHANNELS, Grid, TerrainMap, interpolated
 
+_SIGHT_TOLERANCE = 0.1
+"""How far above a lidar's line of sight remembered ground may be [m]: a cell."""
 _STORED_EVERY = 0.5
 """Time after which what a lidar sees is stored again where the robot stands [s]."""
 _KEPT_WITHIN, _OBSTACLE_HEIGHT = 2.0, 0.25
@@ -58,6 +60,8 @@ class TemporalMemory:
         self._source, self._robot, self._stiffness = source, robot, stiffness
         self._retention_time, self._retention_distance = retention_time, retention_distance
         self._blind_zone_only = blind_zone_only
+        mounted = [float(pose[2, 3]) for name, pose in robot.sensors.items() if is_lidar(name)]
+        self._lidar_height = max(mounted, default=float(robot.bounds[1][2]))
         self._near = np.hypot(*np.meshgrid(source.grid.x, source.grid.y)) < _KEPT_WITHIN
         self._memory = _Memory(source.grid)
         self._previous: MotionState | None = None
@@ -96,7 +100,9 @@ class TemporalMemory:
         disappeared = values[0] - now.height.numpy() > _OBSTACLE_HEIGHT
         if self._blind_zone_only:
             obstacle = np.zeros_like(fresh)
-            kept = fresh & now.before_observed()
+            # What rose above the line of sight has gone: somebody walked by.
+            sight = now.looked_over(self._lidar_height + float(motion.terrain_from_base[2, 3]))
+            kept = fresh & (values[0] <= sight + _SIGHT_TOLERANCE)
         else:
             obstacle = fresh & now.observed.numpy() & self._near & disappeared
             kept = (fresh & ~now.observed.numpy()) | obstacle

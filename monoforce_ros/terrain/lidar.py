@@ -11,7 +11,7 @@ import torch
 
 from monoforce_ros.terrain.grid import Grid
 from monoforce_ros.terrain.scatter import horizontal_scatter
-from monoforce_ros.terrain.terrain_map import TerrainDefaults, TerrainMap
+from monoforce_ros.terrain.terrain_map import TerrainDefaults, TerrainMap, polar
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,9 @@ def terrain_from_cloud(
         ground = visible
     else:
         faces = observed & (heights - lowest > _FACE)
-        feet = np.where(faces & _thin(points, lowest, observed, grid, settings), lowest, heights)
+        feet = heights
+        if faces.any():
+            feet = np.where(faces & _thin(points, lowest, faces, grid, settings), lowest, heights)
         ground = interpolated_ground(heights, observed, support, grid, feet)
     return TerrainMap.from_height(
         torch.from_numpy(ground.astype(np.float32)),
@@ -112,16 +114,15 @@ def require_cells(count: int, returns: int, grid: Grid, settings: LidarSettings 
         )
 
 
-def _thin(
-    points: np.ndarray, lowest: np.ndarray, observed: np.ndarray, grid: Grid, settings: LidarSettings
-) -> np.ndarray:
-    """Cells ``[rows, columns]`` where what rises above the ground is a surface, and no vegetation."""
-    rows, columns, inside = grid.cells(points[:, :2])
-    flat = (rows * grid.columns + columns)[inside]
-    place = points[inside]
-    floor = np.where(observed, lowest, np.inf).ravel()
-    rising = (place[:, 2] > floor[flat] + 0.5 * _FACE) & (place[:, 2] < settings.highest)
+def _thin(points: np.ndarray, lowest: np.ndarray, faces: np.ndarray, grid: Grid, settings: LidarSettings) -> np.ndarray:
+    """Cells ``[rows, columns]`` of ``faces`` where what rises above the ground is a surface, and no vegetation."""
     reach = max(1, round(_THIN_WITHIN / grid.resolution))
+    near = cv2.dilate(faces.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)).ravel() > 0
+    rows, columns, inside = grid.cells(points[:, :2])
+    flat = rows * grid.columns + columns
+    inside &= near[np.where(inside, flat, 0)]
+    flat, place = flat[inside], points[inside]
+    rising = (place[:, 2] > lowest.ravel()[flat] + 0.5 * _FACE) & (place[:, 2] < settings.highest)
     scatter, count = horizontal_scatter(place[rising], flat[rising], reach, grid)
     return (count >= _FEWEST_OF_A_FACE) & (scatter < _THIN)
 
@@ -137,7 +138,8 @@ def interpolated_ground(
         support: ground contact points ``[m, 3]`` [m] of the robot, whose cells take their height; may be empty.
         grid: cells of the map.
         feet: heights ``[rows, columns]`` [m] between which ground is interpolated as well, and taken where it is lower:
-            those of the foot of a wall, which a blind zone before it would otherwise make a ramp.
+            those of the foot of a wall, which a blind zone before it would otherwise make a ramp. The robot is at the
+            origin of the map's frame.
     """
     rows, columns, inside = grid.cells(support[:, :2])
     if not inside.any():
@@ -151,9 +153,16 @@ def interpolated_ground(
     # A wall nearby casts a blind zone before it: interpolated, its height would begin below the robot.
     if (tall := observed & _tall_nearby(heights, support[inside], grid)).any():
         ground = np.where(where, ground, np.minimum(ground, fill_holes(known, where & ~tall)))
-    if feet is not None and (feet < heights)[observed].any():
-        known = np.where(observed & (feet < heights), np.minimum(feet, known), known)
-        ground = np.where(where, ground, np.minimum(ground, fill_holes(known, where)))
+    if feet is not None and (faces := observed & (feet < heights)).any():
+        known = np.where(faces, np.minimum(feet, known), known)
+        # Behind a face its top is the neighbour, not its foot.
+        distance, sector = polar(grid)
+        nearest = np.full(int(sector.max()) + 1, np.inf)
+        np.minimum.at(nearest, sector[faces], distance[faces])
+        # A face seen in every second direction goes on between them; where there is none nothing changes.
+        nearest = np.min([np.roll(nearest, by) for by in (-1, 0, 1)], axis=0)
+        before = ~where & (distance < np.where(np.isinf(nearest), 0.0, nearest)[sector])
+        ground = np.where(before, np.minimum(ground, fill_holes(known, where)), ground)
     return ground
 
 

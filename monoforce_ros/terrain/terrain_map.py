@@ -163,25 +163,35 @@ class TerrainMap:
             reach: how far a measured cell speaks for cells behind it [m].
         """
         observed = self.observed.cpu().numpy()
-        distance, sector = _polar(self.grid)
+        distance, sector = polar(self.grid)
         farthest = np.full(_SECTORS, -np.inf)
         np.maximum.at(farthest, sector[observed], distance[observed])
         # Neighbouring sectors speak for it, too: a far row of returns has gaps.
         farthest = np.max([np.roll(farthest, by) for by in (-1, 0, 1)], axis=0)
         return ~observed & (distance > farthest[sector] + reach)
 
-    def before_observed(self) -> np.ndarray:
-        """Whether a cell of a single map lies nearer than all that was measured in its direction.
+    def looked_over(self, sensor_height: float) -> np.ndarray:
+        """Height below which a lidar sees nothing, nearer than all that it measured in a direction [m].
 
-        That is the blind zone of a lidar, below its lowest row of returns; ``[rows, columns]`` bool, False where
-        nothing was measured in a direction. The robot is at the origin of the map's frame.
+        That is its blind zone, below the lines of sight to the nearest measured cells; ``[rows, columns]``, -inf beyond
+        them and where nothing was measured in a direction. The robot is at the origin of the map's frame.
+
+        Args:
+            sensor_height: of the lidar in the map's frame [m].
         """
         observed = self.observed.cpu().numpy()
-        distance, sector = _polar(self.grid)
-        nearest = np.full(_SECTORS, np.inf)
-        np.minimum.at(nearest, sector[observed], distance[observed])
-        nearest[np.isinf(nearest)] = 0.0
-        return ~observed & (distance < nearest[sector])
+        distance, sector = polar(self.grid)
+        away, where = distance[observed], sector[observed]
+        # Of repeated indices the last value counts, that of the nearest cell.
+        order = np.argsort(-away, kind="stable")
+        nearest, height = np.zeros(_SECTORS), np.full(_SECTORS, -np.inf)
+        nearest[where[order]] = away[order]
+        height[where[order]] = self.height.cpu().numpy()[observed][order]
+        share = distance / np.maximum(nearest[sector], 1e-6)
+        sight = np.full(distance.shape, -np.inf)
+        blind = ~observed & (share < 1.0)
+        sight[blind] = (sensor_height + (height[sector] - sensor_height) * share)[blind]
+        return sight
 
     @property
     def spreads(self) -> tuple[str, ...]:
@@ -235,8 +245,8 @@ class TerrainMap:
 
 
 @lru_cache(maxsize=8)
-def _polar(grid: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """Distance of each cell from the origin [m], and the sector of its direction, ``[rows, columns]``."""
+def polar(grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+    """Distance of each cell from the origin [m], and the number of the sector in which it lies, ``[rows, columns]``."""
     x, y = np.meshgrid(grid.x, grid.y)
     sector = ((np.arctan2(y, x) / (2.0 * np.pi) + 0.5) * _SECTORS).astype(int) % _SECTORS
     return np.hypot(x, y), sector
