@@ -7,6 +7,8 @@ import pytest
 import torch
 from test_training import maps_of
 
+from monoforce_ros.bags import Recording, smooth
+from monoforce_ros.core import without_nan
 from monoforce_ros.encoder import EncoderConfig, load_encoder, new_encoder
 from monoforce_ros.encoder.checkpoint import shipped_checkpoint
 from monoforce_ros.robots import load_robot, robot_digest
@@ -15,7 +17,14 @@ from monoforce_ros.training.adaptation import shares_targets, split_recording
 from monoforce_ros.training.batches import Batches
 from monoforce_ros.training.losses import LossWeights, geometric_loss
 from monoforce_ros.training.recording_samples import SamplesError, read_samples
-from monoforce_ros.training.sample_extraction import SampleSettings, _fingerprint, _usable_topics, extract_samples
+from monoforce_ros.training.sample_extraction import (
+    SampleSettings,
+    _fingerprint,
+    _segments,
+    _trace,
+    _usable_topics,
+    extract_samples,
+)
 from monoforce_ros.training.samples import Augmentation, sample
 from monoforce_ros.training.train_cli import build_parser, main
 from monoforce_ros.training.trainer import Process, Trainer, TrainingSettings, is_symmetric
@@ -202,3 +211,29 @@ def test_a_held_out_bag_is_not_trained_on_however_its_path_is_written(tmp_path, 
     )
     train_cli._train(options, Process("cpu"))
     assert asked == [["b"], ["a"]]
+
+
+def test_nothing_of_a_sample_is_from_beyond_a_jump_of_the_localisation(demo_bag, husky, tmp_path):
+    recording = Recording.open(demo_bag).in_base_frame("base_link")
+    motion = recording.motion
+    middle = int(0.5 * (int(motion.stamps[0]) + int(motion.stamps[-1])))
+    later = motion.stamps > middle
+    jumped = replace(motion, positions=motion.positions + np.where(later, 1.0, 0.0)[:, None] * [2.0, 0.0, 2.0])
+    stretches = smooth(jumped).stretches
+    assert len(stretches) == 2
+    spans = [(int(jumped.stamps[part][0]), int(jumped.stamps[part][-1])) for part in stretches]
+    settings = SampleSettings(iterations=5)
+    segments = _segments(replace(recording, motion=jumped), jumped, recording.commands, husky, settings, spans)
+    # Those of the first half say nothing of the second one, where everything is 2 m higher.
+    assert {end for _, end, _ in segments} == {end for _, end in spans}
+    for start, end, segment in segments:
+        heights = segment.geometric[segment.observed]
+        assert start < end and np.ptp(np.quantile(heights, (0.05, 0.95))) < 1.5
+    stamp = int(jumped.stamps[later][20])
+    torn, whole = _trace(jumped, husky, stamp), _trace(jumped, husky, stamp, spans[1][0])
+    assert np.ptp(torn[:, 2]) > 1.5 > 1.0 > np.ptp(whole[:, 2])
+
+
+def test_json_has_no_nan():
+    content = {"a": float("nan"), "b": [1.0, float("inf"), {"c": 2}], "d": "text"}
+    assert without_nan(content) == {"a": None, "b": [1.0, None, {"c": 2}], "d": "text"}

@@ -3,7 +3,7 @@
 from monoforce_ros.core.alignment import DelayCorrelation, Delayed, largest_spread, nearest_stamp
 from monoforce_ros.core.camera import CameraModel
 from monoforce_ros.core.command_line import OptionParser, most_similar, nearest
-from monoforce_ros.core.files import atomic_path, unfinished_path, write_bytes, write_text
+from monoforce_ros.core.files import atomic_path, unfinished_path, without_nan, write_bytes, write_text
 from monoforce_ros.core.frames import FrameError, RobotFrames, TransformTree
 from monoforce_ros.core.geometry import (
     homogeneous,
@@ -67,6 +67,7 @@ __all__ = [
     "start_warp",
     "transform_points",
     "unfinished_path",
+    "without_nan",
     "wrap_angle",
     "write_bytes",
     "write_text",

@@ -1,11 +1,13 @@
-"""Atomic file writes: write to a temporary file in the target's folder, then rename it."""
+"""Atomic file writes: write to a temporary file in the target's folder, then rename it; numbers that JSON has."""
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 
 def unfinished_path(path: str | Path) -> Path:
@@ -42,3 +44,14 @@ def write_bytes(path: str | Path, data: bytes) -> None:
     """Write a binary file atomically."""
     with atomic_path(path) as unfinished:
         unfinished.write_bytes(data)
+
+
+def without_nan(value: Any) -> Any:
+    """The same content with None in place of numbers that are not finite, which JSON does not have."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {key: without_nan(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [without_nan(entry) for entry in value]
+    return value

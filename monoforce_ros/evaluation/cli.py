@@ -192,7 +192,9 @@ def run(options: argparse.Namespace) -> None:
     predictor = Predictor(
         robot, source, horizon=max(options.horizons), options=PhysicsOptions(soil=read_soil(options.soil))
     )
-    topics = tuple(options.images or recording.images) if "camera" in source.sensors else ()
+    # As in training: images without a CameraInfo, such as overlays for debugging, are none of a camera.
+    calibrated = [topic for topic in recording.images if topic in recording.cameras]
+    topics = tuple(options.images or calibrated or recording.images) if "camera" in source.sensors else ()
     evaluation = evaluate_recording(
         recording,
         predictor,

@@ -60,9 +60,12 @@ class Adaptation:
         """The result in words."""
         lines = [
             f"kept {self.share:.0%} of the change, so that obstacles in randomised worlds stay detected",
-            f"held-out part: error of the visible surface {_cm(self.before.median)} → {_cm(self.after.median)} "
-            f"(level ground {_cm(self.before.level)})",
         ]
+        if np.isfinite(self.before.median):
+            lines.append(
+                f"held-out part: error of the visible surface {_cm(self.before.median)} → {_cm(self.after.median)} "
+                f"(level ground {_cm(self.before.level)})"
+            )
         if np.isfinite(self.before.support):
             lines.append(
                 f"held-out part: error of the ground under the wheels {_cm(self.before.support)} → "

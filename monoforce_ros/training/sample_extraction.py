@@ -115,8 +115,10 @@ def _samples(
     smoothed = smooth(corrected_motion(recording.motion, robot.effects))
     motion = smoothed.motion
     commands = corrected_commands(recording.commands, robot.effects)
-    segments = _segments(recording, motion, commands, robot, settings)
-    arrays = _read_images(recording, motion, robot, config, settings, topics, [start for start, _ in segments])
+    spans = [(int(motion.stamps[part][0]), int(motion.stamps[part][-1])) for part in smoothed.stretches]
+    segments = _segments(recording, motion, commands, robot, settings, spans)
+    places = [(start, end) for start, end, _ in segments]
+    arrays = _read_images(recording, motion, robot, config, settings, topics, places, spans)
     windows = cut_windows(motion, commands, length=CHUNK, stride=settings.chunk_period, stretches=smoothed.stretches)
     chunks = Chunks(
         stamps=np.array([state.stamp for state in windows.starts]),
@@ -132,7 +134,7 @@ def _samples(
         name=bag.name,
         cameras=tuple(recording.cameras[topic] for topic in topics),
         images=torch.from_numpy(arrays.pop("images")),
-        segments=tuple(segment for _, segment in segments),
+        segments=tuple(segment for _, _, segment in segments),
         chunks=chunks,
         file=None,
         **arrays,
@@ -177,21 +179,28 @@ def _segments(
     commands: CommandTrack,
     robot: RobotModel,
     settings: SampleSettings,
-) -> list[tuple[int, Segment]]:
-    """Segments along the recording, with the start of each [ns]."""
+    spans: Sequence[tuple[int, int]],
+) -> list[tuple[int, int, Segment]]:
+    """Segments along the recording, with the start of each and the end of the samples that may lie in it [ns].
+
+    None spans a jump of the localisation, after which all lies elsewhere: ``spans`` are the stretches between [ns].
+    """
     # The margin covers the map of any sample on the trajectory.
     fitting = FitSettings(margin=7.5, iterations=settings.iterations)
-    first, last = int(motion.stamps[0]), int(motion.stamps[-1])
-    starts = range(first, max(first + 1, last - round(1e9 * _LENGTH) + 1), round(1e9 * _STRIDE))
-    segments: list[tuple[int, Segment]] = []
+    starts = [
+        (start, first, last)
+        for first, last in spans
+        for start in range(first, max(first + 1, last - round(1e9 * _LENGTH) + 1), round(1e9 * _STRIDE))
+    ]
+    segments: list[tuple[int, int, Segment]] = []
     reason = ""
-    for start in starts:
+    for start, first, last in starts:
         try:
             grid, pose = trajectory_grid(motion, start, _LENGTH, fitting), trajectory_frame(motion, start)
             visible = None
             if recording.clouds:
-                first_sweep = start - round(1e9 * _SWEEPS_BEFORE)
-                last_sweep = start + round(1e9 * (_LENGTH + _SWEEPS_AFTER))
+                first_sweep = max(start - round(1e9 * _SWEEPS_BEFORE), first)
+                last_sweep = min(start + round(1e9 * (_LENGTH + _SWEEPS_AFTER)), last)
                 visible = visible_terrain(recording, motion, robot, grid, pose, start=first_sweep, stop=last_sweep)
             fit = fit_terrain(motion, commands, robot, start=start, length=_LENGTH, visible=visible, settings=fitting)
         except (TerrainError, ValueError) as error:
@@ -202,6 +211,7 @@ def _segments(
         segments.append(
             (
                 start,
+                last,
                 Segment(
                     grid, pose, terrain.geometric_height.numpy().astype(np.float32), observed,
                     terrain.height.numpy().astype(np.float32), fit.contact_mask,
@@ -221,9 +231,15 @@ def _read_images(
     config: EncoderConfig,
     settings: SampleSettings,
     topics: Sequence[str],
-    starts: list[int],
+    places: Sequence[tuple[int, int]],
+    spans: Sequence[tuple[int, int]],
 ) -> dict[str, np.ndarray]:
-    """Images, poses, contact points of the wheels and sweeps of every sample."""
+    """Images, poses, contact points of the wheels and sweeps of every sample.
+
+    ``places`` are starts of the segments and ends of what may lie in them, ``spans`` those of the stretches between
+    jumps of the localisation [ns].
+    """
+    starts = [start for start, _ in places]
     end = min(int(motion.stamps[-1]) - round(1e9 * CHUNK), starts[-1] + round(1e9 * _LENGTH))
     matched = []
     previous: int | None = None
@@ -254,6 +270,9 @@ def _read_images(
         except StaleDataError:
             continue
         state = states[0]
+        segment = max((i for i, start in enumerate(starts) if start <= state.stamp), default=-1)
+        if segment < 0 or state.stamp > places[segment][1]:
+            continue
         under = support_points(robot, state, config.stiffness)
         placed = state.odometry_from_terrain
         rows["images"].append(np.stack([pixels[i][frame.stamp] for i, frame in enumerate(frames)]))
@@ -263,13 +282,14 @@ def _read_images(
             np.stack([s.odometry_from_base @ pose for s, pose in zip(states, mounted, strict=True)])
         )
         rows["support"].append(under @ placed[:3, :3].T + placed[:3, 3])
-        rows["segment_of"].append(max(i for i, start in enumerate(starts) if start <= state.stamp))
+        rows["segment_of"].append(segment)
     if not rows["stamps"]:
         raise SamplesError(f"{recording.path}: no image is within the odometry and followed by one second of motion")
     arrays = {name: np.array(values) for name, values in rows.items()}
     sweeps = _sweeps_near(recording, motion, robot, arrays["stamps"])
     joined = np.concatenate(sweeps) if sweeps else np.zeros((0, 3))
-    traces = [_trace(motion, robot, int(stamp)) for stamp in arrays["stamps"]]
+    begins = [max((first for first, _ in spans if first <= stamp), default=0) for stamp in arrays["stamps"].tolist()]
+    traces = [_trace(motion, robot, int(stamp), first) for stamp, first in zip(arrays["stamps"], begins, strict=True)]
     return {
         **arrays,
         "traces": np.concatenate(traces).astype(np.float32),
@@ -279,9 +299,9 @@ def _read_images(
     }
 
 
-def _trace(motion: MotionTrack, robot: RobotModel, stamp: int) -> np.ndarray:
-    """Ground that the robot drove over before a time ``[k, 3]``, in the odometry frame [m]."""
-    before = motion.stamps <= stamp
+def _trace(motion: MotionTrack, robot: RobotModel, stamp: int, since: int = 0) -> np.ndarray:
+    """Ground that the robot drove over before a time, from ``since`` on ``[k, 3]``, in the odometry frame [m]."""
+    before = (motion.stamps <= stamp) & (motion.stamps >= since)
     # One pose in ten centimetres is needed, and odometry may be far denser.
     recent = np.flatnonzero(before)[-_TRACE_POSES:]
     poses = np.tile(np.eye(4), (len(recent), 1, 1))

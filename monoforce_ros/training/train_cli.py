@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from monoforce_ros.bags import BagError, add_read_options, read_options
-from monoforce_ros.core import OptionParser, write_text
+from monoforce_ros.core import OptionParser, without_nan, write_text
 from monoforce_ros.encoder import (
     SENSORS,
     CheckpointError,
@@ -412,7 +412,7 @@ def _adapt(options: argparse.Namespace) -> None:
         adapted, share = keep_obstacles(encoder, adapted, choosing, bar.update)
     save_encoder(adapted, options.out / "encoder.safetensors")
     result = compare(encoder, adapted, [part[1] for part in parts], judging, share)
-    write_text(options.out / "adaptation.json", json.dumps(asdict(result), indent=1) + "\n")
+    write_text(options.out / "adaptation.json", json.dumps(without_nan(asdict(result)), indent=1) + "\n")
     print(result.summary)
     print(f"use it with checkpoint:={options.out / 'encoder.safetensors'}")
 
@@ -615,7 +615,7 @@ class _Log:
 
 
 def _write_summary(out: Path, trainer: Trainer, description: dict) -> None:
-    content = json.dumps(description | {"history": trainer.described_history}, indent=2, default=str)
+    content = json.dumps(without_nan(description | {"history": trainer.described_history}), indent=2, default=str)
     write_text(out / "training.json", content)
     checkpoint = out / "encoder.safetensors"
     line = f"{checkpoint}: {checkpoint.stat().st_size / 1e6:.1f} MB"
