@@ -11,6 +11,7 @@ from monoforce_ros.bags import Recording, smooth
 from monoforce_ros.core import without_nan
 from monoforce_ros.encoder import EncoderConfig, load_encoder, new_encoder
 from monoforce_ros.encoder.checkpoint import shipped_checkpoint
+from monoforce_ros.encoder.view import support_plane
 from monoforce_ros.robots import load_robot, robot_digest
 from monoforce_ros.training import train_cli
 from monoforce_ros.training.adaptation import shares_targets, split_recording
@@ -237,3 +238,21 @@ def test_nothing_of_a_sample_is_from_beyond_a_jump_of_the_localisation(demo_bag,
 def test_json_has_no_nan():
     content = {"a": float("nan"), "b": [1.0, float("inf"), {"c": 2}], "d": "text"}
     assert without_nan(content) == {"a": None, "b": [1.0, None, {"c": 2}], "d": "text"}
+
+
+def test_a_sample_of_a_sweep_alone_shows_no_camera_of_many():
+    random = np.random.default_rng(2)
+    drawn = [Augmentation.draw(random, (0.0, 0.0, 1.0)) for _ in range(20)]
+    assert not any(augmentation.shows(camera) for augmentation in drawn for camera in range(9))
+    assert Augmentation().shows(8)
+
+
+@pytest.mark.parametrize(("half_length", "off"), [(0.3, 0.01), (1.4, 0.01)])
+def test_the_plane_under_the_wheels_reaches_those_of_a_long_robot(half_length, off):
+    slope = np.tan(np.radians(20.0))
+    support = np.array([[x, y, slope * x] for x in (-half_length, half_length) for y in (-0.5, 0.5)])
+    ground, plane, near = support_plane(support, CONFIG.grid)
+    rows, columns, _ = CONFIG.grid.cells(support[:, :2])
+    heights = ground + (plane * near)[rows, columns]
+    cell = 0.5 * CONFIG.resolution * slope
+    assert np.abs(heights - support[:, 2]).max() < off + cell

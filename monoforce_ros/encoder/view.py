@@ -20,7 +20,7 @@ _EMPTY = 127
 """Grey level of the part of the network's view that no image covers: zero after normalisation."""
 _SUPPORT_REACH, _SUPPORT_END = 1.0, 2.5
 """Distances from the robot's centre up to which the plane under its wheels describes the ground, and from which on
-level ground is the better guess [m]."""
+level ground is the better guess [m]; both are larger for wheels further away than the first."""
 _STEEPEST = 1.5
 """Limit of the plane's height relative to the robot's ground, as an input [m]."""
 
@@ -202,7 +202,9 @@ def support_plane(support: np.ndarray | None, grid: Grid) -> tuple[float, np.nda
     if support is None or len(support) < 3:
         return 0.0, np.zeros(shape), np.zeros(shape)
     distance = np.hypot(grid.x[None, :], grid.y[:, None])
-    near = np.clip((_SUPPORT_END - distance) / (_SUPPORT_END - _SUPPORT_REACH), 0.0, 1.0)
+    # Of a long robot at least as far as its own wheels.
+    beyond = max(0.0, float(np.hypot(*support[:, :2].T).max()) - _SUPPORT_REACH)
+    near = np.clip((_SUPPORT_END + beyond - distance) / (_SUPPORT_END - _SUPPORT_REACH), 0.0, 1.0)
     middle = support.mean(axis=0)
     slope = np.linalg.lstsq(support[:, :2] - middle[:2], support[:, 2] - middle[2], rcond=None)[0]
     plane = slope[0] * (grid.x[None, :] - middle[0]) + slope[1] * (grid.y[:, None] - middle[1])

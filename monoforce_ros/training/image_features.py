@@ -83,7 +83,7 @@ def image_features(
     parts = []
     for done, recording in enumerate(recordings, start=1):
         for variant in range(max(variants, 1)):
-            content = [FEATURES_VERSION, recording.name, len(recording), list(recording.images.shape), weights,
+            content = [FEATURES_VERSION, recording.name, _content(recording), weights,
                        variant if variants else -1, seed if variants else -1]  # fmt: skip
             digest = hashlib.sha256(json.dumps(content).encode()).hexdigest()[:12]
             file = folder / f"features-{digest}.safetensors"
@@ -95,6 +95,15 @@ def image_features(
     if not sum(map(len, parts)):
         raise SamplesError(f"{len(recordings)} recordings: got no image, expected some to learn depth from")
     return ImageFeatures.stack(parts)
+
+
+def _content(recording: RecordingSamples) -> str:
+    """Hash of a recording's images, at a sixteenth of their size, and of where its cameras were."""
+    found = hashlib.sha256(str(list(recording.images.shape)).encode())
+    found.update(recording.images[..., ::16, ::16].contiguous().numpy().tobytes())
+    found.update(np.asarray(recording.odometry_from_cameras).tobytes())
+    found.update(repr(recording.cameras).encode())
+    return found.hexdigest()
 
 
 @torch.no_grad()

@@ -141,7 +141,7 @@ class Augmentation:
 
     def shows(self, camera: int) -> bool:
         """Whether a camera, by its index, is kept."""
-        return camera >= len(self.cameras) or self.cameras[camera] <= self.camera_share
+        return not self.cameras or self.cameras[camera % len(self.cameras)] <= self.camera_share
 
     def thinned(self, points: np.ndarray, sensor: np.ndarray) -> np.ndarray:
         """Kept points ``[n, 3]`` of a sweep measured from ``sensor`` ``[3]``, with noise: some rings, some points of
