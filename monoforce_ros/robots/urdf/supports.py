@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -60,12 +61,16 @@ def find_supports(
             if not hint and abs(float(points[:, 2].min()) - ground) > reach:
                 continue
             shape = _shape(points, group, max(_SMALLEST * radius, _SMALLEST_RADIUS))
-            name = link if len(groups) == 1 else f"{link}_{number}"
+            one = len(groups) == 1
+            name, swivel = link if one else f"{link}_{number}", joint
+            if not one:
+                # Joints are told by their names.
+                swivel = replace(joint, name=f"{joint.name}_{number}")
             reason = "by hint" if hint else "by its name" if named else "a sphere that reaches the ground"
             pivot = shape.centre + np.array([_TRAIL * shape.radius, 0.0, 0.0])
             found.append(
                 WheelPart(
-                    name, joint, shape, swivel=joint, shapes=tuple(entry[1] for entry in group), pivot=pivot,
+                    name, swivel, shape, swivel=swivel, shapes=tuple(entry[1] for entry in group), pivot=pivot,
                     reason=f"fixed to the body, {reason}",
                 )
             )  # fmt: skip
