@@ -196,3 +196,19 @@ def test_who_walked_by_is_forgotten_when_the_lidar_looks_over_the_place(husky, k
     height = terrain.height.numpy() - ground
     trail = (np.abs(GRID.x - 1.6) < 0.5)[None, :] & (np.abs(GRID.y) < 1.5)[:, None]
     assert height[trail].max() < 0.45 and (height[trail] > 0.3).sum() < 15
+
+
+@pytest.mark.parametrize("depth", [0.5, 4.0])
+def test_the_top_of_a_wall_is_no_ceiling(husky, depth):
+    ground = -husky.ground_clearance
+    random = np.random.default_rng(0)
+    floor = random.uniform(-6.4, 6.4, (40_000, 2))
+    floor = floor[(floor[:, 0] < 2.0) | (np.abs(floor[:, 1]) > 2.0) | (floor[:, 0] > 2.1 + depth)]
+    front = np.column_stack([np.full(4000, 2.0), random.uniform([-2.0, ground], [2.0, ground + 1.4], (4000, 2))])
+    top = random.uniform([2.0, -2.0], [2.0 + depth, 2.0], (8000, 2))
+    level, raised = np.full(len(floor), ground), np.full(len(top), ground + 1.4)
+    cloud = np.concatenate([np.column_stack([floor, level]), front, np.column_stack([top, raised])]).astype(np.float32)
+    source = choose_terrain_source("lidar_interpolation", husky)
+    height = source.terrain(Observation(0, cloud=cloud), STILL).height.numpy() - ground
+    on_top = (GRID.x > 2.1) & (GRID.x < 1.9 + depth)
+    assert height[np.abs(GRID.y) < 1.8][:, on_top].min() > 1.2

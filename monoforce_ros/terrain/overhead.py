@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from monoforce_ros.terrain.grid import Grid
+from monoforce_ros.terrain.terrain_map import polar
 
 _SLOPES = (0.2, 0.5)
 """Slopes across gaps between returns at which ground is sought, gentle first, so that ground behind a gap is found
@@ -16,6 +17,8 @@ _NEXT, _STEP = 0.25, 0.5
 """Neighbouring returns at most so far apart [m] are ground together if the height differs by no more than that [m]:
 banks of up to 63° go on, ceilings over the foot of a wall do not."""
 _MOST_ROUNDS = 12
+_EDGE = 0.3
+"""How far the top of a wall may be above its highest return [m]: rings of a lidar are apart."""
 
 
 class GroundReference:
@@ -96,11 +99,12 @@ def without_overhead(
 
     A cell's returns are overhead if even the lowest is further above the nearest ground than the robot needs, allowing
     for a slope in between, and so are those above a gap of this height: a ceiling over a lidar's blind zone has no
-    returns of the floor below it, and would be taken for ground.
+    returns of the floor below it, and would be taken for ground. What lies behind a wall that rises as high is the top
+    of it: a platform, a quay.
 
     Args:
         points: ``[n, 3]`` [m], z up.
-        grid: cells of the map; points off it are kept.
+        grid: cells of the map, with the robot at the origin of its frame; points off it are kept.
         support: points of the ground under the wheels ``[m, 3]`` [m]; without any on the map all points are kept.
         headroom: vertical gap that the robot passes under [m].
         lowest, highest: limits of the heights that a map takes [m]; points beyond are kept, and do not matter here.
@@ -113,11 +117,29 @@ def without_overhead(
     floor = np.full(grid.rows * grid.columns, np.inf)
     np.minimum.at(floor, flat, z)
     reference = GroundReference(floor.reshape(grid.rows, grid.columns), support, grid)
-    over = reference.headroom(flat, floor[flat]) > headroom
-    over |= _above_gaps(flat, z, floor, headroom)
+    high = (reference.headroom(np.arange(len(floor)), floor) > headroom) & np.isfinite(floor)
+    above = _above_gaps(flat, z, floor, headroom)
+    if high.any():
+        top = np.full(len(floor), -np.inf)
+        carried = ~above & ~high[flat]
+        np.maximum.at(top, flat[carried], z[carried])
+        high &= floor > _tops_before(top, grid) + _EDGE
+    over = above | high[flat]
     keep = np.ones(len(points), bool)
     keep[np.flatnonzero(inside)[over]] = False
     return points[keep]
+
+
+def _tops_before(top: np.ndarray, grid: Grid) -> np.ndarray:
+    """Height of the highest of what stands nearer to the origin in the direction of each cell, ``[rows · columns]``."""
+    distance, sector = polar(grid)
+    ring = (distance / grid.resolution).astype(int).ravel()
+    sector = sector.ravel()
+    highest = np.full((int(sector.max()) + 1, int(ring.max()) + 2), -np.inf)
+    # One further: what stands in the cell itself is not before it.
+    np.maximum.at(highest, (sector, ring + 1), top)
+    beside = np.max([np.roll(highest, by, axis=0) for by in (-1, 0, 1)], axis=0)
+    return np.maximum.accumulate(beside, axis=1)[sector, ring]
 
 
 def _above_gaps(cells: np.ndarray, z: np.ndarray, floor: np.ndarray, headroom: float) -> np.ndarray:
