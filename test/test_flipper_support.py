@@ -1,4 +1,4 @@
-"""A robot on lowered flippers stands on them: maps of a lidar begin below them, not in them."""
+"""A robot on lowered flippers is carried by them: maps of a lidar begin below them, not in them."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import torch
 
 from monoforce_ros.core import MotionState
 from monoforce_ros.perception import Observation, choose_terrain_source
-from monoforce_ros.perception.ground_alignment import posed_robot, support_under
+from monoforce_ros.perception.ground_alignment import standing
 from monoforce_ros.prediction import Predictor
 from monoforce_ros.prediction.joint_motion import JointMotion
 from monoforce_ros.robots import load_robot
@@ -23,7 +23,7 @@ def marv():
 def test_the_ground_is_under_the_flippers_that_carry_a_robot(marv, angle):
     posed = marv.posed(torch.full((4,), angle))
     lowest = float(posed.points[posed.point_drives >= 0][:, 2].min())
-    support = support_under(marv, posed_robot(marv, np.full(4, angle)), STILL, 2e6)
+    _, support = standing(marv, np.full(4, angle), STILL, 2e6)
     assert len(support) >= 4
     assert np.abs(support[:, 2] - lowest).max() < 0.03
     # On both sides, in front of the centre of mass and behind it.

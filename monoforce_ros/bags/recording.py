@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from monoforce_ros.bags.command_timeout import TIMEOUT, expired
 from monoforce_ros.bags.joint_record import JointRecord
 from monoforce_ros.bags.open_bags import opened
 from monoforce_ros.bags.reader import BagError, BagMessage, BagReader
+from monoforce_ros.bags.recorded_clock import from_reception, longest_part
 from monoforce_ros.core import (
     AngularVelocityTrack,
     CameraModel,
@@ -42,9 +44,6 @@ IMAGES = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 IMU, JOINTS = "sensor_msgs/msg/Imu", "sensor_msgs/msg/JointState"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
-_ANOTHER_CLOCK, _AROUND = 86_400 * 10**9, 60 * 10**9
-"""Pause of the poses from which on the clock was set rather than the robot left alone [ns], and how far beyond the
-poses of one clock other messages belong to it [ns]."""
 FIXED = 0.01
 """Largest change of a transform on /tf between frames that are fixed to each other [m, rad]: a joint that moves less
 displaces what is measured by less than odometry's own error."""
@@ -463,25 +462,11 @@ class _Collector:
         }
 
     def _translate_unstamped(self) -> None:
-        """Give messages without stamps the time of the poses' clock, where that is another one than the recorder's.
-
-        A simulation has its own time, and Twist has no stamp: received in 2026, the poses stamped from 0 on.
-        """
-        stamps = np.array(sorted(self._received), np.int64)
-        received = np.array([self._received[stamp] for stamp in stamps.tolist()], np.int64)
-        if len(stamps) < 2 or abs(float(np.median(received - stamps))) < _ANOTHER_CLOCK:
+        """Give messages without stamps the time of the poses' clock, where that is another one than the recorder's."""
+        translated = from_reception(self._received)
+        if translated is None:
             return
-        order = np.argsort(received, kind="stable")
-        received, stamps = received[order], stamps[order]
-        topics = sorted(set(self._unstamped) - self._stamped)
-
-        def translated(time: int) -> int:
-            before = int(np.clip(np.searchsorted(received, time, side="right") - 1, 0, len(received) - 2))
-            step = max(int(received[before + 1] - received[before]), 1)
-            share = (time - int(received[before])) / step
-            return int(stamps[before]) + round(share * int(stamps[before + 1] - stamps[before]))
-
-        tracks = self._tracks()
+        topics, tracks = sorted(set(self._unstamped) - self._stamped), self._tracks()
         for topic in topics:
             for track in tracks.get(topic, []):
                 track[:] = [(translated(entry[0]), *entry[1:]) for entry in track]
@@ -495,27 +480,15 @@ class _Collector:
             )
 
     def _keep_one_clock(self) -> None:
-        """Keep the longest part of a recording during which the clock was set forward by a day or more.
-
-        A computer without a battery for its clock starts in 1970, until the network tells it the time.
-        """
-        stamps = np.unique(np.array([stamp for stamp, _ in self.states], np.int64))
-        breaks = np.flatnonzero(np.diff(stamps) > _ANOTHER_CLOCK)
-        if not len(breaks):
+        found = longest_part(np.array([stamp for stamp, _ in self.states], np.int64))
+        if found is None:
             return
-        parts = np.split(stamps, breaks + 1)
-        kept = max(parts, key=len)
-        start, stop = int(kept[0]) - _AROUND, int(kept[-1]) + _AROUND
-        for tracks in self._tracks().values():
-            for track in tracks:
-                track[:] = [entry for entry in track if start <= entry[0] <= stop]
+        start, stop, text = found
+        for track in itertools.chain.from_iterable(self._tracks().values()):
+            track[:] = [entry for entry in track if start <= entry[0] <= stop]
         for topic, frames in self.indexed.items():
             self.indexed[topic] = [frame for frame in frames if start <= frame.stamp <= stop]
-        days = float(np.diff(stamps)[breaks].max()) * 1e-9 / 86400.0
-        self.warnings.append(
-            f"the clock was set forward by {days:.0f} days during the recording: of {len(parts)} parts the longest is "
-            f"used, {float(kept[-1] - kept[0]) * 1e-9:.0f} s; set the clock before recording (chrony)"
-        )
+        self.warnings.append(text)
 
     def _command(self, message: Message) -> np.ndarray:
         if hasattr(message, "drive") or hasattr(message, "steering_angle"):

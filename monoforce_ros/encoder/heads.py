@@ -233,6 +233,11 @@ def _layer(decrease: Tensor, resolution: float) -> Tensor:
     return torch.where(mean > SMALLEST_DECREASE, decrease, 0.0)
 
 
+def terrain_of(maps: EncodedMaps, batch: EncoderInput, config: EncoderConfig) -> TerrainMap:
+    """The prediction for a batch of one, kept within the returns of its sweep where the network takes sweeps."""
+    return terrain_maps(within_returns(maps, batch) if config.believes else maps, config)[0]
+
+
 def terrain_maps(maps: EncodedMaps, config: EncoderConfig) -> list[TerrainMap]:
     """The predictions of a batch as terrain maps on the CPU.
 

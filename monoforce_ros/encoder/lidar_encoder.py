@@ -11,7 +11,7 @@ from torch import nn
 
 from monoforce_ros.encoder.birds_eye import BirdsEyeNetwork
 from monoforce_ros.encoder.config import EncoderConfig
-from monoforce_ros.encoder.heads import EncodedMaps, map_heads, maps_from_heads, terrain_maps, within_returns
+from monoforce_ros.encoder.heads import EncodedMaps, map_heads, maps_from_heads, terrain_of
 from monoforce_ros.encoder.sweep import HIT
 from monoforce_ros.encoder.view import SUPPORT_CHANNELS, CameraView, EncoderInput, encoder_input
 from monoforce_ros.terrain import TerrainMap
@@ -54,5 +54,4 @@ class LidarEncoder(nn.Module):
         if self.training:
             self.eval()
         batch = encoder_input([], support, self.config, sweep=sweep, trace=trace).to(self.heads.weight.device)
-        maps = self(batch)
-        return terrain_maps(within_returns(maps, batch) if self.config.believes else maps, self.config)[0]
+        return terrain_of(self(batch), batch, self.config)

@@ -13,14 +13,7 @@ from torch.nn import functional
 from monoforce_ros.encoder.backbone import COARSE_CHANNELS, FINE_CHANNELS, Backbone
 from monoforce_ros.encoder.birds_eye import BirdsEyeNetwork
 from monoforce_ros.encoder.config import EncoderConfig
-from monoforce_ros.encoder.heads import (
-    EncodedMaps,
-    map_heads,
-    maps_from_heads,
-    terrain_maps,
-    with_edges,
-    within_returns,
-)
+from monoforce_ros.encoder.heads import EncodedMaps, map_heads, maps_from_heads, terrain_of, with_edges
 from monoforce_ros.encoder.image_context import ImageContext, resized
 from monoforce_ros.encoder.lift import depth_values, lifted_points, map_cells, splat
 from monoforce_ros.encoder.sweep import HIT
@@ -233,5 +226,4 @@ class TerrainEncoder(nn.Module):
         if self.training:
             self.eval()
         batch = encoder_input(views, support, self.config, sweep=sweep, trace=trace).to(self.depths.device)
-        maps = self(batch)
-        return terrain_maps(within_returns(maps, batch) if self.config.believes else maps, self.config)[0]
+        return terrain_of(self(batch), batch, self.config)

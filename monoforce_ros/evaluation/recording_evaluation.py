@@ -15,6 +15,7 @@ from monoforce_ros.evaluation.metrics import Poses, Summary, position_errors, ro
 from monoforce_ros.evaluation.twist_check import with_usable_twists
 from monoforce_ros.messages import MessageError
 from monoforce_ros.perception import FlatTerrain, Observation, TrustedTerrain
+from monoforce_ros.physics import IdentityCache
 from monoforce_ros.prediction import JointMotion, Prediction, Predictor
 from monoforce_ros.reporting import progress
 from monoforce_ros.robots import RobotModel
@@ -103,9 +104,7 @@ def evaluate_recording(
     Raises:
         EvaluationError: sensor data or commands are missing, or no window has enough odometry after it.
     """
-    recording = corrected_recording(recording, predictor.robot)
-    usable, fault = with_usable_twists(recording.motion, smooth(recording.motion).motion)
-    recording = replace(recording, motion=usable)
+    recording, fault = _prepared(recording, predictor.robot)
     sensors = predictor.source.sensors
     stamps = _window_stamps(recording, sensors, image_topics, stride, minimum_duration or min(horizons))
     count = round(max(horizons) / SAMPLE_TIME) + 1
@@ -189,8 +188,7 @@ def evaluate_recording(
 
 def predict_at(recording: Recording, predictor: Predictor, stamp: int, image_topics: Sequence[str] = ()) -> Prediction:
     """A prediction with contact forces from the data at ``stamp`` [ns], under the commands recorded after it."""
-    recording = corrected_recording(recording, predictor.robot)
-    recording = replace(recording, motion=with_usable_twists(recording.motion, smooth(recording.motion).motion)[0])
+    recording, _ = _prepared(recording, predictor.robot)
     return predictor.predict(
         observe(recording, predictor.robot, stamp, predictor.source.sensors, image_topics),
         recording.motion.at(stamp, maximum_gap=MAXIMUM_GAP),
@@ -212,6 +210,21 @@ def recorded_joints(recording: Recording, predictor: Predictor, stamps: Sequence
         measured = np.full((len(starts), len(predictor.robot.joints)), np.nan)
     after = np.stack([predictor.command_stamps(int(stamp))[predictor.history :] for stamp in starts])
     return JointMotion.recorded(measured, recording.joints.flipper_angles(after))
+
+
+_PREPARED: IdentityCache[tuple[Recording, str]] = IdentityCache(1)
+"""The last recording: pictures of single predictions follow its evaluation, and smoothing its poses takes time."""
+
+
+def _prepared(recording: Recording, robot: RobotModel) -> tuple[Recording, str]:
+    """The corrected recording with usable velocities, and what was wrong with its own."""
+
+    def prepared() -> tuple[Recording, str]:
+        corrected = corrected_recording(recording, robot)
+        motion, fault = with_usable_twists(corrected.motion, smooth(corrected.motion).motion)
+        return replace(corrected, motion=motion), fault
+
+    return _PREPARED.get((recording, robot), prepared)
 
 
 def corrected_recording(recording: Recording, robot: RobotModel) -> Recording:

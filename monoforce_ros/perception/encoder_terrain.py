@@ -12,7 +12,7 @@ import torch
 from monoforce_ros.core import MotionState
 from monoforce_ros.encoder import CameraView, Encoder, EncoderConfig
 from monoforce_ros.perception.fusion import material_by_compliance
-from monoforce_ros.perception.ground_alignment import align_to_ground, posed_robot, support_under
+from monoforce_ros.perception.ground_alignment import align_to_ground, standing
 from monoforce_ros.perception.lidar import usable_returns
 from monoforce_ros.perception.observation import Observation
 from monoforce_ros.perception.trace import DrivenGround
@@ -94,8 +94,7 @@ class EncoderTerrain:
             wanted = {"camera": "an image", "lidar": "a point cloud"}
             names = " or ".join(wanted[name] for name in self.sensors)
             raise ValueError(f"the terrain encoder needs {names}, and the observation has none")
-        posed = posed_robot(self.robot, observation.flipper_angles)
-        support = support_under(self.robot, posed, motion, self.stiffness)
+        posed, support = standing(self.robot, observation.flipper_angles, motion, self.stiffness)
         sweep = None
         if cloud is not None:
             sweep = usable_returns(cloud, posed, motion, support, self.grid)

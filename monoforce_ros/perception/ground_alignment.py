@@ -9,7 +9,7 @@ import torch
 from scipy.spatial import ConvexHull
 
 from monoforce_ros.core import MotionState, transform_points
-from monoforce_ros.physics import rest_depth
+from monoforce_ros.physics import IdentityCache, rest_depth
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import TerrainMap
 
@@ -53,19 +53,36 @@ def posed_robot(robot: RobotModel, flipper_angles: np.ndarray | None) -> RobotMo
     return robot.posed(torch.from_numpy(np.where(np.isfinite(flipper_angles), flipper_angles, at_rest)))
 
 
-def support_under(robot: RobotModel, posed: RobotModel, motion: MotionState, stiffness: float) -> np.ndarray:
-    """As :func:`support_points`, of a robot that may stand on its flippers.
+_STANDING: IdentityCache[tuple[RobotModel, np.ndarray]] = IdentityCache(8)
+"""What an encoder, its fallback, their comparison and the memory all ask for at one time."""
 
-    What carries it then is the facet of the convex hull of its tracks that lies below its centre of mass.
+
+def standing(
+    robot: RobotModel, flipper_angles: np.ndarray | None, motion: MotionState, stiffness: float
+) -> tuple[RobotModel, np.ndarray]:
+    """A robot with its flippers as measured, and the ground under it as of :func:`support_points`.
+
+    What carries a robot on its flippers is the facet of the convex hull of its tracks that lies below its centre of
+    mass.
 
     Args:
         robot: as in its file.
-        posed: the same with its flippers as measured, see :func:`posed_robot`.
+        flipper_angles: see :func:`posed_robot`.
         motion: its pose.
         stiffness: of the ground [N/m³].
     """
-    if posed is robot:
-        return support_points(robot, motion, stiffness)
+
+    def found() -> tuple[RobotModel, np.ndarray]:
+        posed = posed_robot(robot, flipper_angles)
+        if posed is robot:
+            return robot, support_points(robot, motion, stiffness)
+        return posed, _carrying(posed, motion) + np.array([0.0, 0.0, rest_depth(robot, stiffness)])
+
+    return _STANDING.get((robot, motion, flipper_angles), found, values=stiffness)
+
+
+def _carrying(posed: RobotModel, motion: MotionState) -> np.ndarray:
+    """Points of the tracks of a robot on its flippers that touch the ground ``[m, 3]``, in terrain axes [m]."""
     tracks = posed.points[posed.point_drives >= 0].double().cpu().numpy()
     points = transform_points(motion.terrain_from_base, tracks)
     centre = transform_points(motion.terrain_from_base, posed.centre_of_mass.double().cpu().numpy()[None])[0]
@@ -74,9 +91,7 @@ def support_under(robot: RobotModel, posed: RobotModel, motion: MotionState, sti
     # The lower hull is the largest of the planes of its facets.
     heights = -(planes[:, :2] @ centre[:2] + planes[:, 3]) / planes[:, 2]
     plane = planes[int(np.argmax(heights))]
-    carrying = points[points @ plane[:3] + plane[3] > -_ON_THE_GROUND]
-    carrying[:, 2] += rest_depth(robot, stiffness)
-    return carrying
+    return points[points @ plane[:3] + plane[3] > -_ON_THE_GROUND]
 
 
 def ground_around(cloud: np.ndarray, robot: RobotModel, motion: MotionState, stiffness: float) -> float:

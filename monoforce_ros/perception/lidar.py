@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from monoforce_ros.core import MotionState, transform_points
-from monoforce_ros.perception.ground_alignment import posed_robot, support_under
+from monoforce_ros.perception.ground_alignment import standing
 from monoforce_ros.perception.observation import Observation
 from monoforce_ros.physics import IdentityCache
 from monoforce_ros.robots import RobotModel
@@ -36,8 +36,7 @@ class LidarTerrain:
         """Interpolated map; raises ``TerrainError`` if too few returns lie on the grid."""
         if observation.cloud is None:
             raise ValueError("the lidar terrain source needs a point cloud, and the observation has none")
-        posed = posed_robot(self.robot, observation.flipper_angles)
-        support = support_under(self.robot, posed, motion, self.material.stiffness)
+        posed, support = standing(self.robot, observation.flipper_angles, motion, self.material.stiffness)
         settings = replace(self.settings, headroom=self.robot.headroom)
         return terrain_from_cloud(
             usable_returns(observation.cloud, posed, motion, support, self.grid),
@@ -59,7 +58,7 @@ def usable_returns(
     support: np.ndarray,
     grid: Grid,
 ) -> np.ndarray:
-    """Returns of the ground and of what stands on it: neither of the robot nor of what it passes under.
+    """Returns of the ground and of objects on it: neither of the robot nor of what it passes under.
 
     Args:
         cloud: returns ``[n, 3]`` in the base frame [m].

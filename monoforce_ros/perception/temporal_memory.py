@@ -9,7 +9,7 @@ import torch
 
 from monoforce_ros.core import NANOSECOND, CameraModel, MotionState
 from monoforce_ros.perception.clearance import clear_of_robot
-from monoforce_ros.perception.ground_alignment import align_to_ground, posed_robot, support_under
+from monoforce_ros.perception.ground_alignment import align_to_ground, standing
 from monoforce_ros.perception.observation import Observation, TerrainSource
 from monoforce_ros.perception.trace import continues
 from monoforce_ros.robots import RobotModel, is_lidar
@@ -116,8 +116,7 @@ class TemporalMemory:
         if not kept.any():
             return now
         joined = now.with_cells(torch.from_numpy(kept), dict(zip(CHANNELS, torch.from_numpy(values), strict=True)))
-        posed = posed_robot(self._robot, observation.flipper_angles)
-        support = support_under(self._robot, posed, motion, self._stiffness)
+        posed, support = standing(self._robot, observation.flipper_angles, motion, self._stiffness)
         return clear_of_robot(align_to_ground(joined, support), posed, motion)
 
 

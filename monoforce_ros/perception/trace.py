@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from monoforce_ros.core import NANOSECOND, MotionState, MotionTrack, transform_points
 from monoforce_ros.perception.ground_alignment import lowest_points, support_points
@@ -108,7 +109,16 @@ def unbroken(track: MotionTrack, since: MotionState) -> bool:
         track: measured motion that begins at the time of the state, or earlier.
         since: a state measured earlier by the same odometry.
     """
-    later = list(track.states(since.stamp - 1, int(track.stamps[-1])))
-    if not later or (later[0].stamp - since.stamp) * NANOSECOND > _LONGEST_BREAK:
+    first = int(np.searchsorted(track.stamps, since.stamp))
+    if first == len(track) or (int(track.stamps[first]) - since.stamp) * NANOSECOND > _LONGEST_BREAK:
         return False
-    return all(continues(after, before) for before, after in zip([since, *later], later, strict=False))
+    if not continues(track.at(int(track.stamps[first])), since):
+        return False
+    # As of :func:`continues`, of all states at once.
+    positions, velocities = track.positions[first:], track.linear_velocities[first:-1]
+    elapsed = np.diff(track.stamps[first:]) * NANOSECOND
+    moved = (
+        Rotation.from_quat(track.quaternions[first:-1]).apply(velocities) * elapsed[:, None] if len(elapsed) else 0.0
+    )
+    off = np.linalg.norm(np.diff(positions, axis=0) - moved, axis=1)
+    return bool((off < _JUMP * np.maximum(1.0, elapsed)).all())

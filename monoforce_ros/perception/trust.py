@@ -15,7 +15,7 @@ from scipy import stats
 
 from monoforce_ros.core import MotionState, transform_points
 from monoforce_ros.perception.encoder_terrain import EncoderTerrain
-from monoforce_ros.perception.ground_alignment import posed_robot, support_under
+from monoforce_ros.perception.ground_alignment import standing
 from monoforce_ros.perception.observation import Observation, TerrainSource
 from monoforce_ros.perception.temporal_memory import TemporalMemory
 from monoforce_ros.perception.trace import continues
@@ -370,9 +370,8 @@ class TrustedTerrain:
         """The encoder's map or the fallback's; raises the source's errors."""
         self.predicted = predicted = self.source.terrain(observation, motion)
         other = self._fallback(observation, motion)
-        robot = self._encoder.robot
-        posed = posed_robot(robot, observation.flipper_angles)
-        support = support_under(robot, posed, motion, self._encoder.stiffness)
+        encoder = self._encoder
+        _, support = standing(encoder.robot, observation.flipper_angles, motion, encoder.stiffness)
         cameras = {}
         for name, pose in observation.base_from_cameras.items():
             axis = (motion.terrain_from_base @ pose)[:3, 2]

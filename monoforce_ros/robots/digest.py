@@ -1,4 +1,4 @@
-"""Digest of a robot: a hash of all that its file says, by which results that depend on it are told from others."""
+"""Digest of a robot: a hash of all that its file says, to notice results of another robot."""
 
 from __future__ import annotations
 

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from monoforce_ros.terrain.grid import Grid
+from monoforce_ros.terrain.overhead import beyond_gap
 from monoforce_ros.terrain.scatter import horizontal_scatter
 from monoforce_ros.terrain.terrain_map import TerrainDefaults, TerrainMap, polar
 
@@ -199,15 +200,12 @@ def cell_quantiles(
         return heights.reshape(shape), observed
     order = np.lexsort((z, flat))
     flat, z = flat[order], z[order]
-    first = np.r_[True, flat[1:] != flat[:-1]]
-    # Count the gaps below each return: within a cell, only returns below the first gap belong to the ground.
-    gaps = np.cumsum(np.r_[False, ~first[1:] & (np.diff(z) > settings.headroom)])
-    cell = np.cumsum(first) - 1
-    ground = gaps == gaps[np.flatnonzero(first)][cell]
-    flat, z, cell = flat[ground], z[ground], cell[ground]
-    starts = np.flatnonzero(np.r_[True, cell[1:] != cell[:-1]])
+    # Within a cell, only returns below the first gap belong to the ground.
+    ground = ~beyond_gap(flat, z, settings.headroom)
+    flat, z = flat[ground], z[ground]
+    starts = np.flatnonzero(np.r_[True, flat[1:] != flat[:-1]])
     standing = stands_on_ground(z[starts], flat[starts], grid, settings)
-    counts = np.diff(np.r_[starts, len(cell)])
+    counts = np.diff(np.r_[starts, len(flat)])
     for row, quantile in zip(heights, quantiles, strict=True):
         position = starts + (counts - 1) * quantile
         below = np.floor(position).astype(np.int64)

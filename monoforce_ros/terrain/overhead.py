@@ -80,11 +80,7 @@ def hanging_low(
 
     Of points without overhead for a taller robot these are what it cannot pass under.
     """
-    rows, columns, inside = grid.cells(points[:, :2])
-    inside &= (points[:, 2] > lowest) & (points[:, 2] < highest)
-    flat, z = (rows * grid.columns + columns)[inside], points[inside, 2]
-    floor = np.full(grid.rows * grid.columns, np.inf)
-    np.minimum.at(floor, flat, z)
+    flat, z, floor, _ = _floors(points, grid, lowest, highest)
     over = _above_gaps(flat, z, floor, headroom)
     heights = np.full(grid.rows * grid.columns, -np.inf)
     np.maximum.at(heights, flat[over], z[over])
@@ -109,13 +105,9 @@ def without_overhead(
         headroom: vertical gap that the robot passes under [m].
         lowest, highest: limits of the heights that a map takes [m]; points beyond are kept, and do not matter here.
     """
-    rows, columns, inside = grid.cells(points[:, :2])
-    inside &= (points[:, 2] > lowest) & (points[:, 2] < highest)
-    if not len(support) or not grid.cells(support[:, :2])[2].any() or not inside.any():
+    flat, z, floor, inside = _floors(points, grid, lowest, highest)
+    if not len(support) or not grid.cells(support[:, :2])[2].any() or not len(z):
         return points
-    flat, z = (rows * grid.columns + columns)[inside], points[inside, 2]
-    floor = np.full(grid.rows * grid.columns, np.inf)
-    np.minimum.at(floor, flat, z)
     reference = GroundReference(floor.reshape(grid.rows, grid.columns), support, grid)
     high = (reference.headroom(np.arange(len(floor)), floor) > headroom) & np.isfinite(floor)
     above = _above_gaps(flat, z, floor, headroom)
@@ -128,6 +120,26 @@ def without_overhead(
     keep = np.ones(len(points), bool)
     keep[np.flatnonzero(inside)[over]] = False
     return points[keep]
+
+
+def _floors(
+    points: np.ndarray, grid: Grid, lowest: float, highest: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Flat cells and heights of the points on the map ``[k]``, the lowest of each cell ``[rows · columns]``, infinite
+    without one, and which points these are ``[n]`` bool."""
+    rows, columns, inside = grid.cells(points[:, :2])
+    inside &= (points[:, 2] > lowest) & (points[:, 2] < highest)
+    flat, z = (rows * grid.columns + columns)[inside], points[inside, 2]
+    floor = np.full(grid.rows * grid.columns, np.inf)
+    np.minimum.at(floor, flat, z)
+    return flat, z, floor, inside
+
+
+def beyond_gap(cells: np.ndarray, z: np.ndarray, headroom: float) -> np.ndarray:
+    """Points above a gap of ``headroom`` in their cell, ``[n]`` bool; sorted by cell, and by height within each."""
+    first = np.r_[True, cells[1:] != cells[:-1]]
+    gaps = np.cumsum(np.r_[False, ~first[1:] & (np.diff(z) > headroom)])
+    return gaps > gaps[np.flatnonzero(first)][np.cumsum(first) - 1]
 
 
 def _tops_before(top: np.ndarray, grid: Grid) -> np.ndarray:
@@ -151,8 +163,5 @@ def _above_gaps(cells: np.ndarray, z: np.ndarray, floor: np.ndarray, headroom: f
     if not len(index):
         return result
     order = index[np.lexsort((z[index], cells[index]))]
-    cell, height = cells[order], z[order]
-    first = np.r_[True, cell[1:] != cell[:-1]]
-    gaps = np.cumsum(np.r_[False, ~first[1:] & (np.diff(height) > headroom)])
-    result[order] = gaps > gaps[np.flatnonzero(first)][np.cumsum(first) - 1]
+    result[order] = beyond_gap(cells[order], z[order], headroom)
     return result

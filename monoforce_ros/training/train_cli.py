@@ -253,6 +253,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
+def _training_bags(options: argparse.Namespace) -> list[Path]:
+    """Bags that are not held out, however their paths are written."""
+    held_out = {bag.resolve() for bag in options.held_out}
+    return [bag for bag in options.bags if bag.resolve() not in held_out]
+
+
 def _what_is_kept(options: argparse.Namespace) -> str:
     """What the same command does after an interruption."""
     if options.samples_only:
@@ -283,9 +289,7 @@ def _train(options: argparse.Namespace, process: Process) -> None:
     start = None if options.start_from is None else load_encoder(options.start_from)
     config, settings = _config(options, start), _settings(options)
     robot = load_robot(options.robot)
-    held_out = list(options.held_out)
-    named = {bag.resolve() for bag in held_out}
-    bags = [bag for bag in options.bags if bag.resolve() not in named]
+    held_out, bags = list(options.held_out), _training_bags(options)
     if not held_out and len(bags) >= 4:
         held_out = bags[7::8] or bags[-1:]
         bags = [bag for bag in bags if bag not in held_out]
@@ -435,8 +439,7 @@ def _with_vegetation(
     file = options.out / "robot.yaml"
     if process.first and not file.is_file():
         found = fit_vegetation(training, robot, config)
-        named = {bag.resolve() for bag in options.held_out}
-        bags = [bag for bag in options.bags if bag.resolve() not in named]
+        bags = _training_bags(options)
         write_robot(options.robot, file, [found.effect] if found else [], bags, fingerprint(bags), found_by="train")
         if found:
             print(

@@ -64,7 +64,7 @@ def find_supports(
             one = len(groups) == 1
             name, swivel = link if one else f"{link}_{number}", joint
             if not one:
-                # Joints are told by their names.
+                # Names of joints are unique.
                 swivel = replace(joint, name=f"{joint.name}_{number}")
             reason = "by hint" if hint else "by its name" if named else "a sphere that reaches the ground"
             pivot = shape.centre + np.array([_TRAIL * shape.radius, 0.0, 0.0])
