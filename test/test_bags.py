@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from nav_msgs.msg import Odometry
 from rclpy.serialization import deserialize_message
 
-from monoforce_ros.bags import BagError, BagReader, BagWriter, Recording, builders
-from monoforce_ros.bags.recording import camera_info_topics, find_transform
+from monoforce_ros.bags import BagError, BagReader, BagWriter, Recording, builders, camera_info_topics, find_transform
 from monoforce_ros.core import unfinished_path
 
 START = 1_700_000_000_000_000_000

@@ -7,20 +7,22 @@ from monoforce_ros.bags.joint_record import JointRecord
 from monoforce_ros.bags.read_options import DETECTED, ReadOptions, add_read_options, read_options
 from monoforce_ros.bags.reader import BagError, BagMessage, BagReader
 from monoforce_ros.bags.recording import (
-    CAMERA_INFO,
-    CLOUD,
-    COMMANDS,
     FIXED,
-    IMAGES,
-    ODOMETRY,
     Frame,
     Recording,
-    camera_info_topics,
     find_transform,
-    is_rectified,
     nearest_frame,
 )
 from monoforce_ros.bags.smoothing import SmoothedMotion, smooth
+from monoforce_ros.bags.topic_choice import (
+    CAMERA_INFO,
+    CLOUD,
+    COMMANDS,
+    IMAGES,
+    ODOMETRY,
+    camera_info_topics,
+    is_rectified,
+)
 from monoforce_ros.bags.types import type_store
 from monoforce_ros.bags.windows import Windows, cut_windows
 from monoforce_ros.bags.writer import BagWriter

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +17,22 @@ from monoforce_ros.bags.joint_record import JointRecord
 from monoforce_ros.bags.open_bags import opened
 from monoforce_ros.bags.reader import BagError, BagMessage, BagReader
 from monoforce_ros.bags.recorded_clock import from_reception, longest_part
+from monoforce_ros.bags.topic_choice import (
+    ACKERMANN,
+    CAMERA_INFO,
+    CLOUD,
+    COMMANDS,
+    IMAGES,
+    IMU,
+    JOINTS,
+    ODOMETRY,
+    TRANSFORMS,
+    camera_info_topics,
+    chosen_topic,
+    is_commanded,
+    is_rectified,
+    topic_choices,
+)
 from monoforce_ros.core import (
     AngularVelocityTrack,
     CameraModel,
@@ -36,14 +52,6 @@ if TYPE_CHECKING:
     # Players of bags start without physics.
     from monoforce_ros.robots import RobotModel
 
-ODOMETRY = "nav_msgs/msg/Odometry"
-COMMANDS = ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist")
-ACKERMANN = ("ackermann_msgs/msg/AckermannDriveStamped", "ackermann_msgs/msg/AckermannDrive")
-CLOUD = "sensor_msgs/msg/PointCloud2"
-IMAGES = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
-CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
-IMU, JOINTS = "sensor_msgs/msg/Imu", "sensor_msgs/msg/JointState"
-TRANSFORMS = "tf2_msgs/msg/TFMessage"
 FIXED = 0.01
 """Largest change of a transform on /tf between frames that are fixed to each other [m, rad]: a joint that moves less
 displaces what is measured by less than odometry's own error."""
@@ -125,14 +133,14 @@ class Recording:
         command_types = COMMANDS if robot is None or robot.steered is None else (*COMMANDS, *ACKERMANN)
         with BagReader(path) as bag:
             chosen = {
-                "odometry": _choose(bag, odometry, (ODOMETRY,)),
-                "commands": _choose(bag, commands, command_types),
-                "cloud": _choose(bag, cloud, (CLOUD,)),
-                "imu": _choose(bag, None, (IMU,)),
-                "joints": _choose(bag, joints, (JOINTS,), lambda topic: not _is_commanded(topic)),
+                "odometry": chosen_topic(bag, odometry, (ODOMETRY,)),
+                "commands": chosen_topic(bag, commands, command_types),
+                "cloud": chosen_topic(bag, cloud, (CLOUD,)),
+                "imu": chosen_topic(bag, None, (IMU,)),
+                "joints": chosen_topic(bag, joints, (JOINTS,), lambda topic: not is_commanded(topic)),
             }
             if robot is not None and robot.flippers:
-                chosen["flipper_commands"] = _choose(bag, flipper_commands, (JOINTS,), _is_commanded)
+                chosen["flipper_commands"] = chosen_topic(bag, flipper_commands, (JOINTS,), is_commanded)
             if chosen["odometry"] is None:
                 raise BagError(f"{bag.path} has no {ODOMETRY} topic; it contains {sorted(set(bag.topics.values()))}")
             image_topics = bag.of_type(*IMAGES)
@@ -141,7 +149,7 @@ class Recording:
             collected = _Collector(bag, chosen, robot)
             collected.warnings.extend(bag.warnings)
             named = {"odometry": odometry, "commands": commands, "cloud": cloud}
-            collected.choices = _choices(bag, chosen, named, command_types)
+            collected.choices = topic_choices(bag, chosen, named, command_types)
             collected.warnings.extend(collected.choices)
             try:
                 for message in bag.messages(topics):
@@ -283,62 +291,6 @@ def nearest_frame(frames: Sequence[Frame], stamp: int, *, limit: float = np.inf)
 def find_transform(transforms: dict[tuple[str, str], np.ndarray], parent: str, child: str) -> np.ndarray | None:
     """``[4, 4]`` parent ← child along any chain of transforms, or None if they are not connected."""
     return TransformTree(transforms).find(parent, child)
-
-
-def camera_info_topics(image_topic: str) -> tuple[str, str]:
-    """Where the CameraInfo of an image topic may be, likeliest first.
-
-    By the convention of image_transport it is beside the topic of the raw image. Drivers that name the raw image by its
-    namespace (``color`` with ``color/compressed``) have it below that topic.
-
-    >>> camera_info_topics("/camera/front/image_raw/compressed")
-    ('/camera/front/camera_info', '/camera/front/image_raw/camera_info')
-    """
-    base = image_topic.removesuffix("/compressed")
-    space, slash, _ = base.rpartition("/")
-    return f"{space}{slash}camera_info", f"{base}/camera_info"
-
-
-def is_rectified(image_topic: str) -> bool:
-    """Whether the images of a topic are rectified, by the names of image_proc: ``image_rect``, ``image_rect_color``."""
-    name = image_topic.removesuffix("/compressed").rpartition("/")[2].lower()
-    return any(word.startswith("rect") for word in name.split("_"))
-
-
-def _is_commanded(topic: str) -> bool:
-    """Whether joint states on a topic are commands, by its name."""
-    return "command" in topic.lower() or "cmd" in topic.lower()
-
-
-def _choose(
-    bag: BagReader,
-    named: str | None,
-    message_types: tuple[str, ...],
-    accepts: Callable[[str], bool] = lambda topic: True,
-) -> str | None:
-    if named:
-        if bag.topics.get(named) not in message_types:
-            raise BagError(
-                f"{bag.path}: topic {named} is {bag.topics.get(named, 'absent')}, expected {' or '.join(message_types)}"
-            )
-        return named
-    candidates = [topic for topic in bag.of_type(*message_types) if accepts(topic)]
-    return max(candidates, key=lambda topic: bag.counts[topic], default=None)
-
-
-def _choices(
-    bag: BagReader, chosen: Mapping[str, str | None], named: Mapping[str, str | None], command_types: tuple[str, ...]
-) -> list[str]:
-    """What was chosen among several topics of a type, and how to choose another one."""
-    texts = []
-    for role, types in (("odometry", (ODOMETRY,)), ("commands", command_types), ("cloud", (CLOUD,))):
-        others = [topic for topic in bag.of_type(*types) if topic != chosen[role] and bag.counts[topic]]
-        if others and not named[role]:
-            texts.append(
-                f"{role}: {chosen[role]} is used, with the most messages of its type, not {', '.join(others)}; "
-                f"--{role} TOPIC selects another one"
-            )
-    return texts
 
 
 class _Collector:

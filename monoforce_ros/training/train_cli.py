@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import override
 
 import cv2
-import numpy as np
 import torch
 
 from monoforce_ros.bags import BagError, add_read_options, read_options
@@ -58,6 +57,7 @@ from monoforce_ros.training.trainer import (
     describe,
     state_file,
 )
+from monoforce_ros.training.training_log import TrainingLog
 from monoforce_ros.training.training_state import TrainingError
 from monoforce_ros.training.vegetation_fit import EFFECT, fit_vegetation
 from monoforce_ros.training.world_samples import (
@@ -328,7 +328,7 @@ def _train(options: argparse.Namespace, process: Process) -> None:
             f"{sum(p.numel() for p in encoder.parameters()) / 1e6:.2f} million parameters, on {process.device}"
             + (f"; resuming from step {trainer.step}" if resumed else "")
         )
-    with _Log(options.out, settings.steps, trainer, quiet=options.quiet or not process.first) as log:
+    with TrainingLog(options.out, settings.steps, trainer, quiet=options.quiet or not process.first) as log:
         trainer.run(log)
     if process.first and validation:
         best = load_encoder(options.out / "encoder.safetensors")
@@ -570,51 +570,6 @@ def _extract(task: tuple) -> tuple[Path | None, str]:
         return extract_samples(bag, robot, config, folder, settings=settings, image_topics=topics), ""
     except (SamplesError, BagError, ValueError) as error:
         return None, str(error)
-
-
-class _Log:
-    """Progress bar and TensorBoard log."""
-
-    def __init__(self, out: Path, steps: int, trainer: Trainer, *, quiet: bool):
-        from torch.utils.tensorboard import SummaryWriter
-
-        self.trainer, self.logged = trainer, len(trainer.history)
-        self.writer = SummaryWriter(str(out / "log"), purge_step=trainer.step + 1) if trainer.process.first else None
-        self.bar = progress_bar(steps, initial=trainer.step, label="training", unit="step", quiet=quiet)
-        # tqdm prints nothing without a terminal; log twenty lines instead.
-        self.steps, self.lines = steps, 0 if quiet or sys.stderr.isatty() else max(1, steps // 20)
-        self.smooth: float | None = None
-
-    def __enter__(self) -> _Log:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.bar.close()
-        if self.writer is not None:
-            self.writer.close()
-
-    def __call__(self, step: int, losses: dict[str, float]) -> None:
-        total = losses["total"]
-        if np.isfinite(total):
-            self.smooth = total if self.smooth is None else 0.95 * self.smooth + 0.05 * total
-        history = self.trainer.history
-        summary = {} if self.smooth is None else {"loss": f"{self.smooth:.3f}"}
-        if history:
-            _, latest = history[-1]
-            summary["held out"] = f"{100 * latest.geometric:.1f}, {100 * latest.supporting:.1f} cm"
-        self.bar.set_postfix(summary)
-        self.bar.update()
-        if self.lines and (step % self.lines == 0 or step == self.steps):
-            text = ", ".join(f"{name} {value}" for name, value in summary.items())
-            print(f"step {step} of {self.steps}: {text}", flush=True)
-        if self.writer is None:
-            return
-        for name, value in losses.items():
-            self.writer.add_scalar(f"loss/{name}", value, step)
-        for validated_step, validation in history[self.logged :]:
-            for name in ("geometric", "supporting", "loss"):
-                self.writer.add_scalar(f"held out/{name}", getattr(validation, name), validated_step)
-        self.logged = len(history)
 
 
 def _write_summary(out: Path, trainer: Trainer, description: dict) -> None:
