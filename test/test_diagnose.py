@@ -12,7 +12,7 @@ import yaml
 from recorded_rollout import recorded
 from scipy.spatial.transform import Rotation
 
-from monoforce_ros.bags import Recording, SmoothedMotion, builders, smooth
+from monoforce_ros.bags import Recording, SmoothedMotion, smooth
 from monoforce_ros.core import AngularVelocityTrack, CommandTrack, MotionTrack, WheelTrack
 from monoforce_ros.discrepancy import (
     Diagnosis,
@@ -41,7 +41,6 @@ from monoforce_ros.discrepancy.terrain_evidence import supporting_terrain, terra
 from monoforce_ros.discrepancy.wheels import compare_with_wheels
 from monoforce_ros.effects.catalogue import CATALOGUE, drive_speeds, recorded_commands, recorded_motion
 from monoforce_ros.evaluation.recording_evaluation import PHYSICS, evaluate_recording
-from monoforce_ros.messages import decoding
 from monoforce_ros.perception import FlatTerrain
 from monoforce_ros.physics import State, rollout
 from monoforce_ros.prediction import Predictor
@@ -551,17 +550,6 @@ def test_wheel_speeds_identify_effects_of_the_drives(husky, effects):
     assert compare_with_wheels(commands, None, husky) is None
     unrelated = WheelTrack(commands.stamps, random.standard_normal((len(twists), 2)))
     assert compare_with_wheels(commands, unrelated, husky) is None
-
-
-def test_wheels_are_found_among_the_joints():
-    def joints(names, speeds):
-        return decoding.decode_wheel_speeds(builders.joint_state(1, names, [0.0] * len(names), np.array(speeds, float)))
-
-    names = ["front_left_wheel", "rear_left_wheel_joint", "front_right_wheel", "arm_left"]
-    np.testing.assert_allclose(joints(names, [1.0, 3.0, 5.0, 99.0]), [2.0, 5.0])
-    assert joints(["front_left_wheel"], [1.0]) is None
-    assert joints(["left_track", "right_track"], [np.nan, 1.0]) is None
-    assert joints([], []) is None
 
 
 def test_long_recordings_are_subsampled_over_their_length():

@@ -73,7 +73,7 @@ EXAMPLES = {
     "imu": (lambda: builders.imu(STAMP, "imu_link", [0, 0, 0.1], [0, 0, 9.81]), decoding.decode_angular_velocity),
     "joint_state": (
         lambda: builders.joint_state(STAMP, ["left_wheel", "right_wheel"], [0, 0], [1.0, 1.0]),
-        decoding.decode_wheel_speeds,
+        decoding.decode_wheels,
     ),
     "twist": (lambda: builders.twist(0.5, 0.1), decoding.decode_command),
     "twist_stamped": (lambda: builders.twist_stamped(STAMP, "base_link", 0.5, 0.1), decoding.decode_command),

@@ -234,7 +234,7 @@ def test_joints_without_a_velocity_interface_are_measured():
 def test_joints_that_steer_or_spring_at_a_wheel_are_no_wheels():
     names = ["front_left_wheel_steering_joint", "front_right_wheel_steering_joint", "left_wheel", "right_wheel"]
     state = builders.joint_state(STAMP, [*names, "left_wheel_suspension"], [0.0] * 5, [0.0, 0.0, 10.0, 12.0, 3.0])
-    assert decoding.decode_wheel_speeds(state).tolist() == [10.0, 12.0]
+    assert decoding.decode_wheels(state) == {"left_wheel": (0.0, 10.0), "right_wheel": (0.0, 12.0)}
 
 
 def test_rectified_images_are_projected_by_p_without_distortion():

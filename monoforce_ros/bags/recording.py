@@ -33,6 +33,7 @@ from monoforce_ros.bags.topic_choice import (
     is_rectified,
     topic_choices,
 )
+from monoforce_ros.bags.wheel_joints import WheelSample, wheel_track
 from monoforce_ros.core import (
     AngularVelocityTrack,
     CameraModel,
@@ -306,7 +307,7 @@ class _Collector:
         self.twists: list[tuple[int, np.ndarray]] = []
         self.angular_velocities: list[tuple[int, np.ndarray]] = []
         self.imu_frame = ""
-        self.wheels: list[tuple[int, np.ndarray]] = []
+        self.wheels: list[WheelSample] = []
         self.joints: list[tuple[int, np.ndarray]] = []
         self.flipper_commands: list[tuple[int, np.ndarray]] = []
         self._unknown_joints: dict[str, list[str]] = {}
@@ -357,9 +358,8 @@ class _Collector:
                 rate, self.imu_frame = decoding.decode_angular_velocity(decoded)
                 self.angular_velocities.append((stamp, rate))
             elif message.topic == self.chosen["joints"]:
-                speeds = decoding.decode_wheel_speeds(decoded)
-                if speeds is not None:
-                    self.wheels.append((stamp, speeds))
+                if wheels := decoding.decode_wheels(decoded):
+                    self.wheels.append((stamp, wheels))
                 self._take_joints(message.topic, stamp, decoded, self.joints)
             elif message.topic == self.chosen.get("flipper_commands"):
                 self._take_joints(message.topic, stamp, decoded, self.flipper_commands)
@@ -520,6 +520,7 @@ class _Collector:
                 f"{self.chosen['commands']}: the base stops when commands fall silent; {count} commands before a "
                 f"silence expire after {TIMEOUT:g} s instead of being held"
             )
+        wheels = self._wheel_track(commands, motion)
         return Recording(
             path=self.bag.path,
             motion=motion,
@@ -546,15 +547,15 @@ class _Collector:
             choices=tuple(self.choices),
             odometry_child_frame=self.frames[1],
             angular_velocity=self._angular_velocity_track(),
-            wheels=self._wheel_track(),
+            wheels=wheels,
             joints=self._joint_record(),
         )
 
-    def _wheel_track(self) -> WheelTrack | None:
-        if not self.wheels:
-            return None
-        stamps, speeds = _in_order(self.wheels)
-        return WheelTrack(stamps, np.array(speeds))
+    def _wheel_track(self, commands: CommandTrack, motion: MotionTrack) -> WheelTrack | None:
+        sides = {name: decoding.wheel_side(name) or "" for name in {name for _, found in self.wheels for name in found}}
+        track, texts = wheel_track(self.wheels, sides, commands, motion)
+        self.choices += [f"{self.chosen['joints']}: {text}" for text in texts]
+        return track
 
     def _joint_record(self) -> JointRecord | None:
         if self.robot is None:

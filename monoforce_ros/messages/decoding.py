@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 import struct
 from collections.abc import Sequence
 from dataclasses import replace
@@ -266,25 +268,48 @@ def decode_angular_velocity(message: Any) -> tuple[np.ndarray, str]:
 
 _NOT_ROLLING = ("steer", "swivel", "caster", "castor", "suspension", "shock", "spring", "rocker", "bogie")
 """Parts of names of joints at a wheel that do not drive it."""
+_ROLLING = ("wheel", "track", "tyre", "tire")
+_ABBREVIATED = re.compile(r"[fbrm]?[lr]|[lr][fbrm]")
+"""Sides as words of a name: l, r, or with front, back, rear or middle: fl, rl, lf, lr (left rear)."""
 
 
-def decode_wheel_speeds(message: Any) -> np.ndarray | None:
-    """``sensor_msgs/JointState`` → mean speed of the left and of the right wheels ``[2]`` [rad/s].
+def wheel_side(name: str) -> str | None:
+    """``left`` or ``right`` for the name of a wheel's or track's joint, None for others.
 
-    Wheels are joints whose names contain wheel or track, and left or right, but none that steers, swivels or springs.
-    None if a side has no wheels or no finite speeds.
+    Sides are written out (``front_left_wheel_joint``, ``wheelLeft``) or short, as a word of their own (``fl_wheel``,
+    ``wheel_r``); joints that steer, swivel or spring are no wheels.
     """
-    sides: dict[str, list[float]] = {"left": [], "right": []}
-    for name, speed in zip(message.name, np.asarray(message.velocity, np.float64).tolist(), strict=False):
-        lowered = name.lower()
-        if ("wheel" in lowered or "track" in lowered) and not any(word in lowered for word in _NOT_ROLLING):
-            for side, speeds in sides.items():
-                if side in lowered:
-                    speeds.append(speed)
-    if not all(sides.values()):
+    lowered = name.lower()
+    if not any(word in lowered for word in _ROLLING) or any(word in lowered for word in _NOT_ROLLING):
         return None
-    values = np.array([np.mean(speeds) for speeds in sides.values()])
-    return values if np.isfinite(values).all() else None
+    written = [side for side in ("left", "right") if side in lowered]
+    if written:
+        return written[0] if len(written) == 1 else None
+    words = re.split(r"[^a-z]+", re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower())
+    short = {_side_of_word(word) for word in words if _ABBREVIATED.fullmatch(word)}
+    return short.pop() if len(short) == 1 else None
+
+
+def _side_of_word(word: str) -> str:
+    """A word with l is on the left: in ``rl`` and ``lr`` the other letter is rear."""
+    return "left" if "l" in word else "right"
+
+
+def decode_wheels(message: Any) -> dict[str, tuple[float, float]]:
+    """``sensor_msgs/JointState`` → angle [rad] and rate [rad/s] of each wheel, see :func:`wheel_side`.
+
+    NaN where the message has no finite value.
+    """
+    angles, rates = (np.asarray(values, np.float64) for values in (message.position, message.velocity))
+
+    def value(values: np.ndarray, index: int) -> float:
+        return float(values[index]) if index < len(values) and np.isfinite(values[index]) else math.nan
+
+    return {
+        str(name): (value(angles, index), value(rates, index))
+        for index, name in enumerate(message.name)
+        if wheel_side(str(name))
+    }
 
 
 def decode_joints(message: Any, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
