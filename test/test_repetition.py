@@ -107,7 +107,9 @@ def test_an_effect_that_others_replace_half_of_the_time_belongs_to_a_class_with_
     assert judged.found_again == (1, 2) and judged.indistinguishable == ("payload",)
 
 
-def test_an_effect_beside_another_that_is_found_again_in_fewer_than_half_of_the_repetitions_is_not_added(husky):
+def test_an_effect_beside_another_that_is_found_again_in_fewer_than_half_of_the_repetitions_is_not_added(
+    husky, monkeypatch
+):
     motion, commands = simulated_recording(husky, (("command_delay", {"delay": 0.3}),), seconds=40.0)
     evidence, windows = windows_of(motion, commands)
     found = explain(evidence, husky, windows, None, SETTINGS)
@@ -132,6 +134,9 @@ def test_an_effect_beside_another_that_is_found_again_in_fewer_than_half_of_the_
     others = (Repeated(named=("drive_gain",)), Repeated(named=("drive_loss",)), Repeated(named=("turning_scrub",)))
     nothing = Repetition(0, others).confirmed(found, decision, SETTINGS.thresholds)
     assert nothing.verdict == Verdict.UNKNOWN_EFFECT and nothing.trial is None and nothing.parts is both
+    # One without which the others are no measurements belongs to them.
+    monkeypatch.setattr(found.search, "credible", lambda trial: len(trial.names) > 1)
+    assert names(delay, delay, payload)[0] == (name, "payload")
     # The only effect is kept: its doubt stands on the first screen.
     alone = replace(decision, trial=found.decision.trial)
     assert Repetition(0, (Repeated(), Repeated())).confirmed(found, alone, SETTINGS.thresholds) is alone

@@ -169,11 +169,13 @@ class Judging:
             confidence=self.thresholds.confidence,
         )
 
-    def _credible(self, trial: Trial, added: int = 1) -> bool:
-        """Whether the effects that were added last are measurements."""
-        estimates = self.estimates(self.refit(trial.effects))[-added:]
+    def credible(self, trial: Trial, last: int | None = None) -> bool:
+        """Whether the effects of a trial that no sensor measured, or the ``last`` of them, are measurements."""
+        fit = self.refit(trial.effects)
+        first = self.fixed_count(fit.effects) if last is None else len(fit.effects) - last
         return not any(
-            complaint(replace(estimate, in_file=own_values(self.robot, estimate.name))) for estimate in estimates
+            complaint(replace(estimate, in_file=own_values(self.robot, estimate.name)))
+            for estimate in self.estimates(fit)[first:]
         )
 
     def ranked(self, fit: Fit) -> list[int]:

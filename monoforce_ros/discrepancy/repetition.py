@@ -70,7 +70,8 @@ class Repetition:
         selection, Meinshausen and Bühlmann 2010), where another one that takes their place is the same finding.
 
         The rest is judged anew: without them it may leave what does not look like the healthy robot. Where none of
-        several effects is found again, the recording does not say what is wrong.
+        several effects is found again, the recording does not say what is wrong. An effect without which the values of
+        the others are no measurements belongs to them, and stays.
         """
         trial, search = decision.trial, explanation.search
         if trial is None or decision.verdict != Verdict.EFFECT_FOUND or len(trial.names) < 2:
@@ -88,6 +89,8 @@ class Repetition:
             remarks = (*decision.remarks, remark)
             return replace(decision, verdict=Verdict.UNKNOWN_EFFECT, trial=None, parts=trial, remarks=remarks)
         best = search.judge(kept)
+        if search.credible(trial) and not search.credible(best):
+            return decision
         findings = explanation.findings
         findings = replace(findings, best=best, fit=search.fit_test(best, findings.nominal), formula=None)
         again = decide(findings, thresholds)

@@ -200,7 +200,7 @@ class Search(Judging):
         for other in trial.effects[fixed:]:
             if not self._adds(self.judge((*trial.effects[:fixed], other)), trial):
                 return None
-        return trial if self._credible(trial, added=2) else None
+        return trial if self.credible(trial, last=2) else None
 
     def _moved(self, entry: tuple[str, Mapping[str, float]], coefficients: np.ndarray) -> tuple[str, dict[str, float]]:
         """An effect whose values are multiples of those that it has, as distances from the nominal robot's."""
@@ -256,7 +256,7 @@ class Search(Judging):
             listed.append(
                 CandidateScore(entry.name, number, float(gain), entry.test.adjusted, judged=trial is not None)
             )
-        kept = [trial for trial in judged if self._adds(best, trial) and self._credible(trial)]
+        kept = [trial for trial in judged if self._adds(best, trial) and self.credible(trial, last=1)]
         return sorted(kept, key=lambda trial: trial.loss), listed
 
     def _beside(self, base: Effects, found: Candidates, rate: float) -> Sequence[Screened]:
