@@ -34,6 +34,37 @@ def test_a_ray_projects_back_to_its_pixel(lens, u, v, depth):
     np.testing.assert_allclose(pixels[0], [u, v], atol=0.05)
 
 
+@pytest.mark.parametrize(
+    ("coefficients", "focal"),
+    [([0.0, 0.0, 0.0, 0.0], 180.0), ([-0.0075, 0.0445, -0.0418, 0.0073], 286.0), ([0.02, -0.004, 0.001, 0.0], 200.0)],
+)
+def test_a_wide_fisheye_has_rays_by_its_polynomial_and_none_beyond_80_degrees(coefficients, focal):
+    """Pixels by the polynomial of Kannala and Brandt, up to the black corners around a circular image."""
+    matrix = np.array([[focal, 0, 424.0], [0, focal, 400.0], [0, 0, 1]])
+    lens = CameraModel(848, 800, matrix, np.array(coefficients), "equidistant")
+
+    def radius(angle):
+        return angle * (1.0 + sum(k * angle ** (2 * n + 2) for n, k in enumerate(coefficients)))
+
+    directions = np.random.default_rng(0).uniform(-np.pi, np.pi, 200)
+    angles = np.linspace(0.01, np.radians(100.0), 200)
+    pixels = matrix[:2, 2] + focal * radius(angles)[:, None] * np.c_[np.cos(directions), np.sin(directions)]
+    rays = lens.rays(pixels)
+    known = angles < np.radians(79.9)
+    monotone = np.gradient(radius(angles), angles) > 0
+    found = np.arctan(np.linalg.norm(rays[known, :2], axis=1))
+    np.testing.assert_allclose(found, angles[known], atol=1e-6)
+    np.testing.assert_allclose(np.arctan2(rays[known, 1], rays[known, 0]), directions[known], atol=1e-6)
+    assert np.isnan(rays[(angles > np.radians(80.1)) & monotone, :2]).all()
+    # Points are seen up to the same angle, also where no pixel of the border has a ray.
+    points = np.c_[np.sin(angles) * np.cos(directions), np.sin(angles) * np.sin(directions), np.cos(angles)] * 3.0
+    placed, inside = lens.project(points)
+    in_image = ((pixels > 0) & (pixels < [847, 799])).all(axis=1)
+    assert (inside == (in_image & (angles <= np.radians(80.0)))).mean() > 0.98
+    both = inside & in_image & known
+    np.testing.assert_allclose(placed[both], pixels[both], atol=0.05)
+
+
 @pytest.mark.parametrize("lens", LENSES)
 def test_points_behind_or_far_to_the_side_of_the_camera_have_no_pixel(lens):
     points = np.array([[0, 0, -3.0], [30.0, 0, 1.0], [0, -40.0, 0.9], [0.0, 0.0, 0.0]])

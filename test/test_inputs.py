@@ -3,6 +3,7 @@
 import time
 
 import numpy as np
+import pytest
 
 from monoforce_ros.core import MotionState
 from monoforce_ros.nodes.inputs import Inputs
@@ -82,6 +83,39 @@ def test_images_triggered_together_are_not_mixed_with_previous_ones():
                 taken.append({entry.message for entry in found.values()})
     # Until a sensor has sent twice its rate is not known.
     assert taken[-4:] == [{2}, {3}, {4}, {5}]
+
+
+def used_sets(offsets, *, rate=10.0, seconds=6.0, clocks=None):
+    """Names of the sensors in each set of cameras whose messages come at these phases [s]."""
+    names = [f"c{index}" for index in range(len(offsets))]
+    kept = Inputs(names, slop=0.1, patience=2.0, on_time_jump=lambda *_: None)
+    events = sorted(
+        (offset + tick / rate, name, clock)
+        for name, offset, clock in zip(names, offsets, clocks or [0.0] * len(names), strict=True)
+        for tick in range(1, int(seconds * rate))
+    )
+    moved(kept, 0)
+    sets = []
+    for time_, name, clock in events:
+        moved(kept, round(time_ * SECOND))
+        kept.add_sensor(name, round((time_ + clock) * SECOND), name)
+        if found := kept.take(odometry_timeout=0.0, wait=0.0):
+            sets.append(set(found))
+    return sets, kept
+
+
+@pytest.mark.parametrize("offsets", [(0.0, 0.02, 0.04, 0.08), (0.0, 0.033, 0.066), (0.0, 0.05)])
+def test_cameras_that_are_not_triggered_together_are_used_together(offsets):
+    sets, kept = used_sets(offsets)
+    assert len(sets) > 25
+    assert all(len(found) == len(offsets) for found in sets[1:]) and not kept.apart
+
+
+@pytest.mark.parametrize("clock", [-0.3, 0.3])
+def test_a_camera_with_another_clock_is_left_out_and_named(clock):
+    sets, kept = used_sets((0.0, 0.0, 0.0, 0.0), clocks=[0.0, 0.0, 0.0, clock])
+    assert len(sets) > 25 and sets[-1] == {"c0", "c1", "c2"}
+    assert kept.apart == {"c3": pytest.approx(-clock, abs=0.11)}
 
 
 def test_inputs_are_skipped_instead_of_delayed():

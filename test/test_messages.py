@@ -237,6 +237,30 @@ def test_joints_that_steer_or_spring_at_a_wheel_are_no_wheels():
     assert decoding.decode_wheels(state) == {"left_wheel": (0.0, 10.0), "right_wheel": (0.0, 12.0)}
 
 
+def test_one_bad_transform_does_not_cost_the_others():
+    message = builders.static_transforms(STAMP, "base_link", {"lidar": np.eye(4), "wheel": np.eye(4)})
+    bad = next(entry for entry in message.transforms if entry.child_frame_id == "wheel")
+    bad.transform.rotation.w = 0.0
+    assert list(decoding.decode_transforms(message)) == [("base_link", "lidar")]
+    message.transforms.remove(next(entry for entry in message.transforms if entry.child_frame_id == "lidar"))
+    with pytest.raises(MessageError, match="quaternion is zero"):
+        decoding.decode_transforms(message)
+
+
+def test_a_jpeg_that_ends_early_is_refused():
+    pixels = np.random.default_rng(0).integers(0, 255, (60, 80, 3), dtype=np.uint8)
+    data = cv2.imencode(".jpg", pixels)[1].tobytes()
+    whole = builders.compressed_image(STAMP, "camera", "jpeg", data + b"\x00" * 16)
+    assert decoding.decode_image(whole).shape == (60, 80, 3)
+    for share in (0.5, 0.9):
+        cut = builders.compressed_image(STAMP, "camera", "jpeg", data[: int(share * len(data))])
+        with pytest.raises(MessageError, match="cannot be decoded"):
+            decoding.decode_image(cut)
+    depth = builders.compressed_image(STAMP, "camera", "16UC1; png compressed ", data)
+    with pytest.raises(MessageError, match="depth image"):
+        decoding.decode_image(depth)
+
+
 def test_rectified_images_are_projected_by_p_without_distortion():
     matrix = np.array([[400.0, 0, 320], [0, 400, 240], [0, 0, 1]])
     info = builders.camera_info(STAMP, "camera", 640, 480, matrix, [-0.3, 0.1, 0, 0, 0])

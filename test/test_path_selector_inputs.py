@@ -430,6 +430,22 @@ def test_a_goal_that_comes_no_nearer_is_dropped(robot):
     assert robot.live(15.0, until=robot.says("it has come no nearer to its goal for 3 s, 4")), robot.status()
 
 
+@pytest.mark.parametrize("robot", ["progress_timeout:=3.0"], indirect=True)
+def test_a_goal_does_not_outlive_a_long_stop(robot):
+    """Candidates that come back must not move a robot that people have stopped watching."""
+    robot.listen(TwistStamped)
+    robot.obeys = True
+    robot.send_goal(50.0, 0.0)
+    assert robot.live(10.0, until=lambda: robot.place[0] > 0.5), robot.status()
+    robot.live(6.0, candidates=False)
+    robot.commands.clear()
+    robot.live(2.0)
+    assert not robot.driven, robot.status()
+    assert "the goal is dropped: stopped for 3 s (candidates are" in robot.process.output
+    robot.send_goal(50.0, 0.0)
+    assert robot.live(10.0, until=lambda: robot.driven), robot.status()
+
+
 def test_odometry_that_begins_anew_drops_the_goal(robot):
     """Where the goal is in the new frame is unknown: a robot that restarts must not drive on by itself."""
     robot.listen(TwistStamped)

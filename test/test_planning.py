@@ -43,8 +43,8 @@ def terrain_of(height: np.ndarray, **changes) -> TerrainMap:
     return replace(TerrainMap.from_height(torch.from_numpy(height.astype(np.float32)), GRID), **changes)
 
 
-def assessed(husky, terrain, fan, **how):
-    """Costs of commands held for 3 s from standstill in the middle of a map."""
+def assessed(husky, terrain, fan, speed=0.0, **how):
+    """Costs of commands held for 3 s from a speed (standstill) in the middle of a map."""
     fan = np.array(fan, float)
     fan = fan if fan.ndim == 3 else np.atleast_2d(fan)[:, None]
     twists = torch.from_numpy(over_horizon(fan, np.zeros((0, 2)), STEPS)).float()
@@ -52,6 +52,7 @@ def assessed(husky, terrain, fan, **how):
     middle = GRID.rows // 2
     height = float(terrain.height[middle, middle]) - low - float(rest_depth(husky, float(terrain.stiffness.mean())))
     state = State.at_rest(height, batch=len(fan))
+    state = replace(state, velocity=state.velocity + torch.tensor([speed, 0.0, 0.0]))
     result = rollout(terrain, husky, husky.drive_speeds(twists), state, options=PhysicsOptions(), with_contact=True)
     return assess(result, terrain, husky, twists, **how), result
 
@@ -273,6 +274,23 @@ def test_ground_behind_which_nothing_was_measured_may_be_a_drop_however_sure_an_
     assert term((X < 1.2) | (X > 4.5)) < 0.01
 
 
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_an_edge_under_the_wheels_of_one_side_counts(husky, side):
+    """Nothing is measured beyond 0.1 m beside the middle: the wheels, 0.28 m beside it, may be over a drop."""
+    edge = terrain_of(np.zeros_like(X), observed=torch.from_numpy(side * Y < 0.1))
+    spreads = {name: torch.full_like(edge.height, 0.005) for name in ("geometric_spread", "decrease_spread")}
+    edge = replace(edge, **spreads)
+    found, _ = assessed(husky, edge, [[0.9, 0.0], [0.9, -0.3 * side]])
+    along, away = found.terms["unobserved"].tolist()
+    assert along > 0.5 and away < 0.5 * along
+
+
+@pytest.mark.parametrize("speed", [1.5, 3.0])
+def test_braking_is_no_slip(husky, speed):
+    found, _ = assessed(husky, terrain_of(np.zeros_like(X)), [[0.0, 0.0], [0.5, 0.0]], speed=speed)
+    assert bool(found.feasible[0]), found.violations(0)
+
+
 def test_what_counts_as_unobserved_depends_on_the_way_driven_and_on_the_robot_s_length(husky):
     unknown = terrain_of(np.zeros_like(X), observed=torch.zeros(X.shape, dtype=torch.bool))
     small = replace(husky, points=0.2 * husky.points, wheel_radius=0.2 * husky.wheel_radius)
@@ -284,7 +302,9 @@ def test_what_counts_as_unobserved_depends_on_the_way_driven_and_on_the_robot_s_
         still = torch.zeros(1, count, 3)
         place = still.clone()
         place[0, 1:, 0] = torch.tensor(moved)
-        rollout = SimpleNamespace(position=place, inside=torch.ones(1, count, dtype=torch.bool))
+        rollout = SimpleNamespace(
+            position=place, inside=torch.ones(1, count, dtype=torch.bool), rotation=torch.eye(3).expand(1, count, 3, 3)
+        )
         return float(_unobserved(rollout, unknown, robot)[0])
 
     assert term(small, [0.1, 0.3, 0.5]) == 1.0
@@ -294,7 +314,11 @@ def test_what_counts_as_unobserved_depends_on_the_way_driven_and_on_the_robot_s_
     slow = [1.0 + 0.02 * i for i in range(1, 50)] + [2.5, 3.0]
     still = torch.zeros(1, len(slow) + 1, 3)
     still[0, 1:, 0] = torch.tensor(slow)
-    rollout = SimpleNamespace(position=still, inside=torch.ones(1, len(slow) + 1, dtype=torch.bool))
+    rollout = SimpleNamespace(
+        position=still,
+        inside=torch.ones(1, len(slow) + 1, dtype=torch.bool),
+        rotation=torch.eye(3).expand(1, len(slow) + 1, 3, 3),
+    )
     assert float(_unobserved(rollout, half, husky)[0]) == pytest.approx(0.35, abs=0.03)
 
 
@@ -369,6 +393,9 @@ def test_selection_weighs_cost_against_the_remaining_distance():
     assert select_candidate(costly, robot, np.array([8.0, 0.0]), SelectionWeights(cost=10.0)) == 1
     assert select_candidate(candidates | {"feasible": np.zeros(4)}, robot, np.array([8.0, 0.0])) is None
     assert select_candidate(candidates | {"cost": np.full(4, np.inf)}, robot, np.array([8.0, 0.0])) is None
+    # At an astronomical distance all scores are infinite: no infeasible candidate may win.
+    with np.errstate(over="ignore", invalid="ignore"):
+        assert select_candidate(restricted, robot, np.array([1e200, 0.0])) in (1, 2, 3, None)
     with pytest.raises(ValueError, match="fields \\['cost'\\] are missing"):
         select_candidate({k: v for k, v in candidates.items() if k != "cost"}, robot, np.zeros(2))
 

@@ -23,9 +23,14 @@ def observe(
 ) -> Observation:
     """The data of ``sensors`` (``lidar``, ``camera``) nearest to a stamp [ns], moved to the robot's pose at that stamp.
 
-    Images more than :data:`MAXIMUM_SPREAD` away from the stamp are left out; so are clouds used together with images.
+    Images more than :data:`MAXIMUM_SPREAD` away from the stamp are left out; so are clouds used together with images,
+    and images that cannot be used (depths, damaged ones, of another size than their CameraInfo) beside others that can.
+
+    Raises:
+        ValueError: none of the images can be used, and there is no cloud.
     """
     cloud, images, cameras, poses = None, {}, {}, {}
+    refused: ValueError | None = None
     if "lidar" in sensors:
         frame = nearest_frame(recording.clouds, stamp, limit=MAXIMUM_SPREAD if "camera" in sensors else np.inf)
         if frame is not None:
@@ -38,10 +43,22 @@ def observe(
             continue
         if topic not in recording.cameras:
             raise BagError(f"{recording.path}: no CameraInfo for the images on {topic}")
-        images[topic] = recording.image(frame)
-        cameras[topic] = recording.cameras[topic]
-        pose = recording.sensor_pose(cameras[topic].frame_id, robot.base_frame, robot.sensors)
+        camera = recording.cameras[topic]
+        try:
+            image = recording.image(frame)
+            if image.shape[:2] != (camera.height, camera.width):
+                raise BagError(
+                    f"{topic}: images are {image.shape[1]} × {image.shape[0]} px, but CameraInfo says {camera.width} × "
+                    f"{camera.height} px"
+                )
+            pose = recording.sensor_pose(camera.frame_id, robot.base_frame, robot.sensors)
+        except ValueError as error:
+            refused = refused or error
+            continue
+        images[topic], cameras[topic] = image, camera
         poses[topic] = _base_motion(recording, frame.stamp, stamp) @ pose
+    if refused is not None and not images and cloud is None:
+        raise refused
     return Observation(stamp, cloud, images, cameras, poses, flippers_at(recording, stamp), recording.motion)
 
 

@@ -18,6 +18,9 @@ _MOST_DISTORTED = 10.0
 _CONSISTENT = 0.5
 """Smallest share of the image, or of 60° of a fisheye, in which pixels and rays have to agree: calibrations fit the
 centre, and a polynomial may fold in the corners of a wide lens."""
+_WIDEST_RAY, _FISHEYE_STEPS = np.radians(80.0), 1601
+"""Angle off a fisheye's axis up to which its pixels have rays: beyond, a lens shows nothing that a map could use; and
+the number of angles at which its polynomial is tabulated."""
 _FISHEYE_ANGLE = np.radians(60.0)
 _CORNER = 0.95
 """Share of both edges from which a principal point is in the corner: that of an image twice as large is at 1."""
@@ -175,14 +178,15 @@ class CameraModel:
             pixels: ``[..., 2]`` (u, v); the centre of the first pixel is (0, 0).
 
         Returns:
-            ``[..., 3]`` with z = 1, so that a ray times a depth is a point.
+            ``[..., 3]`` with z = 1, so that a ray times a depth is a point. NaN where a fisheye shows what lies 80° off
+            its axis and more, or where its polynomial is not monotone.
         """
         pixels = np.asarray(pixels, np.float64)
         flat = pixels.reshape(-1, 1, 2)
         if not self.is_distorted and self.distortion_model != "equidistant":
             normalised = (flat[:, 0] - self.matrix[:2, 2]) / np.array([self.matrix[0, 0], self.matrix[1, 1]])
         elif self.distortion_model == "equidistant":
-            normalised = cv2.fisheye.undistortPoints(flat, self.matrix, self._fisheye())[:, 0]
+            normalised = self._fisheye_rays((flat[:, 0] - self.matrix[:2, 2]) / self.matrix[[0, 1], [0, 1]])
         else:
             criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-9)
             # The function with termination criteria has different names in OpenCV 4 and 5.
@@ -208,6 +212,34 @@ class CameraModel:
             projected, _ = cv2.projectPoints(points[:, None], zero, zero, self.matrix, self.distortion)
         return projected.reshape(-1, 2)
 
+    def _fisheye_angles(self) -> tuple[np.ndarray, np.ndarray]:
+        """Angles off the axis [rad], as far as the image's radius grows with them, and these radii at focal length 1.
+
+        ``cv2.fisheye.undistortPoints`` clips radii at 90°, beyond which pixels get rays to the opposite side.
+        """
+        angles = np.linspace(0.0, _WIDEST_RAY, _FISHEYE_STEPS)
+        radii = angles * (1.0 + sum(k * angles ** (2 * n + 2) for n, k in enumerate(self._fisheye())))
+        falling = np.flatnonzero(np.diff(radii) <= 0.0)
+        stop = int(falling[0]) + 1 if len(falling) else len(angles)
+        return angles[:stop], radii[:stop]
+
+    def _fisheye_rays(self, distorted: np.ndarray) -> np.ndarray:
+        """Undistorted image coordinates ``[n, 2]`` of distorted ones, both at focal length 1."""
+        angles, radii = self._fisheye_angles()
+        radius = np.linalg.norm(distorted, axis=1)
+        if len(angles) < 2:
+            return np.where(radius[:, None] == 0.0, distorted, np.nan)
+        angle = np.interp(radius, radii, angles, right=np.nan)
+        for _ in range(2):
+            # Newton's steps: the table's spacing leaves errors of 1e-7.
+            value, slope = angle.copy(), np.ones_like(angle)
+            for n, k in enumerate(self._fisheye()):
+                value += k * angle ** (2 * n + 3)
+                slope += (2 * n + 3) * k * angle ** (2 * n + 2)
+            angle = angle - np.where(slope > 0.1, (value - radius) / np.maximum(slope, 0.1), 0.0)
+        factor = np.divide(np.tan(angle), radius, out=np.ones_like(radius), where=radius > 1e-9)
+        return distorted * factor[:, None]
+
     def _fisheye(self) -> np.ndarray:
         return self.distortion[:4] if self.distortion.size else np.zeros(4)
 
@@ -218,9 +250,13 @@ class CameraModel:
     def _largest_slope(self) -> float:
         """Largest ratio of distance from the optical axis and depth that is seen, a little beyond the image's corners.
 
+        Of a fisheye that is the largest angle with a ray.
+
         Where the distortion folds within the image no ray leads to its border. Beyond the largest that does, points
         would get the pixels of nearer ones.
         """
+        if self.distortion_model == "equidistant":
+            return float(np.tan(self._fisheye_angles()[0][-1]))
         across, down = (np.linspace(0.0, size - 1.0, 9) for size in (self.width, self.height))
         rows = [np.c_[across, np.full(9, v)] for v in down[[0, -1]]]
         columns = [np.c_[np.full(9, u), down] for u in across[[0, -1]]]
@@ -229,8 +265,8 @@ class CameraModel:
             rays = self.rays(border)
             slopes = self._slope(rays)
             led_back = np.isfinite(slopes) & (slopes < 1e6)
-            led_back[led_back] = (
-                np.linalg.norm(self._projected(rays[led_back]) - border[led_back], axis=1) < _SAME_PIXEL
-            )
+            if led_back.any():
+                apart = np.linalg.norm(self._projected(rays[led_back]) - border[led_back], axis=1)
+                led_back[led_back] = apart < _SAME_PIXEL
         largest = float(slopes[led_back].max(initial=0.1))
         return largest * 1.05 if led_back.all() else largest

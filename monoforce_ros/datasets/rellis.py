@@ -161,7 +161,7 @@ def sequence_to_bag(
     Raises:
         DatasetError: a cloud or image is damaged, or there are fewer than two frames.
     """
-    chosen = frames or range(len(sequence))
+    chosen = range(len(sequence)) if frames is None else frames
     chosen = range(max(chosen.start, 0), min(chosen.stop, len(sequence)))
     if len(chosen) < 2:
         raise DatasetError(f"{sequence.path}: got frames {frames}, expected at least two of its {len(sequence)}")

@@ -75,13 +75,15 @@ def decode_image(message: Any) -> np.ndarray:
 
 def _decode_compressed(message: Any) -> np.ndarray:
     data = np.frombuffer(message.data, np.uint8)
-    if "compressedDepth" in message.format:
+    if "compressedDepth" in message.format or message.format.startswith(("16UC1", "32FC1")):
         raise MessageError(f"image format: got {message.format!r}, a depth image; expected a colour or grey image")
     size = _encoded_size(data.tobytes())
     if size is not None and not 1 <= size[0] * size[1] <= MAXIMUM_IMAGE_PIXELS:
         # A few bytes may claim a picture that no memory holds.
         raise MessageError(f"image size: got {size[0]} × {size[1]}, expected 1 to {MAXIMUM_IMAGE_PIXELS} pixels")
-    decoded = cv2.imdecode(data, cv2.IMREAD_COLOR) if size is not None else None
+    # Some versions of OpenCV fill what is missing of a JPEG with grey. FF D9 ends it, and cannot occur in its pixels.
+    cut = data[:2].tobytes() == b"\xff\xd8" and data.tobytes().rfind(b"\xff\xd9") < data.size // 2
+    decoded = cv2.imdecode(data, cv2.IMREAD_COLOR) if size is not None and not cut else None
     if decoded is None:
         raise MessageError(
             f"compressed image: {data.size} bytes of format {message.format!r} cannot be decoded, expected jpeg or png"
@@ -128,7 +130,12 @@ def _decode_raw(message: Any) -> np.ndarray:
     pixels = rows.view(dtype).reshape(height, width, channels)
     if kind == "u2":
         pixels = (pixels >> 8).astype(np.uint8)
-    return pixels.copy() if conversion is None else cv2.cvtColor(pixels, conversion)
+    try:
+        return pixels.copy() if conversion is None else cv2.cvtColor(pixels, conversion)
+    except cv2.error as error:
+        raise MessageError(
+            f"image: {width} × {height} px cannot be of the encoding {message.encoding}, expected an even width"
+        ) from error
 
 
 def _binned(camera: CameraModel, message: Any) -> CameraModel:
@@ -431,16 +438,23 @@ def decode_occupancy(message: Any) -> tuple[np.ndarray, float, np.ndarray]:
 
 
 def decode_transforms(message: Any) -> dict[tuple[str, str], np.ndarray]:
-    """``tf2_msgs/TFMessage`` → ``{(parent, child): [4, 4] parent ← child}``."""
+    """``tf2_msgs/TFMessage`` → ``{(parent, child): [4, 4] parent ← child}``, without those that are none.
+
+    Raises ``MessageError`` if none of several can be used.
+    """
     transforms = {}
+    fault = ""
     for entry in message.transforms:
         rotation, translation = entry.transform.rotation, entry.transform.translation
         quaternion = np.array([rotation.x, rotation.y, rotation.z, rotation.w], float)
         offset = np.array([translation.x, translation.y, translation.z], float)
         if not (np.isfinite(quaternion).all() and np.isfinite(offset).all() and np.linalg.norm(quaternion) > 0.5):
-            raise MessageError(f"transform to {entry.child_frame_id!r}: not finite, or its quaternion is zero")
+            fault = fault or f"transform to {entry.child_frame_id!r}: not finite, or its quaternion is zero"
+            continue
         matrix = np.eye(4)
         matrix[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
         matrix[:3, 3] = offset
         transforms[entry.header.frame_id.lstrip("/"), entry.child_frame_id.lstrip("/")] = matrix
+    if fault and not transforms:
+        raise MessageError(fault)
     return transforms

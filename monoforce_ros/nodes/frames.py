@@ -69,6 +69,9 @@ class TransformListener:
         except MessageError as error:
             self._node.get_logger().warning(f"/tf: {error}", throttle_duration_sec=10.0)
             return
+        if len(found) < len({(entry.header.frame_id, entry.child_frame_id) for entry in message.transforms}):
+            text = "/tf: a transform is not finite, or its quaternion is zero; it is left out"
+            self._node.get_logger().warning(text, throttle_duration_sec=10.0)
         for (parent, child), matrix in found.items():
             self.tree.add(parent, child, matrix)
             edge = parent.lstrip("/"), child.lstrip("/")
@@ -80,4 +83,5 @@ class TransformListener:
             return
         for entry in message.transforms:
             frames = entry.header.frame_id.lstrip("/"), entry.child_frame_id.lstrip("/")
-            self._history.add(*frames, found[frames], None if static else decoding.stamp_of(entry))
+            if frames in found:
+                self._history.add(*frames, found[frames], None if static else decoding.stamp_of(entry))

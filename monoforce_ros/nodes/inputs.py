@@ -20,6 +20,9 @@ TIME_JUMP = 1_000_000_000
 
 ODOMETRY_LAG = 30_000_000
 """Largest time by which sensor data may be newer than the odometry used with them [ns]."""
+_OVERDUE_INTERVALS, _FREE_INTERVALS = 2.5, 0.9
+"""Median intervals of the sensors without a set that belongs together, after which the newest messages are one: at
+first, and while the sensors run freely."""
 MOST_WAITING = 16
 """Sets of sensor messages that wait for odometry: 0.3 s of a lidar and three cameras at 10 Hz each, and some more."""
 
@@ -31,6 +34,8 @@ class Received:
     message: Any
     stamp: int
     arrival: float
+    behind: float = 0.0
+    """By how much the newest odometry was stamped later when it arrived [s]."""
 
 
 class Inputs:
@@ -74,6 +79,11 @@ class Inputs:
         self._intervals: dict[str, int] = {}
         self._waiting: deque[dict[str, Received]] = deque()
         self._first_sensor = 0.0
+        self._last_set: int | None = None
+        self._free_running = False
+        self.apart: dict[str, float] = {}
+        """By how much the stamps of sensors that were left out of the last set are older than its newest [s]; of one
+        whose clock is ahead this is negative."""
 
     def forget(self) -> None:
         """Discard all data: what came before, as while the node was paused, is no longer current."""
@@ -142,21 +152,53 @@ class Inputs:
             now = time.monotonic()
             if topic in self._newest:
                 self._intervals[topic] = stamp - self._newest[topic].stamp
-            self._newest[topic] = Received(message, stamp, now)
+            behind = (self._states[-1].stamp - stamp) * NANOSECOND if self._states else 0.0
+            self._newest[topic] = Received(message, stamp, now, behind)
             # A sensor that has stopped does not delay the others.
             live = [entry for entry in self._newest.values() if now - entry.arrival <= self._patience]
             self._first_sensor = self._first_sensor or now
             if len(self._newest) < len(self._sensors) and now - self._first_sensor < self._patience:
                 return  # the other sensors may still be starting
-            if max(e.stamp for e in live) - min(e.stamp for e in live) > 1e9 * largest_spread(
+            newest = max(entry.stamp for entry in live)
+            triggered = newest - min(entry.stamp for entry in live) <= 1e9 * largest_spread(
                 self._slop, (1e-9 * entry for entry in self._intervals.values())
-            ):
-                return
+            )
+            if not triggered:
+                if not self._overdue(newest):
+                    return
+                live = self._together(live)
+                newest = max(entry.stamp for entry in live)
+            self._free_running, self._last_set = not triggered, newest
+            self.apart = {
+                name: (newest - entry.stamp) * NANOSECOND
+                for name, entry in self._newest.items()
+                if entry not in live and now - entry.arrival <= self._patience
+            }
             self._waiting.append({name: entry for name, entry in self._newest.items() if entry in live})
             if len(self._waiting) > MOST_WAITING:
                 self._waiting.popleft()
                 self.dropped += 1
             self.changed.notify_all()
+
+    def _overdue(self, newest: int) -> bool:
+        """Whether the sensors' usual time between messages has passed without a set that belongs together.
+
+        Cameras that are not triggered together, or whose clocks differ, never make one. One message that is lost leaves
+        two intervals without a set: only more is overdue, until it is known that the sensors run freely.
+        """
+        if self._last_set is None:
+            self._last_set = newest
+            return False
+        if not self._intervals:
+            return False
+        usual = float(np.median(list(self._intervals.values())))
+        return newest - self._last_set > (_FREE_INTERVALS if self._free_running else _OVERDUE_INTERVALS) * usual
+
+    def _together(self, live: list[Received]) -> list[Received]:
+        """The most messages that lie within the slop, the newest of several such groups."""
+        slop = round(self._slop * 1e9)
+        groups = [[other for other in live if 0 <= entry.stamp - other.stamp <= slop] for entry in live]
+        return max(groups, key=lambda group: (len(group), max(entry.stamp for entry in group)))
 
     def take(self, *, odometry_timeout: float, wait: float) -> dict[str, Received] | None:
         """The newest complete set of sensor messages with which odometry has caught up; None after ``wait`` [s].

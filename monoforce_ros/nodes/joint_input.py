@@ -22,7 +22,7 @@ class JointInput:
     """
 
     def __init__(self, robot: RobotModel, *, continues: bool, timeout: float):
-        self._robot, self._continues, self._timeout = robot, continues, timeout
+        self._robot, self._continues, self.timeout = robot, continues, timeout
         self._lock = threading.Lock()
         self._stamps = np.zeros(len(robot.joints), np.int64)
         """When each joint was measured last [ns]; 0: never."""
@@ -74,7 +74,7 @@ class JointInput:
 
     @property
     def _limit(self) -> int:
-        return round(self._timeout * 1e9)
+        return round(self.timeout * 1e9)
 
     def _stamp(self, message: JointState) -> int:
         stamp = decoding.stamp_of(message)
@@ -103,7 +103,7 @@ class JointInput:
             relation = "older" if ages[worst] > 0 else "newer"
             raise ValueError(
                 f"joint states: the newest of {self._robot.joint_names[worst]} is {1e-9 * abs(ages[worst]):.1f} s "
-                f"{relation} than the sensor data, expected at most {self._timeout:g} s"
+                f"{relation} than the sensor data, expected at most {self.timeout:g} s"
             )
         angles = np.where(measured, angles, unknown)
         rates = np.where(measured, rates, unknown) if self._continues else unknown

@@ -23,6 +23,15 @@ class MonitorOutput:
         self._clear_requested = False
         self._publisher = node.create_publisher(Float32MultiArray, "predicted/live_gap", 1)
 
+    @property
+    def command_timeout(self) -> float:
+        """Age from which on a command no longer acts [s]."""
+        return self._gap.command_timeout
+
+    @command_timeout.setter
+    def command_timeout(self, seconds: float) -> None:
+        self._gap.command_timeout = seconds
+
     def clear(self) -> None:
         """Discard everything after a backward time jump; may be called from any thread."""
         self._clear_requested = True

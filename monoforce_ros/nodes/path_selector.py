@@ -90,6 +90,8 @@ class PathSelectorNode(Node):
         self._odometry = OdometryInput(self.frames, self.transforms, self.health, settings.timeout)
         self._candidates = CandidateInput(self.health, settings.timeout)
         self._driving = False
+        self._stopped_since = np.inf
+        """Since when there has been no reliable command [s]."""
         self._halting = 0
         """Commands to stand that are still to be sent."""
         self._last_command: tuple[float, ...] = (0.0, 0.0)
@@ -153,8 +155,8 @@ class PathSelectorNode(Node):
         if len(bad := np.flatnonzero(~np.isfinite(points).all(axis=1))):
             place = f"({points[bad[0], 0]:g}, {points[bad[0], 1]:g}, {points[bad[0], 2]:g})"
             which = f" at point {bad[0] + 1} of {len(points)}" if len(points) > 1 else ""
-            message = f"the {kind} is not finite{which} {place} and is ignored"
-            self.health.report(PART, ERROR, message, reason="goal")
+            # Whoever sent it meant another goal than the one that the robot drives to.
+            self._drop(f"the {kind} is not finite{which} {place}: the robot stands; send it again")
             return
         course, previous = Course(kind, frame_id, stamp, points, time.monotonic()), self._received
         if course.repeats(previous) and previous is not None and course.received - previous.received < _TWICE:
@@ -263,8 +265,17 @@ class PathSelectorNode(Node):
         if self._course is None:
             return None
         try:
-            return self._drive(self._course)
+            command = self._drive(self._course)
+            self._stopped_since = np.inf
+            return command
         except Stop as stop:
+            limit, now = self.settings.progress_timeout, time.monotonic()
+            self._stopped_since = min(self._stopped_since, now)
+            if limit and now - max(self._stopped_since, self._course.received) > limit:
+                # A robot must not drive on by itself once what stopped it is gone and people are around it.
+                kind = self._course.kind
+                self._drop(f"the {kind} is dropped: stopped for {limit:g} s ({stop}); send it again (progress_timeout)")
+                return None
             self.health.report(PART, WARN, f"stopped: {stop}", reason=stop.reason)
             return None
         except Refusal as refusal:

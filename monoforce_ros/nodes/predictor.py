@@ -195,6 +195,9 @@ class PredictorNode(ManagedNode):
             self.ensemble.apply(changed)
         if self.costmap is not None:
             self.costmap.apply(changed)
+        if self.joints is not None:
+            self.joints.timeout = changed.odometry_timeout
+        self.monitor.command_timeout = changed.command_timeout
         self.settings = changed
 
     def _terrain_source(self) -> TerrainSource:
@@ -427,6 +430,10 @@ class PredictorNode(ManagedNode):
         try:
             track = corrected_motion(self.inputs.motion(), self.robot.effects)
             observation = self.decoder.observe(stamp, received, track, maximum_gap=self.settings.odometry_timeout)
+            for part, seconds in self.inputs.apart.items():
+                side = "behind" if seconds > 0 else "ahead of"
+                text = f"{abs(seconds):.2f} s {side} the other sensors and not used with them: another clock, or slow?"
+                self.health.report(part, WARN, text, reason="apart")
             if observation is None:
                 self.health.report(
                     "prediction",

@@ -15,6 +15,9 @@ from monoforce_ros.perception import Observation
 
 LIDAR = "lidar"
 """Part of the diagnostics for the point clouds; every other sensor is a camera."""
+_LATEST = 1.0
+"""Time by which a sensor's data may be older than the newest odometry when they arrive [s]: slow drivers and encoders
+of images take some tenths of it. What is older starts the prediction where the robot no longer is."""
 _AGE = "age relative to the newest sensor [s]"
 
 
@@ -68,6 +71,11 @@ class SensorDecoder:
             if part == "odometry":
                 continue
             try:
+                if entry.behind > _LATEST:
+                    raise MessageError(
+                        f"stamped {entry.behind:.1f} s before the odometry that has arrived, expected at most "
+                        f"{_LATEST:g} s: another clock? Synchronise it (PTP, chrony)"
+                    )
                 pose = self._sensor_pose(entry, track, maximum_gap)
                 pose = track.base_between(entry.stamp, stamp, maximum_gap=maximum_gap) @ pose
                 if part == LIDAR:

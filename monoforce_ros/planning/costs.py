@@ -223,12 +223,14 @@ def _load_loss(sides: Tensor, step: float) -> Tensor:
 def _slip(rollout: Rollout, robot: RobotModel, twists: Tensor) -> Tensor:
     """Mean difference of commanded and achieved forward speed over the mean commanded drive speed ``[N]``.
 
-    Yaw does not count: a skid-steered robot loses part of it to scrubbing on any ground.
+    Yaw does not count: a skid-steered robot loses part of it to scrubbing on any ground. A robot that brakes takes time
+    for it: its own speed at the start counts like a commanded one.
     """
     ahead = (rollout.velocity[:, 1:] * rollout.rotation[:, 1:, :, 0]).sum(-1)
     arm = float(robot.drive_offsets.abs().max())
     commanded = (twists[..., 0].abs() + arm * twists[..., 1].abs()).mean(dim=1)
-    return (twists[..., 0] - ahead).abs().mean(dim=1) / commanded.clamp_min(0.1)
+    own = (rollout.velocity[:, 0] * rollout.rotation[:, 0, :, 0]).sum(-1).abs()
+    return (twists[..., 0] - ahead).abs().mean(dim=1) / torch.maximum(commanded, own).clamp_min(0.1)
 
 
 def _effort(traction: Tensor, robot: RobotModel, twists: Tensor) -> Tensor:
@@ -238,7 +240,7 @@ def _effort(traction: Tensor, robot: RobotModel, twists: Tensor) -> Tensor:
 
 
 def _unobserved(rollout: Rollout, terrain: TerrainMap, robot: RobotModel) -> Tensor:
-    """Share of the path over unknown ground ``[N]``, from 0 to 1.
+    """Share of the path with the middle or a side of the robot over unknown ground ``[N]``, from 0 to 1.
 
     Off the map ground is unknown. Where the map tells the spread of its heights, a cell is unknown to the degree that
     its height may be off by more than the clearance below the hull: the probability of that for a Laplace distribution.
@@ -247,14 +249,19 @@ def _unobserved(rollout: Rollout, terrain: TerrainMap, robot: RobotModel) -> Ten
     """
     grid = terrain.grid
     place = rollout.position.detach()[..., :2]
-    column = ((place[..., 0] - grid.origin[0]) / grid.resolution).round().clamp(0, grid.columns - 1).nan_to_num(0.0)
-    row = ((place[..., 1] - grid.origin[1]) / grid.resolution).round().clamp(0, grid.rows - 1).nan_to_num(0.0)
+    # Ground under the wheels or tracks of either side counts as that under the middle does.
+    driven_points = robot.points[robot.point_drives >= 0][:, 1]
+    sides = torch.stack([driven_points.min(), driven_points.new_zeros(()), driven_points.max()]).to(place)
+    across = rollout.rotation.detach()[..., :2, 1]
+    spots = place[..., None, :] + sides[:, None] * across[..., None, :]
+    column = ((spots[..., 0] - grid.origin[0]) / grid.resolution).round().clamp(0, grid.columns - 1).nan_to_num(0.0)
+    row = ((spots[..., 1] - grid.origin[1]) / grid.resolution).round().clamp(0, grid.rows - 1).nan_to_num(0.0)
     if terrain.height_spread is None:
         unknown = 1.0 - torch.from_numpy(terrain.measured_nearby()).to(place)
     else:
         unknown = torch.exp(-_hull_clearance(robot) / terrain.height_spread.to(place).clamp_min(1e-4))
         unknown = torch.maximum(unknown, torch.from_numpy(terrain.extrapolated()).to(place))
-    degree = torch.where(rollout.inside, unknown[row.long(), column.long()], 1.0)
+    degree = torch.where(rollout.inside, unknown[row.long(), column.long()].amax(dim=-1), 1.0)
     distance = (place - place[:, :1]).norm(dim=-1)
     # No sensor sees the ground below the robot and close around it, but the first is known to support it.
     low, high = robot.bounds

@@ -117,7 +117,10 @@ def select_candidate(
         largest = np.maximum(np.abs(commands).max(axis=0), 1e-6)
         previous = np.resize([*previous_command, 0.0], commands.shape[1])
         score = score + weights.change * (np.abs(commands - previous) / largest).mean(axis=1)
-    return int(np.where(feasible, score, np.inf).argmin())
+    score = np.where(feasible, score, np.inf)
+    best = int(score.argmin())
+    # A goal at an astronomical distance makes all scores infinite.
+    return best if np.isfinite(score[best]) else None
 
 
 def _nearest(paths: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
