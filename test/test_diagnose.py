@@ -392,6 +392,18 @@ def test_the_nominal_file_is_not_overwritten_and_a_stale_one_does_not_stay(late_
         diagnose_bag(late_robot, str(nominal), tmp_path)
     with pytest.raises(ValueError, match="--held-out got a path that does not exist"):
         diagnose_bag(late_robot, "husky", tmp_path / "out", held_out=[tmp_path / "nowhere"])
+    # What commissioning learned must not be lost either, nor the work of a diagnosis that cannot be written.
+    commissioned = tmp_path / "commissioned" / "husky.yaml"
+    commissioned.parent.mkdir()
+    monkeypatch.setattr(
+        NominalModel, "read", classmethod(lambda cls, robot, samples: True if robot == str(commissioned) else None)
+    )
+    commissioned.write_text(nominal.read_text())
+    with pytest.raises(ValueError, match="the folder of the commissioned file husky.yaml, expected another --out"):
+        diagnose_bag(late_robot, "husky", commissioned.parent)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ValueError, match="--out cannot be made a folder"):
+        diagnose_bag(late_robot, "husky", tmp_path / "file")
     # A report without an effect must not stand beside a robot file of an earlier one.
     stale = tmp_path / "out" / "husky.yaml"
     stale.parent.mkdir()

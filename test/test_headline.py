@@ -51,6 +51,17 @@ def test_an_explained_error_is_good_and_what_is_left_is_said_first():
     assert lines[0].startswith("effect_found: ") and "Unexplained" in lines[1]
 
 
+def test_a_robot_that_was_blocked_is_not_all_right_because_its_model_is():
+    seen = "the wheels turn (9.3 m) but the robot stays where it is (within 0.02 m)"
+    gap = {"position_2s": row(0.02, None), "heading_2s": row(0.5, None, unit="deg", noise=0.3)}
+    blocked = Diagnosis(Verdict.NO_DISCREPANCY, gap=gap, observed=(seen,))
+    top = headline(blocked)
+    assert top.tone is Tone.PARTLY and top.findings == (seen,) and "Nothing is wrong" not in top.sentence
+    assert any(seen in line for line in summary_lines(blocked))
+    assert "but the robot stays where it is" in diagnosis_page(blocked, {}, None)
+    assert headline(replace(blocked, observed=())).tone is Tone.GOOD
+
+
 def test_what_the_localisation_errs_by_itself_is_said_beside_what_is_unexplained():
     floor = NoiseFloor(2.0, 0.01, 0.01, 0.02)
     found = diagnosed((0.5, 0.06), (20.0, 8.0), localisation_error=7.3, noise_floor=floor)

@@ -8,8 +8,10 @@ import torch
 import yaml
 from scipy.spatial.transform import Rotation
 
-from monoforce_ros.bags import Recording
+from monoforce_ros.bags import Recording, SmoothedMotion
 from monoforce_ros.core import CommandTrack, MotionTrack, WheelTrack
+from monoforce_ros.discrepancy import commissioning
+from monoforce_ros.discrepancy.evidence import Evidence
 from monoforce_ros.discrepancy.healthy_wheels import HealthyWheels, drives_of
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.wheel_motion import undriven_stretches, wheels_without_motion
@@ -372,6 +374,16 @@ def test_stretches_driven_by_joystick_are_found(husky, silent, by_wheels):
     # Driven by commands alone there are none, even with slow drives.
     wheels = wheels_of(true, husky, HUSKY_BASE) if by_wheels else None
     assert len(undriven_stretches(true, wheels, motion, husky)) == 0
+
+
+def test_what_somebody_drove_with_a_joystick_is_not_commissioned(husky):
+    recorded, true = with_joystick(drawn_commands(80.0, 6), 30.0, 44.0, silent=False)
+    motion = driven(husky, true, HUSKY_BASE)
+    evidence = Evidence(SmoothedMotion(motion, 0.002, 0.001, (slice(0, len(motion)),)), recorded)
+    entry = commissioning._prepare(evidence, husky, np.array([0.5, 1.0, 1.5, 2.0]), 1.0)
+    starts = (entry.data.starts - ORIGIN) * 1e-9
+    assert not ((starts > 31.0) & (starts < 43.0)).any()
+    assert (starts < 29.0).any() and (starts > 46.0).any()
 
 
 def test_a_base_that_keeps_its_last_command_is_driven_by_it(husky):

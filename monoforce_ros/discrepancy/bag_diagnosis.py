@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -38,6 +39,16 @@ from monoforce_ros.training import split_maps
 
 _MARGIN = 4.0
 """Of a lidar map around the driven path [m]."""
+
+
+def usable_folder(out: Path) -> None:
+    """Make a folder, or raise ``ValueError``: before the work, for its results would be lost after it."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"{out}: --out cannot be made a folder: {error}") from error
+    if not os.access(out, os.W_OK):
+        raise ValueError(f"{out}: --out cannot be written to, expected a folder with write permission")
 
 
 @dataclass(frozen=True)
@@ -160,6 +171,9 @@ def diagnose_bag(
     found_file = out / f"{model.name}.yaml"
     if found_file.exists() and found_file.resolve() == robot_file_of(robot).resolve():
         raise ValueError(f"{out}: got the folder of the nominal robot file {found_file.name}, expected another --out")
+    if found_file.exists() and NominalModel.read(str(found_file), settings.samples) is not None:
+        # It would be replaced by what was found, and the commissioning be lost.
+        raise ValueError(f"{out}: got the folder of the commissioned file {found_file.name}, expected another --out")
     progress(0.0, "reading")
     evidence, recording, ground = read_with_ground(bag, model, terrain, reading)
     data = fingerprint([bag])
@@ -169,6 +183,7 @@ def diagnose_bag(
             raise ValueError(f"{other}: --held-out got a path that does not exist, expected a bag")
         if fingerprint([other]) == data:
             raise ValueError(f"{other}: --held-out got the diagnosed recording {bag}, expected another recording")
+    usable_folder(out)
     nominal = NominalModel.read(robot, settings.samples)
     steeper = beyond_commissioning(ground.slope, None if nominal is None else nominal.slope)
     # A robot that was commissioned on such slopes is known there, without a map, too.

@@ -14,8 +14,9 @@ import torch
 
 from monoforce_ros.bags import BagError, add_read_options, read_options
 from monoforce_ros.core import OptionParser
-from monoforce_ros.discrepancy.bag_diagnosis import BagDiagnosis, diagnose_bag, read_with_ground
+from monoforce_ros.discrepancy.bag_diagnosis import BagDiagnosis, diagnose_bag, read_with_ground, usable_folder
 from monoforce_ros.discrepancy.commissioning import commission
+from monoforce_ros.discrepancy.comparable_windows import comparable_starts
 from monoforce_ros.discrepancy.diagnosis import DiagnosisSettings
 from monoforce_ros.discrepancy.export import export_effects, export_target
 from monoforce_ros.discrepancy.nominal_residual import residual_complaint
@@ -128,7 +129,14 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _export(found: BagDiagnosis, options: argparse.Namespace) -> None:
     """Write the effects for other tools, and say what these lack."""
-    for exported in export_effects(options.export, load_robot(options.robot), found.diagnosis.effects):
+    diagnosis = found.diagnosis
+    # What is too doubtful for a robot file is so for a controller.
+    effects = diagnosis.effects if found.robot_file else ()
+    if diagnosis.effects and not effects:
+        print("  not exported: what was found, since it is not written into a robot file either; see the doubts")
+    if effects and diagnosis.part:
+        print(f"  exported as if it acted everywhere: {diagnosis.part}")
+    for exported in export_effects(options.export, load_robot(options.robot), effects):
         for file in exported.files:
             print(f"  {exported.kind}: {file}")
         for text in exported.not_exported:
@@ -227,6 +235,7 @@ def _diagnose_many(options: argparse.Namespace) -> int:
 
 def _commission(options: argparse.Namespace) -> int:
     robot = load_robot(options.robot)
+    usable_folder(options.out)
     recordings = []
     for bag in options.bags:
         evidence, _, ground = read_with_ground(bag, robot, options.terrain, read_options(options))
@@ -234,6 +243,8 @@ def _commission(options: argparse.Namespace) -> int:
         print(f"{bag}: ground: {ground.description}")
         if ground.unknown:
             print(f"diagnose: {bag}: {ground.complaint}", file=sys.stderr)
+        for remark in comparable_starts(evidence, robot, DiagnosisSettings())[1]:
+            print(f"{bag}: {remark}")
     settings = DiagnosisSettings()
     effects, nominal = commission(recordings, robot, samples=settings.samples)
     kept = nominal.entry(settings.samples)

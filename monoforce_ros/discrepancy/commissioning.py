@@ -11,6 +11,7 @@ import numpy as np
 from monoforce_ros.discrepancy.areas import shows_vegetation
 from monoforce_ros.discrepancy.attitude import lean_of
 from monoforce_ros.discrepancy.command_changes import covered_changes
+from monoforce_ros.discrepancy.comparable_windows import not_comparable
 from monoforce_ros.discrepancy.directions import Directions
 from monoforce_ros.discrepancy.estimates import EffectEstimate, beyond_file
 from monoforce_ros.discrepancy.evidence import MOTION, Evidence, EvidenceWindows, window_starts
@@ -151,6 +152,8 @@ def commission(
 def _prepare(evidence: Evidence, robot: RobotModel, samples: np.ndarray, stride: float) -> _Prepared:
     smoothed = evidence.smoothed
     starts = window_starts(smoothed.motion, smoothed.stretches, float(samples[-1]), stride)
+    # What somebody drove with a joystick, or wheels that turned in place, is not how the robot follows its commands.
+    starts = starts[~not_comparable(evidence, robot, starts, float(samples[-1]))[0]]
     found = motion_faults(smoothed, evidence.commands, evidence.wheels) or complaints(evidence, starts)
     if found:
         raise ValueError("; ".join(found))

@@ -27,12 +27,21 @@ def comparable_starts(
     smoothed = evidence.smoothed
     starts = window_starts(smoothed.motion, smoothed.stretches, settings.horizon, settings.stride)
     starts = subsampled(starts, BLOCK, settings.max_windows)
+    left_out, remarks = not_comparable(evidence, robot, starts, settings.horizon)
+    return starts[~left_out], remarks
+
+
+def not_comparable(
+    evidence: Evidence, robot: RobotModel, starts: np.ndarray, horizon: float
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Windows in which something else than ground and commands moves or holds the robot, ``[W]`` bool, and why."""
     if not len(starts) or not len(evidence.commands):
-        return starts, ()
+        return np.zeros(len(starts), bool), ()
+    smoothed = evidence.smoothed
 
     def overlapping(stretches: np.ndarray) -> np.ndarray:
         low, high = stretches.reshape(-1, 2).T
-        return ((starts[:, None] < high) & (starts[:, None] + round(settings.horizon * 1e9) > low)).any(axis=1)
+        return ((starts[:, None] < high) & (starts[:, None] + round(horizon * 1e9) > low)).any(axis=1)
 
     remarks = []
     undriven = undriven_stretches(evidence.commands, evidence.wheels, smoothed.motion, robot)
@@ -46,7 +55,13 @@ def comparable_starts(
         if spinning.side == "both":
             left_out |= overlapping(np.array(spinning.stretches, np.int64))
             remarks[-1] += "; this time is left out"
-    return starts[~left_out], tuple(remarks)
+    return left_out, tuple(remarks)
+
+
+def blocked_wheels(evidence: Evidence, robot: RobotModel) -> str:
+    """When wheels turn while the robot, or one side of it, stays where it is, in words; empty where they do not."""
+    found = wheels_without_motion(evidence.smoothed.motion, evidence.wheels, evidence.commands, robot)
+    return "" if found is None else found.summary()
 
 
 def windows_of(

@@ -9,7 +9,7 @@ import numpy as np
 
 from monoforce_ros.discrepancy.areas import Area, worst_place
 from monoforce_ros.discrepancy.attitude import changed_lean, lean_of
-from monoforce_ros.discrepancy.comparable_windows import comparable_starts, windows_of
+from monoforce_ros.discrepancy.comparable_windows import blocked_wheels, comparable_starts, windows_of
 from monoforce_ros.discrepancy.comparison import (
     ABOVE_NOISE,
     Comparison,
@@ -108,6 +108,8 @@ class Diagnosis:
     set_aside: Verdict | None = None
     """Verdict on all effects where only those that sensors measured are kept, since the ground may be the cause of the
     rest, which is listed in ``known_parts``; None where nothing was set aside."""
+    observed: tuple[str, ...] = ()
+    """What the recording shows of the robot besides: wheels that turn in place, a lean that has changed."""
     motion_unexplained: bool = False
     """Whether, besides what a sensor measured, the motion is not as predicted, and no effect improves it."""
 
@@ -276,6 +278,7 @@ def diagnose(
         part="" if part is None or decision.verdict in _NOTHING_ADDED else part.remark,
         set_aside=None if aside is None else aside.verdict,
         motion_unexplained=motion_unexplained,
+        observed=tuple(filter(None, (blocked_wheels(evidence, robot), leans))),
     )
 
 

@@ -119,6 +119,12 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
             tuple(diagnosis.remarks), ("record again as said here, then run diagnose on the new recording",),
         )  # fmt: skip
     if diagnosis.verdict == Verdict.NO_DISCREPANCY:
+        observed = diagnosis.observed
+        if observed and not complaints:
+            return Headline(
+                Tone.PARTLY, "The robot moves as its model predicts, but something else is wrong.", "", observed, (),
+                _sizes(diagnosis), diagnosis.advice,
+            )  # fmt: skip
         return Headline(
             Tone.PARTLY if complaints else Tone.GOOD,
             # A model that misses the healthy robot by much cannot say that nothing is wrong.
@@ -126,7 +132,7 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
             if complaints
             else "Nothing is wrong: the robot moves as its model predicts.",
             "",
-            (),
+            observed,
             tuple(complaints),
             _sizes(diagnosis),
             diagnosis.advice,
