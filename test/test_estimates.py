@@ -75,6 +75,23 @@ def test_the_moment_of_a_load_in_the_file_counts_as_none():
     assert complaint(replace(load, in_file={"mass": 10.0, "x": 0.1})) == ""
 
 
+@pytest.mark.parametrize(("deviation", "found"), [(0.02, True), (0.5, False)])
+def test_two_lags_of_equal_length_are_a_finding_where_their_sum_is_determined(deviation, found):
+    """Residuals hardly depend on how 0.43 s are divided: both intervals reach 0."""
+    directions = np.array([[1.0, 1.0], [1.0, -1.0]]) / np.sqrt(2.0)
+    covariance = directions @ np.diag([(deviation / np.sqrt(2.0)) ** 2, 0.4**2]) @ directions.T
+    lags = {"time_constant": 0.222, "second_time_constant": 0.205}
+    (lag,) = estimate_effects(Fit((("actuator_lag", lags),), np.ones(40), covariance, blocks=1000), {})
+    assert lag.parameters["time_constant"].low == lag.parameters["second_time_constant"].low == 0.0
+    total = lag.products["total_time"]
+    assert total.value == pytest.approx(0.427)
+    assert total.high - total.value == pytest.approx(1.96 * deviation, rel=0.01)
+    assert (complaint(lag) == "") == found
+    assert ("sum of both time constants is certain: 0.427 s" in finding(lag)) == found
+    # The same lags in the robot's file are no change.
+    assert complaint(replace(lag, in_file=lags)) != ""
+
+
 def test_products_of_unknown_parameters_are_refused():
     class Load(type(CATALOGUE["payload"])):
         products = (Product("moment_w", ("mass", "w"), "kg m", "moment"),)

@@ -90,4 +90,4 @@ def _holds_neutral(value: ParameterEstimate, known: Parameter) -> bool:
 
 def _neutral_product(product: Product, known: Mapping[str, Parameter]) -> float:
     one, other = product.factors
-    return known[one].neutral * known[other].neutral
+    return product.of(known[one].neutral, known[other].neutral)

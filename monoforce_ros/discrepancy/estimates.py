@@ -42,7 +42,7 @@ class EffectEstimate:
     indistinguishable: tuple[str, ...] = ()
     """Other effects that explain the recording about as well in its place."""
     products: Mapping[str, ParameterEstimate] = field(default_factory=dict)
-    """Products of two of its parameters, see :class:`~monoforce_ros.effects.effect.Product`."""
+    """Products and sums of two of its parameters, see :class:`~monoforce_ros.effects.effect.Product`."""
     found_again: tuple[int, int] | None = None
     """In how many of how many repetitions, each without another part of the recording, it or one of these others is
     found; None for a recording too short for that, and for a formula."""

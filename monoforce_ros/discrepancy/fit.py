@@ -294,10 +294,10 @@ def estimate_effects(
             if not set(product.factors) <= set(place):
                 continue
             one, other = (place[key] for key in product.factors)
-            gradient = values[other] * units[one] + values[one] * units[other]
+            by_one, by_other = product.slopes(float(values[one]), float(values[other]))
             # The formula's error is a share of the effect, whose size is that of the first factor.
-            half = half_width(gradient, float(formula_part[one] * values[other] ** 2))
-            value = float(values[one] * values[other])
+            half = half_width(by_one * units[one] + by_other * units[other], float(formula_part[one] * by_one**2))
+            value = product.of(float(values[one]), float(values[other]))
             products[product.name] = ParameterEstimate(value, value - half, value + half, product.unit)
         others = tuple(indistinguishable.get(name, ()))
         estimates.append(EffectEstimate(name, listed, others, products))

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.signal import lfilter
 from torch import Tensor
 
-from monoforce_ros.effects.effect import Effect, Parameter, Values, WheelResponse
+from monoforce_ros.effects.effect import Effect, Parameter, Product, Values, WheelResponse
 from monoforce_ros.effects.first_order import lagged
 from monoforce_ros.effects.ramp import at_stamps
 
@@ -39,6 +39,10 @@ class ActuatorLag(Effect):
     order = 40
     identified = ("time_constant",)
     refined = ("second_time_constant",)
+    # Two lags of about the same length look alike however their sum is divided.
+    products = (
+        Product("total_time", ("time_constant", "second_time_constant"), "s", "sum of both time constants", adds=True),
+    )
     manoeuvre = "steps of the speed from standing"
     commissioning_start: ClassVar = {"time_constant": 0.03}
     wheel_response = WheelResponse(

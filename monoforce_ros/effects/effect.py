@@ -42,12 +42,22 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Product:
-    """A product of two parameters, which a recording may determine better than either of them."""
+    """A product or sum of two parameters, which a recording may determine better than either of them."""
 
     name: str
     factors: tuple[str, str]
     unit: str
     meaning: str
+    adds: bool = False
+    """Whether it is their sum."""
+
+    def of(self, one: float, other: float) -> float:
+        """Its value."""
+        return one + other if self.adds else one * other
+
+    def slopes(self, one: float, other: float) -> tuple[float, float]:
+        """Its derivatives by both."""
+        return (1.0, 1.0) if self.adds else (other, one)
 
 
 @dataclass(frozen=True)
