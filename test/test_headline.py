@@ -51,6 +51,20 @@ def test_an_explained_error_is_good_and_what_is_left_is_said_first():
     assert lines[0].startswith("effect_found: ") and "Unexplained" in lines[1]
 
 
+def test_an_error_as_small_as_the_healthy_robots_does_not_grow():
+    """A turned sensor explains the position; the heading goes from 0.47° to 0.58° where a healthy robot has 0.7°."""
+    turned = effect("sensor_yaw_offset", angle=(0.09, 0.06, 0.12))
+    found = diagnosed((0.2, 0.01), (0.47, 0.58), effects=(turned,))
+    found = replace(found, gap={**found.gap, "heading_2s": row(0.47, 0.58, unit="deg", noise=0.15)})
+    assert headline(found).tone is Tone.PARTLY and "grew" in headline(found).unexplained
+    known = headline(replace(found, healthy={"position": 0.012, "heading": 0.7}))
+    assert known.tone is Tone.GOOD and known.helps
+    assert "the heading error was no larger than the healthy robot's before" in known.unexplained
+    # One that grows beyond the healthy robot's is said.
+    grown = replace(found, gap={**found.gap, "heading_2s": row(0.47, 0.9, unit="deg", noise=0.15)})
+    assert "grew" in headline(replace(grown, healthy={"position": 0.012, "heading": 0.4})).unexplained
+
+
 def test_a_robot_that_was_blocked_is_not_all_right_because_its_model_is():
     seen = "the wheels turn (9.3 m) but the robot stays where it is (within 0.02 m)"
     gap = {"position_2s": row(0.02, None), "heading_2s": row(0.5, None, unit="deg", noise=0.3)}

@@ -108,6 +108,9 @@ class Diagnosis:
     set_aside: Verdict | None = None
     """Verdict on all effects where only those that sensors measured are kept, since the ground may be the cause of the
     rest, which is listed in ``known_parts``; None where nothing was set aside."""
+    healthy: Mapping[str, float] = field(default_factory=dict)
+    """Median errors of the healthy robot at the end of a window, ``position`` [m] and ``heading`` [deg]; empty for one
+    that was never commissioned."""
     observed: tuple[str, ...] = ()
     """What the recording shows of the robot besides: wheels that turn in place, a lean that has changed."""
     motion_unexplained: bool = False
@@ -278,8 +281,20 @@ def diagnose(
         part="" if part is None or decision.verdict in _NOTHING_ADDED else part.remark,
         set_aside=None if aside is None else aside.verdict,
         motion_unexplained=motion_unexplained,
+        healthy={} if nominal is None else _medians(expected[-1]),
         observed=tuple(filter(None, (blocked_wheels(evidence, robot), leans))),
     )
+
+
+def _medians(rms: np.ndarray) -> dict[str, float]:
+    """Median errors of position [m] and heading [deg] that are normal with RMS along, across and in heading [m, rad].
+
+    The median of a distance whose two parts are normal is √(ln 2) of its RMS (Rayleigh), of one such part 0.674.
+    """
+    return {
+        "position": float(np.sqrt(np.log(2.0)) * np.hypot(rms[0], rms[1])),
+        "heading": float(np.degrees(0.6745 * rms[2])),
+    }
 
 
 def _without_effects(compared: Sequence[Comparison]) -> list[Comparison]:

@@ -38,6 +38,8 @@ class Explained:
     row: GapRow
     recording: str
     """Name of the held-out recording; empty for the held-out blocks of the diagnosed one."""
+    healthy: float = 0.0
+    """Median error of the healthy robot, if it is known."""
 
     @property
     def share(self) -> float:
@@ -48,15 +50,15 @@ class Explained:
 
     @property
     def counts(self) -> bool:
-        """Whether there was an error to explain."""
-        return self.row.before > ABOVE_NOISE * self.row.noise
+        """Whether there was an error to explain: above the noise, and larger than the healthy robot's."""
+        return self.row.before > max(ABOVE_NOISE * self.row.noise, self.healthy)
 
     @property
     def grew(self) -> bool:
         """Whether the error is larger with the effects: its median, or beyond chance where it is mostly noise."""
         assert self.row.after is not None
         certain = self.row.gain_high is not None and self.row.gain_high < 0
-        return self.row.after > self.row.before and (self.counts or certain)
+        return self.row.after > self.row.before and (self.counts or (certain and self.row.after > self.healthy))
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,10 @@ def explained(diagnosis: Diagnosis) -> tuple[Explained, ...]:
                 if name.startswith(f"{metric}_") and 0 < row.horizon <= JUDGED and row.after is not None
             ]
             if rows:
-                found.append(Explained(metric, max(rows, key=lambda row: row.horizon), recording))
+                row = max(rows, key=lambda row: row.horizon)
+                # What is known of the healthy robot is its error at the end of a window.
+                healthy = diagnosis.healthy.get(metric, 0.0) if row.horizon == JUDGED else 0.0
+                found.append(Explained(metric, row, recording, healthy))
     return tuple(found)
 
 
@@ -221,7 +226,9 @@ def _left(rows: Sequence[Explained]) -> str:
     texts = []
     for row in rows:
         where = f" on {row.recording}" if row.recording else ""
-        if not row.counts:
+        if not row.counts and row.row.before > ABOVE_NOISE * row.row.noise:
+            texts.append(f"the {row.metric} error{where} was no larger than the healthy robot's before")
+        elif not row.counts:
             texts.append(f"the {row.metric} error{where} was hardly above the noise before")
         elif row.grew:
             texts.append(f"all of the {row.metric} error{where}, which grew")
