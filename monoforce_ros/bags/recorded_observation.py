@@ -46,11 +46,7 @@ def observe(
         camera = recording.cameras[topic]
         try:
             image = recording.image(frame)
-            if image.shape[:2] != (camera.height, camera.width):
-                raise BagError(
-                    f"{topic}: images are {image.shape[1]} × {image.shape[0]} px, but CameraInfo says {camera.width} × "
-                    f"{camera.height} px"
-                )
+            camera.check_image(image)
             pose = recording.sensor_pose(camera.frame_id, robot.base_frame, robot.sensors)
         except ValueError as error:
             refused = refused or error

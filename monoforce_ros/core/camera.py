@@ -92,6 +92,14 @@ class CameraModel:
                 f"than {self.distortion_model!r}, or of another image size?"
             )
 
+    def check_image(self, image: np.ndarray) -> None:
+        """Raise ``ValueError`` if an image ``[height, width, ...]`` is not of this camera's size."""
+        if image.shape[:2] != (self.height, self.width):
+            raise ValueError(
+                f"images are {image.shape[1]} × {image.shape[0]} px, but CameraInfo says {self.width} × "
+                f"{self.height} px"
+            )
+
     def _check_matrix(self) -> None:
         matrix, size = self.matrix, np.array([self.width, self.height])
         focal, centre = matrix[[0, 1], [0, 1]], matrix[:2, 2]

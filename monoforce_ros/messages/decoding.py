@@ -77,12 +77,13 @@ def _decode_compressed(message: Any) -> np.ndarray:
     data = np.frombuffer(message.data, np.uint8)
     if "compressedDepth" in message.format or message.format.startswith(("16UC1", "32FC1")):
         raise MessageError(f"image format: got {message.format!r}, a depth image; expected a colour or grey image")
-    size = _encoded_size(data.tobytes())
+    content = data.tobytes()
+    size = _encoded_size(content)
     if size is not None and not 1 <= size[0] * size[1] <= MAXIMUM_IMAGE_PIXELS:
         # A few bytes may claim a picture that no memory holds.
         raise MessageError(f"image size: got {size[0]} × {size[1]}, expected 1 to {MAXIMUM_IMAGE_PIXELS} pixels")
     # Some versions of OpenCV fill what is missing of a JPEG with grey. FF D9 ends it, and cannot occur in its pixels.
-    cut = data[:2].tobytes() == b"\xff\xd8" and data.tobytes().rfind(b"\xff\xd9") < data.size // 2
+    cut = content[:2] == b"\xff\xd8" and content.rfind(b"\xff\xd9") < len(content) // 2
     decoded = cv2.imdecode(data, cv2.IMREAD_COLOR) if size is not None and not cut else None
     if decoded is None:
         raise MessageError(

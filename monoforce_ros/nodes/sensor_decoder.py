@@ -114,9 +114,5 @@ class SensorDecoder:
                 "`camera_info_topics`"
             )
         image = decoding.decode_image(message)
-        if image.shape[:2] != (camera.height, camera.width):
-            raise MessageError(
-                f"images are {image.shape[1]} × {image.shape[0]} px, but CameraInfo says {camera.width} × "
-                f"{camera.height} px"
-            )
+        camera.check_image(image)
         return image, camera
