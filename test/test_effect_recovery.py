@@ -191,6 +191,20 @@ def test_what_explains_little_of_as_little_as_a_healthy_robot_shows_makes_up_for
     assert search._makes_up(first, second) == made_up
 
 
+def test_a_further_effect_in_whose_presence_the_first_one_goes_must_explain_more_than_that(monkeypatch):
+    """Of two effects that the motion shows only together, the first one may not be significant beside the other."""
+    husky = load_robot("husky")
+    hidden = (("rolling_resistance", {"coefficient": 0.3}), ("constant_force", {"x": 60.0, "y": 0.0}))
+    search = Search(husky, driven(replace(husky, effects=hidden)), SCALE)
+    first = search.judge((("rolling_resistance", {"coefficient": 0.25}),))
+    further, _ = search._further(first, 2)
+    assert further is not None and further.names[0] == "rolling_resistance"
+    force = search.judge((("constant_force", {"x": -100.0, "y": 0.0}),))
+    assert force.loss > first.loss
+    monkeypatch.setattr(search, "_pruned", lambda trial: force)
+    assert search._further(first, 2)[0] is None
+
+
 def test_beside_a_further_effect_the_values_of_the_first_one_are_fitted_once_more():
     """Compliance alone makes up for low friction, too: with its value as it is, delays promise more than friction."""
     hidden = (("friction_scale", {"factor": 0.25}), ("drive_compliance", {"speed_loss": 0.42}))

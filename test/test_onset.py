@@ -26,12 +26,19 @@ SAMPLES = np.array([0.5, 1.0, 1.5, 2.0])
 SECONDS, ONSET = 72.0, 40.0
 
 
-def _recording(begins: float, gain: float = 0.75, drain: float = 0.0) -> EvidenceWindows:
-    """Drives that reach a share of the commanded speed from a time on, and lose ``drain`` of it every minute."""
+def _recording(
+    begins: float, gain: float = 0.75, drain: float = 0.0, turns: tuple[float, float] = (-0.8, 0.8)
+) -> EvidenceWindows:
+    """Drives that reach a share of the commanded speed from a time on, and lose ``drain`` of it every minute.
+
+    Yaw rates are drawn between ``turns`` [rad/s].
+    """
     husky = load_robot("husky")
     random = np.random.default_rng(2)
     steps = round(SECONDS / 0.01)
-    commanded = np.repeat(random.uniform([0.1, -0.8], [0.9, 0.8], (round(SECONDS / 1.5), 2)), 150, axis=0)[:steps]
+    commanded = np.repeat(random.uniform([0.1, turns[0]], [0.9, turns[1]], (round(SECONDS / 1.5), 2)), 150, axis=0)[
+        :steps
+    ]
     speeds = drive_speeds(husky, torch.as_tensor(commanded[None], dtype=torch.float32), 0.01)
     speeds = speeds * (1.0 - drain * torch.arange(steps)[None, :, None] * 0.01 / 60.0)
     acting = torch.arange(steps)[None, :, None] * 0.01 >= begins
@@ -132,6 +139,17 @@ def test_a_compass_near_iron_deviates_with_the_heading_and_a_sensor_that_was_tur
         recording = _compass(data, deviations)
         scale = np.tile([0.01, 0.01, 0.005], (4, 1))
         assert Search(husky, recording, scale).follows_heading(offset, acting) == follows
+
+
+@pytest.mark.parametrize("gain", [0.75, 0.9])
+def test_a_change_at_a_time_stays_one_where_the_heading_goes_with_time(gain):
+    """The robot turns by half a circle in all: of the onset and its heading neither adds much to the other."""
+    data = _recording(ONSET, gain, turns=(-0.06, 0.15))
+    residual = np.tile([0.03, 0.03, 0.015], (4, 1))
+    healthy = NominalModel(residual, {"drive_gain": 0.25}, segments=5, loss=0.5, loss_spread=0.2)
+    search = Search(load_robot("husky"), data, residual, nominal=healthy)
+    acting = data.starts >= data.starts[0] + ONSET * 1e9
+    assert not search.follows_heading((("drive_gain", {"gain": 0.5 + 0.5 * gain}),), acting)
 
 
 def test_wheels_that_confirm_the_file_show_no_change():

@@ -248,6 +248,7 @@ def _findings(search: Search, outcome: Outcome) -> Findings:
     return Findings(
         outcome.nominal, outcome.best, outcome.fit,
         healthy_loss=search.healthy_loss,
+        healthy_spread=search.healthy_spread,
         commissioned=search.commissioned,
         known=search.known,
     )  # fmt: skip

@@ -16,7 +16,7 @@ from monoforce_ros.discrepancy.fit import Fit, estimate_effects, fit_effects, fl
 from monoforce_ros.discrepancy.hypothesis import Effects, Predictions, own_values
 from monoforce_ros.discrepancy.left_out import values_without_parts
 from monoforce_ros.discrepancy.nominal import NominalModel
-from monoforce_ros.discrepancy.residual_size import ResidualSize, residual_size
+from monoforce_ros.discrepancy.residual_size import ResidualSize, drive_spread, residual_size
 from monoforce_ros.discrepancy.score_test import motion_count
 from monoforce_ros.discrepancy.screening import Screening
 from monoforce_ros.discrepancy.thresholds import Thresholds
@@ -89,6 +89,12 @@ class Judging:
     def healthy_loss(self) -> float:
         """Mean loss of the healthy robot."""
         return HEALTHY_LOSS if self.nominal is None else self.nominal.loss
+
+    @property
+    def healthy_spread(self) -> float:
+        """Standard deviation of the logarithm of the healthy robot's mean loss on a drive; 0 where it is unknown."""
+        healthy = self.nominal
+        return 0.0 if healthy is None or not healthy.segments else drive_spread(healthy, self.thresholds)
 
     def loss_of(self, effects: Effects) -> np.ndarray:
         """Robust loss of each window, ``[W]``."""
@@ -217,7 +223,7 @@ class Judging:
             p = min(1.0, 2.0 * p)
         explained = 1.0
         if self.commissioned and trial.effects:
-            explained = excess_share(nominal.loss, trial.loss, self.healthy_loss, self.thresholds.drive_spread)
+            explained = excess_share(nominal.loss, trial.loss, self.healthy_loss, self.healthy_spread)
         return FitTest(p, name, tuple(tests), explained)
 
     def size_p(self, trial: Trial) -> float | None:

@@ -43,14 +43,21 @@ def residual_size(
     """
     blocks = len(np.unique(blocks_of(starts)))
     above = float(np.log(max(float(losses.mean()), 1e-9) / expected))
-    variances = np.square(
-        [thresholds.drive_spread, loss_error(losses, starts), healthy.loss_spread / np.sqrt(healthy.segments)]
-    )
+    learned = healthy.loss_spread / np.sqrt(healthy.segments)
+    variances = np.square([thresholds.drive_spread, loss_error(losses, starts), learned])
     degrees = np.array([thresholds.calibration_degrees, max(blocks - 1, 1), healthy.segments - 1])
     total = max(float(variances.sum()), 1e-12)
     spread = float(np.sqrt(total))
     freedom = total**2 / max(float((variances**2 / degrees).sum()), 1e-24)
     return ResidualSize(above, spread, float(student_distribution.sf(above / spread, freedom)))
+
+
+def drive_spread(healthy: NominalModel, thresholds: Thresholds) -> float:
+    """Standard deviation of the logarithm of a healthy drive's mean loss about what commissioning learned.
+
+    By how much drives differ, and by the standard error of the mean over the segments of commissioning.
+    """
+    return float(np.hypot(thresholds.drive_spread, healthy.loss_spread / np.sqrt(max(healthy.segments, 1))))
 
 
 def loss_error(losses: np.ndarray, starts: np.ndarray) -> float:

@@ -111,12 +111,20 @@ class Search(Judging):
         return any(test.adjusted <= self.thresholds.further_rate for test in tests)
 
     def follows_heading(self, effects: Effects, acting: np.ndarray) -> bool:
-        """Whether effects change with the heading, and that explains why they act in some windows ``[W]`` more."""
+        """Whether effects change with the heading, and that explains why they act in some windows ``[W]`` more.
+
+        Where the robot turned once in a recording, its heading goes with time. Of two explanations of which neither adds
+        to the other, that one counts which explains more; of a change with the heading, which has two coefficients, as
+        much is no more than of one between two parts.
+        """
         base = self.refit(effects).effects
         fixed, residual = self.fixed_count(base), self.directions.scaled(base)
         headings, part = self.directions.of_heading(base, fixed, acting)
-        tests = self.screening.tested(base, fixed, residual, headings)
-        if all(test.adjusted > self.thresholds.fit_rate for test in tests):
+        by_heading = self.screening.tested(base, fixed, residual, headings)
+        if all(test.adjusted > self.thresholds.fit_rate for test in by_heading):
+            return False
+        by_part = self.screening.tested(base, fixed, residual, part)
+        if max(test.gain for test in by_part) >= max(test.gain for test in by_heading):
             return False
         tests = self.screening.tested(base, fixed, residual, part, beside=headings)
         return all(test.adjusted > self.thresholds.effect_rate for test in tests)
@@ -158,7 +166,9 @@ class Search(Judging):
         if not judged:
             return None, listed
         further = self._pruned(self._preferred(judged))
-        return None if self._makes_up(best, further) else further, listed
+        # Where two effects show only together, the older one may go and leave a further one that explains little.
+        worse = further.loss >= best.loss
+        return None if worse or self._makes_up(best, further) else further, listed
 
     def _makes_up(self, best: Trial, further: Trial) -> bool:
         """Whether a further effect makes up for formulas that are not exact.

@@ -55,6 +55,8 @@ class Findings:
     """Mean loss of the healthy robot."""
     commissioned: bool
     """Whether the healthy robot's residuals are known, with which those that are left can be compared."""
+    healthy_spread: float = 0.0
+    """Standard deviation of the logarithm of this loss on a drive; 0 where it is unknown."""
     known: Effects = ()
     """Effects measured by the gyro or the wheel speeds, which act in all trials."""
     formula: Trial | None = None
@@ -125,8 +127,9 @@ def leaves_most(findings: Findings, thresholds: Thresholds) -> bool:
 def decide(findings: Findings, thresholds: Thresholds = Thresholds()) -> Decision:  # noqa: B008
     """The verdict on a recording."""
     nominal, best = findings.nominal, findings.best
-    spread = thresholds.drive_spread if findings.commissioned else 0.0
-    share = excess_share(nominal.loss, best.loss, findings.healthy_loss, spread) if best.effects else None
+    share = None
+    if best.effects:
+        share = excess_share(nominal.loss, best.loss, findings.healthy_loss, findings.healthy_spread)
     losses = Losses(nominal.loss, best.loss, findings.healthy_loss, share, p_rest=findings.fit.p)
     if fits(findings, thresholds):
         if not best.effects:
