@@ -53,6 +53,22 @@ def test_a_gyro_is_biased_beyond_what_a_healthy_one_is(bias, biased):
     assert found.biased() == biased
 
 
+@pytest.mark.parametrize(("tilt", "bias", "biased"), [(20.0, 0.0, False), (20.0, 0.03, True), (0.0, -0.02, True)])
+def test_an_imu_that_leans_is_not_biased_in_laps_one_way_round(tilt, bias, biased):
+    """It measures a share of each turn, always of the same sign."""
+    motion, gyro = turning(20.0)
+    seconds = (motion.stamps - motion.stamps[0]) * 1e-9
+    lap = Rotation.from_rotvec(0.5 * seconds[:, None] * [0, 0, 1]) * Rotation.from_quat(motion.quaternions)
+    turns = motion.angular_velocities + [0.0, 0.0, 0.5]
+    motion = replace(motion, quaternions=lap.as_quat(), angular_velocities=turns)
+    rates = (gyro.rates + [0.0, 0.0, 0.5]) * np.cos(np.radians(tilt)) + [0.0, 0.0, bias]
+    found = compare_with_gyro(
+        SmoothedMotion(motion, 0.003, 0.002, (slice(0, len(motion)),)), replace(gyro, rates=rates)
+    )
+    assert found.bias == pytest.approx(bias, abs=0.004)
+    assert found.biased() == biased
+
+
 def test_a_gyro_that_is_too_slow_to_compare_says_nothing():
     motion, gyro = turning(20.0)
     slow = AngularVelocityTrack(gyro.stamps[::50], gyro.rates[::50])

@@ -205,6 +205,17 @@ def test_a_further_effect_in_whose_presence_the_first_one_goes_must_explain_more
     assert search._further(first, 2)[0] is None
 
 
+@pytest.mark.parametrize("measured", [True, False])
+def test_an_effect_is_exchanged_for_one_that_predicts_better_and_is_a_measurement(monkeypatch, measured):
+    husky = load_robot("husky")
+    search = Search(husky, driven(replace(husky, effects=(("actuator_lag", {"time_constant": 0.5}),))), SCALE)
+    wrong = search.judge((("command_delay", {"delay": 0.3}),))
+    if not measured:
+        monkeypatch.setattr(search, "credible", lambda trial, last=None: trial.names != ("actuator_lag",))
+    best, _ = search._exchanged(wrong)
+    assert (best.names == ("actuator_lag",)) == measured
+
+
 def test_beside_a_further_effect_the_values_of_the_first_one_are_fitted_once_more():
     """Compliance alone makes up for low friction, too: with its value as it is, delays promise more than friction."""
     hidden = (("friction_scale", {"factor": 0.25}), ("drive_compliance", {"speed_loss": 0.42}))

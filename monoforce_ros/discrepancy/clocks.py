@@ -13,6 +13,8 @@ from scipy.stats import t as student
 from monoforce_ros.bags import SmoothedMotion
 from monoforce_ros.core import AngularVelocityTrack, DelayCorrelation
 
+_OUTLIER = 6.0
+"""Median distances from the median: four standard deviations of normal noise."""
 _STEP = 0.02
 _LAGS = np.arange(-50, 81) * _STEP
 """Delays of the poses that are tested [s]."""
@@ -98,22 +100,27 @@ def compare_with_gyro(smoothed: SmoothedMotion, gyro: AngularVelocityTrack | Non
     count = len(found)
     left_out = found.peak_without_each(peak) if count > 2 else np.array([offset])
     spread = np.sqrt((count - 1) / count * np.sum((left_out - left_out.mean()) ** 2))
-    differences, medians = [], []
+    both = []
     for times, rate in pieces:
         measured, known = _gyro_rate(times - offset, clock, sign * gyro.rates[:, axis])
         if known.mean() > 0.5:
-            differences.append((measured - rate)[known])
-            medians.append(float(np.median(differences[-1])))
-    if not differences:
+            both.append(np.stack([measured, rate])[:, known])
+    if not both:
         # Too few measurements for their mean.
         return None
+    # An IMU that leans measures a share of each turn: in laps one way round that looks like a bias.
+    least, most = _scale_range(np.concatenate(both, axis=1))
+    scale = float(np.sqrt(least * most))
+    differences = [measured - scale * rate for measured, rate in both]
     everything = np.concatenate(differences)
     bias = float(np.median(everything))
+    by_scale = 0.5 * (most - least) * abs(float(np.median(np.concatenate([rate for _, rate in both]))))
+    by_chance = _mean_half_width([float(np.median(piece)) for piece in differences])
     return GyroFinding(
         offset=float(offset),
         offset_half_width=float(max(1.96 * spread, 0.01)),
         bias=bias,
-        bias_half_width=_mean_half_width(medians),
+        bias_half_width=by_chance + by_scale,
         spread=float(np.median(np.abs(everything))),
         spread_without=float(np.median(np.abs(everything - bias))),
         correlation=correlation,
@@ -152,6 +159,21 @@ def heading_disagreement(
     if len(poses) < _FEWEST_WINDOWS:
         return None
     return float(min(np.median(np.abs(poses - scale * measured)) for scale in _SCALES))
+
+
+def _scale_range(rates: np.ndarray) -> tuple[float, float]:
+    """Smallest and largest factor from the yaw rate of the poses to that of a gyro, from both, ``[2, N]`` [rad/s].
+
+    Both are noisy: the factor lies between the slope of either's regression on the other (Frisch 1934). What is far from
+    all others, such as a jump of the poses, does not count.
+    """
+    measured, rate = rates
+    away = np.abs(measured - rate - np.median(measured - rate))
+    measured, rate = rates[:, away <= _OUTLIER * max(float(np.median(away)), 1e-9)]
+    (of_gyro, shared), (_, of_poses) = np.cov(measured, rate)
+    if shared <= 0.0:
+        return 1.0, 1.0
+    return float(shared / of_poses), float(of_gyro / shared)
 
 
 def _mean_half_width(values: list[float]) -> float:

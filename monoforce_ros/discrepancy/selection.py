@@ -346,8 +346,10 @@ class Search(Judging):
             middle = 0.5 * (others.before + reached)
             near = [entry for entry in others.screened if entry.name != name and entry.loss < middle]
             judged = sorted([*(self.judge(entry.effects) for entry in near[:_JUDGED]), best], key=lambda t: t.loss)
-            if judged[0] is not best and self._gain(best, judged[0])[1] > 0:
-                best = judged[0]
+            # An effect that is no measurement, whose value may as well be none, takes the place of no other.
+            better = next((trial for trial in judged if trial is best or self.credible(trial, last=1)), best)
+            if better is not best and self._gain(best, better)[1] > 0:
+                best = better
             kept = best.names[-1] if name not in best.names else name
             instead = [trial for trial in judged if trial is not best]
             indistinguishable[kept] = self._indistinguishable(best, instead, kept)
