@@ -59,9 +59,10 @@ def test_an_imu_that_leans_is_not_biased_in_laps_one_way_round(tilt, bias, biase
     motion, gyro = turning(20.0)
     seconds = (motion.stamps - motion.stamps[0]) * 1e-9
     lap = Rotation.from_rotvec(0.5 * seconds[:, None] * [0, 0, 1]) * Rotation.from_quat(motion.quaternions)
-    turns = motion.angular_velocities + [0.0, 0.0, 0.5]
+    turns = motion.angular_velocities + np.array([0.0, 0.0, 0.5])
     motion = replace(motion, quaternions=lap.as_quat(), angular_velocities=turns)
-    rates = (gyro.rates + [0.0, 0.0, 0.5]) * np.cos(np.radians(tilt)) + [0.0, 0.0, bias]
+    up = np.array([0.0, 0.0, 1.0])
+    rates = (gyro.rates + 0.5 * up) * np.cos(np.radians(tilt)) + bias * up
     found = compare_with_gyro(
         SmoothedMotion(motion, 0.003, 0.002, (slice(0, len(motion)),)), replace(gyro, rates=rates)
     )
