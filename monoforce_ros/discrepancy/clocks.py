@@ -164,8 +164,8 @@ def heading_disagreement(
 def _scale_range(rates: np.ndarray) -> tuple[float, float]:
     """Smallest and largest factor from the yaw rate of the poses to that of a gyro, from both, ``[2, N]`` [rad/s].
 
-    Both are noisy: the factor lies between the slope of either's regression on the other (Frisch 1934). What is far from
-    all others, such as a jump of the poses, does not count.
+    Both are noisy: the factor lies between the slope of either's regression on the other (Frisch 1934). What is far
+    from all others, such as a jump of the poses, does not count.
     """
     measured, rate = rates
     away = np.abs(measured - rate - np.median(measured - rate))

@@ -113,9 +113,9 @@ class Search(Judging):
     def follows_heading(self, effects: Effects, acting: np.ndarray) -> bool:
         """Whether effects change with the heading, and that explains why they act in some windows ``[W]`` more.
 
-        Where the robot turned once in a recording, its heading goes with time. Of two explanations of which neither adds
-        to the other, that one counts which explains more; of a change with the heading, which has two coefficients, as
-        much is no more than of one between two parts.
+        Where the robot turned once in a recording, its heading goes with time. Of two explanations of which neither
+        adds to the other, that one counts which explains more; of a change with the heading, which has two
+        coefficients, as much is no more than of one between two parts.
         """
         base = self.refit(effects).effects
         fixed, residual = self.fixed_count(base), self.directions.scaled(base)

@@ -50,13 +50,14 @@ class Thresholds:
             38 singles, pairs and outside effects of the MuJoCo platforms for choosing that was 0.018, 0.020, 0.023,
             0.10, 0.16 and 0.25 for effects that were not there, and 0.05, 0.14, 0.18, 0.40, 0.51, 0.60 and 0.77 for
             second ones that were (``benchmarks/platforms/further_shares.py``).
-        explained_share: smallest share of the excess loss, that above a healthy robot's mean and one standard deviation of
-            it (``drive_spread`` and the standard error of commissioning), which effects must explain to be the explanation; what explains less is reported as a known part. Of what
-            these leave a further effect must explain as much where that is no larger than on a healthy robot. On the 75
-            singles and pairs of the 30 MuJoCo platforms for choosing the true effects explain at least 0.5, 0.6, 0.7,
-            0.8 and 0.9 of what exceeds the mean on 69, 67, 66, 61 and 57 (``benchmarks/platforms/true_effects.py``, by
-            their motion alone). What a search takes for the cause of an effect outside the catalogue explained 0.06,
-            0.12, 0.14, 0.52 and 0.62 of it on five of these drives (``share_explained`` of run.py).
+        explained_share: smallest share of the excess loss, that above a healthy robot's mean and one standard deviation
+            of it (``drive_spread`` and the standard error of commissioning), which effects must explain to be the
+            explanation; what explains less is reported as a known part. Of what these leave a further effect must
+            explain as much where that is no larger than on a healthy robot. On the 75 singles and pairs of the 30
+            MuJoCo platforms for choosing the true effects explain at least 0.5, 0.6, 0.7, 0.8 and 0.9 of what exceeds
+            the mean on 69, 67, 66, 61 and 57 (``benchmarks/platforms/true_effects.py``, by their motion alone). What a
+            search takes for the cause of an effect outside the catalogue explained 0.06, 0.12, 0.14, 0.52 and 0.62 of
+            it on five of these drives (``share_explained`` of run.py).
         most_share: share of a loss that is most of it, by definition. Of a robot that was never commissioned nobody
             knows the healthy loss: there effects must not leave most of the loss, nor a formula explain most of that.
     """
