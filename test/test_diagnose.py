@@ -17,7 +17,7 @@ import yaml
 from recorded_rollout import recorded
 from scipy.spatial.transform import Rotation
 
-from monoforce_ros.bags import Recording, SmoothedMotion, smooth
+from monoforce_ros.bags import ReadOptions, Recording, SmoothedMotion, smooth
 from monoforce_ros.core import AngularVelocityTrack, CommandTrack, MotionTrack, WheelTrack
 from monoforce_ros.discrepancy import (
     Diagnosis,
@@ -454,6 +454,26 @@ def test_a_comparison_that_fails_late_loses_no_diagnosis(late_robot, late_again,
     found = diagnose_bag(late_robot, "husky", tmp_path / "out", held_out=[late_again])
     assert json.loads(found.report.read_text())["held_out"] == {}
     assert any("the held-out recording again could not be compared: no room" in text for text in found.doubts)
+
+
+def test_a_driver_that_publishes_rpm_is_said_and_its_wheels_are_used(late_again, tmp_path, monkeypatch):
+    class Published(ReadOptions):
+        def open(self, path, robot=None):
+            recording = super().open(path, robot)
+            wheels = replace(recording.wheels, speeds=30.0 / np.pi * recording.wheels.speeds)
+            return replace(recording, wheels=wheels)
+
+    seen = []
+
+    def diagnosed(evidence, *_, **__):
+        seen.append(evidence.wheels)
+        return Diagnosis(Verdict.NO_DISCREPANCY)
+
+    monkeypatch.setattr(bag_diagnosis, "diagnose", diagnosed)
+    found = diagnose_bag(late_again, "husky", tmp_path / "out", reading=Published())
+    np.testing.assert_allclose(seen[0].speeds, Recording.open(late_again).wheels.speeds)
+    assert any("they are taken for revolutions per minute" in text for text in found.complaints)
+    assert "revolutions per minute" in json.loads(found.report.read_text())["inputs"]["problems of the bag"]
 
 
 def test_folders_of_reports_never_coincide():

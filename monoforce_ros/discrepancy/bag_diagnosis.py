@@ -25,6 +25,7 @@ from monoforce_ros.discrepancy.separate_stretches import laid_apart
 from monoforce_ros.discrepancy.step_errors import compare_after_steps
 from monoforce_ros.discrepancy.terrain_evidence import supporting_terrain, traced_terrain
 from monoforce_ros.discrepancy.verdict import Decision, Verdict
+from monoforce_ros.discrepancy.wheel_units import contradictions, in_rad_per_second
 from monoforce_ros.discrepancy.wheels import compare_with_wheels
 from monoforce_ros.discrepancy.wording import finding
 from monoforce_ros.effects import CATALOGUE
@@ -98,8 +99,11 @@ def read_with_ground(
     recording = reading.open(bag, robot)
     robot = reading.robot_in_bag(robot)
     smoothed = smooth(recording.motion)
+    wheels, unit = in_rad_per_second(smoothed.motion, recording.wheels, recording.commands, robot)
+    if unit:
+        recording = replace(recording, wheels=wheels, warnings=(*recording.warnings, unit))
     evidence = Evidence(
-        smoothed, recording.commands, gyro=recording.angular_velocity, wheels=recording.wheels, joints=recording.joints
+        smoothed, recording.commands, gyro=recording.angular_velocity, wheels=wheels, joints=recording.joints
     )
     ground = choose_ground(terrain, recording, smoothed, robot)
     if ground.source == "flat":
@@ -205,7 +209,10 @@ def diagnose_bag(
     # Named effects stay, with this doubt.
     steeper = steeper if diagnosis.effects else ""
     harder = "" if nominal is None else uncovered_doubt(evidence, settings.horizon, nominal.changes)
-    doubts = list(dict.fromkeys(text for text in (ground.complaint, *rest, steeper, harder, large) if text))
+    ratio = None if nominal is None or nominal.wheels is None else nominal.wheels.ratio
+    wrong, remarks = contradictions(evidence.smoothed.motion, evidence.wheels, evidence.commands, model, ratio)
+    diagnosis = replace(diagnosis, remarks=(*diagnosis.remarks, *remarks))
+    doubts = list(dict.fromkeys(text for text in (*wrong, ground.complaint, *rest, steeper, harder, large) if text))
     if diagnosis.verdict == Verdict.NOT_IDENTIFIABLE:
         diagnosis = _with_wheels(diagnosis, evidence, model)
     if diagnosis.verdict != Verdict.NOT_IDENTIFIABLE:
@@ -234,6 +241,7 @@ def diagnose_bag(
         "ground": ground.description,
         "ground_unknown": ground.unknown,
         "topics": ", ".join(f"{role} {topic}" for role, topic in recording.topics.items()),
+        **({"problems of the bag": "; ".join(recording.warnings)} if recording.warnings else {}),
         "noise of the poses": f"{100 * smoothed.position_noise:.1f} cm, {np.degrees(smoothed.rotation_noise):.2f}°",
         "duration_s": round(time.monotonic() - began, 1),
     }

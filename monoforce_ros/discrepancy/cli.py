@@ -25,6 +25,7 @@ from monoforce_ros.discrepancy.nominal_residual import residual_complaint
 from monoforce_ros.discrepancy.repetition import prepare_processes
 from monoforce_ros.discrepancy.report import effect_entry, summary_lines
 from monoforce_ros.discrepancy.verdict import Verdict
+from monoforce_ros.discrepancy.wheel_units import contradictions
 from monoforce_ros.effects import EffectError
 from monoforce_ros.encoder import CheckpointError
 from monoforce_ros.reporting import progress_bar
@@ -33,6 +34,8 @@ from monoforce_ros.terrain import TerrainError, TerrainFileError
 
 NOT_IDENTIFIABLE_STATUS = 3
 """Exit status where a recording cannot be diagnosed; 1 is an error, 2 a wrong option."""
+_MOST_COMPLAINTS = 3
+"""Problems of a bag that are printed; all are in the report."""
 _ERRORS = (BagError, CheckpointError, EffectError, RobotFileError, TerrainFileError, TerrainError, ValueError, OSError)
 
 
@@ -165,7 +168,7 @@ def _status(found: BagDiagnosis) -> int:
 
 def print_finding(found: BagDiagnosis) -> None:
     """Print the result."""
-    for complaint in found.complaints[:3]:
+    for complaint in found.complaints[:_MOST_COMPLAINTS]:
         print(f"diagnose: {found.bag}: {complaint}", file=sys.stderr)
     first, *rest = summary_lines(found.diagnosis, found.doubts)
     print(f"{found.bag}: {first}")
@@ -276,12 +279,15 @@ def _commission(options: argparse.Namespace) -> int:
     usable_folder(options.out)
     recordings = []
     for bag in options.bags:
-        evidence, _, ground = read_with_ground(bag, robot, options.terrain, read_options(options))
+        evidence, recording, ground = read_with_ground(bag, robot, options.terrain, read_options(options))
         recordings.append(evidence)
+        wrong, remarks = contradictions(evidence.smoothed.motion, evidence.wheels, evidence.commands, robot)
+        for text in (*recording.warnings[:_MOST_COMPLAINTS], *wrong):
+            print(f"diagnose: {bag}: {text}", file=sys.stderr)
         print(f"{bag}: ground: {ground.description}")
         if ground.unknown:
             print(f"diagnose: {bag}: {ground.complaint}", file=sys.stderr)
-        for remark in comparable_starts(evidence, robot, DiagnosisSettings())[1]:
+        for remark in (*remarks, *comparable_starts(evidence, robot, DiagnosisSettings())[1]):
             print(f"{bag}: {remark}")
     settings = DiagnosisSettings()
     effects, nominal = commission(recordings, robot, samples=settings.samples)
