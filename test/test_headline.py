@@ -168,6 +168,25 @@ def test_a_robot_that_was_never_commissioned_is_a_doubt():
     assert "What differs from the robot file" in pages[1]
 
 
+def test_a_robot_that_was_never_commissioned_is_not_green_and_that_is_said_first():
+    found = headline(diagnosed((0.5, 0.06), (8.0, 1.0), commissioned=False), ["the ground is not level"])
+    assert found.tone is Tone.PARTLY and "never commissioned" in found.doubts[0]
+    alone = headline(diagnosed((0.5, 0.06), (8.0, 1.0), commissioned=False))
+    assert alone.tone is Tone.PARTLY and alone.sentence.startswith("The robot was never commissioned: one ")
+    nothing = headline(Diagnosis(Verdict.NO_DISCREPANCY, commissioned=False))
+    assert nothing.tone is Tone.PARTLY and nothing.sentence.startswith("The robot was never commissioned")
+    assert "never commissioned" in nothing.doubts[0] and any("commission the robot" in text for text in nothing.actions)
+    doubtful = headline(Diagnosis(Verdict.NO_DISCREPANCY, commissioned=False), ["the ground is not level"])
+    # Nobody knows how large the healthy robot's errors are.
+    assert "healthy robot's" not in doubtful.sentence
+
+
+def test_errors_that_grow_a_little_are_not_said_to_grow_from_a_number_to_itself():
+    top = headline(diagnosed((0.5, 0.06), (2.41, 2.44)))
+    assert any("from 2.41 to 2.44 deg" in text for text in top.doubts)
+    assert any("2.41 → 2.44°" in text for text in top.confidence)
+
+
 def test_names_of_effects_keep_their_letters_in_a_report():
     remarks = ("drive_gain explains 93 % of the excess loss", "the rest is as a healthy robot's")
     page = diagnosis_page(replace(diagnosed((0.5, 0.06), (8.0, 1.0)), remarks=remarks), {}, None)

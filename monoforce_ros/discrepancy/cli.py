@@ -17,7 +17,7 @@ from monoforce_ros.bags import BagError, add_read_options, read_options
 from monoforce_ros.core import OptionParser
 from monoforce_ros.discrepancy.bag_diagnosis import BagDiagnosis, diagnose_bag, read_with_ground, usable_folder
 from monoforce_ros.discrepancy.commissioning import commission
-from monoforce_ros.discrepancy.comparable_windows import comparable_starts
+from monoforce_ros.discrepancy.comparable_windows import comparable_windows
 from monoforce_ros.discrepancy.diagnosis import DiagnosisSettings
 from monoforce_ros.discrepancy.export import export_effects, export_target
 from monoforce_ros.discrepancy.interruption import INTERRUPTED_STATUS, interruptible, uninterrupted
@@ -287,7 +287,7 @@ def _commission(options: argparse.Namespace) -> int:
         print(f"{bag}: ground: {ground.description}")
         if ground.unknown:
             print(f"diagnose: {bag}: {ground.complaint}", file=sys.stderr)
-        for remark in (*remarks, *comparable_starts(evidence, robot, DiagnosisSettings())[1]):
+        for remark in (*remarks, *comparable_windows(evidence, robot, DiagnosisSettings()).left_out):
             print(f"{bag}: {remark}")
     settings = DiagnosisSettings()
     effects, nominal = commission(recordings, robot, samples=settings.samples)

@@ -122,7 +122,7 @@ class PathComparison:
     """A measured path and its predictions, ``[K, 3]`` along, across [m], heading [rad] in the frame of its start."""
 
     start: float
-    """Since the first window [s]."""
+    """Since the start of the recording [s]."""
     measured: np.ndarray
     before: np.ndarray
     after: np.ndarray | None
@@ -272,7 +272,7 @@ def measured_paths(
     picked = order[np.unique(np.linspace(0.5 * len(order), len(order) - 1, count).astype(int))]
     return [
         PathComparison(
-            start=float(starts[index] - data.starts[0]) * 1e-9,
+            start=float(starts[index] - data.motion.stamps[0]) * 1e-9,
             measured=measured[index],
             before=measured[index] + before[index],
             after=None if after is None else measured[index] + after[index],
