@@ -21,6 +21,7 @@ from monoforce_ros.discrepancy.comparable_windows import comparable_windows
 from monoforce_ros.discrepancy.diagnosis import DiagnosisSettings
 from monoforce_ros.discrepancy.export import export_effects, export_target
 from monoforce_ros.discrepancy.interruption import INTERRUPTED_STATUS, interruptible, uninterrupted
+from monoforce_ros.discrepancy.kept_effects import kept_effects
 from monoforce_ros.discrepancy.nominal_residual import residual_complaint
 from monoforce_ros.discrepancy.repetition import prepare_processes
 from monoforce_ros.discrepancy.report import effect_entry, summary_lines
@@ -299,6 +300,8 @@ def _commission(options: argparse.Namespace) -> int:
     for effect in effects:
         for key, parameter in effect.parameters.items():
             print(f"{effect.name}: {key} {parameter.value:.3g} {parameter.unit}")
+    for text in kept_effects(recordings, robot, effects):
+        print(text)
     print(nominal.summary(settings.horizon))
     print(f"robot file: {out}")
     for bag, evidence in zip(options.bags, recordings, strict=True):
