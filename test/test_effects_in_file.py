@@ -157,7 +157,7 @@ def test_what_was_found_is_judged_and_worded_against_the_file():
     assert complaint(listed[0]) and not complaint(gain)
     assert complaint(beyond_file([estimate("drive_gain", gain=(0.8, 0.78, 0.82))], robot)[0])
     assert "60 % more" in finding(friction) and "slippery" not in finding(friction)
-    assert finding(friction).endswith("Its file says factor 0.5.")
+    assert finding(friction).endswith("The robot's file says factor 0.5.")
     exported = {effect.name: effect.parameters for effect in effects_to_export(robot, (gain,))}
     assert exported["drive_gain"]["gain"].value == 1.0
     assert "file" not in finding(listed[1])

@@ -250,7 +250,7 @@ def diagnose(
     expected = floor if nominal is None else np.sqrt(floor**2 + (nominal.residual_in(data) ** 2).mean(axis=0))
     paths = tuple(measured_paths(robot, data, judged))
     regimes = find_regimes(data)
-    hints = advice(decision.verdict, effects)
+    hints = advice(decision.verdict, effects, gyro=evidence.gyro is not None)
     place = None
     if part is None and decision.verdict == Verdict.UNKNOWN_EFFECT:
         place = worst_place(data, search.loss_of(()), settings.thresholds.comparison_rate)

@@ -147,6 +147,9 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
     counted = [row for row in rows if row.counts]
     grew = [row for row in rows if row.grew]
     remedies = [remedy(effect.name) for effect in effects]
+    remedies += [
+        f"if it is {cause(other)} instead: {remedy(other)}" for effect in named for other in effect.indistinguishable
+    ]
     if complaints:
         # What was found under a doubt about the recording or the ground may be nothing but its cause.
         remedies = ["remove the cause of the doubt first, then run diagnose again"]
@@ -197,6 +200,8 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
             )
             return result(Tone.PARTLY, f"The robot was never commissioned: {differ} the error.")
         sentence = "The cause was found." if len(effects) == 1 else f"{len(effects)} causes were found."
+        if any(effect.indistinguishable for effect in named):
+            sentence = "The error is explained, by causes of which this recording cannot tell some apart."
         return result(Tone.GOOD, sentence)
     if grew and not any(row.share >= MOST for row in counted):
         sentence = "The error is not explained: with what was found, predictions get worse."

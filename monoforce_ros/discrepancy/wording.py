@@ -70,7 +70,7 @@ def _in_file(estimate: EffectEstimate) -> str:
         for key, value in estimate.in_file.items()
         if key in known and value != known[key].neutral
     ]
-    return f" Its file says {', '.join(said)}." if said else ""
+    return f" The robot's file says {', '.join(said)}." if said else ""
 
 
 _FACTORS_ON_MODEL = frozenset({"friction_scale", "terrain_softness", "turning_scrub"})
