@@ -209,6 +209,21 @@ def test_a_page_gives_angles_in_degrees_and_no_share_of_noise():
     assert "-50 %" not in page and "length of the recording [s]" in page
 
 
+def test_a_held_out_recording_from_before_the_fault_leaves_the_cause_open():
+    held_out = {"monday": {"position_2s": row(0.003, 0.07), "heading_2s": row(0.1, 3.0, "deg", 0.02)}}
+    before = diagnosed((0.5, 0.05), (8.0, 0.8), held_out=held_out, healthy={"position": 0.01, "heading": 0.5})
+    top = headline(before)
+    assert top.tone is Tone.PARTLY and top.sentence.startswith("A cause was found, but the held-out recordings")
+    assert top.actions[0].startswith("if the held-out recordings were driven with the same fault") and not top.helps
+
+
+def test_factors_have_no_unit():
+    scrub = effect("turning_scrub", track_width_factor=(0.83, 0.75, 0.91))
+    found = diagnosed((0.5, 0.06), (8.0, 1.0), effects=(scrub,))
+    assert any("track_width_factor 0.83 (0.75 to 0.91)" in line for line in summary_lines(found))
+    assert "<b>0.83</b></td>" in diagnosis_page(found, {}, None)
+
+
 def test_names_of_effects_keep_their_letters_in_a_report():
     remarks = ("drive_gain explains 93 % of the excess loss", "the rest is as a healthy robot's")
     page = diagnosis_page(replace(diagnosed((0.5, 0.06), (8.0, 1.0)), remarks=remarks), {}, None)

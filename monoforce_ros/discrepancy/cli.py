@@ -299,7 +299,8 @@ def _commission(options: argparse.Namespace) -> int:
     )
     for effect in effects:
         for key, parameter in effect.parameters.items():
-            print(f"{effect.name}: {key} {parameter.value:.3g} {parameter.unit}")
+            unit = "" if parameter.unit == "-" else f" {parameter.unit}"
+            print(f"{effect.name}: {key} {parameter.value:.3g}{unit}")
     for text in kept_effects(recordings, robot, effects):
         print(text)
     print(nominal.summary(settings.horizon))

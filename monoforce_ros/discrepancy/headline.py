@@ -146,6 +146,8 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
     doubts += [f"{cause(e.name)} shows in a part of the recording only: drive longer to be sure" for e in unstable]
     counted = [row for row in rows if row.counts]
     grew = [row for row in rows if row.grew]
+    # A recording from before the fault says nothing of what explains it.
+    elsewhere = bool(rows) and not counted and all(row.recording for row in rows)
     remedies = [remedy(effect.name) for effect in effects]
     remedies += [
         f"if it is {cause(other)} instead: {remedy(other)}" for effect in named for other in effect.indistinguishable
@@ -153,6 +155,11 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
     if complaints:
         # What was found under a doubt about the recording or the ground may be nothing but its cause.
         remedies = ["remove the cause of the doubt first, then run diagnose again"]
+    elif grew and elsewhere:
+        question = (
+            "if the held-out recordings were driven with the same fault, do not use what was found; else hold out "
+        )
+        remedies = [f"{question}some that were", *remedies]
     elif grew:
         remedies = ["do not use what was found yet: drive longer, with more kinds of motion, and run diagnose again"]
     actions = [*remedies, *diagnosis.advice]
@@ -203,7 +210,9 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
         if any(effect.indistinguishable for effect in named):
             sentence = "The error is explained, by causes of which this recording cannot tell some apart."
         return result(Tone.GOOD, sentence)
-    if grew and not any(row.share >= MOST for row in counted):
+    if grew and elsewhere:
+        sentence = "A cause was found, but the held-out recordings show no error that it could explain."
+    elif grew and not any(row.share >= MOST for row in counted):
         sentence = "The error is not explained: with what was found, predictions get worse."
     elif not enough:
         sentence = "Most of the error is not explained; a part of the cause was found."

@@ -176,7 +176,7 @@ def _effects_table(effects: Sequence[EffectEstimate]) -> str:
             others = html.escape(", ".join(effect.indistinguishable)) or "–"
             rows.append(
                 f"<tr><td style='white-space:normal'>{name}</td><td>{key}</td>"
-                f"<td><b>{parameter.value:.3g}</b> {parameter.unit}</td>"
+                f"<td><b>{parameter.value:.3g}</b>{'' if parameter.unit == '-' else ' ' + parameter.unit}</td>"
                 f"<td>{parameter.low:.3g} to {parameter.high:.3g}</td>"
                 f"<td style='white-space:normal'>{others if number == 0 else ''}</td></tr>"
             )
