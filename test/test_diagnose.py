@@ -1,9 +1,14 @@
 """`diagnose`: injected faults are named, estimated, added to the robot's file, and improve predictions."""
 
 import json
+import os
 import shutil
+import signal
 import subprocess
+import sys
+import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +17,7 @@ import yaml
 from recorded_rollout import recorded
 from scipy.spatial.transform import Rotation
 
-from monoforce_ros.bags import Recording, SmoothedMotion, smooth
+from monoforce_ros.bags import ReadOptions, Recording, SmoothedMotion, smooth
 from monoforce_ros.core import AngularVelocityTrack, CommandTrack, MotionTrack, WheelTrack
 from monoforce_ros.discrepancy import (
     Diagnosis,
@@ -422,6 +427,82 @@ def test_held_out_recordings_with_the_same_name_stay_apart(late_robot, late_agai
     tables = json.loads(found.report.read_text())["held_out"]
     assert list(tables) == ["monday/recording", "tuesday/recording", "again"]
     assert all(table["position_2s"]["after"] is None for table in tables.values())
+
+
+def test_a_held_out_recording_that_cannot_be_compared_is_refused_before_the_work(late_robot, tmp_path, monkeypatch):
+    def unexpected(*_, **__):
+        raise AssertionError("diagnosed although the held-out recording is of no use")
+
+    monkeypatch.setattr(bag_diagnosis, "diagnose", unexpected)
+    short, damaged = tmp_path / "short", tmp_path / "damaged"
+    flat = TerrainSettings(flat=True)
+    record(short, RecordingSettings(duration=4.0, seed=3, terrain=flat, camera=None, lidar=None))
+    shutil.copytree(short, damaged)
+    (damaged / "metadata.yaml").write_text("nothing: here")
+    for held_out in (short, damaged):
+        with pytest.raises(ValueError, match=f"{held_out}: --held-out got a recording that cannot be compared: "):
+            diagnose_bag(late_robot, "husky", tmp_path / "out", held_out=[held_out])
+
+
+def test_a_comparison_that_fails_late_loses_no_diagnosis(late_robot, late_again, tmp_path, monkeypatch):
+    monkeypatch.setattr(bag_diagnosis, "diagnose", lambda *_, **__: Diagnosis(Verdict.NO_DISCREPANCY))
+
+    def failing(self, effects):
+        raise MemoryError("no room")
+
+    monkeypatch.setattr(bag_diagnosis.HeldOutBag, "table", failing)
+    found = diagnose_bag(late_robot, "husky", tmp_path / "out", held_out=[late_again])
+    assert json.loads(found.report.read_text())["held_out"] == {}
+    assert any("the held-out recording again could not be compared: no room" in text for text in found.doubts)
+
+
+def test_a_driver_that_publishes_rpm_is_said_and_its_wheels_are_used(late_again, tmp_path, monkeypatch):
+    class Published(ReadOptions):
+        def open(self, path, robot=None):
+            recording = super().open(path, robot)
+            wheels = replace(recording.wheels, speeds=30.0 / np.pi * recording.wheels.speeds)
+            return replace(recording, wheels=wheels)
+
+    seen = []
+
+    def diagnosed(evidence, *_, **__):
+        seen.append(evidence.wheels)
+        return Diagnosis(Verdict.NO_DISCREPANCY)
+
+    monkeypatch.setattr(bag_diagnosis, "diagnose", diagnosed)
+    found = diagnose_bag(late_again, "husky", tmp_path / "out", reading=Published())
+    np.testing.assert_allclose(seen[0].speeds, Recording.open(late_again).wheels.speeds)
+    assert any("they are taken for revolutions per minute" in text for text in found.complaints)
+    assert "revolutions per minute" in json.loads(found.report.read_text())["inputs"]["problems of the bag"]
+
+
+def test_folders_of_reports_never_coincide():
+    bags = [Path(text) for text in ("a/short", "b/short.bag", "c/00_short", "d/other")]
+    folders = cli.report_folders(bags)
+    assert len(set(folders)) == len(bags) and folders[2:] == ["00_short", "other"]
+    assert cli.report_folders([Path("a/short"), Path("b/short")]) == ["00_short", "01_short"]
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_ctrl_c_ends_it_in_one_line_without_half_a_report(late_robot, late_again, tmp_path, ros_environment, count):
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "monoforce_ros.discrepancy.cli", *(late_robot, late_again)[:count]]
+    running = subprocess.Popen(
+        [*command, "--out", out, "--quiet"], env=ros_environment, text=True, start_new_session=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=Path(__file__).parents[1],
+    )  # fmt: skip
+    # Once folders exist the work has begun, of several bags in processes of their own.
+    folder = out if count == 1 else out / late_robot.name
+    for _ in range(600):
+        if folder.exists():
+            break
+        time.sleep(0.1)
+    time.sleep(2.0)
+    os.killpg(running.pid, signal.SIGINT)
+    _, said = running.communicate(timeout=20)
+    assert running.returncode == 130
+    assert said.splitlines() == ["diagnose: interrupted; nothing was written beyond what is listed above"]
+    assert [path for path in out.rglob("*") if path.is_file()] == []
 
 
 def benchmark_row(injected, estimated, loss=9.0, **more):

@@ -9,7 +9,7 @@ from test_steering import rover
 
 from monoforce_ros.bags import ReadOptions, smooth
 from monoforce_ros.discrepancy import DiagnosisSettings, Evidence, Verdict, commission, diagnose
-from monoforce_ros.discrepancy.comparable_windows import comparable_starts, windows_of
+from monoforce_ros.discrepancy.comparable_windows import comparable_windows, windows_of
 from monoforce_ros.discrepancy.explanation import explain
 from monoforce_ros.discrepancy.gap import noisy_motions
 from monoforce_ros.robots import load_robot, robot_file
@@ -60,7 +60,7 @@ class Healthy:
         """What explains a drive with hidden faults, and the estimates of the effects."""
         settings = DiagnosisSettings(max_effects=1)
         evidence = evidence_of(self.folder / name, self.path, 32, *hidden, **self.settings)
-        starts, _ = comparable_starts(evidence, self.robot, settings)
+        starts = comparable_windows(evidence, self.robot, settings).starts
         noisy = noisy_motions(evidence.smoothed, settings.seed)
         windows = windows_of(evidence, self.robot, starts, np.array(settings.samples), noisy)
         found = explain(evidence, self.robot, windows, self.nominal, settings, repeated=True)

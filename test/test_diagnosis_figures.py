@@ -6,8 +6,12 @@ from scipy.interpolate import make_smoothing_spline
 
 from monoforce_ros.bags import SmoothedMotion, smoothing
 from monoforce_ros.core import CommandTrack, MotionTrack
-from monoforce_ros.discrepancy.figures import with_gaps
+from monoforce_ros.discrepancy.comparison import measured_paths
+from monoforce_ros.discrepancy.diagnosis import Details
+from monoforce_ros.discrepancy.evidence import EvidenceWindows
+from monoforce_ros.discrepancy.figures import timeline_figure, with_gaps
 from monoforce_ros.discrepancy.nominal_residual import residual_complaint
+from monoforce_ros.robots import load_robot
 
 
 def test_no_line_is_drawn_across_a_gap():
@@ -32,6 +36,20 @@ def driving(speed, yaw_rate):
     motion = MotionTrack(stamps, places, quaternions, zeros, zeros)
     smoothed = SmoothedMotion(motion, 0.001, 0.001, (slice(0, 400),))
     return smoothed, CommandTrack(stamps, np.tile([speed, yaw_rate], (400, 1)))
+
+
+def test_times_are_those_of_the_recording_where_windows_begin_later():
+    smoothed, commands = driving(0.5, 0.3)
+    # An effect that begins after 8 s: earlier windows are no part of the diagnosis.
+    first = int(smoothed.motion.stamps[0])
+    starts = first + np.arange(8, 14) * 10**9
+    data = EvidenceWindows(smoothed.motion, commands, starts, 2.0, np.array([2.0]))
+    zeros = np.zeros((len(starts), 1, 3))
+    figure = timeline_figure(Details(data, zeros, zeros[0], (), ()))
+    np.testing.assert_allclose(figure.axes[0].lines[0].get_xdata(), np.arange(8.0, 14.0))
+    np.testing.assert_allclose(figure.axes[3].lines[0].get_xdata(), np.arange(8.0, 14.0))
+    paths = measured_paths(load_robot("husky"), data, None)
+    assert min(path.start for path in paths) >= 8.0 and figure.axes[3].get_xlabel() == "time in the recording [s]"
 
 
 def residual(position, degrees):

@@ -18,6 +18,7 @@ from monoforce_ros.discrepancy.estimates import EffectEstimate, ParameterEstimat
 from monoforce_ros.discrepancy.evidence import Evidence
 from monoforce_ros.discrepancy.export import effects_to_export
 from monoforce_ros.discrepancy.hypothesis import corrected_evidence
+from monoforce_ros.discrepancy.kept_effects import kept_effects
 from monoforce_ros.discrepancy.sensor_findings import SensorFindings, changed_bias
 from monoforce_ros.discrepancy.wording import finding
 from monoforce_ros.effects import corrected_motion, recorded_motion
@@ -71,6 +72,21 @@ def test_commissioning_takes_out_what_the_file_says_of_sensors(effect):
     assert found["command_delay"]["delay"].value < 0.05
     assert found["turning_scrub"]["track_width_factor"].value == pytest.approx(1.0, abs=0.05)
     assert np.abs(nominal.residual[-1]).max() < 0.02
+
+
+@pytest.mark.parametrize("acting", [True, False])
+def test_an_effect_of_the_file_that_stays_is_listed_and_an_outdated_one_is_named(acting):
+    slow = ("drive_gain", {"gain": 0.8})
+    lever = ("sensor_lever_arm", {"x": 0.5, "y": 0.0})
+    robot = husky(slow, lever, ("friction_scale", {"factor": 0.9}))
+    data = driven(husky(slow) if acting else husky())
+    fitted = (estimate("friction_scale", factor=(1.0, 0.9, 1.1)),)
+    evidence = evidence_of(data, recorded_motion(data.motion, husky(lever)))
+    gain, arm = kept_effects([evidence], robot, fitted)
+    assert gain.startswith("drive_gain: gain 0.8 stays as in the robot's file; it was not fitted")
+    assert ("predicted no worse without it" in gain) == (not acting)
+    # What sensors err by was taken out of the recordings.
+    assert arm == "sensor_lever_arm: x 0.5 m, y 0 m stays as in the robot's file; it was not fitted"
 
 
 def test_grass_that_one_recording_of_several_shows_is_not_held_against_the_robot():
@@ -141,7 +157,32 @@ def test_what_was_found_is_judged_and_worded_against_the_file():
     assert complaint(listed[0]) and not complaint(gain)
     assert complaint(beyond_file([estimate("drive_gain", gain=(0.8, 0.78, 0.82))], robot)[0])
     assert "60 % more" in finding(friction) and "slippery" not in finding(friction)
-    assert finding(friction).endswith("Its file says factor 0.5.")
+    assert finding(friction).endswith("The robot's file says factor 0.5.")
     exported = {effect.name: effect.parameters for effect in effects_to_export(robot, (gain,))}
     assert exported["drive_gain"]["gain"].value == 1.0
     assert "file" not in finding(listed[1])
+
+
+def test_scrub_rotation_centre_and_payload_are_worded_against_the_file():
+    robot = husky(
+        ("turning_scrub", {"track_width_factor": 2.0}),
+        ("rotation_centre", {"x": -0.1}),
+        ("payload", {"mass": 10.0, "x": 0.1, "y": 0.0}),
+    )
+
+    def found(name, **values):
+        return finding(beyond_file([estimate(name, **{k: (v, v, v) for k, v in values.items()})], robot)[0])
+
+    # Less scrub than the file's: it turns more than the model does, though less than without any.
+    assert found("turning_scrub", track_width_factor=1.6).startswith("The robot turns 25 % more than its model does")
+    assert found("rotation_centre", x=-0.02).startswith("The robot turns about a point 0.08 m ahead of the one that")
+    # 25 kg at 0.2 m are the file's 10 kg at 0.1 m and 15 kg at 0.267 m.
+    assert found("payload", mass=25.0, x=0.2, y=0.0).startswith(
+        "The robot carries 15 kg that its model does not have, 0.27 m ahead of"
+    )
+    assert found("payload", mass=2.0, x=0.1, y=0.0).startswith("The robot is 8 kg lighter than modelled, 0.10 m ahead")
+    # As heavy, elsewhere: where the difference of next to nothing lies has no meaning.
+    moved = found("payload", mass=10.2, x=-0.2, y=0.0)
+    assert moved.startswith("The robot's load lies 0.3 m backward of where its model has it.")
+    # Without a file they are as they were.
+    assert "50 % less than" in finding(estimate("turning_scrub", track_width_factor=(2.0, 1.9, 2.1)))

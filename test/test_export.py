@@ -287,6 +287,98 @@ def test_parameters_of_nav2_respect_the_effects(husky, tmp_path):
     assert [text.split(":")[0] for text in exported.not_exported] == ["payload"]
 
 
+def controller_of(tmp_path, robot, *effects, name="diff_drive_controller"):
+    target = tmp_path / "robot.diff_drive.yaml"
+    (exported,) = export_effects([str(target)], robot, effects)
+    content = yaml.safe_load(target.read_text())
+    return (content or {}).get(name, {}).get("ros__parameters", {}), exported, target.read_text()
+
+
+def test_exported_limits_are_those_of_the_base_that_the_multipliers_correct(husky, tmp_path):
+    effects = (
+        estimate("drive_gain", gain=0.8),
+        estimate("drive_asymmetry", difference=0.1),
+        estimate("actuator_saturation", limit=0.5),
+        estimate("turning_scrub", track_width_factor=1.2),
+    )
+    parameters, _, _ = controller_of(tmp_path, husky, *effects)
+    # A twist at each limit, through the controller: no drive is commanded more than it follows, and one is nearly.
+    half, separation = 0.2854, parameters["wheel_separation_multiplier"]
+    for speed, yaw_rate in ((parameters["linear.x.max_velocity"], 0.0), (0.0, parameters["angular.z.max_velocity"])):
+        left = (speed - yaw_rate * separation * half) / parameters["left_wheel_radius_multiplier"]
+        right = (speed + yaw_rate * separation * half) / parameters["right_wheel_radius_multiplier"]
+        assert max(abs(left), abs(right)) == pytest.approx(0.5, rel=1e-3)
+    target = tmp_path / "x.nav2.yaml"
+    export_effects([str(target)], husky, effects)
+    smoother = yaml.safe_load(target.read_text())["velocity_smoother"]["ros__parameters"]
+    assert smoother["max_velocity"][0] == pytest.approx(parameters["linear.x.max_velocity"])
+    assert smoother["max_velocity"][2] == pytest.approx(parameters["angular.z.max_velocity"])
+    assert "For a base whose controller has the parameters" in target.read_text()
+
+
+def test_limits_of_the_twist_have_parameters(husky, tmp_path):
+    effects = (estimate("yaw_rate_limit", limit=0.7), estimate("acceleration_limit", limit=0.9),
+               estimate("yaw_acceleration_limit", limit=1.4))  # fmt: skip
+    parameters, exported, _ = controller_of(tmp_path, husky, *effects)
+    assert not exported.not_exported
+    assert parameters["angular.z.max_velocity"] == 0.7 and "linear.x.max_velocity" not in parameters
+    assert parameters["linear.x.max_acceleration"] == 0.9 and parameters["linear.x.max_deceleration"] == -0.9
+    assert parameters["angular.z.max_acceleration_reverse"] == -1.4
+    target = tmp_path / "x.nav2.yaml"
+    (exported,) = export_effects([str(target)], husky, (*effects, estimate("friction_scale", factor=0.5)))
+    assert not exported.not_exported
+    content = yaml.safe_load(target.read_text())
+    smoother = content["velocity_smoother"]["ros__parameters"]
+    assert smoother["max_velocity"] == [1.0, 0.0, 0.7] and smoother["max_accel"] == [0.9, 0.0, 1.4]
+    assert smoother["max_decel"] == [-0.9, 0.0, -1.4]
+    mppi = content["controller_server"]["ros__parameters"]["FollowPath"]
+    # The smaller of grip and ramp.
+    assert mppi["ax_max"] == 0.9 and mppi["az_max"] == 1.4 and mppi["wz_max"] == 0.7
+
+
+@pytest.mark.parametrize("kind", ["diff_drive", "nav2"])
+@pytest.mark.parametrize("central", [False, True])
+def test_a_robot_without_top_speed_or_with_one_drive_is_exported(husky, tmp_path, kind, central):
+    robot = replace(husky, maximum_speed=float("inf"), maximum_yaw_rate=float("inf"))
+    if central:
+        one = replace(robot, drive_names=("middle",), drive_offsets=torch.zeros(1))
+        robot = replace(one, point_drives=one.point_drives.clamp(max=0))
+    for effects in (
+        (estimate("turning_scrub", track_width_factor=1.3),),
+        (estimate("acceleration_limit", limit=1.0), estimate("actuator_deadband", width=0.1)),
+        (estimate("actuator_saturation", limit=0.4), estimate("drive_gain", gain=0.9)),
+        (estimate("yaw_rate_limit", limit=0.4),),
+    ):
+        target = tmp_path / f"{effects[0].name}.out"
+        export_effects([f"{kind}:{target}"], robot, effects)
+        text = target.read_text()
+        yaml.safe_load(text)
+        assert " inf" not in text.lower() and " nan" not in text.lower() and "[inf" not in text
+
+
+def test_a_car_gets_the_parameters_of_a_steering_controller(tmp_path):
+    car = load_robot("rally_car")
+    effects = (estimate("drive_gain", gain=0.9), estimate("actuator_saturation", limit=5.0),
+               estimate("steering_offset", offset=0.05))  # fmt: skip
+    parameters, exported, text = controller_of(tmp_path, car, *effects, name="ackermann_steering_controller")
+    assert parameters == {"traction_wheels_radius": pytest.approx(0.9 * 0.095, abs=1e-4)}
+    assert [said.split(":")[0] for said in exported.not_exported] == ["actuator_saturation", "steering_offset"]
+    assert "diff_drive_controller" not in text and "wheel_separation" not in text
+    target = tmp_path / "x.nav2.yaml"
+    export_effects([str(target)], car, effects)
+    mppi = yaml.safe_load(target.read_text())["controller_server"]["ros__parameters"]["FollowPath"]
+    # The fastest turn of a car is the sharpest one at its largest speed.
+    assert mppi["vx_max"] == pytest.approx(4.5) and mppi["wz_max"] == pytest.approx(4.5 * 0.597, rel=1e-3)
+
+
+def test_values_of_the_robot_file_have_its_interval_or_none(husky, tmp_path):
+    known = replace(husky, effects=(("drive_gain", {"gain": 0.9}), ("actuator_saturation", {"limit": 0.6})),
+                    effect_intervals=(("drive_gain", {"gain": (0.85, 0.95)}),))  # fmt: skip
+    _, _, text = controller_of(tmp_path, known)
+    assert "drive_gain 0.9, 0.85 to 0.95" in text
+    assert "0.6 m/s, from the robot's file, which has no interval" in text and "0.6 to 0.6" not in text
+
+
 @pytest.mark.parametrize("kind", ["mujoco", "diff_drive", "nav2"])
 def test_every_effect_is_exported_or_said(husky, tmp_path, kind):
     for name, effect in CATALOGUE.items():

@@ -10,10 +10,11 @@ from monoforce_ros.discrepancy import Diagnosis, EffectEstimate, ParameterEstima
 from monoforce_ros.discrepancy.bag_diagnosis import without_blame_for_ground
 from monoforce_ros.discrepancy.comparison import GapRow
 from monoforce_ros.discrepancy.credibility import complaint
-from monoforce_ros.discrepancy.gap import NoiseFloor
+from monoforce_ros.discrepancy.gap import Localisation, NoiseFloor
 from monoforce_ros.discrepancy.ground import beyond_commissioning
 from monoforce_ros.discrepancy.headline import Tone, explained, headline
 from monoforce_ros.discrepancy.page import diagnosis_page
+from monoforce_ros.discrepancy.preflight import advice
 from monoforce_ros.discrepancy.report import report_content, summary_lines
 from monoforce_ros.discrepancy.wording import cause, finding, remedy
 from monoforce_ros.effects import CATALOGUE, identifiable_effects
@@ -166,6 +167,61 @@ def test_a_robot_that_was_never_commissioned_is_a_doubt():
     pages = [diagnosis_page(diagnosed((0.5, 0.06), (8.0, 1.0), commissioned=it), {}, None) for it in (True, False)]
     assert ["What is wrong" in page for page in pages] == [True, False]
     assert "What differs from the robot file" in pages[1]
+
+
+def test_a_robot_that_was_never_commissioned_is_not_green_and_that_is_said_first():
+    found = headline(diagnosed((0.5, 0.06), (8.0, 1.0), commissioned=False), ["the ground is not level"])
+    assert found.tone is Tone.PARTLY and "never commissioned" in found.doubts[0]
+    alone = headline(diagnosed((0.5, 0.06), (8.0, 1.0), commissioned=False))
+    assert alone.tone is Tone.PARTLY and alone.sentence.startswith("The robot was never commissioned: one ")
+    nothing = headline(Diagnosis(Verdict.NO_DISCREPANCY, commissioned=False))
+    assert nothing.tone is Tone.PARTLY and nothing.sentence.startswith("The robot was never commissioned")
+    assert "never commissioned" in nothing.doubts[0] and any("commission the robot" in text for text in nothing.actions)
+    doubtful = headline(Diagnosis(Verdict.NO_DISCREPANCY, commissioned=False), ["the ground is not level"])
+    # Nobody knows how large the healthy robot's errors are.
+    assert "healthy robot's" not in doubtful.sentence
+
+
+def test_errors_that_grow_a_little_are_not_said_to_grow_from_a_number_to_itself():
+    top = headline(diagnosed((0.5, 0.06), (2.41, 2.44)))
+    assert any("from 2.41 to 2.44 deg" in text for text in top.doubts)
+    assert any("2.41 → 2.44°" in text for text in top.confidence)
+
+
+def test_causes_that_a_recording_cannot_tell_apart_are_not_called_the_cause_and_each_has_a_remedy():
+    both = effect("command_delay", delay=(0.3, 0.28, 0.32), indistinguishable=("command_clock_offset",))
+    top = headline(diagnosed((0.5, 0.06), (8.0, 1.0), effects=(both,)))
+    assert "cannot tell" in top.sentence and "The cause was found" not in top.sentence
+    assert "if it is a wrong command clock instead: synchronise the clocks of planner and base" in top.actions
+    # To record an IMU is advice for a recording without one.
+    without, with_gyro = (advice(Verdict.EFFECT_FOUND, [both], gyro=gyro) for gyro in (False, True))
+    assert any("IMU" in text for text in without) and not any("IMU" in text for text in with_gyro)
+    assert any("synchronise the clocks" in text for text in with_gyro)
+
+
+def test_a_page_gives_angles_in_degrees_and_no_share_of_noise():
+    found = diagnosed((0.5, 0.06), (8.0, 1.0), localisation=(
+        Localisation("heading error", "turning", 2.0, 0.7, 0.4, 0.1, -0.01, "rad", 2.0),
+    ))  # fmt: skip
+    noisy = GapRow(2.0, 0.015, 0.02, -0.01, 0.001, "deg", 0.014, -0.5)
+    page = diagnosis_page(replace(found, gap={**found.gap, "lean_2s": noisy}), {"recording_s": 40.0}, None)
+    assert "RMS 5.7°, mean -0.57°" in page and " rad" not in page
+    assert "-50 %" not in page and "length of the recording [s]" in page
+
+
+def test_a_held_out_recording_from_before_the_fault_leaves_the_cause_open():
+    held_out = {"monday": {"position_2s": row(0.003, 0.07), "heading_2s": row(0.1, 3.0, "deg", 0.02)}}
+    before = diagnosed((0.5, 0.05), (8.0, 0.8), held_out=held_out, healthy={"position": 0.01, "heading": 0.5})
+    top = headline(before)
+    assert top.tone is Tone.PARTLY and top.sentence.startswith("A cause was found, but the held-out recordings")
+    assert top.actions[0].startswith("if the held-out recordings were driven with the same fault") and not top.helps
+
+
+def test_factors_have_no_unit():
+    scrub = effect("turning_scrub", track_width_factor=(0.83, 0.75, 0.91))
+    found = diagnosed((0.5, 0.06), (8.0, 1.0), effects=(scrub,))
+    assert any("track_width_factor 0.83 (0.75 to 0.91)" in line for line in summary_lines(found))
+    assert "<b>0.83</b></td>" in diagnosis_page(found, {}, None)
 
 
 def test_names_of_effects_keep_their_letters_in_a_report():

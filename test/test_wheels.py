@@ -15,6 +15,7 @@ from monoforce_ros.discrepancy.evidence import Evidence
 from monoforce_ros.discrepancy.healthy_wheels import HealthyWheels, drives_of
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.wheel_motion import undriven_stretches, wheels_without_motion
+from monoforce_ros.discrepancy.wheel_units import contradictions, in_rad_per_second
 from monoforce_ros.discrepancy.wheels import best_of, changed_drives, compare_with_wheels
 from monoforce_ros.effects import CATALOGUE, drive_speeds, effect_values
 from monoforce_ros.physics import State, rollout
@@ -322,6 +323,59 @@ def test_wheels_that_turn_while_the_robot_stays_are_found_with_their_stretch(hus
     # What cannot be compared is no finding.
     assert wheels_without_motion(motion, None, commands, husky) is None
     assert wheels_without_motion(motion, wheels, commands, load_robot("tradr")) is None
+
+
+@pytest.mark.parametrize(
+    ("factor", "said"),
+    [
+        (30.0 / np.pi, "revolutions per minute"),
+        (180.0 / np.pi, "degrees per second"),
+        # At the radius of a Husky revolutions per second and metres per second are alike.
+        (0.5 / np.pi, "revolutions per second or metres per second"),
+        (24.0, "of the motors before a gear"),
+    ],
+)
+def test_wheel_speeds_of_another_unit_do_not_make_a_healthy_drive_stand(husky, factor, said):
+    commands = drawn_commands(60.0, 3)
+    wheels, motion = wheels_of(commands, husky, ()), driven(husky, commands)
+    recorded = replace(wheels, speeds=factor * wheels.speeds)
+    taken, text = in_rad_per_second(motion, recorded, commands, husky)
+    assert said in text and f"{factor:.2g}"[:2] in text
+    np.testing.assert_allclose(taken.speeds, wheels.speeds, rtol=0.05, atol=0.05)
+    assert wheels_without_motion(motion, taken, commands, husky) is None
+    assert len(undriven_stretches(commands, taken, motion, husky)) == 0
+    # Wheels of any unit that turn while the robot stays are still found.
+    stuck = held(motion, 0.0, 59.5)
+    assert wheels_without_motion(stuck, in_rad_per_second(stuck, recorded, commands, husky)[0], commands, husky)
+
+
+@pytest.mark.parametrize("effects", [(), (("drive_gain", {"gain": 0.25}),), (("drive_loss", {"loss": -1.0}),)])
+def test_wheel_speeds_in_rad_per_second_stay_though_drives_are_weak_or_the_robot_stands(husky, effects):
+    commands = drawn_commands(60.0, 3)
+    wheels, motion = wheels_of(commands, husky, effects), driven(husky, commands, effects)
+    assert in_rad_per_second(motion, wheels, commands, husky) == (wheels, "")
+    if not effects:
+        assert in_rad_per_second(held(motion, 0.0, 59.5), wheels, commands, husky)[1] == ""
+
+
+def test_a_wrong_radius_or_track_width_in_the_robot_file_is_said(husky):
+    commands = drawn_commands(90.0, 3, hold=3.0)
+    # Every other stretch straight ahead.
+    commands.twists[(np.arange(len(commands)) // 60) % 2 == 0, 1] = 0.0
+    wheels, motion = wheels_of(commands, husky, ()), driven(husky, commands)
+    assert contradictions(motion, wheels, commands, husky) == ((), ())
+    (doubt,), _ = contradictions(motion, wheels, commands, replace(husky, wheel_radius=1.25 * husky.wheel_radius))
+    assert "1.25 times as fast as commanded" in doubt and "a radius of 0.16" in doubt
+    # As it was when the robot was commissioned, whose drives were learned with that ratio.
+    known = 1.0 / husky.wheel_radius
+    wide = replace(husky, wheel_radius=1.25 * husky.wheel_radius)
+    assert contradictions(motion, wheels, commands, wide, known)[0] == ()
+    narrow = replace(husky, drive_offsets=0.6 * husky.drive_offsets)
+    _, (remark,) = contradictions(motion, wheels, commands, narrow)
+    assert "differ by 1.67 times" in remark and "the base controller has one of 0.571 m" in remark
+    # Drives that are too slow move the robot as slowly, which is an effect and no error of the file.
+    slow = (("drive_gain", {"gain": 0.7}),)
+    assert contradictions(driven(husky, commands, slow), wheels_of(commands, husky, slow), commands, husky)[0] == ()
 
 
 @pytest.mark.parametrize("factor", [0.04, 0.1])

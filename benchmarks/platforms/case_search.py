@@ -8,7 +8,7 @@ import numpy as np
 from case_recording import CaseFiles
 
 from monoforce_ros.discrepancy.bag_diagnosis import read_with_ground
-from monoforce_ros.discrepancy.comparable_windows import comparable_starts, windows_of
+from monoforce_ros.discrepancy.comparable_windows import comparable_windows, windows_of
 from monoforce_ros.discrepancy.explanation import DiagnosisSettings
 from monoforce_ros.discrepancy.gap import noisy_motions, residual_scale
 from monoforce_ros.discrepancy.hypothesis import corrected_evidence
@@ -27,7 +27,7 @@ def search_of(files: CaseFiles, nominal_file: Path, onset: float = 0.0) -> Searc
     map_file = files.terrain(files.bag)
     read, _, _ = read_with_ground(files.bag, robot, str(map_file) if map_file.exists() else "auto")
     evidence, nominal = with_known_components(corrected_evidence(read, robot), nominal)
-    starts, _ = comparable_starts(evidence, robot, settings)
+    starts = comparable_windows(evidence, robot, settings).starts
     noisy = noisy_motions(evidence.smoothed, settings.seed)
     if not len(starts):
         return None

@@ -11,30 +11,28 @@ from pathlib import Path
 import numpy as np
 
 from monoforce_ros.bags import DETECTED, BagError, ReadOptions, Recording, smooth
-from monoforce_ros.discrepancy.clocks import compare_with_gyro
 from monoforce_ros.discrepancy.command_changes import uncovered_doubt
-from monoforce_ros.discrepancy.comparison import GapRow, HeldOut, compare, gap_table
 from monoforce_ros.discrepancy.credibility import complaint
 from monoforce_ros.discrepancy.diagnosis import Diagnosis, DiagnosisSettings, diagnose
 from monoforce_ros.discrepancy.encoder_ground import encoder_maps
-from monoforce_ros.discrepancy.evidence import COMPONENTS, MOTION, Evidence, window_starts
-from monoforce_ros.discrepancy.gap import noisy_motions
+from monoforce_ros.discrepancy.evidence import COMPONENTS, MOTION, Evidence
 from monoforce_ros.discrepancy.ground import Ground, beyond_commissioning, choose_ground
-from monoforce_ros.discrepancy.hypothesis import Effects, corrected_evidence
-from monoforce_ros.discrepancy.nominal import NominalModel, with_known_components
+from monoforce_ros.discrepancy.held_out_bags import HeldOutBag, named_bags, refuse_unusable
+from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.nominal_residual import residual_complaint
 from monoforce_ros.discrepancy.report import effect_entry, write_diagnosis
-from monoforce_ros.discrepancy.sensor_findings import heading_noise
 from monoforce_ros.discrepancy.separate_stretches import laid_apart
 from monoforce_ros.discrepancy.step_errors import compare_after_steps
 from monoforce_ros.discrepancy.terrain_evidence import supporting_terrain, traced_terrain
 from monoforce_ros.discrepancy.verdict import Decision, Verdict
+from monoforce_ros.discrepancy.wheel_units import contradictions, in_rad_per_second
 from monoforce_ros.discrepancy.wheels import compare_with_wheels
 from monoforce_ros.discrepancy.wording import finding
 from monoforce_ros.effects import CATALOGUE
+from monoforce_ros.encoder import CheckpointError
 from monoforce_ros.robots import RobotModel, fingerprint, load_robot, write_robot
 from monoforce_ros.robots import robot_file as robot_file_of
-from monoforce_ros.terrain import Grid, load_terrain
+from monoforce_ros.terrain import Grid, TerrainError, TerrainFileError, load_terrain
 from monoforce_ros.training import split_maps
 
 _MARGIN = 4.0
@@ -101,8 +99,11 @@ def read_with_ground(
     recording = reading.open(bag, robot)
     robot = reading.robot_in_bag(robot)
     smoothed = smooth(recording.motion)
+    wheels, unit = in_rad_per_second(smoothed.motion, recording.wheels, recording.commands, robot)
+    if unit:
+        recording = replace(recording, wheels=wheels, warnings=(*recording.warnings, unit))
     evidence = Evidence(
-        smoothed, recording.commands, gyro=recording.angular_velocity, wheels=recording.wheels, joints=recording.joints
+        smoothed, recording.commands, gyro=recording.angular_velocity, wheels=wheels, joints=recording.joints
     )
     ground = choose_ground(terrain, recording, smoothed, robot)
     if ground.source == "flat":
@@ -177,22 +178,19 @@ def diagnose_bag(
     progress(0.0, "reading")
     evidence, recording, ground = read_with_ground(bag, model, terrain, reading)
     data = fingerprint([bag])
-    others = _distinct_names(held_out)
-    for other in others.values():
-        if not other.exists():
-            raise ValueError(f"{other}: --held-out got a path that does not exist, expected a bag")
-        if fingerprint([other]) == data:
-            raise ValueError(f"{other}: --held-out got the diagnosed recording {bag}, expected another recording")
+    named = named_bags(held_out)
+    refuse_unusable(named, bag, data)
     usable_folder(out)
     nominal = NominalModel.read(robot, settings.samples)
+    others = {name: _held_out(path, model, nominal, terrain, reading) for name, path in named.items()}
     steeper = beyond_commissioning(ground.slope, None if nominal is None else nominal.slope)
     # A robot that was commissioned on such slopes is known there, without a map, too.
     known = nominal is not None and nominal.slope is not None and not steeper
-    unexplained, named = ground.unexplained or steeper, ground.uneven and not known
+    unexplained, by_name = ground.unexplained or steeper, ground.uneven and not known
 
     def ground_explains(decision: Decision) -> bool:
         names = () if decision.trial is None else decision.trial.names
-        return bool(unexplained) and may_be_the_ground(decision.verdict, names, named=named)
+        return bool(unexplained) and may_be_the_ground(decision.verdict, names, named=by_name)
 
     diagnosis = diagnose(
         evidence,
@@ -204,34 +202,31 @@ def diagnose_bag(
     )
     rest: tuple[str, ...] = ()
     if diagnosis.set_aside is not None and diagnosis.verdict == Verdict.EFFECT_FOUND:
-        rest = without_blame_for_ground(diagnosis, unexplained, named=named).advice
+        rest = without_blame_for_ground(diagnosis, unexplained, named=by_name).advice
     else:
-        diagnosis = without_blame_for_ground(diagnosis, unexplained, named=named)
+        diagnosis = without_blame_for_ground(diagnosis, unexplained, named=by_name)
     large = residual_complaint(None if nominal is None else nominal.residual, evidence.smoothed, evidence.commands)
     # Named effects stay, with this doubt.
     steeper = steeper if diagnosis.effects else ""
     harder = "" if nominal is None else uncovered_doubt(evidence, settings.horizon, nominal.changes)
-    doubts = list(dict.fromkeys(text for text in (ground.complaint, *rest, steeper, harder, large) if text))
+    ratio = None if nominal is None or nominal.wheels is None else nominal.wheels.ratio
+    wrong, remarks = contradictions(evidence.smoothed.motion, evidence.wheels, evidence.commands, model, ratio)
+    diagnosis = replace(diagnosis, remarks=(*diagnosis.remarks, *remarks))
+    doubts = list(dict.fromkeys(text for text in (*wrong, ground.complaint, *rest, steeper, harder, large) if text))
     if diagnosis.verdict == Verdict.NOT_IDENTIFIABLE:
         diagnosis = _with_wheels(diagnosis, evidence, model)
-    robot_file = None
-    # On ground that no map shows slopes pass for effects: of that only what sensors measured belongs into a robot file.
-    credible = bool(diagnosis.effects) and (bool(rest) or not ground.unknown)
-    if credible and not any(map(complaint, diagnosis.effects)):
-        effects = [effect_entry(effect) for effect in diagnosis.effects]
-        robot_file = write_robot(robot, found_file, effects, [bag], data)
-    elif found_file.exists():
-        # Rename the robot file of an earlier diagnosis, which would be mistaken for a result of this one.
-        found_file.replace(found_file.with_suffix(".earlier.yaml"))
     if diagnosis.verdict != Verdict.NOT_IDENTIFIABLE:
         progress(0.96, "comparing with a kinematic fit")
         diagnosis = replace(diagnosis, steps=compare_after_steps(evidence, model, diagnosis.fitted))
     if others:
         progress(0.97, "held-out recordings")
-        tables = {
-            name: _held_out_table(path, model, nominal, diagnosis.fitted, terrain, reading)
-            for name, path in others.items()
-        }
+        tables = {}
+        for name, other in others.items():
+            try:
+                tables[name] = other.table(diagnosis.fitted)
+            except (ValueError, ArithmeticError, RuntimeError, MemoryError) as error:
+                # The diagnosis took minutes and does not depend on it.
+                doubts.append(f"the held-out recording {name} could not be compared: {error}")
         diagnosis = replace(diagnosis, held_out=tables)
     smoothed = evidence.smoothed
     motion = smoothed.motion
@@ -246,11 +241,32 @@ def diagnose_bag(
         "ground": ground.description,
         "ground_unknown": ground.unknown,
         "topics": ", ".join(f"{role} {topic}" for role, topic in recording.topics.items()),
+        **({"problems of the bag": "; ".join(recording.warnings)} if recording.warnings else {}),
         "noise of the poses": f"{100 * smoothed.position_noise:.1f} cm, {np.degrees(smoothed.rotation_noise):.2f}°",
         "duration_s": round(time.monotonic() - began, 1),
     }
+    # Files last: what ends the work before leaves none of it, and those of an earlier run together.
+    robot_file = None
+    # On ground that no map shows slopes pass for effects: of that only what sensors measured belongs into a robot file.
+    credible = bool(diagnosis.effects) and (bool(rest) or not ground.unknown)
+    if credible and not any(map(complaint, diagnosis.effects)):
+        effects = [effect_entry(effect) for effect in diagnosis.effects]
+        robot_file = write_robot(robot, found_file, effects, [bag], data)
+    elif found_file.exists():
+        # Rename the robot file of an earlier diagnosis, which would be mistaken for a result of this one.
+        found_file.replace(found_file.with_suffix(".earlier.yaml"))
     report, page = write_diagnosis(out, diagnosis, inputs, robot_file, doubts)
     return BagDiagnosis(bag, diagnosis, report, page, robot_file, recording.warnings, tuple(doubts), ground)
+
+
+def _held_out(
+    bag: Path, robot: RobotModel, nominal: NominalModel | None, terrain: str, reading: ReadOptions
+) -> HeldOutBag:
+    """A held-out recording, read and checked before the work of a diagnosis, which an error would lose after it."""
+    try:
+        return HeldOutBag.of(read_evidence(bag, robot, terrain, reading)[0], robot, nominal)
+    except (BagError, CheckpointError, TerrainError, TerrainFileError, ValueError, OSError) as error:
+        raise ValueError(f"{bag}: --held-out got a recording that cannot be compared: {error}") from error
 
 
 def may_be_the_ground(verdict: Verdict, names: Sequence[str], *, named: bool) -> bool:
@@ -298,34 +314,3 @@ def _with_wheels(diagnosis: Diagnosis, evidence: Evidence, robot: RobotModel) ->
     wheels = compare_with_wheels(evidence.commands, evidence.wheels, robot)
     remarks = diagnosis.remarks if wheels is None else (*diagnosis.remarks, wheels.summary())
     return replace(diagnosis, remarks=remarks)
-
-
-def _distinct_names(bags: Sequence[Path]) -> dict[str, Path]:
-    """Bags by names that differ: the last part of the path, with as many parents as it takes; each bag once."""
-    paths = list(dict.fromkeys(bag.resolve() for bag in bags))
-    named = {}
-    for path in paths:
-        count = next(
-            count
-            for count in range(1, len(path.parts) + 1)
-            if all(other == path or other.parts[-count:] != path.parts[-count:] for other in paths)
-        )
-        named["/".join(path.parts[-count:])] = path
-    return named
-
-
-def _held_out_table(
-    bag: Path, robot: RobotModel, nominal: NominalModel | None, effects: Effects, terrain: str, reading: ReadOptions
-) -> dict[str, GapRow]:
-    """Errors without and with the effects on a recording to which nothing was fitted."""
-    evidence, _ = read_evidence(bag, robot, terrain, reading)
-    evidence, _ = with_known_components(corrected_evidence(evidence, robot), nominal)
-    smoothed = evidence.smoothed
-    starts = window_starts(smoothed.motion, smoothed.stretches, 2.0, 1.0)
-    if not len(starts):
-        raise ValueError(f"{bag}: no gap-free window of 2 s, expected at least one for the comparison")
-    data = evidence.cut(starts, np.array([2.0]))
-    everywhere = HeldOut.everywhere(effects) if effects else None
-    compared = compare(robot, data, smoothed, everywhere, noisy_motions(smoothed))
-    by_gyro = heading_noise(evidence, compare_with_gyro(smoothed, evidence.gyro))
-    return gap_table(compared, heading_noise=by_gyro)

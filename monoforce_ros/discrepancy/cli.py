@@ -6,8 +6,9 @@ import argparse
 import multiprocessing
 import os
 import sys
-from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Sequence
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, as_completed
+from itertools import chain, count
 from pathlib import Path
 
 import torch
@@ -16,12 +17,16 @@ from monoforce_ros.bags import BagError, add_read_options, read_options
 from monoforce_ros.core import OptionParser
 from monoforce_ros.discrepancy.bag_diagnosis import BagDiagnosis, diagnose_bag, read_with_ground, usable_folder
 from monoforce_ros.discrepancy.commissioning import commission
-from monoforce_ros.discrepancy.comparable_windows import comparable_starts
+from monoforce_ros.discrepancy.comparable_windows import comparable_windows
 from monoforce_ros.discrepancy.diagnosis import DiagnosisSettings
 from monoforce_ros.discrepancy.export import export_effects, export_target
+from monoforce_ros.discrepancy.interruption import INTERRUPTED_STATUS, interruptible, uninterrupted
+from monoforce_ros.discrepancy.kept_effects import kept_effects
 from monoforce_ros.discrepancy.nominal_residual import residual_complaint
+from monoforce_ros.discrepancy.repetition import prepare_processes
 from monoforce_ros.discrepancy.report import effect_entry, summary_lines
 from monoforce_ros.discrepancy.verdict import Verdict
+from monoforce_ros.discrepancy.wheel_units import contradictions
 from monoforce_ros.effects import EffectError
 from monoforce_ros.encoder import CheckpointError
 from monoforce_ros.reporting import progress_bar
@@ -30,6 +35,8 @@ from monoforce_ros.terrain import TerrainError, TerrainFileError
 
 NOT_IDENTIFIABLE_STATUS = 3
 """Exit status where a recording cannot be diagnosed; 1 is an error, 2 a wrong option."""
+_MOST_COMPLAINTS = 3
+"""Problems of a bag that are printed; all are in the report."""
 _ERRORS = (BagError, CheckpointError, EffectError, RobotFileError, TerrainFileError, TerrainError, ValueError, OSError)
 
 
@@ -40,7 +47,7 @@ def build_parser() -> argparse.ArgumentParser:
         description="Compare a robot's model with recordings, find the physical effects that it lacks, and write them "
         "into a copy of its file. Each bag gets a folder with report.html and report.json.",
         epilog="Exit status: 0 a diagnosis was made; 1 an error; 2 wrong usage; 3 a recording cannot be diagnosed "
-        "(not_identifiable), the report says why.",
+        "(not_identifiable), the report says why; 130 interrupted (Ctrl-C).",
     )
     parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 folder or ROS 1 .bag file")
     parser.add_argument("--robot", default="husky", help=f"robot file or one of {', '.join(shipped_robots())}")
@@ -111,20 +118,32 @@ def main(arguments: list[str] | None = None) -> int:
     torch.set_num_threads(1)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
-        # Report a wrong robot before a long recording is read.
-        load_robot(options.robot)
-        if options.commission:
-            return _commission(options)
-        if len(options.bags) > 1:
-            return _diagnose_many(options)
-        found = _with_bar(options.bags[0], options.out, options)
-        print_finding(found)
-        if options.export:
-            _export(found, options)
-        return _status(found)
+        with interruptible():
+            return _done(options)
     except _ERRORS as error:
         print(f"diagnose: {error}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:
+        print("diagnose: interrupted; nothing was written beyond what is listed above", file=sys.stderr)
+        return INTERRUPTED_STATUS
+
+
+def _done(options: argparse.Namespace) -> int:
+    """Do what the options ask for; returns the exit status."""
+    # Report a wrong robot before a long recording is read.
+    load_robot(options.robot)
+    if options.commission:
+        return _commission(options)
+    if len(options.bags) > 1:
+        return _diagnose_many(options)
+    if options.jobs > 1:
+        with uninterrupted():
+            prepare_processes()
+    found = _with_bar(options.bags[0], options.out, options)
+    print_finding(found)
+    if options.export:
+        _export(found, options)
+    return _status(found)
 
 
 def _export(found: BagDiagnosis, options: argparse.Namespace) -> None:
@@ -150,7 +169,7 @@ def _status(found: BagDiagnosis) -> int:
 
 def print_finding(found: BagDiagnosis) -> None:
     """Print the result."""
-    for complaint in found.complaints[:3]:
+    for complaint in found.complaints[:_MOST_COMPLAINTS]:
         print(f"diagnose: {found.bag}: {complaint}", file=sys.stderr)
     first, *rest = summary_lines(found.diagnosis, found.doubts)
     print(f"{found.bag}: {first}")
@@ -202,12 +221,29 @@ def _run_alone(bag: Path, out: Path, options: argparse.Namespace) -> BagDiagnosi
         return str(error)
 
 
+def report_folders(bags: Sequence[Path]) -> list[str]:
+    """Names of the folders of reports, all different: those of the bags, numbered where several bags share one.
+
+    >>> report_folders([Path("monday/short"), Path("tuesday/short.bag"), Path("00_short")])
+    ['00_short_1', '01_short', '00_short']
+    """
+    names = [bag.resolve().name.removesuffix(".bag") for bag in bags]
+    taken = {name for name in names if names.count(name) == 1}
+    folders = []
+    for number, name in enumerate(names):
+        folder = name
+        if name not in taken:
+            numbered = f"{number:02d}_{name}"
+            free = chain([numbered], (f"{numbered}_{again}" for again in count(1)))
+            folder = next(text for text in free if text not in taken)
+            taken.add(folder)
+        folders.append(folder)
+    return folders
+
+
 def _diagnose_many(options: argparse.Namespace) -> int:
     """Diagnose bags in parallel, each into a folder of its own; a failure does not stop the others."""
-    names = [bag.name.removesuffix(".bag") for bag in options.bags]
-    outs = [
-        options.out / (name if names.count(name) == 1 else f"{number:02d}_{name}") for number, name in enumerate(names)
-    ]
+    outs = [options.out / name for name in report_folders(options.bags)]
     failed = refused = 0
     context = multiprocessing.get_context("spawn")
     jobs = min(options.jobs, len(options.bags))
@@ -215,9 +251,15 @@ def _diagnose_many(options: argparse.Namespace) -> int:
         ProcessPoolExecutor(jobs, mp_context=context) as pool,
         progress_bar(len(outs), label="diagnose", unit="bag", quiet=options.quiet, leave=False) as bar,
     ):
-        running = {pool.submit(_run_alone, bag, out, options): bag for bag, out in zip(options.bags, outs, strict=True)}
+        with uninterrupted():
+            # The first tasks start the processes.
+            tasks = zip(options.bags, outs, strict=True)
+            running = {pool.submit(_run_alone, bag, out, options): bag for bag, out in tasks}
         for done in as_completed(running):
-            found = done.result()
+            try:
+                found = done.result()
+            except BrokenExecutor:
+                found = "its process was ended, perhaps for want of memory: use fewer --jobs"
             bar.clear()
             if isinstance(found, str):
                 failed += 1
@@ -238,12 +280,15 @@ def _commission(options: argparse.Namespace) -> int:
     usable_folder(options.out)
     recordings = []
     for bag in options.bags:
-        evidence, _, ground = read_with_ground(bag, robot, options.terrain, read_options(options))
+        evidence, recording, ground = read_with_ground(bag, robot, options.terrain, read_options(options))
         recordings.append(evidence)
+        wrong, remarks = contradictions(evidence.smoothed.motion, evidence.wheels, evidence.commands, robot)
+        for text in (*recording.warnings[:_MOST_COMPLAINTS], *wrong):
+            print(f"diagnose: {bag}: {text}", file=sys.stderr)
         print(f"{bag}: ground: {ground.description}")
         if ground.unknown:
             print(f"diagnose: {bag}: {ground.complaint}", file=sys.stderr)
-        for remark in comparable_starts(evidence, robot, DiagnosisSettings())[1]:
+        for remark in (*remarks, *comparable_windows(evidence, robot, DiagnosisSettings()).left_out):
             print(f"{bag}: {remark}")
     settings = DiagnosisSettings()
     effects, nominal = commission(recordings, robot, samples=settings.samples)
@@ -254,7 +299,10 @@ def _commission(options: argparse.Namespace) -> int:
     )
     for effect in effects:
         for key, parameter in effect.parameters.items():
-            print(f"{effect.name}: {key} {parameter.value:.3g} {parameter.unit}")
+            unit = "" if parameter.unit == "-" else f" {parameter.unit}"
+            print(f"{effect.name}: {key} {parameter.value:.3g}{unit}")
+    for text in kept_effects(recordings, robot, effects):
+        print(text)
     print(nominal.summary(settings.horizon))
     print(f"robot file: {out}")
     for bag, evidence in zip(options.bags, recordings, strict=True):

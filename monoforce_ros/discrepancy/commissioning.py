@@ -153,7 +153,7 @@ def _prepare(evidence: Evidence, robot: RobotModel, samples: np.ndarray, stride:
     smoothed = evidence.smoothed
     starts = window_starts(smoothed.motion, smoothed.stretches, float(samples[-1]), stride)
     # What somebody drove with a joystick, or wheels that turned in place, is not how the robot follows its commands.
-    starts = starts[~not_comparable(evidence, robot, starts, float(samples[-1]))[0]]
+    starts = starts[~not_comparable(evidence, robot, starts, float(samples[-1]))]
     found = motion_faults(smoothed, evidence.commands, evidence.wheels) or complaints(evidence, starts)
     if found:
         raise ValueError("; ".join(found))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,27 +17,40 @@ from monoforce_ros.discrepancy.wheel_motion import undriven_stretches, wheels_wi
 from monoforce_ros.robots import RobotModel
 
 
-def comparable_starts(
-    evidence: Evidence, robot: RobotModel, settings: DiagnosisSettings
-) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Starts ``[W]`` [ns] of windows in which the ground moves the robot as its commands ask.
+@dataclass(frozen=True)
+class Comparable:
+    """Windows in which the model's motion can be compared."""
 
-    Returns:
-        the starts, and in words what was left out for which reason.
-    """
+    starts: np.ndarray
+    """``[W]`` [ns]."""
+    left_out: tuple[str, ...]
+    """In words what was left out for which reason."""
+    blocked: str
+    """When wheels turn while the robot, or one side of it, stays where it is; empty where they do not."""
+
+
+def comparable_windows(evidence: Evidence, robot: RobotModel, settings: DiagnosisSettings) -> Comparable:
+    """Windows of a recording in which the ground moves the robot as its commands ask."""
     smoothed = evidence.smoothed
     starts = window_starts(smoothed.motion, smoothed.stretches, settings.horizon, settings.stride)
     starts = subsampled(starts, BLOCK, settings.max_windows)
-    left_out, remarks = not_comparable(evidence, robot, starts, settings.horizon)
-    return starts[~left_out], remarks
+    left_out, remarks, blocked = _left_out(evidence, robot, starts, settings.horizon)
+    return Comparable(starts[~left_out], remarks, blocked)
 
 
-def not_comparable(
+def not_comparable(evidence: Evidence, robot: RobotModel, starts: np.ndarray, horizon: float) -> np.ndarray:
+    """Windows in which something else than ground and commands moves or holds the robot, ``[W]`` bool."""
+    return _left_out(evidence, robot, starts, horizon)[0]
+
+
+def _left_out(
     evidence: Evidence, robot: RobotModel, starts: np.ndarray, horizon: float
-) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Windows in which something else than ground and commands moves or holds the robot, ``[W]`` bool, and why."""
+) -> tuple[np.ndarray, tuple[str, ...], str]:
+    """What is not comparable ``[W]``, why, and when wheels turn in place."""
+    spinning = wheels_without_motion(evidence.smoothed.motion, evidence.wheels, evidence.commands, robot)
+    blocked = "" if spinning is None else spinning.summary()
     if not len(starts) or not len(evidence.commands):
-        return np.zeros(len(starts), bool), ()
+        return np.zeros(len(starts), bool), (), blocked
     smoothed = evidence.smoothed
 
     def overlapping(stretches: np.ndarray) -> np.ndarray:
@@ -49,19 +63,12 @@ def not_comparable(
     if left_out.any():
         seconds = float(np.diff(undriven, axis=1).sum()) * 1e-9
         remarks.append(f"{seconds:.0f} s are left out in which the robot moved without commands (a joystick?)")
-    spinning = wheels_without_motion(smoothed.motion, evidence.wheels, evidence.commands, robot)
     if spinning is not None:
-        remarks.append(spinning.summary())
+        remarks.append(blocked)
         if spinning.side == "both":
             left_out |= overlapping(np.array(spinning.stretches, np.int64))
             remarks[-1] += "; this time is left out"
-    return left_out, tuple(remarks)
-
-
-def blocked_wheels(evidence: Evidence, robot: RobotModel) -> str:
-    """When wheels turn while the robot, or one side of it, stays where it is, in words; empty where they do not."""
-    found = wheels_without_motion(evidence.smoothed.motion, evidence.wheels, evidence.commands, robot)
-    return "" if found is None else found.summary()
+    return left_out, tuple(remarks), blocked
 
 
 def windows_of(

@@ -22,6 +22,8 @@ from monoforce_ros.robots import RobotModel
 HORIZONS = (1.0, 2.0, 5.0)
 ABOVE_NOISE = 2.0
 """An error counts if it is at least so many times the noise floor: the noise is then the smaller part of it."""
+FEWEST_WINDOWS = 6
+"""At one horizon: the median of fewer is that of a manoeuvre."""
 _METRICS = (("position", "m"), ("heading", "deg"), ("lean", "deg"), ("height", "m"))
 """Errors and their units; the last two where the ground is known."""
 
@@ -120,7 +122,7 @@ class PathComparison:
     """A measured path and its predictions, ``[K, 3]`` along, across [m], heading [rad] in the frame of its start."""
 
     start: float
-    """Since the first window [s]."""
+    """Since the start of the recording [s]."""
     measured: np.ndarray
     before: np.ndarray
     after: np.ndarray | None
@@ -152,7 +154,7 @@ def compare(
         windows = replace(data, starts=starts, horizon=horizon, samples=np.array([horizon]))
         if acting_in is not None and len(starts):
             windows = replace(windows, starts=starts[acting_in(windows)])
-        if len(windows.starts) < 6:
+        if len(windows.starts) < FEWEST_WINDOWS:
             continue
         floor = noise_residuals(data.motion, noisy, windows)
         predictions = Predictions(robot, windows)
@@ -270,7 +272,7 @@ def measured_paths(
     picked = order[np.unique(np.linspace(0.5 * len(order), len(order) - 1, count).astype(int))]
     return [
         PathComparison(
-            start=float(starts[index] - data.starts[0]) * 1e-9,
+            start=float(starts[index] - data.motion.stamps[0]) * 1e-9,
             measured=measured[index],
             before=measured[index] + before[index],
             after=None if after is None else measured[index] + after[index],

@@ -9,7 +9,7 @@ import numpy as np
 
 from monoforce_ros.discrepancy.areas import Area, worst_place
 from monoforce_ros.discrepancy.attitude import changed_lean, lean_of
-from monoforce_ros.discrepancy.comparable_windows import blocked_wheels, comparable_starts, windows_of
+from monoforce_ros.discrepancy.comparable_windows import comparable_windows, windows_of
 from monoforce_ros.discrepancy.comparison import (
     ABOVE_NOISE,
     Comparison,
@@ -152,7 +152,8 @@ def diagnose(
     evidence = corrected_evidence(evidence, robot)
     evidence, nominal = with_known_components(evidence, nominal)
     smoothed = evidence.smoothed
-    starts, left_out = comparable_starts(evidence, robot, settings)
+    comparable = comparable_windows(evidence, robot, settings)
+    starts, left_out = comparable.starts, comparable.left_out
     leans = (
         changed_lean(lean_of(smoothed.motion), nominal.lean) if nominal is not None and evidence.with_attitude else ""
     )
@@ -249,7 +250,7 @@ def diagnose(
     expected = floor if nominal is None else np.sqrt(floor**2 + (nominal.residual_in(data) ** 2).mean(axis=0))
     paths = tuple(measured_paths(robot, data, judged))
     regimes = find_regimes(data)
-    hints = advice(decision.verdict, effects)
+    hints = advice(decision.verdict, effects, gyro=evidence.gyro is not None)
     place = None
     if part is None and decision.verdict == Verdict.UNKNOWN_EFFECT:
         place = worst_place(data, search.loss_of(()), settings.thresholds.comparison_rate)
@@ -282,7 +283,7 @@ def diagnose(
         set_aside=None if aside is None else aside.verdict,
         motion_unexplained=motion_unexplained,
         healthy={} if nominal is None else _medians(expected[-1]),
-        observed=tuple(filter(None, (blocked_wheels(evidence, robot), leans))),
+        observed=tuple(filter(None, (comparable.blocked, leans))),
     )
 
 

@@ -14,7 +14,7 @@ from monoforce_ros.core import write_text
 from monoforce_ros.discrepancy.credibility import complaint
 from monoforce_ros.discrepancy.estimates import EffectEstimate, ParameterEstimate
 from monoforce_ros.discrepancy.mujoco_export import mujoco_files
-from monoforce_ros.discrepancy.ros_export import diff_drive_text, nav2_text
+from monoforce_ros.discrepancy.ros_export import controller_text, nav2_text
 from monoforce_ros.effects import CATALOGUE
 from monoforce_ros.robots import RobotModel
 
@@ -25,7 +25,7 @@ class ExportKind(StrEnum):
     MUJOCO = "mujoco"
     """MuJoCo XML to include in a model."""
     DIFF_DRIVE = "diff_drive"
-    """Parameters of ros2_control's ``diff_drive_controller``."""
+    """Parameters of ros2_control's ``diff_drive_controller``; of a car, of its ``ackermann_steering_controller``."""
     NAV2 = "nav2"
     """Parameters of Nav2's MPPI controller and velocity smoother."""
 
@@ -67,10 +67,13 @@ def export_target(text: str) -> tuple[ExportKind, Path]:
 def effects_to_export(robot: RobotModel, found: Sequence[EffectEstimate]) -> tuple[EffectEstimate, ...]:
     """The effects of the corrected robot: those of its file, and in their place those found that are credible."""
     chosen = {}
+    intervals = dict(robot.effect_intervals)
     for name, values in robot.effects:
         units = {parameter.name: parameter.unit for parameter in CATALOGUE[name].parameters}
+        own = intervals.get(name, {})
+        # Without an interval in the file both ends are the value, which the exports say (`exported_value`).
         known = {
-            key: ParameterEstimate(float(value), float(value), float(value), units[key])
+            key: ParameterEstimate(float(value), *own.get(key, (float(value), float(value))), units[key])
             for key, value in values.items()
         }
         chosen[name] = EffectEstimate(name, known)
@@ -107,4 +110,4 @@ def export_effects(targets: Sequence[str], robot: RobotModel, found: Sequence[Ef
 
 
 _Writer = Callable[[RobotModel, Mapping[str, EffectEstimate]], tuple[str, tuple[str, ...]]]
-_WRITERS: dict[ExportKind, _Writer] = {ExportKind.DIFF_DRIVE: diff_drive_text, ExportKind.NAV2: nav2_text}
+_WRITERS: dict[ExportKind, _Writer] = {ExportKind.DIFF_DRIVE: controller_text, ExportKind.NAV2: nav2_text}

@@ -143,7 +143,9 @@ def regime_figure(regimes: Sequence[RegimeRow]) -> Figure:
 def timeline_figure(details: Details) -> Figure:
     """Residuals at the end of each window over the recording."""
     data = details.data
-    times = (data.starts - data.starts[0]) * 1e-9
+    # Of the recording: windows may begin later, where an effect does.
+    origin = int(data.motion.stamps[0])
+    times = (data.starts - origin) * 1e-9
     compared = next((c for c in details.compared if c.horizon == data.horizon), None)
     figure = Figure(figsize=(11.0, 6.4), layout="constrained", dpi=110)
     axes = figure.subplots(4, 1, sharex=True)
@@ -153,7 +155,7 @@ def timeline_figure(details: Details) -> Figure:
         ax.axhspan(-band, band, color=_FLOOR, alpha=0.25, lw=0)
         ax.plot(*with_gaps(times, factor * details.before[:, -1, axis]), color=_BEFORE, lw=1.4, label=_NOMINAL)
         if compared is not None and compared.after is not None:
-            starts = (compared.starts - data.starts[0]) * 1e-9
+            starts = (compared.starts - origin) * 1e-9
             ax.plot(starts, factor * compared.after[:, axis], ".", color=_AFTER, ms=5, label=_WITH_EFFECTS)
         ax.set_ylabel(name)
     commanded = data.commands.sample(data.starts)

@@ -14,6 +14,8 @@ from monoforce_ros.discrepancy.learned import LEARNED
 from monoforce_ros.discrepancy.verdict import Verdict
 from monoforce_ros.discrepancy.wording import cause, finding, remedy
 
+_NEVER = "the robot's file was never commissioned: this may be how the healthy robot is (diagnose --commission)"
+_COMMISSION = "commission the robot while it is healthy: later reports then say what changed"
 MOST = 0.5
 """Share of an error above which most of it is explained: by the meaning of "most"."""
 
@@ -123,31 +125,11 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
             Tone.UNKNOWN, "This recording cannot be diagnosed.", "", tuple(diagnosis.advice), tuple(complaints),
             tuple(diagnosis.remarks), ("record again as said here, then run diagnose on the new recording",),
         )  # fmt: skip
+    unknown = () if diagnosis.commissioned else (_NEVER,)
     if diagnosis.verdict == Verdict.NO_DISCREPANCY:
-        observed = diagnosis.observed
-        if observed and not complaints:
-            return Headline(
-                Tone.PARTLY, "The robot moves as its model predicts, but something else is wrong.", "", observed, (),
-                _sizes(diagnosis), diagnosis.advice,
-            )  # fmt: skip
-        return Headline(
-            Tone.PARTLY if complaints else Tone.GOOD,
-            # A model that misses the healthy robot by much cannot say that nothing is wrong.
-            "No change was found, with doubts: the errors are as large as the healthy robot's."
-            if complaints
-            else "Nothing is wrong: the robot moves as its model predicts.",
-            "",
-            observed,
-            tuple(complaints),
-            _sizes(diagnosis),
-            diagnosis.advice,
-        )
+        return _without_discrepancy(diagnosis, complaints, unknown)
     effects, refused = credible_effects(diagnosis)
-    doubts = [*complaints, *refused]
-    if not diagnosis.commissioned:
-        doubts.append(
-            "the robot's file was never commissioned: this may be how the healthy robot is (diagnose --commission)"
-        )
+    doubts = [*unknown, *complaints, *refused]
     named = [effect for effect in effects if effect.name != LEARNED]
     rows = explained(diagnosis)
     # Where nothing was added to the motion, what was found is a sensor's own measurement.
@@ -164,15 +146,25 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
     doubts += [f"{cause(e.name)} shows in a part of the recording only: drive longer to be sure" for e in unstable]
     counted = [row for row in rows if row.counts]
     grew = [row for row in rows if row.grew]
+    # A recording from before the fault says nothing of what explains it.
+    elsewhere = bool(rows) and not counted and all(row.recording for row in rows)
     remedies = [remedy(effect.name) for effect in effects]
+    remedies += [
+        f"if it is {cause(other)} instead: {remedy(other)}" for effect in named for other in effect.indistinguishable
+    ]
     if complaints:
         # What was found under a doubt about the recording or the ground may be nothing but its cause.
         remedies = ["remove the cause of the doubt first, then run diagnose again"]
+    elif grew and elsewhere:
+        question = (
+            "if the held-out recordings were driven with the same fault, do not use what was found; else hold out "
+        )
+        remedies = [f"{question}some that were", *remedies]
     elif grew:
         remedies = ["do not use what was found yet: drive longer, with more kinds of motion, and run diagnose again"]
     actions = [*remedies, *diagnosis.advice]
     if not diagnosis.commissioned:
-        actions.append("commission the robot while it is healthy: later reports then say what changed")
+        actions.append(_COMMISSION)
     doubts += [_growth(row) for row in grew]
     enough = bool(counted) and all(row.share >= MOST for row in counted)
     findings = tuple(finding(effect) for effect in effects)
@@ -206,11 +198,21 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
         sentence = "A sensor shows what is wrong; nothing had to be added to how the robot moves."
         if not complete:
             sentence = "A sensor shows a fault; besides, the robot does not move as predicted."
-        return result(Tone.GOOD if complete and not refused and not complaints else Tone.PARTLY, sentence)
+        sure = complete and not refused and not complaints and not unknown
+        return result(Tone.GOOD if sure else Tone.PARTLY, sentence)
     if enough and not grew and not refused and not complaints and not unstable:
+        if unknown:
+            differ = (
+                "one difference from its file explains" if len(effects) == 1 else "differences from its file explain"
+            )
+            return result(Tone.PARTLY, f"The robot was never commissioned: {differ} the error.")
         sentence = "The cause was found." if len(effects) == 1 else f"{len(effects)} causes were found."
+        if any(effect.indistinguishable for effect in named):
+            sentence = "The error is explained, by causes of which this recording cannot tell some apart."
         return result(Tone.GOOD, sentence)
-    if grew and not any(row.share >= MOST for row in counted):
+    if grew and elsewhere:
+        sentence = "A cause was found, but the held-out recordings show no error that it could explain."
+    elif grew and not any(row.share >= MOST for row in counted):
         sentence = "The error is not explained: with what was found, predictions get worse."
     elif not enough:
         sentence = "Most of the error is not explained; a part of the cause was found."
@@ -219,6 +221,26 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
     else:
         sentence = "A cause was found, with doubts."
     return result(Tone.PARTLY, sentence)
+
+
+def _without_discrepancy(diagnosis: Diagnosis, complaints: Sequence[str], unknown: Sequence[str]) -> Headline:
+    """The first screen where nothing is missing in the model; ``unknown`` says that the healthy robot is."""
+    observed, tone = diagnosis.observed, Tone.PARTLY
+    if observed and not complaints:
+        sentence = "The robot moves as its model predicts, but something else is wrong."
+    elif complaints:
+        # A model that misses the healthy robot by much cannot say that nothing is wrong.
+        sentence = "No change was found, with doubts: the errors are as large as the healthy robot's."
+        if unknown:
+            sentence = "No difference from the robot's file was found, with doubts."
+    elif unknown:
+        sentence = "The robot was never commissioned: no difference from its file was found."
+    else:
+        sentence, tone = "Nothing is wrong: the robot moves as its model predicts.", Tone.GOOD
+    actions = (*diagnosis.advice, *((_COMMISSION,) if unknown else ()))
+    return Headline(
+        tone, sentence, "", observed, (*unknown, *complaints), _sizes(diagnosis), actions, of_file=bool(unknown)
+    )
 
 
 def _left(rows: Sequence[Explained]) -> str:
@@ -250,10 +272,21 @@ def _of_localisation(diagnosis: Diagnosis) -> str:
 def _growth(row: Explained) -> str:
     where = f" on {row.recording}" if row.recording else ""
     assert row.row.after is not None
+    before, after = _apart(row.row.before, row.row.after)
     return (
-        f"the {row.metric} error{where} grows with these effects, from {row.row.before:.2g} to "
-        f"{row.row.after:.2g} {row.row.unit} after {row.row.horizon:g} s"
+        f"the {row.metric} error{where} grows with these effects, from {before} to {after} {row.row.unit} after "
+        f"{row.row.horizon:g} s"
     )
+
+
+def _apart(before: float, after: float) -> tuple[str, str]:
+    """Two numbers, with as many digits as it takes to see that they differ, at least two and at most four."""
+    texts = ("", "")
+    for digits in (2, 3, 4):
+        texts = (f"{before:.{digits}g}", f"{after:.{digits}g}")
+        if texts[0] != texts[1]:
+            break
+    return texts
 
 
 def _sizes(diagnosis: Diagnosis) -> tuple[str, ...]:
@@ -262,8 +295,10 @@ def _sizes(diagnosis: Diagnosis) -> tuple[str, ...]:
     for row in explained(diagnosis):
         where = f"held-out recording {row.recording}" if row.recording else "held-out parts of this recording"
         unit = "°" if row.row.unit == "deg" else f" {row.row.unit}"
+        assert row.row.after is not None
+        before, after = _apart(row.row.before, row.row.after)
         texts.append(
-            f"{row.metric} error after {row.row.horizon:g} s: {row.row.before:.2g} → {row.row.after:.2g}{unit} "
+            f"{row.metric} error after {row.row.horizon:g} s: {before} → {after}{unit} "
             f"(median, {where}; noise {row.row.noise:.2g}{unit})"
         )
     if texts:

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.discrepancy.estimates import EffectEstimate
+from monoforce_ros.discrepancy.exported_value import stated
 from monoforce_ros.effects import CATALOGUE
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import TerrainDefaults
@@ -99,10 +100,7 @@ def _fragment(comments: list[str], elements: list[str]) -> str:
 
 def _interval(effect: EffectEstimate, key: str) -> str:
     """``name key: value unit, low to high`` as an XML comment."""
-    value = effect.parameters[key]
-    unit = "" if value.unit == "-" else f" {value.unit}"
-    text = f"{effect.name} {key}: {value.value:.4g}{unit}, {value.low:.4g} to {value.high:.4g}"
-    return f"<!-- {text} -->"
+    return f"<!-- {effect.name} {key}: {stated(effect.parameters[key])} -->"
 
 
 def _value(effects: Mapping[str, EffectEstimate], name: str, key: str) -> float:

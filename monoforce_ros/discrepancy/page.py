@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import html
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from monoforce_ros.discrepancy.comparison import GapRow
+from monoforce_ros.discrepancy.comparison import ABOVE_NOISE, GapRow
 from monoforce_ros.discrepancy.credibility import complaint
 from monoforce_ros.discrepancy.diagnosis import Diagnosis
 from monoforce_ros.discrepancy.estimates import EffectEstimate
@@ -44,6 +45,14 @@ _STYLE = """<style>
 .columns ul.found { font-size: 16px; } .columns li.doubt { color: #b3540e; }
 @media (max-width: 760px) { .columns { grid-template-columns: 1fr; } }
 </style>"""
+_INPUTS = {
+    "data": "fingerprint of the data",
+    "recording_s": "length of the recording [s]",
+    "driven_m": "distance driven [m]",
+    "terrain": "--terrain",
+    "duration_s": "time that the diagnosis took [s]",
+}
+"""What entries of ``report.json`` are called on the page."""
 _MOST_LISTED = 6
 """Entries of each list on the first screen; the others are below it."""
 
@@ -84,7 +93,7 @@ def diagnosis_page(
         )
     if diagnosis.localisation or diagnosis.regimes:
         items = _list_items(
-            f"{entry.text} (RMS {entry.rms:.3g} {entry.unit}, mean {entry.bias:+.2g} {entry.unit})"
+            f"{entry.text} (RMS {_size(entry.rms, entry.unit)}, mean {_size(entry.bias, entry.unit, '+')})"
             for entry in diagnosis.localisation[:5]
         )
         figure = _image(regime_figure(diagnosis.regimes), "error by motion regime") if diagnosis.regimes else ""
@@ -94,12 +103,19 @@ def diagnosis_page(
         parts.append(card(_image(timeline_figure(details), "errors over time"), heading="Over time"))
     if diagnosis.candidates:
         parts.append(card(_image(candidates_figure(diagnosis), "gain of each effect"), heading="Effects tested"))
-    entries: dict[str, object] = dict(inputs)
+    entries = {_INPUTS.get(key, key): value for key, value in inputs.items() if key != "ground_unknown"}
     if robot_file is not None:
         entries["robot file with the added effects"] = robot_file
     parts.append(card(definition_list(entries), heading="Inputs"))
     robot = Path(str(inputs.get("robot", ""))).stem
     return page("Diagnosis", "".join(parts), heading=f"Diagnosis of {robot}" if robot else "Diagnosis")
+
+
+def _size(value: float, unit: str, sign: str = "") -> str:
+    """A number with its unit; angles in degrees, as everywhere on the page."""
+    if unit.startswith("rad"):
+        value, unit = math.degrees(value), unit.replace("rad", "°", 1)
+    return f"{value:{sign}.2g}{'' if unit.startswith('°') else ' '}{unit}"
 
 
 def _facts(inputs: Mapping[str, object]) -> str:
@@ -160,7 +176,7 @@ def _effects_table(effects: Sequence[EffectEstimate]) -> str:
             others = html.escape(", ".join(effect.indistinguishable)) or "–"
             rows.append(
                 f"<tr><td style='white-space:normal'>{name}</td><td>{key}</td>"
-                f"<td><b>{parameter.value:.3g}</b> {parameter.unit}</td>"
+                f"<td><b>{parameter.value:.3g}</b>{'' if parameter.unit == '-' else ' ' + parameter.unit}</td>"
                 f"<td>{parameter.low:.3g} to {parameter.high:.3g}</td>"
                 f"<td style='white-space:normal'>{others if number == 0 else ''}</td></tr>"
             )
@@ -170,7 +186,10 @@ def _effects_table(effects: Sequence[EffectEstimate]) -> str:
 def _gap_card(diagnosis: Diagnosis) -> str:
     rows = []
     for metric, row in diagnosis.gap.items():
-        closed = "–" if row.closed is None else f"{100 * row.closed:.0f} %"
+        # Of an error that is hardly more than noise no share means anything.
+        closed = "–"
+        if row.closed is not None and row.before > ABOVE_NOISE * row.noise:
+            closed = f"{100 * row.closed:.0f} %"
         rows.append(
             f"<tr><td>{_metric(metric, row)}</td><td>{row.noise:.2g} {row.unit}</td>"
             f"<td>{row.before:.3g} {row.unit}</td>{_after_cells(row)}<td>{closed}</td></tr>"

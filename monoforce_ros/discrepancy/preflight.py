@@ -15,6 +15,9 @@ FEWEST_WINDOWS = 12
 """A diagnosis needs at least as many."""
 
 
+_CLOCKS = "synchronise the clocks of planner, base and localisation, and record again: what stays is no clock's error"
+
+
 def complaints(evidence: Evidence, starts: np.ndarray) -> list[str]:
     """Why a recording whose motion can be compared (:func:`motion_faults`) is not sufficient, each with a remedy; empty
     where it is."""
@@ -26,11 +29,18 @@ def complaints(evidence: Evidence, starts: np.ndarray) -> list[str]:
     return found
 
 
-def advice(verdict: Verdict, effects: Sequence[EffectEstimate]) -> tuple[str, ...]:
-    """What to record next."""
+def advice(verdict: Verdict, effects: Sequence[EffectEstimate], *, gyro: bool = False) -> tuple[str, ...]:
+    """What to record next.
+
+    Args:
+        verdict: of the diagnosis.
+        effects: that were found.
+        gyro: whether the recording has one: to record an IMU is then no advice.
+    """
     hints = []
     for effect in effects:
-        hints += [sensor for other in effect.indistinguishable if (sensor := separating_sensor(effect.name, other))]
+        sensors = [sensor for other in effect.indistinguishable if (sensor := separating_sensor(effect.name, other))]
+        hints += [_CLOCKS] if sensors and gyro else sensors
         for other in effect.indistinguishable:
             manoeuvre = separating_manoeuvre(effect.name, other)
             if manoeuvre:

@@ -137,7 +137,7 @@ def summary_lines(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> list[
     lines += [f"  {text}" for text in top.confidence]
     for effect in diagnosis.effects:
         values = ", ".join(
-            f"{key} {parameter.value:.3g} {parameter.unit} ({parameter.low:.3g} to {parameter.high:.3g})"
+            f"{key} {parameter.value:.3g}{_unit(parameter.unit)} ({parameter.low:.3g} to {parameter.high:.3g})"
             for key, parameter in effect.shown.items()
         )
         others = ", ".join(effect.indistinguishable)
@@ -145,3 +145,8 @@ def summary_lines(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> list[
     lines += [f"  {entry.text}" for entry in diagnosis.localisation[:3]]
     lines += [f"  to do: {action}" for action in top.actions]
     return lines
+
+
+def _unit(unit: str) -> str:
+    """A unit behind a number; of what has none nothing."""
+    return "" if unit == "-" else f" {unit}"

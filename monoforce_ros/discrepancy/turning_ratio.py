@@ -6,6 +6,8 @@ it. An effect on the track width is a factor on top of that.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 
@@ -18,6 +20,8 @@ _STEP, _SETTLING, _DRIVING, _MEASURED = 0.01, 1.0, 5.0, 2.0
 """Time step, time at rest before, time of driving, and its last part, whose yaw rate counts [s]."""
 _SHARE = 0.15
 """Speed and yaw rate of the manoeuvres over their largest ones: with any multiplier no limit is reached."""
+_UNLIMITED = 1.0
+"""Speed that stands for a limit which a robot's file does not say [m/s]: its share is slow for any base."""
 _ITERATIONS = 4
 
 
@@ -28,12 +32,12 @@ def turning_ratio(robot: RobotModel, multiplier: float = 1.0) -> float:
         robot: with its effects; those with a delay or a lag must reach their final speed within 3 s.
         multiplier: on the commanded yaw rate, as ``wheel_separation_multiplier`` of diff_drive_controller has it.
     """
-    fastest = min(robot.maximum_speed / float(robot.drive_offsets.abs().max()), robot.maximum_yaw_rate)
-    yaw_rate = _SHARE * fastest
-    commands = torch.tensor([[0.0, yaw_rate * multiplier], [_SHARE * robot.maximum_speed, yaw_rate * multiplier]])
+    top = robot.maximum_speed if math.isfinite(robot.maximum_speed) else _UNLIMITED
+    yaw_rate = _SHARE * min(top / float(robot.drive_offsets.abs().max()), robot.maximum_yaw_rate)
+    commands = torch.tensor([[0.0, yaw_rate * multiplier], [_SHARE * top, yaw_rate * multiplier]])
     twists = torch.zeros(2, round((_SETTLING + _DRIVING) / _STEP), 2)
     twists[:, round(_SETTLING / _STEP) :] = commands[:, None]
-    terrain = TerrainMap.flat(Grid.square(max(16.0, 4.0 * _DRIVING * robot.maximum_speed), 0.5))
+    terrain = TerrainMap.flat(Grid.square(max(16.0, 4.0 * _DRIVING * top), 0.5))
     start = State.at_rest(robot.ground_clearance, batch=2)
     run = rollout(terrain, robot, controls(robot, twists, _STEP), start)
     ahead = run.rotation[:, -round(_MEASURED / _STEP) :, :2, 0].double().numpy()

@@ -110,24 +110,15 @@ def wheels_without_motion(
         The finding for both sides, else for the side that stays longer; None if there is none, or without wheel
         speeds or a wheel radius.
     """
-    if wheels is None or robot.wheel_radius is None or len(wheels) < 10 or len(motion) < 10:
+    if wheels is None:
         return None
-    first, last = max(motion.stamps[0], wheels.stamps[0]), min(motion.stamps[-1], wheels.stamps[-1])
-    stamps = np.arange(first, last + 1, round(_STEP * 1e9), dtype=np.int64)
-    width = round(_PIECE / _STEP)
-    starts = np.arange(0, len(stamps) - width, round(0.5 / _STEP))
-    if len(starts) < _PIECES:
+    ways = wheel_ways(motion, wheels, robot)
+    if ways is None:
         return None
-    half = half_track(robot)
-    speeds = _interpolated(wheels.stamps, wheels.speeds * robot.wheel_radius, stamps)
-    sides = _sides(motion, stamps, half)
-    rolled = np.cumsum(speeds, axis=0) * _STEP
-    inside = starts[:, None] + np.arange(width + 1)
-    usable = (_near(wheels.stamps, stamps) & _near(motion.stamps, stamps))[inside].all(axis=1)
+    stamps, starts, width, usable = ways.stamps, ways.starts, ways.width, ways.usable
+    speeds = ways.speeds
     # Of the ground under the left and the right side, under both together, and of their wheels, [pieces, 3].
-    ground = np.linalg.norm(sides[inside] - sides[starts][:, None], axis=3).max(axis=1)
-    turned = np.abs(rolled[inside] - rolled[starts][:, None]).max(axis=1)
-    ground, turned = (np.column_stack([ways, ways.mean(axis=1)]) for ways in (ground, turned))
+    ground, turned = (np.column_stack([way, way.mean(axis=1)]) for way in (ways.ground, ways.turned))
     driven = usable[:, None] & (turned > _LEAST_WAY)
     added = [uniform_filter1d(way * driven, _PIECES, axis=0, mode="constant") for way in (ground, turned)]
     # A piece in which the robot stops or starts has a share of its own.
@@ -154,6 +145,67 @@ def wheels_without_motion(
         moved=float(ground[kept, column].max()),
         followed=_followed(commands, stamps[where], speeds[where], robot, column),
         origin=int(motion.stamps[0]),
+    )
+
+
+@dataclass(frozen=True)
+class WheelWays:
+    """Ways of wheels and ground in overlapping pieces of 2 s, by side: left, right."""
+
+    stamps: np.ndarray
+    """Times of the samples, ``[m]`` [ns]."""
+    step: float
+    """Time between samples [s]."""
+    speeds: np.ndarray
+    """Of the wheels' rims, ``[m, 2]`` [m/s]."""
+    starts: np.ndarray
+    """Index of the first sample of each piece, ``[n]``."""
+    width: int
+    """Samples between start and end of a piece."""
+    usable: np.ndarray
+    """Pieces in which wheels and motion were measured throughout, ``[n]`` bool."""
+    ground: np.ndarray
+    """Largest distance of each side of the robot from where it was when the piece began, ``[n, 2]`` [m]."""
+    turned: np.ndarray
+    """The same of the wheels' rims along their way, ``[n, 2]`` [m]."""
+    rolled: np.ndarray
+    """Way of the wheels' rims from start to end of a piece, with its sign, ``[n, 2]`` [m]."""
+    apart: np.ndarray
+    """Largest difference of the ways of both sides' wheels within a piece, ``[n]`` [m]."""
+
+
+def wheel_ways(motion: MotionTrack, wheels: WheelTrack, robot: RobotModel) -> WheelWays | None:
+    """Ways of wheels and of the ground under them; None for a recording that is too short, or without a wheel radius.
+
+    Args:
+        motion: measured motion.
+        wheels: measured wheel speeds.
+        robot: its wheel radius and track width are used.
+    """
+    if robot.wheel_radius is None or len(wheels) < 10 or len(motion) < 10:
+        return None
+    first, last = max(motion.stamps[0], wheels.stamps[0]), min(motion.stamps[-1], wheels.stamps[-1])
+    stamps = np.arange(first, last + 1, round(_STEP * 1e9), dtype=np.int64)
+    width = round(_PIECE / _STEP)
+    starts = np.arange(0, len(stamps) - width, round(0.5 / _STEP))
+    if len(starts) < _PIECES:
+        return None
+    speeds = _interpolated(wheels.stamps, wheels.speeds * robot.wheel_radius, stamps)
+    sides = _sides(motion, stamps, half_track(robot))
+    rolled = np.cumsum(speeds, axis=0) * _STEP
+    inside = starts[:, None] + np.arange(width + 1)
+    along = rolled[inside] - rolled[starts][:, None]
+    return WheelWays(
+        stamps,
+        _STEP,
+        speeds,
+        starts,
+        width,
+        usable=(_near(wheels.stamps, stamps) & _near(motion.stamps, stamps))[inside].all(axis=1),
+        ground=np.linalg.norm(sides[inside] - sides[starts][:, None], axis=3).max(axis=1),
+        turned=np.abs(along).max(axis=1),
+        rolled=along[:, -1],
+        apart=np.abs(along[..., 1] - along[..., 0]).max(axis=1),
     )
 
 

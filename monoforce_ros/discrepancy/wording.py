@@ -35,12 +35,29 @@ def finding(estimate: EffectEstimate) -> str:
 def _beyond_model(estimate: EffectEstimate) -> dict[str, float]:
     """Values as a sentence states them: of effects that it compares with the model, beyond what the file says."""
     values = {key: parameter.value for key, parameter in estimate.parameters.items()}
+    if estimate.name == "payload" and "mass" in values and estimate.in_file.get("mass"):
+        return _further_load(values, estimate.in_file)
     for key, file_value in estimate.in_file.items():
         if key in values and estimate.name in _FACTORS_ON_MODEL:
             values[key] /= file_value
-        elif key == "mass" and key in values:
+        elif key in values and estimate.name in _DISTANCES_FROM_MODEL:
             values[key] -= file_value
     return values
+
+
+def _further_load(values: _Values, in_file: _Values) -> dict[str, float]:
+    """The point mass that makes the file's load the one that was found; of the found place where it would weigh little.
+
+    Its moment is the difference of both loads' moments.
+    """
+    mass = values["mass"] - in_file["mass"]
+    further = {"mass": mass}
+    for key in ("x", "y", "z"):
+        if key in values and abs(mass) > _LITTLE * max(abs(values["mass"]), abs(in_file["mass"])):
+            further[key] = (values["mass"] * values[key] - in_file["mass"] * in_file.get(key, 0.0)) / mass
+        elif key in values:
+            further[f"moved_{key}"] = values[key] - in_file.get(key, 0.0)
+    return further
 
 
 def _in_file(estimate: EffectEstimate) -> str:
@@ -53,11 +70,15 @@ def _in_file(estimate: EffectEstimate) -> str:
         for key, value in estimate.in_file.items()
         if key in known and value != known[key].neutral
     ]
-    return f" Its file says {', '.join(said)}." if said else ""
+    return f" The robot's file says {', '.join(said)}." if said else ""
 
 
-_FACTORS_ON_MODEL = frozenset({"friction_scale", "terrain_softness"})
+_FACTORS_ON_MODEL = frozenset({"friction_scale", "terrain_softness", "turning_scrub"})
 """Effects whose sentence compares a factor with what the model assumes."""
+_DISTANCES_FROM_MODEL = frozenset({"rotation_centre"})
+"""Effects whose sentence says how far from the model's a place is."""
+_LITTLE = 0.1
+"""Share of a load below which a difference of two loads says how heavy they are, and not where the difference lies."""
 
 
 def _determined(estimate: EffectEstimate) -> str:
@@ -128,6 +149,9 @@ def _friction(values: _Values) -> str:
 
 def _payload(values: _Values) -> str:
     mass = values["mass"]
+    if "moved_x" in values or "moved_y" in values:
+        moved = _sides(values.get("moved_x", 0.0), values.get("moved_y", 0.0), "m")
+        return f"The robot's load lies {moved} of where its model has it."
     place = ""
     if "x" in values and "y" in values:
         x, y = values["x"], values["y"]
