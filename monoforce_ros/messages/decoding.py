@@ -459,3 +459,11 @@ def decode_transforms(message: Any) -> dict[tuple[str, str], np.ndarray]:
     if fault and not transforms:
         raise MessageError(fault)
     return transforms
+
+
+def transform_stamps(message: Any) -> dict[tuple[str, str], int]:
+    """Stamps [ns] of a ``tf2_msgs/TFMessage`` by the frames of :func:`decode_transforms`."""
+    return {
+        (entry.header.frame_id.lstrip("/"), entry.child_frame_id.lstrip("/")): stamp_of(entry)
+        for entry in message.transforms
+    }
