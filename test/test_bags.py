@@ -27,7 +27,11 @@ def write(path, storage="mcap", count=20, **options):
             bag.write("/cmd_vel", builders.twist_stamped(at, "base_link", 1.0, 0.1), at)
             bag.write("/points", builders.point_cloud(at, "lidar", np.full((30, 3), float(i + 1))), at)
             bag.write("/cam/image_raw", builders.image(at, "cam", np.full((4, 6, 3), i, np.uint8)), at)
-            bag.write("/cam/camera_info", builders.camera_info(at, "cam", 6, 4, np.diag([5.0, 5, 1]), [0] * 5), at)
+            bag.write(
+                "/cam/camera_info",
+                builders.camera_info(at, "cam", 6, 4, [[5.0, 0, 2.5], [0, 5, 1.5], [0, 0, 1]], [0] * 5),
+                at,
+            )
         pose = np.eye(4)
         pose[:3, 3] = [0.1, 0.2, 0.3]
         bag.write("/tf_static", builders.static_transforms(START, "base_link", {"lidar": pose}), at)

@@ -87,7 +87,9 @@ def write(
                     image = builders.image(at, "camera_front", np.full((4, 6, 3), 9, np.uint8))
                     bag.write("/camera_front/image_raw", image, at)
                 if camera and info:
-                    calibration = builders.camera_info(at, "camera_front", 6, 4, np.diag([5.0, 5, 1]), [0] * 5)
+                    calibration = builders.camera_info(
+                        at, "camera_front", 6, 4, [[5.0, 0, 2.5], [0, 5, 1.5], [0, 0, 1]], [0] * 5
+                    )
                     bag.write("/camera_front/camera_info", calibration, at)
     return path
 
@@ -281,7 +283,7 @@ def with_sensors(path, *, cloud_offset=0.0, optical=True, encoding="rgb8", size=
                 image = builders.image(at, "camera", np.zeros((*size, 3), np.uint8))
                 image.encoding = encoding
                 bag.write("/cam/image_raw", image, at)
-                info = builders.camera_info(at, "camera", 64, 48, np.diag([50.0, 50, 1]), [0] * 5)
+                info = builders.camera_info(at, "camera", 64, 48, [[50.0, 0, 31.5], [0, 50, 23.5], [0, 0, 1]], [0] * 5)
                 bag.write("/cam/camera_info", info, at)
     return path
 

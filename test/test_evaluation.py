@@ -215,7 +215,9 @@ def test_images_further_from_the_stamp_than_the_limit_are_left_out(tmp_path):
         bag.write("/points", builders.point_cloud(start, "lidar", np.ones((5, 3))), start)
         image = builders.image(start, "camera_front", np.full((4, 6, 3), 9, np.uint8))
         bag.write("/camera_front/image_raw", image, start)
-        calibration = builders.camera_info(start, "camera_front", 6, 4, np.diag([5.0, 5, 1]), [0] * 5)
+        calibration = builders.camera_info(
+            start, "camera_front", 6, 4, [[5.0, 0, 2.5], [0, 5, 1.5], [0, 0, 1]], [0] * 5
+        )
         bag.write("/camera_front/camera_info", calibration, start)
     recording = Recording.open(tmp_path / "recording")
     topics = ("/camera_front/image_raw",)

@@ -24,22 +24,25 @@ class MovingFrame:
     def __init__(self) -> None:
         self._stamps = array("q")
         self._values = array("d")
+        self._last: np.ndarray | None = None
+        self._stands = False
+        """Whether the last two poses are the same."""
 
     def add(self, stamp: int, matrix: np.ndarray) -> None:
         """Add a pose ``[4, 4]`` of a stamp [ns]."""
-        values = matrix[:3].ravel()
         later = stamp - self._stamps[-1] if self._stamps else -1
         if 0 <= later < _INTERVAL:
             return
-        if (
-            later > 0
-            and len(self._stamps) > 1
-            and all(np.abs(self._kept(place) - values).max() < _SAME for place in (-1, -2))
-        ):
+        values = matrix[:3].ravel()
+        same = self._last is not None and later > 0 and float(np.abs(self._last - values).max()) < _SAME
+        if same and self._stands:
             self._stamps[-1] = stamp
             return
         self._stamps.append(stamp)
         self._values.extend(values)
+        self._stands = same
+        if not same:
+            self._last = values
 
     def track(self) -> PoseTrack:
         """The poses in the order of their stamps; at least one was added."""
@@ -47,7 +50,3 @@ class MovingFrame:
         poses = np.tile(np.eye(4), (len(stamps), 1, 1))
         poses[:, :3] = np.array(self._values).reshape(-1, 3, 4)[first]
         return PoseTrack(stamps, poses)
-
-    def _kept(self, place: int) -> np.ndarray:
-        start = len(self._values) + 12 * place
-        return np.array(self._values[start : start + 12])
