@@ -16,7 +16,7 @@ from monoforce_ros.encoder.checkpoint import shipped_checkpoint
 from monoforce_ros.encoder.view import support_plane
 from monoforce_ros.robots import load_robot, robot_digest
 from monoforce_ros.training import train_cli
-from monoforce_ros.training.adaptation import shares_targets, split_recording
+from monoforce_ros.training.adaptation import REPLAY_WORLDS, shares_targets, split_recording
 from monoforce_ros.training.batches import Batches
 from monoforce_ros.training.losses import LossWeights, geometric_loss
 from monoforce_ros.training.recording_samples import SamplesError, read_samples
@@ -31,6 +31,7 @@ from monoforce_ros.training.samples import Augmentation, sample
 from monoforce_ros.training.train_cli import build_parser, main
 from monoforce_ros.training.trainer import Process, Trainer, TrainingSettings, is_symmetric
 from monoforce_ros.training.training_state import TrainingError
+from monoforce_ros.training.world_samples import FIRST_WORLD, REPLAY_WORLD
 
 CONFIG = EncoderConfig(image_width=64, image_height=64, depth_bins=8, map_features=8, image_features=8)
 
@@ -282,9 +283,53 @@ def test_a_camera_on_a_pan_tilt_head_is_where_it_was_at_each_image(tmp_path, hus
     )
 
 
-def test_a_period_between_those_of_images_holds_on_average(tmp_path, husky):
+def test_a_period_between_those_of_images_holds_on_average(tmp_path, husky, capsys):
     samples = extracted(camera_bag(tmp_path / "bag", first={}), husky, tmp_path, period=0.5)
     assert np.diff(samples.stamps).mean() * 1e-9 == pytest.approx(0.5, abs=0.01)
+    assert "instead of" not in capsys.readouterr().err
+    extracted(tmp_path / "bag", husky, tmp_path, period=0.05)
+    assert "a sample every 0.2 s instead of 0.05 s: images come no more often" in capsys.readouterr().err
+
+
+def test_a_sweep_encoder_needs_no_images(tmp_path, husky, capsys):
+    rng = np.random.default_rng(1)
+    ground = np.column_stack([rng.uniform(-6, 6, (4000, 2)), np.full(4000, -0.6)])
+    with BagWriter(tmp_path / "bag") as bag:
+        mounted = homogeneous(np.eye(3), np.array([0.0, 0.0, 0.47]))
+        bag.write("/tf_static", builders.static_transforms(START, "base_link", {"lidar": mounted}), START)
+        for i in range(50 * SECONDS):
+            at, place = START + i * 20_000_000, [0.01 * i, 0.0, 0.0]
+            bag.write(
+                "/odom", builders.odometry(at, "odom", "base_link", place, [0, 0, 0, 1], [0.5, 0, 0], [0] * 3), at
+            )
+            bag.write("/cmd_vel", builders.twist_stamped(at, "base_link", 0.5, 0.0), at)
+            if i % 10 == 0:
+                bag.write("/points", builders.point_cloud(at, "lidar", ground), at)
+    swept = replace(CONFIG, sensor="lidar")
+    samples = read_samples(extract_samples(tmp_path / "bag", husky, swept, tmp_path / "samples"))
+    assert len(samples) > 20 and samples.images.shape[1] == 0 and len(samples.sweep(5)) > 500
+    batch, target = sample(samples, 5, swept)
+    assert batch.sweep.abs().sum() > 0 and not len(batch.images) and target.observed.any()
+    # An encoder of images cannot use them.
+    with pytest.raises(SamplesError, match="no images with a CameraInfo"):
+        extract_samples(tmp_path / "bag", husky, CONFIG, tmp_path / "samples")
+    out = tmp_path / "out"
+    arguments = [str(tmp_path / "bag"), "--sensor", "lidar", "--out", str(out), "--steps", "1", "--batch", "2"]
+    assert main([*arguments, "--no-vegetation", "--quiet"]) == 0, capsys.readouterr().err
+    assert load_encoder(out / "encoder.safetensors").config.sensor == "lidar"
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_adapting_keeps_to_options_that_are_the_defaults_of_a_training(given):
+    explicit = ["--steps", "2000", "--rate", "1.5e-3", "--worlds", "0", "--world-seed", str(FIRST_WORLD)]
+    options = build_parser().parse_args(["bag", "--adapt", "--out", "o", *(explicit if given else [])])
+    settings = train_cli._adaptation_settings(options)
+    assert (settings.steps, settings.rate) == ((2000, 1.5e-3) if given else (80, 4e-4))
+    worlds = train_cli._world_seeds(options, REPLAY_WORLD, REPLAY_WORLDS)
+    assert worlds == (range(FIRST_WORLD, FIRST_WORLD) if given else range(REPLAY_WORLD, REPLAY_WORLD + REPLAY_WORLDS))
+    trained = train_cli._settings(build_parser().parse_args(["bag"]))
+    assert (trained.steps, trained.rate) == (TrainingSettings.steps, TrainingSettings.rate)
+    assert train_cli._world_seeds(build_parser().parse_args(["bag"])) == range(FIRST_WORLD, FIRST_WORLD)
 
 
 @pytest.mark.parametrize(

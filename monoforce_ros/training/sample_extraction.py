@@ -52,6 +52,9 @@ TARGET_REACH = _LENGTH + _SWEEPS_AFTER
 """How long after the first sample of a segment its target may have been measured [s], at most."""
 _MATCH = 0.1
 """Largest difference between stamps of images that belong to one sample [s]."""
+_SLOWER = 1.5
+"""Median interval of the samples, relative to the wanted one, from which on they are slower: one that is no multiple of
+the images' interval alternates between two."""
 _JITTER = 1_000_000
 """By how much an image may come before its sample is due [ns]."""
 _POSE_GAP = 0.3
@@ -93,15 +96,23 @@ def extract_samples(
 ) -> Path:
     """Extract a bag's samples into a file, unless there is one for the same bag, robot and settings; return its path.
 
+    Encoders of sweeps alone use recordings without usable images, too, with a sample at each sweep.
+
     Raises:
         SamplesError: the recording has no calibrated images, no commands, or is too short.
         BagError: the bag cannot be read.
     """
     fingerprint = _fingerprint(bag, robot, config, settings, image_topics)
     file = folder / f"{bag.name.removesuffix('.bag')}-{fingerprint[:8]}.safetensors"
-    if file.is_file():
-        return file
-    save_samples(_samples(bag, robot, config, settings, image_topics), file)
+    # Encoders of cameras cannot use these.
+    without_images = file.with_name(f"{file.stem}-sweeps{file.suffix}")
+    usable = [file] if config.takes_images else [file, without_images]
+    for found in usable:
+        if found.is_file():
+            return found
+    samples = _samples(bag, robot, config, settings, image_topics)
+    file = file if samples.cameras else without_images
+    save_samples(samples, file)
     return file
 
 
@@ -114,7 +125,9 @@ def _samples(
 ) -> RecordingSamples:
     recording = settings.reading.open(bag, robot)
     robot = settings.reading.robot_in_bag(robot)
-    topics = _camera_topics(recording, robot, image_topics)
+    topics = _camera_topics(recording, robot, image_topics, needed=config.takes_images)
+    if not topics and not recording.clouds:
+        raise SamplesError(f"{bag}: no clouds and no usable images")
     if not len(recording.commands):
         raise SamplesError(f"{bag}: no commands (Twist or TwistStamped), which the physics needs")
     smoothed = smooth(corrected_motion(recording.motion, robot.effects))
@@ -146,21 +159,27 @@ def _samples(
     )
 
 
-def _camera_topics(recording: Recording, robot: RobotModel, image_topics: Sequence[str]) -> tuple[str, ...]:
+def _camera_topics(
+    recording: Recording, robot: RobotModel, image_topics: Sequence[str], *, needed: bool
+) -> tuple[str, ...]:
     """Image topics of the cameras that can be used; others are named on standard error.
 
     Raises:
-        SamplesError: there is none, or one of ``image_topics`` is absent or without a CameraInfo.
+        SamplesError: there is none and images are ``needed``, or one of ``image_topics`` is absent or without a
+            CameraInfo.
     """
     unknown = [topic for topic in image_topics if topic not in recording.images or topic not in recording.cameras]
-    if unknown or not recording.cameras:
+    if unknown or (needed and not recording.cameras):
         raise SamplesError(
             f"{recording.path}: no images with a CameraInfo on {unknown or 'any topic'}; images are on "
             f"{sorted(recording.images)}, CameraInfo is available for {sorted(recording.cameras)}"
         )
     # Images without a CameraInfo, such as overlays for debugging, are none of a camera.
-    choice = chosen_cameras(recording, robot, tuple(image_topics) or tuple(recording.cameras))
-    if not choice.topics:
+    wanted = tuple(image_topics) or tuple(recording.cameras)
+    if not wanted:
+        return ()
+    choice = chosen_cameras(recording, robot, wanted)
+    if needed and not choice.topics:
         reasons = "; ".join(f"{topic}: {reason}" for topic, reason in choice.left_out.items())
         raise SamplesError(f"{recording.path}: no usable image: {reasons}")
     for remark in choice.remarks:
@@ -241,7 +260,7 @@ def _read_images(
     matched: list[tuple[int, dict[int, Frame]]] = []
     due = starts[0]
     stamps = [np.array([frame.stamp for frame in recording.images[topic]], np.int64) for topic in topics]
-    for frame in image_frames(recording, topics, _MATCH):
+    for frame in image_frames(recording, topics, _MATCH) if topics else recording.clouds:
         if not (starts[0] <= frame.stamp <= end and frame.stamp >= due - _JITTER):
             continue
         # A period that is no multiple of the images' interval holds on average.
@@ -260,7 +279,7 @@ def _read_images(
     for stamp, found in matched:
         seen = {i: views[i][frame.stamp] for i, frame in found.items() if frame.stamp in views[i]}
         segment = max((i for i, start in enumerate(starts) if start <= stamp), default=-1)
-        if not seen or segment < 0 or stamp > places[segment][1]:
+        if (topics and not seen) or segment < 0 or stamp > places[segment][1]:
             continue
         try:
             state = motion.at(stamp, maximum_gap=_POSE_GAP)
@@ -269,16 +288,26 @@ def _read_images(
         under = support_points(robot, state, config.stiffness)
         placed = state.odometry_from_terrain
         each = [seen.get(i, blank) for i in range(len(topics))]
-        rows["images"].append(np.stack([pixels for pixels, _ in each]))
+        rows["images"].append(np.array([pixels for pixels, _ in each], np.uint8).reshape(-1, *blank[0].shape))
         rows["stamps"].append(stamp)
         rows["odometry_from_base"].append(state.odometry_from_base)
-        rows["odometry_from_cameras"].append(np.stack([pose for _, pose in each]))
+        rows["odometry_from_cameras"].append(np.array([pose for _, pose in each]).reshape(-1, 4, 4))
         rows["support"].append(under @ placed[:3, :3].T + placed[:3, 3])
         rows["segment_of"].append(segment)
     if not rows["stamps"]:
-        raise SamplesError(f"{recording.path}: no image is within the odometry and followed by one second of motion")
+        raise SamplesError(
+            f"{recording.path}: no {'image' if topics else 'cloud'} is within the odometry and followed by one second "
+            "of motion"
+        )
     arrays = {name: np.array(values) for name, values in rows.items()}
     _report_missing(recording, topics, arrays)
+    interval = float(np.median(np.diff(arrays["stamps"]))) * NANOSECOND if len(arrays["stamps"]) > 1 else 0.0
+    if interval > _SLOWER * settings.period:
+        print(
+            f"{recording.path}: a sample every {interval:.2g} s instead of {settings.period:.2g} s: "
+            f"{'images' if topics else 'clouds'} come no more often",
+            file=sys.stderr,
+        )
     sweeps = _sweeps_near(recording, motion, robot, arrays["stamps"])
     joined = np.concatenate(sweeps) if sweeps else np.zeros((0, 3))
     begins = [max((first for first, _ in spans if first <= stamp), default=0) for stamp in arrays["stamps"].tolist()]
