@@ -6,6 +6,7 @@ import argparse
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import override
 
@@ -192,7 +193,9 @@ def run(options: argparse.Namespace) -> None:
     predictor = Predictor(
         robot, source, horizon=max(options.horizons), options=PhysicsOptions(soil=read_soil(options.soil))
     )
-    topics = _camera_topics(recording, robot, options.images or ()) if "camera" in source.sensors else ()
+    topics, left_out = (
+        _camera_topics(recording, robot, options.images or ()) if "camera" in source.sensors else ((), [])
+    )
     evaluation = evaluate_recording(
         recording,
         predictor,
@@ -201,6 +204,7 @@ def run(options: argparse.Namespace) -> None:
         stride=options.stride,
         quiet=options.quiet,
     )
+    evaluation = replace(evaluation, remarks=(*left_out, *evaluation.remarks))
     if not any(position.windows for position, _ in evaluation.summary(PHYSICS).values()):
         raise EvaluationError(
             f"{bag}: after the start of every window the odometry jumps or pauses, or leaves the map, so that nothing "
@@ -264,15 +268,15 @@ def run(options: argparse.Namespace) -> None:
     print(f"report: {report_html}\ndata:   {report_json}\nfigures: {folder}/prediction_*.png")
 
 
-def _camera_topics(recording: Recording, robot: RobotModel, named: Sequence[str]) -> tuple[str, ...]:
-    """Image topics of the cameras that can be used, of those named or all; others are named on standard error."""
+def _camera_topics(recording: Recording, robot: RobotModel, named: Sequence[str]) -> tuple[tuple[str, ...], list[str]]:
+    """Image topics of the cameras that can be used, of those named or all, and remarks on the others."""
     unknown = [topic for topic in named if topic not in recording.images]
     if unknown:
         raise EvaluationError(f"{recording.path}: no images on {unknown}; there are {sorted(recording.images)}")
     choice = chosen_cameras(recording, robot, named)
     for remark in choice.remarks:
         print(f"warning: {remark}", file=sys.stderr)
-    return choice.topics
+    return choice.topics, choice.remarks
 
 
 def _example_windows(evaluation: RecordingEvaluation) -> list[tuple[str, int]]:
