@@ -337,6 +337,9 @@ def test_adapting_keeps_to_options_that_are_the_defaults_of_a_training(given):
     [
         (["bag", "--adapt", "--out", "o", "--sensor", "camera"], "--sensor"),
         (["bag", "--adapt", "--out", "o", "--held-out", "x"], "--held-out"),
+        # Those of a training by default, too: an adaptation has others.
+        (["bag", "--adapt", "--out", "o", "--losses", "geometric", "terrain", "trajectory"], "--losses has no effect"),
+        (["bag", "--adapt", "--out", "o", "--size=320x240"], "--size has no effect"),
         (["--adapt", "--worlds", "1", "--out", "o"], "--adapt: got no bag"),
     ],
 )

@@ -231,7 +231,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if not options.bags:
             parser.error("--adapt: got no bag, expected some of the robot's own")
         known = tuple(name for name in _NOT_FOR_ADAPTING if hasattr(options, name))
-        parser.refuse_without_effect(options, known, "with --adapt: the encoder that is adapted decides it")
+        parser.refuse_without_effect(
+            options, known, "with --adapt: the encoder that is adapted decides it",
+            sys.argv[1:] if arguments is None else arguments,
+        )  # fmt: skip
     if options.samples_only and options.samples is None and options.out is None:
         parser.error("--samples-only: expected a folder with --samples, or --out")
     if options.out is None and not options.samples_only:
