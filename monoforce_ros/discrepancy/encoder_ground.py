@@ -66,9 +66,10 @@ def encoder_maps(
     cameras = chosen_cameras(recording, robot)
     topics = cameras.topics
     if not topics:
+        found = "no usable images" if any(recording.images.values()) else "no images"
         raise BagError(
-            f"{recording.path}: no usable images, which --terrain {ground.kind} needs; use lidar, traced, flat or a "
-            f"map{''.join(f'; {remark}' for remark in cameras.remarks)}"
+            f"{recording.path}: {found}, which --terrain {ground.kind} needs; use lidar, traced, flat or a map"
+            f"{''.join(f'; {remark}' for remark in cameras.remarks)}"
         )
     mosaics = [_Mosaic(grid), _Mosaic(grid)]
     count, refused = 0, ""
