@@ -66,9 +66,9 @@ def encoder_maps(
     cameras = chosen_cameras(recording, robot)
     topics = cameras.topics
     if not topics:
-        found = "no usable images" if any(recording.images.values()) else "no images"
+        what = "no usable images" if any(recording.images.values()) else "no images"
         raise BagError(
-            f"{recording.path}: {found}, which --terrain {ground.kind} needs; use lidar, traced, flat or a map"
+            f"{recording.path}: {what}, which --terrain {ground.kind} needs; use lidar, traced, flat or a map"
             f"{''.join(f'; {remark}' for remark in cameras.remarks)}"
         )
     mosaics = [_Mosaic(grid), _Mosaic(grid)]
