@@ -8,9 +8,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from nav_msgs.msg import Odometry
 from rclpy.serialization import deserialize_message
+from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import BagError, BagReader, BagWriter, Recording, builders, camera_info_topics, find_transform
-from monoforce_ros.core import unfinished_path
+from monoforce_ros.bags.moving_frame import MovingFrame
+from monoforce_ros.core import homogeneous, unfinished_path
 
 START = 1_700_000_000_000_000_000
 
@@ -27,7 +29,11 @@ def write(path, storage="mcap", count=20, **options):
             bag.write("/cmd_vel", builders.twist_stamped(at, "base_link", 1.0, 0.1), at)
             bag.write("/points", builders.point_cloud(at, "lidar", np.full((30, 3), float(i + 1))), at)
             bag.write("/cam/image_raw", builders.image(at, "cam", np.full((4, 6, 3), i, np.uint8)), at)
-            bag.write("/cam/camera_info", builders.camera_info(at, "cam", 6, 4, np.diag([5.0, 5, 1]), [0] * 5), at)
+            bag.write(
+                "/cam/camera_info",
+                builders.camera_info(at, "cam", 6, 4, [[5.0, 0, 2.5], [0, 5, 1.5], [0, 0, 1]], [0] * 5),
+                at,
+            )
         pose = np.eye(4)
         pose[:3, 3] = [0.1, 0.2, 0.3]
         bag.write("/tf_static", builders.static_transforms(START, "base_link", {"lidar": pose}), at)
@@ -330,3 +336,23 @@ def test_a_bag_is_opened_once_for_many_reads_and_anew_once_it_changed(tmp_path, 
     with pytest.raises(BagError, match="the bag has changed"):
         recording.image(frames[-1])
     assert (Recording.open(path).image(frames[2]) == 2).all()
+
+
+def test_a_frame_that_seldom_moves_takes_little_memory_and_is_where_it_was():
+    def pose(time):
+        """Stands, turns from 60 s on by 0.5 rad/s for 2 s, and stands again."""
+        angle = 0.5 * float(np.clip(time - 60.0, 0.0, 2.0))
+        return homogeneous(Rotation.from_euler("z", angle).as_matrix(), np.array([0.1, 0.0, 0.3]))
+
+    kept = MovingFrame()
+    times = np.arange(0.0, 120.0, 0.01)
+    for time in np.r_[times, times[3000]]:  # one comes late
+        kept.add(round(1e9 * time), pose(time))
+    track = kept.track()
+    assert len(track.stamps) < 120
+    assert (np.diff(track.stamps) > 0).all()
+    for time in (0.0, 31.7, 59.99, 60.503, 61.3, 62.1, 119.0):
+        np.testing.assert_allclose(track.at(round(1e9 * time)), pose(time), atol=6e-3)
+    # Beyond the first and last one: those.
+    np.testing.assert_allclose(track.at(-(10**9)), pose(0.0), atol=1e-9)
+    np.testing.assert_allclose(track.at(500 * 10**9), pose(119.0), atol=1e-9)

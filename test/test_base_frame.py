@@ -51,7 +51,7 @@ def test_an_unknown_offset_is_refused_with_both_frames_and_the_missing_path(disp
 
 def test_data_in_the_odometry_frame_need_the_driver_s_own_topic(recording):
     with pytest.raises(BagError, match="odometry frame .odom. do not say where their sensor is.*record the driver"):
-        recording.sensor_pose("odom", "base_link", {})
+        recording.sensor_pose("odom", "base_link", {}, 0)
 
 
 @pytest.mark.usefixtures("one_thread")

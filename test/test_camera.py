@@ -20,11 +20,13 @@ LENSES = {
 
 
 def camera(lens: str) -> CameraModel:
-    model, coefficients = LENSES[lens]
-    return CameraModel(640, 480, MATRIX, np.array(coefficients), model)
+    skew = 12.0 if lens.startswith("skewed") else 0.0
+    model, coefficients = LENSES[{"skewed": "plumb_bob", "skewed fisheye": "fisheye"}.get(lens, lens)]
+    matrix = MATRIX + np.array([[0.0, skew, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    return CameraModel(640, 480, matrix, np.array(coefficients), model)
 
 
-@pytest.mark.parametrize("lens", LENSES)
+@pytest.mark.parametrize("lens", [*LENSES, "skewed", "skewed fisheye"])
 @given(u=st.floats(0, 639), v=st.floats(0, 479), depth=st.floats(0.3, 50))
 @settings(max_examples=40, deadline=None)
 def test_a_ray_projects_back_to_its_pixel(lens, u, v, depth):
@@ -85,8 +87,15 @@ def test_points_beyond_where_a_distortion_folds_have_no_pixel():
     assert not inside[slopes > 1.6].any()
 
 
-def test_a_resized_image_keeps_its_rays():
-    model = camera("plumb_bob")
+def test_skew_moves_what_lies_below_the_axis_to_the_right():
+    straight, skewed = camera("none"), CameraModel(640, 480, MATRIX + np.eye(3, k=1) * [[12.0], [0], [0]], np.zeros(5))
+    point = np.array([[0.2, 0.5, 1.0]])
+    np.testing.assert_allclose(skewed.project(point)[0] - straight.project(point)[0], [[6.0, 0.0]], atol=1e-9)
+
+
+@pytest.mark.parametrize("lens", ["plumb_bob", "skewed"])
+def test_a_resized_image_keeps_its_rays(lens):
+    model = camera(lens)
     half = model.resized(320, 240)
     np.testing.assert_allclose(half.rays(np.array([100.0, 60.0])), model.rays(np.array([200.5, 120.5])), atol=1e-9)
 
@@ -117,6 +126,11 @@ def test_invalid_calibrations_are_refused(change, message):
         ({"distortion_model": "equidistant", "distortion": np.array([-5.0, 3.0, 0.0, 0.0])}, "a lens would show only"),
         ({"matrix": np.array([[400.0, 0, 1e5], [0, 400.0, 240], [0, 0, 1]])}, "principal point"),
         ({"matrix": np.array([[400.0, 0, 640], [0, 400.0, 480], [0, 0, 1]])}, "is the matrix that of a larger image"),
+        # Of 1280 × 720, 1920 × 1080 and 320 × 240 px.
+        ({"matrix": np.array([[600.0, 0, 640], [0, 600.0, 360], [0, 0, 1]])}, "is the matrix that of a larger image"),
+        ({"matrix": np.array([[900.0, 0, 960], [0, 900.0, 540], [0, 0, 1]])}, "is the matrix that of a larger image"),
+        ({"matrix": np.array([[160.0, 0, 160], [0, 160.0, 120], [0, 0, 1]])}, "is the matrix that of a smaller image"),
+        ({"matrix": np.array([[400.0, 0, 0], [0, 400.0, 0], [0, 0, 1]])}, "is the matrix that of a smaller image"),
         ({"matrix": np.eye(3)}, "are they in pixels"),
         ({"matrix": np.diag([3.6, 3.6, 1.0])}, "are they in pixels"),
         ({"matrix": np.diag([1e6, 1e6, 1.0])}, "are they in pixels"),
@@ -168,3 +182,12 @@ def test_binned_images_and_regions_have_the_rays_of_the_calibrated_one():
 def test_coefficients_of_a_fisheye_may_be_padded_with_zeros():
     padded = CameraModel(640, 480, MATRIX, np.array([-0.02, 0.003, 0.0, 0.0, 0.0]), "equidistant")
     padded.check()
+
+
+@pytest.mark.parametrize("name", ["none", "NONE", "pinhole", "undistorted", ""])
+def test_names_of_no_distortion_are_harmless_without_coefficients(name):
+    for coefficients in ([], [0.0] * 3, [0.0] * 5):
+        assert not decode_camera_info(builders.camera_info(0, "c", 640, 480, MATRIX, coefficients, name)).is_distorted
+    if name:
+        with pytest.raises(MessageError, match="distortion model"):
+            decode_camera_info(builders.camera_info(0, "c", 640, 480, MATRIX, [-0.2, 0.05, 0.0, 0.0, 0.0], name))

@@ -87,7 +87,9 @@ def write(
                     image = builders.image(at, "camera_front", np.full((4, 6, 3), 9, np.uint8))
                     bag.write("/camera_front/image_raw", image, at)
                 if camera and info:
-                    calibration = builders.camera_info(at, "camera_front", 6, 4, np.diag([5.0, 5, 1]), [0] * 5)
+                    calibration = builders.camera_info(
+                        at, "camera_front", 6, 4, [[5.0, 0, 2.5], [0, 5, 1.5], [0, 0, 1]], [0] * 5
+                    )
                     bag.write("/camera_front/camera_info", calibration, at)
     return path
 
@@ -259,8 +261,8 @@ def test_twists_that_are_not_those_of_the_poses_are_named_and_replaced(kind, tex
     assert bool(said) == bool(text)
 
 
-def with_sensors(path, *, cloud_offset=0.0, optical=True, encoding="rgb8"):
-    """Twenty seconds with a lidar and a camera, whose stamps, frame or encoding may be wrong."""
+def with_sensors(path, *, cloud_offset=0.0, optical=True, encoding="rgb8", size=(48, 64)):
+    """Twenty seconds with a lidar and a camera, whose stamps, frame, encoding or size may be wrong."""
     mounted = np.eye(4)
     mounted[:3, 3] = [0.3, 0.0, 0.4]
     if optical:
@@ -278,10 +280,10 @@ def with_sensors(path, *, cloud_offset=0.0, optical=True, encoding="rgb8"):
             if i % 10 == 0:
                 late = at + round(1e9 * cloud_offset)
                 bag.write("/points", builders.point_cloud(late, "lidar", np.full((30, 3), 2.0)), at)
-                image = builders.image(at, "camera", np.zeros((48, 64, 3), np.uint8))
+                image = builders.image(at, "camera", np.zeros((*size, 3), np.uint8))
                 image.encoding = encoding
                 bag.write("/cam/image_raw", image, at)
-                info = builders.camera_info(at, "camera", 64, 48, np.diag([50.0, 50, 1]), [0] * 5)
+                info = builders.camera_info(at, "camera", 64, 48, [[50.0, 0, 31.5], [0, 50, 23.5], [0, 0, 1]], [0] * 5)
                 bag.write("/cam/camera_info", info, at)
     return path
 
@@ -296,6 +298,7 @@ def with_sensors(path, *, cloud_offset=0.0, optical=True, encoding="rgb8"):
         ),
         ({"optical": False}, "its frame camera looks up at the sky"),
         ({"encoding": "rgb161"}, "the images cannot be used: image encoding: got 'rgb161'"),
+        ({"size": (24, 32)}, "the images cannot be used: images are 32 × 24 px, but CameraInfo says 64 × 48 px"),
     ],
 )
 def test_sensors_that_cannot_be_used_are_not_called_ok(tmp_path, husky, fault, text):
@@ -303,4 +306,4 @@ def test_sensors_that_cannot_be_used_are_not_called_ok(tmp_path, husky, fault, t
     texts = check_text(check)
     assert text in texts
     assert ("clouds /points: 40" in texts) == ("cloud_offset" not in fault)
-    assert ("images /cam/image_raw: 40" in texts) == (not {"optical", "encoding"} & set(fault))
+    assert ("images /cam/image_raw: 40" in texts) == (not {"optical", "encoding", "size"} & set(fault))

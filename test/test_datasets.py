@@ -286,3 +286,159 @@ def test_convert_reports_errors_in_one_line(tmp_path, capsys):
     assert len(lines) == 2
     assert "not a ROUGH scene" in lines[0]
     assert "no such file" in lines[1]
+
+
+# ---- damaged folders
+
+
+def rough_folder(root):
+    """A scene of the published layout: two cameras, one cloud, a robot at rest and then driving along x."""
+    folder = root / "scene"
+    for part in ("images", "clouds", "poses", "calibration/cameras"):
+        (folder / part).mkdir(parents=True)
+    seconds, nanoseconds = 1700000000, 250000000
+    rng = np.random.default_rng(4)
+    points = np.zeros(500, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("intensity", "f4")])
+    points["x"], points["y"], points["z"] = rng.uniform(-8, 8, 500), rng.uniform(-8, 8, 500), -1.0
+    np.savez_compressed(folder / "clouds" / f"{seconds}_{nanoseconds:09d}.npz", cloud=points)
+    optical = np.array([[0, 0, 1, 0.3], [-1, 0, 0, 0], [0, -1, 0, 0.5], [0, 0, 0, 1.0]])
+    lidar = np.eye(4)
+    lidar[2, 3] = 0.9
+    transforms = {"T_base_link__os_sensor": {"rows": 4, "cols": 4, "data": lidar.ravel().tolist()}}
+    for name in ("camera_front", "camera_rear"):
+        image = rng.integers(0, 255, (30, 40, 3), np.uint8)
+        cv2.imwrite(str(folder / "images" / f"{seconds}_{nanoseconds:09d}_{name}.png"), image)
+        transforms[f"T_base_link__{name}"] = {"rows": 4, "cols": 4, "data": optical.ravel().tolist()}
+        camera = {
+            "image_width": 40, "image_height": 30, "camera_name": name, "distortion_model": "plumb_bob",
+            "camera_matrix": {"rows": 3, "cols": 3, "data": [30.0, 0.0, 19.5, 0.0, 30.0, 14.5, 0.0, 0.0, 1.0]},
+            "distortion_coefficients": {"rows": 1, "cols": 5, "data": [0.0] * 5},
+        }  # fmt: skip
+        (folder / "calibration" / "cameras" / f"{name}.yaml").write_text(yaml.safe_dump(camera))
+    (folder / "calibration" / "transformations.yaml").write_text(yaml.safe_dump(transforms))
+    rows = ["timestamp, T00"]
+    for i in range(120):
+        pose = lidar.copy()
+        pose[0, 3] = 0.05 * max(0, i - 20)
+        stamp = f"{seconds}.{nanoseconds // 10**6 + 0:03d}" if i == 0 else f"{seconds + (i + 2) // 10}.{(i + 2) % 10}5"
+        rows.append(", ".join([stamp, *(f"{value:.9f}" for value in pose[:3].ravel())]))
+    (folder / "poses" / "lidar_poses.csv").write_text("\n".join(rows) + "\n")
+    return folder
+
+
+def cut(file):
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+
+
+def changed_yaml(file, change):
+    content = yaml.safe_load(file.read_text())
+    change(content)
+    file.write_text(yaml.safe_dump(content))
+
+
+def edited_poses(file, row, column, value):
+    lines = file.read_text().splitlines()
+    parts = [part.strip() for part in lines[row].split(",")] if "," in lines[row] else lines[row].split()
+    parts[column : column + 1] = [] if value is None else [value]
+    lines[row] = (", " if "," in lines[row] else " ").join(parts)
+    file.write_text("\n".join(lines) + "\n")
+
+
+def saved(file, **arrays):
+    with open(file, "wb") as stream:
+        np.savez(stream, **arrays)
+
+
+ROUGH_POSES, ROUGH_TRANSFORMS = "poses/lidar_poses.csv", "calibration/transformations.yaml"
+ROUGH_CLOUD, ROUGH_IMAGE = "clouds/1700000000_250000000.npz", "images/1700000000_250000000_camera_rear.png"
+ROUGH_CAMERA = "calibration/cameras/camera_rear.yaml"
+ROUGH_DAMAGE = {
+    "cut cloud": (ROUGH_CLOUD, cut),
+    "empty cloud": (ROUGH_CLOUD, lambda file: file.write_bytes(b"")),
+    "no array": (ROUGH_CLOUD, lambda file: saved(file)),
+    "objects": (ROUGH_CLOUD, lambda file: saved(file, a=np.array([{}], object))),
+    "other fields": (ROUGH_CLOUD, lambda file: saved(file, a=np.zeros((5, 3)))),
+    "fields of text": (ROUGH_CLOUD, lambda file: saved(file, a=np.zeros(5, [(n, "U3") for n in "xyz"]))),
+    "NaN points": (ROUGH_CLOUD, lambda file: saved(file, a=np.full(5, np.nan, [(n, "f4") for n in "xyz"]))),
+    "cut image": (ROUGH_IMAGE, cut),
+    "empty image": (ROUGH_IMAGE, lambda file: file.write_bytes(b"")),
+    "image of another size": (ROUGH_IMAGE, lambda file: cv2.imwrite(str(file), np.zeros((15, 20, 3), np.uint8))),
+    "NaN pose": (ROUGH_POSES, lambda file: edited_poses(file, 30, 4, "nan")),
+    "infinite pose": (ROUGH_POSES, lambda file: edited_poses(file, 30, 1, "inf")),
+    "missing column": (ROUGH_POSES, lambda file: edited_poses(file, 30, 4, None)),
+    "text": (ROUGH_POSES, lambda file: edited_poses(file, 30, 4, "east")),
+    "text as stamp": (ROUGH_POSES, lambda file: edited_poses(file, 30, 0, "noon")),
+    "one stamp": (ROUGH_POSES, lambda file: file.write_text("\n".join(["t", *file.read_text().splitlines()[1:2] * 3]))),
+    "poses in binary": (ROUGH_POSES, lambda file: file.write_bytes(b"\xff\xfe\x00\x81")),
+    "poses of another time": (
+        ROUGH_POSES, lambda file: file.write_text(file.read_text().replace("\n1700", "\n1600")),
+    ),
+    "no dictionary": (ROUGH_TRANSFORMS, lambda file: changed_yaml(file, lambda c: c.update(T_base_link__os_sensor=3))),
+    "NaN transform": (
+        ROUGH_TRANSFORMS,
+        lambda file: changed_yaml(file, lambda c: c["T_base_link__os_sensor"]["data"].__setitem__(3, float("nan"))),
+    ),
+    "no data": (ROUGH_TRANSFORMS, lambda file: changed_yaml(file, lambda c: c["T_base_link__os_sensor"].pop("data"))),
+    "data is a number": (
+        ROUGH_TRANSFORMS, lambda file: changed_yaml(file, lambda c: c["T_base_link__os_sensor"].update(data=3)),
+    ),
+    "matrix of another image": (
+        ROUGH_CAMERA, lambda file: changed_yaml(file, lambda c: c.update(image_width=160, image_height=120)),
+    ),
+    "NaN matrix": (
+        ROUGH_CAMERA, lambda file: changed_yaml(file, lambda c: c["camera_matrix"]["data"].__setitem__(0, float("nan")))
+    ),
+    "no size": (ROUGH_CAMERA, lambda file: changed_yaml(file, lambda c: c.pop("image_width"))),
+    "cut calibration": (ROUGH_CAMERA, lambda file: file.write_text(file.read_text()[:60] + "[")),
+}  # fmt: skip
+RELLIS_IMAGE = "pylon_camera_node/frame000005-1581624653_250.jpg"
+RELLIS_CLOUD = "os1_cloud_node_kitti_bin/000005.bin"
+RELLIS_DAMAGE = {
+    "cut image": (RELLIS_IMAGE, cut),
+    "empty image": (RELLIS_IMAGE, lambda file: file.write_bytes(b"")),
+    "image of another size": (RELLIS_IMAGE, lambda file: cv2.imwrite(str(file), np.zeros((15, 24, 3), np.uint8))),
+    "cut cloud": (RELLIS_CLOUD, lambda file: file.write_bytes(file.read_bytes()[:1001])),
+    "empty cloud": (RELLIS_CLOUD, lambda file: file.write_bytes(b"")),
+    "three columns": (
+        RELLIS_CLOUD, lambda file: np.fromfile(file, np.float32).reshape(-1, 4)[:, :3].copy().tofile(file),
+    ),
+    "doubles": (RELLIS_CLOUD, lambda file: np.fromfile(file, np.float32).astype(np.float64).tofile(file)),
+    "NaN points": (RELLIS_CLOUD, lambda file: np.full((50, 4), np.nan, np.float32).tofile(file)),
+    "NaN pose": ("poses.txt", lambda file: edited_poses(file, 5, 3, "nan")),
+    "missing column": ("poses.txt", lambda file: edited_poses(file, 5, 3, None)),
+    "NaN focal length": ("camera_info.txt", lambda file: file.write_text("nan 41.0 24.0 15.0")),
+    "matrix of another image": ("camera_info.txt", lambda file: file.write_text("160.0 164.0 96.0 60.0")),
+    "NaN transform": (
+        "transforms.yaml",
+        lambda file: changed_yaml(file, lambda c: c["os1_cloud_node-pylon_camera_node"]["t"].update(x=float("nan"))),
+    ),
+    "no rotation": (
+        "transforms.yaml",
+        lambda file: changed_yaml(file, lambda c: next(iter(c.values())).update(q=dict.fromkeys("xyzw", 0))),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("kind", "damage"), [*(("rough", name) for name in ROUGH_DAMAGE), *(("rellis", name) for name in RELLIS_DAMAGE)]
+)
+def test_a_damaged_folder_is_refused_in_one_line_that_names_the_file(tmp_path, capsys, kind, damage):
+    folder = rough_folder(tmp_path) if kind == "rough" else rellis_folder(tmp_path)
+    assert cli.main([kind, str(folder), str(tmp_path / "whole")]) == 0, capsys.readouterr().err
+    name, change = (ROUGH_DAMAGE if kind == "rough" else RELLIS_DAMAGE)[damage]
+    assert (folder / name).is_file()
+    change(folder / name)
+    capsys.readouterr()
+    assert cli.main([kind, str(folder), str(tmp_path / "bag")]) == 1
+    said = capsys.readouterr().err.splitlines()
+    named = folder.name if damage == "poses of another time" else name.rpartition("/")[2]
+    assert len(said) == 1 and said[0].startswith("convert: ") and named in said[0], said
+    assert not (tmp_path / "bag").exists()
+
+
+def test_frames_without_a_pose_are_named(tmp_path, capsys):
+    folder = rellis_folder(tmp_path)
+    poses = folder / "poses.txt"
+    poses.write_text("\n".join(poses.read_text().splitlines()[:-2]))
+    assert cli.main(["rellis", str(folder), str(tmp_path / "bag")]) == 0
+    assert "2 frames after the last of the 10 poses are left out" in capsys.readouterr().out

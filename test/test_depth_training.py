@@ -156,6 +156,20 @@ def test_features_are_those_of_the_encoder_and_computed_once(world, tmp_path):
         image_features(encoder, [world], tmp_path, variants=0)
 
 
+def test_features_of_another_sweep_or_ground_are_computed_anew(world, tmp_path):
+    """Depths are those that the sweep measured, and rays begin above the ground under the wheels."""
+    encoder = encoder_of()
+    before = image_features(encoder, [world], tmp_path, variants=0)
+    other = replace(world, sweeps=world.sweeps[::4].copy(), sweep_ends=world.sweep_ends // 4)
+    features = image_features(encoder, [other], tmp_path, variants=0)
+    batch, targets = sample(other, 0, CONFIG)
+    expected = torch.where(batch.seen, targets.depth, 0.0)
+    assert torch.equal(features.depth[: len(expected)], expected)
+    assert not torch.equal(before.depth[: len(expected)], expected)
+    lower = image_features(encoder, [replace(world, support=world.support - [0.0, 0.0, 0.3])], tmp_path, variants=0)
+    torch.testing.assert_close(lower.origins[:, 2], before.origins[:, 2] + 0.3, rtol=0.0, atol=1e-4)
+
+
 def test_an_interrupted_training_continues_as_if_it_had_not_been(world, tmp_path, one_thread):
     settings = DepthSettings(steps=6, batch=4, warm_up=2, save_every=3)
 

@@ -10,6 +10,7 @@ from conftest import ROOT
 from matplotlib.collections import PathCollection
 from scipy.integrate import trapezoid
 from scipy.spatial.transform import Rotation
+from test_training_guards import camera_bag
 
 from monoforce_ros.bags import BagWriter, Recording, builders, observe
 from monoforce_ros.bags.recorded_observation import MAXIMUM_SPREAD
@@ -215,7 +216,9 @@ def test_images_further_from_the_stamp_than_the_limit_are_left_out(tmp_path):
         bag.write("/points", builders.point_cloud(start, "lidar", np.ones((5, 3))), start)
         image = builders.image(start, "camera_front", np.full((4, 6, 3), 9, np.uint8))
         bag.write("/camera_front/image_raw", image, start)
-        calibration = builders.camera_info(start, "camera_front", 6, 4, np.diag([5.0, 5, 1]), [0] * 5)
+        calibration = builders.camera_info(
+            start, "camera_front", 6, 4, [[5.0, 0, 2.5], [0, 5, 1.5], [0, 0, 1]], [0] * 5
+        )
         bag.write("/camera_front/camera_info", calibration, start)
     recording = Recording.open(tmp_path / "recording")
     topics = ("/camera_front/image_raw",)
@@ -226,6 +229,22 @@ def test_images_further_from_the_stamp_than_the_limit_are_left_out(tmp_path):
     assert neither.cloud is None and not neither.images
     # A cloud that is not combined with images may be as old as the only one is.
     assert observe(recording, robot, far, ("lidar",)).cloud is not None
+
+
+def test_a_camera_that_dies_or_has_no_pose_ends_no_evaluation(tmp_path, capsys):
+    cameras = {
+        "first": {"times": np.arange(0.0, 6.0, 0.1)}, "second": {}, "third": {"mounted": False},
+        "again": {"of": "second", "name": "/second/image_raw/compressed"},
+    }  # fmt: skip
+    bag = camera_bag(tmp_path / "bag", **cameras)
+    arguments = ["--terrain", "camera", "--horizons", "1", "--stride", "2", "--quiet", "--out", str(tmp_path / "out")]
+    assert main([str(bag), *arguments]) == 0
+    said = capsys.readouterr().err
+    assert "/third/image_raw is left out: " in said and "the pose of frame 'third' on the robot is unknown" in said
+    assert "/second/image_raw/compressed is left out: of the same camera as /second/image_raw" in said
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    # Every 2 s of 16 s, less the horizon.
+    assert report["windows"] == 8 and any("/third/image_raw is left out" in remark for remark in report["remarks"])
 
 
 def test_the_former_name_of_the_retention_time_works_and_warns(demo_bag, capsys):

@@ -55,7 +55,14 @@ EXAMPLES = {
         decoding.decode_image,
     ),
     "camera_info": (
-        lambda: builders.camera_info(STAMP, "camera", 64, 48, np.diag([60.0, 60.0, 1.0]), [0.1, 0.0, 0.0, 0.0, 0.0]),
+        lambda: builders.camera_info(
+            STAMP,
+            "camera",
+            64,
+            48,
+            np.array([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1.0]]),
+            [0.1, 0.0, 0.0, 0.0, 0.0],
+        ),
         decoding.decode_camera_info,
     ),
     "cloud": (

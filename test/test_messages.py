@@ -91,6 +91,14 @@ def test_bayer_patterns_have_red_pixels_where_their_names_say(name):
     assert colour[0] > 150 and colour[1] < 20 and colour[2] < 20
 
 
+@pytest.mark.parametrize("bits", [10, 12, 14, 16])
+def test_images_of_a_sensor_with_fewer_bits_than_are_sent_are_not_black(bits):
+    values = np.linspace(0, (1 << bits) - 1, 48).astype("<u2").reshape(6, 8)
+    message = builders.image(STAMP, "camera", values.view(np.uint8).reshape(6, 16, 1), "mono16")
+    message.width = 8
+    np.testing.assert_array_equal(decoding.decode_image(message)[..., 0], values >> (bits - 8))
+
+
 def test_rows_with_padding_and_other_byte_orders_are_read():
     message = builders.image(STAMP, "camera", np.zeros((4, 6, 3), np.uint8))
     padded = np.zeros((4, 20), np.uint8)

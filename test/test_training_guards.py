@@ -2,19 +2,21 @@
 
 from dataclasses import asdict, replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from test_training import maps_of
 
-from monoforce_ros.bags import Recording, smooth
-from monoforce_ros.core import without_nan
+from monoforce_ros.bags import BagReader, BagWriter, Recording, builders, chosen_cameras, observe, smooth
+from monoforce_ros.core import homogeneous, without_nan
 from monoforce_ros.encoder import EncoderConfig, load_encoder, new_encoder
 from monoforce_ros.encoder.checkpoint import shipped_checkpoint
 from monoforce_ros.encoder.view import support_plane
 from monoforce_ros.robots import load_robot, robot_digest
 from monoforce_ros.training import train_cli
-from monoforce_ros.training.adaptation import shares_targets, split_recording
+from monoforce_ros.training.adaptation import REPLAY_WORLDS, shares_targets, split_recording
 from monoforce_ros.training.batches import Batches
 from monoforce_ros.training.losses import LossWeights, geometric_loss
 from monoforce_ros.training.recording_samples import SamplesError, read_samples
@@ -23,13 +25,13 @@ from monoforce_ros.training.sample_extraction import (
     _fingerprint,
     _segments,
     _trace,
-    _usable_topics,
     extract_samples,
 )
 from monoforce_ros.training.samples import Augmentation, sample
 from monoforce_ros.training.train_cli import build_parser, main
 from monoforce_ros.training.trainer import Process, Trainer, TrainingSettings, is_symmetric
 from monoforce_ros.training.training_state import TrainingError
+from monoforce_ros.training.world_samples import FIRST_WORLD, REPLAY_WORLD
 
 CONFIG = EncoderConfig(image_width=64, image_height=64, depth_bins=8, map_features=8, image_features=8)
 
@@ -163,29 +165,171 @@ def test_configurations_of_damaged_checkpoints_are_refused(name, value):
         EncoderConfig(**{**asdict(EncoderConfig()), name: value})
 
 
-def test_topics_that_cost_samples_are_left_out(capsys):
-    class Bag:
-        path = "bag"
+START, OPTICAL = 10**18, np.array([[0, 0, 1.0, 0.3], [-1, 0, 0, 0], [0, -1, 0, 0.4], [0, 0, 0, 1]])
+SECONDS = 16
 
-        def __init__(self, **images):
-            self.images = {f"/{name}": [FrameAt(round(t * 1e9)) for t in times] for name, times in images.items()}
 
-        def image(self, frame):
-            if frame.stamp == 7 * 10**9:
-                raise ValueError("16UC1 is no colour image")
-            return np.zeros((4, 4, 3), np.uint8)
+def camera_bag(path, **topics):
+    """A drive over level ground with cameras of 48 × 32 px at 5 Hz, each named by its frame; options of each topic:
 
-    class FrameAt:
-        def __init__(self, stamp):
-            self.stamp = stamp
+    name, times, encoding, size, info and mounted (whether its frame is on /tf_static).
+    """
+    with BagWriter(path) as bag:
+        mounted = {frame: OPTICAL for frame, options in topics.items() if options.get("mounted", True)}
+        bag.write("/tf_static", builders.static_transforms(START, "base_link", mounted), START)
+        for i in range(50 * SECONDS):
+            at = START + i * 20_000_000
+            place = [0.01 * i, 0.0, 0.0]
+            bag.write(
+                "/odom", builders.odometry(at, "odom", "base_link", place, [0, 0, 0, 1], [0.5, 0, 0], [0] * 3), at
+            )
+            bag.write("/cmd_vel", builders.twist_stamped(at, "base_link", 0.5, 0.0), at)
+        for frame, options in topics.items():
+            name = options.get("name", f"/{frame}/image_raw")
+            height, width = options.get("size", (32, 48))
+            for time in options.get("times", np.arange(0.0, SECONDS, 0.2)):
+                at = START + round(1e9 * time)
+                image = builders.image(at, frame, np.full((height, width, 3), 90, np.uint8))
+                image.encoding = options.get("encoding", "rgb8")
+                if name.endswith("/compressed"):
+                    _, data = cv2.imencode(".png", np.zeros((height, width, 3), np.uint8))
+                    image = builders.compressed_image(at, frame, "png", data.tobytes())
+                bag.write(name, image, at)
+                info = builders.camera_info(at, options.get("of", frame), 48, 32, MATRIX, [0.0] * 5)
+                bag.write(f"/{options.get('of', frame)}/camera_info", info, at)
+    return path
 
-    times = np.arange(0.0, 12.0, 0.2)
-    bag = Bag(front=times, rear=times + 0.03, dead=times[:12], depth=[7.0, 7.2])
-    assert _usable_topics(bag, tuple(bag.images)) == ("/front", "/rear")
+
+MATRIX = np.array([[40.0, 0, 23.5], [0, 40.0, 15.5], [0, 0, 1]])
+
+
+def extracted(bag, husky, folder, **settings):
+    return read_samples(extract_samples(bag, husky, CONFIG, folder / "samples", settings=SampleSettings(**settings)))
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"size": (16, 24)}, "images are 24 × 16 px, but CameraInfo says 48 × 32 px"),
+        ({"mounted": False}, "the pose of frame 'second' on the robot is unknown"),
+        ({"encoding": "16UC1"}, "image encoding: got '16UC1'"),
+        ({"of": "first", "name": "/first/image_raw/compressed"}, "of the same camera as /first/image_raw"),
+    ],
+)
+def test_a_camera_that_cannot_be_used_does_not_cost_the_others_and_is_named(tmp_path, husky, capsys, options, reason):
+    bag = camera_bag(tmp_path / "bag", first={}, second=options)
+    samples = extracted(bag, husky, tmp_path)
+    assert len(samples) > 20 and len(samples.cameras) == 1
     said = capsys.readouterr().err
-    assert "/dead is left out: images at 20%" in said and "/depth is left out: 16UC1" in said
-    with pytest.raises(SamplesError, match="no usable image: /depth"):
-        _usable_topics(Bag(depth=[7.0]), ("/depth",))
+    assert options.get("name", "/second/image_raw") + " is left out: " in said and reason in said
+    if "of" not in options:
+        with pytest.raises(SamplesError, match="no usable image: /second/image_raw: "):
+            extracted(camera_bag(tmp_path / "alone", second=options), husky, tmp_path)
+
+
+def test_of_one_camera_the_topic_with_more_images_is_used(tmp_path, husky):
+    bag = camera_bag(
+        tmp_path / "bag", first={"times": np.arange(0.0, SECONDS, 1.0)},
+        second={"of": "first", "name": "/first/image_raw/compressed"},
+    )  # fmt: skip
+    assert chosen_cameras(Recording.open(bag), husky).topics == ("/first/image_raw/compressed",)
+
+
+@pytest.mark.parametrize("dead", ["first", "second"])
+def test_a_camera_that_dies_does_not_cost_later_samples(tmp_path, husky, capsys, dead):
+    # Even of the faster one, whose images the samples are at.
+    cameras = {"first": {"times": np.arange(0.0, SECONDS, 0.1)}, "second": {}}
+    whole = extracted(camera_bag(tmp_path / "whole", **cameras), husky, tmp_path)
+    cameras[dead] = {"times": np.arange(0.0, 9.0, 0.05 if dead == "first" else 0.2)}
+    samples = extracted(camera_bag(tmp_path / "bag", **cameras), husky, tmp_path)
+    assert abs(len(samples) - len(whole)) <= 1
+    has = np.isfinite(samples.odometry_from_cameras).all(axis=(2, 3))
+    number = ["first", "second"].index(dead)
+    early, late = samples.stamps <= START + 8.8e9, samples.stamps > START + 9.1e9
+    assert has[:, 1 - number].all() and has[early].all() and not has[late, number].any() and late.sum() > 5
+    said = capsys.readouterr().err
+    assert f"/{dead}/image_raw has usable images for {has[:, number].sum()} of {len(samples)} samples" in said
+    counts = [len(sample(samples, i, CONFIG)[0].images) for i in (0, len(samples) - 1)]
+    assert counts == [2, 1]
+
+
+def test_a_camera_on_a_pan_tilt_head_is_where_it_was_at_each_image(tmp_path, husky):
+    rate = 0.4
+
+    def head(time):
+        return homogeneous(Rotation.from_euler("z", rate * time).as_matrix(), np.zeros(3))
+
+    bag = camera_bag(tmp_path / "bag", first={"mounted": False})
+    with BagReader(bag) as reader:
+        messages = [(m.topic, m.decode(), m.received) for m in reader.messages(reader.topics)]
+    with BagWriter(tmp_path / "moving") as written:
+        for topic, message, at in messages:
+            written.write(topic, message, at)
+        written.write("/tf_static", builders.transforms(START, "head", {"first": OPTICAL}), START)
+        for time in np.arange(0.0, SECONDS, 0.07):
+            at = START + round(1e9 * time)
+            written.write("/tf", builders.transforms(at, "base_link", {"head": head(time)}), at)
+    samples = extracted(tmp_path / "moving", husky, tmp_path)
+    assert len(samples) > 20
+    for i in (0, 3, len(samples) - 1):
+        mounted = np.linalg.inv(samples.odometry_from_base[i]) @ samples.odometry_from_cameras[i, 0]
+        expected = head((samples.stamps[i] - START) * 1e-9) @ OPTICAL
+        np.testing.assert_allclose(mounted, expected, atol=1e-3)
+    # As for evaluate and diagnose.
+    recording = Recording.open(tmp_path / "moving").in_base_frame("base_link")
+    seen = observe(recording, husky, START + 4_100_000_000, ("camera",), tuple(recording.images))
+    np.testing.assert_allclose(
+        next(iter(seen.base_from_cameras.values()))[:3, :3], (head(4.0) @ OPTICAL)[:3, :3], atol=1e-3
+    )
+
+
+def test_a_period_between_those_of_images_holds_on_average(tmp_path, husky, capsys):
+    samples = extracted(camera_bag(tmp_path / "bag", first={}), husky, tmp_path, period=0.5)
+    assert np.diff(samples.stamps).mean() * 1e-9 == pytest.approx(0.5, abs=0.01)
+    assert "instead of" not in capsys.readouterr().err
+    extracted(tmp_path / "bag", husky, tmp_path, period=0.05)
+    assert "a sample every 0.2 s instead of 0.05 s: images come no more often" in capsys.readouterr().err
+
+
+def test_a_sweep_encoder_needs_no_images(tmp_path, husky, capsys):
+    rng = np.random.default_rng(1)
+    ground = np.column_stack([rng.uniform(-6, 6, (4000, 2)), np.full(4000, -0.6)])
+    with BagWriter(tmp_path / "bag") as bag:
+        mounted = homogeneous(np.eye(3), np.array([0.0, 0.0, 0.47]))
+        bag.write("/tf_static", builders.static_transforms(START, "base_link", {"lidar": mounted}), START)
+        for i in range(50 * SECONDS):
+            at, place = START + i * 20_000_000, [0.01 * i, 0.0, 0.0]
+            bag.write(
+                "/odom", builders.odometry(at, "odom", "base_link", place, [0, 0, 0, 1], [0.5, 0, 0], [0] * 3), at
+            )
+            bag.write("/cmd_vel", builders.twist_stamped(at, "base_link", 0.5, 0.0), at)
+            if i % 10 == 0:
+                bag.write("/points", builders.point_cloud(at, "lidar", ground), at)
+    swept = replace(CONFIG, sensor="lidar")
+    samples = read_samples(extract_samples(tmp_path / "bag", husky, swept, tmp_path / "samples"))
+    assert len(samples) > 20 and samples.images.shape[1] == 0 and len(samples.sweep(5)) > 500
+    batch, target = sample(samples, 5, swept)
+    assert batch.sweep.abs().sum() > 0 and not len(batch.images) and target.observed.any()
+    # An encoder of images cannot use them.
+    with pytest.raises(SamplesError, match="no images with a CameraInfo"):
+        extract_samples(tmp_path / "bag", husky, CONFIG, tmp_path / "samples")
+    out = tmp_path / "out"
+    arguments = [str(tmp_path / "bag"), "--sensor", "lidar", "--out", str(out), "--steps", "1", "--batch", "2"]
+    assert main([*arguments, "--no-vegetation", "--quiet"]) == 0, capsys.readouterr().err
+    assert load_encoder(out / "encoder.safetensors").config.sensor == "lidar"
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_adapting_keeps_to_options_that_are_the_defaults_of_a_training(given):
+    explicit = ["--steps", "2000", "--rate", "1.5e-3", "--worlds", "0", "--world-seed", str(FIRST_WORLD)]
+    options = build_parser().parse_args(["bag", "--adapt", "--out", "o", *(explicit if given else [])])
+    settings = train_cli._adaptation_settings(options)
+    assert (settings.steps, settings.rate) == ((2000, 1.5e-3) if given else (80, 4e-4))
+    worlds = train_cli._world_seeds(options, REPLAY_WORLD, REPLAY_WORLDS)
+    assert worlds == (range(FIRST_WORLD, FIRST_WORLD) if given else range(REPLAY_WORLD, REPLAY_WORLD + REPLAY_WORLDS))
+    trained = train_cli._settings(build_parser().parse_args(["bag"]))
+    assert (trained.steps, trained.rate) == (TrainingSettings.steps, TrainingSettings.rate)
+    assert train_cli._world_seeds(build_parser().parse_args(["bag"])) == range(FIRST_WORLD, FIRST_WORLD)
 
 
 @pytest.mark.parametrize(
@@ -193,6 +337,9 @@ def test_topics_that_cost_samples_are_left_out(capsys):
     [
         (["bag", "--adapt", "--out", "o", "--sensor", "camera"], "--sensor"),
         (["bag", "--adapt", "--out", "o", "--held-out", "x"], "--held-out"),
+        # Those of a training by default, too: an adaptation has others.
+        (["bag", "--adapt", "--out", "o", "--losses", "geometric", "terrain", "trajectory"], "--losses has no effect"),
+        (["bag", "--adapt", "--out", "o", "--size=320x240"], "--size has no effect"),
         (["--adapt", "--worlds", "1", "--out", "o"], "--adapt: got no bag"),
     ],
 )

@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING
 
 from monoforce_ros.bags import builders
+from monoforce_ros.bags.camera_choice import CameraChoice, chosen_cameras, image_frames
 from monoforce_ros.bags.joint_record import JointRecord
 from monoforce_ros.bags.read_options import DETECTED, ReadOptions, add_read_options, read_options
 from monoforce_ros.bags.reader import BagError, BagMessage, BagReader
@@ -29,9 +30,11 @@ from monoforce_ros.bags.writer import BagWriter
 from monoforce_ros.core import lazy_exports
 
 if TYPE_CHECKING:
-    from monoforce_ros.bags.recorded_observation import MAXIMUM_GAP, flippers_at, observe
+    from monoforce_ros.bags.recorded_observation import MAXIMUM_GAP, MAXIMUM_SPREAD, flippers_at, observe
 else:  # observations are of perception, which starts torch: players and recorders of bags do without
-    __getattr__ = lazy_exports(__name__, {"recorded_observation": ("MAXIMUM_GAP", "flippers_at", "observe")})
+    __getattr__ = lazy_exports(
+        __name__, {"recorded_observation": ("MAXIMUM_GAP", "MAXIMUM_SPREAD", "flippers_at", "observe")}
+    )
 
 __all__ = [
     "CAMERA_INFO",
@@ -41,11 +44,13 @@ __all__ = [
     "FIXED",
     "IMAGES",
     "MAXIMUM_GAP",
+    "MAXIMUM_SPREAD",
     "ODOMETRY",
     "BagError",
     "BagMessage",
     "BagReader",
     "BagWriter",
+    "CameraChoice",
     "Frame",
     "JointRecord",
     "ReadOptions",
@@ -55,9 +60,11 @@ __all__ = [
     "add_read_options",
     "builders",
     "camera_info_topics",
+    "chosen_cameras",
     "cut_windows",
     "find_transform",
     "flippers_at",
+    "image_frames",
     "is_rectified",
     "nearest_frame",
     "observe",

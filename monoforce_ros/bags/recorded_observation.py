@@ -35,7 +35,7 @@ def observe(
         frame = nearest_frame(recording.clouds, stamp, limit=MAXIMUM_SPREAD if "camera" in sensors else np.inf)
         if frame is not None:
             points, frame_id = recording.cloud(frame)
-            pose = recording.sensor_pose(frame_id, robot.base_frame, robot.sensors)
+            pose = recording.sensor_pose(frame_id, robot.base_frame, robot.sensors, frame.stamp)
             cloud = transform_points(_base_motion(recording, frame.stamp, stamp) @ pose, points).astype(np.float32)
     for topic in image_topics if "camera" in sensors else ():
         frame = nearest_frame(recording.images[topic], stamp, limit=MAXIMUM_SPREAD)
@@ -47,7 +47,7 @@ def observe(
         try:
             image = recording.image(frame)
             camera.check_image(image)
-            pose = recording.sensor_pose(camera.frame_id, robot.base_frame, robot.sensors)
+            pose = recording.sensor_pose(camera.frame_id, robot.base_frame, robot.sensors, frame.stamp)
         except ValueError as error:
             refused = refused or error
             continue

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from monoforce_ros.bags.builders import Message
 from monoforce_ros.bags.command_timeout import TIMEOUT, expired
 from monoforce_ros.bags.joint_record import JointRecord
+from monoforce_ros.bags.moving_frame import MovingFrame
 from monoforce_ros.bags.open_bags import opened
 from monoforce_ros.bags.reader import BagError, BagMessage, BagReader
 from monoforce_ros.bags.recorded_clock import from_reception, longest_part
@@ -42,6 +43,7 @@ from monoforce_ros.core import (
     JointTrack,
     MotionState,
     MotionTrack,
+    PoseTrack,
     RobotFrames,
     TransformTree,
     WheelTrack,
@@ -106,6 +108,10 @@ class Recording:
     """The frame that the odometry messages describe; ``motion`` may be that of the base."""
     joints: JointRecord | None = None
     """Measured and commanded joints of the robot for which the bag was opened, if there are any."""
+    info_topics: dict[str, str] = field(default_factory=dict)
+    """Topic of the CameraInfo of each image topic that has one."""
+    moving_transforms: dict[tuple[str, str], PoseTrack] = field(default_factory=dict)
+    """Poses by parent and child frame on /tf that move beside the odometry frame, as those of a pan-tilt head."""
 
     @classmethod
     def open(
@@ -196,13 +202,14 @@ class Recording:
         """Pose ``[4, 4]`` of a sensor frame in the base frame by the bag's static transforms; None if unconnected."""
         return find_transform(self.static_transforms, base_frame, frame_id)
 
-    def sensor_pose(self, frame_id: str, base_frame: str, known: Mapping[str, object]) -> np.ndarray:
+    def sensor_pose(self, frame_id: str, base_frame: str, known: Mapping[str, object], stamp: int) -> np.ndarray:
         """Pose ``[4, 4]`` of a sensor in the base frame: from the bag's transforms, else from ``known``.
 
         Args:
             frame_id: frame of the sensor.
             base_frame: base frame of the robot.
             known: poses ``[4, 4]`` of the sensors in the robot file, by frame.
+            stamp: of the sensor's data [ns]; a sensor may move on the robot.
 
         Raises:
             BagError: neither has the frame.
@@ -213,9 +220,15 @@ class Recording:
                 "record the driver's own topic, in the sensor's frame"
             )
         try:
-            return RobotFrames(base_frame, known).sensor_pose(frame_id, TransformTree(self.static_transforms))
+            return RobotFrames(base_frame, known).sensor_pose(frame_id, self._transforms_at(stamp))
         except FrameError as error:
             raise BagError(f"{self.path}: {error}") from error
+
+    def _transforms_at(self, stamp: int) -> TransformTree:
+        tree = TransformTree(self.static_transforms)
+        for (parent, child), track in self.moving_transforms.items():
+            tree.add(parent, child, track.at(stamp))
+        return tree
 
     def in_base_frame(
         self, base_frame: str, odometry_child_pose: np.ndarray | None = None, *, file_frame: str = ""
@@ -328,6 +341,7 @@ class _Collector:
         self._moving: set[tuple[str, str]] = set()
         self._newest: dict[tuple[str, str], np.ndarray] = {}
         self._series: dict[tuple[str, str], list[tuple[int, np.ndarray]]] = {}
+        self._moved: dict[tuple[str, str], MovingFrame] = {}
         self.warnings: list[str] = []
         self.choices: list[str] = []
 
@@ -369,7 +383,7 @@ class _Collector:
                 if message.topic not in self.cameras:
                     self.cameras[message.topic] = decoding.decode_camera_info(decoded)
             elif message.message_type == TRANSFORMS:
-                self._take_transforms(decoding.decode_transforms(decoded), message.topic.endswith("tf_static"))
+                self._take_transforms(decoded, message)
         except ValueError as error:
             if len(self.warnings) < 20:
                 self.warnings.append(f"{message.topic}: {error}")
@@ -459,13 +473,18 @@ class _Collector:
             return
         kept.append((stamp, decoding.decode_joints(message, self.robot.joint_names)[0]))
 
-    def _take_transforms(self, found: dict[tuple[str, str], np.ndarray], static: bool) -> None:
-        """Keep static transforms and, of moving ones, those that hold still: frames fixed on the robot."""
+    def _take_transforms(self, message: Message, received: BagMessage) -> None:
+        """Keep static transforms and, of others, those that hold still: frames fixed on the robot; and what moves."""
+        found = decoding.decode_transforms(message)
+        if received.topic.endswith("tf_static"):
+            self.transforms |= found
+            return
+        stamps = decoding.transform_stamps(message)
         for frames, matrix in found.items():
-            if static:
-                self.transforms[frames] = matrix
-                continue
             self._keep_beside_child(frames, matrix)
+            if self.frames[0].lstrip("/") not in (frame.lstrip("/") for frame in frames):
+                kept = self._moved.setdefault(frames, MovingFrame())
+                kept.add(stamps[frames] or received.received, matrix)
             if frames not in self._moving:
                 first = self.transforms.setdefault(frames, matrix)
                 if np.abs(first - matrix).max() > FIXED:
@@ -521,6 +540,12 @@ class _Collector:
                 f"silence expire after {TIMEOUT:g} s instead of being held"
             )
         wheels = self._wheel_track(commands, motion)
+        known = {topic: self.rectified if is_rectified(topic) else self.cameras for topic in image_topics}
+        info_topics = {
+            topic: found[0]
+            for topic, cameras in known.items()
+            if (found := [info for info in camera_info_topics(topic) if info in cameras])
+        }
         return Recording(
             path=self.bag.path,
             motion=motion,
@@ -530,18 +555,15 @@ class _Collector:
                 topic: tuple(sorted(self.indexed.get(topic, ()), key=lambda frame: frame.stamp))
                 for topic in image_topics
             },
-            cameras={
-                topic: cameras[found[0]]
-                for topic in image_topics
-                for cameras in [self.rectified if is_rectified(topic) else self.cameras]
-                if (found := [info for info in camera_info_topics(topic) if info in cameras])
-            },
+            cameras={topic: known[topic][info] for topic, info in info_topics.items()},
+            info_topics=info_topics,
             static_transforms=self.transforms,
             moving={
                 frames: (stamps, np.array(poses))
                 for frames, (stamps, poses) in ((frames, _in_order(kept)) for frames, kept in self._series.items())
                 if frames in self._moving
             },
+            moving_transforms={frames: kept.track() for frames, kept in self._moved.items() if frames in self._moving},
             topics={role: topic for role, topic in self.chosen.items() if topic},
             warnings=tuple(self.warnings),
             choices=tuple(self.choices),

@@ -28,7 +28,7 @@ from monoforce_ros.core.tracks import (
     StaleDataError,
     WheelTrack,
 )
-from monoforce_ros.core.transform_history import PoseHistory, TransformHistory
+from monoforce_ros.core.transform_history import PoseHistory, PoseTrack, TransformHistory
 from monoforce_ros.core.warp_start import start_warp
 
 __all__ = [
@@ -46,6 +46,7 @@ __all__ = [
     "MotionTrack",
     "OptionParser",
     "PoseHistory",
+    "PoseTrack",
     "RobotFrames",
     "StaleDataError",
     "TransformHistory",

@@ -22,8 +22,9 @@ _WIDEST_RAY, _FISHEYE_STEPS = np.radians(80.0), 1601
 """Angle off a fisheye's axis up to which its pixels have rays: beyond, a lens shows nothing that a map could use; and
 the number of angles at which its polynomial is tabulated."""
 _FISHEYE_ANGLE = np.radians(60.0)
-_CORNER = 0.95
-"""Share of both edges from which a principal point is in the corner: that of an image twice as large is at 1."""
+_OFF_CENTRE = 0.15
+"""Share of both edges by which a principal point is off the middle if the matrix is that of an image of another size:
+lenses are mounted to a few per cent of the edge, and common sizes are at least 4/3 of each other."""
 _MOST_OBLONG = 3.0
 """Largest ratio of the focal lengths in pixels: a binned or anamorphic image is up to twice as wide."""
 _SHORTEST, _LONGEST = 0.05, 60.0
@@ -72,6 +73,11 @@ class CameraModel:
             )
 
     @property
+    def _skew(self) -> float:
+        """Columns by which a pixel lies further to the right for each row below the principal point."""
+        return float(self.matrix[0, 1] / self.matrix[1, 1])
+
+    @property
     def is_distorted(self) -> bool:
         """Whether any distortion coefficient differs from zero."""
         return bool(np.any(self.distortion != 0.0))
@@ -115,10 +121,14 @@ class CameraModel:
                 f"camera matrix: got focal lengths {focal[0]:g} and {focal[1]:g} px for {size[0]} × {size[1]} px, "
                 f"expected {_SHORTEST:g} to {_LONGEST:g} times its edge: are they in pixels?"
             )
-        if (centre > _CORNER * size).all():
+        off = (centre + 0.5) / size - 0.5
+        # A region of an image may lie beside the optical axis, but rarely on both sides of the image.
+        if (off > _OFF_CENTRE).all() or (off < -_OFF_CENTRE).all():
             raise ValueError(
-                f"camera matrix: got the principal point ({centre[0]:g}, {centre[1]:g}) px in the corner of an image "
-                f"of {size[0]} × {size[1]} px, expected one near its middle: is the matrix that of a larger image?"
+                f"camera matrix: got the principal point ({centre[0]:g}, {centre[1]:g}) px of an image of "
+                f"{size[0]} × {size[1]} px, expected one near its middle: is the matrix that of a "
+                f"{'larger' if off[0] > 0 else 'smaller'} image? If the image is a region of a larger one, give its "
+                "place as `roi` of CameraInfo"
             )
         if self.distortion_model == "equidistant":
             return
@@ -191,8 +201,11 @@ class CameraModel:
         """
         pixels = np.asarray(pixels, np.float64)
         flat = pixels.reshape(-1, 1, 2)
+        if self._skew:
+            # OpenCV's functions leave out the matrix's skew.
+            flat = flat - np.array([self._skew, 0.0]) * (flat[..., 1:] - self.matrix[1, 2])
         if not self.is_distorted and self.distortion_model != "equidistant":
-            normalised = (flat[:, 0] - self.matrix[:2, 2]) / np.array([self.matrix[0, 0], self.matrix[1, 1]])
+            normalised = (flat[:, 0] - self.matrix[:2, 2]) / self.matrix[[0, 1], [0, 1]]
         elif self.distortion_model == "equidistant":
             normalised = self._fisheye_rays((flat[:, 0] - self.matrix[:2, 2]) / self.matrix[[0, 1], [0, 1]])
         else:
@@ -206,7 +219,7 @@ class CameraModel:
         """The camera after resizing its image to ``width`` × ``height`` pixels (pixel centres kept aligned)."""
         scale = np.array([width / self.width, height / self.height])
         matrix = self.matrix.copy()
-        matrix[0, 0] *= scale[0]
+        matrix[0, :2] *= scale[0]
         matrix[1, 1] *= scale[1]
         matrix[:2, 2] = (matrix[:2, 2] + 0.5) * scale - 0.5
         return CameraModel(width, height, matrix, self.distortion, self.distortion_model, self.frame_id)
@@ -218,7 +231,10 @@ class CameraModel:
             projected, _ = cv2.fisheye.projectPoints(points[:, None], zero, zero, self.matrix, self._fisheye())
         else:
             projected, _ = cv2.projectPoints(points[:, None], zero, zero, self.matrix, self.distortion)
-        return projected.reshape(-1, 2)
+        projected = projected.reshape(-1, 2)
+        if self._skew:
+            projected = projected + np.array([self._skew, 0.0]) * (projected[:, 1:] - self.matrix[1, 2])
+        return projected
 
     def _fisheye_angles(self) -> tuple[np.ndarray, np.ndarray]:
         """Angles off the axis [rad], as far as the image's radius grows with them, and these radii at focal length 1.

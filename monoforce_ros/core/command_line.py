@@ -33,10 +33,17 @@ class OptionParser(argparse.ArgumentParser):
             message += nearest(unknown[0].split("=")[0], self._known_options())
         super().error(message)
 
-    def refuse_without_effect(self, options: argparse.Namespace, names: Sequence[str], reason: str) -> None:
-        """End with an error if one of the options, which have no effect for a ``reason``, differs from its default."""
+    def refuse_without_effect(
+        self, options: argparse.Namespace, names: Sequence[str], reason: str, arguments: Sequence[str] = ()
+    ) -> None:
+        """End with an error if one of the options, which have no effect for a ``reason``, differs from its default.
+
+        Of the ``arguments`` of the command line, options with the value of their default are refused, too.
+        """
+        words = {word.split("=")[0] for word in map(str, arguments)}
+        given = {action.dest for word, action in self._option_string_actions.items() if word in words}
         for name in names:
-            if getattr(options, name) != self.get_default(name):
+            if name in given or getattr(options, name) != self.get_default(name):
                 self.error(f"--{name.replace('_', '-')} has no effect {reason}")
 
     def _known_options(self) -> set[str]:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import deque
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from monoforce_ros.core.frames import TransformTree
 from monoforce_ros.core.geometry import homogeneous
@@ -24,8 +26,14 @@ class PoseHistory:
         self._poses: deque[tuple[int, np.ndarray]] = deque()
 
     def add(self, stamp: int, pose: np.ndarray) -> None:
-        """Keep a pose ``[4, 4]`` of a stamp [ns]; late ones are ignored, after a backward time jump it starts anew."""
-        if self._poses and stamp <= self._poses[-1][0]:
+        """Keep a pose ``[4, 4]`` of a stamp [ns]; late ones are ignored, after a backward time jump it starts anew.
+
+        Of one stamp the last one counts: some publishers leave it at zero.
+        """
+        if self._poses and stamp == self._poses[-1][0]:
+            self._poses[-1] = stamp, pose
+            return
+        if self._poses and stamp < self._poses[-1][0]:
             if (self._poses[-1][0] - stamp) * NANOSECOND < _JUMP:
                 return
             self._poses.clear()
@@ -33,16 +41,16 @@ class PoseHistory:
         while (stamp - self._poses[0][0]) * NANOSECOND > _KEPT:
             self._poses.popleft()
 
-    def at(self, stamp: int) -> np.ndarray | None:
-        """The pose ``[4, 4]`` at a stamp [ns], interpolated; None before the oldest and after the newest one."""
+    def at(self, stamp: int, *, hold: bool = False) -> np.ndarray | None:
+        """The pose ``[4, 4]`` at a stamp [ns], interpolated.
+
+        Before the oldest one and after the newest one it is None or, with ``hold``, that one.
+        """
         poses = list(self._poses)
-        for (before, first), (after, second) in zip(poses[:1] + poses, poses, strict=False):
-            if before <= stamp <= after:
-                share = (stamp - before) / max(after - before, 1)
-                turns = Slerp([0.0, 1.0], Rotation.from_matrix(np.stack([first[:3, :3], second[:3, :3]])))
-                place = (1.0 - share) * first[:3, 3] + share * second[:3, 3]
-                return homogeneous(turns(share).as_matrix(), place)
-        return None
+        after = bisect_left(poses, stamp, key=lambda entry: entry[0])
+        if after < len(poses) and (after > 0 or poses[0][0] == stamp):
+            return _between(poses[max(after - 1, 0)], poses[after], stamp)
+        return poses[min(after, len(poses) - 1)][1] if hold and poses else None
 
     def gap_text(self, stamp: int) -> str:
         """How far a stamp [ns] is outside of the poses, in words."""
@@ -52,6 +60,37 @@ class PoseHistory:
         if stamp > newest:
             return f"the newest one is {(stamp - newest) * NANOSECOND:.2f} s older"
         return f"the oldest one kept is {(oldest - stamp) * NANOSECOND:.2f} s newer"
+
+
+@dataclass(frozen=True)
+class PoseTrack:
+    """A frame's recorded poses."""
+
+    stamps: np.ndarray
+    """``[n]`` int64 [ns], strictly increasing; at least one."""
+    poses: np.ndarray
+    """``[n, 4, 4]``."""
+
+    def at(self, stamp: int) -> np.ndarray:
+        """The pose ``[4, 4]`` at a stamp [ns], interpolated; beyond the first and last one, that one."""
+        after = int(np.searchsorted(self.stamps, stamp))
+        before, after = max(after - 1, 0), min(after, len(self.stamps) - 1)
+        first, second = ((int(self.stamps[i]), self.poses[i]) for i in (before, after))
+        return _between(first, second, min(max(stamp, first[0]), second[0]))
+
+
+def _between(first: tuple[int, np.ndarray], second: tuple[int, np.ndarray], stamp: int) -> np.ndarray:
+    """Pose ``[4, 4]`` at a stamp between two stamped poses [ns]: the translation linear, the turn at a constant rate.
+
+    Most frames of a robot do not move; a pose between two equal ones costs next to nothing.
+    """
+    (before, start), (after, end) = first, second
+    if np.array_equal(start, end):
+        return end
+    share = (stamp - before) / max(after - before, 1)
+    turn = Rotation.from_matrix(start[:3, :3].T @ end[:3, :3]).as_rotvec()
+    place = (1.0 - share) * start[:3, 3] + share * end[:3, 3]
+    return homogeneous(start[:3, :3] @ Rotation.from_rotvec(share * turn).as_matrix(), place)
 
 
 class TransformHistory:
@@ -68,11 +107,14 @@ class TransformHistory:
         else:
             self._stamped.setdefault((parent, child), PoseHistory()).add(stamp, matrix)
 
-    def at(self, stamp: int) -> TransformTree:
-        """The transforms that are known at a stamp [ns]."""
-        tree = TransformTree(self._static)
-        for (parent, child), history in self._stamped.items():
-            pose = history.at(stamp)
+    def at(self, stamp: int, *, hold: bool = False) -> TransformTree:
+        """The transforms that are known at a stamp [ns]; see :meth:`PoseHistory.at`.
+
+        Another thread may add transforms meanwhile.
+        """
+        tree = TransformTree(dict(self._static))
+        for (parent, child), history in list(self._stamped.items()):
+            pose = history.at(stamp, hold=hold)
             if pose is not None:
                 tree.add(parent, child, pose)
         return tree

@@ -20,8 +20,9 @@ from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import BagWriter, builders
 from monoforce_ros.core import CameraModel, homogeneous
-from monoforce_ros.datasets.dataset import DatasetError, odometry_message
+from monoforce_ros.datasets.dataset import DatasetError, odometry_message, require_returns
 from monoforce_ros.datasets.rough import motion_from_poses
+from monoforce_ros.messages import decoding
 
 LIDAR_FRAME, CAMERA_FRAME, BASE_FRAME = "os1_lidar", "pylon_camera", "base_link"
 CLOUDS, IMAGES = "os1_cloud_node_kitti_bin", "pylon_camera_node"
@@ -45,6 +46,8 @@ class RellisSequence:
     camera: CameraModel
     lidar_from_camera: np.ndarray
     """``[4, 4]``, with the optical frame of the camera."""
+    without_pose: int = 0
+    """Frames with a cloud or an image after the last pose."""
 
     @classmethod
     def open(cls, path: str | Path) -> RellisSequence:
@@ -88,28 +91,50 @@ class RellisSequence:
             map_from_lidar=poses,
             camera=_camera(path / "camera_info.txt", size),
             lidar_from_camera=_camera_pose(path / "transforms.yaml"),
+            without_pose=sum(frame >= len(poses) for frame in {*images, *_cloud_numbers(path / CLOUDS)}),
         )
 
     def __len__(self) -> int:
         return len(self.stamps)
 
     def cloud(self, frame: int) -> np.ndarray:
-        """Returns ``[n, 3]`` float32 [m] in the lidar's frame; raises ``DatasetError`` if there is no such cloud."""
+        """Returns ``[n, 3]`` float32 [m] in the lidar's frame.
+
+        Raises:
+            DatasetError: there is no such cloud, or its file does not hold rows of x, y, z and intensity.
+        """
         file = self.path / CLOUDS / f"{frame:06d}.bin"
         if not file.is_file():
             raise DatasetError(f"{file}: no such cloud")
         size = file.stat().st_size
         if size % 16 or not 0 < size <= LARGEST_CLOUD:
             raise DatasetError(f"{file}: got {size} bytes, expected a multiple of 16 up to {LARGEST_CLOUD}")
-        return np.fromfile(file, np.float32).reshape(-1, 4)[:, :3]
+        rows = np.fromfile(file, np.float32).reshape(-1, 4)
+        require_returns(rows[:, :3], file)
+        if (rows[:, 3] < 0.0).any():
+            raise DatasetError(f"{file}: got negative intensities, expected rows of x, y, z and intensity in float32")
+        return rows[:, :3]
 
     def image(self, frame: int) -> np.ndarray:
-        """RGB pixels ``[height, width, 3]``; raises ``DatasetError`` if there is no such image."""
+        """RGB pixels ``[height, width, 3]``; raises ``DatasetError`` if there is no such image or it is damaged."""
+        return decoding.decode_image(self.image_message(frame))
+
+    def image_message(self, frame: int) -> builders.Message:
+        """The image as it is in its file, as ``sensor_msgs/CompressedImage``.
+
+        Raises:
+            DatasetError: there is no such image, it is damaged, or of another size than the first one.
+        """
         file = self.images.get(frame)
-        pixels = None if file is None else cv2.imread(str(file), cv2.IMREAD_COLOR)
-        if pixels is None:
-            raise DatasetError(f"{self.path}: frame {frame} has no image that can be decoded")
-        return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
+        if file is None:
+            raise DatasetError(f"{self.path}: frame {frame} has no image")
+        encoding = "png" if file.suffix == ".png" else "jpeg"
+        message = builders.compressed_image(int(self.stamps[frame]), CAMERA_FRAME, encoding, file.read_bytes())
+        try:
+            self.camera.check_image(decoding.decode_image(message))
+        except ValueError as error:
+            raise DatasetError(f"{file}: {error}") from error
+        return message
 
 
 def read_splits(root: str | Path) -> dict[str, list[tuple[str, int]]]:
@@ -175,6 +200,11 @@ def sequence_to_bag(
         "clouds have the stamps of the images with the same number",
         "the pose of the lidar on the robot comes from the robot file",
     ]
+    if sequence.without_pose and chosen.stop == len(sequence):
+        remarks.append(
+            f"{sequence.without_pose} frames after the last of the {len(sequence)} poses are left out: poses.txt "
+            "has no row for them"
+        )
     events: list[tuple[int, int]] = [(int(motion.stamps[i]), -1 - i) for i in range(len(motion))]
     events += [(int(sequence.stamps[frame]), frame) for frame in chosen]
     sensors = {LIDAR_FRAME: base_from_lidar, CAMERA_FRAME: base_from_lidar @ sequence.lidar_from_camera}
@@ -190,9 +220,7 @@ def sequence_to_bag(
             if (sequence.path / CLOUDS / f"{number:06d}.bin").is_file():
                 bag.write("/points", builders.point_cloud(stamp, LIDAR_FRAME, sequence.cloud(number)), stamp)
             if number in sequence.images:
-                file = sequence.images[number]
-                encoding = "png" if file.suffix == ".png" else "jpeg"
-                image = builders.compressed_image(stamp, CAMERA_FRAME, encoding, file.read_bytes())
+                image = sequence.image_message(number)
                 info = builders.camera_info(
                     stamp, CAMERA_FRAME, camera.width, camera.height, camera.matrix, camera.distortion
                 )
@@ -221,10 +249,14 @@ def _poses(file: Path) -> np.ndarray:
     return matrices
 
 
+def _cloud_numbers(folder: Path) -> set[int]:
+    return {int(file.stem) for file in folder.glob("*.bin") if file.stem.isdecimal()}
+
+
 def _camera(file: Path, size: tuple[int, int]) -> CameraModel:
     try:
         fx, fy, cx, cy = (float(value) for value in file.read_text(encoding="utf-8").split())
-        return CameraModel(
+        camera = CameraModel(
             width=size[0],
             height=size[1],
             matrix=np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
@@ -232,8 +264,10 @@ def _camera(file: Path, size: tuple[int, int]) -> CameraModel:
             distortion_model="plumb_bob",
             frame_id=CAMERA_FRAME,
         )
+        camera.check()
     except (ValueError, UnicodeDecodeError) as error:
         raise DatasetError(f"{file}: expected fx fy cx cy: {error}") from error
+    return camera
 
 
 def _image_size(file: Path) -> tuple[int, int]:
@@ -247,7 +281,14 @@ def _camera_pose(file: Path) -> np.ndarray:
     try:
         content = yaml.safe_load(file.read_text(encoding="utf-8"))
         entry = content["os1_cloud_node-pylon_camera_node"]
-        turn = Rotation.from_quat([float(entry["q"][axis]) for axis in "xyzw"])
-        return homogeneous(turn.as_matrix(), np.array([float(entry["t"][axis]) for axis in "xyz"]))
+        quaternion, place = (
+            np.array([float(entry[k][axis]) for axis in axes]) for k, axes in (("q", "xyzw"), ("t", "xyz"))
+        )
+        if not (np.isfinite(quaternion).all() and np.isfinite(place).all()):
+            raise ValueError(f"got q {quaternion.tolist()} and t {place.tolist()}, expected finite numbers")
+        return homogeneous(Rotation.from_quat(quaternion).as_matrix(), place)
     except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
-        raise DatasetError(f"{file}: expected os1_cloud_node-pylon_camera_node with q and t, got {error!r}") from error
+        text = " ".join(str(error).split())
+        raise DatasetError(
+            f"{file}: expected os1_cloud_node-pylon_camera_node with q and t: {type(error).__name__}: {text}"
+        ) from error

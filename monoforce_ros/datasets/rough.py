@@ -6,6 +6,8 @@ A scene is a folder of ``images/<sec>_<nsec>_<camera>.png``, ``clouds/<sec>_<nse
 
 from __future__ import annotations
 
+import zipfile
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +19,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from monoforce_ros.bags import BagWriter, builders
 from monoforce_ros.core import NANOSECOND, CameraModel, MotionTrack, homogeneous
-from monoforce_ros.datasets.dataset import DatasetError, odometry_message
+from monoforce_ros.datasets.dataset import DatasetError, odometry_message, require_returns
 from monoforce_ros.robots import robot_file
 
 LIDAR_FRAME = "os_sensor"
@@ -49,7 +51,11 @@ class RoughScene:
 
     @classmethod
     def open(cls, path: str | Path) -> RoughScene:
-        """Read the calibration and poses of a scene; images and clouds are read on demand."""
+        """Read the calibration and poses of a scene; images and clouds are read on demand.
+
+        Raises:
+            DatasetError: a file is missing or invalid.
+        """
         path = Path(path)
         transforms = path / "calibration" / "transformations.yaml"
         poses = path / "poses" / "lidar_poses.csv"
@@ -75,19 +81,36 @@ class RoughScene:
         )
 
     def cloud(self, stamp: int) -> np.ndarray:
-        """Points ``[n, 3]`` [m] of the cloud with this stamp in ``os_sensor``, including empty returns."""
+        """Points ``[n, 3]`` [m] of the cloud with this stamp in ``os_sensor``, including empty returns.
+
+        Raises:
+            DatasetError: the file is damaged, has other fields, or no return.
+        """
         file = self._file("clouds", stamp, ".npz")
         if file.stat().st_size > MAXIMUM_CLOUD_BYTES:
             raise DatasetError(f"{file}: {file.stat().st_size} bytes, at most {MAXIMUM_CLOUD_BYTES}")
-        with np.load(file, allow_pickle=False) as content:
-            cloud = content[content.files[0]]
-        missing = {"x", "y", "z"} - set(cloud.dtype.names or ())
-        if missing:
-            raise DatasetError(f"{file}: fields {cloud.dtype.names}, expected x, y and z")
-        return np.stack([cloud[name].astype(np.float32).ravel() for name in "xyz"], axis=1)
+        try:
+            with np.load(file, allow_pickle=False) as content:
+                arrays = [content[name] for name in content.files]
+        # A zip file may be cut anywhere.
+        except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+            raise DatasetError(f"{file}: not readable as a cloud: {error}") from error
+        if not arrays or {"x", "y", "z"} - set(arrays[0].dtype.names or ()):
+            got = f"fields {arrays[0].dtype.names}" if arrays else "no array"
+            raise DatasetError(f"{file}: got {got}, expected an array with the fields x, y and z")
+        try:
+            points = np.stack([arrays[0][name].astype(np.float32).ravel() for name in "xyz"], axis=1)
+        except (TypeError, ValueError) as error:
+            raise DatasetError(f"{file}: x, y or z is no number: {error}") from error
+        require_returns(points, file)
+        return points
 
     def images(self, stamp: int) -> dict[str, np.ndarray]:
-        """RGB images with this stamp by camera, of the cameras that have an image and a calibration."""
+        """RGB images with this stamp by camera, of the cameras that have an image and a calibration.
+
+        Raises:
+            DatasetError: an image is damaged, or of another size than its calibration.
+        """
         found = {}
         for camera in self.cameras:
             file = self._file("images", stamp, f"_{camera}.png")
@@ -96,6 +119,10 @@ class RoughScene:
                 if pixels is None:
                     raise DatasetError(f"{file}: cannot be decoded as an image")
                 found[camera] = cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
+                try:
+                    self.cameras[camera].check_image(pixels)
+                except ValueError as error:
+                    raise DatasetError(f"{file}: {error}") from error
         return found
 
     def pose(self, stamp: int, *, maximum_gap: float = MAXIMUM_POSE_GAP) -> np.ndarray:
@@ -253,7 +280,7 @@ def _read_yaml(file: Path) -> dict:
     try:
         content = yaml.safe_load(file.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise DatasetError(f"{file}: not readable as YAML: {error}") from error
+        raise DatasetError(f"{file}: not readable as YAML: {' '.join(str(error).split())}") from error
     if not isinstance(content, dict):
         raise DatasetError(f"{file}: got {type(content).__name__}, expected a mapping")
     return content
@@ -264,12 +291,15 @@ def _numbers(values: Sequence, count: int, where: str) -> np.ndarray:
         array = np.array([float(value) for value in values])  # some files store numbers as strings
     except (TypeError, ValueError) as error:
         raise DatasetError(f"{where}: not numbers: {error}") from error
-    if count >= 0 and array.size != count:
-        raise DatasetError(f"{where}: got {array.size} numbers, expected {count}")
+    if (count >= 0 and array.size != count) or not np.isfinite(array).all():
+        text = f"{array.size} numbers" if np.isfinite(array).all() else "numbers that are not finite"
+        raise DatasetError(f"{where}: got {text}, expected {count if count >= 0 else 'some'} finite ones")
     return array
 
 
-def _matrix(entry: dict, where: str) -> np.ndarray:
+def _matrix(entry: object, where: str) -> np.ndarray:
+    if not isinstance(entry, dict):
+        raise DatasetError(f"{where}: got {entry!r}, expected a mapping with `data`")
     matrix = _numbers(entry.get("data", ()), 16, where).reshape(4, 4)
     return homogeneous(_orthonormal(matrix[None, :3, :3], where)[0], matrix[:3, 3])
 
@@ -277,7 +307,7 @@ def _matrix(entry: dict, where: str) -> np.ndarray:
 def _camera(file: Path) -> CameraModel:
     content = _read_yaml(file)
     try:
-        return CameraModel(
+        camera = CameraModel(
             width=int(content["image_width"]),
             height=int(content["image_height"]),
             matrix=_numbers(content["camera_matrix"]["data"], 9, f"{file}: camera_matrix").reshape(3, 3),
@@ -285,21 +315,30 @@ def _camera(file: Path) -> CameraModel:
             distortion_model=content.get("distortion_model", "plumb_bob"),
             frame_id=file.stem,
         )
+        camera.check()
     except (KeyError, TypeError, ValueError) as error:
         raise DatasetError(f"{file}: not a camera calibration: {error!r}") from error
+    return camera
 
 
 def _read_poses(file: Path) -> tuple[np.ndarray, np.ndarray]:
-    lines = [line for line in file.read_text(encoding="utf-8").splitlines()[1:] if line.strip()]
-    rows = [[part.strip() for part in line.split(",")] for line in lines]
-    if len(rows) < 2 or any(len(row) != 13 for row in rows):
-        raise DatasetError(f"{file}: expected at least two rows of a stamp and twelve numbers")
+    try:
+        lines = file.read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError as error:
+        raise DatasetError(f"{file}: not readable as a table: {error}") from error
+    rows = [[part.strip() for part in line.split(",")] for line in lines[1:] if line.strip()]
+    odd = next((row for row in rows if len(row) != 13), None)
+    if odd is not None or len(rows) < 2:
+        got = f"{len(rows)} rows" if odd is None else f"a row of {len(odd)} columns"
+        raise DatasetError(f"{file}: got {got}, expected at least two rows of a stamp and twelve numbers")
     # A double resolves current stamps only to a quarter of a microsecond, so they are parsed as integers.
     stamps = np.array([_decimal_stamp(row[0], file) for row in rows], np.int64)
     values = _numbers([value for row in rows for value in row[1:]], 12 * len(rows), str(file)).reshape(-1, 3, 4)
     order = np.argsort(stamps)
     stamps, values = stamps[order], values[order]
     keep = np.r_[True, np.diff(stamps) > 0]
+    if keep.sum() < 2:
+        raise DatasetError(f"{file}: got one stamp in {len(rows)} rows, expected different ones")
     matrices = np.tile(np.eye(4), (int(keep.sum()), 1, 1))
     matrices[:, :3, :3] = _orthonormal(values[keep, :, :3], str(file))
     matrices[:, :3, 3] = values[keep, :, 3]

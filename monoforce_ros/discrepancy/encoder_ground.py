@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 import torch
 
-from monoforce_ros.bags import MAXIMUM_GAP, BagError, Recording, observe
+from monoforce_ros.bags import MAXIMUM_GAP, BagError, Recording, chosen_cameras, image_frames, observe
 from monoforce_ros.core import MotionState, MotionTrack, StaleDataError
 from monoforce_ros.messages import MessageError
 from monoforce_ros.perception import CAMERA_SOURCES, choose_terrain_source
@@ -63,10 +63,13 @@ def encoder_maps(
         BagError: no image of the recording can be used.
         CheckpointError: the encoder cannot be loaded.
     """
-    topics = tuple(topic for topic, frames in recording.images.items() if frames)
+    cameras = chosen_cameras(recording, robot)
+    topics = cameras.topics
     if not topics:
+        what = "no usable images" if any(recording.images.values()) else "no images"
         raise BagError(
-            f"{recording.path}: no images, which --terrain {ground.kind} needs; use lidar, traced, flat or a map"
+            f"{recording.path}: {what}, which --terrain {ground.kind} needs; use lidar, traced, flat or a map"
+            f"{''.join(f'; {remark}' for remark in cameras.remarks)}"
         )
     mosaics = [_Mosaic(grid), _Mosaic(grid)]
     count, refused = 0, ""
@@ -88,9 +91,9 @@ def encoder_maps(
 
 
 def _places(recording: Recording, motion: MotionTrack, topics: Sequence[str]) -> Iterator[tuple[int, MotionState]]:
-    """Stamps of the first camera's images at which the robot has moved on [ns], and its motion there."""
+    """Stamps of images at which the robot has moved on [ns], and its motion there."""
     previous: MotionState | None = None
-    for frame in recording.images[topics[0]]:
+    for frame in image_frames(recording, topics, MAXIMUM_GAP):
         try:
             state = motion.at(frame.stamp, maximum_gap=MAXIMUM_GAP)
         except StaleDataError:

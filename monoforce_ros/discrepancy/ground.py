@@ -81,7 +81,7 @@ def choose_ground(terrain: str, recording: Recording, smoothed: SmoothedMotion, 
     if terrain == "auto" and recording.clouds:
         try:
             points, frame = recording.cloud(recording.clouds[0])
-            recording.sensor_pose(frame, robot.base_frame, robot.sensors)
+            recording.sensor_pose(frame, robot.base_frame, robot.sensors, recording.clouds[0].stamp)
             if len(points):
                 return Ground("lidar", f"lidar map of {len(recording.clouds)} sweeps (the bag has clouds)", slope)
             reason = "the bag's clouds are empty"

@@ -6,13 +6,14 @@ import argparse
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import override
 
 import numpy as np
 import torch
 
-from monoforce_ros.bags import BagError, add_read_options, read_options, smooth
+from monoforce_ros.bags import BagError, Recording, add_read_options, chosen_cameras, read_options, smooth
 from monoforce_ros.core import OptionParser, share_directory
 from monoforce_ros.discrepancy import motion_faults
 from monoforce_ros.effects import EffectError
@@ -40,7 +41,7 @@ from monoforce_ros.perception import (
 from monoforce_ros.physics import SOILS, PhysicsOptions, SoilError, read_soil
 from monoforce_ros.prediction import Predictor
 from monoforce_ros.reporting import figure_png
-from monoforce_ros.robots import RobotFileError, load_robot, shipped_robots
+from monoforce_ros.robots import RobotFileError, RobotModel, load_robot, shipped_robots
 from monoforce_ros.terrain import TerrainDefaults
 
 
@@ -192,9 +193,9 @@ def run(options: argparse.Namespace) -> None:
     predictor = Predictor(
         robot, source, horizon=max(options.horizons), options=PhysicsOptions(soil=read_soil(options.soil))
     )
-    # As in training: images without a CameraInfo, such as overlays for debugging, are none of a camera.
-    calibrated = [topic for topic in recording.images if topic in recording.cameras]
-    topics = tuple(options.images or calibrated or recording.images) if "camera" in source.sensors else ()
+    topics, left_out = (
+        _camera_topics(recording, robot, options.images or ()) if "camera" in source.sensors else ((), [])
+    )
     evaluation = evaluate_recording(
         recording,
         predictor,
@@ -203,6 +204,7 @@ def run(options: argparse.Namespace) -> None:
         stride=options.stride,
         quiet=options.quiet,
     )
+    evaluation = replace(evaluation, remarks=(*left_out, *evaluation.remarks))
     if not any(position.windows for position, _ in evaluation.summary(PHYSICS).values()):
         raise EvaluationError(
             f"{bag}: after the start of every window the odometry jumps or pauses, or leaves the map, so that nothing "
@@ -264,6 +266,17 @@ def run(options: argparse.Namespace) -> None:
     report_json, report_html = write_reports(folder, evaluation, settings, pictures)
     print(terminal_table(evaluation))
     print(f"report: {report_html}\ndata:   {report_json}\nfigures: {folder}/prediction_*.png")
+
+
+def _camera_topics(recording: Recording, robot: RobotModel, named: Sequence[str]) -> tuple[tuple[str, ...], list[str]]:
+    """Image topics of the cameras that can be used, of those named or all, and remarks on the others."""
+    unknown = [topic for topic in named if topic not in recording.images]
+    if unknown:
+        raise EvaluationError(f"{recording.path}: no images on {unknown}; there are {sorted(recording.images)}")
+    choice = chosen_cameras(recording, robot, named)
+    for remark in choice.remarks:
+        print(f"warning: {remark}", file=sys.stderr)
+    return choice.topics, choice.remarks
 
 
 def _example_windows(evaluation: RecordingEvaluation) -> list[tuple[str, int]]:

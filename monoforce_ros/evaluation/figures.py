@@ -65,23 +65,27 @@ class CameraPicture:
     def nearest(cls, recording: Recording, robot: RobotModel, stamp: int) -> CameraPicture | None:
         """The image nearest to a stamp [ns] of the camera that points most forward.
 
-        None if no calibrated camera with a known pose points forward, or without an image within 0.2 s.
+        None if no calibrated camera with a known pose points forward, or without a usable image within 0.2 s.
         """
-        best = None
+        best: tuple[float, CameraPicture] | None = None
         for topic, camera in recording.cameras.items():
             frame = nearest_frame(recording.images[topic], stamp, limit=_IMAGE_LIMIT)
             if frame is None:
                 continue
             try:
-                pose = recording.sensor_pose(camera.frame_id, robot.base_frame, robot.sensors)
+                pose = recording.sensor_pose(camera.frame_id, robot.base_frame, robot.sensors, frame.stamp)
             except BagError:
                 continue
-            if best is None or pose[0, 2] > best[0]:
-                best = pose[0, 2], frame, camera, pose
-        if best is None or best[0] < 0.5:
-            return None
-        _, frame, camera, pose = best
-        return cls(recording.image(frame), camera, pose)
+            forward = float(pose[0, 2])
+            if forward < 0.5 or (best is not None and forward <= best[0]):
+                continue
+            try:
+                image = recording.image(frame)
+                camera.check_image(image)
+            except ValueError:
+                continue
+            best = forward, cls(image, camera, pose)
+        return None if best is None else best[1]
 
 
 def prediction_figure(

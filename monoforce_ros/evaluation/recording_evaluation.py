@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from monoforce_ros.bags import MAXIMUM_GAP, Recording, flippers_at, observe, smooth
+from monoforce_ros.bags import MAXIMUM_GAP, MAXIMUM_SPREAD, Recording, flippers_at, image_frames, observe, smooth
 from monoforce_ros.core import MotionState, StaleDataError, transform_points
 from monoforce_ros.effects import corrected_commands, corrected_motion
 from monoforce_ros.evaluation.metrics import Poses, Summary, position_errors, rotation_errors, summarise
@@ -94,7 +94,8 @@ def evaluate_recording(
         recording: the recording.
         predictor: robot, terrain source and horizon; the horizon must be at least the largest of ``horizons``. With a
             source that falls back, the encoder's own terrain and the confirmed one are compared side by side.
-        image_topics: cameras of a camera terrain source; windows start at images of the first one.
+        image_topics: cameras of a camera terrain source; windows start at images of the first one, and at those of
+            others where it has none.
         horizons: times at which errors are summarised [s].
         stride: smallest time between the starts of windows [s].
         minimum_duration: odometry required after the start of a window [s]; by default the smallest horizon.
@@ -281,10 +282,11 @@ def _window_stamps(
         unknown = [topic for topic in image_topics if topic not in recording.images]
         if unknown:
             raise EvaluationError(f"{recording.path}: no images on {unknown}; there are {sorted(recording.images)}")
-        candidates = np.array([frame.stamp for frame in recording.images[image_topics[0]]], np.int64)
-    else:
-        frames = () if "camera" in sensors else recording.clouds
+        frames = image_frames(recording, image_topics, MAXIMUM_SPREAD)
         candidates = np.array([frame.stamp for frame in frames], np.int64)
+    else:
+        clouds = () if "camera" in sensors else recording.clouds
+        candidates = np.array([frame.stamp for frame in clouds], np.int64)
     if not len(candidates):
         missing = "images" if "camera" in sensors else "point clouds"
         raise EvaluationError(

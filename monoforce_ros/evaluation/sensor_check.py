@@ -6,9 +6,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from monoforce_ros.bags import BagError, Frame, Recording, camera_info_topics
+from monoforce_ros.bags import BagError, Frame, Recording, camera_info_topics, chosen_cameras
 from monoforce_ros.core import NANOSECOND, MotionTrack
-from monoforce_ros.evaluation.findings import Finding, ok, warning
+from monoforce_ros.evaluation.findings import Finding, note, ok, warning
 from monoforce_ros.robots import RobotModel
 
 _FARTHEST = 300.0
@@ -39,7 +39,7 @@ def cloud_findings(recording: Recording, robot: RobotModel) -> Iterator[Finding]
         yield warning(f"{topic}: {apart}")
         return
     try:
-        recording.sensor_pose(frame, robot.base_frame, robot.sensors)
+        recording.sensor_pose(frame, robot.base_frame, robot.sensors, recording.clouds[0].stamp)
         yield ok(f"clouds {topic}: {len(recording.clouds)}, frame {frame}")
     except BagError as error:
         yield warning(f"clouds cannot be used: {error}")
@@ -49,23 +49,27 @@ def cloud_findings(recording: Recording, robot: RobotModel) -> Iterator[Finding]
 
 def image_findings(recording: Recording, robot: RobotModel) -> Iterator[Finding]:
     """Findings about the cameras' images."""
+    left_out = chosen_cameras(recording, robot).left_out
     for topic, frames in recording.images.items():
         if topic not in recording.cameras:
             expected = " or ".join(camera_info_topics(topic))
             yield warning(f"{topic}: no CameraInfo on {expected}; images cannot be used without it")
             continue
         camera = recording.cameras[topic]
-        try:
-            pose = recording.sensor_pose(camera.frame_id, robot.base_frame, robot.sensors)
-        except BagError as error:
-            yield warning(f"{topic}: {error}")
-            continue
         if not frames:
             continue
         try:
-            recording.image(frames[0])
+            pose = recording.sensor_pose(camera.frame_id, robot.base_frame, robot.sensors, frames[0].stamp)
+        except BagError as error:
+            yield warning(f"{topic}: {error}")
+            continue
+        try:
+            camera.check_image(recording.image(frames[0]))
         except ValueError as error:
             yield warning(f"{topic}: the images cannot be used: {error}")
+            continue
+        if topic in left_out:
+            yield note(f"{topic}: {left_out[topic]}")
             continue
         if apart := _apart(frames, recording.motion):
             yield warning(f"{topic}: {apart}")

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import t as student_t
 
-from monoforce_ros.bags import Recording
+from monoforce_ros.bags import Recording, chosen_cameras
 from monoforce_ros.encoder import fused, load_encoder, packed
 from monoforce_ros.evaluation.metrics import Poses, position_errors, rotation_errors
 from monoforce_ros.evaluation.recording_evaluation import (
@@ -119,7 +119,7 @@ def evaluate_sequence(
         if system.key in (FLAT.key, CONSTANT.key):
             continue
         source = (sources or {}).get(system.key) or terrain_source(system, robot)
-        topics = tuple(recording.images) if "camera" in source.sensors else ()
+        topics = chosen_cameras(recording, robot).topics if "camera" in source.sensors else ()
         evaluations[system.key] = evaluate_recording(
             recording, Predictor(robot, source, horizon=HORIZON), image_topics=topics,
             horizons=(HORIZON,), stride=stride, quiet=True, minimum_duration=1.0, baselines=not evaluations,

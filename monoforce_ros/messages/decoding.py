@@ -43,6 +43,13 @@ _IMAGE_ENCODINGS = {
 }
 
 
+_SENSOR_BITS = (10, 12, 14, 16)
+"""Bits of the sensors whose images are sent in 16: the fewest that hold the brightest pixel. An image that uses less
+than a quarter of its range is dark, and brightened by that, as by a gain."""
+_NO_DISTORTION = ("", "none", "pinhole", "perspective", "rectilinear", "undistorted", "no_distortion")
+"""Names that drivers and simulators give images without distortion."""
+
+
 class MessageError(ValueError):
     """A message with unusable content; the text states the value received and the value expected."""
 
@@ -130,7 +137,9 @@ def _decode_raw(message: Any) -> np.ndarray:
     rows = np.ascontiguousarray(data[: step * height].reshape(height, step)[:, :row])
     pixels = rows.view(dtype).reshape(height, width, channels)
     if kind == "u2":
-        pixels = (pixels >> 8).astype(np.uint8)
+        largest = int(pixels.max())
+        bits = next(bits for bits in _SENSOR_BITS if largest < 1 << bits)
+        pixels = (pixels >> (bits - 8)).astype(np.uint8)
     try:
         return pixels.copy() if conversion is None else cv2.cvtColor(pixels, conversion)
     except cv2.error as error:
@@ -163,8 +172,9 @@ def decode_camera_info(message: Any, *, rectified: bool = False) -> CameraModel:
 
     Images that were rectified share the CameraInfo of the raw ones: their projection is P, without distortion.
     """
-    model = message.distortion_model or "plumb_bob"
-    coefficients = np.asarray(message.d, np.float64)
+    model, coefficients = message.distortion_model or "plumb_bob", np.asarray(message.d, np.float64)
+    if message.distortion_model.lower() in _NO_DISTORTION and not coefficients.any():
+        model, coefficients = "plumb_bob", np.zeros(5)
     # Drivers write "plumb_bob" with eight coefficients; OpenCV's rational model takes them as they are.
     try:
         matrix = np.asarray(message.k, np.float64).reshape(3, 3)
@@ -459,3 +469,11 @@ def decode_transforms(message: Any) -> dict[tuple[str, str], np.ndarray]:
     if fault and not transforms:
         raise MessageError(fault)
     return transforms
+
+
+def transform_stamps(message: Any) -> dict[tuple[str, str], int]:
+    """Stamps [ns] of a ``tf2_msgs/TFMessage`` by the frames of :func:`decode_transforms`."""
+    return {
+        (entry.header.frame_id.lstrip("/"), entry.child_frame_id.lstrip("/")): stamp_of(entry)
+        for entry in message.transforms
+    }

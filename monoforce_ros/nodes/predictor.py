@@ -20,7 +20,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState, Poin
 from visualization_msgs.msg import MarkerArray
 
 from monoforce_ros.bags import camera_info_topics, is_rectified
-from monoforce_ros.core import NANOSECOND, CommandTrack, MotionState, RobotFrames, pose_matrix
+from monoforce_ros.core import NANOSECOND, CommandTrack, MotionState, RobotFrames, TransformHistory, pose_matrix
 from monoforce_ros.effects import corrected_commands, corrected_motion
 from monoforce_ros.messages import decoding
 from monoforce_ros.nodes import prediction_messages as encoders
@@ -112,11 +112,12 @@ class PredictorNode(ManagedNode):
             pose_matrix(settings.odometry_child_pose) if settings.odometry_child_pose else None,
             file_frame=self.robot.base_frame,
         )
-        self.transforms = TransformListener(self)
+        history = TransformHistory()
+        self.transforms = TransformListener(self, history)
         if self.transforms.unavailable:
             self.get_logger().info(f"sensor poses are those of the robot file: {self.transforms.unavailable}")
         self._odometry = OdometryReader(self.frames, self.transforms, self.health)
-        self.decoder = SensorDecoder(self.frames, self.transforms.tree, self.health)
+        self.decoder = SensorDecoder(self.frames, history, self.health)
         self.inputs = Inputs(
             list(self.sensor_topics.values()),
             slop=settings.camera_slop,

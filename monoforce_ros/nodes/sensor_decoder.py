@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from monoforce_ros.core import NANOSECOND, CameraModel, MotionTrack, RobotFrames, TransformTree, transform_points
+from monoforce_ros.core import NANOSECOND, CameraModel, MotionTrack, RobotFrames, TransformHistory, transform_points
 from monoforce_ros.messages import MessageError, decoding
 from monoforce_ros.nodes.health import ERROR, OK, Health
 from monoforce_ros.nodes.inputs import Received
@@ -26,11 +26,11 @@ class SensorDecoder:
 
     Args:
         frames: poses of the sensors on the robot.
-        transforms: transforms received so far.
+        transforms: transforms received so far; a sensor may move on the robot, as one on a pan-tilt head.
         health: receives reports on unusable messages.
     """
 
-    def __init__(self, frames: RobotFrames, transforms: TransformTree, health: Health):
+    def __init__(self, frames: RobotFrames, transforms: TransformHistory, health: Health):
         self._frames, self._transforms, self._health = frames, transforms, health
         self._info_topics: dict[str, str] = {}
         self._rectified: set[str] = set()
@@ -99,7 +99,8 @@ class SensorDecoder:
 
         return self._frames.sensor_pose(
             entry.message.header.frame_id,
-            self._transforms,
+            # An image may arrive before the transforms of its time: the newest ones are used then.
+            self._transforms.at(entry.stamp, hold=True),
             odometry_frame=track.frame_id or "odom",
             odometry_from_base=odometry_from_base,
         )

@@ -98,10 +98,12 @@ def image_features(
 
 
 def _content(recording: RecordingSamples) -> str:
-    """Hash of a recording's images, at a sixteenth of their size, and of where its cameras were."""
+    """Hash of a recording's images, at a sixteenth of their size, of where its cameras and the ground were, and of the
+    sweeps that depths are measured by."""
     found = hashlib.sha256(str(list(recording.images.shape)).encode())
     found.update(recording.images[..., ::16, ::16].contiguous().numpy().tobytes())
-    found.update(np.asarray(recording.odometry_from_cameras).tobytes())
+    for name in ("odometry_from_cameras", "odometry_from_base", "support", "sweeps", "sweep_ends"):
+        found.update(np.ascontiguousarray(getattr(recording, name)).tobytes())
     found.update(repr(recording.cameras).encode())
     return found.hexdigest()
 

@@ -87,7 +87,7 @@ class RecordingSamples:
     odometry_from_base: np.ndarray
     """``[N, 4, 4]``."""
     odometry_from_cameras: np.ndarray
-    """Camera poses at the stamps of their images ``[N, cameras, 4, 4]``."""
+    """Camera poses at the stamps of their images ``[N, cameras, 4, 4]``; NaN where a sample lacks a camera's image."""
     support: np.ndarray
     """Contact points of the wheels in the odometry frame ``[N, m, 3]`` [m]."""
     sweeps: np.ndarray

@@ -13,11 +13,20 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from monoforce_ros.bags import DETECTED, BagError, ReadOptions, Recording, cut_windows, nearest_frame, smooth
-from monoforce_ros.core import CommandTrack, MotionTrack, StaleDataError, nearest_stamp, transform_points
+from monoforce_ros.bags import (
+    DETECTED,
+    BagError,
+    Frame,
+    ReadOptions,
+    Recording,
+    chosen_cameras,
+    cut_windows,
+    image_frames,
+    smooth,
+)
+from monoforce_ros.core import NANOSECOND, CommandTrack, MotionTrack, StaleDataError, nearest_stamp, transform_points
 from monoforce_ros.effects import corrected_commands, corrected_motion
 from monoforce_ros.encoder import EncoderConfig, network_image
-from monoforce_ros.messages import MessageError
 from monoforce_ros.perception import support_points, traced_ground
 from monoforce_ros.robots import RobotModel, robot_digest
 from monoforce_ros.terrain import TerrainError
@@ -33,16 +42,23 @@ from monoforce_ros.training.recording_samples import (
 from monoforce_ros.training.terrain_fit import FitSettings, fit_terrain, trajectory_frame, trajectory_grid
 from monoforce_ros.training.visible import visible_terrain
 
+_EXTRACTION = 2
+"""Version of what is extracted: files of samples of an earlier one are not used."""
 _LENGTH, _STRIDE = 10.0, 5.0
 """Length of the trajectories to which terrain is fitted (paper IV-A), and interval between their starts [s]."""
 _SWEEPS_BEFORE, _SWEEPS_AFTER = 2.0, 2.0
 """Sweeps this long before and after a trajectory belong to its map too [s]."""
 TARGET_REACH = _LENGTH + _SWEEPS_AFTER
 """How long after the first sample of a segment its target may have been measured [s], at most."""
-_FEWEST_MATCHED = 0.5
-"""Share of the images of the first topic to which another topic must have one of about the same time."""
 _MATCH = 0.1
 """Largest difference between stamps of images that belong to one sample [s]."""
+_SLOWER = 1.5
+"""Median interval of the samples, relative to the wanted one, from which on they are slower: one that is no multiple of
+the images' interval alternates between two."""
+_JITTER = 1_000_000
+"""By how much an image may come before its sample is due [ns]."""
+_POSE_GAP = 0.3
+"""Largest time between sensor data and the nearest odometry [s]."""
 _TRACE_STEP, _TRACE_POSES = 0.1, 3000
 """Distance between poses of the path driven before a sample [m], and the largest number of poses looked at."""
 _SWEEP_MATCH = 0.15
@@ -54,7 +70,7 @@ class SampleSettings:
     """How samples are extracted from a recording."""
 
     period: float = 0.5
-    """Interval between samples [s]."""
+    """Mean interval between samples [s]; at least that of the images."""
     chunk_period: float = 0.5
     """Interval between the starts of chunks of motion [s]."""
     iterations: int = 0
@@ -80,15 +96,23 @@ def extract_samples(
 ) -> Path:
     """Extract a bag's samples into a file, unless there is one for the same bag, robot and settings; return its path.
 
+    Encoders of sweeps alone use recordings without usable images, too, with a sample at each sweep.
+
     Raises:
         SamplesError: the recording has no calibrated images, no commands, or is too short.
         BagError: the bag cannot be read.
     """
     fingerprint = _fingerprint(bag, robot, config, settings, image_topics)
     file = folder / f"{bag.name.removesuffix('.bag')}-{fingerprint[:8]}.safetensors"
-    if file.is_file():
-        return file
-    save_samples(_samples(bag, robot, config, settings, image_topics), file)
+    # Encoders of cameras cannot use these.
+    without_images = file.with_name(f"{file.stem}-sweeps{file.suffix}")
+    usable = [file] if config.takes_images else [file, without_images]
+    for found in usable:
+        if found.is_file():
+            return found
+    samples = _samples(bag, robot, config, settings, image_topics)
+    file = file if samples.cameras else without_images
+    save_samples(samples, file)
     return file
 
 
@@ -101,15 +125,9 @@ def _samples(
 ) -> RecordingSamples:
     recording = settings.reading.open(bag, robot)
     robot = settings.reading.robot_in_bag(robot)
-    topics = tuple(image_topics) or tuple(topic for topic in recording.images if topic in recording.cameras)
-    unknown = [topic for topic in topics if topic not in recording.images or topic not in recording.cameras]
-    if unknown or not topics:
-        raise SamplesError(
-            f"{bag}: no images with a CameraInfo on {unknown or 'any topic'}; images are on "
-            f"{sorted(recording.images)}, CameraInfo is available for {sorted(recording.cameras)}"
-        )
-    if not image_topics:
-        topics = _usable_topics(recording, topics)
+    topics = _camera_topics(recording, robot, image_topics, needed=config.takes_images)
+    if not topics and not recording.clouds:
+        raise SamplesError(f"{bag}: no clouds and no usable images")
     if not len(recording.commands):
         raise SamplesError(f"{bag}: no commands (Twist or TwistStamped), which the physics needs")
     smoothed = smooth(corrected_motion(recording.motion, robot.effects))
@@ -141,36 +159,32 @@ def _samples(
     )
 
 
-def _usable_topics(recording: Recording, topics: Sequence[str]) -> tuple[str, ...]:
-    """Those image topics that can be decoded and have images of about the same times.
-
-    A sample has an image of each camera: one more that is slow, died early or holds depths would cost nearly all.
+def _camera_topics(
+    recording: Recording, robot: RobotModel, image_topics: Sequence[str], *, needed: bool
+) -> tuple[str, ...]:
+    """Image topics of the cameras that can be used; others are named on standard error.
 
     Raises:
-        SamplesError: none of them can be decoded.
+        SamplesError: there is none and images are ``needed``, or one of ``image_topics`` is absent or without a
+            CameraInfo.
     """
-    reasons: dict[str, str] = {}
-    for topic in topics:
-        try:
-            recording.image(recording.images[topic][0])
-        except (MessageError, IndexError, ValueError) as error:
-            reasons[topic] = str(error) or "no image"
-    decoded = [topic for topic in topics if topic not in reasons]
-    if not decoded:
-        raise SamplesError(f"{recording.path}: no usable image: {'; '.join(f'{t}: {r}' for t, r in reasons.items())}")
-    stamps = {topic: np.array([frame.stamp for frame in recording.images[topic]], np.int64) for topic in decoded}
-    first = max(decoded, key=lambda topic: len(stamps[topic]))
-    kept = []
-    for topic in decoded:
-        matched = [nearest_stamp(stamps[topic], stamp, limit=_MATCH) is not None for stamp in stamps[first].tolist()]
-        share = float(np.mean(matched))
-        if share < _FEWEST_MATCHED:
-            reasons[topic] = f"images at {share:.0%} of the times of {first}"
-        else:
-            kept.append(topic)
-    for topic, reason in reasons.items():
-        print(f"{recording.path}: {topic} is left out: {reason}; --images chooses topics", file=sys.stderr)
-    return (first, *(topic for topic in kept if topic != first))
+    unknown = [topic for topic in image_topics if topic not in recording.images or topic not in recording.cameras]
+    if unknown or (needed and not recording.cameras):
+        raise SamplesError(
+            f"{recording.path}: no images with a CameraInfo on {unknown or 'any topic'}; images are on "
+            f"{sorted(recording.images)}, CameraInfo is available for {sorted(recording.cameras)}"
+        )
+    # Images without a CameraInfo, such as overlays for debugging, are none of a camera.
+    wanted = tuple(image_topics) or tuple(recording.cameras)
+    if not wanted:
+        return ()
+    choice = chosen_cameras(recording, robot, wanted)
+    if needed and not choice.topics:
+        reasons = "; ".join(f"{topic}: {reason}" for topic, reason in choice.left_out.items())
+        raise SamplesError(f"{recording.path}: no usable image: {reasons}")
+    for remark in choice.remarks:
+        print(f"{recording.path}: {remark}; --images chooses topics", file=sys.stderr)
+    return choice.topics
 
 
 def _segments(
@@ -236,56 +250,64 @@ def _read_images(
 ) -> dict[str, np.ndarray]:
     """Images, poses, contact points of the wheels and sweeps of every sample.
 
+    A sample has the images of the cameras that have one near its stamp; a camera may begin late, die early or be slow.
     ``places`` are starts of the segments and ends of what may lie in them, ``spans`` those of the stretches between
     jumps of the localisation [ns].
     """
     starts = [start for start, _ in places]
     end = min(int(motion.stamps[-1]) - round(1e9 * CHUNK), starts[-1] + round(1e9 * _LENGTH))
-    matched = []
-    previous: int | None = None
-    for frame in recording.images[topics[0]]:
-        due = previous is None or frame.stamp - previous >= settings.period * 1e9 - 1e6
-        if not (starts[0] <= frame.stamp <= end and due):
+    period = round(1e9 * settings.period)
+    matched: list[tuple[int, dict[int, Frame]]] = []
+    due = starts[0]
+    stamps = [np.array([frame.stamp for frame in recording.images[topic]], np.int64) for topic in topics]
+    for frame in image_frames(recording, topics, _MATCH) if topics else recording.clouds:
+        if not (starts[0] <= frame.stamp <= end and frame.stamp >= due - _JITTER):
             continue
-        previous = frame.stamp
-        others = [nearest_frame(recording.images[topic], frame.stamp, limit=_MATCH) for topic in topics[1:]]
-        frames = [frame, *(other for other in others if other is not None)]
-        if len(frames) == len(topics):
-            matched.append(frames)
-    pixels = [
-        {f.stamp: network_image(p, config) for f, p in recording.images_of([row[i] for row in matched])}
-        for i in range(len(topics))
+        # A period that is no multiple of the images' interval holds on average.
+        due = (due if frame.stamp - due < period else frame.stamp) + period
+        nearest = {i: nearest_stamp(times, frame.stamp, limit=_MATCH) for i, times in enumerate(stamps)}
+        found = {i: recording.images[topics[i]][place] for i, place in nearest.items() if place is not None}
+        matched.append((frame.stamp, found))
+    views = [
+        _views(recording, motion, robot, config, topic, [found[i] for _, found in matched if i in found])
+        for i, topic in enumerate(topics)
     ]
-    mounted = [
-        recording.sensor_pose(recording.cameras[topic].frame_id, robot.base_frame, robot.sensors) for topic in topics
-    ]
+    blank = np.zeros((config.image_height, config.image_width, 3), np.uint8), np.full((4, 4), np.nan)
     rows: dict[str, list] = {name: [] for name in (
         "images", "stamps", "odometry_from_base", "odometry_from_cameras", "support", "segment_of"
     )}  # fmt: skip
-    for frames in matched:
-        if any(frame.stamp not in pixels[i] for i, frame in enumerate(frames)):
+    for stamp, found in matched:
+        seen = {i: views[i][frame.stamp] for i, frame in found.items() if frame.stamp in views[i]}
+        segment = max((i for i, start in enumerate(starts) if start <= stamp), default=-1)
+        if (topics and not seen) or segment < 0 or stamp > places[segment][1]:
             continue
         try:
-            states = [motion.at(frame.stamp, maximum_gap=0.3) for frame in frames]
+            state = motion.at(stamp, maximum_gap=_POSE_GAP)
         except StaleDataError:
-            continue
-        state = states[0]
-        segment = max((i for i, start in enumerate(starts) if start <= state.stamp), default=-1)
-        if segment < 0 or state.stamp > places[segment][1]:
             continue
         under = support_points(robot, state, config.stiffness)
         placed = state.odometry_from_terrain
-        rows["images"].append(np.stack([pixels[i][frame.stamp] for i, frame in enumerate(frames)]))
-        rows["stamps"].append(state.stamp)
+        each = [seen.get(i, blank) for i in range(len(topics))]
+        rows["images"].append(np.array([pixels for pixels, _ in each], np.uint8).reshape(-1, *blank[0].shape))
+        rows["stamps"].append(stamp)
         rows["odometry_from_base"].append(state.odometry_from_base)
-        rows["odometry_from_cameras"].append(
-            np.stack([s.odometry_from_base @ pose for s, pose in zip(states, mounted, strict=True)])
-        )
+        rows["odometry_from_cameras"].append(np.array([pose for _, pose in each]).reshape(-1, 4, 4))
         rows["support"].append(under @ placed[:3, :3].T + placed[:3, 3])
         rows["segment_of"].append(segment)
     if not rows["stamps"]:
-        raise SamplesError(f"{recording.path}: no image is within the odometry and followed by one second of motion")
+        raise SamplesError(
+            f"{recording.path}: no {'image' if topics else 'cloud'} is within the odometry and followed by one second "
+            "of motion"
+        )
     arrays = {name: np.array(values) for name, values in rows.items()}
+    _report_missing(recording, topics, arrays)
+    interval = float(np.median(np.diff(arrays["stamps"]))) * NANOSECOND if len(arrays["stamps"]) > 1 else 0.0
+    if interval > _SLOWER * settings.period:
+        print(
+            f"{recording.path}: a sample every {interval:.2g} s instead of {settings.period:.2g} s: "
+            f"{'images' if topics else 'clouds'} come no more often",
+            file=sys.stderr,
+        )
     sweeps = _sweeps_near(recording, motion, robot, arrays["stamps"])
     joined = np.concatenate(sweeps) if sweeps else np.zeros((0, 3))
     begins = [max((first for first, _ in spans if first <= stamp), default=0) for stamp in arrays["stamps"].tolist()]
@@ -297,6 +319,47 @@ def _read_images(
         "sweeps": joined.astype(np.float32),
         "sweep_ends": np.cumsum([len(points) for points in sweeps], dtype=np.int64),
     }
+
+
+def _views(
+    recording: Recording,
+    motion: MotionTrack,
+    robot: RobotModel,
+    config: EncoderConfig,
+    topic: str,
+    frames: Sequence[Frame],
+) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+    """Image at the network's size and pose ``[4, 4]`` of the camera in the odometry frame, by stamp [ns]; of images of
+    the camera's size, with a pose."""
+    camera = recording.cameras[topic]
+    found = {}
+    for frame, image in recording.images_of(frames):
+        try:
+            camera.check_image(image)
+            mounted = recording.sensor_pose(camera.frame_id, robot.base_frame, robot.sensors, frame.stamp)
+            pose = motion.at(frame.stamp, maximum_gap=_POSE_GAP).odometry_from_base @ mounted
+        except ValueError:
+            continue
+        found[frame.stamp] = network_image(image, config), pose
+    return found
+
+
+def _report_missing(recording: Recording, topics: Sequence[str], arrays: dict[str, np.ndarray]) -> None:
+    """Name cameras without an image for some samples."""
+    shown = np.isfinite(arrays["odometry_from_cameras"]).all(axis=(2, 3))
+    start, stamps = int(arrays["stamps"][0]), arrays["stamps"]
+    for topic, has in zip(topics, shown.T, strict=True):
+        if has.all():
+            continue
+        times = (
+            [f"{float(stamps[i] - start) * NANOSECOND:.1f}" for i in np.flatnonzero(has)[[0, -1]]] if has.any() else []
+        )
+        between = f", from {' to '.join(times)} s after the first" if times else ""
+        print(
+            f"{recording.path}: {topic} has usable images for {has.sum()} of {len(has)} samples{between}; the others "
+            "are of the remaining cameras",
+            file=sys.stderr,
+        )
 
 
 def _trace(motion: MotionTrack, robot: RobotModel, stamp: int, since: int = 0) -> np.ndarray:
@@ -324,10 +387,10 @@ def _sweeps_near(recording: Recording, motion: MotionTrack, robot: RobotModel, s
         if frame.stamp not in nearest:
             continue
         try:
-            state = motion.at(frame.stamp, maximum_gap=0.3)
+            state = motion.at(frame.stamp, maximum_gap=_POSE_GAP)
         except StaleDataError:
             continue
-        pose = recording.sensor_pose(frame_id, robot.base_frame, robot.sensors)
+        pose = recording.sensor_pose(frame_id, robot.base_frame, robot.sensors, frame.stamp)
         points = points[np.isfinite(points).all(axis=1)] @ pose[:3, :3].T + pose[:3, 3]
         points = transform_points(state.odometry_from_base, points[~robot.covers(points)])
         for index in nearest[frame.stamp]:
@@ -342,7 +405,12 @@ def _fingerprint(
     files = sorted(p for p in bag.rglob("*") if p.is_file()) if bag.is_dir() else [bag]
     if not bag.exists():
         raise BagError(f"{bag} does not exist")
-    content = [SAMPLES_VERSION, [(p.name, p.stat().st_size, p.stat().st_mtime_ns) for p in files], robot.name]
+    content = [
+        SAMPLES_VERSION,
+        _EXTRACTION,
+        [(p.name, p.stat().st_size, p.stat().st_mtime_ns) for p in files],
+        robot.name,
+    ]
     content += [robot_digest(robot), asdict(settings), list(image_topics)]
     content += [config.image_width, config.image_height, config.stiffness]
     return hashlib.sha256(json.dumps(content, default=str).encode()).hexdigest()

@@ -257,7 +257,7 @@ def sample(
     rays, origins, images, depths = [], [], [], []
     shape = (config.feature_rows, config.feature_columns)
     for number, camera in enumerate(recording.cameras if config.takes_images else ()):
-        if not augmentation.shows(number):
+        if not augmentation.shows(number) or not np.isfinite(recording.odometry_from_cameras[index, number]).all():
             continue
         placed = terrain_from_odometry @ recording.odometry_from_cameras[index, number]
         directions = feature_rays(camera, *shape, affine) @ placed[:3, :3].T

@@ -44,6 +44,9 @@ def scene_samples(folder: Path, robot: RobotModel, config: EncoderConfig) -> Rec
     placed = motion.odometry_from_terrain
     heights = found.geometric_height.numpy().astype(np.float32)
     names = sorted(images)
+    unplaced = [name for name in names if name not in scene.base_from_sensors]
+    if unplaced:
+        raise DatasetError(f"{folder}: calibration/transformations.yaml has no pose of {', '.join(unplaced)}")
     poses = np.stack([pose @ scene.base_from_sensors[name] for name in names])
     support = support_points(robot, motion, config.stiffness)
     trace = traced_ground(robot, scene.map_from_base[scene.pose_stamps <= stamp], _TRACE_STEP)

@@ -118,10 +118,10 @@ def build_parser() -> OptionParser:
     parser.add_argument("--out", type=Path, help="folder for the checkpoint, logs and saved state")
     parser.add_argument("--held-out", nargs="+", type=Path, default=[], metavar="BAG", help="recordings to "
                         "validate on (default: every eighth bag)")  # fmt: skip
-    parser.add_argument("--worlds", type=int, default=0, metavar="N", help="also train on N randomised worlds, with "
-                        "the simulator's surfaces as targets (default: %(default)s)")  # fmt: skip
-    parser.add_argument("--world-seed", type=int, default=FIRST_WORLD, metavar="SEED", help="of the first world "
-                        f"(default: %(default)s; {REPLAY_WORLD} with --adapt, which the shipped encoder has not "
+    parser.add_argument("--worlds", type=int, metavar="N", help="also train on N randomised worlds, with the "
+                        f"simulator's surfaces as targets (default: 0; {REPLAY_WORLDS} with --adapt)")  # fmt: skip
+    parser.add_argument("--world-seed", type=int, metavar="SEED", help="of the first world (default: "
+                        f"{FIRST_WORLD}; {REPLAY_WORLD} with --adapt, which the shipped encoder has not "
                         "seen)")  # fmt: skip
     parser.add_argument("--places", type=int, default=PLACES, metavar="N", help="places in each world (default: "
                         "%(default)s)")  # fmt: skip
@@ -140,16 +140,17 @@ def build_parser() -> OptionParser:
     parser.add_argument("--images", nargs="+", default=[], metavar="TOPIC", help="image topics (default: all with a "
                         "CameraInfo)")  # fmt: skip
     add_read_options(parser)
-    parser.add_argument("--period", type=float, default=SampleSettings.period, metavar="S", help="interval between "
-                        "samples (default: %(default)s)")  # fmt: skip
+    parser.add_argument("--period", type=float, default=SampleSettings.period, metavar="S", help="mean interval "
+                        "between samples (default: %(default)s)")  # fmt: skip
     parser.add_argument("--fit-iterations", type=int, default=SampleSettings.iterations, metavar="N", help="gradient "
                         "steps of each terrain fit (paper III-F); 0: the supporting terrain as the wheels traced it "
                         "(default: %(default)s)")  # fmt: skip
-    parser.add_argument("--steps", type=int, default=TrainingSettings.steps, help="(default: %(default)s)")
+    parser.add_argument("--steps", type=int, help=f"(default: {TrainingSettings.steps}; {AdaptationSettings.steps} "
+                        "with --adapt)")  # fmt: skip
     parser.add_argument("--batch", type=int, default=TrainingSettings.batch, help="samples per step and process "
                         "(default: %(default)s)")  # fmt: skip
-    parser.add_argument("--rate", type=float, default=TrainingSettings.rate, help="peak learning rate (default: "
-                        "%(default)s)")  # fmt: skip
+    parser.add_argument("--rate", type=float, help=f"peak learning rate (default: {TrainingSettings.rate:g}; "
+                        f"{AdaptationSettings.rate:g} with --adapt)")  # fmt: skip
     parser.add_argument("--losses", nargs="+", default=["geometric", "terrain", "trajectory"],
                         choices=("geometric", "terrain", "trajectory"),
                         help="losses to minimise (default: all; `geometric` alone is LSS)")  # fmt: skip
@@ -230,7 +231,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if not options.bags:
             parser.error("--adapt: got no bag, expected some of the robot's own")
         known = tuple(name for name in _NOT_FOR_ADAPTING if hasattr(options, name))
-        parser.refuse_without_effect(options, known, "with --adapt: the encoder that is adapted decides it")
+        parser.refuse_without_effect(
+            options, known, "with --adapt: the encoder that is adapted decides it",
+            sys.argv[1:] if arguments is None else arguments,
+        )  # fmt: skip
     if options.samples_only and options.samples is None and options.out is None:
         parser.error("--samples-only: expected a folder with --samples, or --out")
     if options.out is None and not options.samples_only:
@@ -297,9 +301,7 @@ def _train(options: argparse.Namespace, process: Process) -> None:
     if process.first:
         training, validation = (_samples(part, robot, config, options, title) for part, title in
                                 ((bags, "training"), (held_out, "held out")))  # fmt: skip
-        training += _world_samples(
-            range(options.world_seed, options.world_seed + options.worlds), config, options, options.places
-        )
+        training += _world_samples(_world_seeds(options), config, options, options.places)
         if options.worlds and not validation:
             validation = _world_samples(
                 range(HELD_OUT_WORLD, HELD_OUT_WORLD + options.held_out_worlds), config, options
@@ -310,9 +312,7 @@ def _train(options: argparse.Namespace, process: Process) -> None:
         torch.distributed.barrier()
         if not process.first:
             training, validation = (_samples(part, robot, config, options, "") for part in (bags, held_out))
-            training += _world_samples(
-                range(options.world_seed, options.world_seed + options.worlds), config, options, options.places
-            )
+            training += _world_samples(_world_seeds(options), config, options, options.places)
     robot = _with_vegetation(robot, training, config, settings, options, process)
     torch.manual_seed(settings.seed)
     encoder = _encoder(options, config, start)
@@ -391,21 +391,14 @@ def _adapt(options: argparse.Namespace) -> None:
             print(f"train: skipped: {error}", file=sys.stderr)
     if not parts:
         raise SamplesError(f"none of {len(recordings)} recordings is long enough to adapt to")
-    count = options.worlds or REPLAY_WORLDS
-    first = REPLAY_WORLD if options.world_seed == FIRST_WORLD else options.world_seed
-    replay = _world_samples(range(first, first + count), encoder.config, options)
+    replay = _world_samples(_world_seeds(options, REPLAY_WORLD, REPLAY_WORLDS), encoder.config, options)
     choosing, judging = (
         _world_samples(range(first, first + max(options.held_out_worlds // 2, 1)), encoder.config, options)
         for first in (CHOOSING_WORLD, JUDGED_WORLD)
     )
-    defaults = AdaptationSettings()
-    given = options.steps != TrainingSettings.steps, options.rate != TrainingSettings.rate
     if options.device == "cuda":
         print("train: --adapt runs on the CPU", file=sys.stderr)
-    settings = AdaptationSettings(
-        steps=options.steps if given[0] else defaults.steps, batch=options.batch,
-        rate=options.rate if given[1] else defaults.rate, seed=options.seed, precision=options.precision,
-    )  # fmt: skip
+    settings = _adaptation_settings(options)
     with progress_bar(settings.steps, label="adapting", unit="step", quiet=options.quiet) as bar:
 
         def advance(step: int, losses: dict[str, float]) -> None:
@@ -488,12 +481,31 @@ def _config(options: argparse.Namespace, start: Encoder | None) -> EncoderConfig
     )
 
 
+def _given[Value](value: Value | None, default: Value) -> Value:
+    """The value of an option, if it was given: its default depends on others."""
+    return default if value is None else value
+
+
+def _world_seeds(options: argparse.Namespace, first: int = FIRST_WORLD, count: int = 0) -> range:
+    """Seeds of the randomised worlds to train on, by default ``count`` from the ``first`` on."""
+    start = _given(options.world_seed, first)
+    return range(start, start + _given(options.worlds, count))
+
+
+def _adaptation_settings(options: argparse.Namespace) -> AdaptationSettings:
+    return AdaptationSettings(
+        steps=_given(options.steps, AdaptationSettings.steps), batch=options.batch,
+        rate=_given(options.rate, AdaptationSettings.rate), seed=options.seed, precision=options.precision,
+    )  # fmt: skip
+
+
 def _settings(options: argparse.Namespace) -> TrainingSettings:
     given = LossWeights(geometric=options.geometric)
     weights = {name: getattr(given, name) if name in options.losses else 0.0 for name in
                ("geometric", "terrain", "trajectory")}  # fmt: skip
     return TrainingSettings(
-        steps=options.steps, batch=options.batch, rate=options.rate,
+        steps=_given(options.steps, TrainingSettings.steps), batch=options.batch,
+        rate=_given(options.rate, TrainingSettings.rate),
         weights=LossWeights(
             **weights, prominence=options.prominence, depth=0.0 if options.no_depth else LossWeights.depth
         ),

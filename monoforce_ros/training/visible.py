@@ -79,7 +79,7 @@ def _placed_sweeps(
             state = motion.at(frame.stamp, maximum_gap=_LARGEST_GAP)
         except StaleDataError:
             continue
-        pose = recording.sensor_pose(frame_id, robot.base_frame, robot.sensors)
+        pose = recording.sensor_pose(frame_id, robot.base_frame, robot.sensors, frame.stamp)
         points = points[np.isfinite(points).all(axis=1)] @ pose[:3, :3].T + pose[:3, 3]
         points = points[~robot.covers(points)]
         placed = inverse @ state.odometry_from_base
