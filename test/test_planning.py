@@ -280,9 +280,42 @@ def test_an_edge_under_the_wheels_of_one_side_counts(husky, side):
     edge = terrain_of(np.zeros_like(X), observed=torch.from_numpy(side * Y < 0.1))
     spreads = {name: torch.full_like(edge.height, 0.005) for name in ("geometric_spread", "decrease_spread")}
     edge = replace(edge, **spreads)
-    found, _ = assessed(husky, edge, [[0.9, 0.0], [0.9, -0.3 * side]])
+    found, _ = assessed(husky, edge, [[0.9, 0.0], [0.9, -0.6 * side]])
     along, away = found.terms["unobserved"].tolist()
-    assert along > 0.5 and away < 0.5 * along
+    assert along > 0.5 and away < 0.6 * along
+
+
+@pytest.mark.parametrize("spread", [None, 0.005])
+def test_an_edge_right_before_the_robot_counts(husky, spread):
+    """A lidar that looks over the ground within 1.5 m sees none 0.3 m before the robot's nose, and none behind it."""
+    edge = 0.3 + float(husky.bounds[1][0])
+
+    def term(observed, *commands):
+        terrain = terrain_of(np.zeros_like(X), observed=torch.from_numpy(observed))
+        if spread is not None:
+            spreads = {
+                name: torch.full_like(terrain.height, spread) for name in ("geometric_spread", "decrease_spread")
+            }
+            terrain = replace(terrain, **spreads)
+        found, _ = assessed(husky, terrain, commands)
+        return found.terms["unobserved"].tolist()
+
+    seen = np.hypot(X, Y) > 1.5
+    ahead, back, turning = term(seen & (edge > X), [0.3, 0.0], [-0.3, 0.0], [0.0, 0.5])
+    assert ahead > 1.0 and back == 0.0 and turning < 0.01
+    # On level ground the blind zone holds nobody.
+    assert term(seen, [0.3, 0.0], [0.2, 0.4]) == [0.0, 0.0]
+    # An edge that is seen: the front wheels pass it 0.1 m before the middle of the robot has come to it.
+    wheels = float(husky.points[husky.point_drives >= 0][:, 0].max())
+    (over,) = term((np.hypot(X, Y) > 0.6) & (wheels + 0.1 > X), [0.3, 0.0])
+    assert over > 0.7
+
+
+def test_sensors_that_look_ahead_only_keep_a_robot_neither_from_driving_nor_from_backing_out(husky):
+    ahead = (np.abs(np.arctan2(Y, X)) < np.radians(35.0)) & (X > 0.6)
+    terrain = terrain_of(np.zeros_like(X), observed=torch.from_numpy(ahead))
+    found, _ = assessed(husky, terrain, [[0.3, 0.0], [0.3, 0.2], [-0.3, 0.0], [0.0, 0.5]])
+    assert float(found.terms["unobserved"].max()) < 0.4
 
 
 @pytest.mark.parametrize("speed", [1.5, 3.0])
@@ -292,7 +325,7 @@ def test_braking_is_no_slip(husky, speed):
 
 
 def test_what_counts_as_unobserved_depends_on_the_way_driven_and_on_the_robot_s_length(husky):
-    unknown = terrain_of(np.zeros_like(X), observed=torch.zeros(X.shape, dtype=torch.bool))
+    unknown = terrain_of(np.zeros_like(X), observed=torch.from_numpy(np.hypot(X, Y) > 2.0))
     small = replace(husky, points=0.2 * husky.points, wheel_radius=0.2 * husky.wheel_radius)
     length = float((small.bounds[1] - small.bounds[0])[0])
     assert 0.1 < length < 0.3
@@ -309,7 +342,7 @@ def test_what_counts_as_unobserved_depends_on_the_way_driven_and_on_the_robot_s_
 
     assert term(small, [0.1, 0.3, 0.5]) == 1.0
     assert term(husky, [0.1, 0.3, 0.5]) == 0.0
-    # A third of the way over unknown ground, though it takes only two of fifty steps.
+    # Two fifths of the way with a wheel over unknown ground, though it takes only a third of the steps.
     half = replace(unknown, observed=torch.from_numpy(X < 2.0))
     slow = [1.0 + 0.02 * i for i in range(1, 50)] + [2.5, 3.0]
     still = torch.zeros(1, len(slow) + 1, 3)
@@ -319,7 +352,8 @@ def test_what_counts_as_unobserved_depends_on_the_way_driven_and_on_the_robot_s_
         inside=torch.ones(1, len(slow) + 1, dtype=torch.bool),
         rotation=torch.eye(3).expand(1, len(slow) + 1, 3, 3),
     )
-    assert float(_unobserved(rollout, half, husky)[0]) == pytest.approx(0.35, abs=0.03)
+    front = float(husky.points[husky.point_drives >= 0][:, 0].max())
+    assert float(_unobserved(rollout, half, husky)[0]) == pytest.approx((3.0 - (2.1 - front)) / 3.0, abs=0.03)
 
 
 def test_weights_and_limits_scale_the_terms(husky):

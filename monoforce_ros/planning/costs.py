@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, fields
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -240,34 +241,70 @@ def _effort(traction: Tensor, robot: RobotModel, twists: Tensor) -> Tensor:
 
 
 def _unobserved(rollout: Rollout, terrain: TerrainMap, robot: RobotModel) -> Tensor:
-    """Share of the path with the middle or a side of the robot over unknown ground ``[N]``, from 0 to 1.
+    """Share of the path with a wheel, a track or the middle of the robot over unknown ground ``[N]``, from 0 to 1.
 
     Off the map ground is unknown. Where the map tells the spread of its heights, a cell is unknown to the degree that
     its height may be off by more than the clearance below the hull: the probability of that for a Laplace distribution.
     Elsewhere cells without a measurement nearby are. So is ground that nothing was measured behind, whatever an encoder
     makes of it: it may be a drop.
+
+    No sensor sees the ground below the robot and close around it, but the first is known to support it. Within a
+    robot's length from the start only what may be a drop counts: the result is the larger one of the share of the
+    whole path over such ground, and the share of the rest of the path over any unknown ground.
     """
     grid = terrain.grid
     place = rollout.position.detach()[..., :2]
-    # Ground under the wheels or tracks of either side counts as that under the middle does.
-    driven_points = robot.points[robot.point_drives >= 0][:, 1]
-    sides = torch.stack([driven_points.min(), driven_points.new_zeros(()), driven_points.max()]).to(place)
-    across = rollout.rotation.detach()[..., :2, 1]
-    spots = place[..., None, :] + sides[:, None] * across[..., None, :]
-    column = ((spots[..., 0] - grid.origin[0]) / grid.resolution).round().clamp(0, grid.columns - 1).nan_to_num(0.0)
-    row = ((spots[..., 1] - grid.origin[1]) / grid.resolution).round().clamp(0, grid.rows - 1).nan_to_num(0.0)
+    # Ground under the wheels or tracks of either side and end counts as that under the middle does.
+    driven_points = robot.points[robot.point_drives >= 0][:, :2]
+    reach = torch.stack([driven_points.amin(0), driven_points.new_zeros(2), driven_points.amax(0)]).to(place)
+    axes = rollout.rotation.detach()[..., :2, :2]
+    under = torch.cartesian_prod(reach[:, 0], reach[:, 1])
+    spots = place[..., None, :] + (axes[..., None, :, :] @ under[:, :, None])[..., 0]
+    column = ((spots[..., 0] - grid.origin[0]) / grid.resolution).round()
+    row = ((spots[..., 1] - grid.origin[1]) / grid.resolution).round()
+    on_map = (column >= 0) & (column < grid.columns) & (row >= 0) & (row < grid.rows)
+    column = column.clamp(0, grid.columns - 1).nan_to_num(0.0).long()
+    row = row.clamp(0, grid.rows - 1).nan_to_num(0.0).long()
+    beyond = torch.from_numpy(terrain.extrapolated()).to(place)
     if terrain.height_spread is None:
         unknown = 1.0 - torch.from_numpy(terrain.measured_nearby()).to(place)
     else:
         unknown = torch.exp(-_hull_clearance(robot) / terrain.height_spread.to(place).clamp_min(1e-4))
-        unknown = torch.maximum(unknown, torch.from_numpy(terrain.extrapolated()).to(place))
-    degree = torch.where(rollout.inside, unknown[row.long(), column.long()].amax(dim=-1), 1.0)
-    distance = (place - place[:, :1]).norm(dim=-1)
-    # No sensor sees the ground below the robot and close around it, but the first is known to support it.
+    unknown = torch.maximum(unknown, beyond)
+    drop = beyond * torch.from_numpy(_looked_at(terrain, robot)).to(place)
+    degree, close = (
+        torch.where(on_map, values[row, column], 1.0).amax(dim=-1).masked_fill(~rollout.inside, 1.0)
+        for values in (unknown, drop)
+    )
     low, high = robot.bounds
-    moved = (distance > float(high[0] - low[0])).to(degree)
-    driven = moved * functional.pad((place[:, 1:] - place[:, :-1]).norm(dim=-1), (1, 0))
-    return (degree * driven).sum(dim=1) / driven.sum(dim=1).clamp_min(1e-6)
+    moved = ((place - place[:, :1]).norm(dim=-1) > float(high[0] - low[0])).to(degree)
+    driven = functional.pad((place[:, 1:] - place[:, :-1]).norm(dim=-1), (1, 0))
+    # Turning in place displaces a robot by centimetres, which are no path.
+    return torch.maximum(_share(degree, driven * moved), _share(close, driven, shortest=grid.resolution))
+
+
+def _share(degree: Tensor, driven: Tensor, *, shortest: float = 1e-6) -> Tensor:
+    """Sum of values ``[N, T + 1]`` times lengths driven ``[N, T + 1]``, over the whole length, at least one [m]."""
+    return (degree * driven).sum(dim=1) / driven.sum(dim=1).clamp_min(shortest)
+
+
+def _looked_at(terrain: TerrainMap, robot: RobotModel) -> np.ndarray:
+    """Cells not below the robot, in directions where its sensors look ``[rows, columns]`` bool.
+
+    The robot is at the origin of the map's frame. Cameras and some lidars look ahead only: where nothing is measured
+    behind the robot, the widest direction with a measurement is taken for the edge of the field of view. A robot that
+    backs out there drives over ground that it came from.
+    """
+    grid = terrain.grid
+    x, y = np.meshgrid(grid.x, grid.y)
+    low, high = (bound.double().cpu().numpy() for bound in robot.bounds)
+    half = 0.5 * grid.resolution
+    outside = (x < low[0] - half) | (x > high[0] + half) | (y < low[1] - half) | (y > high[1] + half)
+    observed = terrain.observed.cpu().numpy()
+    if not observed.any() or (observed & (x < -grid.resolution)).any():
+        return outside
+    bearing = np.abs(np.arctan2(y, x))
+    return outside & (bearing <= bearing[observed].max())
 
 
 def _hull_clearance(robot: RobotModel) -> float:
