@@ -206,8 +206,13 @@ def test_a_robot_whose_wheels_stand_in_what_the_map_takes_for_ground_may_stand_a
     twists = torch.tensor([[0.0, 0.0], [-0.4, 0.0], [0.8, 0.0]])[:, None].expand(3, 300, 2)
     state = State.at_rest(robot.ground_clearance, batch=3)
     result = rollout(terrain, robot, robot.drive_speeds(twists), state, with_contact=True, force_every=6)
-    found = assess(result, terrain, robot, twists)
+    still = rollout(terrain, robot, robot.drive_speeds(torch.zeros(1, 300, 2)), start, with_contact=True, force_every=6)
+    found = assess(result, terrain, robot, twists, standing=still)
     assert found.feasible[:2].tolist() == [True, True], (found.violations(0), found.violations(1))
+    # Whether one candidate is feasible does not depend on the others, such as one that stands.
+    leaving = rollout(terrain, robot, robot.drive_speeds(twists[1:2]), start, with_contact=True, force_every=6)
+    alone = assess(leaving, terrain, robot, twists[1:2], standing=still)
+    assert bool(alone.feasible[0]) and float(alone.cost[0]) == pytest.approx(float(found.cost[1]), rel=1e-4)
     # Driving on costs more than leaving.
     assert float(found.cost[2]) > float(found.cost[1])
 

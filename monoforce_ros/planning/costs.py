@@ -87,14 +87,10 @@ def force_every(time_step: float) -> int:
 _FURTHER = 0.05
 """Share of the limit by which a robot that is beyond it may go further for a moment, as it starts to move."""
 
-_STANDING = 1e-3
-"""Largest command of a candidate that stands still [m/s, rad/s]."""
 _SETTLED = 0.6
 """Time in which a body that starts inside the ground is pushed out of it [s]: of a Husky, a Warthog and a TRADR with
 their wheels or tracks in ground of 0.25 m, on one side, at the front or at a corner, seven of nine came to rest within
 0.5 s. What presses longer is held against no candidate either: see the limits in :func:`assess`."""
-_CONTACT_TERMS = ("force_variation", "wheel_load", "collision")
-"""Terms of the forces that the map exerts on a robot that stands still, too."""
 
 
 @dataclass(frozen=True)
@@ -142,20 +138,25 @@ def assess(
     *,
     weights: CostWeights = CostWeights(),
     limits: Limits = Limits(),
+    standing: Rollout | None = None,
 ) -> Assessment:
-    """Terms, cost and feasibility of candidates. Differentiable in the rollout.
+    """Terms, cost and feasibility of candidates, each of them by itself. Differentiable in the rollout.
 
     Args:
         rollout: rollout of all candidates ``[N]``, with contact force sums.
         terrain: the map of the rollout.
         robot: the robot of the rollout.
         twists: commanded forward speed [m/s] and yaw rate [rad/s] of each step ``[N, T, 2]``.
+        weights: weights of the terms.
+        limits: limits of the terms.
+        standing: of a robot that stands, the rollout without commands ``[1]``, from the same start and with the same
+            times. Where the map exerts forces beyond a limit even then, candidates with no larger ones are feasible.
 
     Raises:
-        ValueError: the rollout has no contact force sums, or the shape of ``twists`` does not match it.
+        ValueError: a rollout has no contact force sums, or the shape of ``twists`` does not match it.
     """
     contact = rollout.contact
-    if contact is None:
+    if contact is None or (standing is not None and standing.contact is None):
         raise ValueError("costs: the rollout has no contact forces; roll out with `with_contact=True`")
     expected = (rollout.position.shape[0], rollout.position.shape[1] - 1, 2)
     if tuple(twists.shape) != expected:
@@ -175,14 +176,15 @@ def assess(
     }
     # A robot that leans beyond a limit, or stands too close, has to get away: what makes it no worse is feasible.
     starts = {"roll": rolls[:, 0] / limits.roll, "pitch": pitches[:, 0] / limits.pitch}
-    standing = twists.abs().amax(dim=(1, 2)) < _STANDING
-    if bool(standing.any()):
-        own = {name: raw[name][standing][:1] / getattr(limits, name) for name in _CONTACT_TERMS}
-        if any(bool(value > 1.0) for value in own.values()):
+    if standing is not None:
+        own = _contact_terms(standing, step, weight)
+        if any(float(value) > getattr(limits, name) for name, value in own.items()):
             # The robot does stand here. What the map does to it then is the map's error, such as grass taken for
             # ground around the wheels, and no candidate's fault.
-            raw |= _contact_terms(rollout, step, weight, skipped=round(_SETTLED / step))
-            starts |= {name: raw[name][standing][:1] / getattr(limits, name) for name in _CONTACT_TERMS}
+            skipped = round(_SETTLED / step)
+            raw |= _contact_terms(rollout, step, weight, skipped=skipped)
+            own = _contact_terms(standing, step, weight, skipped=skipped)
+            starts |= {name: value.detach() / getattr(limits, name) for name, value in own.items()}
     terms = {name: torch.nan_to_num(value / getattr(limits, name), nan=torch.inf) for name, value in raw.items()}
     terms["obstacle_clearance"], close, left = closeness(rollout, terrain, robot, limits.obstacle_clearance)
     # Who stands too close may turn before it leaves, and has left if it ends no closer.
@@ -195,7 +197,7 @@ def assess(
 
 
 def _contact_terms(rollout: Rollout, step: float, weight: Tensor, skipped: int = 0) -> dict[str, Tensor]:
-    """Terms of the contact forces ``[N]``, without the first ``skipped`` ones."""
+    """Terms of the forces that the map exerts, also on a robot that stands ``[N]``, without the first ones."""
     contact = rollout.contact
     assert contact is not None
     # Of a horizon shorter than that, the last two remain.
