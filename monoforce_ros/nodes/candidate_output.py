@@ -135,30 +135,35 @@ class CandidateOutput:
         standing = self._standing(prediction, before)
         rollout, assessment = self._assess(prediction, twists, standing)
         angles = self._commanded_flippers(prediction)
+        # Standing costs least and makes no progress: it is the best one only where nothing else is feasible.
+        moving = torch.from_numpy(np.abs(sequences).max(axis=(1, 2)) > _STANDING)
+        best = assessment.best_among(moving)
         # Speed and yaw rate are refined, of candidates that do not move sideways.
-        if settings.refine_seconds and assessment.best is not None and not sequences[assessment.best][:, 2:].any():
-            found = self._refined(prediction, before[:, :2], sequences[assessment.best][:, :2], standing)
-            best = np.pad(found.sequence[None], ((0, 0), (0, 0), (0, before.shape[-1] - 2)))
-            refined = over_horizon(best, before, steps)
+        if settings.refine_seconds and best is not None and not sequences[best][:, 2:].any():
+            found = self._refined(prediction, before[:, :2], sequences[best][:, :2], standing)
+            padded = np.pad(found.sequence[None], ((0, 0), (0, 0), (0, before.shape[-1] - 2)))
+            refined = over_horizon(padded, before, steps)
             refined_rollout, refined_assessment = self._assess(prediction, refined, standing, found.flippers)
             twists = np.concatenate([twists, refined])
             rollout, assessment = rollout.joined(refined_rollout), assessment.joined(refined_assessment)
-            if found.flippers is not None and assessment.best == len(twists) - 1:
+            best = assessment.best_among(torch.cat([moving, torch.ones(1, dtype=torch.bool)]))
+            if found.flippers is not None and best == len(twists) - 1:
                 angles = found.flippers
+        best = assessment.best if best is None else best
         data: dict[str, object] = {
-            "candidates": messages.candidate_markers(motion, rollout, assessment, frame_id),
+            "candidates": messages.candidate_markers(motion, rollout, assessment, best, frame_id),
             "candidate_costs": messages.candidate_costs(
                 motion, rollout, twists[:, start], assessment, frame_id, delay * time_step
             ),
         }
-        if assessment.best is not None:
+        if best is not None:
             if angles is not None:
                 data["flipper_angles"] = self._flipper_angles(prediction, angles, delay)
-            data["best_path"] = messages.best_path(motion, rollout, assessment.best, frame_id, settings.path_time_step)
+            data["best_path"] = messages.best_path(motion, rollout, best, frame_id, settings.path_time_step)
         if "candidate_rollouts" in self._publishers:
             data["candidate_rollouts"] = messages.candidate_rollouts(
-                motion, rollout, self._predictor.robot, twists[:, self._predictor.history :, :2], assessment, frame_id,
-                settings.path_time_step,
+                motion, rollout, self._predictor.robot, twists[:, self._predictor.history :, :2], assessment, best,
+                frame_id, settings.path_time_step,
             )  # fmt: skip
         self._statistics["candidates start after [s]"] = f"{delay * time_step:.2f}"
         self._statistics["feasible candidates"] = f"{int(assessment.feasible.sum())} of {len(twists)}"

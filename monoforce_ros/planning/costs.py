@@ -107,9 +107,12 @@ class Assessment:
     @property
     def best(self) -> int | None:
         """Index of the feasible candidate with the lowest cost; None without a feasible one."""
-        if not bool(self.feasible.any()):
-            return None
-        return int(torch.where(self.feasible, self.cost, torch.inf).argmin())
+        return self.best_among(torch.ones_like(self.feasible))
+
+    def best_among(self, chosen: Tensor) -> int | None:
+        """Index of the feasible one with the lowest cost among some candidates ``[N]`` bool; None without one."""
+        possible = self.feasible & chosen
+        return int(torch.where(possible, self.cost, torch.inf).argmin()) if bool(possible.any()) else None
 
     def joined(self, other: Assessment) -> Assessment:
         """These candidates followed by others."""
