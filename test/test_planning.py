@@ -184,6 +184,26 @@ def test_a_robot_that_stands_beside_a_wall_may_leave_but_not_come_closer(husky):
     assert away.feasible.tolist() == [True, True, False] or away.feasible.tolist() == [True, False, False]
 
 
+def test_a_robot_that_leaves_an_obstacle_does_not_come_near_another_one(husky):
+    side, front = float(husky.bounds[1][1]), float(husky.bounds[1][0])
+    beside = side + 0.05 < Y
+
+    def feasible(height, *commands):
+        found, _ = assessed(husky, terrain_of(np.where(height, 1.0, 0.0)), commands)
+        assert float(found.terms["collision"].max()) < 0.7, "nothing is hit"
+        assert float(found.terms["obstacle_clearance"].min()) > 1.0, "all start too close"
+        return found.feasible.tolist()
+
+    # A wall beside the robot, and one across its way, before which the path ends.
+    assert feasible(beside, [0.3, 0.0], [0.3, -0.1]) == [True, True]
+    ahead = [0.314, 0.0], [0.314, -0.05], [0.1, 0.0]
+    assert feasible(beside | (front + 1.0 < X), *ahead) == [False, False, True]
+    # It leaves the wall, and ends beside another one.
+    swerve = [*[[0.4, -0.8]] * 2, *[[0.4, 0.8]] * 2, [0.2, 0.0]]
+    assert feasible(beside, swerve) == [True]
+    assert feasible(beside | ((X > 1.0) & (-side - 0.28 > Y)), swerve) == [False]
+
+
 def test_a_diverged_candidate_does_not_hide_the_wall_from_the_others(husky):
     wall = terrain_of(np.where(float(husky.bounds[1][1]) + 0.05 < Y, 1.0, 0.0))
     twists = torch.tensor([[0.5, 0.0], [0.5, 0.0]])[:, None].expand(2, 200, 2)

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from monoforce_ros.physics import Rollout
-from monoforce_ros.planning.clearance import LARGEST, closeness
+from monoforce_ros.planning.clearance import FURTHER, LARGEST, closeness
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import TerrainMap
 
@@ -83,9 +83,6 @@ def force_every(time_step: float) -> int:
     """Interval, in steps of ``time_step`` [s], at which :func:`assess` needs contact forces."""
     return max(1, round(_FORCE_INTERVAL / time_step))
 
-
-_FURTHER = 0.05
-"""Share of the limit by which a robot that is beyond it may go further for a moment, as it starts to move."""
 
 _SETTLED = 0.6
 """Time in which a body that starts inside the ground is pushed out of it [s]: of a Husky, a Warthog and a TRADR with
@@ -189,12 +186,11 @@ def assess(
             own = _contact_terms(standing, step, weight, skipped=skipped)
             starts |= {name: value.detach() / getattr(limits, name) for name, value in own.items()}
     terms = {name: torch.nan_to_num(value / getattr(limits, name), nan=torch.inf) for name, value in raw.items()}
-    terms["obstacle_clearance"], close, left = closeness(rollout, terrain, robot, limits.obstacle_clearance)
-    # Who stands too close may turn before it leaves, and has left if it ends no closer.
-    starts["obstacle_clearance"] = torch.where((close > 1.0) & (left <= close + _FURTHER), torch.inf, close)
+    terms["obstacle_clearance"], leaves = closeness(rollout, terrain, robot, limits.obstacle_clearance)
+    starts["obstacle_clearance"] = torch.where(leaves, torch.inf, 0.0)
     cost = sum(getattr(weights, name) * terms[name] for name in TERMS)
     cost = torch.where(rollout.valid, cost, torch.inf)
-    most = {name: (starts[name] + _FURTHER).clamp_min(1.0) if name in starts else 1.0 for name in TERMS}
+    most = {name: (starts[name] + FURTHER).clamp_min(1.0) if name in starts else 1.0 for name in TERMS}
     feasible = torch.stack([value <= most[name] for name, value in terms.items()]).all(dim=0) & rollout.valid
     return Assessment(terms, cost, feasible)
 
