@@ -87,7 +87,13 @@ class PathSelectorNode(Node):
         self._given_up: Course | None = None
         """The last plan to an end that the robot did not follow."""
         self._started = time.monotonic()
-        self._odometry = OdometryInput(self.frames, self.transforms, self.health, settings.timeout)
+        self._odometry = OdometryInput(
+            self.frames,
+            self.transforms,
+            self.health,
+            settings.timeout,
+            lambda: self._inputs["odometry"].publisher_names,
+        )
         self._candidates = CandidateInput(self.health, settings.timeout)
         self._driving = False
         self._stopped_since = np.inf

@@ -82,6 +82,8 @@ class AdaptiveSubscription:
         self._subscribed: _Offer | None = None
         self.wrong_type = ""
         """Types on the topic if none of them is usable."""
+        self.publisher_names = ""
+        """Fully qualified names of the nodes that publish on the topic, half a second ago at the latest."""
         self._timer = node.create_timer(0.5, self._update, clock=STEADY)
         self._update()
 
@@ -101,6 +103,7 @@ class AdaptiveSubscription:
 
     def _update(self) -> None:
         publishers = self._node.get_publishers_info_by_topic(self.topic)
+        self.publisher_names = ", ".join(sorted({full_name(info) for info in publishers}))
         offered = {info.topic_type for info in publishers}
         usable = [name for name in self._types if name in offered]
         self.wrong_type = "" if usable or not offered else ", ".join(sorted(offered))
@@ -153,6 +156,11 @@ def _durability(publishers: list[TopicEndpointInfo]) -> DurabilityPolicy:
     """Transient local if every publisher offers it, for the last message sent before the subscription."""
     latched = bool(publishers) and all(p.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in publishers)
     return DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+
+
+def full_name(info: TopicEndpointInfo) -> str:
+    """Fully qualified name of an endpoint's node."""
+    return f"{info.node_namespace}/{info.node_name}".replace("//", "/")
 
 
 def other_listeners(node: Node, topic: str) -> set[str]:
