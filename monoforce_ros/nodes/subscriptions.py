@@ -58,6 +58,7 @@ class AdaptiveSubscription:
             best-effort messages are easily lost, otherwise best effort, which works with every publisher.
         follow_listeners: of several possible types, take the one that other nodes listen to. For commands: a base that
             listens to one type shows which one is meant.
+        raw: whether the callback gets serialised messages.
     """
 
     def __init__(
@@ -70,6 +71,7 @@ class AdaptiveSubscription:
         depth: int,
         reliability: str = "auto",
         follow_listeners: bool = False,
+        raw: bool = False,
     ):
         self._node = node
         self.topic = node.resolve_topic_name(topic)
@@ -78,6 +80,7 @@ class AdaptiveSubscription:
         self._depth = depth
         self._reliability = reliability
         self._follow_listeners = follow_listeners
+        self._raw = raw
         self._subscription: Subscription | None = None
         self._subscribed: _Offer | None = None
         self.wrong_type = ""
@@ -91,6 +94,11 @@ class AdaptiveSubscription:
     def publishers(self) -> int:
         """Number of publishers on the topic."""
         return self._node.count_publishers(self.topic)
+
+    @property
+    def latched(self) -> bool:
+        """Whether the subscription asks for the last message that was sent before it."""
+        return self._subscribed is not None and self._subscribed.durability == DurabilityPolicy.TRANSIENT_LOCAL
 
     @property
     def silence_cause(self) -> str:
@@ -121,7 +129,7 @@ class AdaptiveSubscription:
         quality = QoSProfile(depth=self._depth, reliability=wanted.reliability, durability=wanted.durability)
         try:
             self._subscription = self._node.create_subscription(
-                self._types[wanted.type], self.topic, self._callback, quality
+                self._types[wanted.type], self.topic, self._callback, quality, raw=self._raw
             )
         except RuntimeError as error:
             # A process has one type per topic, and the middleware may still be removing the former subscription: the
