@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import binary_erosion
 
 from monoforce_ros.effects import drive_speeds
 from monoforce_ros.perception import with_clear_start
@@ -428,6 +429,21 @@ def test_occupancy_matches_the_terrain_for_any_heading(heading):
     assert found.data.dtype == np.int8 and found.data.min() == -1 and found.data.max() == 100
     with pytest.raises(ValueError, match="occupancy limits"):
         occupancy(terrain, pose, slope_limit=0.0, step_limit=0.1)
+
+
+@pytest.mark.parametrize("direction", [0.0, np.pi / 8, np.pi / 4, 3 * np.pi / 4])
+def test_the_cost_of_a_slope_and_of_an_edge_does_not_depend_on_their_direction(direction):
+    along = np.cos(direction) * X + np.sin(direction) * Y
+
+    def cost(height):
+        found = occupancy(terrain_of(height), np.eye(4), slope_limit=0.5, step_limit=0.03)
+        # Away from the border, where heights are continued level.
+        return found.data[binary_erosion(found.grid.inside, iterations=5)]
+
+    slope = cost(np.tan(0.4) * along)
+    assert slope.min() >= 79 and slope.max() <= 81
+    # A kerb of 10 cm.
+    assert cost(np.where(along > 0.0, 0.1, 0.0)).max() == 100
 
 
 def test_selection_weighs_cost_against_the_remaining_distance():
