@@ -250,12 +250,13 @@ def _unobserved(rollout: Rollout, terrain: TerrainMap, robot: RobotModel) -> Ten
     makes of it: it may be a drop.
 
     No sensor sees the ground below the robot and close around it, but the first is known to support it. Within a
-    robot's length from the start only what may be a drop counts: the result is the larger one of the share of the
-    whole path over such ground, and the share of the rest of the path over any unknown ground.
+    robot's length from the start only what may be a drop counts, under the wheels of either end, too: the result is the
+    larger one of the share of the whole path over such ground, and the share of the rest of the path over any unknown
+    ground.
     """
     grid = terrain.grid
     place = rollout.position.detach()[..., :2]
-    # Ground under the wheels or tracks of either side and end counts as that under the middle does.
+    # Ground under the wheels or tracks of either side counts as that under the middle does.
     driven_points = robot.points[robot.point_drives >= 0][:, :2]
     reach = torch.stack([driven_points.amin(0), driven_points.new_zeros(2), driven_points.amax(0)]).to(place)
     axes = rollout.rotation.detach()[..., :2, :2]
@@ -273,9 +274,13 @@ def _unobserved(rollout: Rollout, terrain: TerrainMap, robot: RobotModel) -> Ten
         unknown = torch.exp(-_hull_clearance(robot) / terrain.height_spread.to(place).clamp_min(1e-4))
     unknown = torch.maximum(unknown, beyond)
     drop = beyond * torch.from_numpy(_looked_at(terrain, robot)).to(place)
+    # Between two rows of returns the ends of a robot are over a gap most of the time, its middle is not.
+    middle = under[:, 0] == 0.0
     degree, close = (
-        torch.where(on_map, values[row, column], 1.0).amax(dim=-1).masked_fill(~rollout.inside, 1.0)
-        for values in (unknown, drop)
+        torch.where(on_map[..., chosen], values[row[..., chosen], column[..., chosen]], 1.0)
+        .amax(dim=-1)
+        .masked_fill(~rollout.inside, 1.0)
+        for values, chosen in ((unknown, middle), (drop, torch.ones_like(middle)))
     )
     low, high = robot.bounds
     moved = ((place - place[:, :1]).norm(dim=-1) > float(high[0] - low[0])).to(degree)
