@@ -294,3 +294,25 @@ def test_a_type_that_jazzy_does_not_have_is_recorded_from_its_package(start, pee
     with BagReader(tmp_path / "out") as bag:
         assert bag.topics["/goals"] == "nav_msgs/msg/Goals"
         assert min(len(list(bag.messages([topic]))) for topic in ("/goals", "/cmd_vel")) >= 15
+
+
+@pytest.mark.unhurried_nodes
+def test_a_driver_that_starts_again_with_best_effort_is_recorded_on(start, peer, tmp_path):
+    recorder = start("bag_recorder", tmp_path / "out", "--topics", "/restarted")
+    clocks = peer.node.create_publisher(Clock, "/restarted", 10)
+    message, deadline = Clock(), time.monotonic() + 30
+    while "recording /restarted (" not in recorder.output:
+        assert time.monotonic() < deadline, recorder.output
+        peer.spin(0.05)
+    peer.node.destroy_publisher(clocks)
+    clocks = peer.node.create_publisher(
+        Clock, "/restarted", QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+    )
+    for second in range(80):
+        message.clock.sec = 1 + second
+        clocks.publish(message)
+        peer.spin(0.05)
+    assert recorder.stop() == 0 and "Traceback" not in recorder.output
+    with BagReader(tmp_path / "out") as bag:
+        received = {entry.decode().clock.sec for entry in bag.messages(["/restarted"])}
+    assert {60, 70, 80} <= received

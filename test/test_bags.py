@@ -8,9 +8,19 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from nav_msgs.msg import Odometry
 from rclpy.serialization import deserialize_message
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from scipy.spatial.transform import Rotation
 
-from monoforce_ros.bags import BagError, BagReader, BagWriter, Recording, builders, camera_info_topics, find_transform
+from monoforce_ros.bags import (
+    BagError,
+    BagReader,
+    BagWriter,
+    Recording,
+    builders,
+    camera_info_topics,
+    find_transform,
+    type_store,
+)
 from monoforce_ros.bags.moving_frame import MovingFrame
 from monoforce_ros.core import homogeneous, unfinished_path
 
@@ -159,6 +169,26 @@ def test_a_bag_without_metadata_is_read_with_a_warning(tmp_path, storage):
     for opened in (recording, Recording.open(storage_file(path))):
         assert len(opened.motion) == 20
         assert opened.cloud(opened.clouds[7])[0][0, 0] == 8.0
+
+
+@pytest.mark.parametrize("storage", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+@pytest.mark.parametrize("metadata", [True, False])
+def test_messages_compressed_one_by_one_are_read(tmp_path, storage, metadata):
+    """``ros2 bag record --compression-mode message``; only metadata.yaml says so."""
+    path, types = tmp_path / "drive", type_store()
+    writer = Writer(path, version=9, storage_plugin=storage)
+    writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
+    with writer:
+        connection = writer.add_connection("/cmd_vel", "geometry_msgs/msg/Twist", typestore=types)
+        for n in range(20):
+            message = builders.twist(0.1 * n, 0.0)
+            writer.write(connection, START + n, types.serialize_cdr(message, message.__msgtype__))
+    if not metadata:
+        (path / "metadata.yaml").unlink()
+    for opened in (path, next(file for file in path.iterdir() if file.suffix in (".mcap", ".db3"))):
+        with BagReader(opened) as bag:
+            speeds = [message.decode().linear.x for message in bag.messages()]
+        np.testing.assert_allclose(speeds, 0.1 * np.arange(20))
 
 
 def test_a_real_ros_1_bag_without_its_index_is_read(tmp_path, real_data):

@@ -119,6 +119,9 @@ def test_a_wall_is_not_driven_into(peer, predictor, heard):
     assert not feasible[straight] and collision[straight] > 1.0
     assert feasible[0] and feasible[COUNT - 2], "the outermost arcs pass the wall"
     ends = [message.poses[-1].pose.position for message in heard["/predicted/best_path"]]
+    # Standing, the last candidate, costs least, but the best one moves.
+    cost = values[:, names.index("cost")]
+    assert cost[-1] == cost.min() and all(np.hypot(p.x - 1.0, p.y - 2.0) > 1.0 for p in ends)
     # The robot stands at (1, 2): no best path ends in the wall or beyond it straight ahead.
     assert all(not (p.x > 2.6 and abs(p.y - 2.0) < 0.6) for p in ends)
 
@@ -181,9 +184,10 @@ def test_candidates_of_a_planner_are_compared_and_refined(peer, start):
     names, values = table(costs[-1])
     assert len(values) == 4, "three candidates and the refined one"
     np.testing.assert_allclose(values[:3, names.index("speed")], sequences[:, 0, 0], atol=1e-6)
-    feasible = values[:3, names.index("feasible")] > 0
-    best = values[:3, names.index("cost")][feasible].min()
-    assert values[3, names.index("cost")] <= best + 1e-3
+    # The best one that moves is refined, not the one that stands.
+    feasible = values[:2, names.index("feasible")] > 0
+    best = values[:2, names.index("cost")][feasible].min()
+    assert values[3, names.index("cost")] <= best + 1e-3 and values[3, names.index("speed")] > 0.1
     names, values = table(spreads[-1])
     assert {"time", "along", "across", "heading", "radius_90"} <= set(names) and len(values) > 10
     radius = values[:, names.index("radius_90")]
@@ -236,7 +240,9 @@ def test_candidates_of_a_planner_are_compared_and_refined(peer, start):
     np.testing.assert_allclose(velocities[1, middle - 1, 0], 0.4, atol=0.05)
     terms = np.array(message.terms).reshape(count, len(message.term_names))
     assert "roll" in message.term_names and np.isfinite(terms).all() and len(message.costs) == count
-    assert message.best == int(np.argmin(np.where(message.feasible, message.costs, np.inf)))
+    costs_moving = np.where(message.feasible, message.costs, np.inf)
+    costs_moving[2] = np.inf
+    assert message.best == int(np.argmin(costs_moving))
 
 
 def test_candidates_that_come_too_late_are_reported(peer, start):

@@ -4,8 +4,10 @@ import time
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from monoforce_ros.core import MotionState
+from monoforce_ros.nodes.alternating_poses import AlternatingPoses
 from monoforce_ros.nodes.inputs import Inputs
 from monoforce_ros.nodes.rate_limiter import RateLimiter
 
@@ -211,3 +213,39 @@ def test_what_came_before_a_pause_is_forgotten():
     assert kept.motion_stamp == 0
     moved(kept, 50_000_000)
     assert kept.motion_stamp == 50_000_000
+
+
+def _two_tracks(rates, apart, noise=0.0, seconds=2.0):
+    """What is found at each pose [m] of a robot on a circle at 1 m/s, from two estimators at two rates [Hz]."""
+    generator, found, alternating = np.random.default_rng(0), [], AlternatingPoses()
+    poses = sorted((n / rate, index) for index, rate in enumerate(rates) if rate for n in range(int(seconds * rate)))
+    for now, index in poses:
+        place = np.array([np.sin(now), 1.0 - np.cos(now) + index * apart, 0.0]) + noise * generator.normal(size=3)
+        rotation = Rotation.from_euler("z", now).as_matrix()
+        found.append(alternating.add(MotionState(round(1e9 * (now + 1)), place, rotation, np.zeros(3), np.zeros(3))))
+    return np.array(found)
+
+
+@pytest.mark.parametrize("rates", [(50, 50), (50, 10), (30, 47)])
+def test_two_estimators_on_one_topic_are_found(rates):
+    found = _two_tracks(rates, 0.4)
+    assert found[-1] == pytest.approx(0.4, abs=0.05) and (found > 0.0).mean() > 0.6
+
+
+def test_one_estimator_is_not_taken_for_two():
+    assert not _two_tracks((50, 0), 0.0, noise=0.05).any(), "noise"
+    assert not _two_tracks((50, 50), 0.02).any(), "two that agree"
+    alternating = AlternatingPoses()
+    jumps = [MotionState(10**9 + n * 20_000_000, np.array([float(n > 40), 0, 0]), np.eye(3), np.zeros(3), np.zeros(3))
+             for n in range(100)]  # fmt: skip
+    assert not any(alternating.add(state) for state in jumps), "a jump"
+
+
+def test_an_estimator_is_used_again_once_the_other_one_is_silent():
+    alternating = AlternatingPoses()
+    found = []
+    for n in range(200):
+        place = np.array([0.0, 0.4 * (n % 2) * (n < 100), 0.0])
+        state = MotionState(10**9 + n * 20_000_000, place, np.eye(3), np.zeros(3), np.zeros(3))
+        found.append(alternating.add(state) > 0.0)
+    assert all(found[20:100]) and not any(found[155:])

@@ -207,6 +207,7 @@ def test_every_parameter_is_an_argument_and_reaches_the_nodes_that_have_it():
         (["ns:=left"], "unknown launch argument 'ns'; did you mean 'namespace'?"),
         (["slam:=true"], "unknown launch argument 'slam'.*--show-args lists all arguments"),
         (["candidates=32"], "unexpected argument 'candidates=32': launch arguments are given as candidates:=32"),
+        (["robot:=husky", "robot:=jackal"], "'robot' is given twice, as 'husky' and 'jackal': give it once"),
         (["--robot", "husky"], "unexpected argument '--robot': launch arguments are given as robot:=VALUE"),
     ],
 )

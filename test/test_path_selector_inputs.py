@@ -811,6 +811,24 @@ def test_motion_against_the_command_is_found_and_nothing_else_is_taken_for_it():
         assert against(0.0, 0.6, -1.0, seconds=16.0, turns=turns) == {"yaw rate"}
 
 
+@pytest.mark.parametrize("command", [(0.0, 0.0, 0.4), (0.0, 0.0, -0.4), (0.8, 0.0, 0.4)])
+def test_motion_to_the_side_is_compared_with_the_commands_too(command):
+    def check(share):
+        """The robot carries out a share of its speed to the left, and all of its forward speed."""
+        found, random = ProgressCheck(), np.random.default_rng(3)
+        for step in range(100):
+            place = 0.1 * step * np.array([command[0], share * command[2]]) + 0.005 * random.standard_normal(2)
+            turn = np.array([[0.0, -1.0], [1.0, 0.0]])
+            found.add(0.1 * step, command, turn @ place, np.pi / 2)
+        return found
+
+    assert check(1.0).moving and check(1.0).unfollowed < 1.0 and not check(1.0).opposed
+    if command[0] == 0.0:
+        stuck = check(0.0)
+        assert stuck.moving is False and stuck.unfollowed > 6.0
+        assert check(-1.0).opposed == "speed"
+
+
 def test_the_time_without_motion_as_commanded_is_counted():
     check = ProgressCheck()
     for step in range(80):

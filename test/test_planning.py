@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import binary_erosion
 
 from monoforce_ros.effects import drive_speeds
 from monoforce_ros.perception import with_clear_start
@@ -184,6 +185,26 @@ def test_a_robot_that_stands_beside_a_wall_may_leave_but_not_come_closer(husky):
     assert away.feasible.tolist() == [True, True, False] or away.feasible.tolist() == [True, False, False]
 
 
+def test_a_robot_that_leaves_an_obstacle_does_not_come_near_another_one(husky):
+    side, front = float(husky.bounds[1][1]), float(husky.bounds[1][0])
+    beside = side + 0.05 < Y
+
+    def feasible(height, *commands):
+        found, _ = assessed(husky, terrain_of(np.where(height, 1.0, 0.0)), commands)
+        assert float(found.terms["collision"].max()) < 0.7, "nothing is hit"
+        assert float(found.terms["obstacle_clearance"].min()) > 1.0, "all start too close"
+        return found.feasible.tolist()
+
+    # A wall beside the robot, and one across its way, before which the path ends.
+    assert feasible(beside, [0.3, 0.0], [0.3, -0.1]) == [True, True]
+    ahead = [0.314, 0.0], [0.314, -0.05], [0.1, 0.0]
+    assert feasible(beside | (front + 1.0 < X), *ahead) == [False, False, True]
+    # It leaves the wall, and ends beside another one.
+    swerve = [*[[0.4, -0.8]] * 2, *[[0.4, 0.8]] * 2, [0.2, 0.0]]
+    assert feasible(beside, swerve) == [True]
+    assert feasible(beside | ((X > 1.0) & (-side - 0.28 > Y)), swerve) == [False]
+
+
 def test_a_diverged_candidate_does_not_hide_the_wall_from_the_others(husky):
     wall = terrain_of(np.where(float(husky.bounds[1][1]) + 0.05 < Y, 1.0, 0.0))
     twists = torch.tensor([[0.5, 0.0], [0.5, 0.0]])[:, None].expand(2, 200, 2)
@@ -206,8 +227,13 @@ def test_a_robot_whose_wheels_stand_in_what_the_map_takes_for_ground_may_stand_a
     twists = torch.tensor([[0.0, 0.0], [-0.4, 0.0], [0.8, 0.0]])[:, None].expand(3, 300, 2)
     state = State.at_rest(robot.ground_clearance, batch=3)
     result = rollout(terrain, robot, robot.drive_speeds(twists), state, with_contact=True, force_every=6)
-    found = assess(result, terrain, robot, twists)
+    still = rollout(terrain, robot, robot.drive_speeds(torch.zeros(1, 300, 2)), start, with_contact=True, force_every=6)
+    found = assess(result, terrain, robot, twists, standing=still)
     assert found.feasible[:2].tolist() == [True, True], (found.violations(0), found.violations(1))
+    # Whether one candidate is feasible does not depend on the others, such as one that stands.
+    leaving = rollout(terrain, robot, robot.drive_speeds(twists[1:2]), start, with_contact=True, force_every=6)
+    alone = assess(leaving, terrain, robot, twists[1:2], standing=still)
+    assert bool(alone.feasible[0]) and float(alone.cost[0]) == pytest.approx(float(found.cost[1]), rel=1e-4)
     # Driving on costs more than leaving.
     assert float(found.cost[2]) > float(found.cost[1])
 
@@ -280,9 +306,42 @@ def test_an_edge_under_the_wheels_of_one_side_counts(husky, side):
     edge = terrain_of(np.zeros_like(X), observed=torch.from_numpy(side * Y < 0.1))
     spreads = {name: torch.full_like(edge.height, 0.005) for name in ("geometric_spread", "decrease_spread")}
     edge = replace(edge, **spreads)
-    found, _ = assessed(husky, edge, [[0.9, 0.0], [0.9, -0.3 * side]])
+    found, _ = assessed(husky, edge, [[0.9, 0.0], [0.9, -0.6 * side]])
     along, away = found.terms["unobserved"].tolist()
-    assert along > 0.5 and away < 0.5 * along
+    assert along > 0.5 and away < 0.6 * along
+
+
+@pytest.mark.parametrize("spread", [None, 0.005])
+def test_an_edge_right_before_the_robot_counts(husky, spread):
+    """A lidar that looks over the ground within 1.5 m sees none 0.3 m before the robot's nose, and none behind it."""
+    edge = 0.3 + float(husky.bounds[1][0])
+
+    def term(observed, *commands):
+        terrain = terrain_of(np.zeros_like(X), observed=torch.from_numpy(observed))
+        if spread is not None:
+            spreads = {
+                name: torch.full_like(terrain.height, spread) for name in ("geometric_spread", "decrease_spread")
+            }
+            terrain = replace(terrain, **spreads)
+        found, _ = assessed(husky, terrain, commands)
+        return found.terms["unobserved"].tolist()
+
+    seen = np.hypot(X, Y) > 1.5
+    ahead, back, turning = term(seen & (edge > X), [0.3, 0.0], [-0.3, 0.0], [0.0, 0.5])
+    assert ahead > 1.0 and back == 0.0 and turning < 0.01
+    # On level ground the blind zone holds nobody.
+    assert term(seen, [0.3, 0.0], [0.2, 0.4]) == [0.0, 0.0]
+    # An edge that is seen: the front wheels pass it 0.1 m before the middle of the robot has come to it.
+    wheels = float(husky.points[husky.point_drives >= 0][:, 0].max())
+    (over,) = term((np.hypot(X, Y) > 0.6) & (wheels + 0.1 > X), [0.3, 0.0])
+    assert over > 0.7
+
+
+def test_sensors_that_look_ahead_only_keep_a_robot_neither_from_driving_nor_from_backing_out(husky):
+    ahead = (np.abs(np.arctan2(Y, X)) < np.radians(35.0)) & (X > 0.6)
+    terrain = terrain_of(np.zeros_like(X), observed=torch.from_numpy(ahead))
+    found, _ = assessed(husky, terrain, [[0.3, 0.0], [0.3, 0.2], [-0.3, 0.0], [0.0, 0.5]])
+    assert float(found.terms["unobserved"].max()) < 0.4
 
 
 @pytest.mark.parametrize("speed", [1.5, 3.0])
@@ -292,7 +351,7 @@ def test_braking_is_no_slip(husky, speed):
 
 
 def test_what_counts_as_unobserved_depends_on_the_way_driven_and_on_the_robot_s_length(husky):
-    unknown = terrain_of(np.zeros_like(X), observed=torch.zeros(X.shape, dtype=torch.bool))
+    unknown = terrain_of(np.zeros_like(X), observed=torch.from_numpy(np.hypot(X, Y) > 2.0))
     small = replace(husky, points=0.2 * husky.points, wheel_radius=0.2 * husky.wheel_radius)
     length = float((small.bounds[1] - small.bounds[0])[0])
     assert 0.1 < length < 0.3
@@ -309,7 +368,7 @@ def test_what_counts_as_unobserved_depends_on_the_way_driven_and_on_the_robot_s_
 
     assert term(small, [0.1, 0.3, 0.5]) == 1.0
     assert term(husky, [0.1, 0.3, 0.5]) == 0.0
-    # A third of the way over unknown ground, though it takes only two of fifty steps.
+    # Two fifths of the way with a wheel over unknown ground, though it takes only a third of the steps.
     half = replace(unknown, observed=torch.from_numpy(X < 2.0))
     slow = [1.0 + 0.02 * i for i in range(1, 50)] + [2.5, 3.0]
     still = torch.zeros(1, len(slow) + 1, 3)
@@ -319,7 +378,8 @@ def test_what_counts_as_unobserved_depends_on_the_way_driven_and_on_the_robot_s_
         inside=torch.ones(1, len(slow) + 1, dtype=torch.bool),
         rotation=torch.eye(3).expand(1, len(slow) + 1, 3, 3),
     )
-    assert float(_unobserved(rollout, half, husky)[0]) == pytest.approx(0.35, abs=0.03)
+    front = float(husky.points[husky.point_drives >= 0][:, 0].max())
+    assert float(_unobserved(rollout, half, husky)[0]) == pytest.approx((3.0 - (2.1 - front)) / 3.0, abs=0.03)
 
 
 def test_weights_and_limits_scale_the_terms(husky):
@@ -369,6 +429,21 @@ def test_occupancy_matches_the_terrain_for_any_heading(heading):
     assert found.data.dtype == np.int8 and found.data.min() == -1 and found.data.max() == 100
     with pytest.raises(ValueError, match="occupancy limits"):
         occupancy(terrain, pose, slope_limit=0.0, step_limit=0.1)
+
+
+@pytest.mark.parametrize("direction", [0.0, np.pi / 8, np.pi / 4, 3 * np.pi / 4])
+def test_the_cost_of_a_slope_and_of_an_edge_does_not_depend_on_their_direction(direction):
+    along = np.cos(direction) * X + np.sin(direction) * Y
+
+    def cost(height):
+        found = occupancy(terrain_of(height), np.eye(4), slope_limit=0.5, step_limit=0.03)
+        # Away from the border, where heights are continued level.
+        return found.data[binary_erosion(found.grid.inside, iterations=5)]
+
+    slope = cost(np.tan(0.4) * along)
+    assert slope.min() >= 79 and slope.max() <= 81
+    # A kerb of 10 cm.
+    assert cost(np.where(along > 0.0, 0.1, 0.0)).max() == 100
 
 
 def test_selection_weighs_cost_against_the_remaining_distance():

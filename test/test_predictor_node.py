@@ -221,6 +221,24 @@ def test_odometry_of_a_robot_upside_down_or_of_an_optical_frame(peer, predictor,
     refused(peer, predictor, "odometry", "the robot lies on its side or upside down", odometry=bad)
 
 
+def test_odometry_of_two_estimators_that_do_not_agree(peer, predictor):
+    def bad(stamp):
+        beside = 2.0 + 0.4 * (stamp // 20_000_000 % 2)
+        return builders.odometry(stamp, "odom", "base_link", [1, beside, 0.3], [0, 0, 0, 1], [0] * 3, [0] * 3)
+
+    healthy(peer, predictor)
+    # A third of a second shows two tracks.
+    peer.drive(0.6, odometry=bad)
+    peer.settle()
+    peer.begin()
+    peer.drive(1.4, odometry=bad)
+    text = "alternate between two tracks that are 0.40 m or rad apart"
+    assert text in (peer.status("odometry") or (0, ""))[1], peer.status("odometry")
+    assert all(not peer.stamps(topic) for topic in PREDICTED)
+    assert "published by /peer;" in predictor.output
+    healthy(peer, predictor)
+
+
 def test_odometry_with_a_speed_that_no_robot_has(peer, predictor):
     def bad(stamp):
         return builders.odometry(stamp, "odom", "base_link", [1, 2, 0.3], [0, 0, 0, 1], [500.0, 0, 0], [0] * 3)

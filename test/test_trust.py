@@ -17,7 +17,9 @@ from monoforce_ros.perception import (
     TerrainTrust,
     TrustedTerrain,
     support_points,
+    traced_ground,
 )
+from monoforce_ros.perception.ground_alignment import lowest_points
 from monoforce_ros.perception.trust import blended
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap
@@ -256,6 +258,22 @@ def test_driven_ground_moves_with_the_robot_and_ends_after_six_metres(robot):
     away = points[distance > 5.0]
     assert np.median(away[:, 2]) == pytest.approx(-0.13 - 0.02 * np.median(np.hypot(away[:, 0], away[:, 1])), abs=0.03)
     assert not len(driven.update(at(500.0, stamp=int(2e10))))
+
+
+@pytest.mark.parametrize("name", ["husky", "jackal", "warthog", "tradr", "marv", "rally_car", "offroad_car"])
+def test_where_a_robot_tips_over_its_wheels_are_on_no_ground(name):
+    robot = load_robot(name)
+    driven, poses = DrivenGround(robot, 2e6), []
+    for i in range(31):
+        # On a slope of 20°, tipped over on its way, and on its wheels again.
+        turn = Rotation.from_euler("xy", [80.0 if 10 <= i < 20 else 20.0, -10.0], degrees=True).as_matrix()
+        motion = MotionState(int(1e8 * i), np.array([0.11 * i, 0.0, 0.0]), turn, np.array([1.1, 0, 0]), np.zeros(3))
+        points = driven.update(motion)
+        poses.append(np.eye(4))
+        poses[-1][:3, :3], poses[-1][:3, 3] = turn, motion.position
+    lowest = len(lowest_points(robot))
+    assert len(points) / lowest == pytest.approx(20, abs=1)
+    assert len(traced_ground(robot, np.array(poses), 0.1)) / lowest == pytest.approx(20, abs=1)
 
 
 def test_driven_ground_follows_the_track_between_two_maps_and_never_looks_ahead(robot):

@@ -11,7 +11,7 @@ from typing import Any
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection, QosDurability
 
-from monoforce_ros.bags.salvage import SalvagedBag, storage_files
+from monoforce_ros.bags.salvage import SalvagedBag, storage_files, unpacked_message
 from monoforce_ros.bags.types import type_store
 
 
@@ -173,7 +173,8 @@ class BagReader:
             return
         try:
             for connection, received, data in self._any.messages(connections, start=start, stop=stop):
-                yield BagMessage(connection.topic, connection.msgtype, received, data, self)
+                content = unpacked_message(data) if self.is_ros2 else data
+                yield BagMessage(connection.topic, connection.msgtype, received, content, self)
         except GeneratorExit:
             raise
         except BagError:

@@ -22,6 +22,7 @@ from rosbags.typesys.store import Typestore
 from monoforce_ros.bags.types import type_store
 
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _ROS1_MAGIC = b"#ROSBAG V2.0\n"
 _LARGEST_RECORD = 1 << 30
 """Size of a chunk or message beyond which the file is considered damaged [bytes]."""
@@ -206,6 +207,23 @@ def _scan_mcap(
                 raise _BrokenError(f"a chunk claims {unpacked} bytes")
             content = _unpack(compression, data[at + 8 :])
             yield from _scan_mcap(io.BytesIO(content), len(content), schemas, channels)
+
+
+def unpacked_message(data: bytes) -> bytes:
+    """A CDR-encoded message, decompressed if it is a zstd frame: only metadata.yaml tells that messages are.
+
+    CDR begins with a zero. A frame that is damaged, or larger than any message, stays as it is.
+    """
+    if bytes(data[:4]) != _ZSTD_MAGIC:
+        return data
+    from backports import zstd
+
+    frame = zstd.ZstdDecompressor()
+    try:
+        unpacked = frame.decompress(data, max_length=_LARGEST_RECORD)
+    except zstd.ZstdError:
+        return data
+    return unpacked if frame.eof else data
 
 
 def _unpack(compression: str, data: bytes) -> bytes:

@@ -10,7 +10,6 @@ from functools import partial
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from monoforce_ros.bags import BagWriter
 from monoforce_ros.core import OptionParser
@@ -19,6 +18,7 @@ from monoforce_ros.nodes.arguments import own_arguments, refuse_given_parameters
 from monoforce_ros.nodes.clocks import STEADY
 from monoforce_ros.nodes.parameters import refuse_unknown_parameters
 from monoforce_ros.nodes.process import Signals, initialise
+from monoforce_ros.nodes.subscriptions import AdaptiveSubscription
 
 
 def _arguments(arguments: list[str]) -> argparse.Namespace:
@@ -41,6 +41,7 @@ class BagRecorder(Node):
         self._bag = bag
         self._topics = None if topics is None else {self.resolve_topic_name(topic) for topic in topics}
         self._subscribed: set[str] = set()
+        self._subscriptions_by_topic: dict[str, AdaptiveSubscription] = {}
         self._failed: set[str] = set()
         self.recorded = 0
         self._timer = self.create_timer(0.2, self._subscribe_new, clock=STEADY)
@@ -56,8 +57,7 @@ class BagRecorder(Node):
         for topic, types in self.get_topic_names_and_types():
             if topic in self._subscribed or (self._topics is not None and topic not in self._topics):
                 continue
-            publishers = self.get_publishers_info_by_topic(topic)
-            if not publishers:
+            if not self.count_publishers(topic):
                 continue
             self._subscribed.add(topic)
             kind = message_class(types[0])
@@ -71,26 +71,16 @@ class BagRecorder(Node):
                     "AMENT_PREFIX_PATH"
                 )
                 continue
-            # The strictest QoS that every publisher offers loses the fewest messages.
-            reliable = all(p.qos_profile.reliability == ReliabilityPolicy.RELIABLE for p in publishers)
-            latched = all(p.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in publishers)
-            quality = QoSProfile(
-                depth=100,
-                reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-                durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-            )
-            self.create_subscription(
-                kind,
-                topic,
-                partial(self._write, topic, types[0], latched),
-                quality,
-                raw=True,
+            # Follows a driver that starts again with another quality of service.
+            self._subscriptions_by_topic[topic] = AdaptiveSubscription(
+                self, topic, {types[0]: kind}, partial(self._write, topic, types[0]), depth=100, raw=True
             )
             self.get_logger().info(f"recording {topic} ({types[0]})")
 
-    def _write(self, topic: str, message_type: str, latched: bool, data: bytes) -> None:
+    def _write(self, topic: str, message_type: str, data: bytes) -> None:
         if topic in self._failed:
             return
+        latched = self._subscriptions_by_topic[topic].latched
         try:
             self._bag.write_serialized(topic, message_type, data, time.time_ns(), latched=latched)
         except OSError:

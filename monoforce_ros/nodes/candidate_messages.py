@@ -20,7 +20,9 @@ _CIRCLE_INTERVAL = 0.5
 _INFEASIBLE = (0.45, 0.45, 0.45, 0.35)
 
 
-def candidate_markers(motion: MotionState, rollout: Rollout, assessment: Assessment, frame_id: str) -> bytes:
+def candidate_markers(
+    motion: MotionState, rollout: Rollout, assessment: Assessment, best: int | None, frame_id: str
+) -> bytes:
     """``visualization_msgs/MarkerArray``: paths from green (cheapest) to red, infeasible ones grey, the best one thick.
 
     Namespaces ``candidates`` and ``best_candidate``.
@@ -37,7 +39,6 @@ def candidate_markers(motion: MotionState, rollout: Rollout, assessment: Assessm
     colours = colormaps["RdYlGn_r"](shade).astype(np.float32)
     colours[~feasible] = _INFEASIBLE
     each = np.repeat(colours[valid], lines.shape[1], axis=0)
-    best = assessment.best
     chosen = lines[best] if best is not None else np.zeros((0, 3))
     return encoding.marker_array(
         motion.stamp,
@@ -87,6 +88,7 @@ def candidate_rollouts(
     robot: RobotModel,
     sequences: np.ndarray,
     assessment: Assessment,
+    best: int | None,
     frame_id: str,
     time_step: float,
 ) -> bytes:
@@ -98,6 +100,7 @@ def candidate_rollouts(
         robot: that was simulated.
         sequences: commands, each for an equal share of the horizon ``[N, K, 2]``.
         assessment: assessment of the rollouts.
+        best: index of the best one, if any is feasible.
         frame_id: frame of the odometry.
         time_step: time between samples [s].
     """
@@ -118,7 +121,6 @@ def candidate_rollouts(
         raise ValueError("the rollout of the candidates has no contact forces")
     forces = _averaged(rollout.contact.force, chosen, rollout.force_every) @ axes.T
     loads = rollout.contact.load
-    best = assessment.best
     writer = CdrWriter()
     writer.header(motion.stamp, frame_id)
     writer.string(robot.name)

@@ -39,6 +39,8 @@ from monoforce_ros.robots import RobotModel, load_robot
 PART = "candidates"
 TYPED_MESSAGE = "monoforce_msgs/msg/Candidates"
 MAXIMUM_CANDIDATES = 512
+_STANDING = 1e-3
+"""Largest command of a robot that stands still [m/s, rad/s]."""
 
 
 class CandidateOutput:
@@ -130,32 +132,38 @@ class CandidateOutput:
         width = max(0, before.shape[-1] - sequences.shape[-1])
         sequences = np.pad(sequences, ((0, 0), (0, 0), (0, width)))
         twists = over_horizon(sequences, before, steps)
-        rollout, assessment = self._assess(prediction, twists)
+        standing = self._standing(prediction, before)
+        rollout, assessment = self._assess(prediction, twists, standing)
         angles = self._commanded_flippers(prediction)
+        # Standing costs least and makes no progress: it is the best one only where nothing else is feasible.
+        moving = torch.from_numpy(np.abs(sequences).max(axis=(1, 2)) > _STANDING)
+        best = assessment.best_among(moving)
         # Speed and yaw rate are refined, of candidates that do not move sideways.
-        if settings.refine_seconds and assessment.best is not None and not sequences[assessment.best][:, 2:].any():
-            found = self._refined(prediction, before[:, :2], sequences[assessment.best][:, :2])
-            best = np.pad(found.sequence[None], ((0, 0), (0, 0), (0, before.shape[-1] - 2)))
-            refined = over_horizon(best, before, steps)
-            refined_rollout, refined_assessment = self._assess(prediction, refined, found.flippers)
+        if settings.refine_seconds and best is not None and not sequences[best][:, 2:].any():
+            found = self._refined(prediction, before[:, :2], sequences[best][:, :2], standing)
+            padded = np.pad(found.sequence[None], ((0, 0), (0, 0), (0, before.shape[-1] - 2)))
+            refined = over_horizon(padded, before, steps)
+            refined_rollout, refined_assessment = self._assess(prediction, refined, standing, found.flippers)
             twists = np.concatenate([twists, refined])
             rollout, assessment = rollout.joined(refined_rollout), assessment.joined(refined_assessment)
-            if found.flippers is not None and assessment.best == len(twists) - 1:
+            best = assessment.best_among(torch.cat([moving, torch.ones(1, dtype=torch.bool)]))
+            if found.flippers is not None and best == len(twists) - 1:
                 angles = found.flippers
+        best = assessment.best if best is None else best
         data: dict[str, object] = {
-            "candidates": messages.candidate_markers(motion, rollout, assessment, frame_id),
+            "candidates": messages.candidate_markers(motion, rollout, assessment, best, frame_id),
             "candidate_costs": messages.candidate_costs(
                 motion, rollout, twists[:, start], assessment, frame_id, delay * time_step
             ),
         }
-        if assessment.best is not None:
+        if best is not None:
             if angles is not None:
                 data["flipper_angles"] = self._flipper_angles(prediction, angles, delay)
-            data["best_path"] = messages.best_path(motion, rollout, assessment.best, frame_id, settings.path_time_step)
+            data["best_path"] = messages.best_path(motion, rollout, best, frame_id, settings.path_time_step)
         if "candidate_rollouts" in self._publishers:
             data["candidate_rollouts"] = messages.candidate_rollouts(
-                motion, rollout, self._predictor.robot, twists[:, self._predictor.history :, :2], assessment, frame_id,
-                settings.path_time_step,
+                motion, rollout, self._predictor.robot, twists[:, self._predictor.history :, :2], assessment, best,
+                frame_id, settings.path_time_step,
             )  # fmt: skip
         self._statistics["candidates start after [s]"] = f"{delay * time_step:.2f}"
         self._statistics["feasible candidates"] = f"{int(assessment.feasible.sum())} of {len(twists)}"
@@ -198,26 +206,44 @@ class CandidateOutput:
         message.position = angles[delay].tolist()
         return message
 
-    def _assess(
-        self, prediction: Prediction, twists: np.ndarray, flippers: np.ndarray | None = None
-    ) -> tuple[Rollout, Assessment]:
+    def _standing(self, prediction: Prediction, before: np.ndarray) -> Rollout | None:
+        """The rollout without commands; None if the robot is commanded to move before the candidates start."""
+        if np.abs(before[self._predictor.history :]).max(initial=0.0) > _STANDING:
+            return None
+        steps = self._predictor.history + self._predictor.steps
+        return self._roll_out(prediction, np.zeros((1, steps, before.shape[-1])))
+
+    def _roll_out(self, prediction: Prediction, twists: np.ndarray, flippers: np.ndarray | None = None) -> Rollout:
         motions = [prediction.motion] * len(twists)
-        rollout = self._predictor.roll_out(
+        return self._predictor.roll_out(
             prediction.terrain, motions, twists, with_forces=False, with_contact=True, force_every=self._force_every,
             joints=prediction.joints, flippers=None if flippers is None else flippers[None],
         )  # fmt: skip
+
+    def _assess(
+        self,
+        prediction: Prediction,
+        twists: np.ndarray,
+        standing: Rollout | None,
+        flippers: np.ndarray | None = None,
+    ) -> tuple[Rollout, Assessment]:
+        rollout = self._roll_out(prediction, twists, flippers)
         # Costs are of the forward speed: moving sideways alone costs no slip.
         commanded = torch.from_numpy(twists[:, self._predictor.history :, :2]).float()
-        robot = self._predictor.robot
-        weights, limits = self._weights, self._limits
-        return rollout, assess(rollout, prediction.terrain, robot, commanded, weights=weights, limits=limits)
+        found = assess(
+            rollout, prediction.terrain, self._predictor.robot, commanded,
+            weights=self._weights, limits=self._limits, standing=standing,
+        )  # fmt: skip
+        return rollout, found
 
-    def _refined(self, prediction: Prediction, before: np.ndarray, best: np.ndarray) -> Refinement:
+    def _refined(
+        self, prediction: Prediction, before: np.ndarray, best: np.ndarray, standing: Rollout | None
+    ) -> Refinement:
         """The best candidate, refined."""
         budget = self._settings.refine_seconds
         found = refine(
             self._predictor, prediction, before, best, weights=self._weights, limits=self._limits,
-            seconds=budget, round_seconds=self._round_seconds,
+            seconds=budget, round_seconds=self._round_seconds, standing=standing,
         )  # fmt: skip
         # A slow first round, in which kernels are loaded, must not disable refinement for good.
         self._round_seconds = found.round_seconds if found.rounds else 0.9 * self._round_seconds

@@ -9,9 +9,9 @@ from rclpy.duration import Duration, Infinite
 from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.publisher import Publisher
 from rclpy.qos import LivelinessPolicy, QoSCompatibility, QoSProfile, qos_check_compatible
-from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from monoforce_ros.nodes.clocks import STEADY
+from monoforce_ros.nodes.subscriptions import full_name
 
 STAMPED, PLAIN = "geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist"
 _CLASSES = {STAMPED: TwistStamped, PLAIN: Twist}
@@ -124,10 +124,10 @@ class CommandOutput:
         self._listened, self._unreached, bystanders = set(), {}, set()
         own = self._node.get_fully_qualified_name()
         publishers = self._node.get_publishers_info_by_topic(self.topic)
-        self._rivals = {_full_name(info) for info in publishers if info.node_name != _UNKNOWN} - {own}
+        self._rivals = {full_name(info) for info in publishers if info.node_name != _UNKNOWN} - {own}
         for info in self._node.get_subscriptions_info_by_topic(self.topic):
             unnamed = info.node_name == _UNKNOWN
-            name = "a node without a name" if unnamed else _full_name(info)
+            name = "a node without a name" if unnamed else full_name(info)
             if name == own:
                 continue
             compatible, reason = qos_check_compatible(_QUALITY, info.qos_profile)
@@ -203,7 +203,3 @@ class CommandOutput:
         # Some of its topics may be remapped; candidates alone may also come from a node that drives the base.
         outputs = {topic.rpartition("/predicted/")[2] for topic, _ in published if "/predicted/" in topic}
         return len(outputs) > 1 or "path" in outputs
-
-
-def _full_name(info: TopicEndpointInfo) -> str:
-    return f"{info.node_namespace}/{info.node_name}".replace("//", "/")

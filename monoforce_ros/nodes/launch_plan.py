@@ -126,7 +126,7 @@ def plan_nodes(given: Mapping[str, str], words: Sequence[str] = (), *, included:
     """
     schemas = [_Node.read(name) for name in SCHEMAS]
     _refuse_unknown_words(words, schemas, included=included)
-    on_line = {} if included else dict(word.split(":=", 1) for word in words)
+    on_line = {} if included else _values(words)
     # An empty value on the command line was given, to set an empty text in place of the file's.
     values = on_line | {name: text for name, text in given.items() if text}
     namespace = values.get("namespace", "").strip("/")
@@ -197,6 +197,18 @@ def _refuse_unknown_words(words: Sequence[str], nodes: Sequence[_Node], *, inclu
         meant = _meant(name, known)
         advice = f"; did you mean {meant!r}?" if meant else ""
         raise ValueError(f"unknown launch argument {name!r}{advice} --show-args lists all arguments")
+
+
+def _values(words: Sequence[str]) -> dict[str, str]:
+    """Values by name; raises ``ValueError`` for a name with two values, of which ``ros2 launch`` takes the last."""
+    values: dict[str, str] = {}
+    for word in words:
+        name, _, value = word.partition(":=")
+        if values.setdefault(name, value) != value:
+            raise ValueError(
+                f"launch argument {name!r} is given twice, as {values[name]!r} and {value!r}: give it once"
+            )
+    return values
 
 
 def _meant(name: str, known: Sequence[str]) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from nav_msgs.msg import Odometry
@@ -26,11 +26,19 @@ class OdometryInput:
         transforms: of ``/tf``.
         health: gets the part ``odometry``.
         timeout: time without odometry after which the robot stops [s].
+        publishers: tells the names of the nodes that publish on the topic.
     """
 
-    def __init__(self, frames: RobotFrames, transforms: TransformListener, health: Health, timeout: float):
+    def __init__(
+        self,
+        frames: RobotFrames,
+        transforms: TransformListener,
+        health: Health,
+        timeout: float,
+        publishers: Callable[[], str],
+    ):
         self._frames, self._transforms, self._health, self._timeout = frames, transforms, health, timeout
-        self._reader = OdometryReader(frames, transforms, health)
+        self._reader = OdometryReader(frames, transforms, health, publishers)
         self.motion: MotionState | None = None
         """Of the base."""
         self.base_name = ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,7 @@ from nav_msgs.msg import Odometry
 
 from monoforce_ros.core import FrameError, MotionState, RobotFrames
 from monoforce_ros.messages import decoding
+from monoforce_ros.nodes.alternating_poses import AlternatingPoses
 from monoforce_ros.nodes.frames import TRANSFORMS_PATIENCE, TransformListener
 from monoforce_ros.nodes.health import ERROR, Health
 
@@ -42,16 +44,22 @@ class OdometryReader:
         frames: of the robot.
         transforms: of ``/tf``.
         health: gets the part ``odometry``.
+        publishers: tells the names of the nodes that publish on the topic.
     """
 
-    def __init__(self, frames: RobotFrames, transforms: TransformListener, health: Health):
-        self._frames, self._transforms, self._health = frames, transforms, health
+    def __init__(
+        self, frames: RobotFrames, transforms: TransformListener, health: Health, publishers: Callable[[], str]
+    ):
+        self._frames, self._transforms, self._health, self._publishers = frames, transforms, health, publishers
+        self._alternating = AlternatingPoses()
         self.first_arrival = 0.0
         """Steady time of the first message with a stamp [s]; 0 before."""
         self.problem = ""
         """Why the newest message cannot be used; empty if it can."""
         self.frame = ""
         """Frame of the newest message with a stamp, that of REP 105 if it names none."""
+        self.alternates = False
+        """Whether the poses come from two estimators that do not agree."""
 
     def read(self, message: Odometry) -> BaseOdometry | None:
         """What a message says; None if it cannot be used."""
@@ -64,6 +72,8 @@ class OdometryReader:
             self._refuse(ZERO_STAMPS.format("state estimator"), "zero stamp")
             return None
         self.first_arrival = self.first_arrival or time.monotonic()
+        if (frame_id or "odom") != self.frame:
+            self._alternating.clear()
         self.frame = frame_id or "odom"
         try:
             offset = self._frames.odometry_child(child, self._transforms.tree)
@@ -81,6 +91,15 @@ class OdometryReader:
                 f"{child or 'the base'}, x forward and z up, in a frame whose z axis points up (REP 103, REP 105); "
                 "poses in NED or of an optical frame have to be converted",
                 "lies",
+            )
+            return None
+        apart = self._alternating.add(motion)
+        self.alternates = apart > 0.0
+        if self.alternates:
+            self._refuse(
+                f"its poses alternate between two tracks that are {apart:.2f} m or rad apart: expected one estimator "
+                f"on the topic, which is published by {self._publishers()}; remap or stop the other one",
+                "two tracks",
             )
             return None
         self.problem = ""

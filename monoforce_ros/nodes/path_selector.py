@@ -87,7 +87,13 @@ class PathSelectorNode(Node):
         self._given_up: Course | None = None
         """The last plan to an end that the robot did not follow."""
         self._started = time.monotonic()
-        self._odometry = OdometryInput(self.frames, self.transforms, self.health, settings.timeout)
+        self._odometry = OdometryInput(
+            self.frames,
+            self.transforms,
+            self.health,
+            settings.timeout,
+            lambda: self._inputs["odometry"].publisher_names,
+        )
         self._candidates = CandidateInput(self.health, settings.timeout)
         self._driving = False
         self._stopped_since = np.inf
@@ -193,8 +199,7 @@ class PathSelectorNode(Node):
         self._drop_course_after_jump(before, motion)
         self._course_frames.add_odometry(self._odometry.frame, motion, self._odometry.on_robot)
         if self._driving:
-            speed, yaw_rate = self._last_command[:2]
-            self._progress.add(motion.stamp * NANOSECOND, (speed, yaw_rate), motion.position[:2], motion.heading)
+            self._progress.add(motion.stamp * NANOSECOND, self._last_command, motion.position[:2], motion.heading)
 
     def _drop_course_after_jump(self, before: MotionState | None, now: MotionState) -> None:
         """Forget the goal if the odometry goes on elsewhere: the place of a goal in its frame is unknown then."""
@@ -202,7 +207,7 @@ class PathSelectorNode(Node):
             return
         seconds = abs(now.stamp - before.stamp) * NANOSECOND
         measured = (float(np.linalg.norm(motion.linear_velocity)) for motion in (before, now))
-        speed = max(*measured, abs(self._last_command[0]))
+        speed = max(*measured, float(np.hypot(self._last_command[0], sum(self._last_command[2:]))))
         # Where a robot comes to rest after its odometry has become silent is no jump, however long that was.
         moved = float(np.linalg.norm(now.position - before.position))
         if moved <= _JUMP + 3.0 * speed * min(seconds, self.settings.timeout):
@@ -391,7 +396,8 @@ class PathSelectorNode(Node):
             )
 
     def _sent(self, command: tuple[float, ...]) -> str:
-        return f"{command[0]:.2f} m/s and {command[1]:.2f} rad/s are sent to {self._commands.topic}"
+        sideways = f", {command[2]:.2f} m/s to the left" if sum(command[2:]) else ""
+        return f"{command[0]:.2f} m/s{sideways} and {command[1]:.2f} rad/s are sent to {self._commands.topic}"
 
     def _silent_transform(self, course: Course) -> str:
         """Which transform from the course's frame is not sent any more, as when localisation has ended; or empty."""

@@ -116,7 +116,10 @@ class PredictorNode(ManagedNode):
         self.transforms = TransformListener(self, history)
         if self.transforms.unavailable:
             self.get_logger().info(f"sensor poses are those of the robot file: {self.transforms.unavailable}")
-        self._odometry = OdometryReader(self.frames, self.transforms, self.health)
+        self._odometry = OdometryReader(
+            self.frames, self.transforms, self.health,
+            publishers=lambda: self._subscriptions_by_part["odometry"].publisher_names,
+        )  # fmt: skip
         self.decoder = SensorDecoder(self.frames, history, self.health)
         self.inputs = Inputs(
             list(self.sensor_topics.values()),
@@ -292,6 +295,9 @@ class PredictorNode(ManagedNode):
         self._arrivals["odometry"] = time.monotonic()
         received = self._odometry.read(message)
         if received is None:
+            if self._odometry.alternates:
+                # What came before is mixed, too.
+                self.inputs.forget()
             return
         state, frame_id = received.motion, received.frame_id
         if (before := self.inputs.frame_id) and frame_id != before:

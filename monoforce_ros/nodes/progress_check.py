@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,15 +60,16 @@ class ProgressCheck:
     """Compares commanded with measured motion over the last :data:`WINDOW` seconds.
 
     The share ``k`` of the commanded motion that the robot carries out is the slope of a regression of measured on
-    commanded positions (along the measured heading), or of measured on commanded headings. The scatter around the
-    regression gives the standard error of ``k``, so that odometry with more noise has to show more motion.
+    commanded positions (along the measured heading and, of robots that move sideways, across it), or of measured on
+    commanded headings. The scatter around the regression gives the standard error of ``k``, so that odometry with more
+    noise has to show more motion.
     """
 
     def __init__(self) -> None:
-        # Time [s], speed [m/s], yaw rate [rad/s], x [m], y [m], heading [rad].
-        self._samples: deque[tuple[float, float, float, float, float, float]] = deque()
-        # Earlier commands: time [s], speed [m/s], yaw rate [rad/s].
-        self._earlier: deque[tuple[float, float, float]] = deque()
+        # Time [s], speed [m/s], yaw rate [rad/s], speed to the left [m/s], x [m], y [m], heading [rad].
+        self._samples: deque[tuple[float, ...]] = deque()
+        # Earlier commands: time [s], speed [m/s], yaw rate [rad/s], speed to the left [m/s].
+        self._earlier: deque[tuple[float, ...]] = deque()
         self._followed = self._next = 0.0
 
     def clear(self) -> None:
@@ -75,12 +77,12 @@ class ProgressCheck:
         self._samples.clear()
         self._earlier.clear()
 
-    def add(self, time: float, command: tuple[float, float], position: np.ndarray, heading: float) -> None:
+    def add(self, time: float, command: Sequence[float], position: np.ndarray, heading: float) -> None:
         """Note a measured pose and the command in effect.
 
         Args:
             time: time of the pose [s]; a pose of the same time is ignored, after a backward jump it starts anew.
-            command: forward speed [m/s] and yaw rate [rad/s].
+            command: forward speed [m/s], yaw rate [rad/s] and, of robots that move sideways, speed to the left [m/s].
             position: ``[2]`` [m].
             heading: [rad].
         """
@@ -90,9 +92,10 @@ class ProgressCheck:
             self.clear()
         if not self._samples:
             self._followed = self._next = time
-        self._samples.append((time, *command, float(position[0]), float(position[1]), heading))
+        speed, yaw_rate, left = (*command, 0.0)[:3]
+        self._samples.append((time, speed, yaw_rate, left, float(position[0]), float(position[1]), heading))
         while time - self._samples[0][0] > WINDOW:
-            self._earlier.append(self._samples.popleft()[:3])
+            self._earlier.append(self._samples.popleft()[:4])
         while self._earlier and time - self._earlier[0][0] > WINDOW + _LAGS[-1]:
             self._earlier.popleft()
         if time < self._next:
@@ -133,11 +136,12 @@ class ProgressCheck:
         time, position, heading = self._measured()
         if time[-1] - time[0] <= 0.8 * WINDOW:
             return ""
-        given = np.array([*self._earlier, *(sample[:3] for sample in self._samples)])
+        given = np.array([*self._earlier, *(sample[:4] for sample in self._samples)])
         for index, (name, smallest) in enumerate((("speed", _SMALLEST), ("yaw rate", _OPPOSED_TURN))):
             measured = heading[None] if index else position
-            values = given[:, 1 + index]
-            lags = _LAGS[:1] if (values >= 0).all() or (values <= 0).all() else _LAGS
+            values = given[:, [2] if index else [1, 3]]
+            steady = ((values >= 0).all(axis=0) | (values <= 0).all(axis=0)).all()
+            lags = _LAGS[:1] if steady else _LAGS
             if all(_opposes(self._commanded(time, heading, lag)[index], measured, smallest) for lag in lags):
                 return name
         return ""
@@ -173,18 +177,19 @@ class ProgressCheck:
 
     def _measured(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Times [s], positions ``[2, n]`` [m] and headings [rad] within the window."""
-        time, _, _, x, y, heading = np.array(self._samples).T
+        time, _, _, _, x, y, heading = np.array(self._samples).T
         return time, np.array([x, y]), np.unwrap(heading)
 
     def _commanded(self, time: np.ndarray, heading: np.ndarray, lag: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
         """Steps ``[2, n - 1]`` [m] and turns ``[1, n - 1]`` [rad] between poses, of commands with a lag [s]."""
-        given = np.array([*self._earlier, *(sample[:3] for sample in self._samples)])
+        given = np.array([*self._earlier, *(sample[:4] for sample in self._samples)])
         # The command in effect at a time; before the first one, the robot was not commanded to move.
         index = np.searchsorted(given[:, 0], time[:-1] - lag + 1e-9, side="right") - 1
         commands = np.where(index[:, None] >= 0, given[index, 1:], 0.0)
         step = np.diff(time)
-        directions = np.array([np.cos(heading[:-1]), np.sin(heading[:-1])])
-        return commands[:, 0] * step * directions, (commands[:, 1] * step)[None]
+        cosine, sine = np.cos(heading[:-1]), np.sin(heading[:-1])
+        ahead, left = np.array([cosine, sine]), np.array([-sine, cosine])
+        return (commands[:, 0] * ahead + commands[:, 2] * left) * step, (commands[:, 1] * step)[None]
 
 
 def _opposes(steps: np.ndarray, measured: np.ndarray, smallest: float) -> bool:

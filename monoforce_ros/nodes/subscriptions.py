@@ -58,6 +58,7 @@ class AdaptiveSubscription:
             best-effort messages are easily lost, otherwise best effort, which works with every publisher.
         follow_listeners: of several possible types, take the one that other nodes listen to. For commands: a base that
             listens to one type shows which one is meant.
+        raw: whether the callback gets serialised messages.
     """
 
     def __init__(
@@ -70,6 +71,7 @@ class AdaptiveSubscription:
         depth: int,
         reliability: str = "auto",
         follow_listeners: bool = False,
+        raw: bool = False,
     ):
         self._node = node
         self.topic = node.resolve_topic_name(topic)
@@ -78,10 +80,13 @@ class AdaptiveSubscription:
         self._depth = depth
         self._reliability = reliability
         self._follow_listeners = follow_listeners
+        self._raw = raw
         self._subscription: Subscription | None = None
         self._subscribed: _Offer | None = None
         self.wrong_type = ""
         """Types on the topic if none of them is usable."""
+        self.publisher_names = ""
+        """Fully qualified names of the nodes that publish on the topic, half a second ago at the latest."""
         self._timer = node.create_timer(0.5, self._update, clock=STEADY)
         self._update()
 
@@ -89,6 +94,11 @@ class AdaptiveSubscription:
     def publishers(self) -> int:
         """Number of publishers on the topic."""
         return self._node.count_publishers(self.topic)
+
+    @property
+    def latched(self) -> bool:
+        """Whether the subscription asks for the last message that was sent before it."""
+        return self._subscribed is not None and self._subscribed.durability == DurabilityPolicy.TRANSIENT_LOCAL
 
     @property
     def silence_cause(self) -> str:
@@ -101,6 +111,7 @@ class AdaptiveSubscription:
 
     def _update(self) -> None:
         publishers = self._node.get_publishers_info_by_topic(self.topic)
+        self.publisher_names = ", ".join(sorted({full_name(info) for info in publishers}))
         offered = {info.topic_type for info in publishers}
         usable = [name for name in self._types if name in offered]
         self.wrong_type = "" if usable or not offered else ", ".join(sorted(offered))
@@ -118,7 +129,7 @@ class AdaptiveSubscription:
         quality = QoSProfile(depth=self._depth, reliability=wanted.reliability, durability=wanted.durability)
         try:
             self._subscription = self._node.create_subscription(
-                self._types[wanted.type], self.topic, self._callback, quality
+                self._types[wanted.type], self.topic, self._callback, quality, raw=self._raw
             )
         except RuntimeError as error:
             # A process has one type per topic, and the middleware may still be removing the former subscription: the
@@ -153,6 +164,11 @@ def _durability(publishers: list[TopicEndpointInfo]) -> DurabilityPolicy:
     """Transient local if every publisher offers it, for the last message sent before the subscription."""
     latched = bool(publishers) and all(p.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in publishers)
     return DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+
+
+def full_name(info: TopicEndpointInfo) -> str:
+    """Fully qualified name of an endpoint's node."""
+    return f"{info.node_namespace}/{info.node_name}".replace("//", "/")
 
 
 def other_listeners(node: Node, topic: str) -> set[str]:

@@ -26,6 +26,8 @@ _FEWEST_RETURNS = 20
 """Returns that say something of one side: their fifth is four."""
 _ON_THE_GROUND = 0.02
 """How far above the lowest facet of its tracks a point of a robot on its flippers may be to touch the ground [m]."""
+_FOOT = 0.05
+"""Height up to which the lowest points of a robot may touch uneven ground [m]."""
 _LEAST_DOWN = 0.2
 """Vertical component of the normal of a facet that may carry a robot: steeper ones are its sides."""
 _AT_THE_BOTTOM = -0.97
@@ -92,6 +94,25 @@ def _carrying(posed: RobotModel, motion: MotionState) -> np.ndarray:
     heights = -(planes[:, :2] @ centre[:2] + planes[:, 3]) / planes[:, 2]
     plane = planes[int(np.argmax(heights))]
     return points[points @ plane[:3] + plane[3] > -_ON_THE_GROUND]
+
+
+def stands(robot: RobotModel, rotation: np.ndarray) -> bool:
+    """Whether a robot may stand on its wheels or tracks: its centre of mass is above what they touch on a plane.
+
+    One that leans further tips over, and wheels on its upper side are in the air.
+
+    Args:
+        robot: its points and centre of mass.
+        rotation: of the base ``[3, 3]`` in a frame with z up.
+    """
+    down = -rotation[2]
+    if down[2] >= 0.0:
+        return False
+    points, centre = (values.double().cpu().numpy() for values in (robot.points, robot.centre_of_mass))
+    lowest = points[:, 2].min()
+    feet = points[points[:, 2] < lowest + _FOOT, :2]
+    foot = centre[:2] + down[:2] * (lowest - centre[2]) / down[2]
+    return bool(((foot >= feet.min(axis=0)) & (foot <= feet.max(axis=0))).all())
 
 
 def ground_around(cloud: np.ndarray, robot: RobotModel, motion: MotionState, stiffness: float) -> float:

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.core import NANOSECOND, MotionState, MotionTrack, transform_points
-from monoforce_ros.perception.ground_alignment import lowest_points, support_points
+from monoforce_ros.perception.ground_alignment import lowest_points, stands, support_points
 from monoforce_ros.robots import RobotModel
 
 TRACE_LENGTH = 6.0
@@ -22,7 +22,8 @@ def traced_ground(robot: RobotModel, odometry_from_bases: np.ndarray, step: floa
         step: distance between the poses that are used [m].
 
     Returns:
-        ``[k, 3]`` in the odometry frame [m]; empty if the robot has not moved by ``step`` yet.
+        ``[k, 3]`` in the odometry frame [m], without poses in which the robot tips over; empty if it has not moved by
+        ``step`` yet.
     """
     if len(odometry_from_bases) < 2:
         return np.zeros((0, 3))
@@ -31,14 +32,16 @@ def traced_ground(robot: RobotModel, odometry_from_bases: np.ndarray, step: floa
     back = travelled[-1] - travelled
     wanted = np.arange(step, min(TRACE_LENGTH, back[0]) + 1e-9, step)
     index = np.unique(np.searchsorted(-back, -wanted))
+    poses = [pose for pose in odometry_from_bases[index] if stands(robot, pose[:3, :3])]
     lowest = lowest_points(robot)
-    return np.concatenate([transform_points(odometry_from_bases[i], lowest) for i in index] or [np.zeros((0, 3))])
+    return np.concatenate([transform_points(pose, lowest) for pose in poses] or [np.zeros((0, 3))])
 
 
 class DrivenGround:
     """Collects, while driving, the ground under the wheels along the last metres.
 
-    It starts over where odometry jumps or time goes back.
+    It starts over where odometry jumps or time goes back, and leaves out where the robot tips over: its wheels are in
+    the air.
 
     Args:
         robot: its wheels or tracks.
@@ -73,7 +76,8 @@ class DrivenGround:
             if last is None or not continues(state, last):
                 self._places = []
             last = state
-            if not self._places or np.linalg.norm(state.position - self._places[-1][0]) >= self._step:
+            far = not self._places or np.linalg.norm(state.position - self._places[-1][0]) >= self._step
+            if far and stands(self._robot, state.rotation):
                 support = support_points(self._robot, state, self._stiffness)
                 self._places.append((state.position, transform_points(state.odometry_from_terrain, support)))
         self._previous = last

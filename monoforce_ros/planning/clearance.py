@@ -18,13 +18,18 @@ LARGEST = 1.0
 _LEVELS = (1.5, 0.5, 0.25)
 """Value of an obstacle within once, twice and three times the limit. The first is beyond 1, so that what stands closer
 is infeasible; the others make a wider path the cheaper one."""
+FURTHER = 0.05
+"""Share of the limit by which a robot that is beyond it may go further for a moment, as it starts to move."""
+_AROUND = 2.0
+"""Distance of points of the outline that are beside each other, over that of neighbours: the first ones beyond a corner
+come near a wall as the robot turns away from it."""
 _INTERVAL = 0.12
 """Time between the poses that are examined [s]: at 1 m/s about a cell of a map."""
 _RISE = 0.1
 """Height over which an obstacle comes to count in full [m]: of the accuracy of a map's heights, and smooth."""
 
 
-def closeness(rollout: Rollout, terrain: TerrainMap, robot: RobotModel, limit: float) -> tuple[Tensor, ...]:
+def closeness(rollout: Rollout, terrain: TerrainMap, robot: RobotModel, limit: float) -> tuple[Tensor, Tensor]:
     """How close the robot's outline comes to obstacles: 0 beyond three times ``limit``, above 1 within it.
 
     Obstacles are what rises above the highest part of the wheels or tracks, or above the tips of raised flippers, in
@@ -38,12 +43,13 @@ def closeness(rollout: Rollout, terrain: TerrainMap, robot: RobotModel, limit: f
         limit: clearance below which a path is infeasible [m].
 
     Returns:
-        the largest value after the start, the value at the start, and the one at the end, each ``[N]``. Differentiable
-        in the rollout.
+        the largest value after the start ``[N]``, differentiable in the rollout, and whether the robot leaves an
+        obstacle that it starts within the limit of ``[N]`` bool: see :func:`_leaves`.
     """
     height, grid = terrain.height.to(rollout.position), terrain.grid
     every = max(1, math.floor(_INTERVAL / float(rollout.times[1] - rollout.times[0]) + 1e-6))
-    outline = torch.from_numpy(_outline(robot, max(limit, grid.resolution))).to(rollout.position)
+    spacing = max(limit, grid.resolution)
+    outline = torch.from_numpy(_outline(robot, spacing)).to(rollout.position)
     position, rotation = rollout.position[:, ::every], rollout.rotation[:, ::every]
     points = position[:, :, None] + torch.einsum("nsij,pj->nspi", rotation, outline)
     count, steps, around, _ = points.shape
@@ -51,7 +57,7 @@ def closeness(rollout: Rollout, terrain: TerrainMap, robot: RobotModel, limit: f
     lowest = points.detach()[..., 2].nan_to_num(torch.inf).amin()
     if not bool(height.amax() > lowest):
         # Nothing on the map reaches that high.
-        return (points.new_zeros(count),) * 3
+        return points.new_zeros(count), torch.zeros(count, dtype=torch.bool)
     raised = torch.stack([_raised(height, (1 + level) * limit / grid.resolution) for level in range(len(_LEVELS))])
     span = points.new_tensor([grid.columns - 1, grid.rows - 1]) * grid.resolution
     place = 2.0 * (points[..., :2] - points.new_tensor(grid.origin)) / span - 1.0
@@ -60,8 +66,28 @@ def closeness(rollout: Rollout, terrain: TerrainMap, robot: RobotModel, limit: f
         raised[None], place.reshape(1, count * steps, around, 2), align_corners=True, padding_mode="border"
     )[0].reshape(len(_LEVELS), count, steps, around)
     share = ((ground - points[..., 2]) / _RISE).clamp(0.0, 1.0).nan_to_num(1.0)
-    value = (share * points.new_tensor(_LEVELS)[:, None, None, None]).amax(dim=(0, 3))
-    return value[:, 1:].amax(dim=1), value[:, 0], value[:, -1]
+    values = (share * points.new_tensor(_LEVELS)[:, None, None, None]).amax(dim=0)
+    return values[:, 1:].amax(dim=(1, 2)), _leaves(values.detach(), outline, _AROUND * spacing)
+
+
+def _leaves(values: Tensor, outline: Tensor, around: float) -> Tensor:
+    """Whether rollouts that start within the limit of an obstacle leave it, and come near no other ``[N]`` bool.
+
+    A robot may turn before it leaves: until then the parts of its outline that are within the limit at the start, and
+    those beside them, may be there; at the end no closer than at the start. Once it has left, it stays away.
+
+    Args:
+        values: of each point of the outline ``[N, S, P]``.
+        outline: the points ``[P, 3]`` [m].
+        around: distance of points beside each other [m].
+    """
+    near = values > 1.0
+    beside = (torch.cdist(outline[:, :2], outline[:, :2]) <= around + 1e-6).to(values)
+    allowed = near[:, :1].to(values) @ beside > 0.0
+    away = values.amax(dim=2) <= _LEVELS[1]
+    left = away.cummax(dim=1).values
+    stays = ~near.any(dim=2) | (~left & ~(near & ~allowed).any(dim=2))
+    return near[:, 0].any(dim=1) & stays.all(dim=1) & (values[:, -1].amax(dim=1) <= values[:, 0].amax(dim=1) + FURTHER)
 
 
 def _raised(height: Tensor, cells: float) -> Tensor:

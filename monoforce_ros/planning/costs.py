@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, fields
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from monoforce_ros.physics import Rollout
-from monoforce_ros.planning.clearance import LARGEST, closeness
+from monoforce_ros.planning.clearance import FURTHER, LARGEST, closeness
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import TerrainMap
 
@@ -83,17 +84,10 @@ def force_every(time_step: float) -> int:
     return max(1, round(_FORCE_INTERVAL / time_step))
 
 
-_FURTHER = 0.05
-"""Share of the limit by which a robot that is beyond it may go further for a moment, as it starts to move."""
-
-_STANDING = 1e-3
-"""Largest command of a candidate that stands still [m/s, rad/s]."""
 _SETTLED = 0.6
 """Time in which a body that starts inside the ground is pushed out of it [s]: of a Husky, a Warthog and a TRADR with
 their wheels or tracks in ground of 0.25 m, on one side, at the front or at a corner, seven of nine came to rest within
 0.5 s. What presses longer is held against no candidate either: see the limits in :func:`assess`."""
-_CONTACT_TERMS = ("force_variation", "wheel_load", "collision")
-"""Terms of the forces that the map exerts on a robot that stands still, too."""
 
 
 @dataclass(frozen=True)
@@ -110,9 +104,12 @@ class Assessment:
     @property
     def best(self) -> int | None:
         """Index of the feasible candidate with the lowest cost; None without a feasible one."""
-        if not bool(self.feasible.any()):
-            return None
-        return int(torch.where(self.feasible, self.cost, torch.inf).argmin())
+        return self.best_among(torch.ones_like(self.feasible))
+
+    def best_among(self, chosen: Tensor) -> int | None:
+        """Index of the feasible one with the lowest cost among some candidates ``[N]`` bool; None without one."""
+        possible = self.feasible & chosen
+        return int(torch.where(possible, self.cost, torch.inf).argmin()) if bool(possible.any()) else None
 
     def joined(self, other: Assessment) -> Assessment:
         """These candidates followed by others."""
@@ -141,20 +138,25 @@ def assess(
     *,
     weights: CostWeights = CostWeights(),
     limits: Limits = Limits(),
+    standing: Rollout | None = None,
 ) -> Assessment:
-    """Terms, cost and feasibility of candidates. Differentiable in the rollout.
+    """Terms, cost and feasibility of candidates, each of them by itself. Differentiable in the rollout.
 
     Args:
         rollout: rollout of all candidates ``[N]``, with contact force sums.
         terrain: the map of the rollout.
         robot: the robot of the rollout.
         twists: commanded forward speed [m/s] and yaw rate [rad/s] of each step ``[N, T, 2]``.
+        weights: weights of the terms.
+        limits: limits of the terms.
+        standing: of a robot that stands, the rollout without commands ``[1]``, from the same start and with the same
+            times. Where the map exerts forces beyond a limit even then, candidates with no larger ones are feasible.
 
     Raises:
-        ValueError: the rollout has no contact force sums, or the shape of ``twists`` does not match it.
+        ValueError: a rollout has no contact force sums, or the shape of ``twists`` does not match it.
     """
     contact = rollout.contact
-    if contact is None:
+    if contact is None or (standing is not None and standing.contact is None):
         raise ValueError("costs: the rollout has no contact forces; roll out with `with_contact=True`")
     expected = (rollout.position.shape[0], rollout.position.shape[1] - 1, 2)
     if tuple(twists.shape) != expected:
@@ -174,27 +176,27 @@ def assess(
     }
     # A robot that leans beyond a limit, or stands too close, has to get away: what makes it no worse is feasible.
     starts = {"roll": rolls[:, 0] / limits.roll, "pitch": pitches[:, 0] / limits.pitch}
-    standing = twists.abs().amax(dim=(1, 2)) < _STANDING
-    if bool(standing.any()):
-        own = {name: raw[name][standing][:1] / getattr(limits, name) for name in _CONTACT_TERMS}
-        if any(bool(value > 1.0) for value in own.values()):
+    if standing is not None:
+        own = _contact_terms(standing, step, weight)
+        if any(float(value) > getattr(limits, name) for name, value in own.items()):
             # The robot does stand here. What the map does to it then is the map's error, such as grass taken for
             # ground around the wheels, and no candidate's fault.
-            raw |= _contact_terms(rollout, step, weight, skipped=round(_SETTLED / step))
-            starts |= {name: raw[name][standing][:1] / getattr(limits, name) for name in _CONTACT_TERMS}
+            skipped = round(_SETTLED / step)
+            raw |= _contact_terms(rollout, step, weight, skipped=skipped)
+            own = _contact_terms(standing, step, weight, skipped=skipped)
+            starts |= {name: value.detach() / getattr(limits, name) for name, value in own.items()}
     terms = {name: torch.nan_to_num(value / getattr(limits, name), nan=torch.inf) for name, value in raw.items()}
-    terms["obstacle_clearance"], close, left = closeness(rollout, terrain, robot, limits.obstacle_clearance)
-    # Who stands too close may turn before it leaves, and has left if it ends no closer.
-    starts["obstacle_clearance"] = torch.where((close > 1.0) & (left <= close + _FURTHER), torch.inf, close)
+    terms["obstacle_clearance"], leaves = closeness(rollout, terrain, robot, limits.obstacle_clearance)
+    starts["obstacle_clearance"] = torch.where(leaves, torch.inf, 0.0)
     cost = sum(getattr(weights, name) * terms[name] for name in TERMS)
     cost = torch.where(rollout.valid, cost, torch.inf)
-    most = {name: (starts[name] + _FURTHER).clamp_min(1.0) if name in starts else 1.0 for name in TERMS}
+    most = {name: (starts[name] + FURTHER).clamp_min(1.0) if name in starts else 1.0 for name in TERMS}
     feasible = torch.stack([value <= most[name] for name, value in terms.items()]).all(dim=0) & rollout.valid
     return Assessment(terms, cost, feasible)
 
 
 def _contact_terms(rollout: Rollout, step: float, weight: Tensor, skipped: int = 0) -> dict[str, Tensor]:
-    """Terms of the contact forces ``[N]``, without the first ``skipped`` ones."""
+    """Terms of the forces that the map exerts, also on a robot that stands ``[N]``, without the first ones."""
     contact = rollout.contact
     assert contact is not None
     # Of a horizon shorter than that, the last two remain.
@@ -240,34 +242,75 @@ def _effort(traction: Tensor, robot: RobotModel, twists: Tensor) -> Tensor:
 
 
 def _unobserved(rollout: Rollout, terrain: TerrainMap, robot: RobotModel) -> Tensor:
-    """Share of the path with the middle or a side of the robot over unknown ground ``[N]``, from 0 to 1.
+    """Share of the path with a wheel, a track or the middle of the robot over unknown ground ``[N]``, from 0 to 1.
 
     Off the map ground is unknown. Where the map tells the spread of its heights, a cell is unknown to the degree that
     its height may be off by more than the clearance below the hull: the probability of that for a Laplace distribution.
     Elsewhere cells without a measurement nearby are. So is ground that nothing was measured behind, whatever an encoder
     makes of it: it may be a drop.
+
+    No sensor sees the ground below the robot and close around it, but the first is known to support it. Within a
+    robot's length from the start only what may be a drop counts, under the wheels of either end, too: the result is the
+    larger one of the share of the whole path over such ground, and the share of the rest of the path over any unknown
+    ground.
     """
     grid = terrain.grid
     place = rollout.position.detach()[..., :2]
     # Ground under the wheels or tracks of either side counts as that under the middle does.
-    driven_points = robot.points[robot.point_drives >= 0][:, 1]
-    sides = torch.stack([driven_points.min(), driven_points.new_zeros(()), driven_points.max()]).to(place)
-    across = rollout.rotation.detach()[..., :2, 1]
-    spots = place[..., None, :] + sides[:, None] * across[..., None, :]
-    column = ((spots[..., 0] - grid.origin[0]) / grid.resolution).round().clamp(0, grid.columns - 1).nan_to_num(0.0)
-    row = ((spots[..., 1] - grid.origin[1]) / grid.resolution).round().clamp(0, grid.rows - 1).nan_to_num(0.0)
+    driven_points = robot.points[robot.point_drives >= 0][:, :2]
+    reach = torch.stack([driven_points.amin(0), driven_points.new_zeros(2), driven_points.amax(0)]).to(place)
+    axes = rollout.rotation.detach()[..., :2, :2]
+    under = torch.cartesian_prod(reach[:, 0], reach[:, 1])
+    spots = place[..., None, :] + (axes[..., None, :, :] @ under[:, :, None])[..., 0]
+    column = ((spots[..., 0] - grid.origin[0]) / grid.resolution).round()
+    row = ((spots[..., 1] - grid.origin[1]) / grid.resolution).round()
+    on_map = (column >= 0) & (column < grid.columns) & (row >= 0) & (row < grid.rows)
+    column = column.clamp(0, grid.columns - 1).nan_to_num(0.0).long()
+    row = row.clamp(0, grid.rows - 1).nan_to_num(0.0).long()
+    beyond = torch.from_numpy(terrain.extrapolated()).to(place)
     if terrain.height_spread is None:
         unknown = 1.0 - torch.from_numpy(terrain.measured_nearby()).to(place)
     else:
         unknown = torch.exp(-_hull_clearance(robot) / terrain.height_spread.to(place).clamp_min(1e-4))
-        unknown = torch.maximum(unknown, torch.from_numpy(terrain.extrapolated()).to(place))
-    degree = torch.where(rollout.inside, unknown[row.long(), column.long()].amax(dim=-1), 1.0)
-    distance = (place - place[:, :1]).norm(dim=-1)
-    # No sensor sees the ground below the robot and close around it, but the first is known to support it.
+    unknown = torch.maximum(unknown, beyond)
+    drop = beyond * torch.from_numpy(_looked_at(terrain, robot)).to(place)
+    # Between two rows of returns the ends of a robot are over a gap most of the time, its middle is not.
+    middle = under[:, 0] == 0.0
+    degree, close = (
+        torch.where(on_map[..., chosen], values[row[..., chosen], column[..., chosen]], 1.0)
+        .amax(dim=-1)
+        .masked_fill(~rollout.inside, 1.0)
+        for values, chosen in ((unknown, middle), (drop, torch.ones_like(middle)))
+    )
     low, high = robot.bounds
-    moved = (distance > float(high[0] - low[0])).to(degree)
-    driven = moved * functional.pad((place[:, 1:] - place[:, :-1]).norm(dim=-1), (1, 0))
-    return (degree * driven).sum(dim=1) / driven.sum(dim=1).clamp_min(1e-6)
+    moved = ((place - place[:, :1]).norm(dim=-1) > float(high[0] - low[0])).to(degree)
+    driven = functional.pad((place[:, 1:] - place[:, :-1]).norm(dim=-1), (1, 0))
+    # Turning in place displaces a robot by centimetres, which are no path.
+    return torch.maximum(_share(degree, driven * moved), _share(close, driven, shortest=grid.resolution))
+
+
+def _share(degree: Tensor, driven: Tensor, *, shortest: float = 1e-6) -> Tensor:
+    """Sum of values ``[N, T + 1]`` times lengths driven ``[N, T + 1]``, over the whole length, at least one [m]."""
+    return (degree * driven).sum(dim=1) / driven.sum(dim=1).clamp_min(shortest)
+
+
+def _looked_at(terrain: TerrainMap, robot: RobotModel) -> np.ndarray:
+    """Cells not below the robot, in directions where its sensors look ``[rows, columns]`` bool.
+
+    The robot is at the origin of the map's frame. Cameras and some lidars look ahead only: where nothing is measured
+    behind the robot, the widest direction with a measurement is taken for the edge of the field of view. A robot that
+    backs out there drives over ground that it came from.
+    """
+    grid = terrain.grid
+    x, y = np.meshgrid(grid.x, grid.y)
+    low, high = (bound.double().cpu().numpy() for bound in robot.bounds)
+    half = 0.5 * grid.resolution
+    outside = (x < low[0] - half) | (x > high[0] + half) | (y < low[1] - half) | (y > high[1] + half)
+    observed = terrain.observed.cpu().numpy()
+    if not observed.any() or (observed & (x < -grid.resolution)).any():
+        return outside
+    bearing = np.abs(np.arctan2(y, x))
+    return outside & (bearing <= bearing[observed].max())
 
 
 def _hull_clearance(robot: RobotModel) -> float:

@@ -5,13 +5,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt, maximum_filter, minimum_filter, uniform_filter
+from scipy.ndimage import (
+    distance_transform_edt,
+    generate_binary_structure,
+    maximum_filter,
+    minimum_filter,
+    uniform_filter,
+)
 
 from monoforce_ros.planning.goal_planner import LETHAL, UNKNOWN
 from monoforce_ros.terrain import Grid, TerrainMap
 
 _SLOPE_BASE = 0.5
 """Length over which slopes are measured [m]."""
+_CROSS = generate_binary_structure(2, 1)
+"""A cell and its neighbours along both axes."""
 _BLIND_SPOT = 1.5
 """Reach of the blind spot around a robot [m]: a lidar 0.8 m high, whose lowest ring looks 28° down, sees no nearer
 ground."""
@@ -110,8 +118,10 @@ def occupancy(
     height = terrain.height.detach().cpu().double().numpy()
     smooth = uniform_filter(height, max(1, round(_SLOPE_BASE / grid.resolution)), mode="nearest")
     slope = np.arctan(np.hypot(*np.gradient(smooth, grid.resolution)))
-    # The height range over three cells, minus the contribution of the slope.
-    span = maximum_filter(height, 3, mode="nearest") - minimum_filter(height, 3, mode="nearest")
+    # The height range over three cells along both axes, minus the contribution of the slope, which is at most that of
+    # its steepest direction. Corners of a square of cells are further apart: with them a diagonal slope were a step.
+    highest = maximum_filter(height, footprint=_CROSS, mode="nearest")
+    span = highest - minimum_filter(height, footprint=_CROSS, mode="nearest")
     step = np.maximum(0.0, span - 2.0 * grid.resolution * np.tan(np.minimum(slope, 1.4)))
     share = np.maximum(slope / slope_limit, step / step_limit)
     cost = np.where(share >= 1.0, LETHAL, np.minimum(GRADED, np.rint(100.0 * share))).astype(np.int8)

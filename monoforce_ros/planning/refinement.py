@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from monoforce_ros.physics import Rollout
 from monoforce_ros.planning.candidates import over_horizon
 from monoforce_ros.planning.costs import Assessment, CostWeights, Limits, assess, force_every
 from monoforce_ros.prediction import Prediction, Predictor, start_states
@@ -60,6 +61,7 @@ def refine(
     round_seconds: float = 0.0,
     flippers: np.ndarray | None = None,
     only_flippers: bool = False,
+    standing: Rollout | None = None,
 ) -> Refinement:
     """Reduce the cost of a feasible candidate by gradient descent through the rollout, with its end kept in place.
 
@@ -80,6 +82,7 @@ def refine(
         flippers: commanded angles to start from, over the whole horizon ``[delay + T, F]`` [rad]; those before the
             start of the candidate stay. None: the prediction's.
         only_flippers: whether to keep speed and yaw rate as they are.
+        standing: of a robot that stands, the rollout without commands ``[1]``; see :func:`assess`.
     """
     started = time.monotonic()
     steps, robot = predictor.history + predictor.steps - len(before), predictor.robot
@@ -109,8 +112,9 @@ def refine(
             with_contact=True, force_every=every, joints=prediction.joints, flippers=program.whole(angles),
         )  # fmt: skip
         found = assess(
-            rolled, prediction.terrain, robot, twists[:, predictor.history :], weights=weights, limits=limits
-        )
+            rolled, prediction.terrain, robot, twists[:, predictor.history :], weights=weights, limits=limits,
+            standing=standing,
+        )  # fmt: skip
         return rolled.position[:, -1], found
 
     def refinement(change: Tensor, cost: float, count: int, slowest: float) -> Refinement:

@@ -17,6 +17,8 @@ CHANNELS = ("height", "geometric_height", "stiffness", "damping", "friction")
 SPREADS = ("geometric_spread", "decrease_spread")
 """Optional channels: how uncertain the heights are."""
 
+_TOUCHING = 1.5
+"""Distance of the centres of cells that touch, also by a corner [cells]."""
 _SECTORS = 120
 """Directions around the robot in which it is known how far was measured: 3°, two cells of 0.1 m at 4 m."""
 
@@ -153,14 +155,11 @@ class TerrainMap:
         distance = cv2.distanceTransform((~observed).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
         return distance * self.grid.resolution <= reach + 1e-6
 
-    def extrapolated(self, reach: float = 0.3) -> np.ndarray:
+    def extrapolated(self) -> np.ndarray:
         """Whether a cell of a single map lies behind all that was measured in its direction, ``[rows, columns]`` bool.
 
         Sensors see ground behind a gap between their rows of returns, but not behind an edge from which it drops, nor
-        behind a wall. The robot is at the origin of the map's frame.
-
-        Args:
-            reach: how far a measured cell speaks for cells behind it [m].
+        behind a wall. A measured cell speaks for those that touch it. The robot is at the origin of the map's frame.
         """
         observed = self.observed.cpu().numpy()
         distance, sector = polar(self.grid)
@@ -168,7 +167,7 @@ class TerrainMap:
         np.maximum.at(farthest, sector[observed], distance[observed])
         # Neighbouring sectors speak for it, too: a far row of returns has gaps.
         farthest = np.max([np.roll(farthest, by) for by in (-1, 0, 1)], axis=0)
-        return ~observed & (distance > farthest[sector] + reach)
+        return ~observed & (distance > farthest[sector] + _TOUCHING * self.grid.resolution)
 
     def looked_over(self, sensor_height: float) -> np.ndarray:
         """Height below which a lidar sees nothing, nearer than all that it measured in a direction [m].
