@@ -383,6 +383,12 @@ def test_a_frame_that_seldom_moves_takes_little_memory_and_is_where_it_was():
     assert (np.diff(track.stamps) > 0).all()
     for time in (0.0, 31.7, 59.99, 60.503, 61.3, 62.1, 119.0):
         np.testing.assert_allclose(track.at(round(1e9 * time)), pose(time), atol=6e-3)
+    # After a reset of the clock, the second run counts.
+    again = MovingFrame()
+    for time in np.r_[times[:3000] + 100.0, times]:
+        again.add(round(1e9 * time), pose(time))
+    np.testing.assert_allclose(again.track().at(round(61.3e9)), pose(61.3), atol=6e-3)
+    assert again.track().stamps[-1] == round(1e9 * times[-1])
     # Beyond the first and last one: those.
     np.testing.assert_allclose(track.at(-(10**9)), pose(0.0), atol=1e-9)
     np.testing.assert_allclose(track.at(500 * 10**9), pose(119.0), atol=1e-9)

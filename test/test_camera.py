@@ -144,6 +144,12 @@ def test_calibrations_of_no_lens_are_refused(change, message):
         CameraModel(**fields).check()
 
 
+def test_a_region_of_an_image_beside_the_axis_passes():
+    """Cut off by the driver, which shifted the principal point, in both directions."""
+    matrix = np.array([[400.0, 0, 640 * 0.34], [0, 400.0, 480 * 0.24], [0, 0, 1]])
+    CameraModel(640, 480, matrix, np.zeros(5)).check()
+
+
 @pytest.mark.parametrize("lens", LENSES)
 def test_calibrations_of_lenses_pass(lens):
     model = camera(lens)

@@ -53,7 +53,7 @@ def test_a_gyro_is_biased_beyond_what_a_healthy_one_is(bias, biased):
     assert found.biased() == biased
 
 
-@pytest.mark.parametrize(("tilt", "bias", "biased"), [(20.0, 0.0, False), (20.0, 0.03, True), (0.0, -0.02, True)])
+@pytest.mark.parametrize(("tilt", "bias", "biased"), [(20.0, 0.0, False), (20.0, 0.06, True), (0.0, -0.02, True)])
 def test_an_imu_that_leans_is_not_biased_in_laps_one_way_round(tilt, bias, biased):
     """It measures a share of each turn, always of the same sign."""
     motion, gyro = turning(20.0)
@@ -68,6 +68,21 @@ def test_an_imu_that_leans_is_not_biased_in_laps_one_way_round(tilt, bias, biase
     )
     assert found.bias == pytest.approx(bias, abs=0.004)
     assert found.biased() == biased
+
+
+@pytest.mark.parametrize("smoothed_over", [0.0, 0.3, 0.5])
+def test_a_localisation_that_smooths_quick_turns_is_no_bias_of_the_gyro(smoothed_over):
+    """In laps, whose mean it follows: the factor between both rates is that of the quick turns."""
+    motion, gyro = turning(20.0)
+    rates = motion.angular_velocities[:, 2].copy()
+    for i in range(1, len(rates) if smoothed_over else 0):
+        rates[i] = rates[i - 1] + (rates[i] - rates[i - 1]) * 0.05 / smoothed_over
+    up = np.array([0.0, 0.0, 1.0])
+    motion = replace(motion, angular_velocities=(rates[:, None] + 0.5) * up)
+    found = compare_with_gyro(
+        SmoothedMotion(motion, 0.003, 0.002, (slice(0, len(motion)),)), replace(gyro, rates=gyro.rates + 0.5 * up)
+    )
+    assert not found.biased()
 
 
 def test_a_gyro_that_is_too_slow_to_compare_says_nothing():

@@ -329,7 +329,9 @@ def test_limits_of_the_twist_have_parameters(husky, tmp_path):
     assert not exported.not_exported
     content = yaml.safe_load(target.read_text())
     smoother = content["velocity_smoother"]["ros__parameters"]
-    assert smoother["max_velocity"] == [1.0, 0.0, 0.7] and smoother["max_accel"] == [0.9, 0.0, 1.4]
+    # Of the speed nothing was found: it stays Nav2's.
+    assert "vx_max" not in content["controller_server"]["ros__parameters"]["FollowPath"]
+    assert smoother["max_velocity"] == [0.5, 0.0, 0.7] and smoother["max_accel"] == [0.9, 0.0, 1.4]
     assert smoother["max_decel"] == [-0.9, 0.0, -1.4]
     mppi = content["controller_server"]["ros__parameters"]["FollowPath"]
     # The smaller of grip and ramp.

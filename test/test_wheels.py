@@ -15,7 +15,7 @@ from monoforce_ros.discrepancy.evidence import Evidence
 from monoforce_ros.discrepancy.healthy_wheels import HealthyWheels, drives_of
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.wheel_motion import undriven_stretches, wheels_without_motion
-from monoforce_ros.discrepancy.wheel_units import contradictions, in_rad_per_second
+from monoforce_ros.discrepancy.wheel_units import contradictions, in_rad_per_second, wheel_unit
 from monoforce_ros.discrepancy.wheels import best_of, changed_drives, compare_with_wheels
 from monoforce_ros.effects import CATALOGUE, drive_speeds, effect_values
 from monoforce_ros.physics import State, rollout
@@ -339,23 +339,60 @@ def test_wheel_speeds_of_another_unit_do_not_make_a_healthy_drive_stand(husky, f
     commands = drawn_commands(60.0, 3)
     wheels, motion = wheels_of(commands, husky, ()), driven(husky, commands)
     recorded = replace(wheels, speeds=factor * wheels.speeds)
-    taken, text = in_rad_per_second(motion, recorded, commands, husky)
-    assert said in text and f"{factor:.2g}"[:2] in text
+    unit = wheel_unit(motion, recorded, commands, husky)
+    taken = replace(recorded, speeds=recorded.speeds / unit.factor)
+    assert said in unit.text and f"{factor:.2g}"[:2] in unit.text
     np.testing.assert_allclose(taken.speeds, wheels.speeds, rtol=0.05, atol=0.05)
     assert wheels_without_motion(motion, taken, commands, husky) is None
     assert len(undriven_stretches(commands, taken, motion, husky)) == 0
     # Wheels of any unit that turn while the robot stays are still found.
     stuck = held(motion, 0.0, 59.5)
-    assert wheels_without_motion(stuck, in_rad_per_second(stuck, recorded, commands, husky)[0], commands, husky)
+    if factor > 1.0:
+        # Slow wheels of a robot that stays may be slow drives.
+        unit = wheel_unit(stuck, recorded, commands, husky)
+        turning = replace(recorded, speeds=recorded.speeds / unit.factor)
+        assert wheels_without_motion(stuck, turning, commands, husky)
 
 
 @pytest.mark.parametrize("effects", [(), (("drive_gain", {"gain": 0.25}),), (("drive_loss", {"loss": -1.0}),)])
 def test_wheel_speeds_in_rad_per_second_stay_though_drives_are_weak_or_the_robot_stands(husky, effects):
     commands = drawn_commands(60.0, 3)
     wheels, motion = wheels_of(commands, husky, effects), driven(husky, commands, effects)
-    assert in_rad_per_second(motion, wheels, commands, husky) == (wheels, "")
+    assert wheel_unit(motion, wheels, commands, husky).text == ""
     if not effects:
-        assert in_rad_per_second(held(motion, 0.0, 59.5), wheels, commands, husky)[1] == ""
+        assert wheel_unit(held(motion, 0.0, 59.5), wheels, commands, husky).text == ""
+
+
+@pytest.mark.parametrize("limit", [0.0, 0.05, 0.1])
+def test_wheels_that_stand_or_hardly_turn_are_in_no_other_unit(husky, limit):
+    """Dead encoders, an emergency stop, or drives that reach 0.1 m/s: the robot hardly moves, or does not."""
+    commands = drawn_commands(60.0, 3)
+    effects = (("actuator_saturation", {"limit": max(limit, 0.05)}),)
+    wheels, motion = wheels_of(commands, husky, effects), driven(husky, commands, effects)
+    if not limit:
+        wheels = replace(wheels, speeds=np.zeros_like(wheels.speeds))
+        assert wheel_unit(driven(husky, commands), wheels, commands, husky).text == ""
+    assert wheel_unit(motion, wheels, commands, husky).text == ""
+
+
+def test_drives_of_a_commissioned_robot_whose_wheels_have_a_unit_of_their_own(husky, healthy_wheels):
+    """Divided by its own ratio, a recording would show no drive that runs too slow."""
+    commands, factor = drawn_commands(60.0, 3), 30.0
+    slow = (("drive_gain", {"gain": 0.7}),)
+    motion, wheels = driven(husky, commands, slow), wheels_of(commands, husky, slow)
+    recorded = replace(wheels, speeds=factor * wheels.speeds)
+    unit = wheel_unit(motion, recorded, commands, husky, known=factor)
+    assert unit.factor == factor and "as when the robot was commissioned" in unit.text
+    # Revolutions per minute, though the drives run 30 % slow.
+    recorded = replace(wheels, speeds=30.0 / np.pi * wheels.speeds)
+    assert "revolutions per minute" in wheel_unit(motion, recorded, commands, husky).text
+    # A driver that publishes rad/s since then.
+    assert wheel_unit(motion, wheels, commands, husky, known=factor).text == ""
+    # Learned of speeds as they were recorded.
+    old = in_rad_per_second(replace(healthy_wheels, ratio=factor / husky.wheel_radius), husky.wheel_radius)
+    assert old.unit == pytest.approx(factor) and old.ratio == pytest.approx(1.0 / husky.wheel_radius)
+    assert in_rad_per_second(healthy_wheels, husky.wheel_radius) == healthy_wheels
+    assert HealthyWheels.read(old.entry()).unit == pytest.approx(factor)
 
 
 def test_a_wrong_radius_or_track_width_in_the_robot_file_is_said(husky):

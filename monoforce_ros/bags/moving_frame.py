@@ -11,6 +11,8 @@ from monoforce_ros.core import PoseTrack
 _INTERVAL = 20_000_000
 """Between two poses that are kept [ns]: a joint that turns by 1 rad/s at an acceleration of 10 rad/s² is interpolated
 to 0.03°, less than any joint is calibrated to."""
+_JUMP = 1_000_000_000
+"""Step back of the stamps after which a frame starts anew [ns]: a simulator was reset, or a bag played again."""
 _SAME = 1e-6
 """Largest difference between poses of a frame that stands still [m, -]."""
 
@@ -27,10 +29,20 @@ class MovingFrame:
         self._last: np.ndarray | None = None
         self._stands = False
         """Whether the last two poses are the same."""
+        self._went_back = False
+        """Whether the last stamp lay far before the others."""
 
     def add(self, stamp: int, matrix: np.ndarray) -> None:
         """Add a pose ``[4, 4]`` of a stamp [ns]."""
         later = stamp - self._stamps[-1] if self._stamps else -1
+        back = bool(self._stamps) and later < -_JUMP
+        if back and self._went_back:
+            self._stamps, self._values, self._last, self._stands = array("q"), array("d"), None, False
+        elif back:
+            # A single one may only be late.
+            self._went_back = True
+            return
+        self._went_back = False
         if 0 <= later < _INTERVAL:
             return
         values = matrix[:3].ravel()

@@ -482,9 +482,9 @@ class _Collector:
         stamps = decoding.transform_stamps(message)
         for frames, matrix in found.items():
             self._keep_beside_child(frames, matrix)
-            if self.frames[0].lstrip("/") not in (frame.lstrip("/") for frame in frames):
-                kept = self._moved.setdefault(frames, MovingFrame())
-                kept.add(stamps[frames] or received.received, matrix)
+            # Without a stamp nobody knows when it held.
+            if stamps[frames] and self.frames[0].lstrip("/") not in (frame.lstrip("/") for frame in frames):
+                self._moved.setdefault(frames, MovingFrame()).add(stamps[frames], matrix)
             if frames not in self._moving:
                 first = self.transforms.setdefault(frames, matrix)
                 if np.abs(first - matrix).max() > FIXED:
@@ -563,7 +563,12 @@ class _Collector:
                 for frames, (stamps, poses) in ((frames, _in_order(kept)) for frames, kept in self._series.items())
                 if frames in self._moving
             },
-            moving_transforms={frames: kept.track() for frames, kept in self._moved.items() if frames in self._moving},
+            # Before the first odometry its frame was not known.
+            moving_transforms={
+                frames: kept.track()
+                for frames, kept in self._moved.items()
+                if frames in self._moving and self.frames[0].lstrip("/") not in (name.lstrip("/") for name in frames)
+            },
             topics={role: topic for role, topic in self.chosen.items() if topic},
             warnings=tuple(self.warnings),
             choices=tuple(self.choices),

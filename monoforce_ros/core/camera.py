@@ -25,6 +25,10 @@ _FISHEYE_ANGLE = np.radians(60.0)
 _OFF_CENTRE = 0.15
 """Share of both edges by which a principal point is off the middle if the matrix is that of an image of another size:
 lenses are mounted to a few per cent of the edge, and common sizes are at least 4/3 of each other."""
+_MOUNTED = 0.06
+"""Difference of both shares that lenses off the middle by a few per cent of each edge may make."""
+_FAR_OFF = 0.35
+"""Share of an edge by which the axis of a region is off its middle if it lies in a corner of the region."""
 _MOST_OBLONG = 3.0
 """Largest ratio of the focal lengths in pixels: a binned or anamorphic image is up to twice as wide."""
 _SHORTEST, _LONGEST = 0.05, 60.0
@@ -122,8 +126,10 @@ class CameraModel:
                 f"expected {_SHORTEST:g} to {_LONGEST:g} times its edge: are they in pixels?"
             )
         off = (centre + 0.5) / size - 0.5
-        # A region of an image may lie beside the optical axis, but rarely on both sides of the image.
-        if (off > _OFF_CENTRE).all() or (off < -_OFF_CENTRE).all():
+        # A region of an image may lie beside the optical axis; of another size, both shares are the same, or so large
+        # that hardly any region is meant.
+        scaled = abs(off[0] - off[1]) < _MOUNTED or np.abs(off).max() > _FAR_OFF
+        if scaled and ((off > _OFF_CENTRE).all() or (off < -_OFF_CENTRE).all()):
             raise ValueError(
                 f"camera matrix: got the principal point ({centre[0]:g}, {centre[1]:g}) px of an image of "
                 f"{size[0]} × {size[1]} px, expected one near its middle: is the matrix that of a "

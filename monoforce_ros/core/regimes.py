@@ -26,10 +26,12 @@ def motion_regimes(twists: np.ndarray, fast: float) -> dict[str, np.ndarray]:
     """
     speed, rate = twists[..., 0].mean(axis=-1), twists[..., 1].mean(axis=-1)
     size, turning = np.abs(twists[..., 0]).mean(axis=-1), np.abs(twists[..., 1]).mean(axis=-1)
+    turns = turning > TURNING_RATE
     return {
-        "turning": turning > TURNING_RATE,
-        "turning left": rate > 0.5 * TURNING_RATE,
-        "turning right": rate < -0.5 * TURNING_RATE,
+        "turning": turns,
+        # Turns one way round for most of a window.
+        "turning left": turns & (rate > 0.5 * TURNING_RATE),
+        "turning right": turns & (rate < -0.5 * TURNING_RATE),
         "straight": (turning < STRAIGHT_RATE) & (size > STANDING_SPEED),
         "reversing": speed < -STANDING_SPEED,
         "fast": size > fast,

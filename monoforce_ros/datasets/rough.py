@@ -91,7 +91,7 @@ class RoughScene:
             raise DatasetError(f"{file}: {file.stat().st_size} bytes, at most {MAXIMUM_CLOUD_BYTES}")
         try:
             with np.load(file, allow_pickle=False) as content:
-                arrays = [content[name] for name in content.files]
+                arrays = [content[name] for name in content.files[:1]]
         # A zip file may be cut anywhere.
         except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error) as error:
             raise DatasetError(f"{file}: not readable as a cloud: {error}") from error

@@ -18,6 +18,7 @@ from monoforce_ros.discrepancy.encoder_ground import encoder_maps
 from monoforce_ros.discrepancy.evidence import COMPONENTS, MOTION, Evidence
 from monoforce_ros.discrepancy.ground import Ground, beyond_commissioning, choose_ground
 from monoforce_ros.discrepancy.held_out_bags import HeldOutBag, named_bags, refuse_unusable
+from monoforce_ros.discrepancy.interruption import uninterrupted
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.nominal_residual import residual_complaint
 from monoforce_ros.discrepancy.report import effect_entry, write_diagnosis
@@ -25,7 +26,7 @@ from monoforce_ros.discrepancy.separate_stretches import laid_apart
 from monoforce_ros.discrepancy.step_errors import compare_after_steps
 from monoforce_ros.discrepancy.terrain_evidence import supporting_terrain, traced_terrain
 from monoforce_ros.discrepancy.verdict import Decision, Verdict
-from monoforce_ros.discrepancy.wheel_units import contradictions, in_rad_per_second
+from monoforce_ros.discrepancy.wheel_units import contradictions, in_rad_per_second, wheel_unit
 from monoforce_ros.discrepancy.wheels import compare_with_wheels
 from monoforce_ros.discrepancy.wording import finding
 from monoforce_ros.effects import CATALOGUE
@@ -93,18 +94,20 @@ def read_evidence(
 
 
 def read_with_ground(
-    bag: Path, robot: RobotModel, terrain: str, reading: ReadOptions = DETECTED
+    bag: Path, robot: RobotModel, terrain: str, reading: ReadOptions = DETECTED, known_unit: float = 1.0
 ) -> tuple[Evidence, Recording, Ground]:
-    """As :func:`read_evidence`, and which ground was taken."""
+    """As :func:`read_evidence`, and which ground was taken; ``known_unit``: see :func:`wheel_unit`."""
     recording = reading.open(bag, robot)
     robot = reading.robot_in_bag(robot)
     smoothed = smooth(recording.motion)
-    wheels, unit = in_rad_per_second(smoothed.motion, recording.wheels, recording.commands, robot)
-    if unit:
-        recording = replace(recording, wheels=wheels, warnings=(*recording.warnings, unit))
+    unit = wheel_unit(smoothed.motion, recording.wheels, recording.commands, robot, known_unit)
+    if unit.text and recording.wheels is not None:
+        wheels = replace(recording.wheels, speeds=recording.wheels.speeds / unit.factor)
+        recording = replace(recording, wheels=wheels, warnings=(unit.text, *recording.warnings))
     evidence = Evidence(
-        smoothed, recording.commands, gyro=recording.angular_velocity, wheels=wheels, joints=recording.joints
-    )
+        smoothed, recording.commands, gyro=recording.angular_velocity, wheels=recording.wheels,
+        wheel_unit=unit.factor, joints=recording.joints,
+    )  # fmt: skip
     ground = choose_ground(terrain, recording, smoothed, robot)
     if ground.source == "flat":
         return replace(evidence, components=MOTION if ground.unknown else COMPONENTS), recording, ground
@@ -176,12 +179,15 @@ def diagnose_bag(
         # It would be replaced by what was found, and the commissioning be lost.
         raise ValueError(f"{out}: got the folder of the commissioned file {found_file.name}, expected another --out")
     progress(0.0, "reading")
-    evidence, recording, ground = read_with_ground(bag, model, terrain, reading)
+    nominal = NominalModel.read(robot, settings.samples)
+    if nominal is not None and nominal.wheels is not None:
+        nominal = replace(nominal, wheels=in_rad_per_second(nominal.wheels, model.wheel_radius))
+    unit = 1.0 if nominal is None or nominal.wheels is None else nominal.wheels.unit
+    evidence, recording, ground = read_with_ground(bag, model, terrain, reading, unit)
     data = fingerprint([bag])
     named = named_bags(held_out)
     refuse_unusable(named, bag, data)
     usable_folder(out)
-    nominal = NominalModel.read(robot, settings.samples)
     others = {name: _held_out(path, model, nominal, terrain, reading) for name, path in named.items()}
     steeper = beyond_commissioning(ground.slope, None if nominal is None else nominal.slope)
     # A robot that was commissioned on such slopes is known there, without a map, too.
@@ -226,7 +232,8 @@ def diagnose_bag(
                 tables[name] = other.table(diagnosis.fitted)
             except (ValueError, ArithmeticError, RuntimeError, MemoryError) as error:
                 # The diagnosis took minutes and does not depend on it.
-                doubts.append(f"the held-out recording {name} could not be compared: {error}")
+                remark = f"the held-out recording {name} could not be compared: {error}"
+                diagnosis = replace(diagnosis, remarks=(*diagnosis.remarks, remark))
         diagnosis = replace(diagnosis, held_out=tables)
     smoothed = evidence.smoothed
     motion = smoothed.motion
@@ -249,13 +256,15 @@ def diagnose_bag(
     robot_file = None
     # On ground that no map shows slopes pass for effects: of that only what sensors measured belongs into a robot file.
     credible = bool(diagnosis.effects) and (bool(rest) or not ground.unknown)
-    if credible and not any(map(complaint, diagnosis.effects)):
-        effects = [effect_entry(effect) for effect in diagnosis.effects]
-        robot_file = write_robot(robot, found_file, effects, [bag], data)
-    elif found_file.exists():
-        # Rename the robot file of an earlier diagnosis, which would be mistaken for a result of this one.
-        found_file.replace(found_file.with_suffix(".earlier.yaml"))
-    report, page = write_diagnosis(out, diagnosis, inputs, robot_file, doubts)
+    # Together, or a robot file of this diagnosis would lie beside the report of an earlier one.
+    with uninterrupted():
+        if credible and not any(map(complaint, diagnosis.effects)):
+            effects = [effect_entry(effect) for effect in diagnosis.effects]
+            robot_file = write_robot(robot, found_file, effects, [bag], data)
+        elif found_file.exists():
+            # Rename the robot file of an earlier diagnosis, which would be mistaken for a result of this one.
+            found_file.replace(found_file.with_suffix(".earlier.yaml"))
+        report, page = write_diagnosis(out, diagnosis, inputs, robot_file, doubts)
     return BagDiagnosis(bag, diagnosis, report, page, robot_file, recording.warnings, tuple(doubts), ground)
 
 
@@ -263,8 +272,9 @@ def _held_out(
     bag: Path, robot: RobotModel, nominal: NominalModel | None, terrain: str, reading: ReadOptions
 ) -> HeldOutBag:
     """A held-out recording, read and checked before the work of a diagnosis, which an error would lose after it."""
+    unit = 1.0 if nominal is None or nominal.wheels is None else nominal.wheels.unit
     try:
-        return HeldOutBag.of(read_evidence(bag, robot, terrain, reading)[0], robot, nominal)
+        return HeldOutBag.of(read_with_ground(bag, robot, terrain, reading, unit)[0], robot, nominal)
     except (BagError, CheckpointError, TerrainError, TerrainFileError, ValueError, OSError) as error:
         raise ValueError(f"{bag}: --held-out got a recording that cannot be compared: {error}") from error
 

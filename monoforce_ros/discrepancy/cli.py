@@ -124,7 +124,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"diagnose: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print("diagnose: interrupted; nothing was written beyond what is listed above", file=sys.stderr)
+        print("diagnose: interrupted; reports that are listed above are complete", file=sys.stderr)
         return INTERRUPTED_STATUS
 
 

@@ -114,7 +114,9 @@ def compare_with_gyro(smoothed: SmoothedMotion, gyro: AngularVelocityTrack | Non
     differences = [measured - scale * rate for measured, rate in both]
     everything = np.concatenate(differences)
     bias = float(np.median(everything))
-    by_scale = 0.5 * (most - least) * abs(float(np.median(np.concatenate([rate for _, rate in both]))))
+    # Poses that follow quick turns late or by a part, and not slow ones, make a factor of both: none may be true, too.
+    away = max(abs(end - scale) for end in (least, most, 1.0))
+    by_scale = away * abs(float(np.median(np.concatenate([rate for _, rate in both]))))
     by_chance = _mean_half_width([float(np.median(piece)) for piece in differences])
     return GyroFinding(
         offset=float(offset),

@@ -202,7 +202,10 @@ def _healthy_wheels(
     models = [finding.model for finding in drives if finding.model is not None]
     tracks = [(evidence.commands, evidence.wheels) for evidence in recordings if evidence.wheels is not None]
     model = models[0] if len(models) == 1 else best_of(models, tracks, robot)
-    return None if model is None else replace(model, in_file=drives_of(robot.effects))
+    units = [evidence.wheel_unit for evidence in recordings]
+    # Where units differ, each recording says its own.
+    unit = units[0] if np.ptp(units) <= 0.1 * max(units) else 1.0
+    return None if model is None else replace(model, unit=unit, in_file=drives_of(robot.effects))
 
 
 def _further(robot: RobotModel, entry: _Prepared, effects: Effects, wheels: WheelFinding | None) -> Effects:

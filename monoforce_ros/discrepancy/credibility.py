@@ -59,7 +59,7 @@ def complaint(estimate: EffectEstimate) -> str:
         without = "no limit" if math.isinf(neutral) else f"{neutral:g} {value.unit}"
         return (
             f"{estimate.name}: the 95 % interval of {key}, {value.low:.3g} to {value.high:.3g} {value.unit}, holds "
-            f"{without}, at which the effect does nothing"
+            f"{without}, {'as the robot file says' if key in estimate.in_file else 'at which the effect does nothing'}"
         )
     return ""
 

@@ -59,7 +59,9 @@ class Evidence:
     gyro: AngularVelocityTrack | None = None
     """Angular velocity measured by an IMU."""
     wheels: WheelTrack | None = None
-    """Measured wheel speeds."""
+    """Measured wheel speeds, in rad/s."""
+    wheel_unit: float = 1.0
+    """Recorded wheel speeds over these."""
     joints: JointRecord | None = None
     """Measured joints and commands to flippers."""
     components: tuple[str, ...] = MOTION

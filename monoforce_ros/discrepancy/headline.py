@@ -210,7 +210,7 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
         if any(effect.indistinguishable for effect in named):
             sentence = "The error is explained, by causes of which this recording cannot tell some apart."
         return result(Tone.GOOD, sentence)
-    if grew and elsewhere:
+    if elsewhere:
         sentence = "A cause was found, but the held-out recordings show no error that it could explain."
     elif grew and not any(row.share >= MOST for row in counted):
         sentence = "The error is not explained: with what was found, predictions get worse."

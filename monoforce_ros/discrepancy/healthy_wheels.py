@@ -34,6 +34,8 @@ class HealthyWheels:
     """Mean squared error of a wheel's speed where the effects change nothing [m²/s²]."""
     share: float
     """Further mean squared error, as a share of the mean square of what the effects change."""
+    unit: float = 1.0
+    """Recorded speeds over those in rad/s, which are meant by ``ratio``."""
     in_file: Effects = ()
     """Effects of the drives in the robot file when this was learned."""
 
@@ -76,6 +78,7 @@ class HealthyWheels:
         return {
             "effects": _listed(self.effects),
             "ratio_rad_m": float(f"{self.ratio:.5g}"),
+            "unit": float(f"{self.unit:.5g}"),
             "noise_m2_s2": float(f"{self.noise:.4g}"),
             "share": float(f"{self.share:.4g}"),
             "drives": _listed(self.in_file),
@@ -100,10 +103,11 @@ class HealthyWheels:
             if response is None or set(values) != {response.parameter, *response.further}:
                 raise ValueError(f"wheels.effects: got {name} {values}, expected effects that wheel speeds show")
         ratio, noise, share = (float(entry[key]) for key in ("ratio_rad_m", "noise_m2_s2", "share"))
-        numbers = [ratio, noise, share, *(value for _, values in effects for value in values.values())]
-        if not np.isfinite(numbers).all() or ratio <= 0 or noise < 0 or share < 0:
-            raise ValueError("wheels: expected finite numbers, ratio above 0, noise and share of 0 or more")
-        return cls(effects, ratio, noise, share, in_file)
+        unit = float(entry.get("unit", 1.0))
+        numbers = [ratio, noise, share, unit, *(value for _, values in effects for value in values.values())]
+        if not np.isfinite(numbers).all() or min(ratio, unit) <= 0 or noise < 0 or share < 0:
+            raise ValueError("wheels: expected finite numbers, ratio and unit above 0, noise and share of 0 or more")
+        return cls(effects, ratio, noise, share, unit, in_file)
 
 
 def drives_of(effects: Sequence[tuple[str, Mapping[str, Any]]]) -> Effects:

@@ -43,7 +43,12 @@ def _handled_by(handler: object) -> Iterator[None]:
         # Python lets no other thread handle signals.
         yield
         return
-    before = signal.signal(signal.SIGINT, handler)  # type: ignore[arg-type]
+    before = signal.getsignal(signal.SIGINT)
+    if before in (None, signal.SIG_IGN):
+        # Of a job in the background, or of a program in another language around this one.
+        yield
+        return
+    signal.signal(signal.SIGINT, handler)  # type: ignore[arg-type]
     try:
         yield
     finally:

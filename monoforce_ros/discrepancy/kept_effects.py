@@ -17,6 +17,9 @@ from monoforce_ros.effects import CATALOGUE
 from monoforce_ros.robots import RobotModel
 
 _HORIZON = 2.0
+_FEWEST_BLOCKS = 6
+"""Blocks with a difference below which no ranks are improbable enough: five on one side are so by chance in 3 % of
+cases."""
 _ALPHA = 0.05
 """Probability that an effect which is absent passes for needed, over position and heading."""
 
@@ -66,7 +69,7 @@ def _needed(recordings: Sequence[Evidence], robot: RobotModel, together: RobotMo
         with_it, without_it = (_errors(Predictions(model, data)) for model in (together, without))
         blocks = blocks_of(starts)
         gains += [(without_it - with_it)[blocks == block].mean(axis=0) for block in np.unique(blocks)]
-    if not gains:
+    if np.count_nonzero(np.any(gains, axis=-1)) < _FEWEST_BLOCKS:
         return True
     return any(
         bool(part.any()) and wilcoxon(part, alternative="greater").pvalue < 0.5 * _ALPHA for part in np.array(gains).T

@@ -24,7 +24,7 @@ class Onset:
     stamp: int
     """[ns]."""
     since_start: float
-    """Since the first window [s]."""
+    """Since the start of the recording [s]."""
     losses: np.ndarray
     """Of each window, ``[W]``."""
     acting: np.ndarray
@@ -77,4 +77,5 @@ def find_onset(search: Search, trial: Trial) -> Onset | None:
     if low <= 0 or nominal_low <= 0 or min(gain, nominal_gain) < least:
         return None
     stamp = int(begin + round(edge * 1e9))
-    return Onset(stamp, edge, combined, starts >= stamp)
+    since_start = float(stamp - search.data.motion.stamps[0]) * 1e-9
+    return Onset(stamp, since_start, combined, starts >= stamp)

@@ -40,10 +40,10 @@ _NOT_IN_ACKERMANN = _NOT_IN_DIFF_DRIVE | {
 _NO_CONTROLLER = "ros2_controllers has no controller for robots that steer all their wheels"
 _NOT_IN_NAV2 = {
     "actuator_lag": "MPPI's model follows velocities at once, within its acceleration limits",
-    "drive_gain": "correct it in the base controller (diff_drive)",
-    "drive_asymmetry": "correct it in the base controller (diff_drive)",
+    "drive_gain": "correct it in the base controller (ros2_control)",
+    "drive_asymmetry": "correct it in the base controller (ros2_control)",
     "drive_compliance": "the motor drivers need an integral part",
-    "turning_scrub": "correct it in the base controller (diff_drive)",
+    "turning_scrub": "correct it in the base controller (ros2_control)",
     "payload": "MPPI's model has no mass",
 }
 _SMOOTHER_VELOCITY, _SMOOTHER_ACCELERATION = (0.5, 2.5), (2.5, 3.2)
@@ -63,6 +63,9 @@ class _Correction:
 
     @classmethod
     def of(cls, robot: RobotModel, effects: _Effects) -> _Correction:
+        if robot.steered is not None and robot.steered.crabs:
+            # No controller has parameters for it.
+            return cls(1.0, 0.0, 1.0)
         gain = effects["drive_gain"].parameters["gain"].value if "drive_gain" in effects else 1.0
         if robot.steered is not None:
             return cls(gain, 0.0, 1.0)
@@ -196,17 +199,17 @@ def nav2_text(robot: RobotModel, effects: _Effects) -> tuple[str, tuple[str, ...
         robot: the nominal model; its maximum speeds apply where no effect lowers them.
         effects: by name.
     """
-    # A correction changes nothing but at which twist the drives reach their limit.
-    correction = _Correction.of(robot, effects if "actuator_saturation" in effects else {})
+    # A correction changes nothing but at which twist the drives reach their limit, or leave their dead band.
+    correction = _Correction.of(robot, effects)
     limits = correction.limits(robot, effects)
     band, delay = (effects.get(name) for name in ("actuator_deadband", "command_delay"))
-    smoother, mppi = _planned_speeds(effects, limits)
+    smoother, mppi = _planned_speeds(robot, effects, limits)
     for own, more in zip((smoother, mppi), _planned_ramps(effects, limits), strict=True):
         own += more
     half = half_track(robot)
     if band is not None:
-        width = band.parameters["width"].value
-        turning = width / half if half > 0.0 and robot.steered is None else 0.0
+        width = correction.gain * band.parameters["width"].value
+        turning = width / (half * correction.separation) if half > 0.0 and robot.steered is None else 0.0
         smoother.append(f"    deadband_velocity: [{width:.4f}, 0.0, {turning:.4f}]  # {stated_effect(band, 'width')}")
     if delay is not None:
         said = stated_effect(delay, "delay")
@@ -217,8 +220,8 @@ def nav2_text(robot: RobotModel, effects: _Effects) -> tuple[str, tuple[str, ...
         ]
     lines = _heading(robot, "Nav2")
     corrected = [name for name in ("drive_gain", "drive_asymmetry", "turning_scrub") if name in effects]
-    if corrected and (smoother or mppi):
-        lines.append("# For a base whose controller has the parameters of the export for ros2_control (diff_drive).")
+    if corrected and (smoother or mppi) and not (robot.steered is not None and robot.steered.crabs):
+        lines.append("# For a base whose controller has the parameters of the export for ros2_control.")
     if smoother:
         lines += ["velocity_smoother:", "  ros__parameters:", *smoother]
     if mppi:
@@ -231,21 +234,27 @@ def nav2_text(robot: RobotModel, effects: _Effects) -> tuple[str, tuple[str, ...
     return _finished(lines, effects, {*_LIMITS, "actuator_deadband", "friction_scale", "command_delay"}, _NOT_IN_NAV2)
 
 
-def _planned_speeds(effects: _Effects, limits: TwistLimits) -> tuple[list[str], list[str]]:
-    """Lines of the velocity smoother and of MPPI on speeds; none where no effect limits them."""
+def _planned_speeds(robot: RobotModel, effects: _Effects, limits: TwistLimits) -> tuple[list[str], list[str]]:
+    """Lines of the velocity smoother and of MPPI on speeds; none where no effect limits them.
+
+    A limit of the yaw rate says nothing of the speed, which then stays Nav2's.
+    """
     own = [effects[name] for name in ("actuator_saturation", "yaw_rate_limit") if name in effects]
     if not own:
         return [], []
     said = "; ".join(stated_effect(effect, "limit") for effect in own)
-    known, default = (limits.speed, limits.yaw_rate), _SMOOTHER_VELOCITY
+    speed = limits.speed if "actuator_saturation" in effects else math.inf
+    known, default = (speed, limits.yaw_rate), _SMOOTHER_VELOCITY
     vector = [value if math.isfinite(value) else other for value, other in zip(known, default, strict=True)]
+    sideways = robot.maximum_lateral_speed
+    aside = min(sideways, vector[0]) if robot.steered is not None and robot.steered.crabs else 0.0
     lines = [
-        f"    max_velocity: [{vector[0]:.4f}, 0.0, {vector[1]:.4f}]  # {said}{_defaults(known)}",
-        f"    min_velocity: [{-vector[0]:.4f}, 0.0, {-vector[1]:.4f}]",
+        f"    max_velocity: [{vector[0]:.4f}, {aside:.4f}, {vector[1]:.4f}]  # {said}{_defaults(known)}",
+        f"    min_velocity: [{-vector[0]:.4f}, {-aside:.4f}, {-vector[1]:.4f}]",
     ]
     mppi = []
-    if math.isfinite(limits.speed):
-        mppi += [f"      vx_max: {limits.speed:.4f}  # {said}", f"      vx_min: {-limits.speed:.4f}"]
+    if math.isfinite(speed):
+        mppi += [f"      vx_max: {speed:.4f}  # {said}", f"      vx_min: {-speed:.4f}"]
     if math.isfinite(limits.yaw_rate):
         mppi.append(f"      wz_max: {limits.yaw_rate:.4f}  # {said}")
     return lines, mppi

@@ -12,12 +12,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from monoforce_ros.core import CommandTrack, MotionTrack, WheelTrack
+from monoforce_ros.discrepancy.healthy_wheels import HealthyWheels
 from monoforce_ros.discrepancy.wheel_motion import half_track, side_speeds, wheel_ways
 from monoforce_ros.robots import RobotModel
 
 _PLAUSIBLE = (0.4, 2.5)
 """Wheel speeds over commanded ones, and over those of the ground, that drives, tyres and a radius may explain: beyond
 lie the units that are in use, the nearest of them one revolution for a second, 0.16, and rpm, 9.5."""
+_STANDING = 0.02
+"""A ratio below says that the wheels stand, or that their sensors are dead: the smallest one of a unit is that of
+metres per second, the radius of the wheels."""
 _SAME = 0.1
 """Relative difference within which two radii are one: a tyre's rolling radius changes by 5 % from new to worn and with
 its pressure, and wheels that pull on firm ground slip by 5 %."""
@@ -80,6 +84,16 @@ class _Ratios:
     ground_anyhow: _Ratio | None = None
     """Of the sides over the ground under them, straight ahead and in turns."""
 
+    @property
+    def of_commands(self) -> tuple[_Ratio, ...]:
+        """Over the commanded speeds, the surer one first."""
+        return tuple(ratio for ratio in (self.commanded, self.commanded_anyhow) if ratio is not None)
+
+    @property
+    def of_ground(self) -> tuple[_Ratio, ...]:
+        """Over those of the ground, the surer one first."""
+        return tuple(ratio for ratio in (self.ground, self.ground_anyhow) if ratio is not None)
+
     @classmethod
     def of(cls, motion: MotionTrack, wheels: WheelTrack, commands: CommandTrack, robot: RobotModel) -> _Ratios:
         ways = wheel_ways(motion, wheels, robot)
@@ -111,47 +125,85 @@ class _Ratios:
         )
 
 
-def in_rad_per_second(
-    motion: MotionTrack, wheels: WheelTrack | None, commands: CommandTrack, robot: RobotModel
-) -> tuple[WheelTrack | None, str]:
-    """Wheel speeds in rad/s, and in words which unit they were recorded in; empty where they were in rad/s.
+@dataclass(frozen=True)
+class WheelUnit:
+    """The unit in which wheel speeds were recorded."""
 
-    They were not if neither commands nor the ground explain how fast they are: drives that follow a tenth of their
-    commands move the robot as slowly, wheels that turn in place follow their commands.
+    factor: float = 1.0
+    """Recorded speeds over those in rad/s."""
+    text: str = ""
+    """In words; empty for rad/s."""
+
+
+def wheel_unit(
+    motion: MotionTrack, wheels: WheelTrack | None, commands: CommandTrack, robot: RobotModel, known: float = 1.0
+) -> WheelUnit:
+    """The unit of recorded wheel speeds.
+
+    They are in rad/s unless neither commands nor the ground explain how fast they are: drives that follow a tenth of
+    their commands move the robot as slowly, wheels that turn in place follow their commands. Where the robot hardly
+    moves, slow wheels may be slow drives; fast ones are not. The ground's ratio counts first: by it drives that run too
+    slow keep that.
 
     Args:
         motion: measured motion.
         wheels: measured wheel speeds as recorded.
         commands: recorded commands.
         robot: its wheel radius and track width are used.
+        known: factor when the robot was commissioned, which counts as long as it explains the speeds.
     """
     if wheels is None or robot.wheel_radius is None:
-        return wheels, ""
+        return WheelUnit()
+    if known != 1.0:
+        scaled = _Ratios.of(motion, replace(wheels, speeds=wheels.speeds / known), commands, robot)
+        found = [ratio for ratio in (*scaled.of_commands, *scaled.of_ground) if ratio.value > _STANDING]
+        if not found or any(ratio.plausible for ratio in found):
+            return WheelUnit(known, f"wheel speeds are divided by {known:.4g}, as when the robot was commissioned")
     ratios = _Ratios.of(motion, wheels, commands, robot)
-    commanded, ground = ratios.commanded or ratios.commanded_anyhow, ratios.ground or ratios.ground_anyhow
-    if commanded is None or commanded.plausible or (ground is not None and ground.plausible):
-        return wheels, ""
-    ratio = commanded.value
+    commanded, ground = next(iter(ratios.of_commands), None), next(iter(ratios.of_ground), None)
+    if commanded is None or commanded.plausible or commanded.value < _STANDING:
+        return WheelUnit()
+    if ground is None and commanded.value < 1.0:
+        return WheelUnit()
+    if ground is not None and (ground.plausible or ground.value < _STANDING):
+        return WheelUnit()
     units = {
         "revolutions per minute": 30.0 / math.pi,
         "revolutions per second": 0.5 / math.pi,
         "degrees per second": 180.0 / math.pi,
         "metres per second": robot.wheel_radius,
     }
-    near = {name: size for name, size in units.items() if abs(math.log(ratio / size)) < math.log(1.0 + _SAME)}
-    measured = f"wheel speeds are {ratio:.3g} times those of the commands by the file's radius of "
-    measured += f"{robot.wheel_radius:.3g} m"
-    if len(near) == 1:
-        ((name, factor),) = near.items()
-        text = f"{measured}: they are taken for {name}, and converted to rad/s"
-    else:
-        factor = ratio
-        what = " or ".join(near) or "those of the motors before a gear, or of another unit"
-        text = (
-            f"{measured}: they are {what}, and divided by this ratio, so that they do not show whether all drives run "
-            "too slow or too fast; publish rad/s of the wheels"
-        )
-    return replace(wheels, speeds=wheels.speeds / factor), text
+    # In turns wheels slip, so that the ground's ratio is the surest one straight ahead and the least sure one anyhow.
+    known_as: dict[str, list[str]] = {}
+    for of_what, ratio in (("ground", ratios.ground), ("commands", commanded), ("ground", ground)):
+        if ratio is None:
+            continue
+        near = [name for name, size in units.items() if abs(math.log(ratio.value / size)) < math.log(1.0 + _SAME)]
+        measured = f"wheel speeds are {ratio.value:.3g} times those of the {of_what} by the file's radius of "
+        measured += f"{robot.wheel_radius:.3g} m"
+        if len(near) == 1:
+            return WheelUnit(units[near[0]], f"{measured}: they are taken for {near[0]}, and converted to rad/s")
+        known_as.setdefault(measured, near)
+    measured, near = next(iter(known_as.items()))
+    ratio = ratios.ground or commanded
+    what = " or ".join(near) or "those of the motors before a gear, or of another unit"
+    return WheelUnit(
+        ratio.value,
+        f"{measured}: they are {what}, or the radius is wrong; they are divided by this ratio, so that they do not "
+        "show whether all drives run too slow or too fast; publish rad/s of the wheels",
+    )
+
+
+def in_rad_per_second(healthy: HealthyWheels, radius: float | None) -> HealthyWheels:
+    """What was learned of wheels whose unit nobody recognised, for speeds in rad/s.
+
+    Args:
+        healthy: of a robot that was commissioned with speeds as they were recorded, or with a known unit.
+        radius: of the wheels, by the robot's file [m]; None if it has none.
+    """
+    if radius is None or _PLAUSIBLE[0] < healthy.ratio * radius < _PLAUSIBLE[1]:
+        return healthy
+    return replace(healthy, ratio=1.0 / radius, unit=healthy.unit * healthy.ratio * radius)
 
 
 def contradictions(

@@ -36,7 +36,7 @@ def _beyond_model(estimate: EffectEstimate) -> dict[str, float]:
     """Values as a sentence states them: of effects that it compares with the model, beyond what the file says."""
     values = {key: parameter.value for key, parameter in estimate.parameters.items()}
     if estimate.name == "payload" and "mass" in values and estimate.in_file.get("mass"):
-        return _further_load(values, estimate.in_file)
+        return _further_load(values, estimate.in_file, estimate)
     for key, file_value in estimate.in_file.items():
         if key in values and estimate.name in _FACTORS_ON_MODEL:
             values[key] /= file_value
@@ -45,17 +45,21 @@ def _beyond_model(estimate: EffectEstimate) -> dict[str, float]:
     return values
 
 
-def _further_load(values: _Values, in_file: _Values) -> dict[str, float]:
-    """The point mass that makes the file's load the one that was found; of the found place where it would weigh little.
+def _further_load(values: _Values, in_file: _Values, estimate: EffectEstimate) -> dict[str, float]:
+    """The point mass that makes the file's load the one that was found; where it would weigh little, how far the load
+    lies from the file's place, if that is beyond its interval, or only how much heavier it is.
 
     Its moment is the difference of both loads' moments.
     """
     mass = values["mass"] - in_file["mass"]
     further = {"mass": mass}
+    elsewhere = any(
+        key in estimate.parameters and not estimate.parameters[key].holds(in_file.get(key, 0.0)) for key in "xy"
+    )
     for key in ("x", "y", "z"):
         if key in values and abs(mass) > _LITTLE * max(abs(values["mass"]), abs(in_file["mass"])):
             further[key] = (values["mass"] * values[key] - in_file["mass"] * in_file.get(key, 0.0)) / mass
-        elif key in values:
+        elif key in values and elsewhere:
             further[f"moved_{key}"] = values[key] - in_file.get(key, 0.0)
     return further
 

@@ -276,6 +276,8 @@ def _camera_topics(recording: Recording, robot: RobotModel, named: Sequence[str]
     choice = chosen_cameras(recording, robot, named)
     for remark in choice.remarks:
         print(f"warning: {remark}", file=sys.stderr)
+    if recording.images and not choice.topics:
+        raise EvaluationError(f"{recording.path}: no camera can be used: {'; '.join(choice.remarks)}")
     return choice.topics, choice.remarks
 
 

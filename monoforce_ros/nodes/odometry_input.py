@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from nav_msgs.msg import Odometry
@@ -26,7 +26,7 @@ class OdometryInput:
         transforms: of ``/tf``.
         health: gets the part ``odometry``.
         timeout: time without odometry after which the robot stops [s].
-        publishers: tells the names of the nodes that publish on the topic.
+        publishers: tells the names of the nodes that publish on the topic, one for each publisher.
     """
 
     def __init__(
@@ -35,7 +35,7 @@ class OdometryInput:
         transforms: TransformListener,
         health: Health,
         timeout: float,
-        publishers: Callable[[], str],
+        publishers: Callable[[], Sequence[str]],
     ):
         self._frames, self._transforms, self._health, self._timeout = frames, transforms, health, timeout
         self._reader = OdometryReader(frames, transforms, health, publishers)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,11 +44,15 @@ class OdometryReader:
         frames: of the robot.
         transforms: of ``/tf``.
         health: gets the part ``odometry``.
-        publishers: tells the names of the nodes that publish on the topic.
+        publishers: tells the names of the nodes that publish on the topic, one for each publisher.
     """
 
     def __init__(
-        self, frames: RobotFrames, transforms: TransformListener, health: Health, publishers: Callable[[], str]
+        self,
+        frames: RobotFrames,
+        transforms: TransformListener,
+        health: Health,
+        publishers: Callable[[], Sequence[str]],
     ):
         self._frames, self._transforms, self._health, self._publishers = frames, transforms, health, publishers
         self._alternating = AlternatingPoses()
@@ -93,12 +97,13 @@ class OdometryReader:
                 "lies",
             )
             return None
-        apart = self._alternating.add(motion)
-        self.alternates = apart > 0.0
+        apart, names = self._alternating.add(motion), self._publishers()
+        # The poses of one estimator may be rough, but they are its own.
+        self.alternates = apart > 0.0 and len(names) > 1
         if self.alternates:
             self._refuse(
                 f"its poses alternate between two tracks that are {apart:.2f} m or rad apart: expected one estimator "
-                f"on the topic, which is published by {self._publishers()}; remap or stop the other one",
+                f"on the topic, which is published by {', '.join(dict.fromkeys(names))}; remap or stop the other one",
                 "two tracks",
             )
             return None

@@ -85,8 +85,8 @@ class AdaptiveSubscription:
         self._subscribed: _Offer | None = None
         self.wrong_type = ""
         """Types on the topic if none of them is usable."""
-        self.publisher_names = ""
-        """Fully qualified names of the nodes that publish on the topic, half a second ago at the latest."""
+        self.publisher_names: tuple[str, ...] = ()
+        """Fully qualified name of the node of each publisher on the topic, half a second ago at the latest."""
         self._timer = node.create_timer(0.5, self._update, clock=STEADY)
         self._update()
 
@@ -111,7 +111,7 @@ class AdaptiveSubscription:
 
     def _update(self) -> None:
         publishers = self._node.get_publishers_info_by_topic(self.topic)
-        self.publisher_names = ", ".join(sorted({full_name(info) for info in publishers}))
+        self.publisher_names = tuple(sorted(full_name(info) for info in publishers))
         offered = {info.topic_type for info in publishers}
         usable = [name for name in self._types if name in offered]
         self.wrong_type = "" if usable or not offered else ", ".join(sorted(offered))

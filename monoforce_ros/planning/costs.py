@@ -12,7 +12,7 @@ from torch.nn import functional
 from monoforce_ros.physics import Rollout
 from monoforce_ros.planning.clearance import FURTHER, LARGEST, closeness
 from monoforce_ros.robots import RobotModel
-from monoforce_ros.terrain import TerrainMap
+from monoforce_ros.terrain import TerrainMap, polar
 
 _GRAVITY = 9.81
 _FORCE_INTERVAL = 0.06
@@ -84,6 +84,9 @@ def force_every(time_step: float) -> int:
     return max(1, round(_FORCE_INTERVAL / time_step))
 
 
+_REMEMBERED = 2.0
+"""Distance from the robot within which a map may hold what sensors saw before and no longer see [m]: their blind zone,
+1.5 m for a lidar 0.8 m high whose lowest ring looks 28° down, and half a robot."""
 _SETTLED = 0.6
 """Time in which a body that starts inside the ground is pushed out of it [s]: of a Husky, a Warthog and a TRADR with
 their wheels or tracks in ground of 0.25 m, on one side, at the front or at a corner, seven of nine came to rest within
@@ -297,20 +300,23 @@ def _share(degree: Tensor, driven: Tensor, *, shortest: float = 1e-6) -> Tensor:
 def _looked_at(terrain: TerrainMap, robot: RobotModel) -> np.ndarray:
     """Cells not below the robot, in directions where its sensors look ``[rows, columns]`` bool.
 
-    The robot is at the origin of the map's frame. Cameras and some lidars look ahead only: where nothing is measured
-    behind the robot, the widest direction with a measurement is taken for the edge of the field of view. A robot that
-    backs out there drives over ground that it came from.
+    The robot is at the origin of the map's frame. Cameras and some lidars look ahead only: where ground some metres
+    away was measured in less than half of all directions, the widest direction ahead with such ground is taken for
+    the edge of the field of view. A robot that backs out there drives over ground that it came from. Nearer cells may
+    be remembered from before, beside and behind the robot.
     """
     grid = terrain.grid
     x, y = np.meshgrid(grid.x, grid.y)
     low, high = (bound.double().cpu().numpy() for bound in robot.bounds)
     half = 0.5 * grid.resolution
     outside = (x < low[0] - half) | (x > high[0] + half) | (y < low[1] - half) | (y > high[1] + half)
-    observed = terrain.observed.cpu().numpy()
-    if not observed.any() or (observed & (x < -grid.resolution)).any():
+    distance, sector = polar(grid)
+    away = terrain.observed.cpu().numpy() & outside & (distance > _REMEMBERED)
+    ahead = away & (x > 0.0)
+    if not ahead.any() or len(np.unique(sector[away])) >= 0.5 * len(np.unique(sector)):
         return outside
     bearing = np.abs(np.arctan2(y, x))
-    return outside & (bearing <= bearing[observed].max())
+    return outside & (bearing <= bearing[ahead].max())
 
 
 def _hull_clearance(robot: RobotModel) -> float:

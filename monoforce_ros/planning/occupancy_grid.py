@@ -116,8 +116,13 @@ def occupancy(
         )
     grid = terrain.grid
     height = terrain.height.detach().cpu().double().numpy()
-    smooth = uniform_filter(height, max(1, round(_SLOPE_BASE / grid.resolution)), mode="nearest")
-    slope = np.arctan(np.hypot(*np.gradient(smooth, grid.resolution)))
+    cells = max(1, round(_SLOPE_BASE / grid.resolution))
+    # Beyond the border ground goes on as it rises there.
+    around = min(cells, *(count - 1 for count in height.shape))
+    continued = np.pad(height, around, mode="reflect", reflect_type="odd")
+    inside = slice(around, -around or None)
+    smooth = uniform_filter(continued, cells, mode="nearest")
+    slope = np.arctan(np.hypot(*np.gradient(smooth, grid.resolution)))[inside, inside]
     # The height range over three cells along both axes, minus the contribution of the slope, which is at most that of
     # its steepest direction. Corners of a square of cells are further apart: with them a diagonal slope were a step.
     highest = maximum_filter(height, footprint=_CROSS, mode="nearest")

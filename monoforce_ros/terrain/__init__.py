@@ -17,7 +17,7 @@ from monoforce_ros.terrain.lidar import (
 )
 from monoforce_ros.terrain.overhead import hanging_low, without_overhead
 from monoforce_ros.terrain.scatter import horizontal_scatter
-from monoforce_ros.terrain.terrain_map import CHANNELS, TerrainDefaults, TerrainMap
+from monoforce_ros.terrain.terrain_map import CHANNELS, TerrainDefaults, TerrainMap, polar
 
 __all__ = [
     "CHANNELS",
@@ -36,6 +36,7 @@ __all__ = [
     "interpolated",
     "interpolated_ground",
     "load_terrain",
+    "polar",
     "require_cells",
     "save_terrain",
     "stands_on_ground",

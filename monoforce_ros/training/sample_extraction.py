@@ -96,7 +96,7 @@ def extract_samples(
 ) -> Path:
     """Extract a bag's samples into a file, unless there is one for the same bag, robot and settings; return its path.
 
-    Encoders of sweeps alone use recordings without usable images, too, with a sample at each sweep.
+    Encoders of sweeps alone have samples at sweeps, whether or not there are images.
 
     Raises:
         SamplesError: the recording has no calibrated images, no commands, or is too short.
@@ -104,15 +104,11 @@ def extract_samples(
     """
     fingerprint = _fingerprint(bag, robot, config, settings, image_topics)
     file = folder / f"{bag.name.removesuffix('.bag')}-{fingerprint[:8]}.safetensors"
-    # Encoders of cameras cannot use these.
-    without_images = file.with_name(f"{file.stem}-sweeps{file.suffix}")
-    usable = [file] if config.takes_images else [file, without_images]
-    for found in usable:
-        if found.is_file():
-            return found
-    samples = _samples(bag, robot, config, settings, image_topics)
-    file = file if samples.cameras else without_images
-    save_samples(samples, file)
+    if not config.takes_images:
+        # Encoders of cameras cannot use these.
+        file = file.with_name(f"{file.stem}-sweeps{file.suffix}")
+    if not file.is_file():
+        save_samples(_samples(bag, robot, config, settings, image_topics), file)
     return file
 
 
@@ -125,7 +121,7 @@ def _samples(
 ) -> RecordingSamples:
     recording = settings.reading.open(bag, robot)
     robot = settings.reading.robot_in_bag(robot)
-    topics = _camera_topics(recording, robot, image_topics, needed=config.takes_images)
+    topics = _camera_topics(recording, robot, image_topics) if config.takes_images else ()
     if not topics and not recording.clouds:
         raise SamplesError(f"{bag}: no clouds and no usable images")
     if not len(recording.commands):
@@ -159,27 +155,22 @@ def _samples(
     )
 
 
-def _camera_topics(
-    recording: Recording, robot: RobotModel, image_topics: Sequence[str], *, needed: bool
-) -> tuple[str, ...]:
+def _camera_topics(recording: Recording, robot: RobotModel, image_topics: Sequence[str]) -> tuple[str, ...]:
     """Image topics of the cameras that can be used; others are named on standard error.
 
     Raises:
-        SamplesError: there is none and images are ``needed``, or one of ``image_topics`` is absent or without a
+        SamplesError: there is none, or one of ``image_topics`` is absent or without a
             CameraInfo.
     """
     unknown = [topic for topic in image_topics if topic not in recording.images or topic not in recording.cameras]
-    if unknown or (needed and not recording.cameras):
+    if unknown or not recording.cameras:
         raise SamplesError(
             f"{recording.path}: no images with a CameraInfo on {unknown or 'any topic'}; images are on "
             f"{sorted(recording.images)}, CameraInfo is available for {sorted(recording.cameras)}"
         )
     # Images without a CameraInfo, such as overlays for debugging, are none of a camera.
-    wanted = tuple(image_topics) or tuple(recording.cameras)
-    if not wanted:
-        return ()
-    choice = chosen_cameras(recording, robot, wanted)
-    if needed and not choice.topics:
+    choice = chosen_cameras(recording, robot, tuple(image_topics) or tuple(recording.cameras))
+    if not choice.topics:
         reasons = "; ".join(f"{topic}: {reason}" for topic, reason in choice.left_out.items())
         raise SamplesError(f"{recording.path}: no usable image: {reasons}")
     for remark in choice.remarks:
