@@ -368,6 +368,27 @@ def test_a_bag_is_opened_once_for_many_reads_and_anew_once_it_changed(tmp_path, 
     assert (Recording.open(path).image(frames[2]) == 2).all()
 
 
+def test_a_pose_of_the_robot_in_the_world_is_none_of_a_sensor(tmp_path):
+    """Transforms may come before the first odometry, which says in which frame that is."""
+    with BagWriter(tmp_path / "bag") as bag:
+        for i in range(40):
+            at, pose = START + i * 50_000_000, np.eye(4)
+            pose[0, 3] = 0.05 * i
+            bag.write("/tf", builders.transforms(at, "world_odom", {"base_link": pose}), at)
+            if i > 3:
+                place = [0.05 * i, 0, 0]
+                bag.write(
+                    "/odom",
+                    builders.odometry(at, "world_odom", "base_link", place, [0, 0, 0, 1], [1, 0, 0], [0] * 3),
+                    at,
+                )
+        bag.write("/tf_static", builders.static_transforms(START, "map", {"world_odom": np.eye(4)}), START)
+    recording = Recording.open(tmp_path / "bag")
+    assert not recording.moving_transforms
+    with pytest.raises(BagError, match="map"):
+        recording.sensor_pose("map", "base_link", {}, START)
+
+
 def test_a_frame_that_seldom_moves_takes_little_memory_and_is_where_it_was():
     def pose(time):
         """Stands, turns from 60 s on by 0.5 rad/s for 2 s, and stands again."""

@@ -343,6 +343,15 @@ def test_sensors_that_look_ahead_only_keep_a_robot_neither_from_driving_nor_from
     assert float(found.terms["unobserved"].max()) < 0.4
 
 
+def test_ground_remembered_under_and_behind_a_robot_widens_no_field_of_view(husky):
+    """Of a lidar that looks ahead, after a drive of 1.8 m straight ahead: beside the robot nobody looked."""
+    ahead = (np.abs(np.arctan2(Y, X)) < np.radians(35.0)) & (X > 1.2)
+    driven = (np.abs(Y) < 0.4) & (X > -1.8) & (X <= 1.2)
+    terrain = terrain_of(np.zeros_like(X), observed=torch.from_numpy(ahead | driven))
+    found, _ = assessed(husky, terrain, [[0.3, 1.0], [0.5, 0.5], [-0.4, 0.0]])
+    assert float(found.terms["unobserved"].max()) < 0.4
+
+
 @pytest.mark.parametrize("speed", [1.5, 3.0])
 def test_braking_is_no_slip(husky, speed):
     found, _ = assessed(husky, terrain_of(np.zeros_like(X)), [[0.0, 0.0], [0.5, 0.0]], speed=speed)
