@@ -453,6 +453,19 @@ def test_the_cost_of_a_slope_and_of_an_edge_does_not_depend_on_their_direction(d
     assert cost(np.where(along > 0.0, 0.1, 0.0)).max() == 100
 
 
+def test_ground_behind_an_edge_is_unknown_in_the_occupancy():
+    def at(x, height=0.0):
+        observed = torch.from_numpy((X < 2.0) & (np.hypot(X, Y) > 0.5))
+        terrain = terrain_of(np.where(X > 1.85, height, 0.0), observed=observed)
+        found = occupancy(terrain, np.eye(4), slope_limit=0.5, step_limit=0.1)
+        column, row = ((np.array([x, 0.0]) - np.array(found.origin)) / found.resolution).astype(int)
+        return int(found.data[row, column])
+
+    assert at(1.5) == 0 and at(2.25) == -1
+    # A wall stays one.
+    assert at(1.9, height=1.0) == at(1.8, height=1.0) == 100
+
+
 def test_selection_weighs_cost_against_the_remaining_distance():
     candidates = {
         "x": np.array([3.0, 2.5, 0.0, 3.0]), "y": np.array([0.0, 1.5, 0.0, -1.0]),

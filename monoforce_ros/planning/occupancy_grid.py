@@ -130,7 +130,9 @@ def occupancy(
     step = np.maximum(0.0, span - 2.0 * grid.resolution * np.tan(np.minimum(slope, 1.4)))
     share = np.maximum(slope / slope_limit, step / step_limit)
     cost = np.where(share >= 1.0, LETHAL, np.minimum(GRADED, np.rint(100.0 * share))).astype(np.int8)
-    cost = np.where(terrain.measured_nearby(), cost, UNKNOWN).astype(np.int8)
+    # Behind an edge from which the ground drops nothing is measured; a wall stays one.
+    known = terrain.measured_nearby() & ~(terrain.extrapolated() & (cost < LETHAL))
+    cost = np.where(known, cost, UNKNOWN).astype(np.int8)
     aligned = AlignedGrid.around(grid, odometry_from_terrain)
     return Occupancy(aligned, aligned.resampled(cost, UNKNOWN))
 
