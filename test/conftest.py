@@ -50,13 +50,20 @@ def executables() -> Path:
     return folder
 
 
+def hears_interrupts() -> None:
+    """Let Ctrl-C reach the process that is started: tests may run in the background of a shell, where it is ignored."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 class Process:
     """An installed executable at work, with its output in a file."""
 
     def __init__(self, command: list[str], log: Path, environment: dict[str, str]):
         self.log = log
         with log.open("w") as output:
-            self._process = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, env=environment)
+            self._process = subprocess.Popen(
+                command, stdout=output, stderr=subprocess.STDOUT, env=environment, preexec_fn=hears_interrupts
+            )
 
     @property
     def output(self) -> str:

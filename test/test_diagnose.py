@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from conftest import hears_interrupts
 from recorded_rollout import recorded
 from scipy.spatial.transform import Rotation
 
@@ -453,7 +454,8 @@ def test_a_comparison_that_fails_late_loses_no_diagnosis(late_robot, late_again,
     monkeypatch.setattr(bag_diagnosis.HeldOutBag, "table", failing)
     found = diagnose_bag(late_robot, "husky", tmp_path / "out", held_out=[late_again])
     assert json.loads(found.report.read_text())["held_out"] == {}
-    assert any("the held-out recording again could not be compared: no room" in text for text in found.doubts)
+    remark = "the held-out recording again could not be compared: no room"
+    assert remark in found.diagnosis.remarks and found.doubts == ()
 
 
 def test_a_driver_that_publishes_rpm_is_said_and_its_wheels_are_used(late_again, tmp_path, monkeypatch):
@@ -489,7 +491,7 @@ def test_ctrl_c_ends_it_in_one_line_without_half_a_report(late_robot, late_again
     command = [sys.executable, "-m", "monoforce_ros.discrepancy.cli", *(late_robot, late_again)[:count]]
     running = subprocess.Popen(
         [*command, "--out", out, "--quiet"], env=ros_environment, text=True, start_new_session=True,
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=Path(__file__).parents[1],
+        preexec_fn=hears_interrupts, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=Path(__file__).parents[1],
     )  # fmt: skip
     # Once folders exist the work has begun, of several bags in processes of their own.
     folder = out if count == 1 else out / late_robot.name
@@ -501,7 +503,7 @@ def test_ctrl_c_ends_it_in_one_line_without_half_a_report(late_robot, late_again
     os.killpg(running.pid, signal.SIGINT)
     _, said = running.communicate(timeout=20)
     assert running.returncode == 130
-    assert said.splitlines() == ["diagnose: interrupted; nothing was written beyond what is listed above"]
+    assert said.splitlines() == ["diagnose: interrupted; reports that are listed above are complete"]
     assert [path for path in out.rglob("*") if path.is_file()] == []
 
 
