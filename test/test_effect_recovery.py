@@ -205,6 +205,19 @@ def test_a_further_effect_in_whose_presence_the_first_one_goes_must_explain_more
     assert search._further(first, 2)[0] is None
 
 
+@pytest.mark.parametrize(("delay", "found"), [(0.035, False), (0.12, True)])
+def test_a_shift_of_less_than_the_time_between_two_commands_is_no_fault(delay, found):
+    """The base reads commands in its own cycle, which begins anew with each start of a healthy robot."""
+    husky = load_robot("husky")
+    data = driven(replace(husky, effects=(("command_delay", {"delay": delay}),)))
+    slow = CommandTrack(data.commands.stamps[::5], data.commands.twists[::5])
+    names = [effect.name for effect in identifiable_effects(husky)]
+    healthy = NominalModel(SCALE, dict.fromkeys(names, 0.01), segments=5, loss=0.4, loss_spread=0.2)
+    best = Search(husky, replace(data, commands=slow), SCALE, nominal=healthy).run(1, exchange=False).best
+    shifts = {"command_delay", "command_clock_offset", "pose_clock_offset"} & set(best.names)
+    assert bool(shifts) == found
+
+
 @pytest.mark.parametrize("measured", [True, False])
 def test_an_effect_is_exchanged_for_one_that_predicts_better_and_is_a_measurement(monkeypatch, measured):
     husky = load_robot("husky")

@@ -30,7 +30,12 @@ from monoforce_ros.discrepancy.trial import (
     folds_of,
     paired,
 )
+from monoforce_ros.effects import CATALOGUE
 from monoforce_ros.robots import RobotModel
+
+_SLOWEST_CYCLE = 0.1
+"""Longest time between commands that counts [s]: base controllers read them at 10 Hz or faster, also where they are
+sent on change only."""
 
 
 class Judging:
@@ -179,10 +184,25 @@ class Judging:
         """Whether the effects of a trial that no sensor measured, or the ``last`` of them, are measurements."""
         fit = self.refit(trial.effects)
         first = self.fixed_count(fit.effects) if last is None else len(fit.effects) - last
+        if any(self._within_a_command(name, values) for name, values in fit.effects[first:]):
+            return False
         return not any(
             complaint(replace(estimate, in_file=own_values(self.robot, estimate.name)))
             for estimate in self.estimates(fit)[first:]
         )
+
+    def _within_a_command(self, name: str, values: Mapping[str, float]) -> bool:
+        """Whether an effect only shifts the motion by less than the time between two commands.
+
+        A base controller reads commands in its own cycle: how long the last one has lain there, up to the time between
+        two, differs from one start of a healthy robot to the next.
+        """
+        key = CATALOGUE[name].shifts if name in CATALOGUE else ""
+        if not key or key not in values or not self.commissioned:
+            return False
+        stamps = self.data.commands.stamps
+        interval = float(np.median(np.diff(stamps))) * 1e-9 if len(stamps) > 1 else 0.0
+        return abs(values[key] - own_values(self.robot, name).get(key, 0.0)) <= min(interval, _SLOWEST_CYCLE)
 
     def ranked(self, fit: Fit) -> list[int]:
         """Indices of a fit's effects, ranked by leave-one-out loss: the loss of the others, fitted again without it."""

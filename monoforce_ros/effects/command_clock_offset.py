@@ -22,6 +22,7 @@ class CommandClockOffset(Effect):
     parameters = (Parameter("offset", "s", 0.0, -2.0, 2.0, 0.2, "recorded minus true time", resolution=0.03),)
     identified = ("offset",)
     manoeuvre = "stops and starts"
+    shifts = "offset"
     separated_by_sensor: ClassVar = {
         "pose_clock_offset": "record an IMU: its gyro shows whether the poses or the base are late"
     }

@@ -32,6 +32,7 @@ class CommandDelay(Effect):
     order = 10
     acts_on_steering = True
     identified = ("delay",)
+    shifts = "delay"
     manoeuvre = "steps of the speed from standing"
     commissioning_start: ClassVar = {"delay": 0.03}
     separated_by: ClassVar = {"actuator_lag": "steps of the speed from standing"}

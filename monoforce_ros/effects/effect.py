@@ -121,6 +121,8 @@ class Effect(ABC):
     turns is none: a slope pulls whichever way the robot turns."""
     acts_on_steering: ClassVar[bool] = False
     """Whether :meth:`drive_speeds` also acts on steering angles, as a delay of all commands does."""
+    shifts: ClassVar[str] = ""
+    """Parameter by which the motion is shifted in time against the commands, as by a dead time or a clock [s]."""
     clock: ClassVar[str] = ""
     """Parameter that is the time since a recording's start: predictions of recordings set it for each trajectory."""
     needs: ClassVar[str] = ""

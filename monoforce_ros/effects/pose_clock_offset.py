@@ -20,6 +20,7 @@ class PoseClockOffset(Effect):
     parameters = (Parameter("offset", "s", 0.0, -2.0, 2.0, 0.2, "recorded minus true time"),)
     identified = ("offset",)
     manoeuvre = "stops and starts"
+    shifts = "offset"
     gyro_measures = "offset"
 
     def motion(self, motion: MotionTrack, values: Mapping[str, float]) -> MotionTrack:
