@@ -24,6 +24,7 @@ from monoforce_ros.physics import PhysicsOptions
 from monoforce_ros.robots import load_robot
 from monoforce_ros.training import train_cli
 from monoforce_ros.training.batches import Batches
+from monoforce_ros.training.gathered_samples import recorded_worlds
 from monoforce_ros.training.judgement import BOTH, CAMERAS, SWEEP
 from monoforce_ros.training.losses import (
     LossWeights,
@@ -144,7 +145,7 @@ def test_worlds_drawn_side_by_side_are_those_drawn_one_after_another(tmp_path):
     drawn = {}
     for jobs in (1, 2):
         options = build_parser().parse_args(["--jobs", str(jobs), "--samples", str(tmp_path / str(jobs)), "--quiet"])
-        drawn[jobs] = train_cli._world_samples(range(431_000, 431_002), EncoderConfig(), options, places=2)
+        drawn[jobs] = recorded_worlds(range(431_000, 431_002), EncoderConfig(), options, places=2)
     assert len(drawn[1]) == len(drawn[2]) == 2
     for alone, beside in zip(drawn[1], drawn[2], strict=True):
         assert alone.name == beside.name and torch.equal(alone.images, beside.images)

@@ -351,7 +351,7 @@ def test_options_that_adapting_ignores_are_refused(arguments, text, capsys):
 
 def test_a_held_out_bag_is_not_trained_on_however_its_path_is_written(tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr(train_cli, "_samples", lambda bags, *_: asked.append([bag.name for bag in bags]) or [])
+    monkeypatch.setattr(train_cli, "recorded_bags", lambda bags, *_: asked.append([bag.name for bag in bags]) or [])
     monkeypatch.chdir(tmp_path)
     (tmp_path / "bags").mkdir()
     options = build_parser().parse_args(

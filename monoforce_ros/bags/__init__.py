@@ -7,8 +7,8 @@ from monoforce_ros.bags.camera_choice import CameraChoice, chosen_cameras, image
 from monoforce_ros.bags.joint_record import JointRecord
 from monoforce_ros.bags.read_options import DETECTED, ReadOptions, add_read_options, read_options
 from monoforce_ros.bags.reader import BagError, BagMessage, BagReader
+from monoforce_ros.bags.recorded_transforms import FIXED
 from monoforce_ros.bags.recording import (
-    FIXED,
     Frame,
     Recording,
     find_transform,

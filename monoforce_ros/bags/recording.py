@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 from monoforce_ros.bags.builders import Message
 from monoforce_ros.bags.command_timeout import TIMEOUT, expired
 from monoforce_ros.bags.joint_record import JointRecord
-from monoforce_ros.bags.moving_frame import MovingFrame
 from monoforce_ros.bags.open_bags import opened
 from monoforce_ros.bags.reader import BagError, BagMessage, BagReader
 from monoforce_ros.bags.recorded_clock import from_reception, longest_part
+from monoforce_ros.bags.recorded_transforms import RecordedTransforms
 from monoforce_ros.bags.topic_choice import (
     ACKERMANN,
     CAMERA_INFO,
@@ -54,10 +54,6 @@ from monoforce_ros.messages import decoding
 if TYPE_CHECKING:
     # Players of bags start without physics.
     from monoforce_ros.robots import RobotModel
-
-FIXED = 0.01
-"""Largest change of a transform on /tf between frames that are fixed to each other [m, rad]: a joint that moves less
-displaces what is measured by less than odometry's own error."""
 
 
 @dataclass(frozen=True)
@@ -337,11 +333,7 @@ class _Collector:
         self._of_rectified = {
             info for topic in bag.of_type(*IMAGES) if is_rectified(topic) for info in camera_info_topics(topic)
         }
-        self.transforms: dict[tuple[str, str], np.ndarray] = {}
-        self._moving: set[tuple[str, str]] = set()
-        self._newest: dict[tuple[str, str], np.ndarray] = {}
-        self._series: dict[tuple[str, str], list[tuple[int, np.ndarray]]] = {}
-        self._moved: dict[tuple[str, str], MovingFrame] = {}
+        self.transforms = RecordedTransforms()
         self.warnings: list[str] = []
         self.choices: list[str] = []
 
@@ -365,7 +357,7 @@ class _Collector:
                 self.frames = (frame_id, child_frame_id)
                 self.states.append((stamp, state))
                 self._received[stamp] = message.received
-                self._take_moving(stamp)
+                self.transforms.sample(stamp)
             elif message.topic == self.chosen["commands"]:
                 self.twists.append((stamp, self._command(decoded)))
             elif message.topic == self.chosen["imu"]:
@@ -383,7 +375,7 @@ class _Collector:
                 if message.topic not in self.cameras:
                     self.cameras[message.topic] = decoding.decode_camera_info(decoded)
             elif message.message_type == TRANSFORMS:
-                self._take_transforms(decoded, message)
+                self._take_transforms(decoded, message.topic)
         except ValueError as error:
             if len(self.warnings) < 20:
                 self.warnings.append(f"{message.topic}: {error}")
@@ -420,7 +412,7 @@ class _Collector:
         """What is kept of each topic: lists of stamps and values."""
         chosen = self.chosen
         return {
-            chosen["odometry"]: [self.states, *self._series.values()],
+            chosen["odometry"]: [self.states, *self.transforms.beside_odometry.values()],
             chosen["commands"]: [self.twists],
             chosen["imu"]: [self.angular_velocities],
             chosen["joints"]: [self.wheels, self.joints],
@@ -473,35 +465,12 @@ class _Collector:
             return
         kept.append((stamp, decoding.decode_joints(message, self.robot.joint_names)[0]))
 
-    def _take_transforms(self, message: Message, received: BagMessage) -> None:
-        """Keep static transforms and, of others, those that hold still: frames fixed on the robot; and what moves."""
+    def _take_transforms(self, message: Message, topic: str) -> None:
         found = decoding.decode_transforms(message)
-        if received.topic.endswith("tf_static"):
-            self.transforms |= found
-            return
-        stamps = decoding.transform_stamps(message)
-        for frames, matrix in found.items():
-            self._keep_beside_child(frames, matrix)
-            # Without a stamp nobody knows when it held.
-            if stamps[frames] and self.frames[0].lstrip("/") not in (frame.lstrip("/") for frame in frames):
-                self._moved.setdefault(frames, MovingFrame()).add(stamps[frames], matrix)
-            if frames not in self._moving:
-                first = self.transforms.setdefault(frames, matrix)
-                if np.abs(first - matrix).max() > FIXED:
-                    self._moving.add(frames)
-                    del self.transforms[frames]
-
-    def _keep_beside_child(self, frames: tuple[str, str], matrix: np.ndarray) -> None:
-        """Keep a transform of the odometry's child frame, other than its pose, as the newest one."""
-        odometry, child = (frame.lstrip("/") for frame in self.frames)
-        names = [frame.lstrip("/") for frame in frames]
-        if child in names and odometry not in names:
-            self._newest[frames] = matrix
-
-    def _take_moving(self, stamp: int) -> None:
-        """Keep the newest transforms of the odometry's child frame at the stamp of an odometry message."""
-        for frames, matrix in self._newest.items():
-            self._series.setdefault(frames, []).append((stamp, matrix))
+        if topic.endswith("tf_static"):
+            self.transforms.add_static(found)
+        else:
+            self.transforms.add(found, decoding.transform_stamps(message), self.frames)
 
     def recording(self, image_topics: list[str]) -> Recording:
         if not self.states:
@@ -557,18 +526,14 @@ class _Collector:
             },
             cameras={topic: known[topic][info] for topic, info in info_topics.items()},
             info_topics=info_topics,
-            static_transforms=self.transforms,
+            static_transforms=self.transforms.fixed,
             moving={
                 frames: (stamps, np.array(poses))
-                for frames, (stamps, poses) in ((frames, _in_order(kept)) for frames, kept in self._series.items())
-                if frames in self._moving
+                for frames, kept in self.transforms.beside_odometry.items()
+                if self.transforms.changed(frames)
+                for stamps, poses in (_in_order(kept),)
             },
-            # Before the first odometry its frame was not known.
-            moving_transforms={
-                frames: kept.track()
-                for frames, kept in self._moved.items()
-                if frames in self._moving and self.frames[0].lstrip("/") not in (name.lstrip("/") for name in frames)
-            },
+            moving_transforms=self.transforms.tracks(self.frames[0]),
             topics={role: topic for role, topic in self.chosen.items() if topic},
             warnings=tuple(self.warnings),
             choices=tuple(self.choices),

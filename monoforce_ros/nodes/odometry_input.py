@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from nav_msgs.msg import Odometry
 
-from monoforce_ros.core import MotionState, RobotFrames
-from monoforce_ros.nodes.frames import TransformListener
-from monoforce_ros.nodes.health import OK, Health
+from monoforce_ros.core import MotionState
+from monoforce_ros.nodes.health import OK
 from monoforce_ros.nodes.odometry_reader import PART, OdometryReader
 from monoforce_ros.nodes.stop import Stop
 
@@ -22,23 +21,12 @@ class OdometryInput:
     """Receives odometry.
 
     Args:
-        frames: of the robot.
-        transforms: of ``/tf``.
-        health: gets the part ``odometry``.
+        reader: of its messages.
         timeout: time without odometry after which the robot stops [s].
-        publishers: tells the names of the nodes that publish on the topic, one for each publisher.
     """
 
-    def __init__(
-        self,
-        frames: RobotFrames,
-        transforms: TransformListener,
-        health: Health,
-        timeout: float,
-        publishers: Callable[[], Sequence[str]],
-    ):
-        self._frames, self._transforms, self._health, self._timeout = frames, transforms, health, timeout
-        self._reader = OdometryReader(frames, transforms, health, publishers)
+    def __init__(self, reader: OdometryReader, timeout: float):
+        self._reader, self._timeout = reader, timeout
         self.motion: MotionState | None = None
         """Of the base."""
         self.base_name = ""
@@ -69,11 +57,11 @@ class OdometryInput:
         if received.motion.stamp != self._stamp:
             self._stamp, self._advanced = received.motion.stamp, self.arrival
         self.motion = received.motion
-        self.base_name = self._frames.base_name(received.child_frame_id, self._transforms.tree.frames)
+        self.base_name = self._reader.base_name(received.child_frame_id)
         self.on_robot = {
             received.child_frame_id or self.base_name: received.base_from_child, self.base_name: np.eye(4)
         }  # fmt: skip
-        self._health.report(PART, OK, "receiving odometry")
+        self._reader.health.report(PART, OK, "receiving odometry")
         return True
 
     def usable(self, cause: str) -> MotionState:

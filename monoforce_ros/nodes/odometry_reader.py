@@ -54,7 +54,7 @@ class OdometryReader:
         health: Health,
         publishers: Callable[[], Sequence[str]],
     ):
-        self._frames, self._transforms, self._health, self._publishers = frames, transforms, health, publishers
+        self._frames, self._transforms, self.health, self._publishers = frames, transforms, health, publishers
         self._alternating = AlternatingPoses()
         self.first_arrival = 0.0
         """Steady time of the first message with a stamp [s]; 0 before."""
@@ -64,6 +64,10 @@ class OdometryReader:
         """Frame of the newest message with a stamp, that of REP 105 if it names none."""
         self.alternates = False
         """Whether the poses come from two estimators that do not agree."""
+
+    def base_name(self, child_frame_id: str) -> str:
+        """Name of the base's frame beside that which the odometry describes."""
+        return self._frames.base_name(child_frame_id, self._transforms.tree.frames)
 
     def read(self, message: Odometry) -> BaseOdometry | None:
         """What a message says; None if it cannot be used."""
@@ -113,4 +117,4 @@ class OdometryReader:
     def _refuse(self, problem: str, reason: str, *, silent: bool = False) -> None:
         self.problem = problem
         if not silent:
-            self._health.report(PART, ERROR, problem, reason=reason)
+            self.health.report(PART, ERROR, problem, reason=reason)

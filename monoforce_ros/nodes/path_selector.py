@@ -23,6 +23,7 @@ from monoforce_ros.nodes.flipper_output import FlipperOutput
 from monoforce_ros.nodes.frames import TransformListener
 from monoforce_ros.nodes.health import ERROR, OK, WARN, Health
 from monoforce_ros.nodes.odometry_input import OdometryInput
+from monoforce_ros.nodes.odometry_reader import OdometryReader
 from monoforce_ros.nodes.parameters import declare_parameters, settings_without_effect
 from monoforce_ros.nodes.process import run_schema_node
 from monoforce_ros.nodes.progress_check import PATIENCE, WINDOW, MeasuredVelocity, ProgressCheck
@@ -87,13 +88,10 @@ class PathSelectorNode(Node):
         self._given_up: Course | None = None
         """The last plan to an end that the robot did not follow."""
         self._started = time.monotonic()
-        self._odometry = OdometryInput(
-            self.frames,
-            self.transforms,
-            self.health,
-            settings.timeout,
-            lambda: self._inputs["odometry"].publisher_names,
+        reader = OdometryReader(
+            self.frames, self.transforms, self.health, publishers=lambda: self._inputs["odometry"].publisher_names
         )
+        self._odometry = OdometryInput(reader, settings.timeout)
         self._candidates = CandidateInput(self.health, settings.timeout)
         self._driving = False
         self._stopped_since = np.inf

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
 import sys
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 from typing import override
@@ -15,7 +13,7 @@ from typing import override
 import cv2
 import torch
 
-from monoforce_ros.bags import BagError, add_read_options, read_options
+from monoforce_ros.bags import BagError, add_read_options
 from monoforce_ros.core import OptionParser, without_nan, write_text
 from monoforce_ros.encoder import (
     SENSORS,
@@ -29,7 +27,7 @@ from monoforce_ros.encoder import (
     new_encoder,
     save_encoder,
 )
-from monoforce_ros.reporting import progress, progress_bar
+from monoforce_ros.reporting import progress_bar
 from monoforce_ros.robots import RobotFileError, RobotModel, fingerprint, load_robot, shipped_robots, write_robot
 from monoforce_ros.synthetic import STYLES
 from monoforce_ros.training.adaptation import (
@@ -42,13 +40,13 @@ from monoforce_ros.training.adaptation import (
     shares_targets,
     split_recording,
 )
-from monoforce_ros.training.batches import use_one_thread
 from monoforce_ros.training.depth_training import DepthSettings, DepthTrainer, depth_errors
+from monoforce_ros.training.gathered_samples import recorded_bags, recorded_worlds
 from monoforce_ros.training.image_features import image_features
 from monoforce_ros.training.judgement import BOTH, CAMERAS, SWEEP, calibrated
 from monoforce_ros.training.losses import LossWeights
-from monoforce_ros.training.recording_samples import RecordingSamples, SamplesError, read_samples
-from monoforce_ros.training.sample_extraction import SampleSettings, extract_samples
+from monoforce_ros.training.recording_samples import RecordingSamples, SamplesError
+from monoforce_ros.training.sample_extraction import SampleSettings
 from monoforce_ros.training.trainer import (
     BACKBONE_PARTS,
     Process,
@@ -68,9 +66,6 @@ from monoforce_ros.training.world_samples import (
     PLACES,
     REPLAY_WORLD,
     WORLD_STYLES,
-    world_file,
-    world_samples,
-    world_settings,
 )
 
 _JUDGED_IMAGES = 256
@@ -299,11 +294,11 @@ def _train(options: argparse.Namespace, process: Process) -> None:
         bags = [bag for bag in bags if bag not in held_out]
     # The first process extracts samples, the others read its files.
     if process.first:
-        training, validation = (_samples(part, robot, config, options, title) for part, title in
+        training, validation = (recorded_bags(part, robot, config, options, title) for part, title in
                                 ((bags, "training"), (held_out, "held out")))  # fmt: skip
-        training += _world_samples(_world_seeds(options), config, options, options.places)
+        training += recorded_worlds(_world_seeds(options), config, options, options.places)
         if options.worlds and not validation:
-            validation = _world_samples(
+            validation = recorded_worlds(
                 range(HELD_OUT_WORLD, HELD_OUT_WORLD + options.held_out_worlds), config, options
             )
     if options.samples_only:
@@ -311,8 +306,8 @@ def _train(options: argparse.Namespace, process: Process) -> None:
     if process.count > 1:
         torch.distributed.barrier()
         if not process.first:
-            training, validation = (_samples(part, robot, config, options, "") for part in (bags, held_out))
-            training += _world_samples(_world_seeds(options), config, options, options.places)
+            training, validation = (recorded_bags(part, robot, config, options, "") for part in (bags, held_out))
+            training += recorded_worlds(_world_seeds(options), config, options, options.places)
     robot = _with_vegetation(robot, training, config, settings, options, process)
     torch.manual_seed(settings.seed)
     encoder = _encoder(options, config, start)
@@ -377,7 +372,7 @@ def _adapt(options: argparse.Namespace) -> None:
     torch.set_num_threads(options.threads or torch.get_num_threads())
     encoder = load_encoder(options.start_from or "")
     robot = load_robot(options.robot)
-    recordings = _samples(options.bags, robot, encoder.config, options, "samples")
+    recordings = recorded_bags(options.bags, robot, encoder.config, options, "samples")
     parts = []
     for recording in recordings:
         try:
@@ -391,9 +386,9 @@ def _adapt(options: argparse.Namespace) -> None:
             print(f"train: skipped: {error}", file=sys.stderr)
     if not parts:
         raise SamplesError(f"none of {len(recordings)} recordings is long enough to adapt to")
-    replay = _world_samples(_world_seeds(options, REPLAY_WORLD, REPLAY_WORLDS), encoder.config, options)
+    replay = recorded_worlds(_world_seeds(options, REPLAY_WORLD, REPLAY_WORLDS), encoder.config, options)
     choosing, judging = (
-        _world_samples(range(first, first + max(options.held_out_worlds // 2, 1)), encoder.config, options)
+        recorded_worlds(range(first, first + max(options.held_out_worlds // 2, 1)), encoder.config, options)
         for first in (CHOOSING_WORLD, JUDGED_WORLD)
     )
     if options.device == "cuda":
@@ -513,75 +508,6 @@ def _settings(options: argparse.Namespace) -> TrainingSettings:
         sensor_shares=None if options.all_sensors else tuple(options.sensor_shares),
         validate_every=options.validate_every, save_every=options.save_every, precision=options.precision,
     )  # fmt: skip
-
-
-def _world_samples(
-    seeds: Sequence[int], config: EncoderConfig, options: argparse.Namespace, places: int = PLACES
-) -> list[RecordingSamples]:
-    """Samples of randomised worlds; those in which the robot cannot stand are left out."""
-    folder = options.samples or options.out / "samples"
-    tasks = [(seed, config, folder, places, world_settings(seed, options.world_styles)) for seed in seeds]
-    missing = sum(
-        not world_file(seed, config, folder, places=places, settings=settings).is_file() for seed, *_, settings in tasks
-    )
-    bar = progress(tasks, label="worlds", unit="world", quiet=options.quiet or not tasks)
-    found = []
-    with _processes(min(options.jobs, missing)) as pool:
-        drawn = pool.map(_draw_world, tasks) if missing > 1 and options.jobs > 1 else map(_draw_world, tasks)
-        for _, (file, reason) in zip(bar, drawn, strict=False):
-            if file is not None:
-                found.append(read_samples(file))
-            else:
-                print(f"left out: {reason}", file=sys.stderr)
-    return found
-
-
-def _draw_world(task: tuple) -> tuple[Path | None, str]:
-    """File of a world's samples, or the reason why there is none."""
-    seed, config, folder, places, settings = task
-    try:
-        return world_samples(seed, config, folder, places=places, settings=settings), ""
-    except SamplesError as error:
-        return None, str(error)
-
-
-def _processes(count: int) -> ProcessPoolExecutor:
-    """Processes of one thread each, at least one; they start with their first task."""
-    return ProcessPoolExecutor(
-        max(1, count), mp_context=multiprocessing.get_context("spawn"), initializer=use_one_thread
-    )
-
-
-def _samples(
-    bags: Sequence[Path], robot: RobotModel, config: EncoderConfig, options: argparse.Namespace, title: str
-) -> list[RecordingSamples]:
-    """Samples of each usable bag, extracted in parallel; with a progress bar if there is a title."""
-    recordings = []
-    settings = SampleSettings(period=options.period, iterations=options.fit_iterations, reading=read_options(options))
-    folder = options.samples or options.out / "samples"
-    bar = progress(bags, label=title, unit="bag", quiet=options.quiet or not title or not bags)
-    with _processes(min(options.jobs, len(bags))) as pool:
-        tasks = [(bag, robot, config, folder, settings, tuple(options.images)) for bag in bags]
-        # A single bag is processed here: starting another process takes longer.
-        extracted = pool.map(_extract, tasks) if len(bags) > 1 and options.jobs > 1 else map(_extract, tasks)
-        for bag, (file, reason) in zip(bar, extracted, strict=False):
-            if file is not None:
-                recordings.append(read_samples(file))
-            else:
-                # A single unusable bag must not end a long training.
-                print(f"train: {bag} skipped: {reason}", file=sys.stderr)
-    if bags and not recordings:
-        raise SamplesError(f"none of {len(bags)} bags gives samples")
-    return recordings
-
-
-def _extract(task: tuple) -> tuple[Path | None, str]:
-    """File of a bag's samples, or the reason why there is none."""
-    bag, robot, config, folder, settings, topics = task
-    try:
-        return extract_samples(bag, robot, config, folder, settings=settings, image_topics=topics), ""
-    except (SamplesError, BagError, ValueError) as error:
-        return None, str(error)
 
 
 def _write_summary(out: Path, trainer: Trainer, description: dict) -> None:
