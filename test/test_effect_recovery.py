@@ -12,7 +12,9 @@ from monoforce_ros.core import CommandTrack
 from monoforce_ros.discrepancy import commissioning
 from monoforce_ros.discrepancy.areas import shows_vegetation
 from monoforce_ros.discrepancy.commissioning import commission
+from monoforce_ros.discrepancy.cycle_start import explain_aligned
 from monoforce_ros.discrepancy.evidence import Evidence, EvidenceWindows, window_starts
+from monoforce_ros.discrepancy.explanation import DiagnosisSettings, Windows
 from monoforce_ros.discrepancy.fit import first_values, fit_effects
 from monoforce_ros.discrepancy.hypothesis import Predictions
 from monoforce_ros.discrepancy.nominal import NominalModel
@@ -287,3 +289,23 @@ def test_the_height_of_a_payload_is_found_where_slopes_show_it(height):
     for key in found.keys() - {"mass"}:
         # Mass and place trade off against each other; the moment is what moves the robot.
         assert found["mass"] * found[key] == pytest.approx(payload["mass"] * payload[key], rel=0.2), key
+
+
+@pytest.mark.parametrize(("delay", "shifted"), [(0.08, True), (0.2, False)])
+def test_where_a_base_reads_commands_later_in_its_cycle_that_is_neither_a_fault_nor_a_lag(delay, shifted):
+    """It delays all motion: beside a tilt a lag stands in for it."""
+    husky = load_robot("husky")
+    tilt = ("gravity_tilt", {"about_y": 0.05, "about_x": 0.0})
+    data = driven(replace(husky, effects=(tilt, ("command_delay", {"delay": delay}))))
+    data = replace(data, commands=CommandTrack(data.commands.stamps[::10], data.commands.twists[::10]))
+    varying = dict.fromkeys((effect.name for effect in identifiable_effects(husky)), 0.01)
+    healthy = NominalModel(SCALE, varying, segments=5, loss=0.2, loss_spread=0.1)
+    evidence = Evidence(SmoothedMotion(data.motion, 0.001, 0.001, (slice(0, len(data.motion)),)), data.commands)
+    windows = Windows(data, np.full((len(data.starts), *SCALE.shape), 1e-4))
+    aligned = explain_aligned(evidence, husky, windows, healthy, DiagnosisSettings(max_effects=2))
+    assert bool(aligned.remark) == shifted
+    later = 1e-9 * (aligned.evidence.commands.stamps[0] - data.commands.stamps[0])
+    assert later == pytest.approx(delay if shifted else 0.0, abs=0.01)
+    if shifted:
+        ((name, values),) = aligned.explanation.decision.trial.effects
+        assert name == "gravity_tilt" and values["about_y"] == pytest.approx(0.05, abs=0.005)

@@ -25,11 +25,7 @@ def found(after: float, *, before: float = 2.5, healthy: float = 0.5, p: float =
     """Findings of one effect that reduces the mean loss to ``after``."""
     share = excess_share(before, after, healthy, Thresholds().drive_spread)
     fit = FitTest(p, "torque_z:vx", (), share if commissioned else 1.0)
-    spread = Thresholds().drive_spread if commissioned else 0.0
-    return Findings(
-        trial(before), trial(after, EFFECTS), fit,
-        healthy_loss=healthy, healthy_spread=spread, commissioned=commissioned,
-    )  # fmt: skip
+    return Findings(trial(before), trial(after, EFFECTS), fit, healthy_loss=healthy, commissioned=commissioned)
 
 
 @pytest.mark.parametrize("after", [0.4, 0.7, 1.05])

@@ -24,9 +24,11 @@ from monoforce_ros.discrepancy.comparison import (
     measured_paths,
     regime_table,
 )
+from monoforce_ros.discrepancy.credibility import complaint
+from monoforce_ros.discrepancy.cycle_start import explain_aligned
 from monoforce_ros.discrepancy.estimates import EffectEstimate, beyond_file
 from monoforce_ros.discrepancy.evidence import MOTION, Evidence, EvidenceWindows
-from monoforce_ros.discrepancy.explanation import DiagnosisSettings, explain
+from monoforce_ros.discrepancy.explanation import DiagnosisSettings
 from monoforce_ros.discrepancy.fit import Fit
 from monoforce_ros.discrepancy.flippers import BLOCKED
 from monoforce_ros.discrepancy.gap import (
@@ -38,6 +40,7 @@ from monoforce_ros.discrepancy.gap import (
 )
 from monoforce_ros.discrepancy.hypothesis import Effects, corrected_evidence
 from monoforce_ros.discrepancy.kinematic_baseline import StepComparison
+from monoforce_ros.discrepancy.learned import LEARNED
 from monoforce_ros.discrepancy.motion_check import motion_faults
 from monoforce_ros.discrepancy.nominal import NominalModel, with_known_components
 from monoforce_ros.discrepancy.preflight import advice, complaints
@@ -167,7 +170,8 @@ def diagnose(
     progress(0.02, "noise floor")
     noisy = noisy_motions(smoothed, settings.seed)
     windows = windows_of(evidence, robot, starts, samples, noisy)
-    explanation = explain(evidence, robot, windows, nominal, settings, _Steps(progress, 0.05, 0.6))
+    aligned = explain_aligned(evidence, robot, windows, nominal, settings, _Steps(progress, 0.05, 0.6))
+    evidence, explanation = aligned.evidence, aligned.explanation
     part = explanation.part
     area, meaning = (part.area if isinstance(part, Region) else None), "acts here"
     aside = None
@@ -225,7 +229,11 @@ def diagnose(
         whole = search.refit(decision.trial.effects)
         estimates = _estimated(search, whole, outcome)
         fitted = whole.effects
-        effects = tuple(sensors.with_interval(estimates[i], search) for i in search.ranked(whole))
+        ranked = [estimates[i] for i in search.ranked(whole)]
+        # What is no measurement, such as a value at its bound, does not come first, whatever hangs on it.
+        doubted = [estimate.name != LEARNED and bool(complaint(estimate)) for estimate in ranked]
+        ranked = [estimate for _, estimate in sorted(zip(doubted, ranked, strict=True), key=lambda entry: entry[0])]
+        effects = tuple(sensors.with_interval(estimate, search) for estimate in ranked)
         if repetition is not None:
             effects = repetition.judged(effects)
     motion_unexplained = False
@@ -242,8 +250,9 @@ def diagnose(
             motion_unexplained = decision.verdict == Verdict.NO_IMPROVEMENT
             decision = replace(decision, verdict=Verdict.EFFECT_FOUND)
         decision = replace(decision, remarks=(*decision.remarks, sensors.flippers.summary()))
-    if left_out or leans:
-        decision = replace(decision, remarks=(*decision.remarks, *left_out, *([leans] if leans else [])))
+    said = (*left_out, *filter(None, (aligned.remark, leans)))
+    if said:
+        decision = replace(decision, remarks=(*decision.remarks, *said))
     if sensors.wheels is not None:
         decision = replace(decision, remarks=(*decision.remarks, sensors.wheels.summary()))
     at_horizon = next((comparison for comparison in compared if comparison.horizon == settings.horizon), None)

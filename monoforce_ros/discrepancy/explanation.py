@@ -194,8 +194,8 @@ def explain(
             doubted = named and search.follows_heading(after.best.effects, found_part.acting)
             if not doubted and (after.best.effects or not partly):
                 part, windows, search, outcome = found_part, acting, there, after
-    if (partly or not passed) and search.grows_with_time(first):
-        # From one block to the next, like a supply that drains, rather than from some time on.
+    if (partly or found or not passed) and search.grows_with_time(first):
+        # From one block to the next, like a supply that drains, rather than from some time on or from the beginning.
         growing = searched(whole, of_time=True)
         after = growing.run(settings.max_effects, exchange=not repeated, missing=partly)
         if _grows(after.best) and after.fit.passed(thresholds):
@@ -248,7 +248,6 @@ def _findings(search: Search, outcome: Outcome) -> Findings:
     return Findings(
         outcome.nominal, outcome.best, outcome.fit,
         healthy_loss=search.healthy_loss,
-        healthy_spread=search.healthy_spread,
         commissioned=search.commissioned,
         known=search.known,
     )  # fmt: skip

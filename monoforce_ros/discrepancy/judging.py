@@ -12,7 +12,16 @@ from monoforce_ros.discrepancy.credibility import complaint
 from monoforce_ros.discrepancy.directions import Directions
 from monoforce_ros.discrepancy.estimates import EffectEstimate, effect_sizes
 from monoforce_ros.discrepancy.evidence import EvidenceWindows
-from monoforce_ros.discrepancy.fit import Fit, estimate_effects, fit_effects, flat, neutral_values, robust, scales
+from monoforce_ros.discrepancy.fit import (
+    Fit,
+    estimate_effects,
+    fit_effects,
+    flat,
+    neutral_values,
+    robust,
+    scales,
+    without,
+)
 from monoforce_ros.discrepancy.hypothesis import Effects, Predictions, own_values
 from monoforce_ros.discrepancy.left_out import values_without_parts
 from monoforce_ros.discrepancy.nominal import NominalModel
@@ -36,6 +45,8 @@ from monoforce_ros.robots import RobotModel
 _SLOWEST_CYCLE = 0.1
 """Longest time between commands that counts [s]: base controllers read them at 10 Hz or faster, also where they are
 sent on change only."""
+_CYCLE = next(effect for effect in CATALOGUE.values() if effect.shifts_cycle)
+"""By which commands act sooner or later, as they do where a controller's cycle begins at another time."""
 
 
 class Judging:
@@ -191,18 +202,59 @@ class Judging:
             for estimate in self.estimates(fit)[first:]
         )
 
-    def _within_a_command(self, name: str, values: Mapping[str, float]) -> bool:
-        """Whether an effect only shifts the motion by less than the time between two commands.
+    @property
+    def command_interval(self) -> float:
+        """Time between two commands, at most that of the slowest controllers [s]; 0 of a robot never commissioned.
 
         A base controller reads commands in its own cycle: how long the last one has lain there, up to the time between
         two, differs from one start of a healthy robot to the next.
         """
-        key = CATALOGUE[name].shifts if name in CATALOGUE else ""
-        if not key or key not in values or not self.commissioned:
-            return False
         stamps = self.data.commands.stamps
-        interval = float(np.median(np.diff(stamps))) * 1e-9 if len(stamps) > 1 else 0.0
-        return abs(values[key] - own_values(self.robot, name).get(key, 0.0)) <= min(interval, _SLOWEST_CYCLE)
+        if not self.commissioned or len(stamps) < 2:
+            return 0.0
+        return min(float(np.median(np.diff(stamps))) * 1e-9, _SLOWEST_CYCLE)
+
+    def _within_a_command(self, name: str, values: Mapping[str, float]) -> bool:
+        """Whether an effect only shifts the motion by less than the time between two commands."""
+        key = CATALOGUE[name].shifts if name in CATALOGUE else ""
+        if not key or key not in values:
+            return False
+        return abs(values[key] - own_values(self.robot, name).get(key, 0.0)) <= self.command_interval
+
+    def start_of_cycle(self, best: Trial, *, explained: bool) -> Effects:
+        """The effect by which the base reads commands sooner or later than on the healthy robot; none where it is more
+        than the time between two commands, which is a fault, or explains nothing.
+
+        Args:
+            best: the effects that were found.
+            explained: whether they are the explanation: another beginning of the cycle then takes the place of one of
+                them, as of a lag, if it predicts better.
+        """
+        interval = self.command_interval
+        if not interval or any(CATALOGUE[name].shifts for name in best.names if name in CATALOGUE):
+            return ()
+        found = [without(best.effects, name) for name in best.names[self.fixed_count(best.effects) :]]
+        trials = [self._with_start_of_cycle(base, interval) for base in found]
+        better = [trial for trial in trials if trial is not None and trial.loss < best.loss]
+        beside = None if explained else self._with_start_of_cycle(best.effects or self.known, interval)
+        if beside is not None and self._adds(best, beside):
+            better.append(beside)
+        return min(better, key=lambda trial: trial.loss).effects[-1:] if better else ()
+
+    def _with_start_of_cycle(self, others: Effects, interval: float) -> Trial | None:
+        """The trial with another beginning of the cycle, by at most an interval, where it is significant."""
+        base = self.refit(others).effects if others else ()
+        fixed, residual = self.fixed_count(base), self.directions.scaled(base)
+        fits = [
+            self.screening.quick_fit((*base, (_CYCLE.name, {_CYCLE.shifts: offset})), len(base), 4)
+            for offset in (-0.5 * interval, 0.5 * interval)
+        ]
+        effects = min(fits, key=lambda fit: fit[1])[0]
+        (test,) = self.screening.tested(base, fixed, residual, [self.directions.influence(base, effects[-1])])
+        if test.p > self.thresholds.further_rate:
+            return None
+        trial = self.judge(effects)
+        return trial if abs(dict(trial.effects)[_CYCLE.name][_CYCLE.shifts]) <= interval else None
 
     def ranked(self, fit: Fit) -> list[int]:
         """Indices of a fit's effects, ranked by leave-one-out loss: the loss of the others, fitted again without it."""
@@ -243,7 +295,8 @@ class Judging:
             p = min(1.0, 2.0 * p)
         explained = 1.0
         if self.commissioned and trial.effects:
-            explained = excess_share(nominal.loss, trial.loss, self.healthy_loss, self.healthy_spread)
+            spread = self.healthy_spread if size is None else size.spread
+            explained = excess_share(nominal.loss, trial.loss, self.healthy_loss, spread)
         return FitTest(p, name, tuple(tests), explained)
 
     def size_p(self, trial: Trial) -> float | None:

@@ -55,8 +55,6 @@ class Findings:
     """Mean loss of the healthy robot."""
     commissioned: bool
     """Whether the healthy robot's residuals are known, with which those that are left can be compared."""
-    healthy_spread: float = 0.0
-    """Standard deviation of the logarithm of this loss on a drive; 0 where it is unknown."""
     known: Effects = ()
     """Effects measured by the gyro or the wheel speeds, which act in all trials."""
     formula: Trial | None = None
@@ -129,7 +127,9 @@ def decide(findings: Findings, thresholds: Thresholds = Thresholds()) -> Decisio
     nominal, best = findings.nominal, findings.best
     share = None
     if best.effects:
-        share = excess_share(nominal.loss, best.loss, findings.healthy_loss, findings.healthy_spread)
+        share = findings.fit.explained
+        if not findings.commissioned:
+            share = excess_share(nominal.loss, best.loss, findings.healthy_loss)
     losses = Losses(nominal.loss, best.loss, findings.healthy_loss, share, p_rest=findings.fit.p)
     if fits(findings, thresholds):
         if not best.effects:

@@ -23,6 +23,7 @@ class CommandClockOffset(Effect):
     identified = ("offset",)
     manoeuvre = "stops and starts"
     shifts = "offset"
+    shifts_cycle = True
     separated_by_sensor: ClassVar = {
         "pose_clock_offset": "record an IMU: its gyro shows whether the poses or the base are late"
     }

@@ -123,6 +123,8 @@ class Effect(ABC):
     """Whether :meth:`drive_speeds` also acts on steering angles, as a delay of all commands does."""
     shifts: ClassVar[str] = ""
     """Parameter by which the motion is shifted in time against the commands, as by a dead time or a clock [s]."""
+    shifts_cycle: ClassVar[bool] = False
+    """Whether it shifts commands to both sides, as where a controller's cycle begins at another time than before."""
     clock: ClassVar[str] = ""
     """Parameter that is the time since a recording's start: predictions of recordings set it for each trajectory."""
     needs: ClassVar[str] = ""
