@@ -233,23 +233,27 @@ class Judging:
         interval = self.command_interval
         if not interval or any(CATALOGUE[name].shifts for name in best.names if name in CATALOGUE):
             return ()
+        reached = self.screening.quick_loss(self.refit(best.effects).effects if best.effects else self.known)
         found = [without(best.effects, name) for name in best.names[self.fixed_count(best.effects) :]]
-        trials = [self._with_start_of_cycle(base, interval) for base in found]
+        trials = [self._with_start_of_cycle(base, interval, reached) for base in found]
         better = [trial for trial in trials if trial is not None and trial.loss < best.loss]
-        beside = None if explained else self._with_start_of_cycle(best.effects or self.known, interval)
+        beside = None if explained else self._with_start_of_cycle(best.effects or self.known, interval, reached)
         if beside is not None and self._adds(best, beside):
             better.append(beside)
         return min(better, key=lambda trial: trial.loss).effects[-1:] if better else ()
 
-    def _with_start_of_cycle(self, others: Effects, interval: float) -> Trial | None:
-        """The trial with another beginning of the cycle, by at most an interval, where it is significant."""
+    def _with_start_of_cycle(self, others: Effects, interval: float, reached: float) -> Trial | None:
+        """The trial with another beginning of the cycle, by at most an interval, where it is significant and leaves
+        less than the loss that is reached without it."""
         base = self.refit(others).effects if others else ()
         fixed, residual = self.fixed_count(base), self.directions.scaled(base)
         fits = [
             self.screening.quick_fit((*base, (_CYCLE.name, {_CYCLE.shifts: offset})), len(base), 4)
             for offset in (-0.5 * interval, 0.5 * interval)
         ]
-        effects = min(fits, key=lambda fit: fit[1])[0]
+        effects, loss = min(fits, key=lambda fit: fit[1])
+        if loss >= reached:
+            return None
         (test,) = self.screening.tested(base, fixed, residual, [self.directions.influence(base, effects[-1])])
         if test.p > self.thresholds.further_rate:
             return None
