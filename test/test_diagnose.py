@@ -407,6 +407,17 @@ def test_the_nominal_file_is_not_overwritten_and_a_stale_one_does_not_stay(late_
     commissioned.write_text(nominal.read_text())
     with pytest.raises(ValueError, match="the folder of the commissioned file husky.yaml, expected another --out"):
         diagnose_bag(late_robot, "husky", commissioned.parent)
+    # What an earlier diagnosis wrote, with the commissioning of its nominal file, may be replaced by the same again.
+    (commissioned.parent / "report.json").write_text(json.dumps({"robot_file": str(commissioned)}))
+    with pytest.raises(ValueError, match="--held-out got a path that does not exist"):
+        diagnose_bag(late_robot, "husky", commissioned.parent, held_out=[tmp_path / "nowhere"])
+    os.utime(commissioned, ns=(1 << 62, 1 << 62))
+    with pytest.raises(ValueError, match="the folder of the commissioned file husky.yaml"):
+        diagnose_bag(late_robot, "husky", commissioned.parent)
+    os.utime(commissioned, ns=(0, 0))
+    (commissioned.parent / "report.json").write_text("[]")
+    with pytest.raises(ValueError, match="the folder of the commissioned file husky.yaml"):
+        diagnose_bag(late_robot, "husky", commissioned.parent)
     (tmp_path / "file").write_text("")
     with pytest.raises(ValueError, match="--out cannot be made a folder"):
         diagnose_bag(late_robot, "husky", tmp_path / "file")

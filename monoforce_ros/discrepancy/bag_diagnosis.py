@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -175,7 +176,8 @@ def diagnose_bag(
     found_file = out / f"{model.name}.yaml"
     if found_file.exists() and found_file.resolve() == robot_file_of(robot).resolve():
         raise ValueError(f"{out}: got the folder of the nominal robot file {found_file.name}, expected another --out")
-    if found_file.exists() and NominalModel.read(str(found_file), settings.samples) is not None:
+    commissioned = found_file.exists() and NominalModel.read(str(found_file), settings.samples) is not None
+    if commissioned and not _written_by_diagnosis(found_file):
         # It would be replaced by what was found, and the commissioning be lost.
         raise ValueError(f"{out}: got the folder of the commissioned file {found_file.name}, expected another --out")
     progress(0.0, "reading")
@@ -266,6 +268,20 @@ def diagnose_bag(
             found_file.replace(found_file.with_suffix(".earlier.yaml"))
         report, page = write_diagnosis(out, diagnosis, inputs, robot_file, doubts)
     return BagDiagnosis(bag, diagnosis, report, page, robot_file, recording.warnings, tuple(doubts), ground)
+
+
+def _written_by_diagnosis(found_file: Path) -> bool:
+    """Whether the report beside a robot file says that its diagnosis wrote the file: the same may replace it.
+
+    Not where the file is newer than the report: then commissioning replaced it.
+    """
+    report = found_file.parent / "report.json"
+    try:
+        written = json.loads(report.read_text(encoding="utf-8")).get("robot_file")
+        newer = found_file.stat().st_mtime_ns > report.stat().st_mtime_ns
+    except (OSError, ValueError, AttributeError):
+        return False
+    return not newer and isinstance(written, str) and Path(written).name == found_file.name
 
 
 def _held_out(
