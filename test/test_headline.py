@@ -157,6 +157,21 @@ def test_an_effect_that_one_part_of_the_recording_shows_is_not_good():
         assert any(f"found again in {times[0]} of 3 searches" in text for text in top.confidence)
 
 
+def test_what_is_held_out_is_said_as_it_is():
+    """Only in a short recording were the effects selected on the blocks that judge them."""
+    short, long = (diagnosed((0.5, 0.06), (8.0, 1.0), repeated=repeated) for repeated in (False, True))
+    pages = [diagnosis_page(found, {}, None) for found in (short, long)]
+    assert ["selected on these same blocks" in page for page in pages] == [True, False]
+    assert ["never saw its part of the recording" in page for page in pages] == [False, True]
+    sizes = [" ".join(headline(found).confidence) for found in (short, long)]
+    assert ["held-out parts of this recording" in text for text in sizes] == [False, True]
+    assert "blocks of this recording left out of the fit" in sizes[0]
+    # Nothing was fitted: nothing is held out.
+    assert "never saw" not in diagnosis_page(replace(diagnosed((0.5, None), (8.0, None)), fitted=()), {}, None)
+    within = diagnosis_page(replace(long, part="It begins 40 s after the start."), {}, None)
+    assert "chosen on the whole recording" in within and "chosen on the whole" not in pages[1]
+
+
 def test_a_robot_that_was_never_commissioned_is_a_doubt():
     known, unknown = (headline(diagnosed((0.5, 0.06), (8.0, 1.0), commissioned=it)) for it in (True, False))
     assert not known.doubts and "never commissioned" in unknown.doubts[0]

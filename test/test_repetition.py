@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from test_diagnose import simulated_recording
 
-from monoforce_ros.bags import SmoothedMotion
-from monoforce_ros.core import WheelTrack
+from monoforce_ros.bags import JointRecord, SmoothedMotion
+from monoforce_ros.core import AngularVelocityTrack, JointTrack, WheelTrack
 from monoforce_ros.discrepancy import DiagnosisSettings, Evidence
 from monoforce_ros.discrepancy.comparison import HeldOut
 from monoforce_ros.discrepancy.estimates import EffectEstimate
@@ -90,6 +90,34 @@ def test_sensors_are_taken_without_the_part(husky):
         measured.append([findings.known for findings in parts])
     assert measured[0][2] == measured[1][2] != ()
     assert all(measured[0][part] != measured[1][part] for part in (0, 1))
+
+
+def test_joints_and_gyro_are_taken_without_the_part():
+    """A flipper that turns the other way and a biased gyro in one part only: without it nobody knows."""
+    marv = load_robot("marv")
+    motion, commands = simulated_recording(marv, (), seconds=60.0)
+    evidence, windows = windows_of(motion, commands)
+    places = HeldOut(((),) * 3, int(windows.data.starts[0]), LENGTH)
+    stamps = motion.stamps
+    held = places.part_of(stamps) == 2
+    names = tuple(joint.name for joint in marv.joints)
+    wanted = np.tile(0.8 * np.sin(0.5e-9 * (stamps - stamps[0]))[:, None], (1, len(names)))
+    rates = np.zeros((len(stamps), 3))
+    rates[:, 2] = motion.angular_velocities[:, 2]
+    measured = []
+    for share, bias in ((0.0, 0.0), (2.0, 0.3)):
+        angles = wanted.copy()
+        angles[held, -1] *= 1.0 - share
+        joints = JointRecord(JointTrack(stamps, names, angles), JointTrack(stamps, names, wanted), 4)
+        gyro = AngularVelocityTrack(stamps, rates + bias * held[:, None])
+        recorded = replace(evidence, joints=joints, gyro=gyro)
+        measured.append(
+            [SensorFindings.of(without_part(recorded, places, part), marv, commissioned=False) for part in range(3)]
+        )
+    healthy, lying = measured
+    assert healthy[2].gyro is not None and lying[2].gyro == healthy[2].gyro
+    assert lying[0].gyro != healthy[0].gyro
+    assert lying[2].flippers is None and all(lying[part].flippers is not None for part in (0, 1))
 
 
 def test_too_short_a_recording_is_not_repeated(husky):

@@ -253,11 +253,25 @@ def regime_table(comparison: Comparison) -> list[RegimeRow]:
 
 
 def measured_paths(
-    robot: RobotModel, data: EvidenceWindows, held_out: HeldOut | None, count: int = 6
+    robot: RobotModel,
+    data: EvidenceWindows,
+    stretches: Sequence[slice],
+    held_out: HeldOut | None,
+    count: int = 6,
 ) -> list[PathComparison]:
-    """Predicted and measured paths of some windows with errors above the median, the largest error first."""
-    horizon = 5.0
-    starts = data.starts[data.starts < data.motion.stamps[-1] - round((horizon + 0.1) * 1e9)]
+    """Predicted and measured paths of some windows with errors above the median, the largest error first.
+
+    Args:
+        robot: the nominal model.
+        data: the recording.
+        stretches: parts of its motion without gaps; each path lies within one.
+        held_out: the effects that predict each window, or None.
+        count: largest number of paths.
+    """
+    horizon, stamps = 5.0, data.motion.stamps
+    spans = np.array([(stamps[part.start], stamps[part.stop - 1]) for part in stretches], np.int64).reshape(-1, 2)
+    begins, ends = data.starts[:, None], data.starts[:, None] + round((horizon + 0.1) * 1e9)
+    starts = data.starts[((begins >= spans[:, 0]) & (ends < spans[:, 1])).any(axis=1)]
     if held_out is not None:
         starts = held_out.judged(starts, horizon)
     if not len(starts):

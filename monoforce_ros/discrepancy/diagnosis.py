@@ -69,6 +69,8 @@ class Details:
     """Where the effects act, if only there; of an unknown effect where errors are largest at every visit."""
     area_meaning: str = "acts here"
     """Of ``area``, in a legend."""
+    stretches: tuple[slice, ...] = ()
+    """Parts of the motion without gaps; empty: all of it is one."""
 
 
 @dataclass(frozen=True)
@@ -113,6 +115,9 @@ class Diagnosis:
     that was never commissioned."""
     observed: tuple[str, ...] = ()
     """What the recording shows of the robot besides: wheels that turn in place, a lean that has changed."""
+    repeated: bool = False
+    """Whether the whole search was repeated without parts of the recording, which what it found then predicts; else
+    windows are predicted with values fitted to other blocks, and effects were selected on all of them."""
     motion_unexplained: bool = False
     """Whether, besides what a sensor measured, the motion is not as predicted, and no effect improves it."""
 
@@ -248,7 +253,7 @@ def diagnose(
         decision = replace(decision, remarks=(*decision.remarks, sensors.wheels.summary()))
     at_horizon = next((comparison for comparison in compared if comparison.horizon == settings.horizon), None)
     expected = floor if nominal is None else np.sqrt(floor**2 + (nominal.residual_in(data) ** 2).mean(axis=0))
-    paths = tuple(measured_paths(robot, data, judged))
+    paths = tuple(measured_paths(robot, data, smoothed.stretches, judged))
     regimes = find_regimes(data)
     hints = advice(decision.verdict, effects, gyro=evidence.gyro is not None)
     place = None
@@ -278,9 +283,10 @@ def diagnose(
         losses=decision.losses,
         localisation_error=apart if apart > ABOVE_NOISE * noise else None,
         commissioned=search.commissioned,
-        details=Details(data, before, floor, tuple(compared), paths, area, meaning),
+        details=Details(data, before, floor, tuple(compared), paths, area, meaning, smoothed.stretches),
         part="" if part is None or decision.verdict in _NOTHING_ADDED else part.remark,
         set_aside=None if aside is None else aside.verdict,
+        repeated=repetition is not None,
         motion_unexplained=motion_unexplained,
         healthy={} if nominal is None else _medians(expected[-1]),
         observed=tuple(filter(None, (comparable.blocked, leans))),

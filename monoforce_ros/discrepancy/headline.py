@@ -291,9 +291,10 @@ def _apart(before: float, after: float) -> tuple[str, str]:
 
 def _sizes(diagnosis: Diagnosis) -> tuple[str, ...]:
     """The size of the errors, before and after, in plain numbers."""
+    parts = "held-out parts of this recording" if diagnosis.repeated else "blocks of this recording left out of the fit"
     texts = []
     for row in explained(diagnosis):
-        where = f"held-out recording {row.recording}" if row.recording else "held-out parts of this recording"
+        where = f"held-out recording {row.recording}" if row.recording else parts
         unit = "°" if row.row.unit == "deg" else f" {row.row.unit}"
         assert row.row.after is not None
         before, after = _apart(row.row.before, row.row.after)

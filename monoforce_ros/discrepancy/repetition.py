@@ -207,7 +207,11 @@ def _found(
 
 
 def without_part(evidence: Evidence, places: HeldOut, number: int) -> Evidence:
-    """The sensors of a recording without one part."""
+    """The sensors of a recording without what they measured in one part.
+
+    Commands of the part stay, to wheels and to flippers: they say nothing of how the robot answered, and one that was
+    given in the part may hold behind it.
+    """
     smoothed = evidence.smoothed
     stretches: list[slice] = []
     for stretch in smoothed.stretches:
@@ -215,8 +219,18 @@ def without_part(evidence: Evidence, places: HeldOut, number: int) -> Evidence:
         kept = poses[places.part_of(smoothed.motion.stamps[poses]) != number]
         runs = np.split(kept, np.flatnonzero(np.diff(kept) > 1) + 1)
         stretches += [slice(int(run[0]), int(run[-1]) + 1) for run in runs if len(run) > 1]
-    wheels = evidence.wheels
+    wheels, gyro, joints = evidence.wheels, evidence.gyro, evidence.joints
     if wheels is not None:
         chosen = places.part_of(wheels.stamps) != number
         wheels = WheelTrack(wheels.stamps[chosen], wheels.speeds[chosen])
-    return replace(evidence, smoothed=replace(smoothed, stretches=tuple(stretches)), wheels=wheels)
+    if gyro is not None:
+        chosen = places.part_of(gyro.stamps) != number
+        gyro = replace(gyro, stamps=gyro.stamps[chosen], rates=gyro.rates[chosen])
+    if joints is not None and joints.measured is not None:
+        chosen = places.part_of(joints.measured.stamps) != number
+        measured = replace(
+            joints.measured, stamps=joints.measured.stamps[chosen], angles=joints.measured.angles[chosen]
+        )
+        joints = replace(joints, measured=measured)
+    smoothed = replace(smoothed, stretches=tuple(stretches))
+    return replace(evidence, smoothed=smoothed, wheels=wheels, gyro=gyro, joints=joints)
