@@ -157,6 +157,24 @@ def test_an_effect_that_one_part_of_the_recording_shows_is_not_good():
         assert any(f"found again in {times[0]} of 3 searches" in text for text in top.confidence)
 
 
+def test_a_name_that_changes_with_the_part_of_the_recording_is_said_as_one_class():
+    slow = effect("drive_gain", gain=(0.9, 0.85, 0.95))
+    unstable = replace(slow, found_again=(1, 3), named_otherwise=("turning_scrub", "payload"))
+    found = diagnosed((0.5, 0.06), (8.0, 1.0), effects=(unstable,))
+    top = headline(found)
+    assert top.tone is Tone.PARTLY and "the name of its cause changes" in top.sentence
+    names = f"{cause('drive_gain')}, {cause('turning_scrub')} or {cause('payload')}"
+    (text,) = top.findings
+    assert text.startswith(f"The name changes with the part of the recording: {names}. By all of it: ")
+    assert any(names in doubt for doubt in top.doubts)
+    assert not any("in a part of the recording only" in doubt for doubt in top.doubts)
+    assert f"if it is {cause('payload')} instead: {remedy('payload')}" in top.actions
+    assert names in "\n".join(summary_lines(found)) and names in diagnosis_page(found, {}, None)
+    assert report_content(found, {}, None)["effects"][0]["named_otherwise"] == ["turning_scrub", "payload"]
+    alone = headline(diagnosed((0.5, 0.06), (8.0, 1.0), effects=(replace(unstable, named_otherwise=()),)))
+    assert any("in a part of the recording only" in doubt for doubt in alone.doubts)
+
+
 def test_what_is_held_out_is_said_as_it_is():
     """Only in a short recording were the effects selected on the blocks that judge them."""
     short, long = (diagnosed((0.5, 0.06), (8.0, 1.0), repeated=repeated) for repeated in (False, True))

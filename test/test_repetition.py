@@ -133,6 +133,24 @@ def test_an_effect_that_others_replace_half_of_the_time_belongs_to_a_class_with_
     repeated = (Repeated(named=("drive_gain",)), Repeated(named=("payload",)), None, None)
     (judged,) = Repetition(0, repeated).judged([EffectEstimate("drive_gain", {})])
     assert judged.found_again == (1, 2) and judged.indistinguishable == ("payload",)
+    assert judged.named_otherwise == ()
+
+
+def test_a_name_that_changes_with_each_part_is_one_class_with_all_that_takes_its_place():
+    def judged(*named):
+        repeated = tuple(Repeated(named=names) for names in named)
+        return Repetition(0, repeated).judged([EffectEstimate("drive_gain", {})])[0]
+
+    changes = judged(("payload",), ("turning_scrub",), ("drive_gain",))
+    assert changes.found_again == (1, 3) and changes.indistinguishable == ()
+    assert changes.named_otherwise == ("payload", "turning_scrub")
+    assert judged(("payload",), ("turning_scrub",), ("viscous_drag",)).named_otherwise[-1] == "viscous_drag"
+    # Found again in most of them it keeps its name; where others find nothing, there is none in its place.
+    assert judged(("payload",), ("drive_gain",), ("drive_gain",)).named_otherwise == ()
+    assert judged((), (), ("drive_gain",)).named_otherwise == ()
+    # One that takes its place in half of them means the same.
+    most = judged(("payload",), ("payload",), ("turning_scrub",))
+    assert most.indistinguishable == ("payload",) and most.named_otherwise == ("turning_scrub",)
 
 
 def test_an_effect_beside_another_that_is_found_again_in_fewer_than_half_of_the_repetitions_is_not_added(
@@ -162,6 +180,7 @@ def test_an_effect_beside_another_that_is_found_again_in_fewer_than_half_of_the_
     others = (Repeated(named=("drive_gain",)), Repeated(named=("drive_loss",)), Repeated(named=("turning_scrub",)))
     nothing = Repetition(0, others).confirmed(found, decision, SETTINGS.thresholds)
     assert nothing.verdict == Verdict.UNKNOWN_EFFECT and nothing.trial is None and nothing.parts is both
+    assert "these name drive_gain or drive_loss or turning_scrub" in nothing.remarks[-1]
     # One without which the others are no measurements belongs to them.
     monkeypatch.setattr(found.search, "credible", lambda trial: len(trial.names) > 1)
     assert names(delay, delay, payload)[0] == (name, "payload")

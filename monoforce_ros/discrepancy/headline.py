@@ -143,14 +143,21 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
             others = " or ".join(cause(other) for other in effect.indistinguishable)
             doubts.append(f"{cause(effect.name)} could as well be {others}: this recording cannot tell them apart")
     unstable = [effect for effect in named if effect.found_again and 2 * effect.found_again[0] < effect.found_again[1]]
-    doubts += [f"{cause(e.name)} shows in a part of the recording only: drive longer to be sure" for e in unstable]
+    doubts += [
+        f"{_class_of(effect)}: drive longer to be sure"
+        if effect.named_otherwise
+        else f"{cause(effect.name)} shows in a part of the recording only: drive longer to be sure"
+        for effect in unstable
+    ]
     counted = [row for row in rows if row.counts]
     grew = [row for row in rows if row.grew]
     # A recording from before the fault says nothing of what explains it.
     elsewhere = bool(rows) and not counted and all(row.recording for row in rows)
     remedies = [remedy(effect.name) for effect in effects]
     remedies += [
-        f"if it is {cause(other)} instead: {remedy(other)}" for effect in named for other in effect.indistinguishable
+        f"if it is {cause(other)} instead: {remedy(other)}"
+        for effect in named
+        for other in (*effect.indistinguishable, *effect.named_otherwise)
     ]
     if complaints:
         # What was found under a doubt about the recording or the ground may be nothing but its cause.
@@ -167,7 +174,10 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
         actions.append(_COMMISSION)
     doubts += [_growth(row) for row in grew]
     enough = bool(counted) and all(row.share >= MOST for row in counted)
-    findings = tuple(finding(effect) for effect in effects)
+    findings = tuple(
+        f"{_class_of(effect)}. By all of it: {finding(effect)}" if effect.named_otherwise else finding(effect)
+        for effect in effects
+    )
     if not named:
         # Without a name for it, where the error shows is what is known.
         findings += tuple(
@@ -218,9 +228,17 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
         sentence = "Most of the error is not explained; a part of the cause was found."
     elif grew:
         sentence = f"A cause was found, but with it the {grew[0].metric} error grows."
+    elif any(effect.named_otherwise for effect in unstable):
+        sentence = "The error is explained, but the name of its cause changes with the part of the recording."
     else:
         sentence = "A cause was found, with doubts."
     return result(Tone.PARTLY, sentence)
+
+
+def _class_of(effect: EffectEstimate) -> str:
+    """One class of an effect and what other parts of the recording name in its place."""
+    *names, last = (cause(name) for name in (effect.name, *effect.named_otherwise))
+    return f"The name changes with the part of the recording: {', '.join(names)} or {last}"
 
 
 def _without_discrepancy(diagnosis: Diagnosis, complaints: Sequence[str], unknown: Sequence[str]) -> Headline:

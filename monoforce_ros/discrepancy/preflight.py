@@ -41,7 +41,7 @@ def advice(verdict: Verdict, effects: Sequence[EffectEstimate], *, gyro: bool = 
     for effect in effects:
         sensors = [sensor for other in effect.indistinguishable if (sensor := separating_sensor(effect.name, other))]
         hints += [_CLOCKS] if sensors and gyro else sensors
-        for other in effect.indistinguishable:
+        for other in (*effect.indistinguishable, *effect.named_otherwise):
             manoeuvre = separating_manoeuvre(effect.name, other)
             if manoeuvre:
                 hints.append(f"{manoeuvre} would distinguish {effect.name} from {other}")
