@@ -14,10 +14,12 @@ from monoforce_ros.discrepancy.gap import Localisation, NoiseFloor
 from monoforce_ros.discrepancy.ground import beyond_commissioning
 from monoforce_ros.discrepancy.headline import Tone, explained, headline
 from monoforce_ros.discrepancy.page import diagnosis_page
+from monoforce_ros.discrepancy.partial_effects import effects_for_file, file_entry, with_advice
 from monoforce_ros.discrepancy.preflight import advice
 from monoforce_ros.discrepancy.report import report_content, summary_lines
 from monoforce_ros.discrepancy.wording import cause, finding, remedy
 from monoforce_ros.effects import CATALOGUE, identifiable_effects
+from monoforce_ros.robots import load_robot, write_robot
 
 
 def effect(name, *, indistinguishable=(), **parameters):
@@ -122,10 +124,46 @@ def test_a_part_of_the_recording_is_said_beside_what_acts_there():
     found = diagnosed((0.5, 0.06), (8.0, 1.0), part=there)
     top = headline(found)
     assert top.findings == ("The drives react 0.30 s late to every command.", there)
-    assert any("only for" in action for action in top.actions)
     assert there in "\n".join(summary_lines(found)) and there in diagnosis_page(found, {}, None)
     assert report_content(found, {}, None)["part"] == there
     assert report_content(diagnosed((0.5, 0.06), (8.0, 1.0)), {}, None)["part"] is None
+
+
+ICE = effect("friction_scale", factor=(0.15, 0.1, 0.2))
+PATCH = "It acts within 2.5 m of (7.3, 3.3) in the odometry frame (26 of 86 windows)."
+
+
+def test_what_acts_on_a_part_of_the_ground_is_written_into_a_robot_file_only_if_it_is_asked_for(tmp_path):
+    found = diagnosed((0.5, 0.06), (8.0, 1.0), effects=(DELAY, ICE), part=PATCH, partial=(ICE.name,), regional=True)
+    # What a sensor measured acts everywhere.
+    assert effects_for_file(found) == (DELAY,)
+    assert effects_for_file(found, local=True) == (DELAY, ICE)
+    for local, said in ((False, "not written into a robot file"), (True, "new file on such ground only")):
+        advised = with_advice(found, local=local)
+        for text in ("\n".join(summary_lines(advised)), diagnosis_page(advised, {}, None)):
+            assert said in text
+            assert "on all other ground predictions get worse with it" in text
+    file = write_robot("husky", tmp_path / "husky.yaml", [file_entry(found, e) for e in (DELAY, ICE)], [], "0")
+    lines = file.read_text().splitlines()
+    above = [lines[lines.index(f"- name: {name}") - 1] for name in ("command_delay", "friction_scale")]
+    assert not above[0].startswith("#")
+    assert above[1].startswith("# friction_scale: It acts within 2.5 m") and "predictions get worse" in above[1]
+    assert dict(load_robot(file).effects)["friction_scale"] == {"factor": 0.15}
+    # The comment stays in copies of the file.
+    again = write_robot(file, tmp_path / "again.yaml", [], [], "0")
+    assert above[1] in again.read_text().splitlines()
+
+
+def test_what_began_in_the_middle_describes_the_robot_since_then():
+    since = "It begins 43 s after the start; these figures are of the time after that."
+    found = diagnosed((0.5, 0.06), (8.0, 1.0), part=since, partial=(DELAY.name,))
+    assert effects_for_file(found) == (DELAY,)
+    assert (
+        file_entry(found, DELAY)["part"].startswith("It begins 43 s") and "before" in file_entry(found, DELAY)["part"]
+    )
+    assert any("the motion before that is predicted worse" in action for action in headline(with_advice(found)).actions)
+    whole = diagnosed((0.5, 0.06), (8.0, 1.0))
+    assert with_advice(whole) is whole and "part" not in file_entry(whole, DELAY)
 
 
 @pytest.mark.parametrize(

@@ -107,6 +107,10 @@ class Diagnosis:
     """Errors after steps of the command beside those of a kinematic fit."""
     part: str = ""
     """The part of the recording in which alone the effects act, in words; empty if they act in all of it."""
+    partial: tuple[str, ...] = ()
+    """Names of the effects that act in ``part`` only; what sensors measured acts always."""
+    regional: bool = False
+    """Whether ``part`` is a part of the ground, rather than the time from some moment on."""
     set_aside: Verdict | None = None
     """Verdict on all effects where only those that sensors measured are kept, since the ground may be the cause of the
     rest, which is listed in ``known_parts``; None where nothing was set aside."""
@@ -285,6 +289,8 @@ def diagnose(
         commissioned=search.commissioned,
         details=Details(data, before, floor, tuple(compared), paths, area, meaning, smoothed.stretches),
         part="" if part is None or decision.verdict in _NOTHING_ADDED else part.remark,
+        partial=() if part is None else tuple(name for name, _ in fitted if name not in dict(search.known)),
+        regional=isinstance(part, Region),
         set_aside=None if aside is None else aside.verdict,
         repeated=repetition is not None,
         motion_unexplained=motion_unexplained,

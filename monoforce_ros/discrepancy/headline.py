@@ -186,8 +186,6 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
         )
     if diagnosis.part:
         findings += (diagnosis.part,)
-        if effects:
-            actions.append("use the robot's new file only for what is like this part of the recording")
     helps = bool(effects) and not grew and not refused and any(row.share > 0 for row in rows)
 
     def result(tone: Tone, sentence: str) -> Headline:
