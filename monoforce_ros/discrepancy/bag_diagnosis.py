@@ -107,7 +107,7 @@ def read_with_ground(
         recording = replace(recording, wheels=wheels, warnings=(unit.text, *recording.warnings))
     evidence = Evidence(
         smoothed, recording.commands, gyro=recording.angular_velocity, wheels=recording.wheels,
-        wheel_unit=unit.factor, joints=recording.joints,
+        wheel_unit=unit.factor, efforts=recording.efforts, joints=recording.joints,
     )  # fmt: skip
     ground = choose_ground(terrain, recording, smoothed, robot)
     if ground.source == "flat":

@@ -39,6 +39,7 @@ from monoforce_ros.discrepancy.gap import (
 from monoforce_ros.discrepancy.hypothesis import Effects, corrected_evidence
 from monoforce_ros.discrepancy.kinematic_baseline import StepComparison
 from monoforce_ros.discrepancy.motion_check import motion_faults
+from monoforce_ros.discrepancy.motor_efforts import changed_efforts
 from monoforce_ros.discrepancy.nominal import NominalModel, with_known_components
 from monoforce_ros.discrepancy.preflight import advice, complaints
 from monoforce_ros.discrepancy.region import Region
@@ -118,7 +119,8 @@ class Diagnosis:
     """Median errors of the healthy robot at the end of a window, ``position`` [m] and ``heading`` [deg]; empty for one
     that was never commissioned."""
     observed: tuple[str, ...] = ()
-    """What the recording shows of the robot besides: wheels that turn in place, a lean that has changed."""
+    """What the recording shows of the robot besides: wheels that turn in place, a lean or currents of the motors that
+    have changed."""
     repeated: bool = False
     """Whether the whole search was repeated without parts of the recording, which what it found then predicts; else
     windows are predicted with values fitted to other blocks, and effects were selected on all of them."""
@@ -166,9 +168,11 @@ def diagnose(
     leans = (
         changed_lean(lean_of(smoothed.motion), nominal.lean) if nominal is not None and evidence.with_attitude else ""
     )
+    known = None if nominal is None else nominal.efforts
+    efforts = changed_efforts(evidence.commands, evidence.efforts, evidence.wheels, robot, known, settings.thresholds)
     faults = motion_faults(smoothed, evidence.commands, evidence.wheels)
     if faults:
-        return Diagnosis(Verdict.NOT_IDENTIFIABLE, advice=faults, remarks=left_out)
+        return Diagnosis(Verdict.NOT_IDENTIFIABLE, advice=faults, remarks=(*left_out, *efforts))
     found = complaints(evidence, starts)
     if found:
         return Diagnosis(Verdict.NOT_IDENTIFIABLE, advice=(*left_out, *found))
@@ -251,8 +255,9 @@ def diagnose(
             motion_unexplained = decision.verdict == Verdict.NO_IMPROVEMENT
             decision = replace(decision, verdict=Verdict.EFFECT_FOUND)
         decision = replace(decision, remarks=(*decision.remarks, sensors.flippers.summary()))
-    if left_out or leans:
-        decision = replace(decision, remarks=(*decision.remarks, *left_out, *([leans] if leans else [])))
+    said = (*left_out, *filter(None, (leans, *efforts)))
+    if said:
+        decision = replace(decision, remarks=(*decision.remarks, *said))
     if sensors.wheels is not None:
         decision = replace(decision, remarks=(*decision.remarks, sensors.wheels.summary()))
     at_horizon = next((comparison for comparison in compared if comparison.horizon == settings.horizon), None)
@@ -295,7 +300,7 @@ def diagnose(
         repeated=repetition is not None,
         motion_unexplained=motion_unexplained,
         healthy={} if nominal is None else _medians(expected[-1]),
-        observed=tuple(filter(None, (comparable.blocked, leans))),
+        observed=tuple(filter(None, (comparable.blocked, leans, *efforts))),
     )
 
 

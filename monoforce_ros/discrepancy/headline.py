@@ -186,6 +186,7 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
         )
     if diagnosis.part:
         findings += (diagnosis.part,)
+    findings += diagnosis.observed
     helps = bool(effects) and not grew and not refused and any(row.share > 0 for row in rows)
 
     def result(tone: Tone, sentence: str) -> Headline:
@@ -243,7 +244,7 @@ def _without_discrepancy(diagnosis: Diagnosis, complaints: Sequence[str], unknow
     """The first screen where nothing is missing in the model; ``unknown`` says that the healthy robot is."""
     observed, tone = diagnosis.observed, Tone.PARTLY
     if observed and not complaints:
-        sentence = "The robot moves as its model predicts, but something else is wrong."
+        sentence = "The robot moves as its model predicts, but something else is not as usual."
     elif complaints:
         # A model that misses the healthy robot by much cannot say that nothing is wrong.
         sentence = "No change was found, with doubts: the errors are as large as the healthy robot's."
