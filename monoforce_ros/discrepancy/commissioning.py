@@ -59,6 +59,7 @@ COMMISSIONED_IN_VEGETATION = _commissioned("vegetation")
 """Effects that every robot needs in addition where a recording leads through vegetation."""
 _VEGETATION = frozenset(name for name, _ in COMMISSIONED_IN_VEGETATION)
 _FEWEST_SEGMENTS = 3
+"""As many as parts: of two the variance between segments would have one degree of freedom."""
 _PARTS = 3
 """Parts of a single recording that take turns in being predicted by the others."""
 _MOST_EFFECTS = 4

@@ -20,10 +20,13 @@ from monoforce_ros.discrepancy.trial import BLOCK, blocks_of
 from monoforce_ros.robots import RobotModel
 
 HORIZONS = (1.0, 2.0, 5.0)
+"""At which errors are told [s]: half and whole of the windows to which effects are fitted, and beyond them, where only
+the effects' form predicts. Those of 5 s decide nothing (:data:`JUDGED`)."""
 ABOVE_NOISE = 2.0
 """An error counts if it is at least so many times the noise floor: the noise is then the smaller part of it."""
 FEWEST_WINDOWS = 6
-"""At one horizon: the median of fewer is that of a manoeuvre."""
+"""At one horizon: windows begin a second apart, so that six of 2 s are three which do not overlap; fewer are one
+manoeuvre."""
 _METRICS = (("position", "m"), ("heading", "deg"), ("lean", "deg"), ("height", "m"))
 """Errors and their units; the last two where the ground is known."""
 

@@ -16,6 +16,8 @@ from monoforce_ros.robots import RobotModel, servo_response
 
 BLOCKED = "blocked_flipper"
 _PIECE, _STEP = 2.0, 0.02
+"""Length of the pieces, that of a diagnosed window, and time step of the modelled servos, below their time constants
+(0.05 s of the shipped robot's) [s]."""
 _SMALLEST_MOVE = 0.05
 """Change of a commanded angle that an encoder of 1° tells from none within a piece [rad]."""
 _FEWEST = 5
@@ -23,6 +25,7 @@ _FEWEST = 5
 _SMALLEST_SHARE = 0.2
 """A servo that is slower than its file says by 0.4 s loses a fifth of a move within a piece of 2 s."""
 _QUANTILE = 1.96
+"""Of the normal distribution, for an interval of 95 %."""
 
 
 @dataclass(frozen=True)

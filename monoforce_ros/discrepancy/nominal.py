@@ -22,8 +22,11 @@ from monoforce_ros.robots import RobotFileError, read_commissioning, read_nomina
 SEGMENT = 16.0
 """Length of the segments between which the healthy robot varies [s]: two blocks of cross-validation, so that most kinds
 of motion occur in each."""
-# Of the rates those by which attitude and height change as much within the first half second.
 _SMALLEST = np.array([0.01, 0.01, *np.radians([0.3, 0.3, 0.3]), 0.01, *np.radians([0.6, 0.6]), 0.02])
+"""Errors below which nothing is worth a name [m, m, rad, rad, rad, m, rad/s, rad/s, m/s]: a centimetre, and the 0.3° by
+which a vertical repeats between drives (``attitude.REPEATABILITY``). Of the rates those by which attitude and height
+change as much within the first half second. The centimetre is a choice, not calibrated: a simulated robot without noise
+must not be blamed for errors of its integration."""
 _CHANGES = ("speed_m_s", "yaw_rate_rad_s")
 
 
