@@ -115,3 +115,23 @@ def test_no_modules_import_each_other_in_a_circle():
 
     for module in sorted(graph):
         visit(module)
+
+
+def test_numbers_of_a_diagnosis_say_where_they_come_from():
+    """Every number that stands by itself in a module of ``discrepancy`` has a sentence below it."""
+    silent = []
+    for path in sorted((PACKAGE / "discrepancy").glob("*.py")):
+        body = ast.parse(path.read_text(), filename=str(path)).body
+        for node, below in zip(body, [*body[1:], None], strict=True):
+            targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+            value = node.value if isinstance(node, ast.Assign | ast.AnnAssign) else None
+            names = [part.id for target in targets if target for part in ast.walk(target) if isinstance(part, ast.Name)]
+            if value is None or isinstance(value, ast.Dict) or not names or not names[0].isupper():
+                continue
+            numbers = [part.value for part in ast.walk(value) if isinstance(part, ast.Constant)]
+            if not any(isinstance(number, int | float) and not isinstance(number, bool) for number in numbers):
+                continue
+            text = below.value.value if isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant) else None
+            if not isinstance(text, str):
+                silent.append(f"{path.name}:{node.lineno} {', '.join(names)}")
+    assert not silent, f"{silent}: expected a docstring that says where the number comes from"

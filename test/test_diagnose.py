@@ -268,6 +268,7 @@ def test_an_injected_delay_is_named_added_and_closes_the_gap(
     assert held_out["after"] < 0.5 * held_out["before"]
     page = (out / "report.html").read_text()
     assert page.count("<img") >= 6 and "On held-out recordings" in page
+    assert ("selected on these same blocks" in page) == (effect["found_again"] is None)
     assert "Effects missing in the model" in page and "data:image/png;base64" in page and "src='http" not in page
     # The written robot file loads and predicts the same recording better.
     found = load_robot(report["robot_file"])

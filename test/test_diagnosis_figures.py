@@ -1,15 +1,17 @@
 """Figures and warnings of a diagnosis."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.interpolate import make_smoothing_spline
 
 from monoforce_ros.bags import SmoothedMotion, smoothing
 from monoforce_ros.core import CommandTrack, MotionTrack
-from monoforce_ros.discrepancy.comparison import measured_paths
+from monoforce_ros.discrepancy.comparison import Comparison, measured_paths
 from monoforce_ros.discrepancy.diagnosis import Details
 from monoforce_ros.discrepancy.evidence import EvidenceWindows
-from monoforce_ros.discrepancy.figures import timeline_figure, with_gaps
+from monoforce_ros.discrepancy.figures import map_figure, timeline_figure, with_gaps
 from monoforce_ros.discrepancy.nominal_residual import residual_complaint
 from monoforce_ros.robots import load_robot
 
@@ -48,8 +50,32 @@ def test_times_are_those_of_the_recording_where_windows_begin_later():
     figure = timeline_figure(Details(data, zeros, zeros[0], (), ()))
     np.testing.assert_allclose(figure.axes[0].lines[0].get_xdata(), np.arange(8.0, 14.0))
     np.testing.assert_allclose(figure.axes[3].lines[0].get_xdata(), np.arange(8.0, 14.0))
-    paths = measured_paths(load_robot("husky"), data, None)
+    paths = measured_paths(load_robot("husky"), data, smoothed.stretches, None)
     assert min(path.start for path in paths) >= 8.0 and figure.axes[3].get_xlabel() == "time in the recording [s]"
+
+
+def test_neither_the_map_nor_a_path_leads_across_a_gap():
+    """Eight seconds and ten, ten metres and two minutes apart."""
+    smoothed, commands = driving(0.5, 0.3)
+    motion, late = smoothed.motion, np.arange(400) >= 160
+    motion = replace(
+        motion,
+        stamps=motion.stamps + late * 120 * 10**9,
+        positions=motion.positions + late[:, None] * np.array([10.0, 0.0, 0.0]),
+    )
+    stretches = (slice(0, 160), slice(160, 400))
+    commands = replace(commands, stamps=motion.stamps)
+    starts = np.r_[motion.stamps[0:120:20], motion.stamps[160:360:20]]
+    data = EvidenceWindows(motion, commands, starts, 2.0, np.array([2.0]))
+    zeros = np.zeros((len(starts), 3))
+    compared = Comparison(2.0, starts, zeros, None, zeros, data)
+    details = Details(data, zeros[:, None], zeros[:1], (compared,), (), stretches=stretches)
+    lines = map_figure(details).axes[0].collections[0].get_segments()
+    assert max(np.linalg.norm(np.diff(line, axis=0), axis=1).max() for line in lines) < 0.1
+    assert sum(map(len, lines)) == 400
+    for path in measured_paths(load_robot("husky"), data, stretches, None, count=20):
+        assert not 8.0 - 5.0 < path.start < 8.0
+        assert np.hypot(*path.measured[-1, :2]) < 3.0
 
 
 def residual(position, degrees):

@@ -41,13 +41,13 @@ def recorded(robot, *, shares=(0.0, 0.0, 0.0, 0.0), lag=0.0, noise=0.01, seed=0,
 def test_flippers_that_follow_are_not_blocked(marv, lag, moves):
     for seed in range(5):
         joints, stamps = recorded(marv, lag=lag, seed=seed, moves=moves)
-        assert compare_with_commands(joints, marv, stamps) is None
+        assert compare_with_commands(joints, marv, stamps[[[0, -1]]]) is None
 
 
 @pytest.mark.parametrize("share", [1.0, 0.5])
 def test_the_lost_share_of_a_flipper_is_measured(marv, share):
     joints, stamps = recorded(marv, shares=(0.0, share, 0.0, 0.0))
-    found = compare_with_commands(joints, marv, stamps)
+    found = compare_with_commands(joints, marv, stamps[[[0, -1]]])
     index = [flipper.name for flipper in marv.flippers].index("front_right")
     assert index == 1
     name, values = found.effect
@@ -60,13 +60,13 @@ def test_the_lost_share_of_a_flipper_is_measured(marv, share):
     assert found.after < (0.3 if share == 1.0 else 0.7) * found.before
     # A file that says so already is not told again.
     known = replace(marv, effects=(("blocked_flipper", {"front_right": share}),))
-    assert compare_with_commands(joints, known, stamps) is None
+    assert compare_with_commands(joints, known, stamps[[[0, -1]]]) is None
 
 
 def test_without_commands_or_measurements_nothing_is_said(marv):
     joints, stamps = recorded(marv, shares=(1.0, 0.0, 0.0, 0.0))
-    assert compare_with_commands(replace(joints, commanded=None), marv, stamps) is None
-    assert compare_with_commands(replace(joints, measured=None), marv, stamps) is None
-    assert compare_with_commands(None, marv, stamps) is None
+    assert compare_with_commands(replace(joints, commanded=None), marv, stamps[[[0, -1]]]) is None
+    assert compare_with_commands(replace(joints, measured=None), marv, stamps[[[0, -1]]]) is None
+    assert compare_with_commands(None, marv, stamps[[[0, -1]]]) is None
     gone = replace(joints.measured, angles=np.full_like(joints.measured.angles, np.nan))
-    assert compare_with_commands(replace(joints, measured=gone), marv, stamps) is None
+    assert compare_with_commands(replace(joints, measured=gone), marv, stamps[[[0, -1]]]) is None

@@ -14,10 +14,12 @@ from monoforce_ros.discrepancy.gap import Localisation, NoiseFloor
 from monoforce_ros.discrepancy.ground import beyond_commissioning
 from monoforce_ros.discrepancy.headline import Tone, explained, headline
 from monoforce_ros.discrepancy.page import diagnosis_page
+from monoforce_ros.discrepancy.partial_effects import effects_for_file, file_entry, with_advice
 from monoforce_ros.discrepancy.preflight import advice
 from monoforce_ros.discrepancy.report import report_content, summary_lines
 from monoforce_ros.discrepancy.wording import cause, finding, remedy
 from monoforce_ros.effects import CATALOGUE, identifiable_effects
+from monoforce_ros.robots import load_robot, write_robot
 
 
 def effect(name, *, indistinguishable=(), **parameters):
@@ -122,10 +124,46 @@ def test_a_part_of_the_recording_is_said_beside_what_acts_there():
     found = diagnosed((0.5, 0.06), (8.0, 1.0), part=there)
     top = headline(found)
     assert top.findings == ("The drives react 0.30 s late to every command.", there)
-    assert any("only for" in action for action in top.actions)
     assert there in "\n".join(summary_lines(found)) and there in diagnosis_page(found, {}, None)
     assert report_content(found, {}, None)["part"] == there
     assert report_content(diagnosed((0.5, 0.06), (8.0, 1.0)), {}, None)["part"] is None
+
+
+ICE = effect("friction_scale", factor=(0.15, 0.1, 0.2))
+PATCH = "It acts within 2.5 m of (7.3, 3.3) in the odometry frame (26 of 86 windows)."
+
+
+def test_what_acts_on_a_part_of_the_ground_is_written_into_a_robot_file_only_if_it_is_asked_for(tmp_path):
+    found = diagnosed((0.5, 0.06), (8.0, 1.0), effects=(DELAY, ICE), part=PATCH, partial=(ICE.name,), regional=True)
+    # What a sensor measured acts everywhere.
+    assert effects_for_file(found) == (DELAY,)
+    assert effects_for_file(found, local=True) == (DELAY, ICE)
+    for local, said in ((False, "not written into a robot file"), (True, "new file on such ground only")):
+        advised = with_advice(found, local=local)
+        for text in ("\n".join(summary_lines(advised)), diagnosis_page(advised, {}, None)):
+            assert said in text
+            assert "on all other ground predictions get worse with it" in text
+    file = write_robot("husky", tmp_path / "husky.yaml", [file_entry(found, e) for e in (DELAY, ICE)], [], "0")
+    lines = file.read_text().splitlines()
+    above = [lines[lines.index(f"- name: {name}") - 1] for name in ("command_delay", "friction_scale")]
+    assert not above[0].startswith("#")
+    assert above[1].startswith("# friction_scale: It acts within 2.5 m") and "predictions get worse" in above[1]
+    assert dict(load_robot(file).effects)["friction_scale"] == {"factor": 0.15}
+    # The comment stays in copies of the file.
+    again = write_robot(file, tmp_path / "again.yaml", [], [], "0")
+    assert above[1] in again.read_text().splitlines()
+
+
+def test_what_began_in_the_middle_describes_the_robot_since_then():
+    since = "It begins 43 s after the start; these figures are of the time after that."
+    found = diagnosed((0.5, 0.06), (8.0, 1.0), part=since, partial=(DELAY.name,))
+    assert effects_for_file(found) == (DELAY,)
+    assert (
+        file_entry(found, DELAY)["part"].startswith("It begins 43 s") and "before" in file_entry(found, DELAY)["part"]
+    )
+    assert any("the motion before that is predicted worse" in action for action in headline(with_advice(found)).actions)
+    whole = diagnosed((0.5, 0.06), (8.0, 1.0))
+    assert with_advice(whole) is whole and "part" not in file_entry(whole, DELAY)
 
 
 @pytest.mark.parametrize(
@@ -155,6 +193,39 @@ def test_an_effect_that_one_part_of_the_recording_shows_is_not_good():
         assert (top.tone is Tone.GOOD) == sure
         assert any("in a part of the recording only" in text for text in top.doubts) == (not sure)
         assert any(f"found again in {times[0]} of 3 searches" in text for text in top.confidence)
+
+
+def test_a_name_that_changes_with_the_part_of_the_recording_is_said_as_one_class():
+    slow = effect("drive_gain", gain=(0.9, 0.85, 0.95))
+    unstable = replace(slow, found_again=(1, 3), named_otherwise=("turning_scrub", "payload"))
+    found = diagnosed((0.5, 0.06), (8.0, 1.0), effects=(unstable,))
+    top = headline(found)
+    assert top.tone is Tone.PARTLY and "the name of its cause changes" in top.sentence
+    names = f"{cause('drive_gain')}, {cause('turning_scrub')} or {cause('payload')}"
+    (text,) = top.findings
+    assert text.startswith(f"The name changes with the part of the recording: {names}. By all of it: ")
+    assert any(names in doubt for doubt in top.doubts)
+    assert not any("in a part of the recording only" in doubt for doubt in top.doubts)
+    assert f"if it is {cause('payload')} instead: {remedy('payload')}" in top.actions
+    assert names in "\n".join(summary_lines(found)) and names in diagnosis_page(found, {}, None)
+    assert report_content(found, {}, None)["effects"][0]["named_otherwise"] == ["turning_scrub", "payload"]
+    alone = headline(diagnosed((0.5, 0.06), (8.0, 1.0), effects=(replace(unstable, named_otherwise=()),)))
+    assert any("in a part of the recording only" in doubt for doubt in alone.doubts)
+
+
+def test_what_is_held_out_is_said_as_it_is():
+    """Only in a short recording were the effects selected on the blocks that judge them."""
+    short, long = (diagnosed((0.5, 0.06), (8.0, 1.0), repeated=repeated) for repeated in (False, True))
+    pages = [diagnosis_page(found, {}, None) for found in (short, long)]
+    assert ["selected on these same blocks" in page for page in pages] == [True, False]
+    assert ["never saw its part of the recording" in page for page in pages] == [False, True]
+    sizes = [" ".join(headline(found).confidence) for found in (short, long)]
+    assert ["held-out parts of this recording" in text for text in sizes] == [False, True]
+    assert "blocks of this recording left out of the fit" in sizes[0]
+    # Nothing was fitted: nothing is held out.
+    assert "never saw" not in diagnosis_page(replace(diagnosed((0.5, None), (8.0, None)), fitted=()), {}, None)
+    within = diagnosis_page(replace(long, part="It begins 40 s after the start."), {}, None)
+    assert "chosen on the whole recording" in within and "chosen on the whole" not in pages[1]
 
 
 def test_a_robot_that_was_never_commissioned_is_a_doubt():

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from test_diagnose import simulated_recording
 
-from monoforce_ros.bags import SmoothedMotion
-from monoforce_ros.core import WheelTrack
+from monoforce_ros.bags import JointRecord, SmoothedMotion
+from monoforce_ros.core import AngularVelocityTrack, JointTrack, WheelTrack
 from monoforce_ros.discrepancy import DiagnosisSettings, Evidence
 from monoforce_ros.discrepancy.comparison import HeldOut
 from monoforce_ros.discrepancy.estimates import EffectEstimate
@@ -92,6 +92,34 @@ def test_sensors_are_taken_without_the_part(husky):
     assert all(measured[0][part] != measured[1][part] for part in (0, 1))
 
 
+def test_joints_and_gyro_are_taken_without_the_part():
+    """A flipper that turns the other way and a biased gyro in one part only: without it nobody knows."""
+    marv = load_robot("marv")
+    motion, commands = simulated_recording(marv, (), seconds=60.0)
+    evidence, windows = windows_of(motion, commands)
+    places = HeldOut(((),) * 3, int(windows.data.starts[0]), LENGTH)
+    stamps = motion.stamps
+    held = places.part_of(stamps) == 2
+    names = tuple(joint.name for joint in marv.joints)
+    wanted = np.tile(0.8 * np.sin(0.5e-9 * (stamps - stamps[0]))[:, None], (1, len(names)))
+    rates = np.zeros((len(stamps), 3))
+    rates[:, 2] = motion.angular_velocities[:, 2]
+    measured = []
+    for share, bias in ((0.0, 0.0), (2.0, 0.3)):
+        angles = wanted.copy()
+        angles[held, -1] *= 1.0 - share
+        joints = JointRecord(JointTrack(stamps, names, angles), JointTrack(stamps, names, wanted), 4)
+        gyro = AngularVelocityTrack(stamps, rates + bias * held[:, None])
+        recorded = replace(evidence, joints=joints, gyro=gyro)
+        measured.append(
+            [SensorFindings.of(without_part(recorded, places, part), marv, commissioned=False) for part in range(3)]
+        )
+    healthy, lying = measured
+    assert healthy[2].gyro is not None and lying[2].gyro == healthy[2].gyro
+    assert lying[0].gyro != healthy[0].gyro
+    assert lying[2].flippers is None and all(lying[part].flippers is not None for part in (0, 1))
+
+
 def test_too_short_a_recording_is_not_repeated(husky):
     motion, commands = simulated_recording(husky, (), seconds=20.0)
     evidence, windows = windows_of(motion, commands)
@@ -105,6 +133,24 @@ def test_an_effect_that_others_replace_half_of_the_time_belongs_to_a_class_with_
     repeated = (Repeated(named=("drive_gain",)), Repeated(named=("payload",)), None, None)
     (judged,) = Repetition(0, repeated).judged([EffectEstimate("drive_gain", {})])
     assert judged.found_again == (1, 2) and judged.indistinguishable == ("payload",)
+    assert judged.named_otherwise == ()
+
+
+def test_a_name_that_changes_with_each_part_is_one_class_with_all_that_takes_its_place():
+    def judged(*named):
+        repeated = tuple(Repeated(named=names) for names in named)
+        return Repetition(0, repeated).judged([EffectEstimate("drive_gain", {})])[0]
+
+    changes = judged(("payload",), ("turning_scrub",), ("drive_gain",))
+    assert changes.found_again == (1, 3) and changes.indistinguishable == ()
+    assert changes.named_otherwise == ("payload", "turning_scrub")
+    assert judged(("payload",), ("turning_scrub",), ("viscous_drag",)).named_otherwise[-1] == "viscous_drag"
+    # Found again in most of them it keeps its name; where others find nothing, there is none in its place.
+    assert judged(("payload",), ("drive_gain",), ("drive_gain",)).named_otherwise == ()
+    assert judged((), (), ("drive_gain",)).named_otherwise == ()
+    # One that takes its place in half of them means the same.
+    most = judged(("payload",), ("payload",), ("turning_scrub",))
+    assert most.indistinguishable == ("payload",) and most.named_otherwise == ("turning_scrub",)
 
 
 def test_an_effect_beside_another_that_is_found_again_in_fewer_than_half_of_the_repetitions_is_not_added(
@@ -134,6 +180,7 @@ def test_an_effect_beside_another_that_is_found_again_in_fewer_than_half_of_the_
     others = (Repeated(named=("drive_gain",)), Repeated(named=("drive_loss",)), Repeated(named=("turning_scrub",)))
     nothing = Repetition(0, others).confirmed(found, decision, SETTINGS.thresholds)
     assert nothing.verdict == Verdict.UNKNOWN_EFFECT and nothing.trial is None and nothing.parts is both
+    assert "these name drive_gain or drive_loss or turning_scrub" in nothing.remarks[-1]
     # One without which the others are no measurements belongs to them.
     monkeypatch.setattr(found.search, "credible", lambda trial: len(trial.names) > 1)
     assert names(delay, delay, payload)[0] == (name, "payload")

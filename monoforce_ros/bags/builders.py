@@ -105,15 +105,17 @@ def ackermann_drive(stamp: int, frame_id: str, speed: float, steering_angle: flo
     return _make("ackermann_msgs/msg/AckermannDriveStamped", header=header(stamp, frame_id), drive=drive)
 
 
-def joint_state(stamp: int, names: Sequence[str], positions: Vector, velocities: Vector) -> Message:
-    """``sensor_msgs/JointState`` [rad, rad/s]."""
+def joint_state(
+    stamp: int, names: Sequence[str], positions: Vector, velocities: Vector, efforts: Vector = ()
+) -> Message:
+    """``sensor_msgs/JointState`` [rad, rad/s, N m or A]."""
     return _make(
         "sensor_msgs/msg/JointState",
         header=header(stamp, ""),
         name=list(names),
         position=np.asarray(positions, np.float64),
         velocity=np.asarray(velocities, np.float64),
-        effort=np.zeros(0),
+        effort=np.asarray(efforts, np.float64),
     )
 
 

@@ -34,11 +34,12 @@ from monoforce_ros.bags.topic_choice import (
     is_rectified,
     topic_choices,
 )
-from monoforce_ros.bags.wheel_joints import WheelSample, wheel_track
+from monoforce_ros.bags.wheel_joints import EffortSample, WheelSample, effort_track, wheel_track
 from monoforce_ros.core import (
     AngularVelocityTrack,
     CameraModel,
     CommandTrack,
+    EffortTrack,
     FrameError,
     JointTrack,
     MotionState,
@@ -98,6 +99,8 @@ class Recording:
     """Measurements of the IMU, if there is one."""
     wheels: WheelTrack | None = None
     """Measured wheel speeds, if there are any."""
+    efforts: EffortTrack | None = None
+    """Currents or torques of the drive wheels' motors, if there are any."""
     choices: tuple[str, ...] = ()
     """Topics that were chosen among several of their type; also among the warnings."""
     odometry_child_frame: str = ""
@@ -317,6 +320,7 @@ class _Collector:
         self.angular_velocities: list[tuple[int, np.ndarray]] = []
         self.imu_frame = ""
         self.wheels: list[WheelSample] = []
+        self.efforts: list[EffortSample] = []
         self.joints: list[tuple[int, np.ndarray]] = []
         self.flipper_commands: list[tuple[int, np.ndarray]] = []
         self._unknown_joints: dict[str, list[str]] = {}
@@ -366,6 +370,8 @@ class _Collector:
             elif message.topic == self.chosen["joints"]:
                 if wheels := decoding.decode_wheels(decoded):
                     self.wheels.append((stamp, wheels))
+                if efforts := decoding.decode_efforts(decoded):
+                    self.efforts.append((stamp, efforts))
                 self._take_joints(message.topic, stamp, decoded, self.joints)
             elif message.topic == self.chosen.get("flipper_commands"):
                 self._take_joints(message.topic, stamp, decoded, self.flipper_commands)
@@ -415,7 +421,7 @@ class _Collector:
             chosen["odometry"]: [self.states, *self.transforms.beside_odometry.values()],
             chosen["commands"]: [self.twists],
             chosen["imu"]: [self.angular_velocities],
-            chosen["joints"]: [self.wheels, self.joints],
+            chosen["joints"]: [self.wheels, self.efforts, self.joints],
             chosen.get("flipper_commands"): [self.flipper_commands],
         }
 
@@ -540,14 +546,19 @@ class _Collector:
             odometry_child_frame=self.frames[1],
             angular_velocity=self._angular_velocity_track(),
             wheels=wheels,
+            efforts=effort_track(self.efforts, self._sides(self.efforts)),
             joints=self._joint_record(),
         )
 
     def _wheel_track(self, commands: CommandTrack, motion: MotionTrack) -> WheelTrack | None:
-        sides = {name: decoding.wheel_side(name) or "" for name in {name for _, found in self.wheels for name in found}}
-        track, texts = wheel_track(self.wheels, sides, commands, motion)
+        track, texts = wheel_track(self.wheels, self._sides(self.wheels), commands, motion)
         self.choices += [f"{self.chosen['joints']}: {text}" for text in texts]
         return track
+
+    @staticmethod
+    def _sides(samples: Sequence[tuple[int, Mapping[str, Any]]]) -> dict[str, str]:
+        """Side of each wheel in the samples."""
+        return {name: decoding.wheel_side(name) or "" for name in {name for _, found in samples for name in found}}
 
     def _joint_record(self) -> JointRecord | None:
         if self.robot is None:

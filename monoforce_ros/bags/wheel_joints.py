@@ -7,10 +7,12 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from monoforce_ros.core import NANOSECOND, CommandTrack, MotionTrack, WheelTrack
+from monoforce_ros.core import NANOSECOND, CommandTrack, EffortTrack, MotionTrack, WheelTrack
 
 WheelSample = tuple[int, Mapping[str, tuple[float, float]]]
 """A joint state: its stamp [ns], and the angle [rad] and rate [rad/s] of each wheel, NaN where the message has none."""
+EffortSample = tuple[int, Mapping[str, float]]
+"""The stamp of a joint state [ns], and the effort of each wheel that has one."""
 
 _LONGEST_STEP = 1.0
 """Time over which angles are differentiated, and rates of different messages belong together, at most [s]."""
@@ -74,6 +76,33 @@ def wheel_track(
     left = np.array([sides[name] == "left" for name in names])
     mean = np.stack([speeds[:, left].mean(axis=1), speeds[:, ~left].mean(axis=1)], axis=1)
     return WheelTrack(stamps, mean), texts
+
+
+def effort_track(samples: Sequence[EffortSample], sides: Mapping[str, str]) -> EffortTrack | None:
+    """Mean magnitude of the efforts of the left and of the right wheels over time.
+
+    Signs are left out: drivers publish them by the direction of the motor, the command or the wheel. None if a side has
+    no efforts, or none of them is ever other than zero, as of drivers that measure none.
+
+    Args:
+        samples: efforts by wheel in the order of the bag.
+        sides: ``left`` or ``right`` for each wheel's name.
+    """
+    series: dict[str, list[tuple[int, float]]] = defaultdict(list)
+    for stamp, joints in samples:
+        for name, effort in joints.items():
+            series[name].append((stamp, abs(effort)))
+    found: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    for name, entries in series.items():
+        stamps, first = np.unique(np.array([stamp for stamp, _ in entries], np.int64), return_index=True)
+        found[name] = stamps, np.array([entries[index][1] for index in first])
+    if {sides[name] for name in found} != {"left", "right"}:
+        return None
+    stamps, efforts = _together(found)
+    left = np.array([sides[name] == "left" for name in found])
+    if not len(stamps) or not efforts.any():
+        return None
+    return EffortTrack(stamps, np.stack([efforts[:, left].mean(axis=1), efforts[:, ~left].mean(axis=1)], axis=1))
 
 
 def _rates(entries: Sequence[tuple[int, float, float]]) -> tuple[np.ndarray, np.ndarray, bool]:

@@ -232,6 +232,19 @@ class WheelTrack:
 
 
 @dataclass(frozen=True)
+class EffortTrack:
+    """How hard the motors of the left and right wheels work over time: currents or torques, as the driver publishes."""
+
+    stamps: np.ndarray
+    """``[n]`` int64 [ns], ascending."""
+    efforts: np.ndarray
+    """Mean magnitude over the left and over the right wheels, ``[n, 2]`` [A, N m, or another unit of the driver]."""
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+
+@dataclass(frozen=True)
 class CommandTrack:
     """Commanded motion over time; each command holds until the next."""
 

@@ -42,6 +42,7 @@ _COLUMNS = (
     "ros_time", "meas_left_vel", "meas_right_vel", "cmd_vel_x", "cmd_vel_omega", "icp_pos_x", "icp_pos_y",
     "icp_pos_z", "icp_quat_x", "icp_quat_y", "icp_quat_z", "icp_quat_w", "imu_z",
 )  # fmt: skip
+_CURRENTS = ("left_wheel_current", "right_wheel_current")
 _TRUTH = {"True": 1.0, "False": 0.0}
 _LONGEST_REPEAT = 0.25
 _LAGS = np.arange(-10, 61) * 0.05
@@ -69,6 +70,8 @@ class DriveRun:
     """``[n, 4]`` x, y, z, w."""
     gyro: np.ndarray
     """Yaw rate as recorded, of unknown sign, ``[n]`` [rad/s]."""
+    currents: np.ndarray | None = None
+    """Of the left and right motors, ``[n, 2]`` [A]; None where none were recorded."""
 
 
 @dataclass(frozen=True)
@@ -184,7 +187,9 @@ def drive_to_bag(
         messages += [(int(motion.stamps[i]), "/odom", odometry_message(motion, i)) for i in range(len(motion))]
         for index, stamp in enumerate(run.stamps.tolist()):
             twist = builders.twist_stamped(stamp, BASE_FRAME, *run.twists[index].tolist())
-            wheels = builders.joint_state(stamp, ["left_wheel", "right_wheel"], [0.0, 0.0], run.wheels[index])
+            currents = () if run.currents is None else run.currents[index]
+            names = ["left_wheel", "right_wheel"]
+            wheels = builders.joint_state(stamp, names, [0.0, 0.0], run.wheels[index], currents)
             messages += [(stamp, "/cmd_vel", twist), (stamp, "/joint_states", wheels)]
             if clocks.gyro_sign:
                 rate = np.array([0.0, 0.0, clocks.gyro_sign * run.gyro[index]])
@@ -373,6 +378,8 @@ def _open_log(path: Path) -> DriveRecording:
             if missing:
                 raise DatasetError(f"{path}: got no column {', '.join(missing)}; expected a continuous log of DRIVE")
             columns = [names.index(name) for name in _COLUMNS]
+            # Later logs of the dataset have currents, too.
+            columns += [names.index(name) for name in _CURRENTS] if set(_CURRENTS) <= set(names) else []
             for number, row in enumerate(reader, start=2):
                 read += sum(map(len, row)) + len(row)
                 if read > LARGEST_FILE:
@@ -381,7 +388,7 @@ def _open_log(path: Path) -> DriveRecording:
                     raise DatasetError(f"{path}, line {number}: got {len(row)} columns, expected {len(names)}")
                 # A double cannot represent current stamps in nanoseconds.
                 stamps.append(int(row[columns[0]]))
-                rows.append([float(row[column]) for column in columns[1:]])
+                rows.append([float(row[column] or "nan") for column in columns[1:]])
     except (OSError, EOFError, UnicodeDecodeError, csv.Error, ValueError) as error:
         if isinstance(error, DatasetError):
             raise
@@ -392,13 +399,16 @@ def _open_log(path: Path) -> DriveRecording:
     order = np.argsort(times, kind="stable")
     times, values = times[order], values[order]
     norms = np.linalg.norm(values[:, 7:11], axis=1)
-    keep = np.r_[True, np.diff(times) > 0] & np.isfinite(values).all(axis=1) & (np.abs(norms - 1.0) < 0.01)
+    keep = np.r_[True, np.diff(times) > 0] & np.isfinite(values[:, :12]).all(axis=1) & (np.abs(norms - 1.0) < 0.01)
     times, values = times[keep], values[keep]
     runs = []
     for part in np.split(np.arange(len(times)), np.flatnonzero(np.diff(times) > 1_000_000_000) + 1):
         if len(part) >= 20:
             row = values[part]
-            runs.append(DriveRun(times[part], row[:, 2:4], row[:, 0:2], row[:, 4:7], row[:, 7:11], row[:, 11]))
+            currents = row[:, 12:] if row.shape[1] > 12 else None
+            runs.append(
+                DriveRun(times[part], row[:, 2:4], row[:, 0:2], row[:, 4:7], row[:, 7:11], row[:, 11], currents)
+            )
     if not runs:
         raise DatasetError(f"{path}: no 20 consecutive samples without a gap")
     return DriveRecording(path, tuple(runs))

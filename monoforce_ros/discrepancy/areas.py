@@ -19,6 +19,8 @@ _FEWEST_BLOCKS = 3
 _SHARES = (0.1, 0.2, 0.3, 0.4, 0.5)
 """Shares of the windows that circles hold."""
 _MOST_CENTRES = 60
+"""Centres of circles, spread over the path: half of a diagnosis' windows, which begin a second apart, so that
+neighbours overlap. It only saves time."""
 _CLUSTERS = 3
 """Places that are tested without a scan."""
 

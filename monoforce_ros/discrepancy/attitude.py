@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from monoforce_ros.core import MotionTrack
 
 _UP = np.array([0.0, 0.0, 1.0])
+"""The vertical in the odometry frame."""
 _MOST = 4000
 """Rotations that a fit takes from a recording at most."""
 _PARTS = 16

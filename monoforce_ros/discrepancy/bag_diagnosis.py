@@ -22,7 +22,8 @@ from monoforce_ros.discrepancy.held_out_bags import HeldOutBag, named_bags, refu
 from monoforce_ros.discrepancy.interruption import uninterrupted
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.nominal_residual import residual_complaint
-from monoforce_ros.discrepancy.report import effect_entry, write_diagnosis
+from monoforce_ros.discrepancy.partial_effects import effects_for_file, file_entry, with_advice
+from monoforce_ros.discrepancy.report import write_diagnosis
 from monoforce_ros.discrepancy.separate_stretches import laid_apart
 from monoforce_ros.discrepancy.step_errors import compare_after_steps
 from monoforce_ros.discrepancy.terrain_evidence import supporting_terrain, traced_terrain
@@ -107,7 +108,7 @@ def read_with_ground(
         recording = replace(recording, wheels=wheels, warnings=(unit.text, *recording.warnings))
     evidence = Evidence(
         smoothed, recording.commands, gyro=recording.angular_velocity, wheels=recording.wheels,
-        wheel_unit=unit.factor, joints=recording.joints,
+        wheel_unit=unit.factor, efforts=recording.efforts, joints=recording.joints,
     )  # fmt: skip
     ground = choose_ground(terrain, recording, smoothed, robot)
     if ground.source == "flat":
@@ -153,6 +154,7 @@ def diagnose_bag(
     reading: ReadOptions = DETECTED,
     settings: DiagnosisSettings = DiagnosisSettings(),  # noqa: B008
     held_out: Sequence[Path] = (),
+    local_effects: bool = False,
     progress: Callable[[float, str], None] = lambda share, step: None,
 ) -> BagDiagnosis:
     """Diagnose a bag; write ``report.json``, ``report.html`` and, if effects were identified, a new robot file.
@@ -165,6 +167,8 @@ def diagnose_bag(
         reading: topics and frames that replace those that the bag says.
         settings: settings of the diagnosis.
         held_out: further recordings on which errors before and after are compared; nothing is fitted to them.
+        local_effects: whether the robot file also gets effects that act on a part of the ground only, with which
+            predictions on all other ground get worse.
         progress: called with the share of the work done and the next step.
 
     Raises:
@@ -223,15 +227,23 @@ def diagnose_bag(
     doubts = list(dict.fromkeys(text for text in (*wrong, ground.complaint, *rest, steeper, harder, large) if text))
     if diagnosis.verdict == Verdict.NOT_IDENTIFIABLE:
         diagnosis = _with_wheels(diagnosis, evidence, model)
+    diagnosis = with_advice(diagnosis, local=local_effects)
+    for_file = effects_for_file(diagnosis, local=local_effects)
+    elsewhere = len(for_file) < len(diagnosis.effects)
+    in_file = {effect.name for effect in for_file}
+    fitted = tuple(entry for entry in diagnosis.fitted if entry[0] in in_file)
     if diagnosis.verdict != Verdict.NOT_IDENTIFIABLE:
         progress(0.96, "comparing with a kinematic fit")
-        diagnosis = replace(diagnosis, steps=compare_after_steps(evidence, model, diagnosis.fitted))
-    if others:
+        diagnosis = replace(diagnosis, steps=compare_after_steps(evidence, model, fitted))
+    if others and elsewhere:
+        remark = "held-out recordings are not compared: where on them the ground is like that is not known"
+        diagnosis = replace(diagnosis, remarks=(*diagnosis.remarks, remark))
+    elif others:
         progress(0.97, "held-out recordings")
         tables = {}
         for name, other in others.items():
             try:
-                tables[name] = other.table(diagnosis.fitted)
+                tables[name] = other.table(fitted)
             except (ValueError, ArithmeticError, RuntimeError, MemoryError) as error:
                 # The diagnosis took minutes and does not depend on it.
                 remark = f"the held-out recording {name} could not be compared: {error}"
@@ -257,11 +269,11 @@ def diagnose_bag(
     # Files last: what ends the work before leaves none of it, and those of an earlier run together.
     robot_file = None
     # On ground that no map shows slopes pass for effects: of that only what sensors measured belongs into a robot file.
-    credible = bool(diagnosis.effects) and (bool(rest) or not ground.unknown)
+    credible = bool(for_file) and (bool(rest) or not ground.unknown)
     # Together, or a robot file of this diagnosis would lie beside the report of an earlier one.
     with uninterrupted():
         if credible and not any(map(complaint, diagnosis.effects)):
-            effects = [effect_entry(effect) for effect in diagnosis.effects]
+            effects = [file_entry(diagnosis, effect) for effect in for_file]
             robot_file = write_robot(robot, found_file, effects, [bag], data)
         elif found_file.exists():
             # Rename the robot file of an earlier diagnosis, which would be mistaken for a result of this one.

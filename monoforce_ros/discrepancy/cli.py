@@ -23,6 +23,7 @@ from monoforce_ros.discrepancy.export import export_effects, export_target
 from monoforce_ros.discrepancy.interruption import INTERRUPTED_STATUS, interruptible, uninterrupted
 from monoforce_ros.discrepancy.kept_effects import kept_effects
 from monoforce_ros.discrepancy.nominal_residual import residual_complaint
+from monoforce_ros.discrepancy.partial_effects import effects_for_file
 from monoforce_ros.discrepancy.repetition import prepare_processes
 from monoforce_ros.discrepancy.report import effect_entry, summary_lines
 from monoforce_ros.discrepancy.verdict import Verdict
@@ -78,6 +79,12 @@ def build_parser() -> argparse.ArgumentParser:
         default=[],
         metavar="BAG",
         help="compare errors before and after on these other recordings too; nothing is fitted to them",
+    )
+    parser.add_argument(
+        "--local-effects",
+        action="store_true",
+        help="write effects that act on a part of the ground only into the robot file (and exports), too: predictions "
+        "on all other ground get worse with them",
     )
     parser.add_argument(
         "--export",
@@ -150,11 +157,12 @@ def _export(found: BagDiagnosis, options: argparse.Namespace) -> None:
     """Write the effects for other tools, and say what these lack."""
     diagnosis = found.diagnosis
     # What is too doubtful for a robot file is so for a controller.
-    effects = diagnosis.effects if found.robot_file else ()
-    if diagnosis.effects and not effects:
-        print("  not exported: what was found, since it is not written into a robot file either; see the doubts")
-    if effects and diagnosis.part:
-        print(f"  exported as if it acted everywhere: {diagnosis.part}")
+    effects = effects_for_file(diagnosis, local=options.local_effects) if found.robot_file else ()
+    left = [effect.name for effect in diagnosis.effects if effect not in effects]
+    if left:
+        print(f"  not exported: {', '.join(left)}, since it is not written into a robot file either; see the report")
+    if any(effect.name in diagnosis.partial for effect in effects):
+        print(f"  exported as if it acted everywhere and always: {diagnosis.part}")
     for exported in export_effects(options.export, load_robot(options.robot), effects):
         for file in exported.files:
             print(f"  {exported.kind}: {file}")
@@ -208,6 +216,7 @@ def _run(
             max_effects=options.effects, processes=options.jobs if len(options.bags) == 1 else 1
         ),
         held_out=options.held_out,
+        local_effects=options.local_effects,
         progress=progress,
     )
 

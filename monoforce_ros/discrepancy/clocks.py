@@ -16,6 +16,8 @@ from monoforce_ros.core import AngularVelocityTrack, DelayCorrelation
 _OUTLIER = 6.0
 """Median distances from the median: four standard deviations of normal noise."""
 _STEP = 0.02
+"""Between the delays that are tested [s]: below the time between poses of any odometry up to 50 Hz, which is the
+finding's own resolution; the peak is interpolated."""
 _LAGS = np.arange(-50, 81) * _STEP
 """Delays of the poses that are tested [s]."""
 _PIECE = 8.0
@@ -26,7 +28,8 @@ _APART, _LONGEST_GAP, _FEWEST_WINDOWS = 1.0, 0.2, 10
 _WEAKEST = np.sqrt(0.5)
 """Smallest correlation of the two yaw rates for a conclusion: they share at least half of their variance."""
 _LEAST_TURNING = 0.08
-"""Smallest standard deviation of the yaw rate in a piece that is used for the delay [rad/s]."""
+"""Smallest standard deviation of the yaw rate in a piece that is used for the delay [rad/s]: about ten times the
+largest bias of a healthy gyro, so that the robot's turns and not the sensors' errors are correlated."""
 _SCALES = np.arange(0.7, 1.301, 0.02)
 """Factors on the gyro's rate that are tried when headings are compared."""
 _HEALTHY_BIAS = np.radians(0.5)

@@ -31,6 +31,7 @@ from monoforce_ros.discrepancy.ground import slopes_of
 from monoforce_ros.discrepancy.healthy_wheels import HealthyWheels, drives_of
 from monoforce_ros.discrepancy.hypothesis import Effects, Predictions, corrected_evidence
 from monoforce_ros.discrepancy.motion_check import motion_faults
+from monoforce_ros.discrepancy.motor_efforts import HealthyEfforts
 from monoforce_ros.discrepancy.nominal import SEGMENT, NominalModel
 from monoforce_ros.discrepancy.preflight import complaints
 from monoforce_ros.discrepancy.residual_model import fit_terms, motion_terms
@@ -58,6 +59,7 @@ COMMISSIONED_IN_VEGETATION = _commissioned("vegetation")
 """Effects that every robot needs in addition where a recording leads through vegetation."""
 _VEGETATION = frozenset(name for name, _ in COMMISSIONED_IN_VEGETATION)
 _FEWEST_SEGMENTS = 3
+"""As many as parts: of two the variance between segments would have one degree of freedom."""
 _PARTS = 3
 """Parts of a single recording that take turns in being predicted by the others."""
 _MOST_EFFECTS = 4
@@ -144,6 +146,7 @@ def commission(
         if recordings[0].with_attitude
         else None,
         wheels=_healthy_wheels(recordings, drives, replace(robot, effects=_together(robot, merged.effects))),
+        efforts=HealthyEfforts.learned([(evidence.commands, evidence.efforts) for evidence in recordings], robot),
     )
     progress(1.0, "done")
     return beyond_file(estimate_effects(merged, {}), robot), nominal

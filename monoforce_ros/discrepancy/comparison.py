@@ -20,10 +20,13 @@ from monoforce_ros.discrepancy.trial import BLOCK, blocks_of
 from monoforce_ros.robots import RobotModel
 
 HORIZONS = (1.0, 2.0, 5.0)
+"""At which errors are told [s]: half and whole of the windows to which effects are fitted, and beyond them, where only
+the effects' form predicts. Those of 5 s decide nothing (:data:`JUDGED`)."""
 ABOVE_NOISE = 2.0
 """An error counts if it is at least so many times the noise floor: the noise is then the smaller part of it."""
 FEWEST_WINDOWS = 6
-"""At one horizon: the median of fewer is that of a manoeuvre."""
+"""At one horizon: windows begin a second apart, so that six of 2 s are three which do not overlap; fewer are one
+manoeuvre."""
 _METRICS = (("position", "m"), ("heading", "deg"), ("lean", "deg"), ("height", "m"))
 """Errors and their units; the last two where the ground is known."""
 
@@ -253,11 +256,25 @@ def regime_table(comparison: Comparison) -> list[RegimeRow]:
 
 
 def measured_paths(
-    robot: RobotModel, data: EvidenceWindows, held_out: HeldOut | None, count: int = 6
+    robot: RobotModel,
+    data: EvidenceWindows,
+    stretches: Sequence[slice],
+    held_out: HeldOut | None,
+    count: int = 6,
 ) -> list[PathComparison]:
-    """Predicted and measured paths of some windows with errors above the median, the largest error first."""
-    horizon = 5.0
-    starts = data.starts[data.starts < data.motion.stamps[-1] - round((horizon + 0.1) * 1e9)]
+    """Predicted and measured paths of some windows with errors above the median, the largest error first.
+
+    Args:
+        robot: the nominal model.
+        data: the recording.
+        stretches: parts of its motion without gaps; each path lies within one.
+        held_out: the effects that predict each window, or None.
+        count: largest number of paths.
+    """
+    horizon, stamps = 5.0, data.motion.stamps
+    spans = np.array([(stamps[part.start], stamps[part.stop - 1]) for part in stretches], np.int64).reshape(-1, 2)
+    begins, ends = data.starts[:, None], data.starts[:, None] + round((horizon + 0.1) * 1e9)
+    starts = data.starts[((begins >= spans[:, 0]) & (ends < spans[:, 1])).any(axis=1)]
     if held_out is not None:
         starts = held_out.judged(starts, horizon)
     if not len(starts):

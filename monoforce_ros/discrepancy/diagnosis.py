@@ -42,6 +42,7 @@ from monoforce_ros.discrepancy.hypothesis import Effects, corrected_evidence
 from monoforce_ros.discrepancy.kinematic_baseline import StepComparison
 from monoforce_ros.discrepancy.learned import LEARNED
 from monoforce_ros.discrepancy.motion_check import motion_faults
+from monoforce_ros.discrepancy.motor_efforts import changed_efforts
 from monoforce_ros.discrepancy.nominal import NominalModel, with_known_components
 from monoforce_ros.discrepancy.preflight import advice, complaints
 from monoforce_ros.discrepancy.region import Region
@@ -72,6 +73,8 @@ class Details:
     """Where the effects act, if only there; of an unknown effect where errors are largest at every visit."""
     area_meaning: str = "acts here"
     """Of ``area``, in a legend."""
+    stretches: tuple[slice, ...] = ()
+    """Parts of the motion without gaps; empty: all of it is one."""
 
 
 @dataclass(frozen=True)
@@ -108,6 +111,10 @@ class Diagnosis:
     """Errors after steps of the command beside those of a kinematic fit."""
     part: str = ""
     """The part of the recording in which alone the effects act, in words; empty if they act in all of it."""
+    partial: tuple[str, ...] = ()
+    """Names of the effects that act in ``part`` only; what sensors measured acts always."""
+    regional: bool = False
+    """Whether ``part`` is a part of the ground, rather than the time from some moment on."""
     set_aside: Verdict | None = None
     """Verdict on all effects where only those that sensors measured are kept, since the ground may be the cause of the
     rest, which is listed in ``known_parts``; None where nothing was set aside."""
@@ -115,7 +122,11 @@ class Diagnosis:
     """Median errors of the healthy robot at the end of a window, ``position`` [m] and ``heading`` [deg]; empty for one
     that was never commissioned."""
     observed: tuple[str, ...] = ()
-    """What the recording shows of the robot besides: wheels that turn in place, a lean that has changed."""
+    """What the recording shows of the robot besides: wheels that turn in place, a lean or currents of the motors that
+    have changed."""
+    repeated: bool = False
+    """Whether the whole search was repeated without parts of the recording, which what it found then predicts; else
+    windows are predicted with values fitted to other blocks, and effects were selected on all of them."""
     motion_unexplained: bool = False
     """Whether, besides what a sensor measured, the motion is not as predicted, and no effect improves it."""
 
@@ -160,9 +171,11 @@ def diagnose(
     leans = (
         changed_lean(lean_of(smoothed.motion), nominal.lean) if nominal is not None and evidence.with_attitude else ""
     )
+    known = None if nominal is None else nominal.efforts
+    efforts = changed_efforts(evidence.commands, evidence.efforts, evidence.wheels, robot, known, settings.thresholds)
     faults = motion_faults(smoothed, evidence.commands, evidence.wheels)
     if faults:
-        return Diagnosis(Verdict.NOT_IDENTIFIABLE, advice=faults, remarks=left_out)
+        return Diagnosis(Verdict.NOT_IDENTIFIABLE, advice=faults, remarks=(*left_out, *efforts))
     found = complaints(evidence, starts)
     if found:
         return Diagnosis(Verdict.NOT_IDENTIFIABLE, advice=(*left_out, *found))
@@ -250,14 +263,14 @@ def diagnose(
             motion_unexplained = decision.verdict == Verdict.NO_IMPROVEMENT
             decision = replace(decision, verdict=Verdict.EFFECT_FOUND)
         decision = replace(decision, remarks=(*decision.remarks, sensors.flippers.summary()))
-    said = (*left_out, *filter(None, (aligned.remark, leans)))
+    said = (*left_out, *filter(None, (aligned.remark, leans, *efforts)))
     if said:
         decision = replace(decision, remarks=(*decision.remarks, *said))
     if sensors.wheels is not None:
         decision = replace(decision, remarks=(*decision.remarks, sensors.wheels.summary()))
     at_horizon = next((comparison for comparison in compared if comparison.horizon == settings.horizon), None)
     expected = floor if nominal is None else np.sqrt(floor**2 + (nominal.residual_in(data) ** 2).mean(axis=0))
-    paths = tuple(measured_paths(robot, data, judged))
+    paths = tuple(measured_paths(robot, data, smoothed.stretches, judged))
     regimes = find_regimes(data)
     hints = advice(decision.verdict, effects, gyro=evidence.gyro is not None)
     place = None
@@ -287,12 +300,15 @@ def diagnose(
         losses=decision.losses,
         localisation_error=apart if apart > ABOVE_NOISE * noise else None,
         commissioned=search.commissioned,
-        details=Details(data, before, floor, tuple(compared), paths, area, meaning),
+        details=Details(data, before, floor, tuple(compared), paths, area, meaning, smoothed.stretches),
         part="" if part is None or decision.verdict in _NOTHING_ADDED else part.remark,
+        partial=() if part is None else tuple(name for name, _ in fitted if name not in dict(search.known)),
+        regional=isinstance(part, Region),
         set_aside=None if aside is None else aside.verdict,
+        repeated=repetition is not None,
         motion_unexplained=motion_unexplained,
         healthy={} if nominal is None else _medians(expected[-1]),
-        observed=tuple(filter(None, (comparable.blocked, leans))),
+        observed=tuple(filter(None, (comparable.blocked, leans, *efforts))),
     )
 
 

@@ -47,6 +47,10 @@ class EffectEstimate:
     """In how many of how many repetitions, each without another part of the recording, it or one of these others is
     found; None for a recording too short for that, and for a formula."""
 
+    named_otherwise: tuple[str, ...] = ()
+    """Other effects that repetitions name in its place, where fewer than half of them find it: together with it they
+    are one class, whose name changes with the part of the recording."""
+
     in_file: Mapping[str, float] = field(default_factory=dict)
     """Values of the same effect in the robot's file, which take the place of the neutral ones."""
 

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from monoforce_ros.bags import JointRecord, SmoothedMotion
-from monoforce_ros.core import AngularVelocityTrack, CommandTrack, MotionTrack, WheelTrack
+from monoforce_ros.core import AngularVelocityTrack, CommandTrack, EffortTrack, MotionTrack, WheelTrack
 from monoforce_ros.terrain import TerrainMap
 
 MOTION = ("along", "across", "heading")
@@ -62,6 +62,8 @@ class Evidence:
     """Measured wheel speeds, in rad/s."""
     wheel_unit: float = 1.0
     """Recorded wheel speeds over these."""
+    efforts: EffortTrack | None = None
+    """Currents or torques of the drive wheels' motors."""
     joints: JointRecord | None = None
     """Measured joints and commands to flippers."""
     components: tuple[str, ...] = MOTION

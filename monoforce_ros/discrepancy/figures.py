@@ -86,9 +86,10 @@ def map_figure(details: Details) -> Figure:
     top = max(float(np.quantile(errors[0], 0.95)), 0.02)
     figure = Figure(figsize=(5.5 * len(sets) + (1.5 if len(sets) == 1 else 0.0), 4.2), layout="constrained", dpi=110)
     axes = np.atleast_1d(figure.subplots(1, len(sets), sharex=True, sharey=True))
-    track = data.motion.positions[:, :2]
+    # Nobody knows how the robot came from one stretch to the next.
+    tracks = [data.motion.positions[part, :2] for part in details.stretches or (slice(None),)]
     for ax, (name, _), error in zip(axes, sets, errors, strict=True):
-        ax.add_collection(LineCollection([track], colors=_PALE, linewidths=1.2))
+        ax.add_collection(LineCollection(tracks, colors=_PALE, linewidths=1.2))
         points = ax.scatter(*places.T, c=error, cmap="inferno_r", vmin=0, vmax=top, s=46, edgecolors="white", lw=0.4)
         if details.area is not None and isinstance(details.area.place, Circle):
             circle = details.area.place

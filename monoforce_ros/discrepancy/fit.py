@@ -18,6 +18,8 @@ from monoforce_ros.effects import CATALOGUE, Effect
 OUTLIER = 3.0
 """Scaled residuals beyond this are weighted linearly instead of quadratically."""
 _DAMPINGS = (1e-3, 1e-1, 3.0)
+"""Shares of the diagonal of the normal equations (Marquardt 1963): hardly any, and more where that step fails. They
+change how many steps a fit takes, not where it ends."""
 _NOT_FINITE = 1e3
 """Scaled residual assumed for a prediction that is not finite."""
 _BLOCK = 4.0

@@ -16,6 +16,8 @@ from monoforce_ros.robots import RobotModel, servo_response
 
 BLOCKED = "blocked_flipper"
 _PIECE, _STEP = 2.0, 0.02
+"""Length of the pieces, that of a diagnosed window, and time step of the modelled servos, below their time constants
+(0.05 s of the shipped robot's) [s]."""
 _SMALLEST_MOVE = 0.05
 """Change of a commanded angle that an encoder of 1° tells from none within a piece [rad]."""
 _FEWEST = 5
@@ -23,6 +25,7 @@ _FEWEST = 5
 _SMALLEST_SHARE = 0.2
 """A servo that is slower than its file says by 0.4 s loses a fifth of a move within a piece of 2 s."""
 _QUANTILE = 1.96
+"""Of the normal distribution, for an interval of 95 %."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,7 @@ class FlipperFinding:
         return f"measured angles: flippers lose a part of their commanded motion ({', '.join(lost)})"
 
 
-def compare_with_commands(joints: JointRecord | None, robot: RobotModel, stamps: np.ndarray) -> FlipperFinding | None:
+def compare_with_commands(joints: JointRecord | None, robot: RobotModel, spans: np.ndarray) -> FlipperFinding | None:
     """Compare measured flipper angles with what the servos of the robot's file make of the commands.
 
     Within pieces of 2 s, each from its measured start, the measured change of the angle is a share of the one that was
@@ -76,16 +79,19 @@ def compare_with_commands(joints: JointRecord | None, robot: RobotModel, stamps:
     Args:
         joints: of the recording.
         robot: limits, lags and rates of its flippers.
-        stamps: those between which the robot moved [ns].
+        spans: begin and end of each part of the recording that counts ``[S, 2]`` [ns]; pieces lie within one.
 
     Returns:
         None without both measured and commanded angles, and where every flipper follows.
     """
     count = len(robot.flippers)
-    if joints is None or joints.measured is None or joints.commanded is None or not count or len(stamps) < 2:
+    if joints is None or joints.measured is None or joints.commanded is None or not count:
         return None
     known = dict(dict(robot.effects).get(BLOCKED, {}))
-    starts = np.arange(stamps[0], stamps[-1] - round(_PIECE / NANOSECOND), round(_PIECE / NANOSECOND))
+    length = round(_PIECE / NANOSECOND)
+    starts = np.concatenate(
+        [np.zeros(0, np.int64), *(np.arange(first, last - length, length) for first, last in spans)]
+    )
     if not len(starts):
         return None
     times = starts[:, None] + (np.arange(round(_PIECE / _STEP)) * _STEP / NANOSECOND).astype(np.int64)

@@ -15,6 +15,8 @@ from monoforce_ros.discrepancy.evidence import ATTITUDE, EvidenceWindows, rate_m
 from monoforce_ros.discrepancy.nominal import NominalModel, smallest_of
 
 _NOISE_DRAWS = 3
+"""Motions with other noise: three times 120 windows tell a root mean square within 4 %, one over √(2 · 360), or where
+overlapping windows count half within 5 %."""
 _ERRORS = (
     ("along-track error", "m"),
     ("cross-track error", "m"),

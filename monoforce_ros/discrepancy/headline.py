@@ -143,14 +143,21 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
             others = " or ".join(cause(other) for other in effect.indistinguishable)
             doubts.append(f"{cause(effect.name)} could as well be {others}: this recording cannot tell them apart")
     unstable = [effect for effect in named if effect.found_again and 2 * effect.found_again[0] < effect.found_again[1]]
-    doubts += [f"{cause(e.name)} shows in a part of the recording only: drive longer to be sure" for e in unstable]
+    doubts += [
+        f"{_class_of(effect)}: drive longer to be sure"
+        if effect.named_otherwise
+        else f"{cause(effect.name)} shows in a part of the recording only: drive longer to be sure"
+        for effect in unstable
+    ]
     counted = [row for row in rows if row.counts]
     grew = [row for row in rows if row.grew]
     # A recording from before the fault says nothing of what explains it.
     elsewhere = bool(rows) and not counted and all(row.recording for row in rows)
     remedies = [remedy(effect.name) for effect in effects]
     remedies += [
-        f"if it is {cause(other)} instead: {remedy(other)}" for effect in named for other in effect.indistinguishable
+        f"if it is {cause(other)} instead: {remedy(other)}"
+        for effect in named
+        for other in (*effect.indistinguishable, *effect.named_otherwise)
     ]
     if complaints:
         # What was found under a doubt about the recording or the ground may be nothing but its cause.
@@ -167,7 +174,10 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
         actions.append(_COMMISSION)
     doubts += [_growth(row) for row in grew]
     enough = bool(counted) and all(row.share >= MOST for row in counted)
-    findings = tuple(finding(effect) for effect in effects)
+    findings = tuple(
+        f"{_class_of(effect)}. By all of it: {finding(effect)}" if effect.named_otherwise else finding(effect)
+        for effect in effects
+    )
     if not named:
         # Without a name for it, where the error shows is what is known.
         findings += tuple(
@@ -176,8 +186,7 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
         )
     if diagnosis.part:
         findings += (diagnosis.part,)
-        if effects:
-            actions.append("use the robot's new file only for what is like this part of the recording")
+    findings += diagnosis.observed
     helps = bool(effects) and not grew and not refused and any(row.share > 0 for row in rows)
 
     def result(tone: Tone, sentence: str) -> Headline:
@@ -218,16 +227,24 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
         sentence = "Most of the error is not explained; a part of the cause was found."
     elif grew:
         sentence = f"A cause was found, but with it the {grew[0].metric} error grows."
+    elif any(effect.named_otherwise for effect in unstable):
+        sentence = "The error is explained, but the name of its cause changes with the part of the recording."
     else:
         sentence = "A cause was found, with doubts."
     return result(Tone.PARTLY, sentence)
+
+
+def _class_of(effect: EffectEstimate) -> str:
+    """One class of an effect and what other parts of the recording name in its place."""
+    *names, last = (cause(name) for name in (effect.name, *effect.named_otherwise))
+    return f"The name changes with the part of the recording: {', '.join(names)} or {last}"
 
 
 def _without_discrepancy(diagnosis: Diagnosis, complaints: Sequence[str], unknown: Sequence[str]) -> Headline:
     """The first screen where nothing is missing in the model; ``unknown`` says that the healthy robot is."""
     observed, tone = diagnosis.observed, Tone.PARTLY
     if observed and not complaints:
-        sentence = "The robot moves as its model predicts, but something else is wrong."
+        sentence = "The robot moves as its model predicts, but something else is not as usual."
     elif complaints:
         # A model that misses the healthy robot by much cannot say that nothing is wrong.
         sentence = "No change was found, with doubts: the errors are as large as the healthy robot's."
@@ -291,9 +308,10 @@ def _apart(before: float, after: float) -> tuple[str, str]:
 
 def _sizes(diagnosis: Diagnosis) -> tuple[str, ...]:
     """The size of the errors, before and after, in plain numbers."""
+    parts = "held-out parts of this recording" if diagnosis.repeated else "blocks of this recording left out of the fit"
     texts = []
     for row in explained(diagnosis):
-        where = f"held-out recording {row.recording}" if row.recording else "held-out parts of this recording"
+        where = f"held-out recording {row.recording}" if row.recording else parts
         unit = "°" if row.row.unit == "deg" else f" {row.row.unit}"
         assert row.row.after is not None
         before, after = _apart(row.row.before, row.row.after)

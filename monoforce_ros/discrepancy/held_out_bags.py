@@ -18,6 +18,7 @@ from monoforce_ros.discrepancy.sensor_findings import heading_noise
 from monoforce_ros.robots import RobotModel, fingerprint
 
 _HORIZON = 2.0
+"""Of the windows that are counted [s]: that of a diagnosis."""
 
 
 @dataclass(frozen=True)

@@ -45,6 +45,7 @@ from monoforce_ros.terrain import Grid, TerrainMap
 HISTORY = 4.0
 """Length of the commands before a window, for delays, lags and the integral part of drives [s]."""
 _LARGEST_BATCH = 1024
+"""Trajectories that are rolled out together: it bounds the memory, and changes no result."""
 _LEAN = slice(len(MOTION), len(MOTION) + 2)
 """Roll and pitch among the components of a residual."""
 _LEVEL_REACH, _HILLY_REACH = 0.1, 0.3
@@ -98,6 +99,7 @@ def correct_measurements(
 
 
 _LEVEL = Lean(np.zeros(2), np.zeros(2), np.zeros(2))
+"""Of a robot that stands upright on a level plane."""
 _MeasurementKey = tuple[tuple[str, tuple[tuple[str, float], ...]], ...]
 """Measurement effects with their parameters, hashable."""
 

@@ -17,6 +17,7 @@ from monoforce_ros.effects import CATALOGUE
 from monoforce_ros.robots import RobotModel
 
 _HORIZON = 2.0
+"""At which errors with and without an effect are compared [s]: that of a diagnosis' windows."""
 _FEWEST_BLOCKS = 6
 """Blocks with a difference below which no ranks are improbable enough: five on one side are so by chance in 3 % of
 cases."""

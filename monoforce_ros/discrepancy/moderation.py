@@ -16,6 +16,8 @@ from scipy.optimize import brentq
 from scipy.stats import f as f_distribution
 
 _FEWEST_DEGREES = 0.5
+"""Of the prior, where the equation for them has no smaller solution: variances that differ by more tell nothing of each
+other, and the prior then weighs half as much as a single segment."""
 _SOURCES = 3
 """The prior rests on the same segments as the variances themselves. It cannot have more degrees of freedom than as many
 independent residuals have: three, along, across and heading."""

@@ -15,7 +15,9 @@ from monoforce_ros.bags import SmoothedMotion
 from monoforce_ros.core import NANOSECOND, CommandTrack, DelayCorrelation, MotionTrack, WheelTrack, wrap_angle
 
 _LAGS = np.arange(-0.5, 1.525, 0.025)
-"""Delays from command to motion that a base may have [s]."""
+"""Delays from command to motion that a base may have [s]: dead times of real Warthogs reach 0.65 s, and their poses are
+up to 0.85 s late. Motion before its command is that of clocks which are apart; the half second is a choice, and beyond
+it other offsets are tried (:func:`_unrelated`)."""
 _STEP = 0.1
 """Time between samples for everything but the delay [s]."""
 _SPAN = 2.0
@@ -25,14 +27,25 @@ _MOVED, _TURNED = 0.1, np.radians(5.0)
 _LEAST_MOVING = 2.0
 """Time that a robot must move: a single window [s]."""
 _COMMANDED = 0.05
-"""Speed [m/s] or yaw rate [rad/s] from which on a command asks for motion."""
+"""Speed [m/s] or yaw rate [rad/s] from which on a command asks for motion: that by which a robot that stands is told
+(:data:`_MOVED`) from one that moves."""
+_NOISES, _COURSE_NOISES = 5.0, 10.0
+"""Standard deviations of the poses' noise beyond which a robot moved: noise alone does in less than one of a million
+cases; and from which on its course is known within 8° (√2 / 10), less than half of a curve that counts."""
 _STILL_HEADING, _CURVED_COURSE = np.radians(1.0), np.radians(20.0)
 """A heading that stays within the first while the direction of travel changes by more than the second is not measured.
 A rigid robot that does not slip changes both alike; ice or a slope turns the course by less."""
 _SIDEWAYS = np.radians(45.0)
 """Median angle between heading and direction of travel beyond which x is not the forward axis: it is nearer to y."""
 _UNRELATED = 0.5
-"""Largest correlation of commands and motion at which they may be unrelated."""
+"""Largest correlation of commands and motion at which they may be unrelated: three quarters of the variance is then
+something else. Whether they are is tested against the same commands at other times."""
+_RELATED, _BETTER = np.sqrt(0.5), 1.5
+"""Correlation at another offset of the clocks from which on these are apart: half of the variance is shared; and how
+many times that without one it must be, since the best of some hundred offsets is larger by chance."""
+_LONG_ENOUGH = 20.0
+"""Length from which on motion can be called unrelated [s]: ten windows; of a shorter one chance correlations are
+large."""
 _IDENTIFIED = 2.0
 """Largest offset of a clock that ``diagnose`` identifies as an effect: the bound of the catalogue [s]."""
 _BROKEN = 0.1
@@ -166,7 +179,7 @@ def _sampled(smoothed: SmoothedMotion) -> Iterator[tuple[np.ndarray, np.ndarray,
 def _standing(smoothed: SmoothedMotion, commands: CommandTrack, wheels: WheelTrack | None) -> str:
     """That the robot does not move; empty if it does."""
     span = round(_SPAN / _STEP)
-    least = max(_MOVED, 5.0 * smoothed.position_noise), max(_TURNED, 5.0 * smoothed.rotation_noise)
+    least = max(_MOVED, _NOISES * smoothed.position_noise), max(_TURNED, _NOISES * smoothed.rotation_noise)
     moving = judged = 0.0
     for _, places, headings in _sampled(smoothed):
         shift = np.linalg.norm(places[span:] - places[:-span], axis=1)
@@ -197,7 +210,8 @@ def _pose_faults(smoothed: SmoothedMotion, *, crabs: bool = False) -> Iterator[s
     """Faults of the poses alone; a robot that was commanded to move sideways has no course of its heading."""
     motion = smoothed.motion
     rotations = Rotation.from_quat(motion.quaternions).as_matrix()
-    if np.median(rotations[:, 2, 2]) < 0.7:
+    # Nearer to its side than to its wheels, for most of the time: 45°.
+    if np.median(rotations[:, 2, 2]) < np.sqrt(0.5):
         yield (
             "by its poses the robot lies on its side or upside down: record poses of the base frame in a frame whose "
             "z axis points up"
@@ -206,7 +220,7 @@ def _pose_faults(smoothed: SmoothedMotion, *, crabs: bool = False) -> Iterator[s
     if crabs:
         return
     courses, headings, offsets = [], [], []
-    least = max(0.2, 10.0 * smoothed.position_noise)
+    least = max(0.2, _COURSE_NOISES * smoothed.position_noise)
     for _, places, heading in _sampled(smoothed):
         step = round(0.5 / _STEP)
         moved = places[step:] - places[:-step]
@@ -250,12 +264,12 @@ def _unrelated(smoothed: SmoothedMotion, commands: CommandTrack, wheels: WheelTr
     span = (int(motion.stamps[-1]) - int(motion.stamps[0])) * NANOSECOND
     followed = _Followed.by_motion(motion)
     correlation = _follows(followed, commands)
-    if correlation >= _UNRELATED or correlation <= 0.0 or span < 20.0:
+    if correlation >= _UNRELATED or correlation <= 0.0 or span < _LONG_ENOUGH:
         return ""
     # The clocks may be apart by more than a base can be late.
     wide = np.arange(-min(60.0, 0.5 * span), min(60.0, 0.5 * span), 0.1)
     offset, best = _correlated(followed, commands, wide, (0, 1))
-    if best > max(0.7, 1.5 * correlation):
+    if best > max(_RELATED, _BETTER * correlation):
         if abs(offset) <= _IDENTIFIED:
             return ""
         return (

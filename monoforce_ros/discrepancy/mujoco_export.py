@@ -28,6 +28,7 @@ _CONTACT_TIME = 0.02
 _TIME_STEP = 0.002
 """MuJoCo's default time step, for which the buffer of delayed commands is sized [s]."""
 _GRAVITY = 9.81
+"""[m/s²]."""
 _NOT_IN_MUJOCO = {
     "actuator_deadband": "MuJoCo's actuators have no dead band: cut the commands before they reach the controls",
     "drive_compliance": "set the gain of each wheel's servo to N r² / speed_loss, for a wheel of load N and radius r",

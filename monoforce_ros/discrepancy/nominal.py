@@ -14,6 +14,7 @@ from monoforce_ros.discrepancy.command_changes import uncovered_residual
 from monoforce_ros.discrepancy.evidence import COMPONENTS, MOTION, Evidence, EvidenceWindows
 from monoforce_ros.discrepancy.healthy_wheels import HealthyWheels
 from monoforce_ros.discrepancy.moderation import VariancePrior
+from monoforce_ros.discrepancy.motor_efforts import HealthyEfforts
 from monoforce_ros.discrepancy.residual_model import TERMS, motion_terms
 from monoforce_ros.effects import CATALOGUE
 from monoforce_ros.robots import RobotFileError, read_commissioning, read_nominal_residual, robot_file
@@ -21,8 +22,11 @@ from monoforce_ros.robots import RobotFileError, read_commissioning, read_nomina
 SEGMENT = 16.0
 """Length of the segments between which the healthy robot varies [s]: two blocks of cross-validation, so that most kinds
 of motion occur in each."""
-# Of the rates those by which attitude and height change as much within the first half second.
 _SMALLEST = np.array([0.01, 0.01, *np.radians([0.3, 0.3, 0.3]), 0.01, *np.radians([0.6, 0.6]), 0.02])
+"""Errors below which nothing is worth a name [m, m, rad, rad, rad, m, rad/s, rad/s, m/s]: a centimetre, and the 0.3° by
+which a vertical repeats between drives (``attitude.REPEATABILITY``). Of the rates those by which attitude and height
+change as much within the first half second. The centimetre is a choice, not calibrated: a simulated robot without noise
+must not be blamed for errors of its integration."""
 _CHANGES = ("speed_m_s", "yaw_rate_rad_s")
 
 
@@ -56,6 +60,8 @@ class NominalModel:
     unknown."""
     wheels: HealthyWheels | None = None
     """How the drives followed commands; None without wheel speeds."""
+    efforts: HealthyEfforts | None = None
+    """How hard the drives' motors worked; None without their currents or torques."""
 
     @property
     def with_attitude(self) -> bool:
@@ -145,6 +151,8 @@ class NominalModel:
         ) | (
             {} if self.wheels is None else {"wheels": self.wheels.entry()}
         ) | (
+            {} if self.efforts is None else {"efforts": self.efforts.entry()}
+        ) | (
             {} if self.changes is None else
             {"command_changes": {key: float(f"{value:.3g}") for key, value in zip(_CHANGES, self.changes, strict=True)}}
         )  # fmt: skip
@@ -185,6 +193,7 @@ class NominalModel:
             leaned = entry.get("lean_rad")
             lean = None if leaned is None else np.array([float(leaned[0]), float(leaned[1])])
             wheels = None if entry.get("wheels") is None else HealthyWheels.read(entry["wheels"])
+            efforts = None if entry.get("efforts") is None else HealthyEfforts.read(entry["efforts"])
         except (KeyError, IndexError, TypeError, ValueError) as error:
             raise RobotFileError(f"{robot_file(robot)}: commissioning: expected numbers, got {error!r}") from error
         values = [*variation.values(), *numbers, *([] if motion_loss is None else [motion_loss])]
@@ -215,7 +224,7 @@ class NominalModel:
             )
         return cls(
             residual, variation, segments, loss=numbers[0], motion_loss=motion_loss, loss_spread=numbers[1],
-            terms=terms, slope=slope, changes=changes, lean=lean, wheels=wheels,
+            terms=terms, slope=slope, changes=changes, lean=lean, wheels=wheels, efforts=efforts,
         )  # fmt: skip
 
 

@@ -28,10 +28,16 @@ from monoforce_ros.discrepancy.wording import finding
 from monoforce_ros.reporting import card, definition_list, figure_png, page, picture, table
 
 _CROSS_VALIDATED = (
-    "Each window is predicted with parameters fitted to other blocks of the recording. Two things are not held out: "
-    "values measured by the gyro or the wheel speeds come from the whole recording, and the effects were selected on "
-    "these same blocks. The improvement is therefore somewhat optimistic; check it on another recording (--held-out)."
+    "Each window is predicted with values fitted to other blocks of the recording, which is too short to be searched "
+    "again without each part of it. Two things are not held out: values measured by the gyro or the wheel speeds come "
+    "from the whole recording, and the effects were selected on these same blocks. The improvement is therefore "
+    "somewhat optimistic; check it on another recording (--held-out)."
 )
+_REPEATED = (
+    "Each window is predicted with what a search that never saw its part of the recording found there: sensors were "
+    "compared, effects selected and values fitted without it."
+)
+_WITH_PART = "Where or when they act alone was chosen on the whole recording."
 _COLOURS = {Tone.GOOD: "#0b6e4f", Tone.PARTLY: "#b3540e", Tone.UNKNOWN: "#a11d33"}
 _STYLE = """<style>
 .facts { display: flex; flex-wrap: wrap; gap: 4px 26px; color: #51606e; margin: 2px 0 14px; }
@@ -194,13 +200,19 @@ def _gap_card(diagnosis: Diagnosis) -> str:
             f"<tr><td>{_metric(metric, row)}</td><td>{row.noise:.2g} {row.unit}</td>"
             f"<td>{row.before:.3g} {row.unit}</td>{_after_cells(row)}<td>{closed}</td></tr>"
         )
-    note = f"{_CROSS_VALIDATED} " if diagnosis.fitted else ""
+    note = f"{_held_out_note(diagnosis)} " if diagnosis.fitted else ""
     head = ("median error", "noise floor", "before", "after", "mean gain, 95 % interval", "reducible gap closed")
     return card(
         _image(gap_figure(diagnosis), "errors before and after") + table(head, rows),
         heading="Prediction error",
         caption=f"{note}The reducible gap is the error above the noise floor.",
     )
+
+
+def _held_out_note(diagnosis: Diagnosis) -> str:
+    """What the errors with the added effects never saw."""
+    note = _REPEATED if diagnosis.repeated else _CROSS_VALIDATED
+    return f"{note} {_WITH_PART}" if diagnosis.part else note
 
 
 def _after_cells(row: GapRow) -> str:

@@ -86,7 +86,9 @@ class Repetition:
         remark = f"{dropped} found again in fewer than half of the searches without a part of the recording"
         kept = tuple(entry for entry in trial.effects if entry[0] not in missing)
         if not kept:
-            remarks = (*decision.remarks, remark)
+            others = dict.fromkeys(n for r in self.repeated if r is not None for n in r.named if n not in trial.names)
+            instead = f"; these name {' or '.join(others)}" if others else ""
+            remarks = (*decision.remarks, f"{remark}{instead}")
             return replace(decision, verdict=Verdict.UNKNOWN_EFFECT, trial=None, parts=trial, remarks=remarks)
         best = search.judge(kept)
         if search.credible(trial) and not search.credible(best):
@@ -100,7 +102,8 @@ class Repetition:
     def judged(self, effects: Sequence[EffectEstimate]) -> tuple[EffectEstimate, ...]:
         """The effects of the whole recording, each with how often it was found again.
 
-        Where another effect is found in its place half of the time, the recording does not tell the two apart.
+        Where another effect is found in its place half of the time, the recording does not tell the two apart. Where
+        fewer than half of the repetitions find it, it is one class with all that they name in its place.
         """
         names = [effect.name for effect in effects]
         alike = {effect.name: effect.indistinguishable for effect in effects}
@@ -115,6 +118,7 @@ class Repetition:
                     effect,
                     indistinguishable=(*effect.indistinguishable, *support.instead),
                     found_again=(support.found, support.repetitions),
+                    named_otherwise=support.named_otherwise,
                 )
             )
         return tuple(result)
@@ -126,7 +130,7 @@ class Repetition:
         missed = [r for r in done if not same & set(r.named)]
         instead = [other for r in missed for other in r.named if other not in names]
         often = tuple(other for other in dict.fromkeys(instead) if 2 * instead.count(other) >= len(done))
-        return _Support(len(done) - len(missed), len(done), often)
+        return _Support(len(done) - len(missed), len(done), often, tuple(dict.fromkeys(instead)))
 
 
 @dataclass(frozen=True)
@@ -137,11 +141,20 @@ class _Support:
     repetitions: int
     instead: tuple[str, ...]
     """Other effects that take its place in at least half of the repetitions."""
+    others: tuple[str, ...]
+    """All that take its place in any of them."""
 
     @property
     def often(self) -> bool:
         """Whether it, or another one in its place, is found in at least half of them."""
         return bool(self.instead) or 2 * self.found >= self.repetitions
+
+    @property
+    def named_otherwise(self) -> tuple[str, ...]:
+        """The other names of an effect that fewer than half of them find, without those that mean the same."""
+        if 2 * self.found >= self.repetitions:
+            return ()
+        return tuple(name for name in self.others if name not in self.instead)
 
 
 def prepare_processes() -> None:
@@ -207,7 +220,11 @@ def _found(
 
 
 def without_part(evidence: Evidence, places: HeldOut, number: int) -> Evidence:
-    """The sensors of a recording without one part."""
+    """The sensors of a recording without what they measured in one part.
+
+    Commands of the part stay, to wheels and to flippers: they say nothing of how the robot answered, and one that was
+    given in the part may hold behind it.
+    """
     smoothed = evidence.smoothed
     stretches: list[slice] = []
     for stretch in smoothed.stretches:
@@ -215,8 +232,18 @@ def without_part(evidence: Evidence, places: HeldOut, number: int) -> Evidence:
         kept = poses[places.part_of(smoothed.motion.stamps[poses]) != number]
         runs = np.split(kept, np.flatnonzero(np.diff(kept) > 1) + 1)
         stretches += [slice(int(run[0]), int(run[-1]) + 1) for run in runs if len(run) > 1]
-    wheels = evidence.wheels
+    wheels, gyro, joints = evidence.wheels, evidence.gyro, evidence.joints
     if wheels is not None:
         chosen = places.part_of(wheels.stamps) != number
         wheels = WheelTrack(wheels.stamps[chosen], wheels.speeds[chosen])
-    return replace(evidence, smoothed=replace(smoothed, stretches=tuple(stretches)), wheels=wheels)
+    if gyro is not None:
+        chosen = places.part_of(gyro.stamps) != number
+        gyro = replace(gyro, stamps=gyro.stamps[chosen], rates=gyro.rates[chosen])
+    if joints is not None and joints.measured is not None:
+        chosen = places.part_of(joints.measured.stamps) != number
+        measured = replace(
+            joints.measured, stamps=joints.measured.stamps[chosen], angles=joints.measured.angles[chosen]
+        )
+        joints = replace(joints, measured=measured)
+    smoothed = replace(smoothed, stretches=tuple(stretches))
+    return replace(evidence, smoothed=smoothed, wheels=wheels, gyro=gyro, joints=joints)

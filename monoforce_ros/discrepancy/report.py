@@ -31,6 +31,7 @@ def effect_entry(effect: EffectEstimate) -> dict:
         "indistinguishable": others,
         "rivals": others,
         "found_again": None if effect.found_again is None else list(effect.found_again),
+        "named_otherwise": list(effect.named_otherwise),
     }
 
 

@@ -25,6 +25,7 @@ BEFORE = 0.5
 _LARGEST = 3.0
 """Residuals beyond so many standard deviations count as if they were that large."""
 _UPDATES = 200
+"""Steps of the multiplicative iteration: they bound the time."""
 _PRIOR_WINDOWS = 1.0
 """Weight of the prior, in windows."""
 

@@ -20,6 +20,7 @@ from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import TerrainDefaults
 
 _GRAVITY = 9.81
+"""[m/s²]."""
 _NO_PARAMETER = "has no parameter here"
 _LIMITS = ("actuator_saturation", "yaw_rate_limit", "acceleration_limit", "yaw_acceleration_limit")
 _NOT_IN_DIFF_DRIVE = {

@@ -64,7 +64,9 @@ class SensorFindings:
         gyro = compare_with_gyro(evidence.smoothed, evidence.gyro)
         wheels = compare_with_wheels(evidence.commands, evidence.wheels, robot, healthy, thresholds.drive_spread)
         excluded: tuple[str, ...] = () if gyro is None else ("pose_clock_offset",)
-        flippers = compare_with_commands(evidence.joints, robot, evidence.smoothed.motion.stamps)
+        stamps = evidence.smoothed.motion.stamps
+        spans = [(stamps[part.start], stamps[part.stop - 1]) for part in evidence.smoothed.stretches]
+        flippers = compare_with_commands(evidence.joints, robot, np.array(spans, np.int64).reshape(-1, 2))
         if not commissioned and not any(CATALOGUE[name].stage == "command" for name, _ in robot.effects):
             known = measured_effects(gyro, wheels, flippers)
             return cls(gyro, wheels, known, excluded=excluded, flippers=flippers)

@@ -16,11 +16,29 @@ from monoforce_ros.robots import RobotModel
 _HISTORY = 4.0
 """Length of the commands before a block [s]: twice the longest dead time of the catalogue, for slow integral parts."""
 _LONGEST_GAP = 1.0
+"""Between samples of a block [s]: a quarter of it, so that no block is judged by less than half of its time."""
 BLOCK = 4.0
 """Length of the blocks that are fitted or held out together [s]: longer than drives respond to a step."""
 _MOST_SAMPLES = 80
-"""Samples of a block that are used at most: about 13 Hz, which shows a time constant of 0.08 s."""
+"""Samples of a block that are used at most: every so many are taken, so that 10 to 20 Hz remain, about 13 Hz of a rate
+of 40 or 50 Hz. One time constant of 0.08 s then lies between two samples."""
 _FEWEST_SAMPLES = 10
+"""Of a block that is used: 2.5 Hz, at which commands that are held for a second are still told apart."""
+
+_SETTLED = 1.5
+"""Time for which a command must have been constant where the ratio of wheels and commands is taken [s]: a real
+Warthog's drives (0.65 s dead time, 0.4 s lag) have reached nine tenths of it then."""
+_CONSTANT = 0.02
+"""Range of commands over the fastest one within which they are constant."""
+_MEDIUM = (0.1, 0.6)
+"""Commands over the fastest one at which that ratio is taken: above a dead band, and up to the lowest limit with which
+the fits of limits begin."""
+_FEWEST_STEADY = 10
+"""Samples of each side that say a ratio; of fewer that of all samples is taken."""
+_DEAD = 0.5
+"""Ratio of one side over that of the other below which that side has lost most of its speed."""
+_SMALLEST_RATIO = 0.1
+"""Measured [rad/s] over commanded speed [m/s] below which wheels do not turn: that of a wheel with a radius of 10 m."""
 
 
 @dataclass(frozen=True)
@@ -127,18 +145,19 @@ class WheelBlocks:
     def ratio(self) -> float | None:
         """Measured [rad/s] over commanded speed [m/s] where a command of medium size was constant for a while."""
         commanded, top = self.commanded(), self.fastest.speed
-        # From 1.5 s before a sample until it.
-        settled = round(1.5 / self.step)
+        # Until the sample.
+        settled = round(_SETTLED / self.step)
         shift = {"size": settled + 1, "origin": settled // 2, "axis": 2}
         extent = self.at_samples(maximum_filter1d(commanded, **shift) - minimum_filter1d(commanded, **shift))
         recent = self.at_samples(commanded)
-        steady = self.pairs & (extent < 0.02 * top) & (np.abs(recent) > 0.1 * top) & (np.abs(recent) < 0.6 * top)
+        medium = (np.abs(recent) > _MEDIUM[0] * top) & (np.abs(recent) < _MEDIUM[1] * top)
+        steady = self.pairs & (extent < _CONSTANT * top) & medium
         sides = [self.measured[:, side][steady[:, side]] / recent[:, side][steady[:, side]] for side in range(2)]
-        if min(map(len, sides)) < 10:
+        if min(map(len, sides)) < _FEWEST_STEADY:
             measured, recent = self.measured[self.pairs], recent[self.pairs]
             ratio = float(recent @ measured) / max(float(recent @ recent), 1e-9)
         else:
             # A dead side says nothing about the wheel's radius.
             left, right = (float(np.median(side)) for side in sides)
-            ratio = 0.5 * (left + right) if min(left, right) > 0.5 * max(left, right) else max(left, right)
-        return ratio if ratio > 0.1 else None
+            ratio = 0.5 * (left + right) if min(left, right) > _DEAD * max(left, right) else max(left, right)
+        return ratio if ratio > _SMALLEST_RATIO else None

@@ -13,11 +13,13 @@ from monoforce_ros.core import CommandTrack, MotionTrack, WheelTrack
 from monoforce_ros.robots import RobotModel
 
 _STEP = 0.1
+"""Between samples of ways and commands [s]: the time in which a base controller reads a command at 10 Hz."""
 _PIECE = 2.0
 """Length of the pieces in which wheels and motion are compared [s]: longer than clocks and filters are late."""
 _SHORTEST = 3.0
 """Shortest stretch that is reported [s]: more than one piece, and more than wheels may spin when a robot starts."""
 _LARGEST_GAP = 1.0
+"""Between measurements over which ways are interpolated [s]: half a piece."""
 _PIECES = 9
 """Overlapping pieces over which ways are added up: 6 s, so that neither a start nor a wandering pose decides."""
 _LEAST_WAY = 0.1

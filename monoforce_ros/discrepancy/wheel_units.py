@@ -16,7 +16,7 @@ from monoforce_ros.discrepancy.healthy_wheels import HealthyWheels
 from monoforce_ros.discrepancy.wheel_motion import half_track, side_speeds, wheel_ways
 from monoforce_ros.robots import RobotModel
 
-_PLAUSIBLE = (0.4, 2.5)
+PLAUSIBLE = (0.4, 2.5)
 """Wheel speeds over commanded ones, and over those of the ground, that drives, tyres and a radius may explain: beyond
 lie the units that are in use, the nearest of them one revolution for a second, 0.16, and rpm, 9.5."""
 _STANDING = 0.02
@@ -58,7 +58,7 @@ class _Ratio:
     @property
     def plausible(self) -> bool:
         """Whether it may be that of drives, tyres and a radius."""
-        return _PLAUSIBLE[0] < self.value < _PLAUSIBLE[1]
+        return PLAUSIBLE[0] < self.value < PLAUSIBLE[1]
 
     def over(self, other: _Ratio) -> _Ratio:
         """Divided by the median of another one."""
@@ -201,7 +201,7 @@ def in_rad_per_second(healthy: HealthyWheels, radius: float | None) -> HealthyWh
         healthy: of a robot that was commissioned with speeds as they were recorded, or with a known unit.
         radius: of the wheels, by the robot's file [m]; None if it has none.
     """
-    if radius is None or _PLAUSIBLE[0] < healthy.ratio * radius < _PLAUSIBLE[1]:
+    if radius is None or PLAUSIBLE[0] < healthy.ratio * radius < PLAUSIBLE[1]:
         return healthy
     return replace(healthy, ratio=1.0 / radius, unit=healthy.unit * healthy.ratio * radius)
 

@@ -27,13 +27,22 @@ from monoforce_ros.discrepancy.wheel_model import (
     neutral_of,
     response_of,
 )
+from monoforce_ros.discrepancy.wheel_units import PLAUSIBLE
 from monoforce_ros.effects import wheel_effects
 from monoforce_ros.robots import RobotModel
 
 _STEP, _FINE_STEP = 0.04, 0.01
 """Of the modelled wheel speeds, in the selection and in the final fit [s]."""
 _MOST_BLOCKS = 60
-"""Blocks that are used at most: whole ones, spread evenly over the recording."""
+"""Blocks that are used at most: whole ones, spread evenly over the recording. It only saves time: of four
+minutes of driving a test by ranks needs no more."""
+_FEWEST_SAMPLES = 100
+"""Of the wheels: ten blocks with as few samples as count, or two with 50 or more."""
+_SLOWEST = 0.1
+"""Fastest commanded speed of the wheels below which nothing is said of the drives [m/s]: twice that at which wheels may
+creep."""
+_FOLLOWED = 0.5
+"""Share of the wheels' variance that commands must explain: most of it."""
 _ALPHA = 0.05
 """Probability that a step of the selection adds an effect that the wheels do not show, over all candidates."""
 _LARGEST_MODEL = 5
@@ -45,7 +54,8 @@ _GAIN = "drive_gain"
 _SAME_RATIO = 0.02
 """Relative difference of the measured speed ratio from the known radius' within which they are one: a worn tyre's."""
 _FURTHER = 0.01
-"""Share of the error that a further effect must remove for the search to go on."""
+"""Share of the error that a further effect must remove for the search to go on: it only saves time, for what is added
+is decided by the test."""
 
 
 @dataclass(frozen=True)
@@ -111,10 +121,10 @@ def compare_with_wheels(
         healthy: what commissioning learned of the wheels; None where it is unknown.
         spread: standard deviation of the logarithm of a mean loss between healthy drives.
     """
-    if wheels is None or len(wheels) < 100 or not len(commands):
+    if wheels is None or len(wheels) < _FEWEST_SAMPLES or not len(commands):
         return None
     found = WheelBlocks.of(commands, wheels, robot, _STEP)
-    if found is None or found.fastest.speed < 0.1:
+    if found is None or found.fastest.speed < _SLOWEST:
         return None
     chosen = found.spread(_MOST_BLOCKS)
     blocks = found[chosen]
@@ -141,7 +151,7 @@ def compare_with_wheels(
     baseline = selection.scored((), None)
     count = float(blocks.known.sum()) * 2
     spreads = [float(np.var(part[blocks.pairs])) for part in (blocks.measured, blocks.at_samples(blocks.commanded()))]
-    if best.loss / count > 0.5 * min(spreads):
+    if best.loss / count > (1.0 - _FOLLOWED) * min(spreads):
         # The wheels do not follow the commands.
         return None
     effects = named(best.names, values)
@@ -237,7 +247,7 @@ def _selected(blocks: WheelBlocks, measured: float, healthy: HealthyWheels | Non
     """
     radius = blocks.robot.wheel_radius if healthy is None else 1.0 / healthy.ratio
     free = _Selection(replace(blocks, measured=blocks.measured / measured))
-    if radius is None or not 0.4 < measured * radius < 2.5:
+    if radius is None or not PLAUSIBLE[0] < measured * radius < PLAUSIBLE[1]:
         return free, measured, 1.0
     known, gain = _Selection(replace(blocks, measured=blocks.measured * radius)), measured * radius
     if abs(gain - 1.0) > _SAME_RATIO:

@@ -29,6 +29,7 @@ class ActuatorDeadband(Effect):
         speeds=lambda speeds, value, step: np.sign(speeds) * np.maximum(np.abs(speeds) - value, 0.0),
         starts=lambda fastest: (0.05 * fastest.speed,),
         bounds=lambda fastest: (0.0, 0.6 * fastest.speed),
+        # 4 cm in a window of 2 s; a choice, not calibrated.
         counts=lambda value, fastest: value >= 0.02,
         wording="slower by {:.2f} m/s",
         excludes=("actuator_saturation", "drive_gain"),

@@ -46,6 +46,7 @@ class CommandDelay(Effect):
         speeds=_delayed,
         starts=lambda fastest: (0.05, 0.3, 0.7),
         bounds=lambda fastest: (0.0, 1.8),
+        # Longer than the 0.05 s between commands at 20 Hz, by which a base that reads them in its own cycle is late.
         counts=lambda value, fastest: value >= 0.06,
         wording="{:.2f} s late",
     )

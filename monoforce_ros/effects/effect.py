@@ -85,7 +85,9 @@ class WheelResponse:
     bounds: Callable[[Fastest], tuple[float, float]]
     """Bounds of the fit."""
     counts: Callable[[float, Fastest], bool]
-    """Whether a fitted value is large enough to count as an effect."""
+    """Whether a fitted value is large enough to count as an effect: where wheels show a smaller one beyond chance, it
+    is not named, and where their interval holds only smaller ones, the effect is ruled out (a test of equivalence needs
+    such a margin, which no standard error supplies)."""
     wording: str
     """Text for reports, with braces for the values."""
     further: tuple[str, ...] = ()

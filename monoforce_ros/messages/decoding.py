@@ -330,6 +330,17 @@ def decode_wheels(message: Any) -> dict[str, tuple[float, float]]:
     }
 
 
+def decode_efforts(message: Any) -> dict[str, float]:
+    """``sensor_msgs/JointState`` → effort of each wheel, see :func:`wheel_side`; those without a finite one are left
+    out. Many drivers publish the motor's current [A] rather than a torque [N m]."""
+    efforts = np.asarray(message.effort, np.float64)
+    return {
+        str(name): float(efforts[index])
+        for index, name in enumerate(message.name)
+        if wheel_side(str(name)) and index < len(efforts) and np.isfinite(efforts[index])
+    }
+
+
 def decode_joints(message: Any, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
     """``sensor_msgs/JointState`` → angles [rad] and rates [rad/s] of the named joints, each ``[J]``, in their order.
 

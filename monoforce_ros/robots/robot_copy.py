@@ -14,6 +14,8 @@ import yaml
 from monoforce_ros.core import write_text
 from monoforce_ros.robots.loader import RobotFileError, robot_file
 
+_FORM: dict[str, Any] = {"sort_keys": False, "allow_unicode": True}
+
 
 def fingerprint(paths: Sequence[Path]) -> str:
     """A hash of the contents of bags, 16 hexadecimal digits."""
@@ -42,7 +44,8 @@ def write_robot(
         robot: name or file of the nominal robot.
         out: the copy; it appears once it is complete.
         effects: entries with ``name``, ``parameters`` {name: {value, low, high, unit}} and, optionally,
-            ``indistinguishable``: names of effects that explain the data equally well.
+            ``indistinguishable``: names of effects that explain the data equally well, and ``part``: where or when
+            alone the effect acts, in a sentence, which also becomes a comment beside it.
         bags: recordings from which the effects were identified.
         data_fingerprint: fingerprint of the bags.
         commissioning: nominal residual of the healthy robot, for later runs: ``samples_s`` and ``residual_rms``.
@@ -68,13 +71,23 @@ def write_robot(
                 "data": data_fingerprint,
                 "indistinguishable": indistinguishable,
                 "rivals": list(indistinguishable),  # the former name, kept for one release
+                **({"part": str(effect["part"])} if effect.get("part") else {}),
             },
         }
-    content["effects"] = list(present.values())
     if commissioning is not None:
         content["commissioning"] = dict(commissioning)
-    write_text(out, yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
+    dumped = yaml.safe_dump({key: value for key, value in content.items() if key != "effects"}, **_FORM)
+    listed = "".join(map(_listed, present.values()))
+    write_text(out, f"{dumped}effects:\n{listed}" if listed else f"{dumped}effects: []\n")
     return out
+
+
+def _listed(effect: Mapping[str, Any]) -> str:
+    """An entry of the list of effects, below a comment on the part in which alone it acts."""
+    provenance = effect.get("provenance")
+    part = provenance.get("part") if isinstance(provenance, Mapping) else None
+    comment = f"# {effect['name']}: {' '.join(str(part).split())}\n" if part else ""
+    return comment + yaml.safe_dump([effect], **_FORM)
 
 
 def read_commissioning(robot: str | Path) -> Mapping[str, Any] | None:
