@@ -76,6 +76,8 @@ class EncoderTerrain:
         self._driven = DrivenGround(robot, self.stiffness)
         self.start_error = 0.0
         """Median difference between the last map and the ground under the wheels, before they were aligned [m]."""
+        self.used: tuple[str, ...] = ()
+        """Sensors of which the last map was made: a sweep with too few points is left out beside images."""
 
     @property
     def grid(self) -> Grid:
@@ -103,6 +105,8 @@ class EncoderTerrain:
                 require_cells(cells, len(sweep), self.grid)
             elif cells < LidarSettings().minimum_cells:
                 sweep = None
+        had = {"camera": bool(views), "lidar": sweep is not None}
+        self.used = tuple(name for name in self.sensors if had[name])
         trace = self._driven.update(motion, observation.track)
         with encoder_threads(self._threads):
             found = self.encoder.terrain(views, support, sweep=sweep, trace=trace)

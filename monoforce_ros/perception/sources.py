@@ -12,7 +12,7 @@ from monoforce_ros.perception.fusion import LidarCameraTerrain
 from monoforce_ros.perception.lidar import LidarTerrain
 from monoforce_ros.perception.observation import TerrainSource
 from monoforce_ros.perception.temporal_memory import TemporalMemory
-from monoforce_ros.perception.trust import TrustedTerrain
+from monoforce_ros.perception.trusted_terrain import TrustedTerrain
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import Grid, TerrainDefaults
 
@@ -100,8 +100,8 @@ def choose_terrain_source(
     level, lidar = FlatTerrain(robot, learned.grid, material), LidarTerrain(robot, learned.grid, material)
     if kind == "lidar_camera" and "lidar" not in sensors:
         learned = LidarCameraTerrain(lidar, learned)
-    # With a memory of the images, that of the lidar has nothing to add.
-    recall = None if retention_time and "camera" in sensors else memory(learned)
+    # What the encoder says is remembered already, but counts only as far as it is trusted.
+    recall = None if retention_time and "camera" in sensors and not fallback else memory(learned)
     if fallback:
         if kind == "lidar":
             return TrustedTerrain(learned, own, [lidar], expected=1.0, memory=recall)
