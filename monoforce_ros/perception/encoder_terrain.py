@@ -49,8 +49,9 @@ class EncoderTerrain:
         robot: the robot on the ground.
         sensors: sensors used, of ``camera`` and ``lidar``; of two sensors either may be absent from an observation.
         threads: CPU threads of the encoder; see :func:`encoder_threads`.
-        material: material of rigid ground, of which shape says little; images tell that of what is soft. By default it
-            is predicted everywhere.
+        material: material of rigid ground, of which neither shape nor look says much (docs/training.md); images tell
+            that of what is soft, its friction relative to the ground for which the encoder was made. By default it is
+            predicted everywhere.
 
     Raises:
         ValueError: the encoder does not take one of the sensors.
@@ -117,7 +118,11 @@ class EncoderTerrain:
         if self._material is None:
             return aligned
         rigid = aligned.with_material(self._material)
-        return material_by_compliance(rigid, aligned) if views else rigid
+        if not views:
+            return rigid
+        usual = self.encoder.config.friction
+        friction = aligned.friction * (self._material.friction / usual) if usual > 0.0 else rigid.friction
+        return material_by_compliance(rigid, replace(aligned, friction=friction))
 
 
 def _with_low_overhead(terrain: TerrainMap, sweep: np.ndarray) -> TerrainMap:
