@@ -1,5 +1,6 @@
 """Trust: predictions are compared with the ground found later, and a harmful encoder is not used."""
 
+import shlex
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from monoforce_ros.core import CameraModel, MotionState, MotionTrack
 from monoforce_ros.encoder import EncoderConfig, new_encoder
+from monoforce_ros.nodes.terrain_health import TerrainHealth
 from monoforce_ros.perception import (
     DrivenGround,
     EncoderTerrain,
@@ -23,6 +25,7 @@ from monoforce_ros.perception.ground_alignment import lowest_points
 from monoforce_ros.perception.trusted_terrain import blended
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap
+from monoforce_ros.training.train_cli import build_parser
 
 GRID = Grid.square(12.8, 0.2)
 WHEELS = np.array([[0.3, 0.3], [0.3, -0.3], [-0.3, 0.3], [-0.3, -0.3]])
@@ -126,6 +129,38 @@ def test_what_a_sweep_says_is_used_until_the_ground_says_otherwise():
     assert wrong[0] == 1.0 and wrong[-1] < 0.6
     half = shares(lambda ahead, x: 2.0 * (hill(ahead + x) - hill(x)))
     assert half[0] == 1.0 and (0.4 < half[-1] < 0.7 or half[-1] == 0.0)
+
+
+def test_one_place_alone_decides_nothing():
+    """Level ground, of which prediction and fallback say the same, and one block where they differ."""
+    place = 4.0
+
+    def share(expected, found, length):
+        """The prediction is a bump of 10 cm, the ground found there one of ``found`` metres."""
+        trust = TerrainTrust(GRID, expected)
+
+        def bump(x, height):
+            return np.where((x > place) & (x < place + length), height, 0.0)
+
+        for x in np.arange(0.0, 8.0, 0.1):
+            height = bump(np.broadcast_to(GRID.x, (GRID.rows, GRID.columns)) + x, 0.1)
+            terrain = TerrainMap.from_height(torch.from_numpy(height.astype(np.float32)), GRID)
+            support = np.column_stack([WHEELS, bump(x + WHEELS[:, 0], found)])
+            report = trust.update(at(x), support, terrain, {}, 0.0, TerrainMap.flat(GRID))
+        return report.share
+
+    assert share(1.0, 0.0, 0.2) == 1.0 and share(0.0, 0.1, 0.2) == 0.0
+    assert share(1.0, 0.0, 2.5) < 0.5 and share(0.0, 0.1, 2.5) > 0.6
+
+
+def test_the_command_that_diagnostics_name_is_one():
+    source = TrustedTerrain(FlatTerrain(load_robot("husky"), GRID, TerrainDefaults()), None, [])
+    health = TerrainHealth(None, source, "my robots/husky.yaml", "own.safetensors")
+    words = shlex.split(health.adaptation.partition(" (then ")[0])
+    assert words[:4] == ["ros2", "run", "monoforce_ros", "train"]
+    found = build_parser().parse_args(words[4:])
+    assert found.adapt and [str(bag) for bag in found.bags] == ["BAG"] and str(found.out) == "adapted"
+    assert (found.robot, str(found.start_from)) == ("my robots/husky.yaml", "own.safetensors")
 
 
 def test_half_of_the_ground_is_used_by_half():

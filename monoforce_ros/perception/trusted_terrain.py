@@ -55,6 +55,7 @@ class TrustedTerrain:
         """By the sensors that an observation had."""
         self.report: TrustReport | None = None
         """Result of the last comparison; None before the first map."""
+        self._fell_back_to: TerrainSource | None = None
         self.predicted: TerrainMap | None = None
         """The encoder's last map, before any of it was replaced by the fallback's."""
 
@@ -67,6 +68,11 @@ class TrustedTerrain:
     def grid(self) -> Grid:
         """Grid of the source."""
         return self.source.grid
+
+    @property
+    def fallback_report(self) -> TrustReport | None:
+        """Report of the fallback of the last map, if that one has an encoder that has to be trusted, too."""
+        return self._fell_back_to.report if isinstance(self._fell_back_to, TrustedTerrain) else None
 
     def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
         """The encoder's map or the fallback's; raises the source's errors."""
@@ -105,9 +111,11 @@ class TrustedTerrain:
         usable = [f for f in self._fallbacks if all(measured[sensor] for sensor in f.sensors)]
         for fallback in usable[:-1]:
             try:
+                self._fell_back_to = fallback
                 return fallback.terrain(observation, motion)
             except TerrainError:
                 continue
+        self._fell_back_to = usable[-1]
         return usable[-1].terrain(observation, motion)
 
 
