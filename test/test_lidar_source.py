@@ -10,7 +10,7 @@ import torch
 
 from monoforce_ros.bags import Recording, observe
 from monoforce_ros.core import MotionState
-from monoforce_ros.encoder import EncoderConfig, load_encoder, new_encoder, save_encoder
+from monoforce_ros.encoder import CheckpointError, EncoderConfig, load_encoder, new_encoder, save_encoder
 from monoforce_ros.evaluation import evaluate_recording
 from monoforce_ros.evaluation.tables import PHYSICS
 from monoforce_ros.perception import (
@@ -98,6 +98,23 @@ def test_other_grids_and_encoders_without_sweeps_are_interpolated(tmp_path, husk
     assert isinstance(choose_terrain_source("lidar", husky, grid=Grid.square()), EncoderTerrain)
 
 
+def test_without_the_shipped_encoder_sweeps_are_interpolated_and_the_node_says_so(tmp_path, husky, monkeypatch):
+    missing = tmp_path / "terrain_encoder.safetensors"
+    monkeypatch.setattr("monoforce_ros.encoder.checkpoint.shipped_checkpoint", lambda: missing)
+    said = []
+    source = choose_terrain_source("lidar", husky, fallback=True, grid=Grid.square(10.0, 0.2), warn=said.append)
+    assert isinstance(source, LidarTerrain) and source.grid == Grid.square(10.0, 0.2)
+    assert len(said) == 1 and f"{missing} does not exist" in said[0] and "interpolates the point cloud" in said[0]
+    missing.write_bytes(b"version https://git-lfs.github.com/spec/v1")
+    missing.with_suffix(".json").write_text('{"format": 2}')
+    assert isinstance(choose_terrain_source("lidar", husky, warn=said.append), LidarTerrain)
+    assert "damaged" in said[1]
+    # A file that the user names has to be there, and images say nothing without an encoder.
+    for kind, checkpoint in (("lidar", missing), ("lidar", tmp_path / "own.safetensors"), ("lidar_camera", "")):
+        with pytest.raises(CheckpointError):
+            choose_terrain_source(kind, husky, checkpoint=checkpoint, warn=said.append)
+
+
 def test_material_is_the_given_one(husky):
     material = TerrainDefaults(stiffness=1e6, damping=3e4, friction=0.55)
     random = np.random.default_rng(0)
@@ -162,4 +179,23 @@ def test_with_both_sensors_rigid_ground_has_the_given_material(recording, husky)
     )
     depth = found.geometric_height - found.height
     assert (found.friction[depth < 0.02] == 0.55).all() and int((depth < 0.02).sum()) > 1000
+    # Of what is soft the encoder tells how far it differs from the ground that it was made for.
+    usual = replace(material, friction=0.8)
+    plain = choose_terrain_source("lidar_camera", husky, material=usual).terrain(
+        observation, recording.motion.at(stamp)
+    )
+    torch.testing.assert_close(found.friction, plain.friction * (0.55 / 0.8))
     assert (found.friction[depth > 0.06] != 0.55).any()
+
+
+def test_from_images_ground_has_the_given_friction(recording, husky):
+    stamp = recording.clouds[len(recording.clouds) // 2].stamp
+    observation = observe(recording, husky, stamp, ("camera",), tuple(recording.images))
+    material = TerrainDefaults(friction=0.5)
+    for fallback in (False, True):
+        source = choose_terrain_source("camera", husky, material=material, fallback=fallback)
+        found = source.terrain(observation, recording.motion.at(stamp))
+        found = source.predicted if fallback else found
+        depth = found.geometric_height - found.height
+        assert (found.friction[depth < 0.02] == 0.5).all() and int((depth < 0.02).sum()) > 1000
+        assert float(found.friction.max()) < 0.6

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from monoforce_ros.core import MotionState
+from monoforce_ros.core import CameraModel, MotionState
 from monoforce_ros.perception import Observation, choose_terrain_source
 from monoforce_ros.perception.lidar import usable_returns
 from monoforce_ros.robots import load_robot
@@ -181,6 +181,34 @@ def test_behind_the_edge_of_a_step_the_plateau_goes_on(husky, lidar):
     before, behind = row[:, (GRID.x > 0.8) & (GRID.x < 1.8)], row[:, (GRID.x > 2.1) & (GRID.x < 3.0)]
     # Three rings of the VLP-16 hit the face within 15 cm, which may be a ramp.
     assert np.median(before) < {"OS0": 0.1, "VLP-16": 0.3}[lidar] and np.median(behind) > 0.25
+
+
+@pytest.mark.parametrize("camera_retention_time", [0.0, 10.0])
+@pytest.mark.parametrize("covered", [False, True], ids=["silent", "covered"])
+def test_a_wall_stays_for_a_while_when_the_lidar_dies(husky, covered, camera_retention_time):
+    ground = -husky.ground_clearance
+    source = choose_terrain_source(
+        "lidar_camera", husky, fallback=True, lidar_retention_time=10.0, retention_time=camera_retention_time
+    )
+    camera = CameraModel(320, 240, np.array([[200.0, 0, 160], [0, 200.0, 120], [0, 0, 1]]), np.zeros(5))
+    cloud = ray_cast(LIDARS["VLP-16"], ground, 0.65, [((3.0, -2.0, 0.0), (3.4, 2.0, 1.0))], columns=720)
+    front, across = np.abs(GRID.x - 3.0) < 0.25, np.abs(GRID.y) < 1.5
+
+    def wall(seconds, sweep):
+        motion = replace(STILL, stamp=round(seconds * 1e9))
+        picture = np.full((240, 320, 3), 90, np.uint8)
+        pose = np.array([[0.0, 0, 1, 0.3], [-1, 0, 0, 0], [0, -1, 0, 0.3], [0, 0, 0, 1]])
+        observation = Observation(motion.stamp, sweep, {"front": picture}, {"front": camera}, {"front": pose})
+        height = source.terrain(observation, motion).height.numpy() - ground
+        return float(np.median(height[across][:, front].max(axis=1)))
+
+    for step in range(5):
+        assert wall(0.3 * step, cloud) > 0.7
+    dead = cloud[:5] if covered else None
+    assert all(wall(seconds, dead) > 0.7 for seconds in (1.5, 4.0, 7.0, 10.5))
+    assert wall(12.0, dead) < 0.1
+    # It is back, and somebody has taken the wall away.
+    assert wall(12.3, ray_cast(LIDARS["VLP-16"], ground, 0.65, [], columns=720)) < 0.1
 
 
 @pytest.mark.parametrize("kind", ["lidar", "lidar_interpolation"])

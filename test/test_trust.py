@@ -1,5 +1,6 @@
 """Trust: predictions are compared with the ground found later, and a harmful encoder is not used."""
 
+import shlex
 from dataclasses import replace
 
 import numpy as np
@@ -7,8 +8,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from monoforce_ros.core import MotionState, MotionTrack
+from monoforce_ros.core import CameraModel, MotionState, MotionTrack
 from monoforce_ros.encoder import EncoderConfig, new_encoder
+from monoforce_ros.nodes.terrain_health import TerrainHealth
 from monoforce_ros.perception import (
     DrivenGround,
     EncoderTerrain,
@@ -20,9 +22,10 @@ from monoforce_ros.perception import (
     traced_ground,
 )
 from monoforce_ros.perception.ground_alignment import lowest_points
-from monoforce_ros.perception.trust import blended
+from monoforce_ros.perception.trusted_terrain import blended
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap
+from monoforce_ros.training.train_cli import build_parser
 
 GRID = Grid.square(12.8, 0.2)
 WHEELS = np.array([[0.3, 0.3], [0.3, -0.3], [-0.3, 0.3], [-0.3, -0.3]])
@@ -79,6 +82,9 @@ def test_holes_that_are_not_there_are_noticed_within_metres_and_named():
     first = next(i for i, report in enumerate(reports) if not report.trusted)
     assert 0.1 * first < 4.0
     assert not reports[-1].trusted and reports[-1].error > reports[-1].level_error
+    assert (
+        reports[-1].by_camera == {"front": (reports[-1].by_camera["front"])} and reports[-1].by_camera["front"][0] > 0.5
+    )
     assert reports[-1].worst_camera == "front" and "worst from front: adapt the encoder" in reports[-1].explanation
 
 
@@ -123,6 +129,38 @@ def test_what_a_sweep_says_is_used_until_the_ground_says_otherwise():
     assert wrong[0] == 1.0 and wrong[-1] < 0.6
     half = shares(lambda ahead, x: 2.0 * (hill(ahead + x) - hill(x)))
     assert half[0] == 1.0 and (0.4 < half[-1] < 0.7 or half[-1] == 0.0)
+
+
+def test_one_place_alone_decides_nothing():
+    """Level ground, of which prediction and fallback say the same, and one block where they differ."""
+    place = 4.0
+
+    def share(expected, found, length):
+        """The prediction is a bump of 10 cm, the ground found there one of ``found`` metres."""
+        trust = TerrainTrust(GRID, expected)
+
+        def bump(x, height):
+            return np.where((x > place) & (x < place + length), height, 0.0)
+
+        for x in np.arange(0.0, 8.0, 0.1):
+            height = bump(np.broadcast_to(GRID.x, (GRID.rows, GRID.columns)) + x, 0.1)
+            terrain = TerrainMap.from_height(torch.from_numpy(height.astype(np.float32)), GRID)
+            support = np.column_stack([WHEELS, bump(x + WHEELS[:, 0], found)])
+            report = trust.update(at(x), support, terrain, {}, 0.0, TerrainMap.flat(GRID))
+        return report.share
+
+    assert share(1.0, 0.0, 0.2) == 1.0 and share(0.0, 0.1, 0.2) == 0.0
+    assert share(1.0, 0.0, 2.5) < 0.5 and share(0.0, 0.1, 2.5) > 0.6
+
+
+def test_the_command_that_diagnostics_name_is_one():
+    source = TrustedTerrain(FlatTerrain(load_robot("husky"), GRID, TerrainDefaults()), None, [])
+    health = TerrainHealth(None, source, "my robots/husky.yaml", "own.safetensors")
+    words = shlex.split(health.adaptation.partition(" (then ")[0])
+    assert words[:4] == ["ros2", "run", "monoforce_ros", "train"]
+    found = build_parser().parse_args(words[4:])
+    assert found.adapt and [str(bag) for bag in found.bags] == ["BAG"] and str(found.out) == "adapted"
+    assert (found.robot, str(found.start_from)) == ("my robots/husky.yaml", "own.safetensors")
 
 
 def test_half_of_the_ground_is_used_by_half():
@@ -243,6 +281,68 @@ def test_the_fallback_replaces_the_maps_of_a_harmful_encoder(robot):
     for x in np.arange(8.0, 24.0, 0.1):
         trusted.terrain(Observation(int(1e9 * x), cloud=cloud), at(x))
     assert trusted.report.trusted
+
+
+@pytest.fixture(scope="module")
+def believing():
+    """An untrained encoder of both sensors that believes what a sweep measured and says nothing of pictures."""
+    config = EncoderConfig(sensor="camera_lidar", image_width=64, image_height=48, resolution=0.2, edges=False)
+    encoder = new_encoder(config).eval()
+    with torch.no_grad():
+        encoder.heads.weight.zero_()
+        encoder.heads.bias.zero_()
+        encoder.heads.bias[1] = -3.0
+        encoder.heads.bias[[7, 9]] = 3.0
+    return encoder
+
+
+CAMERA = CameraModel(64, 48, np.array([[40.0, 0, 32], [0, 40.0, 24], [0, 0, 1]]), np.zeros(5))
+FORWARD = np.array([[0.0, 0, 1, 0.3], [-1, 0, 0, 0], [0, -1, 0, 0.5], [0, 0, 0, 1]])
+
+
+def seen(x, *, lidar=True, camera=True):
+    """What the sensors of a robot on the hill see: a sweep of the ground around it, a grey picture."""
+    random = np.random.default_rng(1)
+    place = random.uniform(-6.0, 6.0, (6000, 2))
+    cloud = np.column_stack([place, hill(x + place[:, 0]) - hill(x) - 0.1323]).astype(np.float32)
+    names = ["front"] if camera else []
+    return Observation(
+        int(1e9 * x),
+        cloud=cloud if lidar else None,
+        images={name: np.full((48, 64, 3), 90, np.uint8) for name in names},
+        cameras=dict.fromkeys(names, CAMERA),
+        base_from_cameras=dict.fromkeys(names, FORWARD),
+    )
+
+
+def test_a_share_is_that_of_the_sensors_that_there_are(robot, believing):
+    source = EncoderTerrain(believing, robot, ("lidar", "camera"))
+    trusted = TrustedTerrain(source, source, [FlatTerrain(robot, believing.config.grid, TerrainDefaults())])
+    for x in np.arange(0.0, 6.0, 0.1):
+        trusted.terrain(seen(x), at(x, hill(x)))
+    earned = trusted.report.share
+    assert earned > 0.5 and trusted.report.sensors == ("lidar", "camera")
+    # The lidar dies: nothing has confirmed what pictures alone say.
+    terrain = trusted.terrain(seen(6.0, lidar=False), at(6.0, hill(6.0)))
+    assert trusted.report.share == 0.0 and trusted.report.sensors == ("camera",)
+    assert "images alone" in trusted.report.explanation and float(terrain.height.std()) < 1e-6
+    for x in np.arange(6.1, 10.0, 0.1):
+        trusted.terrain(seen(x, lidar=False), at(x, hill(x)))
+    alone = trusted.report
+    assert alone.share < 0.2 and alone.error > 0.1
+    # It is back: so is what both had earned, and ground found meanwhile counts, too.
+    trusted.terrain(seen(10.0), at(10.0, hill(10.0)))
+    assert trusted.report.share > 0.5 and trusted.report.sensors == ("lidar", "camera")
+    trusted.terrain(seen(10.1, camera=False), at(10.1, hill(10.1)))
+    assert trusted.report.share == 0.0 and "sweep alone" in trusted.report.explanation
+    # A covered lidar is none.
+    covered = replace(seen(10.2), cloud=seen(10.2).cloud[:5])
+    trusted.terrain(covered, at(10.2, hill(10.2)))
+    assert trusted.report.sensors == ("camera",) and trusted.report.share < 0.2
+    # An odometry jump ends all of it.
+    trusted.terrain(seen(500.0, lidar=False), at(500.0, hill(500.0), stamp=int(11e9)))
+    trusted.terrain(seen(500.1), at(500.1, hill(500.1), stamp=int(11.1e9)))
+    assert trusted.report.share == 0.0 and np.isnan(trusted.report.error)
 
 
 def test_driven_ground_moves_with_the_robot_and_ends_after_six_metres(robot):

@@ -136,6 +136,11 @@ class Health:
         with self._lock:
             self._parts[part].values.update(values)
 
+    def set_values(self, part: str, values: dict[str, str]) -> None:
+        """Replace a part's values, so that none remains of what no longer holds."""
+        with self._lock:
+            self._parts[part].values = dict(values)
+
     def level(self, part: str) -> bytes:
         """The level last reported for a part."""
         with self._lock:

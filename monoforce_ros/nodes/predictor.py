@@ -42,7 +42,8 @@ from monoforce_ros.nodes.rate_limiter import RateLimiter
 from monoforce_ros.nodes.schema import read_schema, schema_path
 from monoforce_ros.nodes.sensor_decoder import LIDAR, SensorDecoder
 from monoforce_ros.nodes.subscriptions import AdaptiveSubscription, command_types
-from monoforce_ros.perception import Observation, TerrainSource, TrustReport, choose_terrain_source, ground_around
+from monoforce_ros.nodes.terrain_health import TerrainHealth
+from monoforce_ros.perception import Observation, TerrainSource, choose_terrain_source, ground_around
 from monoforce_ros.physics import PhysicsOptions, read_soil
 from monoforce_ros.prediction import FORCE_INTERVAL, Prediction, Predictor
 from monoforce_ros.robots import load_robot
@@ -106,6 +107,7 @@ class PredictorNode(ManagedNode):
         self.predictor.warm_up()
         self.sensor_topics = self._sensor_topics()
         self.health = Health(self, ["odometry", "commands", *self.sensor_topics, "prediction", "live gap"])
+        self._terrain_health = TerrainHealth(self.health, self.predictor.source, settings.robot, settings.checkpoint)
         self.frames = RobotFrames(
             settings.base_frame or self.robot.base_frame,
             {name: pose.double().numpy() for name, pose in self.robot.sensors.items()},
@@ -478,7 +480,7 @@ class PredictorNode(ManagedNode):
                 text = "the odometry cannot be used, see its entry in /diagnostics"
             self.health.report("prediction", ERROR, f"nothing published: {text}", reason=type(error).__name__)
             return
-        self._report_trust()
+        self._terrain_health.report()
         self._predictions += 1
         if self._predictions == 1:
             topic = self.resolve_topic_name("predicted/path")
@@ -489,22 +491,6 @@ class PredictorNode(ManagedNode):
         self._last_prediction = time.monotonic()
         self._durations = [*self._durations[-199:], time.monotonic() - started]
         self.health.report("prediction", OK, "predicting", latency_ms=f"{1e3 * self._durations[-1]:.0f}")
-
-    def _report_trust(self) -> None:
-        """Report how the encoder's earlier predictions agreed with the ground found there."""
-        report = getattr(self.predictor.source, "report", None)
-        if not isinstance(report, TrustReport):
-            return
-        values = {
-            f"error, {distance} [cm] (level ground)": f"{100 * own:.1f} ({100 * level:.1f})"
-            for distance, (own, level) in report.by_distance.items()
-        }
-        if report.trusted:
-            self.health.report("terrain", OK, report.explanation, reason="trusted")
-        else:
-            text = f"falling back, the encoder is not used: {report.explanation}"
-            self.health.report("terrain", WARN, text, reason="not trusted")
-        self.health.report_values("terrain", values)
 
     def _report_ground(self, observation: Observation, motion: MotionState) -> None:
         """Report whether the ground that a lidar sees around the robot is that on which it stands."""

@@ -14,7 +14,8 @@ from monoforce_ros.perception.sources import (
     choose_terrain_source,
 )
 from monoforce_ros.perception.trace import DrivenGround, traced_ground, unbroken
-from monoforce_ros.perception.trust import TerrainTrust, TrustedTerrain, TrustReport
+from monoforce_ros.perception.trust import TerrainTrust, TrustReport
+from monoforce_ros.perception.trusted_terrain import TrustedTerrain
 
 __all__ = [
     "CAMERA_SOURCES",

@@ -49,8 +49,9 @@ class EncoderTerrain:
         robot: the robot on the ground.
         sensors: sensors used, of ``camera`` and ``lidar``; of two sensors either may be absent from an observation.
         threads: CPU threads of the encoder; see :func:`encoder_threads`.
-        material: material of rigid ground, of which shape says little; images tell that of what is soft. By default it
-            is predicted everywhere.
+        material: material of rigid ground, of which neither shape nor look says much (docs/training.md); images tell
+            that of what is soft, its friction relative to the ground for which the encoder was made. By default it is
+            predicted everywhere.
 
     Raises:
         ValueError: the encoder does not take one of the sensors.
@@ -76,6 +77,8 @@ class EncoderTerrain:
         self._driven = DrivenGround(robot, self.stiffness)
         self.start_error = 0.0
         """Median difference between the last map and the ground under the wheels, before they were aligned [m]."""
+        self.used: tuple[str, ...] = ()
+        """Sensors of which the last map was made: a sweep with too few points is left out beside images."""
 
     @property
     def grid(self) -> Grid:
@@ -103,6 +106,8 @@ class EncoderTerrain:
                 require_cells(cells, len(sweep), self.grid)
             elif cells < LidarSettings().minimum_cells:
                 sweep = None
+        had = {"camera": bool(views), "lidar": sweep is not None}
+        self.used = tuple(name for name in self.sensors if had[name])
         trace = self._driven.update(motion, observation.track)
         with encoder_threads(self._threads):
             found = self.encoder.terrain(views, support, sweep=sweep, trace=trace)
@@ -113,7 +118,11 @@ class EncoderTerrain:
         if self._material is None:
             return aligned
         rigid = aligned.with_material(self._material)
-        return material_by_compliance(rigid, aligned) if views else rigid
+        if not views:
+            return rigid
+        usual = self.encoder.config.friction
+        friction = aligned.friction * (self._material.friction / usual) if usual > 0.0 else rigid.friction
+        return material_by_compliance(rigid, replace(aligned, friction=friction))
 
 
 def _with_low_overhead(terrain: TerrainMap, sweep: np.ndarray) -> TerrainMap:

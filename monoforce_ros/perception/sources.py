@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from monoforce_ros.encoder import fused, load_encoder, packed
+from monoforce_ros.encoder import CheckpointError, fused, load_encoder, packed
 from monoforce_ros.perception.encoder_terrain import EncoderTerrain
 from monoforce_ros.perception.flat import FlatTerrain
 from monoforce_ros.perception.fusion import LidarCameraTerrain
 from monoforce_ros.perception.lidar import LidarTerrain
 from monoforce_ros.perception.observation import TerrainSource
 from monoforce_ros.perception.temporal_memory import TemporalMemory
-from monoforce_ros.perception.trust import TrustedTerrain
+from monoforce_ros.perception.trusted_terrain import TrustedTerrain
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import Grid, TerrainDefaults
 
@@ -46,7 +46,7 @@ def choose_terrain_source(
         kind: its name.
         robot: the robot on the ground.
         grid: cells of the maps; sources with cameras use the encoder's. The source ``lidar`` interpolates on any other
-            grid than the encoder's, and where the encoder takes no sweeps.
+            grid than the encoder's, where the encoder takes no sweeps, and without the shipped encoder's files.
         material: material of ground for which the source does not predict it.
         checkpoint: checkpoint of the encoder; empty for the shipped one.
         device: device of the encoder.
@@ -61,7 +61,7 @@ def choose_terrain_source(
 
     Raises:
         ValueError: there is no such source or precision.
-        CheckpointError: the encoder cannot be loaded.
+        CheckpointError: the encoder cannot be loaded, other than the shipped one for the source ``lidar``.
     """
     if kind not in SOURCES:
         raise ValueError(f"terrain source: got {kind!r}, expected one of {SOURCES}")
@@ -83,7 +83,14 @@ def choose_terrain_source(
 
     if kind == "lidar_interpolation":
         return measured(grid or Grid.square())
-    encoder = load_encoder(checkpoint, None if kind == "lidar" else "camera")
+    try:
+        encoder = load_encoder(checkpoint, None if kind == "lidar" else "camera")
+    except CheckpointError as error:
+        # What the user named has to be there; without the shipped encoder a sweep still says where the ground is.
+        if kind != "lidar" or str(checkpoint):
+            raise
+        warn(f"terrain source lidar interpolates the point cloud like lidar_interpolation: {error}")
+        return measured(grid or Grid.square())
     sensors = tuple(name for name in kind.split("_") if name == "camera" or encoder.config.takes_sweeps)
     own_grid = encoder.config.grid
     if kind == "lidar" and (not sensors or grid not in (None, own_grid)):
@@ -93,15 +100,15 @@ def choose_terrain_source(
         return measured(grid or own_grid)
     # Packed weights and half precision save time on the CPU only.
     encoder = packed(fused(encoder, precision)) if device == "cpu" else fused(encoder).to(device)
-    own = EncoderTerrain(encoder, robot, sensors, threads=threads, material=material if "lidar" in sensors else None)
+    own = EncoderTerrain(encoder, robot, sensors, threads=threads, material=material)
     learned: TerrainSource = own
     if retention_time and "camera" in sensors:
-        learned = TemporalMemory(learned, robot, stiffness=encoder.config.stiffness, retention_time=retention_time)
+        learned = TemporalMemory(learned, robot, stiffness=own.stiffness, retention_time=retention_time)
     level, lidar = FlatTerrain(robot, learned.grid, material), LidarTerrain(robot, learned.grid, material)
     if kind == "lidar_camera" and "lidar" not in sensors:
         learned = LidarCameraTerrain(lidar, learned)
-    # With a memory of the images, that of the lidar has nothing to add.
-    recall = None if retention_time and "camera" in sensors else memory(learned)
+    # What the encoder says is remembered already, but counts only as far as it is trusted.
+    recall = None if retention_time and "camera" in sensors and not fallback else memory(learned)
     if fallback:
         if kind == "lidar":
             return TrustedTerrain(learned, own, [lidar], expected=1.0, memory=recall)

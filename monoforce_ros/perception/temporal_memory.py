@@ -39,7 +39,7 @@ class TemporalMemory:
         retention_distance: distance travelled after which a cell is forgotten, since odometry drifts [m].
         blind_zone_only: fill only what lies nearer than all that is observed in its direction. A lidar looks all
             around, and what it sees behind a place shows that nothing stands there any more; what it cannot see below
-            its lowest row of returns may still be there.
+            its lowest row of returns may still be there. Without a sweep all that it measured is kept.
     """
 
     def __init__(
@@ -79,10 +79,19 @@ class TemporalMemory:
 
     def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
         """The source's current map with earlier observations; raises the source's errors."""
-        return self.recalled(self._source.terrain(observation, motion), observation, motion)
+        now = self._source.terrain(observation, motion)
+        return self.recalled(now, observation, motion, swept=observation.cloud is not None)
 
-    def recalled(self, now: TerrainMap, observation: Observation, motion: MotionState) -> TerrainMap:
-        """A current map of the source, or one made of it, with earlier observations."""
+    def recalled(
+        self, now: TerrainMap, observation: Observation, motion: MotionState, *, swept: bool = True
+    ) -> TerrainMap:
+        """A current map of the source, or one made of it, with earlier observations.
+
+        Args:
+            now: the map.
+            observation, motion: from which it was made.
+            swept: whether a lidar's sweep was part of it, without which a memory of the blind zone learns nothing.
+        """
         recalibrated = any(
             not _equal(camera, self._cameras.get(name, camera)) for name, camera in observation.cameras.items()
         )
@@ -102,14 +111,15 @@ class TemporalMemory:
             obstacle = np.zeros_like(fresh)
             # What rose above the line of sight has gone: somebody walked by.
             sight = now.looked_over(self._lidar_height + float(motion.terrain_from_base[2, 3]))
-            kept = fresh & (values[0] <= sight + _SIGHT_TOLERANCE)
+            # But where nothing is measured any more, nothing shows that it has.
+            kept = fresh & (values[0] <= sight + _SIGHT_TOLERANCE) if swept else fresh
         else:
             obstacle = fresh & now.observed.numpy() & self._near & disappeared
             kept = (fresh & ~now.observed.numpy()) | obstacle
         seen = now.observed & ~torch.from_numpy(obstacle)
         if not self._blind_zone_only:
             memory.write(replace(now, observed=seen), motion)
-        elif memory.is_due(motion):
+        elif swept and memory.is_due(motion):
             # A row of returns hits single cells, which would be lost between those of the memory.
             nearby = torch.from_numpy(now.measured_nearby(1.5 * now.grid.resolution))
             memory.write(replace(now, observed=nearby), motion)
