@@ -115,6 +115,8 @@ def maps_from_heads(
     anew would blur the steps of walls and posts into slopes, and a smooth H_d below single leaves would leave spikes in
     H_t. Between such cells, a tenth output says how far the interpolation is believed.
     """
+    # Channel by channel in memory: each is used alone.
+    outputs = outputs.contiguous()
     geometric, decrease, stiffness, damping, friction, geometric_spread, decrease_spread = outputs[:, :_HEADS].unbind(1)
     below = functional.softplus(decrease, beta=_SOFTPLUS_BETA)
     if config.believes:
@@ -165,8 +167,7 @@ def within_returns(maps: EncodedMaps, batch: EncoderInput) -> EncodedMaps:
     if not bool(beyond.any()):
         return maps
     solid = _roughness(sweep) < _PLANE
-    other = (standing & ~solid).float()[:, None]
-    beside = functional.max_pool2d(other, 2 * _BESIDE + 1, 1, _BESIDE)[:, 0] > 0
+    beside = _within(standing & ~solid, _BESIDE)
     change = torch.where(solid & ~(beside & (beyond < 0.0)), beyond, 0.0)
     if not bool(change.any()):
         return maps
@@ -175,6 +176,14 @@ def within_returns(maps: EncodedMaps, batch: EncoderInput) -> EncodedMaps:
              zip(change.cpu().numpy(), standing.cpu().numpy(), plane, strict=True)]  # fmt: skip
     correction = torch.as_tensor(np.stack(added), dtype=change.dtype, device=change.device)
     return replace(maps, geometric_height=maps.geometric_height + correction)
+
+
+def _within(cells: Tensor, reach: int) -> Tensor:
+    """Cells ``[B, rows, columns]`` (bool) with one of ``cells`` in the square of half-width ``reach`` [cells]."""
+    # Squares of 21 × 21 cells take PyTorch's pooling 3 ms, and 0.01 ms row by row and column by column.
+    square = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    pages = [cv2.dilate(page, square) for page in cells.cpu().numpy().astype(np.uint8)]
+    return torch.as_tensor(np.stack(pages), device=cells.device) > 0
 
 
 def _spread_from(changed: np.ndarray) -> np.ndarray:
@@ -210,7 +219,7 @@ def _roughness(sweep: Tensor) -> Tensor:
         pages.append([cv2.boxFilter(term, -1, (size, size), borderType=cv2.BORDER_CONSTANT) for term in terms])
     means = torch.as_tensor(np.array(pages), device=device)
     count = means[:, 0]
-    mx, my, mz, xx, yy, xy, xz, yz, zz, within = (means[:, i] / count.clamp_min(1e-9) for i in range(1, 11))
+    mx, my, mz, xx, yy, xy, xz, yz, zz, within = (means[:, 1:] / count.clamp_min(1e-9)[:, None]).unbind(1)
     xx, yy, zz = xx - mx**2, yy - my**2, zz - mz**2
     xy, xz, yz = xy - mx * my, xz - mx * mz, yz - my * mz
     determinant = xx * yy - xy**2
