@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from monoforce_ros.encoder.config import EncoderConfig
 from monoforce_ros.encoder.edges import restore_edges
-from monoforce_ros.encoder.sweep import BETWEEN, LOWEST, STANDING, TOP
+from monoforce_ros.encoder.sweep import BETWEEN, HIT, LOWEST, STANDING, TOP
 from monoforce_ros.encoder.view import EncoderInput
 from monoforce_ros.terrain import TerrainMap, fill_holes
 
@@ -136,12 +136,19 @@ def maps_from_heads(
         stiffness=config.stiffness * torch.exp(stiffness.clamp(-4.0, 4.0)),
         damping=config.damping * torch.exp(damping.clamp(-4.0, 4.0)),
         friction=config.friction * torch.exp(friction.clamp(-3.0, 1.0)),
-        geometric_spread=config.geometric_spread_factor * _spread(geometric_spread),
+        geometric_spread=_spread_factor(batch, config) * _spread(geometric_spread),
         decrease_spread=config.decrease_spread_factor * _spread(decrease_spread),
         covered=covered,
         evidence=evidence,
         depth=depth,
     )
+
+
+def _spread_factor(batch: EncoderInput, config: EncoderConfig) -> Tensor:
+    """Factor on the spread of H_g of each map ``[B, 1, 1]``: a further one where there is no sweep."""
+    swept = (batch.sweep[:, HIT] > 0).any(dim=(1, 2), keepdim=True) if config.takes_sweeps else None
+    factor = batch.ground.new_full((batch.maps, 1, 1), config.geometric_spread_factor * config.image_spread_factor)
+    return factor if swept is None else torch.where(swept, config.geometric_spread_factor, factor)
 
 
 def _spread(output: Tensor) -> Tensor:
