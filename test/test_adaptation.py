@@ -2,24 +2,40 @@
 
 import copy
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from monoforce_ros.encoder import EncoderConfig, load_encoder, new_encoder, save_encoder
+from monoforce_ros.bags import BagReader, BagWriter
+from monoforce_ros.encoder import EncoderConfig, EncoderInput, load_encoder, new_encoder, save_encoder
 from monoforce_ros.robots import load_robot
 from monoforce_ros.training.adaptation import (
     AdaptationSettings,
     adapt,
     balanced,
+    calibration_and_judging,
     compare,
+    got_worse,
+    judged_adaptation,
     keep_obstacles,
     split_recording,
 )
-from monoforce_ros.training.judgement import CAMERAS, SWEEP, calibrated, judge, judged_maps
+from monoforce_ros.training.judgement import (
+    BOTH,
+    CAMERAS,
+    SWEEP,
+    band_ratios,
+    calibrated,
+    judge,
+    judged_maps,
+    scene_factor,
+    widened,
+)
 from monoforce_ros.training.recording_samples import SamplesError, read_samples
 from monoforce_ros.training.sample_extraction import extract_samples
+from monoforce_ros.training.samples import sample
 from monoforce_ros.training.world_samples import world_samples
 
 CONFIG = EncoderConfig(
@@ -139,6 +155,113 @@ def test_no_more_of_a_change_is_kept_than_lets_obstacles_be_detected(encoder, wo
     assert (found.heads.bias[0] - encoder.heads.bias[0]).item() == pytest.approx(0.5 + share * (height - 0.5), abs=1e-6)
 
 
+def lifted(encoder, by):
+    """A copy whose heights are all higher [m]."""
+    result = copy.deepcopy(encoder)
+    with torch.no_grad():
+        result.heads.bias[0] += by
+    return result
+
+
+def test_weights_that_are_worse_beyond_chance_are_not_kept(encoder, recording):
+    _, held_out = split_recording(recording)
+    # The untrained encoder says the ground that carries the robot.
+    wrong, right = lifted(encoder, 0.6), encoder
+    assert got_worse(right, wrong, [held_out]) == ("surface", "support")
+    assert got_worse(wrong, right, [held_out]) == got_worse(right, right, [held_out]) == ()
+    assert got_worse(right, lifted(right, 0.3), [held_out.subset([0])]) == ("surface", "support")
+
+    chosen, result = judged_adaptation(right, wrong, [held_out], [], 0.75)
+    assert result.share == 0.0 and result.worse == ("surface", "support")
+    assert result.after.median == result.before.median and result.after.support == result.before.support
+    assert all(torch.equal(value, chosen.state_dict()[name]) for name, value in right.state_dict().items())
+    assert "kept nothing of the change: on the held-out part the visible surface and" in result.summary
+
+    chosen, result = judged_adaptation(wrong, right, [held_out], [], 0.75)
+    assert result.share == 0.75 and not result.worse and "kept 75% of the change" in result.summary
+    assert torch.equal(chosen.heads.bias, right.heads.bias)
+
+
+def test_an_encoder_that_is_worse_than_level_ground_is_not_recommended(encoder, recording, tmp_path):
+    _, held_out = split_recording(recording)
+    _, result = judged_adaptation(lifted(encoder, 0.9), lifted(encoder, 0.6), [held_out], [])
+    assert result.share == 1.0 and result.worse_than_level
+    assert "the ground under the wheels is still worse than level ground" in result.summary
+    assert "do not rely on" in result.advice(tmp_path) and "use it with" not in result.advice(tmp_path)
+    good = replace(result, after=replace(result.after, median=0.01, support=0.01))
+    assert not good.worse_than_level and "use it with" in good.advice(tmp_path)
+
+
+def test_bands_are_widened_on_one_half_of_the_held_out_part_and_judged_on_the_other(encoder, recording):
+    _, held_out = split_recording(recording)
+    first, second = calibration_and_judging([held_out])
+    assert first[0].stamps[-1] < second[0].stamps[0] and len(first[0]) + len(second[0]) == len(held_out)
+    assert [len(part) for part in calibration_and_judging([held_out.subset([0])])] == [0, 1]
+    wrong = lifted(encoder, 0.9)
+    assert judge(wrong, second).inside < 0.7
+    chosen, result = judged_adaptation(wrong, wrong, [held_out], [])
+    assert judge(chosen, first).inside == pytest.approx(0.9, abs=0.005)
+    assert result.before.inside == judge(wrong, second).inside < result.after.inside
+    assert f"hold {result.before.inside:.0%} → {result.after.inside:.0%}" in result.summary
+    # Never narrower, and a sweep's own bands stay.
+    sure = copy.deepcopy(encoder)
+    sure.config = replace(sure.config, geometric_spread_factor=50.0, decrease_spread_factor=50.0)
+    assert widened(sure, first).config == sure.config
+    assert chosen.config.geometric_spread_factor == encoder.config.geometric_spread_factor
+
+
+def test_bands_of_images_alone_are_wider_than_those_of_a_sweep(recording):
+    torch.manual_seed(3)
+    encoder = new_encoder(CONFIG).eval()
+    wider = copy.deepcopy(encoder)
+    wider.config = replace(CONFIG, image_spread_factor=1.5)
+    alone, both, swept = (sample(recording, 0, CONFIG, sensors, chunks=1)[0] for sensors in (CAMERAS, BOTH, SWEEP))
+    with torch.no_grad():
+        one, other = (entry(EncoderInput.stack([alone, both, swept])) for entry in (encoder, wider))
+    torch.testing.assert_close(other.geometric_spread[0], 1.5 * one.geometric_spread[0])
+    torch.testing.assert_close(other.geometric_spread[1:], one.geometric_spread[1:])
+    torch.testing.assert_close(other.decrease_spread, one.decrease_spread)
+
+
+def test_bands_hold_what_they_say_in_nine_of_ten_scenes(encoder, recording):
+    assert scene_factor([1.0] * 8) is None and scene_factor([0.5] * 9) == 1.0
+    assert scene_factor([1.0, 1.1, 1.2, 1.3, 1.4, 1.5, 1.6, 1.7, 1.8]) == 1.8
+    assert scene_factor(np.linspace(1.0, 2.0, 19).tolist()) == pytest.approx(1.0 + 17 / 18)
+    random = np.random.default_rng(0)
+    further = [random.lognormal(0.5, 0.3) <= scene_factor(random.lognormal(0.5, 0.3, 24)) for _ in range(2000)]
+    assert np.mean(further) == pytest.approx(23 / 25, abs=0.02)
+    # Nine parts of a recording stand for scenes.
+    scenes = [recording.subset(part.tolist()) for part in np.array_split(np.arange(len(recording)), 9)]
+    found = calibrated(encoder, scenes).config
+    needed = [np.quantile(band_ratios(encoder, [scene]).geometric, 0.9) for scene in scenes]
+    assert found.geometric_spread_factor * found.image_spread_factor == pytest.approx(max(needed), rel=1e-4)
+    assert found.image_spread_factor > 1.0 and calibrated(encoder, scenes[:8]).config.image_spread_factor == 1.0
+    assert calibrated(encoder, scenes, SWEEP).config.image_spread_factor == 1.0
+
+
+def test_wheels_alone_teach_an_encoder_of_a_robot_without_a_lidar(demo_bag, tmp_path, one_thread):
+    bag = tmp_path / "wheels"
+    with BagReader(demo_bag) as reader, BagWriter(bag) as writer:
+        for message in reader.messages():
+            if "PointCloud2" not in message.message_type:
+                writer.write_serialized(message.topic, message.message_type, message.cdr(), message.received)
+    robot = load_robot("husky")
+    recording = read_samples(extract_samples(bag, robot, CONFIG, tmp_path))
+    assert not recording.segments[0].observed.any() and recording.segments[0].contact_mask.any()
+    training, held_out = split_recording(recording)
+    torch.manual_seed(0)
+    start = lifted(new_encoder(CONFIG), 0.2)
+    adapted = adapt(start, robot, [training], [], tmp_path / "out", AdaptationSettings(steps=15, rate=5e-3))
+    _, result = judged_adaptation(start, adapted, [held_out], [])
+    assert result.before.cells == 0 and np.isnan(result.after.median) and not result.worse
+    assert result.before.support > 0.1 and result.after.support < 0.8 * result.before.support
+    assert "visible surface" not in result.summary and "error of the ground under the wheels" in result.summary
+    # What the wheels traced calibrates the bands, too.
+    sure = lifted(start, 0.7)
+    wider = widened(sure, [held_out]).config
+    assert wider.image_spread_factor > 1.0 and wider.decrease_spread_factor > 1.0
+
+
 @pytest.mark.unhurried
 def test_the_executable_adapts_to_a_bag(executables, demo_bag, tmp_path):
     from test_training import run
@@ -152,5 +275,6 @@ def test_the_executable_adapts_to_a_bag(executables, demo_bag, tmp_path):
     assert "held-out part: error of the visible surface" in done.stdout
     assert "randomised worlds: obstacles seen" in done.stdout and "checkpoint:=" in done.stdout
     written = json.loads((tmp_path / "out" / "adaptation.json").read_text())
-    assert set(written) == {"before", "after", "worlds_before", "worlds_after", "share"}
+    assert set(written) == {"before", "after", "worlds_before", "worlds_after", "share", "worse"}
+    assert "level ground" in done.stdout and "% bands hold" in done.stdout
     assert load_encoder(tmp_path / "out" / "encoder.safetensors").config.map_size == CONFIG.map_size

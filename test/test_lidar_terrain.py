@@ -2,9 +2,12 @@
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from monoforce_ros.terrain import Grid, LidarSettings, TerrainError, fill_holes, terrain_from_cloud
 from monoforce_ros.terrain.lidar import cell_heights
+from monoforce_ros.terrain.overhead import by_cell_and_height
 
 GRID = Grid.square(6.4, 0.1)
 
@@ -89,3 +92,35 @@ def test_too_few_returns_are_an_error():
         terrain_from_cloud(np.array([[0.0, 0.0, 0.0], [50.0, 0.0, 0.0]]), GRID)
     heights, observed = cell_heights(np.zeros((0, 3)), GRID, LidarSettings())
     assert not observed.any() and not heights.any()
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 300), st.sampled_from([40, 2**24]), st.floats(1e-3, 1e3), st.integers(0, 2**32 - 1))
+def test_points_are_ordered_by_cell_and_by_height_within_each(count, cells, spread, seed):
+    random = np.random.default_rng(seed)
+    flat, z = random.integers(0, cells, count), random.normal(-100.0, spread, count)
+    z[: count // 4] = np.round(z[: count // 4])
+    order = by_cell_and_height(flat, z)
+    exact = np.lexsort((z, flat))
+    np.testing.assert_array_equal(np.sort(order), np.arange(count))
+    np.testing.assert_array_equal(flat[order], flat[exact])
+    # The key's last digit, for the largest grid and heights of a kilometre.
+    np.testing.assert_allclose(z[order], z[exact], rtol=0, atol=2.0**-52 * cells * 16.0 * max(spread, 1.0))
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 200), st.sampled_from([np.float32, np.float64]), st.integers(0, 2**32 - 1))
+def test_a_point_lies_in_the_cell_whose_centre_is_nearest(count, kind, seed):
+    grid = Grid(rows=30, columns=50, resolution=0.2, origin=(-3.1, 7.3))
+    random = np.random.default_rng(seed)
+    points = random.uniform([-6.0, 4.0], [10.0, 16.0], (count, 2)).astype(kind)
+    points[::7, random.integers(2)] = random.choice([np.nan, np.inf, -np.inf, 1e30])
+    rows, columns, inside = grid.cells(points)
+    assert rows.dtype == columns.dtype == np.int64
+    across, up = np.abs(points[:, :1] - grid.x), np.abs(points[:, 1:] - grid.y)
+    nearest = (across.min(axis=1) < 0.1 - 1e-6) & (up.min(axis=1) < 0.1 - 1e-6)
+    outside = ~((across.min(axis=1) < 0.1 + 1e-6) & (up.min(axis=1) < 0.1 + 1e-6))
+    assert inside[nearest].all() and not inside[outside].any()
+    np.testing.assert_array_equal(columns[nearest], across.argmin(axis=1)[nearest])
+    np.testing.assert_array_equal(rows[nearest], up.argmin(axis=1)[nearest])
+    assert not rows[outside].any() and not columns[outside].any()

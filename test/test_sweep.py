@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from monoforce_ros.encoder import EncoderConfig, encoder_input, extended, load_encoder, new_encoder, save_encoder
 from monoforce_ros.encoder.config import SWEEP_CHANNELS
-from monoforce_ros.encoder.heads import terrain_maps
+from monoforce_ros.encoder.heads import _within, terrain_maps
 from monoforce_ros.encoder.sweep import cell_extremes, sweep_features
 from monoforce_ros.terrain import LidarSettings, cell_heights, terrain_from_cloud
 
@@ -203,3 +203,11 @@ def test_the_height_of_what_stands_is_that_of_the_lidar_map(count, spread, seed)
     rises = features[1] - features[0] > 0.1
     np.testing.assert_array_equal(features[6] > 0, standing)
     np.testing.assert_allclose(features[5], np.where(rises, highest, usual), atol=1e-9)
+
+
+@pytest.mark.parametrize("reach", [1, 10])
+def test_cells_near_others_are_those_that_pooling_finds(reach):
+    cells = torch.rand((3, 40, 60), generator=torch.Generator().manual_seed(4)) > 0.99
+    cells[2] = False
+    pooled = torch.nn.functional.max_pool2d(cells.float()[:, None], 2 * reach + 1, 1, reach)[:, 0] > 0
+    assert torch.equal(_within(cells, reach), pooled)

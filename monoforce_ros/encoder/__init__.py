@@ -9,7 +9,7 @@ from monoforce_ros.encoder.checkpoint import (
     new_encoder,
     save_encoder,
 )
-from monoforce_ros.encoder.config import HEIGHT_CHANNELS, SENSORS, EncoderConfig
+from monoforce_ros.encoder.config import HEIGHT_CHANNELS, SENSORS, SPREAD_FACTORS, EncoderConfig
 from monoforce_ros.encoder.heads import SMALLEST_DECREASE, EncodedMaps
 from monoforce_ros.encoder.inference import fused, multiplies_bfloat16, packed
 from monoforce_ros.encoder.lidar_encoder import LidarEncoder
@@ -21,6 +21,7 @@ __all__ = [
     "HEIGHT_CHANNELS",
     "SENSORS",
     "SMALLEST_DECREASE",
+    "SPREAD_FACTORS",
     "CameraView",
     "CheckpointError",
     "EncodedMaps",

@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from monoforce_ros.encoder.config import EncoderConfig
 from monoforce_ros.encoder.edges import restore_edges
-from monoforce_ros.encoder.sweep import BETWEEN, LOWEST, STANDING, TOP
+from monoforce_ros.encoder.sweep import BETWEEN, HIT, LOWEST, STANDING, TOP
 from monoforce_ros.encoder.view import EncoderInput
 from monoforce_ros.terrain import TerrainMap, fill_holes
 
@@ -115,6 +115,8 @@ def maps_from_heads(
     anew would blur the steps of walls and posts into slopes, and a smooth H_d below single leaves would leave spikes in
     H_t. Between such cells, a tenth output says how far the interpolation is believed.
     """
+    # Channel by channel in memory: each is used alone.
+    outputs = outputs.contiguous()
     geometric, decrease, stiffness, damping, friction, geometric_spread, decrease_spread = outputs[:, :_HEADS].unbind(1)
     below = functional.softplus(decrease, beta=_SOFTPLUS_BETA)
     if config.believes:
@@ -134,12 +136,19 @@ def maps_from_heads(
         stiffness=config.stiffness * torch.exp(stiffness.clamp(-4.0, 4.0)),
         damping=config.damping * torch.exp(damping.clamp(-4.0, 4.0)),
         friction=config.friction * torch.exp(friction.clamp(-3.0, 1.0)),
-        geometric_spread=config.geometric_spread_factor * _spread(geometric_spread),
+        geometric_spread=_spread_factor(batch, config) * _spread(geometric_spread),
         decrease_spread=config.decrease_spread_factor * _spread(decrease_spread),
         covered=covered,
         evidence=evidence,
         depth=depth,
     )
+
+
+def _spread_factor(batch: EncoderInput, config: EncoderConfig) -> Tensor:
+    """Factor on the spread of H_g of each map ``[B, 1, 1]``: a further one where there is no sweep."""
+    swept = (batch.sweep[:, HIT] > 0).any(dim=(1, 2), keepdim=True) if config.takes_sweeps else None
+    factor = batch.ground.new_full((batch.maps, 1, 1), config.geometric_spread_factor * config.image_spread_factor)
+    return factor if swept is None else torch.where(swept, config.geometric_spread_factor, factor)
 
 
 def _spread(output: Tensor) -> Tensor:
@@ -165,8 +174,7 @@ def within_returns(maps: EncodedMaps, batch: EncoderInput) -> EncodedMaps:
     if not bool(beyond.any()):
         return maps
     solid = _roughness(sweep) < _PLANE
-    other = (standing & ~solid).float()[:, None]
-    beside = functional.max_pool2d(other, 2 * _BESIDE + 1, 1, _BESIDE)[:, 0] > 0
+    beside = _within(standing & ~solid, _BESIDE)
     change = torch.where(solid & ~(beside & (beyond < 0.0)), beyond, 0.0)
     if not bool(change.any()):
         return maps
@@ -175,6 +183,14 @@ def within_returns(maps: EncodedMaps, batch: EncoderInput) -> EncodedMaps:
              zip(change.cpu().numpy(), standing.cpu().numpy(), plane, strict=True)]  # fmt: skip
     correction = torch.as_tensor(np.stack(added), dtype=change.dtype, device=change.device)
     return replace(maps, geometric_height=maps.geometric_height + correction)
+
+
+def _within(cells: Tensor, reach: int) -> Tensor:
+    """Cells ``[B, rows, columns]`` (bool) with one of ``cells`` in the square of half-width ``reach`` [cells]."""
+    # Squares of 21 × 21 cells take PyTorch's pooling 3 ms, and 0.01 ms row by row and column by column.
+    square = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    pages = [cv2.dilate(page, square) for page in cells.cpu().numpy().astype(np.uint8)]
+    return torch.as_tensor(np.stack(pages), device=cells.device) > 0
 
 
 def _spread_from(changed: np.ndarray) -> np.ndarray:
@@ -210,7 +226,7 @@ def _roughness(sweep: Tensor) -> Tensor:
         pages.append([cv2.boxFilter(term, -1, (size, size), borderType=cv2.BORDER_CONSTANT) for term in terms])
     means = torch.as_tensor(np.array(pages), device=device)
     count = means[:, 0]
-    mx, my, mz, xx, yy, xy, xz, yz, zz, within = (means[:, i] / count.clamp_min(1e-9) for i in range(1, 11))
+    mx, my, mz, xx, yy, xy, xz, yz, zz, within = (means[:, 1:] / count.clamp_min(1e-9)[:, None]).unbind(1)
     xx, yy, zz = xx - mx**2, yy - my**2, zz - mz**2
     xy, xz, yz = xy - mx * my, xz - mx * mz, yz - my * mz
     determinant = xx * yy - xy**2

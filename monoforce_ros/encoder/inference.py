@@ -15,6 +15,7 @@ from torch.nn.utils import fuse_conv_bn_eval, skip_init
 
 from monoforce_ros.encoder.backbone import NormedConvolution
 from monoforce_ros.encoder.checkpoint import Encoder
+from monoforce_ros.encoder.terrain_encoder import TerrainEncoder
 
 PRECISIONS = ("auto", "float32", "bfloat16")
 
@@ -52,6 +53,8 @@ def fused(encoder: Encoder, precision: str = "float32") -> Encoder:
                     if isinstance(convolution, nn.Conv2d):
                         convolution.weight.data = _rounded(convolution.weight.data)
                 part.to(torch.bfloat16)
+    if isinstance(encoder, TerrainEncoder):
+        encoder.bird.keep_last(encoder.other_inputs)
     return encoder.to(memory_format=torch.channels_last)
 
 
@@ -72,6 +75,8 @@ def packed(encoder: Encoder) -> Encoder:
             parent.bounded = False
         elif isinstance(parent, nn.Sequential):
             _pack_sequence(parent)
+    if _packs(encoder.heads):
+        encoder.register_module("heads", _PackedConvolution(encoder.heads, _ACTIVATIONS[None]))
     return encoder
 
 

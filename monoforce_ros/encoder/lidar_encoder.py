@@ -30,7 +30,8 @@ class LidarEncoder(nn.Module):
     def forward(self, batch: EncoderInput) -> EncodedMaps:
         """Predict maps from a batch with sweeps."""
         sweep = batch.sweep[:, : self.config.sweep_channels]
-        outputs = self.heads(self.bird(torch.cat([sweep, batch.support], dim=1))).float()
+        features = torch.cat([sweep, batch.support], dim=1).to(self.bird.dtype)
+        outputs = self.heads(self.bird(features).to(self.heads.weight.dtype)).float()
         hit = batch.sweep[:, HIT]
         return maps_from_heads(outputs, batch, self.config, torch.ones_like(hit, dtype=torch.bool), hit)
 

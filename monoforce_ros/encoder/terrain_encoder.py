@@ -62,10 +62,7 @@ class TerrainEncoder(nn.Module):
             nn.init.zeros_(self.relative.weight)
             assert self.relative.bias is not None
             nn.init.zeros_(self.relative.bias)
-        inputs = (
-            config.image_features + MOMENTS + SUPPORT_CHANNELS + (config.sweep_channels if config.takes_sweeps else 0)
-        )
-        self.bird = BirdsEyeNetwork(inputs, config.map_features)
+        self.bird = BirdsEyeNetwork(config.image_features + MOMENTS + self.other_inputs, config.map_features)
         self.heads = map_heads(config)
         depths = torch.from_numpy(depth_values(config)).float()
         self.register_buffer("depths", depths, persistent=False)
@@ -90,6 +87,11 @@ class TerrainEncoder(nn.Module):
         self.level_weight.requires_grad_(False)
 
     @property
+    def other_inputs(self) -> int:
+        """Inputs of the bird's-eye-view network besides those of images, the last ones."""
+        return SUPPORT_CHANNELS + (self.config.sweep_channels if self.config.takes_sweeps else 0)
+
+    @property
     def _image_parts(self) -> list[nn.Module]:
         relative = [self.relative] if self.config.relative_bins else []
         return [self.backbone, self.context, self.neck, self.lift, *relative]
@@ -110,16 +112,16 @@ class TerrainEncoder(nn.Module):
         """Predict maps from a batch."""
         config, grid = self.config, self.config.grid
         shape = (batch.maps, grid.rows, grid.columns)
-        if len(batch.images):
-            image_features, covered, evidence, depth = self._splat(batch)
-        else:
-            device = batch.support.device
-            image_features = torch.zeros(batch.maps, config.image_features + MOMENTS, *shape[1:], device=device)
-            covered, evidence, depth = torch.zeros(shape, dtype=torch.bool, device=device), None, None
-        parts = [image_features, batch.support]
+        parts = [batch.support]
         if config.takes_sweeps:
             parts.append(batch.sweep[:, : config.sweep_channels])
-        features = torch.cat([part.to(image_features.dtype) for part in parts], dim=1).to(self.lift.weight.dtype)
+        if len(batch.images):
+            image_features, covered, evidence, depth = self._splat(batch)
+            parts = [image_features, *(part.to(image_features.dtype) for part in parts)]
+        else:
+            # The bird's-eye-view network takes what is left out for zeros.
+            covered, evidence, depth = torch.zeros(shape, dtype=torch.bool, device=batch.support.device), None, None
+        features = torch.cat(parts, dim=1).to(self.lift.weight.dtype)
         if not features.is_cuda:
             features = features.contiguous(memory_format=torch.channels_last)
         outputs = self.heads(self.bird(features).to(self.heads.weight.dtype)).float()

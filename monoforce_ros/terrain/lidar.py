@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from monoforce_ros.terrain.grid import Grid
-from monoforce_ros.terrain.overhead import beyond_gap
+from monoforce_ros.terrain.overhead import beyond_gap, by_cell_and_height
 from monoforce_ros.terrain.scatter import horizontal_scatter
 from monoforce_ros.terrain.terrain_map import TerrainDefaults, TerrainMap, polar
 
@@ -198,7 +198,7 @@ def cell_quantiles(
     shape = (len(quantiles), grid.rows, grid.columns)
     if not len(z):
         return heights.reshape(shape), observed
-    order = np.lexsort((z, flat))
+    order = by_cell_and_height(flat, z)
     flat, z = flat[order], z[order]
     # Within a cell, only returns below the first gap belong to the ground.
     ground = ~beyond_gap(flat, z, settings.headroom)

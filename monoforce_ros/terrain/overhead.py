@@ -135,6 +135,24 @@ def _floors(
     return flat, z, floor, inside
 
 
+def by_cell_and_height(cells: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Order ``[n]`` of points by cell, and by height within each.
+
+    One key in double precision is sorted ten times as fast as two. It tells heights of a map of 12.8 m in cells of
+    0.1 m apart that differ by 10⁻¹¹ m or more, and those of the largest grid by 10⁻⁸ m; nearer ones come in any order.
+
+    Args:
+        cells: flat index of the cell of each point ``[n]``, up to 2²⁴.
+        z: finite heights ``[n]`` [m].
+    """
+    if not len(z):
+        return np.zeros(0, np.int64)
+    low = float(z.min())
+    # More than the heights' range, so that no cell reaches into the next one; a power of two multiplies exactly.
+    span = 2.0 ** (np.floor(np.log2(max(float(z.max()) - low, 1.0))) + 1.0)
+    return np.argsort(cells * span + (z - low))
+
+
 def beyond_gap(cells: np.ndarray, z: np.ndarray, headroom: float) -> np.ndarray:
     """Points above a gap of ``headroom`` in their cell, ``[n]`` bool; sorted by cell, and by height within each."""
     first = np.r_[True, cells[1:] != cells[:-1]]
@@ -148,8 +166,8 @@ def _tops_before(top: np.ndarray, grid: Grid) -> np.ndarray:
     ring = (distance / grid.resolution).astype(int).ravel()
     sector = sector.ravel()
     highest = np.full((int(sector.max()) + 1, int(ring.max()) + 2), -np.inf)
-    # One further: what stands in the cell itself is not before it.
-    np.maximum.at(highest, (sector, ring + 1), top)
+    # One further: what stands in the cell itself is not before it. Pairs of indices take four times as long.
+    np.maximum.at(highest.ravel(), sector * highest.shape[1] + ring + 1, top)
     beside = np.max([np.roll(highest, by, axis=0) for by in (-1, 0, 1)], axis=0)
     return np.maximum.accumulate(beside, axis=1)[sector, ring]
 
@@ -162,6 +180,6 @@ def _above_gaps(cells: np.ndarray, z: np.ndarray, floor: np.ndarray, headroom: f
     index = np.flatnonzero(high[cells])
     if not len(index):
         return result
-    order = index[np.lexsort((z[index], cells[index]))]
+    order = index[by_cell_and_height(cells[index], z[index])]
     result[order] = beyond_gap(cells[order], z[order], headroom)
     return result

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy import stats
 
 from monoforce_ros.encoder import Encoder
 from monoforce_ros.robots import RobotModel
-from monoforce_ros.training.judgement import CAMERAS, SWEEP, Judgement, judge
+from monoforce_ros.training.judgement import CAMERAS, SWEEP, Judgement, judge, sample_errors, widened
 from monoforce_ros.training.losses import LossWeights
 from monoforce_ros.training.recording_samples import RecordingSamples, SamplesError
 from monoforce_ros.training.sample_extraction import TARGET_REACH
@@ -26,6 +27,10 @@ REPLAY_WORLDS = 8
 """Randomised worlds that are trained on alongside, so that walls and grass are not forgotten."""
 SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
 """Shares of the change of the weights that :func:`keep_obstacles` tries."""
+BLOCK = 2.0
+"""Length of the blocks of a held-out part whose mean errors are compared [s]: neighbouring samples see one ground."""
+_LEVEL = 0.05
+"""Error rate at which an adaptation that made nothing worse is taken back."""
 LOST_OBSTACLES = 0.02
 """How far the share of detected obstacles may fall: a requirement, not a measurement."""
 
@@ -53,24 +58,43 @@ class Adaptation:
     worlds_after: Judgement | None
     """On randomised worlds that neither training saw; None without them."""
     share: float = 1.0
-    """Share of the change of the weights that was kept; see :func:`keep_obstacles`."""
+    """Share of the change of the weights that was kept; see :func:`keep_obstacles` and :func:`got_worse`."""
+    worse: tuple[str, ...] = ()
+    """What the adaptation made worse beyond chance, so that none of it was kept: ``surface``, ``support``."""
+
+    @property
+    def worse_than_level(self) -> bool:
+        """Whether level ground at the height of the wheels is still the better guess."""
+        after = self.after
+        return after.median > after.level or after.support > after.support_level
 
     @property
     def summary(self) -> str:
         """The result in words."""
-        lines = [
-            f"kept {self.share:.0%} of the change, so that obstacles in randomised worlds stay detected",
-        ]
-        if np.isfinite(self.before.median):
+        if self.worse:
+            names = " and ".join(_NAMES[name] for name in self.worse)
+            lines = [
+                f"kept nothing of the change: on the held-out part {names} became worse beyond chance; the weights are "
+                "those from before"
+            ]
+        elif self.share == 0.0:
+            lines = ["kept nothing of the change: with any part of it obstacles in randomised worlds were missed"]
+        else:
+            lines = [f"kept {self.share:.0%} of the change, so that obstacles in randomised worlds stay detected"]
+        for name, before, after, level, inside in (
+            ("surface", self.before.median, self.after.median, self.after.level,
+             (self.before.inside, self.after.inside)),
+            ("support", self.before.support, self.after.support, self.after.support_level,
+             (self.before.support_inside, self.after.support_inside)),
+        ):  # fmt: skip
+            if not np.isfinite(before):
+                continue
             lines.append(
-                f"held-out part: error of the visible surface {_cm(self.before.median)} → {_cm(self.after.median)} "
-                f"(level ground {_cm(self.before.level)})"
+                f"held-out part: error of {_NAMES[name]} {_cm(before)} → {_cm(after)} (level ground {_cm(level)}); its "
+                f"90 % bands hold {inside[0]:.0%} → {inside[1]:.0%}"
             )
-        if np.isfinite(self.before.support):
-            lines.append(
-                f"held-out part: error of the ground under the wheels {_cm(self.before.support)} → "
-                f"{_cm(self.after.support)} (level ground {_cm(self.before.support_level)})"
-            )
+            if after > level:
+                lines.append(f"held-out part: {_NAMES[name]} is still worse than level ground")
         if self.worlds_before is not None and self.worlds_after is not None:
             lines.append(
                 f"randomised worlds: obstacles seen {self.worlds_before.obstacles:.0%} → "
@@ -78,6 +102,21 @@ class Adaptation:
                 f"{self.worlds_after.clear:.0%}"
             )
         return "\n".join(lines)
+
+    def advice(self, checkpoint: Path) -> str:
+        """What to do with the result."""
+        if self.worse_than_level:
+            return (
+                f"do not rely on {checkpoint} yet: with a lidar use terrain_source:=lidar, otherwise leave "
+                "camera_fallback on; check the cameras' poses and calibrations (evaluate --check), and adapt to one to "
+                "three minutes of driving over uneven ground"
+            )
+        if self.share == 0.0:
+            return f"{checkpoint} has the weights from before; its bands are as wide as this robot's errors ask for"
+        return f"use it with checkpoint:={checkpoint}"
+
+
+_NAMES = {"surface": "the visible surface", "support": "the ground under the wheels"}
 
 
 def split_recording(recording: RecordingSamples) -> tuple[RecordingSamples, RecordingSamples]:
@@ -195,18 +234,86 @@ def balanced(own: Sequence[RecordingSamples], replay: Sequence[RecordingSamples]
     return [*list(own) * repeats[0], *list(replay) * repeats[1]]
 
 
+def got_worse(before: Encoder, after: Encoder, held_out: Sequence[RecordingSamples]) -> tuple[str, ...]:
+    """What became worse beyond chance on samples that the adaptation did not see: ``surface``, ``support``.
+
+    Differences of the errors are averaged over blocks of :data:`BLOCK`, and their mean is compared with its standard
+    error (Student's t, one-sided, 5 %). A single block has none; there any increase counts.
+    """
+    sensors = _sensors(before)
+    found: dict[str, list[float]] = {"surface": [], "support": []}
+    for recording in held_out:
+        errors = [sample_errors(encoder, recording, sensors) for encoder in (before, after)]
+        blocks = ((recording.stamps - recording.stamps[0]) / (BLOCK * 1e9)).astype(int)
+        for name, values in found.items():
+            change = errors[1][name] - errors[0][name]
+            parts = [change[(blocks == block) & np.isfinite(change)] for block in np.unique(blocks)]
+            values += [float(part.mean()) for part in parts if len(part)]
+    return tuple(name for name, values in found.items() if values and _above_zero(np.array(values)))
+
+
+def _above_zero(values: np.ndarray) -> bool:
+    mean = float(values.mean())
+    if len(values) < 2:
+        return mean > 0.0
+    error = float(values.std(ddof=1)) / np.sqrt(len(values))
+    return mean > error * float(stats.t.ppf(1.0 - _LEVEL, len(values) - 1))
+
+
+def calibration_and_judging(
+    held_out: Sequence[RecordingSamples],
+) -> tuple[list[RecordingSamples], list[RecordingSamples]]:
+    """First and second halves of held-out parts: bands that were widened on a part would look right there.
+
+    A part of a single sample is judged on.
+    """
+    middles = [len(recording) // 2 for recording in held_out]
+    return (
+        [part.subset(list(range(middle))) for part, middle in zip(held_out, middles, strict=True) if middle],
+        [part.subset(list(range(middle, len(part)))) for part, middle in zip(held_out, middles, strict=True)],
+    )
+
+
+def judged_adaptation(
+    before: Encoder,
+    adapted: Encoder,
+    held_out: Sequence[RecordingSamples],
+    worlds: Sequence[RecordingSamples],
+    share: float = 1.0,
+) -> tuple[Encoder, Adaptation]:
+    """The encoder to use, and what it is worth.
+
+    Its weights are those from before where the adapted ones are worse beyond chance on the held-out part. Its bands are
+    widened on the first half of that part where they hold too little, and the second half judges the result.
+
+    Args:
+        before: encoder before the adaptation.
+        adapted: after it, from :func:`keep_obstacles`.
+        held_out: held-out parts of the robot's recordings.
+        worlds: randomised worlds of neither training.
+        share: share of the change that ``adapted`` has.
+    """
+    worse = got_worse(before, adapted, held_out) if share else ()
+    chosen, share = (before, 0.0) if worse else (adapted, share)
+    calibration, judging = calibration_and_judging(held_out)
+    if calibration:
+        chosen = widened(chosen, calibration, _sensors(before))
+    return chosen, compare(before, chosen, judging, worlds, share, worse)
+
+
 def compare(
     before: Encoder,
     after: Encoder,
     held_out: Sequence[RecordingSamples],
     worlds: Sequence[RecordingSamples],
     share: float = 1.0,
+    worse: tuple[str, ...] = (),
 ) -> Adaptation:
     """Errors before and after on samples that neither training saw."""
     sensors = _sensors(before)
     judged = [judge(encoder, held_out, sensors) for encoder in (before, after)]
     others = [judge(encoder, worlds, sensors) if worlds else None for encoder in (before, after)]
-    return Adaptation(judged[0], judged[1], others[0], others[1], share)
+    return Adaptation(judged[0], judged[1], others[0], others[1], share, worse)
 
 
 def _sensors(encoder: Encoder) -> Augmentation:

@@ -17,6 +17,7 @@ from monoforce_ros.bags import BagError, add_read_options
 from monoforce_ros.core import OptionParser, without_nan, write_text
 from monoforce_ros.encoder import (
     SENSORS,
+    SPREAD_FACTORS,
     CheckpointError,
     Encoder,
     EncoderConfig,
@@ -35,7 +36,7 @@ from monoforce_ros.training.adaptation import (
     SHARES,
     AdaptationSettings,
     adapt,
-    compare,
+    judged_adaptation,
     keep_obstacles,
     shares_targets,
     split_recording,
@@ -402,11 +403,11 @@ def _adapt(options: argparse.Namespace) -> None:
         adapted = adapt(encoder, robot, [part[0] for part in parts], replay, options.out, settings, advance)
     with progress_bar(len(SHARES), label="obstacles", unit="judgement", quiet=options.quiet) as bar:
         adapted, share = keep_obstacles(encoder, adapted, choosing, bar.update)
-    save_encoder(adapted, options.out / "encoder.safetensors")
-    result = compare(encoder, adapted, [part[1] for part in parts], judging, share)
+    chosen, result = judged_adaptation(encoder, adapted, [part[1] for part in parts], judging, share)
+    save_encoder(chosen, options.out / "encoder.safetensors")
     write_text(options.out / "adaptation.json", json.dumps(without_nan(asdict(result)), indent=1) + "\n")
     print(result.summary)
-    print(f"use it with checkpoint:={options.out / 'encoder.safetensors'}")
+    print(result.advice(options.out / "encoder.safetensors"))
 
 
 def _with_vegetation(
@@ -442,7 +443,7 @@ def _with_vegetation(
 def _encoder(options: argparse.Namespace, config: EncoderConfig, start: Encoder | None) -> Encoder:
     if start is not None:
         found, expected = asdict(start.config), asdict(config)
-        free = {"decreases", "edges", "geometric_spread_factor", "decrease_spread_factor", "sweep_channels"}
+        free = {"decreases", "edges", *SPREAD_FACTORS, "sweep_channels"}
         if isinstance(start, TerrainEncoder) and not start.config.relative_bins:
             free |= {"relative_bins"}
         names = [n for n in expected if n not in free and expected[n] != found[n]]
@@ -471,8 +472,7 @@ def _config(options: argparse.Namespace, start: Encoder | None) -> EncoderConfig
         decreases=options.losses != ["geometric"],
         edges=options.losses != ["geometric"] if options.edges is None else options.edges,
         # Without held-out recordings nothing calibrates them anew.
-        geometric_spread_factor=given.geometric_spread_factor,
-        decrease_spread_factor=given.decrease_spread_factor,
+        **{name: getattr(given, name) for name in SPREAD_FACTORS},
     )
 
 
