@@ -427,15 +427,21 @@ def test_a_second_report_of_a_platform_is_refused_and_one_that_is_asked_for_is_m
         monkeypatch.setattr("sys.argv", ["run.py", *arguments, *more])
         return platforms_run.main()
 
-    # Recorded and diagnosed in an earlier call.
+    # Recorded and diagnosed in an earlier call, without wheel speeds, too; there is no IMU.
     files = CaseFiles.of(case, tmp_path)
-    result = tmp_path / "results" / "code" / "cases" / f"{case.name}.json"
-    truth = row | {"usable": True, "ground": case.ground, "displacement_m": []}
-    for file, content in ((files.truth, truth), (result, row)):
+    result, ablated = (
+        tmp_path / "results" / folder / "cases" / f"{case.name}.json" for folder in ("code", "code-wheels")
+    )
+    alarm, sensors = row | {"verdict": "unknown_effect"}, {"wheels": True, "gyro": False}
+    truth = row | {"usable": True, "ground": case.ground, "displacement_m": [], "sensors": sensors}
+    for file, content in ((files.truth, truth), (result, row), (ablated, alarm)):
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(json.dumps(content))
-    assert run() == 0
-    assert json.loads((tmp_path / "rows.json").read_text())["rows"] == [row]
+    assert run("--ablations") == 0
+    content = json.loads((tmp_path / "rows.json").read_text())
+    assert content["rows"] == [row] and content["without"] == {"wheels": [alarm], "imu": []}
+    assert content["seconds"].keys() == {"recording", "diagnoses", "ablations"}
+    assert "| with wheels | without wheels | with imu | without imu |" in capsys.readouterr().out
     assert [entry.code for entry in read_ledger(tmp_path / "reported.json")] == ["code"]
     assert run() == 0
     capsys.readouterr()
