@@ -3,13 +3,15 @@
 # make test-lowest  run the tests without nodes with the lowest supported versions (Ubuntu 24.04's), in .venv-lowest
 # make interfaces build monoforce_msgs, the typed message for planners, into install/ (takes a C++ compiler)
 # make bench  run the benchmarks
-# make diagnosis  measure diagnose on drawn platforms in two engines (up to six hours, resumable), on hidden effects and
-#                 real drives (an hour), write the tables of docs/discrepancy.md and docs/physics.md
+# make diagnosis  measure diagnose on drawn platforms in two engines, beside other methods and without wheels or IMU (up to
+#                 six hours on two cores, resumable), write the tables of docs/discrepancy.md
 # make diagnosis-quick  measure diagnose on six drawn platforms (about 15 minutes), write nothing to the documents
+# make diagnosis-effects  measure diagnose on hidden effects in the package's own simulator (an hour), write their tables
+# make diagnosis-real  measure diagnose on real drives (an hour), write the tables of docs/discrepancy.md and docs/physics.md
 # make checkpoint train the shipped terrain encoder on randomised worlds, from nothing (a night)
 # make tables     compare terrain sources on worlds that no training saw, as the paper's tables do (three hours, resumable)
 SHELL := /bin/bash
-.PHONY: demo test test-lowest interfaces bench diagnosis diagnosis-quick engines checkpoint tables lint environment build graphics lock clean help
+.PHONY: demo test test-lowest interfaces bench diagnosis diagnosis-quick diagnosis-effects diagnosis-real engines checkpoint tables lint environment build graphics lock clean help
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
@@ -69,7 +71,7 @@ bench: build interfaces
 	@scripts/run.sh python benchmarks/mujoco_check.py --json out/mujoco_check.json
 	@scripts/run.sh python benchmarks/encoder.py --json out/encoder.json
 
-DRIVES ?= $(or $(MONOFORCE_REAL_DATA),../shared/data)/drive
+REAL_DATA ?= $(or $(MONOFORCE_REAL_DATA),../shared/data)
 engines:
 	@.venv/bin/uv pip install --quiet --python .venv/bin/python -r benchmarks/requirements.txt
 	@.venv/bin/uv pip install --quiet --python .venv/bin/python --no-deps -r benchmarks/engines.txt
@@ -79,12 +81,19 @@ diagnosis-quick: build engines
 
 diagnosis: build graphics engines
 	@mkdir -p out
-	@scripts/run.sh python benchmarks/platforms/run.py --set reporting --baselines --json out/platforms.json --docs docs/discrepancy.md
+	@scripts/run.sh python benchmarks/platforms/run.py --set reporting --baselines --ablations --json out/platforms.json \
+	  --docs docs/discrepancy.md
+
+diagnosis-effects: build graphics engines
+	@mkdir -p out
 	@scripts/run.sh python benchmarks/hidden_effects.py --baselines --json out/hidden_effects.json --docs docs/discrepancy.md
-	@if [ -d "$(DRIVES)" ]; then scripts/run.sh python benchmarks/warthog_reports.py "$(DRIVES)" \
+
+diagnosis-real: build
+	@mkdir -p out
+	@if [ -d "$(REAL_DATA)/drive" ]; then scripts/run.sh python benchmarks/warthog_reports.py "$(REAL_DATA)" \
 	  --json out/warthog.json --docs docs/discrepancy.md && \
-	  scripts/run.sh python benchmarks/steady_turns.py "$(DRIVES)"/*.npz --json out/steady_turns.json --docs docs/physics.md; \
-	  else echo "[diagnosis] no real drives at $(DRIVES)"; fi
+	  scripts/run.sh python benchmarks/steady_turns.py "$(REAL_DATA)"/drive/*.npz --json out/steady_turns.json --docs docs/physics.md; \
+	  else echo "[diagnosis-real] no real drives in $(REAL_DATA)"; fi
 
 checkpoint: build graphics
 	@scripts/train_checkpoint.sh

@@ -1,8 +1,9 @@
-"""Baselines for ``hidden_effects.py``: other ways to reduce the error, cross-validated on the same folds.
+"""Baselines of ``hidden_effects.py`` and ``platforms``: other ways to reduce the error, cross-validated on equal folds.
 
 ``refit``: the commissioning parameters, refitted. ``network``: a small neural network that predicts the model's
 error at the end of a window from its start state and commands. ``sindy``: accelerations by sparse regression (pysindy)
-instead of the physics, integrated from the start of each window.
+instead of the physics, integrated from the start of each window. ``mujoco_sysid``: the robot's MuJoCo model with all
+its parameters free (``mujoco_sysid.py``).
 
 Baselines are trained and tested on all windows of a fold, including those that reach into the next block; ``diagnose``
 is tested only on windows that end within their block.
@@ -10,8 +11,10 @@ is tested only on windows that end within their block.
 
 from __future__ import annotations
 
+import time
 import warnings
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -28,24 +31,75 @@ _STEP = 0.05
 _HISTORY = 0.5
 
 
+METHODS = ("refit", "network", "sindy")
+SYSID_SECONDS = 60.0
+"""Of a processor for MuJoCo's system identification on each of the two folds: together more than ``diagnose`` takes for
+its whole search. The other methods end by themselves long before."""
+
+
+@dataclass(frozen=True)
+class BaselineErrors:
+    """What a method leaves of windows to which it was not fitted.
+
+    Attributes:
+        residuals: predicted minus measured at the last sample, ``[W, 3]`` [m, m, rad].
+        seconds: of a processor for all folds.
+    """
+
+    residuals: np.ndarray
+    seconds: float
+
+    @property
+    def median(self) -> float:
+        """Median position error [m]."""
+        return float(np.median(np.hypot(self.residuals[:, 0], self.residuals[:, 1])))
+
+
 def baseline_errors(
-    evidence: Evidence, data: EvidenceWindows, robot: RobotModel, scale: np.ndarray
-) -> dict[str, np.ndarray]:
-    """Residuals ``[W, 3]`` at the last sample of each window, for each baseline trained on the other folds."""
-    predictions = Predictions(robot, data)
-    before = predictions.residuals([()])[0][:, -1]
+    evidence: Evidence, data: EvidenceWindows, robot: RobotModel, scale: np.ndarray, methods: tuple[str, ...] = METHODS
+) -> dict[str, BaselineErrors]:
+    """Errors of each method, trained on the other folds.
+
+    Args:
+        evidence: of the recording.
+        data: its windows.
+        robot: nominal, with the effects of its file.
+        scale: of residuals ``[K, 3]`` [m, m, rad].
+        methods: of :data:`METHODS`, and ``mujoco_sysid``.
+    """
+    before = Predictions(robot, data).residuals([()])[0][:, -1]
     folds = folds_of(data.starts, 2)
-    results = {name: before.copy() for name in ("refit", "network", "sindy")}
     features = _features(data)
-    for fold in np.unique(folds):
-        fitted, held_out = folds != fold, folds == fold
-        train, test = replace(data, starts=data.starts[fitted]), replace(data, starts=data.starts[held_out])
+
+    def refit(train: EvidenceWindows, test: EvidenceWindows, _: np.ndarray) -> np.ndarray:
         present = dict(robot.effects)
         start = tuple((name, dict(present.get(name, values))) for name, values in COMMISSIONED)
         fit = fit_effects(Predictions(robot, train), [start], scale, iterations=6)
-        results["refit"][held_out] = Predictions(robot, test).residuals([fit.effects])[0][:, -1]
-        results["network"][held_out] = before[held_out] - _network(features[fitted], before[fitted], features[held_out])
-        results["sindy"][held_out] = _sindy(evidence, train, test)
+        return Predictions(robot, test).residuals([fit.effects])[0][:, -1]
+
+    def network(_train: EvidenceWindows, _test: EvidenceWindows, held_out: np.ndarray) -> np.ndarray:
+        predicted = _network(features[~held_out], before[~held_out], features[held_out])
+        return before[held_out] - predicted
+
+    def sindy(train: EvidenceWindows, test: EvidenceWindows, _: np.ndarray) -> np.ndarray:
+        return _sindy(evidence, train, test)
+
+    def mujoco_sysid(train: EvidenceWindows, test: EvidenceWindows, _: np.ndarray) -> np.ndarray:
+        from mujoco_sysid import held_out_errors
+
+        return held_out_errors(robot, train, test, scale, SYSID_SECONDS)
+
+    known: dict[str, Callable[[EvidenceWindows, EvidenceWindows, np.ndarray], np.ndarray]] = {
+        "refit": refit, "network": network, "sindy": sindy, "mujoco_sysid": mujoco_sysid,
+    }  # fmt: skip
+    results = {}
+    for name in methods:
+        began, residuals = time.process_time(), before.copy()
+        for fold in np.unique(folds):
+            held_out = folds == fold
+            train, test = (replace(data, starts=data.starts[part]) for part in (~held_out, held_out))
+            residuals[held_out] = known[name](train, test, held_out)
+        results[name] = BaselineErrors(residuals, time.process_time() - began)
     return results
 
 

@@ -101,7 +101,7 @@ def with_baselines(result: dict, bag: Path, robot: Path, row: Path) -> dict:
     nominal = None if nominal is None else nominal.of_motion()
     scale = np.sqrt((residual_scale(floor, data, nominal) ** 2).reshape(-1, *floor.shape).mean(axis=0))
     errors = baseline_errors(evidence, data, model, scale)
-    result["baselines"] = {name: float(np.median(np.hypot(e[:, 0], e[:, 1]))) for name, e in errors.items()}
+    result["baselines"] = {name: entry.median for name, entry in errors.items()}
     row.write_text(json.dumps(result, indent=1))
     return result
 

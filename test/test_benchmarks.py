@@ -1,8 +1,10 @@
 """The benchmarks run, and the outside check against MuJoCo holds; durations decide nothing here."""
 
 import json
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from conftest import ROOT
@@ -105,3 +107,49 @@ def test_latency_is_measured_between_processes(tmp_path):
     assert done.returncode == 0, done.stderr
     (row,) = json.loads(out.read_text())["rows"]
     assert row["paths"] >= 5 and 0 < row["p50_ms"] <= row["p95_ms"] <= row["p99_ms"] and row["exit_status"] == 0
+
+
+def test_the_tables_of_real_drives_keep_what_was_not_run_and_say_what_is_known():
+    import warthog_reports
+
+    steps = {
+        "windows": 30, "before": 2.0, "after": None, "kinematic": 0.9, "ahead": None, "reckoned": 0.5,
+    }  # fmt: skip
+    gap = {"position_2s": {"before": 1.0, "after": 0.5, "noise": 0.1, "low": 0.4, "high": 0.6}}
+    lag = {"name": "actuator_lag", "parameters": {"time_constant": {"value": 0.31, "unit": "s"}}}
+    row = {
+        "ground": "asphalt", "known": "lag 0.3 s", "verdict": "effect_found", "effects": [lag], "known_parts": [],
+        "gap": gap, "steps": steps, "held_out": {"other": gap}, "seconds": 60.0, "code": "abc",
+        "headline": {"sentence": "Found.", "findings": []},
+    }  # fmt: skip
+    other = {
+        "ground": "Husky, wheels in the air", "effects": [], "verdict": "not_identifiable", "gap": {}, "steps": None,
+        "held_out": {}, "headline": {"sentence": "Not diagnosed.", "findings": ["the wheels turn (at 3 rad/s)"]},
+    }  # fmt: skip
+    before = warthog_reports.section([row | other])
+    text = warthog_reports.section([row], before)
+    assert (
+        text.count("\n| Husky, wheels in the air | lag 0.3 s | `not_identifiable` | Not diagnosed. the wheels turn |")
+        == 1
+    )
+    whole = next(line for line in text.splitlines() if line.startswith("| asphalt | lag"))
+    assert "`actuator_lag` 0.31 s | 1.00 → 0.50 | – | – | 60 s | abc |" in whole
+    assert "\n| asphalt | 30 | 2.00 m | – | 0.90 m | – | 0.50 m |" in text
+    assert "- Effects found on asphalt, on the held-out recording `other`" in text
+    # Nothing run, nothing changed.
+    assert warthog_reports.section([], text) == text
+    files = [drive.file for drive in warthog_reports.DRIVES]
+    assert len(set(files)) == len(files)
+
+
+def test_every_real_drive_is_there_where_the_data_are():
+    import warthog_reports
+
+    data = Path(os.environ.get("MONOFORCE_REAL_DATA", ROOT.parent / "shared" / "data"))
+    if not (data / "drive").exists():
+        pytest.skip(f"no real drives in {data}")
+    for drive in warthog_reports.DRIVES:
+        for name in (drive.file, *drive.held_out):
+            assert (data / name).exists(), name
+    bags = {folder.name for folder in (data / "doughnut").iterdir() if folder.is_dir()}
+    assert bags <= {Path(drive.file).name for drive in warthog_reports.DRIVES}

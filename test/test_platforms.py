@@ -9,12 +9,13 @@ from pathlib import Path
 import null_rates
 import numpy as np
 import pytest
+import run as platforms_run
 import uncovered_changes
 from benchmark_case import SETS, Case, all_cases
 from benchmark_score import closed_share, covered, found_all, healthy_errors, scores, true_value
 from case_recording import CaseFiles, displacement, hidden_job, record_platform, record_together
 from command_faults import DeadBand, Delay, DriveFactors, Lag, TwistLimits
-from diagnosis_run import Judged, commission_platform, commissioned_file
+from diagnosis_run import Judged, commission_platform, commissioned_file, diagnose_case
 from drawn_platform import draw_platform, write_robot_file
 from drive_commands import FollowingDriver, LeadingDriver, ManoeuvreDriver, ReplayedCommands
 from drive_session import DriveJob
@@ -22,11 +23,16 @@ from force_faults import BodyForce, Drag, RollingResistance
 from ground_shape import Ground, draw_hills, write_map
 from hidden_effect import KINDS, OUTSIDE, SINGLES, HiddenEffect, draw_effect
 from injection import TICK, BaseState, Injection, Measurement
+from method_table import METHODS, ablation_table, baseline_table
 from mujoco_engine import simulate
+from reporting_ledger import LEDGER, add_to_ledger, read_ledger, reported_before
+from scipy.spatial.transform import Rotation
 from sensor_recording import measured_poses
 from true_effects import measured, summary
 
 from monoforce_ros.bags import Recording
+from monoforce_ros.core import CommandTrack, MotionTrack
+from monoforce_ros.discrepancy.evidence import EvidenceWindows
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import load_terrain
 
@@ -382,3 +388,154 @@ def test_the_true_effect_explains_most_of_what_it_does_in_the_other_engine(tmp_p
     assert "of 1 drives with an effect below 0.025: 1 at 0, 1 at 1, 0 at 100000" in text
     # So with their losses: the drive is too large beside those that hardly differ.
     assert "too large at 0.0125: 1 at 0.1, 0 at 50" in text
+
+
+def test_platforms_are_reported_by_one_code_only(tmp_path):
+    ledger = tmp_path / "reported.json"
+    first, other = (
+        [Case("reporting", seed, 1, engine, "level", "empty") for seed, engine in zip(seeds, engines, strict=True)]
+        for seeds, engines in (
+            ((700, 701, 702, 708), ("mujoco", "newton", "mujoco", "mujoco")), ((704, 702), ("mujoco", "mujoco")),
+        )
+    )  # fmt: skip
+    assert reported_before(first, "a", ledger) == []
+    add_to_ledger(first, "a", "2026-01-02", ledger)
+    assert [(entry.engine, entry.first, entry.last) for entry in read_ledger(ledger)] == [
+        ("mujoco", 700, 702), ("mujoco", 708, 708), ("newton", 701, 701),
+    ]  # fmt: skip
+    # An interrupted or repeated run of the same code goes on; another code's would not be independent.
+    assert reported_before(first, "a", ledger) == []
+    assert [entry.first for entry in reported_before(other, "b", ledger)] == [700]
+    assert reported_before(other[:1], "b", ledger) == []
+    add_to_ledger(first, "a", "2026-01-03", ledger)
+    assert {entry.date for entry in read_ledger(ledger)} == {"2026-01-02"}
+
+
+def test_the_next_set_for_reporting_is_not_in_the_ledger():
+    assert read_ledger(LEDGER)
+    assert reported_before(all_cases("reporting"), "", LEDGER) == []
+    assert reported_before(all_cases("choosing"), "", LEDGER) == []
+
+
+def test_a_second_report_of_a_platform_is_refused_and_one_that_is_asked_for_is_marked(tmp_path, monkeypatch, capsys):
+    (case, *_) = all_cases("reporting")
+    arguments = ["--work", str(tmp_path), "--set", "reporting", "--cases", case.name, "--label", "code", "--jobs", "1"]
+    arguments += ["--ledger", str(tmp_path / "reported.json"), "--json", str(tmp_path / "rows.json")]
+    row = report_row("empty", [], [], "no_discrepancy") | {"case": case.name, "sensors": {}}
+
+    def run(*more):
+        monkeypatch.setattr("sys.argv", ["run.py", *arguments, *more])
+        return platforms_run.main()
+
+    # Recorded and diagnosed in an earlier call, without wheel speeds, too; there is no IMU.
+    files = CaseFiles.of(case, tmp_path)
+    result, ablated = (
+        tmp_path / "results" / folder / "cases" / f"{case.name}.json" for folder in ("code", "code-wheels")
+    )
+    alarm, sensors = row | {"verdict": "unknown_effect"}, {"wheels": True, "gyro": False}
+    truth = row | {"usable": True, "ground": case.ground, "displacement_m": [], "sensors": sensors}
+    for file, content in ((files.truth, truth), (result, row), (ablated, alarm)):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(json.dumps(content))
+    assert run("--ablations") == 0
+    content = json.loads((tmp_path / "rows.json").read_text())
+    assert content["rows"] == [row] and content["without"] == {"wheels": [alarm], "imu": []}
+    assert content["seconds"].keys() == {"recording", "diagnoses", "ablations"}
+    assert "| with wheels | without wheels | with imu | without imu |" in capsys.readouterr().out
+    assert [entry.code for entry in read_ledger(tmp_path / "reported.json")] == ["code"]
+    assert run() == 0
+    capsys.readouterr()
+    arguments[arguments.index("code")] = "changed"
+    assert run() == 1
+    said = capsys.readouterr().err
+    assert f"{case.engine} {case.platform_seed} to {case.platform_seed}" in said and "--again" in said
+    assert len(read_ledger(tmp_path / "reported.json")) == 1
+    # There is no bag to diagnose again; the row says so, and that it is not independent.
+    assert run("--again") == 0
+    (again,) = json.loads((tmp_path / "rows.json").read_text())["rows"]
+    assert again["verdict"] == "error" and again["independent"] is False
+    assert "Not independent" in capsys.readouterr().out
+    assert [entry.code for entry in read_ledger(tmp_path / "reported.json")] == ["code", "changed"]
+
+
+def test_a_platform_without_a_sensor_has_no_row_without_it(tmp_path):
+    case = Case("choosing", 1000, 2, "mujoco", "level", "empty")
+    files = CaseFiles.of(case, tmp_path)
+    files.truth.parent.mkdir(parents=True)
+    files.truth.write_text(json.dumps({"usable": True, "sensors": {"wheels": False, "gyro": True}}))
+    judged = Judged(ROOT, tmp_path / "results", "wheels", 10.0)
+    assert diagnose_case(case, tmp_path, judged) is None
+    commission_platform(case, tmp_path, judged)
+    assert not (tmp_path / "results").exists()
+
+
+def compared_row(kind, case, after, **errors):
+    gap = {"position_2s": {"before": 0.5, "after": after, "noise": 0.1}}
+    seconds = dict.fromkeys(errors, 4.0)
+    baselines = errors | {"seconds": seconds}
+    hidden = [hidden_entry("drive_gain", gain=0.8)] * (2 if kind == "pair" else 1)
+    return report_row(kind, hidden, [found_entry("drive_gain")]) | {"case": case, "gap": gap, "baselines": baselines}
+
+
+def test_the_table_of_methods_has_singles_pairs_and_their_time():
+    errors = dict.fromkeys(METHODS, 0.3)
+    rows = [compared_row("single", "a", 0.2, **errors), compared_row("pair", "b", None, **(errors | {"sindy": 0.9}))]
+    lines = baseline_table(rows).splitlines()
+    assert "1 single effects" in lines[0] and "1 pairs" in lines[0]
+    cells = {line.split(" | ")[0][2:]: line.strip("| ").split(" | ")[1:] for line in lines[2:]}
+    assert cells["nominal model"] == ["0.500", "0 %", "0.500", "0 %", "–"]
+    assert cells["diagnose"] == ["0.200", "75 %", "0.500", "0 %", "9 s"]
+    assert cells[METHODS["mujoco_sysid"]] == ["0.300", "50 %", "0.300", "50 %", "4 s"]
+    assert cells[METHODS["sindy"]] == ["0.300", "50 %", "0.900", "-100 %", "4 s"]
+    # Rows of earlier runs lack a method: they are compared in none.
+    assert baseline_table([rows[0] | {"baselines": {"refit": 0.3}}]) == "No baselines."
+
+
+def test_an_ablation_is_compared_with_the_same_drives():
+    single = [hidden_entry("drive_gain", gain=0.8)]
+    right = report_row("single", single, [found_entry("drive_gain")]) | {"case": "a"}
+    lines = ablation_table(
+        [right, right | {"case": "b"}], {"wheels": [right | {"effects": [found_entry("payload")]}]}
+    ).splitlines()
+    assert lines[0] == "| score | with wheels | without wheels |"
+    named = next(line for line in lines if line.startswith("| single effects named"))
+    assert "100 % [3, 100] (1/1) | 0 % [0, 98] (0/1)" in named
+
+
+def windows_of(trace, seconds):
+    """Windows of 2 s of a simulated drive with exact poses and the commands of its driver."""
+    stamps = np.arange(len(trace.positions)) * round(TICK * 1e9) + 1_000_000_000
+    motion = MotionTrack(
+        stamps, trace.positions, Rotation.from_matrix(trace.rotations).as_quat(), trace.velocities, trace.rates
+    )
+    commanded = stamps[0] + np.arange(len(trace.commands)) * 50_000_000
+    starts = stamps[0] + (np.arange(1.0, seconds - 2.5, 1.0) * 1e9).astype(np.int64)
+    samples = np.array([0.5, 1.0, 1.5, 2.0])
+    return EvidenceWindows(motion, CommandTrack(commanded, trace.commands), starts, 2.0, samples)
+
+
+def test_mujocos_system_identification_finds_slow_drives(tmp_path):
+    for module in ("mujoco.sysid", "colorama", "tabulate", "plotly"):
+        pytest.importorskip(module, reason="mujoco[sysid] is in benchmarks/requirements.txt")
+    import mujoco_sysid
+
+    platform = draw_platform(1)
+    driver = ManoeuvreDriver(platform.maximum_speed, platform.maximum_yaw_rate, 2)
+    trace = simulate(DriveJob(platform, Ground(), driver, (DriveFactors(left=0.6, right=0.6),), 14.0))
+    robot = load_robot(write_robot_file(platform, tmp_path / "platform.yaml"))
+    data, scale = windows_of(trace, 14.0), np.full((4, 3), 0.02)
+    nominal = mujoco_sysid.Nominal.of(robot)
+    np.testing.assert_allclose(
+        nominal.wheels[:, 0], np.tile(np.sort(nominal.wheels[: platform.axles, 0])[::-1], 2), atol=1e-3
+    )
+    np.testing.assert_allclose(np.abs(nominal.wheels - platform.wheel_centres).max(), 0.0, atol=0.05)
+    start = {name: entry.start for name, entry in mujoco_sysid.FREE.items()}
+
+    def error(values):
+        residuals = mujoco_sysid.WindowRollouts(nominal, data, scale).residuals([values])[0, :, -1]
+        return np.median(np.hypot(residuals[:, 0], residuals[:, 1]))
+
+    found = mujoco_sysid.identify(robot, data, scale, 10.0)
+    assert found.steps >= 2
+    assert error(start) > 0.1
+    assert error(found.values) < 0.4 * error(start)

@@ -30,7 +30,7 @@ def main() -> None:
     bag, robot, terrain, out = sys.argv[1:]
     # baselines.py lies beside this folder.
     sys.path.insert(0, str(Path(__file__).parents[1]))
-    from baselines import baseline_errors
+    from baselines import METHODS, baseline_errors
 
     torch.set_num_threads(1)
     model = load_robot(robot)
@@ -42,9 +42,10 @@ def main() -> None:
     nominal = NominalModel.read(robot, tuple(SAMPLES))
     nominal = None if nominal is None else nominal.of_motion()
     scale = np.sqrt((residual_scale(floor, data, nominal) ** 2).reshape(-1, *floor.shape).mean(axis=0))
-    errors = baseline_errors(evidence, data, model, scale)
-    medians = {name: float(np.median(np.hypot(error[:, 0], error[:, 1]))) for name, error in errors.items()}
-    write_text(Path(out), json.dumps(medians) + "\n")
+    errors = baseline_errors(evidence, data, model, scale, (*METHODS, "mujoco_sysid"))
+    found = {name: entry.median for name, entry in errors.items()}
+    found["seconds"] = {name: round(entry.seconds, 1) for name, entry in errors.items()}
+    write_text(Path(out), json.dumps(found) + "\n")
 
 
 if __name__ == "__main__":

@@ -215,12 +215,13 @@ def table(rows: Sequence[Row]) -> str:
     found = {name: scores(part) for name, part in columns.items()}
     lines = ["| score | target | " + " | ".join(columns) + " |", "|---|---|" + "---|" * len(columns)]
     for key, title in TITLES.items():
-        cells = [_cell(key, found[name][key]) for name in columns]
+        cells = [score_cell(key, found[name][key]) for name in columns]
         lines.append(f"| {title} | {TARGETS.get(key, '–')} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
-def _cell(key: str, entry: dict) -> str:
+def score_cell(key: str, entry: dict) -> str:
+    """A score of a key of :data:`TITLES` as a cell of a table."""
     if not entry["of"]:
         return "–"
     if "median" in entry:
@@ -249,25 +250,3 @@ def row_line(row: Row) -> str:
     ]
     answer = f"{' + '.join(values)} → {' + '.join(effects)}"
     return f"{mark} {row['case']:64s} {row['verdict']:16s} {row['seconds']:4.0f} s  {answer}"
-
-
-def baseline_table(rows: Sequence[Row]) -> str:
-    """Position errors after 2 s of ``diagnose`` and other methods on single effects as a Markdown table."""
-    compared = [r for r in rows if "error" not in r.get("baselines", {"error": ""}) and "position_2s" in r["gap"]]
-    if not compared:
-        return "No baselines."
-    gaps = [row["gap"]["position_2s"] for row in compared]
-    before, noise = (np.array([gap[key] for gap in gaps]) for key in ("before", "noise"))
-    methods = {
-        "nominal model": before,
-        "refit of friction, track width and lag": [row["baselines"]["refit"] for row in compared],
-        "neural residual": [row["baselines"]["network"] for row in compared],
-        "pysindy on the accelerations": [row["baselines"]["sindy"] for row in compared],
-        "diagnose": [gap["before"] if gap["after"] is None else gap["after"] for gap in gaps],
-    }
-    lines = [f"| method, {len(compared)} single effects | median error after 2 s [m] | gap closed |", "|---|---|---|"]
-    for name, values in methods.items():
-        errors = np.array(values)
-        closed = np.median((before - errors) / np.maximum(before - noise, 1e-6))
-        lines.append(f"| {name} | {np.median(errors):.3f} | {100 * closed:.0f} % |")
-    return "\n".join(lines)

@@ -53,8 +53,7 @@ def diagnose_case(case: Case, work: Path, judged: Judged) -> dict | None:
     """The row of a recorded case, from its file where there is one; None where the case cannot be judged."""
     files = CaseFiles.of(case, work)
     truth = json.loads(files.truth.read_text())
-    sensors = truth["sensors"]
-    if not truth["usable"] or not sensors.get({"imu": "gyro"}.get(judged.without, judged.without), True):
+    if not _can_be_judged(truth, judged):
         return None
     result = judged.results / "cases" / f"{case.name}.json"
     if result.exists():
@@ -87,6 +86,12 @@ def diagnose_case(case: Case, work: Path, judged: Judged) -> dict | None:
     return row
 
 
+def _can_be_judged(truth: dict, judged: Judged) -> bool:
+    """Whether the drive is usable, and its platform has the sensor that an ablation takes away."""
+    sensor = {"imu": "gyro"}.get(judged.without, judged.without)
+    return truth["usable"] and truth["sensors"].get(sensor, True)
+
+
 def healthy_values(robot_file: Path) -> dict[str, dict[str, float]]:
     """Effects with their values in a commissioned robot file."""
     effects = yaml.safe_load(robot_file.read_text(encoding="utf-8")).get("effects", [])
@@ -100,7 +105,7 @@ def commission_platform(case: Case, work: Path, judged: Judged) -> None:
     """Commission the platform of a case, unless it was or its commissioning failed."""
     files = CaseFiles.of(case, work)
     result = judged.results / "cases" / f"{case.name}.json"
-    if json.loads(files.truth.read_text())["usable"] and not result.exists():
+    if _can_be_judged(json.loads(files.truth.read_text()), judged) and not result.exists():
         _nominal(case, files, judged)
 
 
@@ -151,15 +156,16 @@ def add_baselines(case: Case, work: Path, judged: Judged) -> dict:
     files, result = CaseFiles.of(case, work), judged.results / "cases" / f"{case.name}.json"
     row = json.loads(result.read_text())
     robot = commissioned_file(judged.results / "nominal" / case.platform_name)
-    if "baselines" not in row and robot is not None:
+    if "mujoco_sysid" not in row.get("baselines", {}) and robot is not None:
         terrain = (_terrain(case, files, files.bag) or ["--terrain", "flat"])[1]
         out = judged.results / "reports" / case.name / "baselines.json"
         out.parent.mkdir(parents=True, exist_ok=True)
         script = str(Path(__file__).with_name("baseline_run.py"))
         arguments = [script, str(_bag(files.bag, judged)), str(robot), terrain, str(out)]
-        status, message, _, _ = _run(arguments, judged)
+        # The system identification alone takes twice as long as a diagnosis.
+        status, message, _, _ = _run(arguments, replace(judged, timeout=4 * judged.timeout))
         if status != 0:
-            # Not kept: pysindy may be installed later.
+            # Not kept: pysindy and mujoco[sysid] may be installed later.
             return row | {"baselines": {"error": message}}
         row["baselines"] = json.loads(out.read_text())
         write_text(result, json.dumps(row, indent=1) + "\n")

@@ -12,16 +12,21 @@ import argparse
 import json
 import multiprocessing
 import sys
+import time
 from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, as_completed, wait
+from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 from benchmark_case import CASE_KINDS, ENGINES, SETS, WORLD_GROUNDS, Case, all_cases
 from benchmark_score import ENGINES as SCORED
-from benchmark_score import baseline_table, row_line, scores, table
+from benchmark_score import row_line, scores, table
 from case_recording import CaseFiles, record_platform, record_together
 from diagnosis_run import ABLATIONS, Judged, add_baselines, code_version, commission_platform, diagnose_case, forget
 from drive_session import DriveJob, Trace
+from method_table import ablation_table, baseline_table
+from reporting_ledger import LEDGER, ReportedPlatforms, add_to_ledger, reported_before
 from tqdm import tqdm
 
 from monoforce_ros.core import write_text
@@ -31,36 +36,98 @@ QUICK_PLATFORMS = 6
 """Of ``--quick``, alternating between the engines."""
 
 
+BASELINE_DRIVES = 20
+"""Single effects of ``--baselines``, and half as many pairs: some 140 s of a processor each."""
+ABLATION_PLATFORMS = 16
+"""Platforms of ``--ablations``."""
+
+
 def main() -> int:
     options = build_parser().parse_args()
     cases = chosen_cases(options)
     if not cases:
         print("no case matches the options", file=sys.stderr)
         return 1
+    code = options.code.resolve()
+    label = options.label or code_version(code)
+    reported = reported_before(cases, label, options.ledger) if options.set == "reporting" else []
+    if reported and not (options.again or options.record_only):
+        print(refusal(reported), file=sys.stderr)
+        return 1
+    began = time.monotonic()
     record(cases, options)
     if options.record_only:
         return 0
-    code = options.code.resolve()
-    label = options.label or code_version(code)
+    spent = {"recording": time.monotonic() - began}
     results = options.work / "results" / "-".join(part for part in (label, options.without) if part)
     judged = Judged(code, results, options.without or "", options.timeout)
     print(f"{len(cases)} cases, code {code} ({label}), results in {results}", flush=True)
     if options.again:
         for case in cases:
             forget(case, judged)
-    rows = [row for row in in_parallel(cases, options, judged) if row is not None]
+    began = time.monotonic()
+    rows = in_parallel(cases, options, judged)
+    spent["diagnoses"] = time.monotonic() - began
     if options.baselines:
+        began = time.monotonic()
         rows = with_baselines(rows, cases, options, judged)
+        spent["baselines"] = time.monotonic() - began
+    began = time.monotonic()
+    ablated = without_sensors(cases, options, judged) if options.ablations else {}
+    if ablated:
+        spent["ablations"] = time.monotonic() - began
+    if reported:
+        rows = [row | {"independent": False} for row in rows]
     rows.sort(key=lambda row: (CASE_KINDS.index(row["kind"]), row["case"]))
-    text = table(rows) + ("\n\n" + baseline_table(rows) if options.baselines else "")
+    text = "\n\n".join(sections(rows, ablated, options, spent, independent=not reported))
     print("\n" + text)
     if options.json:
         found = {"all": scores(rows)}
         found |= {engine: scores([row for row in rows if row["engine"] == engine]) for engine in SCORED}
-        write_text(options.json, json.dumps({"label": label, "scores": found, "rows": rows}, indent=1) + "\n")
+        found |= {f"without {sensor}": scores(part) for sensor, part in ablated.items()}
+        content = {"label": label, "scores": found, "rows": rows, "without": ablated, "seconds": spent}
+        write_text(options.json, json.dumps(content, indent=1) + "\n")
     if options.docs:
         write_between(options.docs, "platforms", text)
+    if options.set == "reporting":
+        # Whoever has seen these figures may change the code for them.
+        add_to_ledger(cases, label, datetime.now(UTC).date().isoformat(), options.ledger)
+        print(f"listed as reported in {options.ledger}: commit it")
     return 0
+
+
+def refusal(reported: Sequence[ReportedPlatforms]) -> str:
+    """Why platforms are not reported by other code again."""
+    entries = ", ".join(f"{e.engine} {e.first} to {e.last} ({e.date}, code {e.code})" for e in reported)
+    return (
+        f"these platforms were reported before: {entries}. Their figures have been seen, so that a second one is not "
+        "independent. Set the first seed of SETS and WORLDS in benchmark_case.py behind them, or say --again, which "
+        "marks every row and the table as not independent"
+    )
+
+
+def sections(
+    rows: Sequence[dict],
+    ablated: dict[str, list[dict]],
+    options: argparse.Namespace,
+    spent: dict[str, float],
+    *,
+    independent: bool,
+) -> list[str]:
+    """The tables, and what they took."""
+    parts = [] if independent else ["**Not independent**: these platforms had been reported before."]
+    parts.append(table(rows))
+    if options.baselines:
+        parts.append(baseline_table(rows))
+    if ablated:
+        parts.append(ablation_table(rows, ablated))
+    processor = sum(row["cpu_seconds"] for rows_of in (rows, *ablated.values()) for row in rows_of)
+    now = ", ".join(f"{name} {seconds / 60:.0f} min" for name, seconds in spent.items())
+    parts.append(
+        f"{len(rows)} drives; the diagnoses took {processor / 3600:.1f} h of a processor. This call, with "
+        f"{options.jobs} at a time and what was kept of earlier ones: {now}."
+    )
+    return parts
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -74,17 +141,37 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--cases", nargs="+", default=[""], metavar="TEXT", help="only names with one of these")
     parser.add_argument("--limit", type=int, metavar="N", help="only the first N of them")
     parser.add_argument("--platforms", type=int, metavar="N", help="only the first N platforms of the set")
-    parser.add_argument("--quick", action="store_true", help=f"only the first {QUICK_PLATFORMS} platforms: 15 minutes")
+    parser.add_argument("--quick", action="store_true", help=f"only the first {QUICK_PLATFORMS} platforms")
     parser.add_argument("--without", choices=ABLATIONS, help="take this sensor out of every recording")
     parser.add_argument("--jobs", type=int, default=2, help="processes (%(default)s)")
     parser.add_argument("--timeout", type=float, default=300.0, help="of a diagnosis [s] (%(default)s)")
     parser.add_argument("--record-only", action="store_true", help="record, do not diagnose")
-    parser.add_argument("--again", action="store_true", help="diagnose again where a result exists")
+    parser.add_argument(
+        "--again",
+        action="store_true",
+        help="diagnose again where a result exists; of platforms that were reported before, as not independent",
+    )
+    parser.add_argument("--ledger", type=Path, default=LEDGER, help="list of the platforms that were reported")
     parser.add_argument(
         "--code", type=Path, default=Path(__file__).parents[2], help="repository to judge (the one of this file)"
     )
     parser.add_argument("--label", help="name of the results' folder (by default a fingerprint of the code)")
-    parser.add_argument("--baselines", action="store_true", help="compare with other methods on single effects")
+    parser.add_argument(
+        "--baselines",
+        type=int,
+        nargs="?",
+        const=BASELINE_DRIVES,
+        metavar="N",
+        help="compare with other methods on the first N single effects and N/2 pairs (%(const)s)",
+    )
+    parser.add_argument(
+        "--ablations",
+        type=int,
+        nargs="?",
+        const=ABLATION_PLATFORMS,
+        metavar="N",
+        help="diagnose the drives of the first N platforms once more without wheel speeds and without IMU (%(const)s)",
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write rows and scores to this file")
     parser.add_argument("--docs", type=Path, metavar="FILE", help="write the table into this document")
     return parser
@@ -148,12 +235,12 @@ def _record_with_newton(platforms: Sequence[Sequence[Case]], work: Path) -> None
     record_together(platforms, work, simulate)
 
 
-def in_parallel(cases: Sequence[Case], options: argparse.Namespace, judged: Judged) -> list[dict | None]:
-    """The rows of cases; each platform is commissioned before its first case."""
+def in_parallel(cases: Sequence[Case], options: argparse.Namespace, judged: Judged) -> list[dict]:
+    """The rows of the cases that can be judged; each platform is commissioned before its first case."""
     platforms: dict[str, list[Case]] = {}
     for case in cases:
         platforms.setdefault(case.platform_name, []).append(case)
-    rows: list[dict | None] = []
+    rows: list[dict] = []
     with _pool(options.jobs) as pool, tqdm(total=len(cases), desc="diagnose", unit="case") as bar:
         waiting = {
             pool.submit(commission_platform, platform[0], options.work, judged): platform
@@ -167,9 +254,9 @@ def in_parallel(cases: Sequence[Case], options: argparse.Namespace, judged: Judg
                 if done in waiting:
                     running |= {pool.submit(diagnose_case, case, options.work, judged) for case in waiting.pop(done)}
                     continue
-                rows.append(result)
                 bar.update()
                 if result is not None:
+                    rows.append(result)
                     bar.write(row_line(result))
     return rows
 
@@ -177,16 +264,36 @@ def in_parallel(cases: Sequence[Case], options: argparse.Namespace, judged: Judg
 def with_baselines(
     rows: Sequence[dict], cases: Sequence[Case], options: argparse.Namespace, judged: Judged
 ) -> list[dict]:
-    """The rows, those of diagnosed single effects with the errors of other methods."""
+    """The rows, those of the first diagnosed single effects and pairs with the errors of other methods."""
     known = {case.name: case for case in cases}
-    singles = [row for row in rows if row["kind"] == "single" and "gap" in row]
-    others = [row for row in rows if row not in singles]
-    with _pool(options.jobs) as pool, tqdm(total=len(singles), desc="baselines", unit="case") as bar:
-        running = [pool.submit(add_baselines, known[row["case"]], options.work, judged) for row in singles]
+    order = {case.name: number for number, case in enumerate(cases)}
+    listed = sorted((row for row in rows if "gap" in row), key=lambda row: order[row["case"]])
+    compared = [row for row in listed if row["kind"] == "single"][: options.baselines]
+    compared += [row for row in listed if row["kind"] == "pair"][: options.baselines // 2]
+    others = [row for row in rows if row not in compared]
+    with _pool(options.jobs) as pool, tqdm(total=len(compared), desc="baselines", unit="case") as bar:
+        running = [pool.submit(add_baselines, known[row["case"]], options.work, judged) for row in compared]
         for done in as_completed(running):
             others.append(done.result())
             bar.update()
     return others
+
+
+def without_sensors(cases: Sequence[Case], options: argparse.Namespace, judged: Judged) -> dict[str, list[dict]]:
+    """The rows of the first platforms' drives by the sensor that was taken out; platforms that lack it are left out."""
+    seeds = list(dict.fromkeys(case.platform_seed for case in cases))[: options.ablations]
+    chosen = [case for case in cases if case.platform_seed in seeds]
+    found = {}
+    for sensor in ABLATIONS:
+        results = judged.results.with_name(f"{judged.results.name}-{sensor}")
+        part = replace(judged, results=results, without=sensor)
+        print(f"without {sensor}: results in {results}", flush=True)
+        if options.again:
+            for case in chosen:
+                forget(case, part)
+        rows = in_parallel(chosen, options, part)
+        found[sensor] = sorted(rows, key=lambda row: (CASE_KINDS.index(row["kind"]), row["case"]))
+    return found
 
 
 def _pool(jobs: int) -> ProcessPoolExecutor:
