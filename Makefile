@@ -63,6 +63,7 @@ lock: environment
 clean:
 	rm -rf build build-lowest install install-lowest log out
 
+SCENES ?= $(or $(MONOFORCE_REAL_DATA),../shared/data)/rough
 bench: build interfaces
 	@mkdir -p out
 	@scripts/run.sh python benchmarks/rollout.py --json out/rollout.json
@@ -70,6 +71,8 @@ bench: build interfaces
 	@scripts/run.sh python benchmarks/integrators.py --json out/integrators.json
 	@scripts/run.sh python benchmarks/mujoco_check.py --json out/mujoco_check.json
 	@scripts/run.sh python benchmarks/encoder.py --json out/encoder.json
+	@if [ -d "$(SCENES)" ]; then scripts/run.sh python benchmarks/real_scenes.py "$(SCENES)" --json out/real_scenes.json; \
+	  else echo "[bench] no real scenes at $(SCENES)"; fi
 
 REAL_DATA ?= $(or $(MONOFORCE_REAL_DATA),../shared/data)
 engines:

@@ -1,9 +1,12 @@
-"""Speed of the terrain encoder: time from images to terrain with one and four cameras, in total and per stage.
+"""Speed of the terrain encoder: time from images or a lidar sweep to terrain, in total and per stage.
 
     scripts/run.sh python benchmarks/encoder.py [--json FILE] [--threads 2] [--compile] [--quick]
 
-Compares the encoder as trained, with folded norms, with packed weights, and in bfloat16 if the processor supports it.
-Every figure is the median of several runs.
+First the shipped encoder in the predictor's terrain sources, along the bundled bag: from a decoded sweep of 5,000 or
+35,000 returns, or images, to the map in the terrain frame, with its trust, memory and fallback. Times are on the clock
+and of the processor, all threads together: the latter do not depend on what else runs. Then stages of an untrained
+encoder with one and four cameras: as trained, with folded norms, with packed weights, and in bfloat16 if the processor
+supports it. Every figure is the median of several runs.
 """
 
 from __future__ import annotations
@@ -14,18 +17,23 @@ import platform
 import statistics
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from monoforce_ros.core import CameraModel, homogeneous, write_text
+from monoforce_ros.bags import Recording, observe
+from monoforce_ros.core import CameraModel, MotionState, homogeneous, write_text
 from monoforce_ros.encoder import CameraView, EncoderConfig, TerrainEncoder, encoder_input, fused, packed
 from monoforce_ros.encoder.heads import terrain_maps, with_edges
 from monoforce_ros.encoder.inference import multiplies_bfloat16
 from monoforce_ros.encoder.lift import lifted_points, map_cells, splat
 from monoforce_ros.encoder.terrain_encoder import MOMENTS
 from monoforce_ros.encoder.view import SUPPORT_CHANNELS
+from monoforce_ros.perception import Observation, choose_terrain_source
+from monoforce_ros.perception.sources import LIDAR_RETENTION_TIME
+from monoforce_ros.robots import load_robot
 
 FORWARD = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
 SUPPORT = np.array([[0.3, 0.3, -0.1], [0.3, -0.3, -0.1], [-0.3, 0.3, -0.1], [-0.3, -0.3, -0.1]])
@@ -55,6 +63,73 @@ def timed(work: Callable[[], object], repeats: int) -> float:
         work()
         durations.append(time.perf_counter() - began)
     return 1e3 * statistics.median(durations)
+
+
+DEMO = Path(__file__).resolve().parent.parent / "bags" / "demo"
+_RETURN_NOISE = 0.02
+"""Of the copies that make larger sweeps [m]."""
+
+
+def along_the_bag(frames: int) -> list[tuple[Observation, MotionState]]:
+    """Sweeps and images of the bundled bag, with the motion at their times."""
+    robot = load_robot("husky")
+    recording = Recording.open(DEMO).in_base_frame(robot.base_frame)
+    stamps = [frame.stamp for frame in recording.clouds[2 : 2 + frames]]
+    topics = tuple(recording.images)
+    return [
+        (observe(recording, robot, stamp, ("lidar", "camera"), topics), recording.motion.at(stamp)) for stamp in stamps
+    ]
+
+
+def with_returns(observation: Observation, count: int) -> Observation:
+    """The observation with so many returns and no image."""
+    cloud, random = observation.cloud, np.random.default_rng(0)
+    assert cloud is not None
+    chosen = np.sort(random.permutation(np.arange(count) % len(cloud))) if count > len(cloud) else np.arange(count)
+    noise = _RETURN_NOISE * random.standard_normal((count, 3)) if count > len(cloud) else 0.0
+    return replace(observation, cloud=(cloud[chosen] + noise).astype(np.float32), images={})
+
+
+def with_cameras(observation: Observation, count: int) -> Observation:
+    """The observation with its first image on so many sides of the robot, and no sweep."""
+    (name, image), *_ = observation.images.items()
+    placed = {}
+    for side in range(count):
+        cosine, sine = np.cos(side * np.pi / 2), np.sin(side * np.pi / 2)
+        turn = homogeneous(np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]]), np.zeros(3))
+        placed[f"{name}/{side}"] = turn @ observation.base_from_cameras[name]
+    return replace(
+        observation,
+        cloud=None,
+        images=dict.fromkeys(placed, image),
+        cameras=dict.fromkeys(placed, observation.cameras[name]),
+        base_from_cameras=placed,
+    )
+
+
+def shipped(threads: int, frames: int) -> dict[str, dict[str, float]]:
+    """Median time on the clock and of the processor of each map of the predictor's terrain sources [ms]."""
+    seen = along_the_bag(frames)
+    found = {}
+    for title, kind, reduced in (
+        *((f"lidar sweep, {n:,} returns", "lidar", lambda o, n=n: with_returns(o, n)) for n in (5_000, 35_000)),
+        *((f"{n} camera(s)", "camera", lambda o, n=n: with_cameras(o, n)) for n in (1, 4)),
+    ):
+        source = choose_terrain_source(
+            kind, load_robot("husky"), precision="auto", threads=threads, lidar_retention_time=LIDAR_RETENTION_TIME,
+            fallback=True,
+        )  # fmt: skip
+        clock, processor = [], []
+        for observation, motion in [(reduced(observation), motion) for observation, motion in seen]:
+            began = time.perf_counter(), time.process_time()
+            source.terrain(observation, motion)
+            clock.append(time.perf_counter() - began[0])
+            processor.append(time.process_time() - began[1])
+        # The first map packs the weights.
+        times = [1e3 * statistics.median(values[1:]) for values in (clock, processor)]
+        found[title] = {"clock_ms": times[0], "processor_ms": times[1]}
+        print(f"shipped encoder, {title}, {threads} threads: {times[0]:.1f} ms, {times[1]:.1f} ms of the processor")
+    return found
 
 
 def stages(encoder: TerrainEncoder, cameras: list[CameraView], repeats: int) -> dict[str, float]:
@@ -110,6 +185,7 @@ def main() -> None:
                 kinds[kind] = fused(plain, precision)
                 kinds[kind].compile(options={"freezing": True})
     figures: dict = {"threads": options.threads, "processor": platform.processor(), "torch": torch.__version__}
+    figures["shipped"] = shipped(options.threads, 4 if options.quick else 31)
     for count in (1, 4):
         cameras = views(count)
         before = timed(lambda: plain.terrain(cameras, SUPPORT), repeats)  # noqa: B023

@@ -25,7 +25,7 @@ from monoforce_ros.datasets import DatasetError
 from monoforce_ros.encoder import TerrainEncoder, load_encoder
 from monoforce_ros.reporting import figure_png
 from monoforce_ros.robots import load_robot
-from monoforce_ros.training.adaptation import adapt, keep_obstacles
+from monoforce_ros.training.adaptation import AdaptationSettings, adapt, keep_obstacles
 from monoforce_ros.training.judgement import BAND, CAMERAS, Judgement, judge, judged_maps
 from monoforce_ros.training.losses import HIGHEST, LOWEST
 from monoforce_ros.training.recording_samples import RecordingSamples, read_samples
@@ -110,6 +110,9 @@ def main() -> None:
     parser.add_argument("--encoder", default="", metavar="FILE", help="checkpoint (default: the shipped encoder)")
     parser.add_argument("--adapt", type=int, default=0, metavar="WORLDS", help="also adapt on the other scenes, with "
                         "this number of randomised worlds beside them")  # fmt: skip
+    parser.add_argument("--steps", type=int, default=AdaptationSettings.steps, help="of an adaptation (%(default)s)")
+    parser.add_argument("--choosing", type=int, default=CHOOSING_WORLDS, metavar="WORLDS", help="worlds that choose "
+                        "how much of an adaptation is kept (%(default)s)")  # fmt: skip
     parser.add_argument("--samples", type=Path, default=Path("out/real_scenes"), metavar="DIR", help="samples of the "
                         "worlds and adapted encoders (%(default)s)")  # fmt: skip
     parser.add_argument("--threads", type=int, default=2, help="PyTorch threads (%(default)s)")
@@ -126,13 +129,14 @@ def main() -> None:
         first = REPLAY_WORLD
         files = [world_samples(first + i, encoder.config, options.samples) for i in range(options.adapt)]
         replay = [read_samples(file) for file in files]
-        files = [world_samples(CHOOSING_WORLD + i, encoder.config, options.samples) for i in range(CHOOSING_WORLDS)]
+        files = [world_samples(CHOOSING_WORLD + i, encoder.config, options.samples) for i in range(options.choosing)]
         choosing = [read_samples(file) for file in files]
         drawn = []
         for scene in scenes:
             others = [other for other in scenes if other is not scene]
             robot = load_robot(robot_of(scene.name))
-            adapted = adapt(encoder, robot, others, replay, options.samples / f"without_{scene.name}")
+            settings, folder = AdaptationSettings(steps=options.steps), options.samples / f"without_{scene.name}"
+            adapted = adapt(encoder, robot, others, replay, folder, settings)
             adapted, share = keep_obstacles(encoder, adapted, choosing)
             print(f"{scene.name}: kept {share:.0%} of the change")
             assert isinstance(adapted, TerrainEncoder), "a copy of the encoder"

@@ -70,6 +70,9 @@ def test_the_encoder_benchmark_writes_its_figures(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     figures = json.loads(out.read_text())
+    cases = ("lidar sweep, 5,000 returns", "lidar sweep, 35,000 returns", "1 camera(s)", "4 camera(s)")
+    assert set(figures["shipped"]) == set(cases)
+    assert all(figures["shipped"][case][time] > 0.0 for case in cases for time in ("clock_ms", "processor_ms"))
     for count in (1, 4):
         row = figures[f"{count} cameras"]
         assert row["fused_ms"] > 0 and row["ratio"] > 0 and all(v > 0 for v in row["stages_ms"].values())

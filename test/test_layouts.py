@@ -2,11 +2,20 @@
 
 import json
 import re
+from dataclasses import replace
 
+import numpy as np
+import torch
 import yaml
 from conftest import ROOT
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import PointCloud2, PointField
 
+from monoforce_ros.core import MotionState
+from monoforce_ros.nodes.prediction_messages import terrain_cloud
 from monoforce_ros.nodes.schema import read_schema
+from monoforce_ros.prediction import Prediction
+from monoforce_ros.terrain import Grid, TerrainMap
 
 # Display of RViz: type of the messages that it draws.
 RVIZ = {
@@ -93,6 +102,49 @@ def test_rviz_receives_best_effort_inputs():
 def test_rviz_shows_a_robot_in_the_namespace_that_it_is_started_in():
     named = [entry["Topic"]["Value"] for entry in [*rviz()["Displays"], *rviz()["Tools"]] if "Topic" in entry]
     assert len(named) > 10 and not [topic for topic in named if topic.startswith("/")]
+
+
+FIELDS = {"RGB8": "rgba", "AxisColor": "z"}
+"""What a transformer of RViz reads."""
+
+
+def terrain_message(spread):
+    """A map of the node as a message, whose expected errors grow along x up to ``spread`` [m]."""
+    terrain = TerrainMap.flat(Grid.square(6.4, 0.1))
+    if spread:
+        errors = torch.linspace(0.0, spread, terrain.grid.columns).expand(terrain.grid.rows, -1)
+        terrain = replace(terrain, geometric_spread=errors, decrease_spread=0.0 * errors)
+    still = MotionState(1, np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3))
+    cloud = deserialize_message(terrain_cloud(Prediction(still, terrain, None), "odom"), PointCloud2)
+    layout = {f.name: ("<u4" if f.datatype == PointField.UINT32 else "<f4", f.offset) for f in cloud.fields}
+    kinds, offsets = zip(*layout.values(), strict=True)
+    record = np.dtype(
+        {"names": list(layout), "formats": list(kinds), "offsets": list(offsets), "itemsize": cloud.point_step}
+    )
+    return cloud, np.frombuffer(bytes(cloud.data), record)
+
+
+def test_rviz_colours_terrain_by_fields_that_its_message_has():
+    displays = [d for d in rviz()["Displays"] if d.get("Topic", {}).get("Value") == "predicted/terrain"]
+    fields = {field.name: field.datatype for field in terrain_message(0.5)[0].fields}
+    read = [FIELDS.get(d["Color Transformer"]) or d["Channel Name"] for d in displays]
+    assert len(read) >= 2 and set(read) <= fields.keys()
+    # By default cells fade: RViz takes the opacity of each point of a field rgba, not of one named rgb.
+    assert [FIELDS.get(d["Color Transformer"]) for d in displays if d["Enabled"]] == ["rgba"]
+    assert fields["rgba"] == PointField.UINT32 and "rgb" not in fields
+
+
+def test_cells_fade_with_their_expected_error():
+    cloud, values = terrain_message(1.0)
+    opacity = (values["rgba"] >> 24).reshape(64, 64)[0] / 255
+    assert opacity[0] > 0.98 and (np.diff(opacity) <= 0.0).all() and opacity[-1] == opacity[40] < 0.2
+    assert 0.45 < opacity[16] < 0.7
+    colour = values["rgba"] & 0xFFFFFF
+    assert (colour == colour[0]).all() and cloud.is_dense
+    # Readers that take all fields for float32 see numbers.
+    assert np.isfinite(np.frombuffer(bytes(cloud.data), "<f4")).all()
+    # Without errors all that is measured is opaque.
+    assert ((terrain_message(0.0)[1]["rgba"] >> 24) > 250).all()
 
 
 def test_goals_of_both_layouts_reach_path_selector():

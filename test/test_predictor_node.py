@@ -50,7 +50,7 @@ def test_outputs_carry_the_stamp_and_frame_of_their_input(peer, predictor):
     assert len(peer.received["/predicted/height_map"][-1].cells) == 128 * 128
     terrain = peer.received["/predicted/terrain"][-1]
     names = ["x", "y", "z", "geometric_height", "stiffness", "damping", "friction", "observed"]
-    names += ["geometric_spread", "decrease_spread"]
+    names += ["geometric_spread", "decrease_spread", "rgba"]
     assert [f.name for f in terrain.fields] == names
     values = np.frombuffer(terrain.data, "<f4").reshape(-1, len(names))
     assert np.isfinite(values).all()

@@ -1,13 +1,19 @@
 """Real images, calibrations, clouds and poses, played into the installed predictor."""
 
+import json
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
+from conftest import ROOT
 
 from monoforce_ros.bags import BagReader, Recording
 from monoforce_ros.core import MotionTrack, transform_points
 from monoforce_ros.datasets import DatasetError, RoughScene, robot_file_for, scene_to_bag
+from monoforce_ros.encoder import EncoderConfig, new_encoder, save_encoder
 from monoforce_ros.messages import stamp_of
 from monoforce_ros.nodes.inputs import ODOMETRY_LAG
 from monoforce_ros.robots import load_robot
@@ -141,3 +147,32 @@ def test_rational_distortion_is_kept(real_data):
     ray = camera.rays(np.array([0.0, 0.0]))
     pixels, inside = camera.project(ray[None])
     assert inside[0] and np.abs(pixels[0]).max() < 0.1
+
+
+@pytest.mark.unhurried
+def test_the_benchmark_adapts_on_all_scenes_but_one(real_data, tmp_path):
+    small = EncoderConfig(
+        sensor="camera_lidar", image_width=64, image_height=48, map_size=6.4, resolution=0.2, depth_bins=12,
+        map_features=8, edges=False,
+    )  # fmt: skip
+    torch.manual_seed(0)
+    save_encoder(new_encoder(small), tmp_path / "start.safetensors")
+    done = subprocess.run(
+        [
+            sys.executable, "benchmarks/real_scenes.py", real_data / "rough",
+            "--encoder", tmp_path / "start.safetensors",
+            "--adapt", "1", "--steps", "2", "--choosing", "1", "--samples", tmp_path / "samples", "--threads", "1",
+            "--json", tmp_path / "found.json",
+        ],
+        cwd=ROOT, capture_output=True, text=True, timeout=600,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    found = json.loads((tmp_path / "found.json").read_text())
+    scenes = {row["scene"] for row in found}
+    assert len(scenes) == 3 and len(found) == 6
+    for scene in scenes:
+        before, after = (row for row in found if row["scene"] == scene)
+        assert (before["encoder"], after["encoder"]) == ("as shipped", "adapted on the others")
+        # Level ground does not depend on the encoder, nor do the cells that are judged on its weights.
+        assert before["level"] == after["level"] and before["cells"] == after["cells"] > 100
+        assert f"{scene}: kept " in done.stdout

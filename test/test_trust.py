@@ -321,6 +321,9 @@ def test_a_share_is_that_of_the_sensors_that_there_are(robot, believing):
     for x in np.arange(0.0, 6.0, 0.1):
         trusted.terrain(seen(x), at(x, hill(x)))
     earned = trusted.report.share
+    own, level = trusted.report.by_lidar
+    # Cells of 20 cm on the sides of the hill.
+    assert own < 0.05 < 0.1 < level
     assert earned > 0.5 and trusted.report.sensors == ("lidar", "camera")
     # The lidar dies: nothing has confirmed what pictures alone say.
     terrain = trusted.terrain(seen(6.0, lidar=False), at(6.0, hill(6.0)))
@@ -329,10 +332,13 @@ def test_a_share_is_that_of_the_sensors_that_there_are(robot, believing):
     for x in np.arange(6.1, 10.0, 0.1):
         trusted.terrain(seen(x, lidar=False), at(x, hill(x)))
     alone = trusted.report
-    assert alone.share < 0.2 and alone.error > 0.1
+    assert alone.share < 0.2 and alone.error > 0.1 and alone.by_lidar is None
     # It is back: so is what both had earned, and ground found meanwhile counts, too.
     trusted.terrain(seen(10.0), at(10.0, hill(10.0)))
     assert trusted.report.share > 0.5 and trusted.report.sensors == ("lidar", "camera")
+    # What images alone had said is compared with what the lidar measures of it now.
+    trusted.terrain(seen(10.05, lidar=False), at(10.05, hill(10.05)))
+    assert trusted.report.by_lidar[0] > 0.1
     trusted.terrain(seen(10.1, camera=False), at(10.1, hill(10.1)))
     assert trusted.report.share == 0.0 and "sweep alone" in trusted.report.explanation
     # A covered lidar is none.

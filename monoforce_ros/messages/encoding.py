@@ -9,7 +9,7 @@ import numpy as np
 
 from monoforce_ros.messages.cdr import CdrWriter
 
-_FLOAT32 = 7
+_UINT32, _FLOAT32 = 6, 7
 _LINE_LIST, _SPHERE_LIST = 5, 7
 
 
@@ -23,18 +23,29 @@ def grid_cells(stamp: int, frame_id: str, resolution: float, points: np.ndarray)
 
 
 def point_cloud(stamp: int, frame_id: str, channels: dict[str, np.ndarray]) -> bytes:
-    """``sensor_msgs/PointCloud2`` with one float32 field per channel, each ``[n]``, in the order given."""
-    columns = np.stack([np.asarray(values, "<f4").ravel() for values in channels.values()], axis=1)
+    """``sensor_msgs/PointCloud2`` with one field per channel, each ``[n]``, in the order given.
+
+    Fields are uint32 where the channel is, float32 otherwise.
+    """
+    whole = {name for name, values in channels.items() if np.asarray(values).dtype == np.uint32}
+    columns = np.stack(
+        [
+            np.asarray(values, "<u4").ravel() if name in whole else np.asarray(values, "<f4").ravel().view("<u4")
+            for name, values in channels.items()
+        ],
+        axis=1,
+    )
+    dense = all(np.isfinite(values).all() for name, values in channels.items() if name not in whole)
     count, step = len(columns), 4 * columns.shape[1]
     writer = CdrWriter()
     writer.header(stamp, frame_id)
     writer.fields("III", 1, count, len(channels))
     for index, name in enumerate(channels):
         writer.string(name)
-        writer.fields("IBI", 4 * index, _FLOAT32, 1)
+        writer.fields("IBI", 4 * index, _UINT32 if name in whole else _FLOAT32, 1)
     writer.fields("BII", 0, step, step * count)
     writer.sequence(columns.reshape(-1).view(np.uint8), 1)
-    writer.fields("B", int(np.isfinite(columns).all()))
+    writer.fields("B", int(dense))
     return writer.bytes()
 
 

@@ -10,6 +10,14 @@ from monoforce_ros.messages import encoding
 from monoforce_ros.planning import AlignedGrid
 from monoforce_ros.prediction import FORCE_LENGTH, Prediction, cell_points, contact_points, force_steps, usable_steps
 from monoforce_ros.robots import RobotModel
+from monoforce_ros.terrain import TerrainMap
+
+_COLOURS = colormaps["turbo"](np.linspace(0.0, 1.0, 256))[:, :3]
+_COLOURED = 1.0
+"""Height above or below the robot at which its colour is the last one [m]."""
+_UNKNOWN, _FAINTEST = 0.5, 0.15
+"""Expected error of a height [m] from which on a cell is drawn as one of which nothing is known, and its opacity: no
+wheel of a shipped robot climbs half a metre."""
 
 
 def height_map(prediction: Prediction, frame_id: str) -> bytes:
@@ -29,7 +37,8 @@ def height_map(prediction: Prediction, frame_id: str) -> bytes:
 def terrain_cloud(prediction: Prediction, frame_id: str) -> bytes:
     """``sensor_msgs/PointCloud2``: every cell with all channels; heights are z coordinates in the odometry frame.
 
-    Maps of an encoder have two more: the expected absolute errors of ``geometric_height`` and of H_d [m].
+    Maps of an encoder have two more: the expected absolute errors of ``geometric_height`` and of H_d [m]. The last one,
+    ``rgba``, is for viewers: the height as a colour, which fades with the expected error.
     """
     terrain, transform = prediction.terrain, prediction.motion.odometry_from_terrain
     points = cell_points(terrain, transform)
@@ -46,8 +55,28 @@ def terrain_cloud(prediction: Prediction, frame_id: str) -> bytes:
             "friction": terrain.friction.numpy(),
             "observed": terrain.observed.numpy().astype(np.float32),
             **{name: getattr(terrain, name).numpy() for name in terrain.spreads},
+            "rgba": _faded(terrain),
         },
     )
+
+
+def _faded(terrain: TerrainMap) -> np.ndarray:
+    """Colour of each cell, packed as RViz reads it (0xAARRGGBB), ``[rows * columns]`` uint32.
+
+    Where the map does not tell its errors, cells without a measurement nearby fade.
+    """
+    height = terrain.height.numpy().ravel()
+    colour = np.rint(255.0 * _COLOURS[np.clip((height / _COLOURED + 1.0) * 128.0, 0.0, 255.0).astype(int)])
+    spread = terrain.height_spread
+    if spread is None:
+        unsure = (~terrain.measured_nearby()).ravel().astype(float)
+    else:
+        unsure = np.clip(spread.numpy().ravel() / _UNKNOWN, 0.0, 1.0)
+    alpha = np.rint(254.0 * (1.0 - (1.0 - _FAINTEST) * unsure)).astype(np.uint32)
+    # Whoever reads all fields as float32 gets no NaN and no infinity.
+    alpha[alpha == 127] = 128
+    red, green, blue = colour.T.astype(np.uint32)
+    return (alpha << 24) | (red << 16) | (green << 8) | blue
 
 
 def path(prediction: Prediction, frame_id: str, time_step: float) -> bytes:

@@ -67,6 +67,8 @@ def _values(report: TrustReport) -> dict[str, str]:
         return f"{100 * own:.1f} ({100 * level:.1f})"
 
     compared = {"": (report.error, report.level_error)} if report.travelled else {}
+    if report.by_lidar is not None:
+        compared[" of the visible surface, lidar"] = report.by_lidar
     compared |= {f", {name}": pair for name, pair in (*report.by_distance.items(), *report.by_camera.items())}
     return {
         "sensors": ", ".join(report.sensors),

@@ -60,6 +60,8 @@ class TrustReport:
     """Mean error of prediction and of level ground [m], by the distance from which a place was predicted."""
     by_camera: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """The same by the camera that looked at a place."""
+    by_lidar: tuple[float, float] | None = None
+    """The same of the visible surface where a lidar measured it then or later; None without any."""
     spread_factor: float = 1.0
     """How much larger errors of predicted heights were than the predicted spreads; at least 1."""
     fallback_error: float = float("nan")
@@ -128,6 +130,8 @@ class _Said:
     motion: MotionState
     height: np.ndarray
     """``[rows, columns]`` in its terrain frame [m]."""
+    surface: np.ndarray
+    """Heights of the visible surface ``[rows, columns]`` [m]."""
     observed: np.ndarray
     level: float
     """Height of level ground in that frame [m]."""
@@ -178,18 +182,22 @@ class TerrainTrust:
         self._pending: list[_Comparison] = []
         """Comparisons of the current block."""
         self._compared: deque[_Comparison] = deque(maxlen=2000)
+        self._measured: deque[tuple[float, float]] = deque(maxlen=round(LENGTH / BLOCK))
+        """Mean errors of the visible surface, and of level ground, where a lidar measured it [m]."""
         self._travelled = self._uncompared = 0.0
         self._due = False
         """Whether the next prediction is to be remembered."""
         self._previous: MotionState | None = None
         self._trusted = True
 
-    def follow(self, motion: MotionState, support: np.ndarray) -> None:
-        """Compare earlier predictions with the ground under the wheels.
+    def follow(self, motion: MotionState, support: np.ndarray, measured: np.ndarray | None = None) -> None:
+        """Compare earlier predictions with the ground under the wheels, and with what a lidar measures.
 
         Args:
             motion: the robot's motion now.
             support: points of the ground under its wheels ``[m, 3]`` in its terrain frame [m].
+            measured: points of the visible surface ``[n, 3]`` in that frame [m]. They are reported and decide nothing:
+                beside a sweep an encoder repeats what was measured.
         """
         if self._previous is None or not continues(motion, self._previous):
             self._start_over()
@@ -203,6 +211,8 @@ class TerrainTrust:
         if self._uncompared > _STEP:
             self._uncompared = 0.0
             self._compare(transform_points(motion.odometry_from_terrain, support))
+        if measured is not None and len(measured):
+            self._compare_surface(transform_points(motion.odometry_from_terrain, measured))
         if self._travelled >= BLOCK:
             self._travelled, self._due = 0.0, True
             if self._pending:
@@ -219,17 +229,18 @@ class TerrainTrust:
         cameras: Mapping[str, float],
         start_error: float,
         fallback: TerrainMap | None = None,
+        measured: np.ndarray | None = None,
     ) -> TrustReport:
         """As :meth:`follow`, and remember the newest prediction.
 
         Args:
-            motion, support: see :meth:`follow`.
+            motion, support, measured: see :meth:`follow`.
             predicted: predicted map.
             cameras: direction of each camera's optical axis in the terrain frame [rad].
             start_error: median difference between predicted and actual ground under the wheels [m].
             fallback: map that is used in place of the predicted one; level ground by default.
         """
-        self.follow(motion, support)
+        self.follow(motion, support, measured)
         if self._due:
             self._due = False
             level = float(support[:, 2].mean())
@@ -237,7 +248,8 @@ class TerrainTrust:
             other = np.full_like(height, level) if fallback is None else fallback.height.numpy().copy()
             spread = None if predicted.height_spread is None else predicted.height_spread.numpy().copy()
             observed = predicted.observed.numpy().copy()
-            self._said.append(_Said(motion, height, observed, level, other, spread, dict(cameras)))
+            surface = predicted.geometric_height.numpy().copy()
+            self._said.append(_Said(motion, height, surface, observed, level, other, spread, dict(cameras)))
         return self._report(start_error)
 
     def _compare(self, points: np.ndarray) -> None:
@@ -275,6 +287,22 @@ class TerrainTrust:
                     camera=camera,
                 )
             )
+
+    def _compare_surface(self, points: np.ndarray) -> None:
+        """Compare the visible surface ``[n, 3]`` in the odometry frame with what was said of it."""
+        errors = []
+        for said in self._said:
+            local = transform_points(np.linalg.inv(said.motion.odometry_from_terrain), points)
+            distance = np.hypot(local[:, 0], local[:, 1])
+            rows, columns, inside = self._grid.cells(local[:, :2])
+            usable = inside & (distance > _NEAREST) & (distance < _FARTHEST) & said.observed[rows, columns]
+            if usable.any():
+                height = local[usable, 2]
+                own = float(np.abs(said.surface[rows, columns][usable] - height).mean())
+                errors.append((own, float(np.abs(said.level - height).mean())))
+        if errors:
+            own, level = np.mean(errors, axis=0).tolist()
+            self._measured.append((own, level))
 
     def _judge(self) -> None:
         if len(self._blocks) < FEWEST_BLOCKS:
@@ -322,6 +350,7 @@ class TerrainTrust:
             name: _errors([entry for entry in entries if entry.camera == name])
             for name in sorted({entry.camera for entry in entries} - {""})
         }
+        measured = np.mean(self._measured, axis=0).tolist() if self._measured else None
         trusted = self._trusted and start_error <= START_TOLERANCE
         return TrustReport(
             trusted=trusted,
@@ -333,6 +362,7 @@ class TerrainTrust:
             worst_camera=max(by_camera, key=lambda name: by_camera[name][0], default=""),
             by_distance=by_distance,
             by_camera=by_camera,
+            by_lidar=(measured[0], measured[1]) if measured else None,
             spread_factor=self._spread_factor(),
             fallback_error=nothing if last is None else last.off,
         )

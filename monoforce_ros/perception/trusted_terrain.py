@@ -13,10 +13,11 @@ import torch
 from monoforce_ros.core import MotionState
 from monoforce_ros.perception.encoder_terrain import EncoderTerrain
 from monoforce_ros.perception.ground_alignment import standing
+from monoforce_ros.perception.lidar import usable_returns
 from monoforce_ros.perception.observation import Observation, TerrainSource
 from monoforce_ros.perception.temporal_memory import TemporalMemory
 from monoforce_ros.perception.trust import BLOCK, FEWEST_BLOCKS, TerrainTrust, TrustReport
-from monoforce_ros.terrain import Grid, TerrainError, TerrainMap
+from monoforce_ros.terrain import Grid, LidarSettings, TerrainError, TerrainMap, cell_heights
 
 _LEAST_MATERIAL = 1e-6
 """Stiffness, damping and friction that count as none, in their units."""
@@ -56,6 +57,8 @@ class TrustedTerrain:
         self.report: TrustReport | None = None
         """Result of the last comparison; None before the first map."""
         self._fell_back_to: TerrainSource | None = None
+        self._measured_at: np.ndarray | None = None
+        """Where the robot was when predictions were last compared with a sweep ``[2]`` [m]."""
         self.predicted: TerrainMap | None = None
         """The encoder's last map, before any of it was replaced by the fallback's."""
 
@@ -88,11 +91,12 @@ class TrustedTerrain:
         present = {"lidar": swept, "camera": bool(observation.images)}
         sensors = tuple(name for name in self.sensors if present[name])
         in_use = self._trusts.setdefault(sensors, TerrainTrust(self.grid, self._expected))
+        measured = self._measured(observation, motion) if swept and present["camera"] else None
         for trust in self._trusts.values():
             if trust is not in_use:
-                trust.follow(motion, support)
+                trust.follow(motion, support, measured)
         report = replace(
-            in_use.update(motion, support, predicted, cameras, encoder.start_error, other),
+            in_use.update(motion, support, predicted, cameras, encoder.start_error, other, measured),
             sensors=sensors,
             missing=tuple(name for name in self.sensors if not present[name]),
         )
@@ -104,6 +108,20 @@ class TrustedTerrain:
         if not (report.trusted or other.spreads):
             used = _with_measured_error(used, report)
         return used if self._memory is None else self._memory.recalled(used, observation, motion, swept=swept)
+
+    def _measured(self, observation: Observation, motion: MotionState) -> np.ndarray | None:
+        """The visible surface that the lidar measures ``[n, 3]`` in the terrain frame [m], every half metre."""
+        place = motion.position[:2]
+        near = self._measured_at is not None and float(np.linalg.norm(place - self._measured_at)) < BLOCK
+        if near or observation.cloud is None:
+            return None
+        self._measured_at = place.copy()
+        robot, grid = self._encoder.robot, self.grid
+        posed, support = standing(robot, observation.flipper_angles, motion, self._encoder.stiffness)
+        points = usable_returns(observation.cloud, posed, motion, support, grid)
+        heights, hit = cell_heights(points, grid, replace(LidarSettings(), headroom=robot.headroom))
+        x, y = np.meshgrid(grid.x, grid.y)
+        return np.column_stack([x[hit], y[hit], heights[hit]])
 
     def _fallback(self, observation: Observation, motion: MotionState) -> TerrainMap:
         """Map of the first fallback whose sensors have measured enough; the last one's error if there is none."""
