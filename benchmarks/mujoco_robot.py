@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.synthetic.graphics import mujoco
-from monoforce_ros.terrain import TerrainMap
+from monoforce_ros.terrain import TerrainDefaults, TerrainMap
 
 TIME_STEP = 1.0 / 120.0
 """Of which half a second has a whole number [s]."""
@@ -119,7 +119,7 @@ class Nominal:
         return cls(
             robot=robot,
             wheels=wheels,
-            friction=0.8 * value("friction_scale", "factor", 1.0),
+            friction=TerrainDefaults().friction * value("friction_scale", "factor", 1.0),
             servo_gain=load * robot.wheel_radius**2 / loss,
             dead_time=value("command_delay", "delay", 0.0),
             lag=value("actuator_lag", "time_constant", 0.0) + value("actuator_lag", "second_time_constant", 0.0),
