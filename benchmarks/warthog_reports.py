@@ -118,14 +118,14 @@ def run(drive: RealDrive, data: Path, folder: Path) -> dict:
 
 
 def code_version() -> str:
-    """Commit of the repository; with a plus sign where the package differs from it."""
-    root = Path(__file__).parents[1]
+    """The last commit that changed the package or its files; with a plus sign where they differ from it."""
 
     def git(*arguments: str) -> str:
-        done = subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True, check=False)
+        command = ["git", *arguments, "--", "monoforce_ros", "config"]
+        done = subprocess.run(command, cwd=Path(__file__).parents[1], capture_output=True, text=True, check=False)
         return done.stdout.strip()
 
-    return (git("rev-parse", "--short=7", "HEAD") or "–") + ("+" if git("status", "--short", "monoforce_ros") else "")
+    return (git("log", "-1", "--format=%h") or "–") + ("+" if git("status", "--short") else "")
 
 
 def whole_line(row: dict) -> str:
@@ -143,12 +143,13 @@ def whole_line(row: dict) -> str:
         f"`{effect['name']}` " + " ".join(f"{v['value']:.3g} {v['unit']}" for v in effect["parameters"].values())
         for effect in named
     )
-    # Where nothing was found, what the report says first.
+    # The verdict alone does not say that predictions grow worse, or that something is missing still.
     top = row["headline"]
-    said = found or " ".join([top["sentence"], *(text.split(" (")[0] for text in top["findings"][:1])])
+    found = found or " ".join(text.split(" (")[0] for text in top["findings"][:1]) or "–"
     return (
-        f"| {row['ground']} | {row['known']} | `{row['verdict']}` | {said} | {change('position_2s')} | "
-        f"{change('position_5s')} | {change('heading_2s')} | {row['seconds']:.0f} s | {row['code']} |"
+        f"| {row['ground']} | {row['known']} | `{row['verdict']}`. {top['sentence']} | {found} | "
+        f"{change('position_2s')} | {change('position_5s')} | {change('heading_2s')} | {row['seconds']:.0f} s | "
+        f"{row['code']} |"
     )
 
 

@@ -132,7 +132,7 @@ def test_the_tables_of_real_drives_keep_what_was_not_run_and_say_what_is_known()
     before = warthog_reports.section([row | other])
     text = warthog_reports.section([row], before)
     assert (
-        text.count("\n| Husky, wheels in the air | lag 0.3 s | `not_identifiable` | Not diagnosed. the wheels turn |")
+        text.count("\n| Husky, wheels in the air | lag 0.3 s | `not_identifiable`. Not diagnosed. | the wheels turn |")
         == 1
     )
     whole = next(line for line in text.splitlines() if line.startswith("| asphalt | lag"))

@@ -518,18 +518,19 @@ def test_mujocos_system_identification_finds_slow_drives(tmp_path):
     for module in ("mujoco.sysid", "colorama", "tabulate", "plotly"):
         pytest.importorskip(module, reason="mujoco[sysid] is in benchmarks/requirements.txt")
     import mujoco_sysid
+    from mujoco_robot import FREE, Nominal
 
     platform = draw_platform(1)
     driver = ManoeuvreDriver(platform.maximum_speed, platform.maximum_yaw_rate, 2)
     trace = simulate(DriveJob(platform, Ground(), driver, (DriveFactors(left=0.6, right=0.6),), 14.0))
     robot = load_robot(write_robot_file(platform, tmp_path / "platform.yaml"))
     data, scale = windows_of(trace, 14.0), np.full((4, 3), 0.02)
-    nominal = mujoco_sysid.Nominal.of(robot)
+    nominal = Nominal.of(robot)
     np.testing.assert_allclose(
         nominal.wheels[:, 0], np.tile(np.sort(nominal.wheels[: platform.axles, 0])[::-1], 2), atol=1e-3
     )
     np.testing.assert_allclose(np.abs(nominal.wheels - platform.wheel_centres).max(), 0.0, atol=0.05)
-    start = {name: entry.start for name, entry in mujoco_sysid.FREE.items()}
+    start = {name: entry.start for name, entry in FREE.items()}
 
     def error(values):
         residuals = mujoco_sysid.WindowRollouts(nominal, data, scale).residuals([values])[0, :, -1]
