@@ -143,6 +143,7 @@ def test_what_acts_on_a_part_of_the_ground_is_written_into_a_robot_file_only_if_
         for text in ("\n".join(summary_lines(advised)), diagnosis_page(advised, {}, None)):
             assert said in text
             assert "on all other ground predictions get worse with it" in text
+    assert report_content(found, {}, None)["partial"] == ["friction_scale"]
     file = write_robot("husky", tmp_path / "husky.yaml", [file_entry(found, e) for e in (DELAY, ICE)], [], "0")
     lines = file.read_text().splitlines()
     above = [lines[lines.index(f"- name: {name}") - 1] for name in ("command_delay", "friction_scale")]

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import BagWriter, SmoothedMotion, builders, smooth
-from monoforce_ros.core import CommandTrack, MotionTrack, WheelTrack
+from monoforce_ros.core import CommandTrack, EffortTrack, MotionTrack, WheelTrack
 from monoforce_ros.discrepancy import Evidence, cli, diagnose, motion_faults
 from monoforce_ros.discrepancy.ground import LEVEL_SLOPE, slopes_of
 from monoforce_ros.evaluation.check import check_bag
@@ -147,6 +147,28 @@ def test_wheels_that_turn_while_the_robot_does_not_are_said():
     assert "wheels turn" in text and "off the ground" in text
     # The same without motion of the wheels is another fault.
     (text,) = motion_faults(smooth(motion), commands, WheelTrack(commands.stamps, 0 * speeds))
+    assert "motors off" in text
+
+
+def test_motors_that_work_while_the_robot_stands_say_that_it_is_blocked():
+    motion, commands = standing(*recorded())
+    # Ten seconds of nothing, and then what it was commanded before, which the robot cannot follow.
+    pause = np.arange(200) * 50_000_000 + commands.stamps[0]
+    later = CommandTrack(
+        np.r_[pause, commands.stamps + 10 * 10**9], np.r_[np.zeros((200, 2)), np.maximum(commands.twists, 0.1)]
+    )
+    stamps = np.arange(pause[0], later.stamps[-1], 50_000_000)
+    asked = (np.abs(later.sample(stamps)) > 0.05).any(axis=1)
+    noise = np.abs(0.2 * np.random.default_rng(0).standard_normal((len(stamps), 2)))
+    working = EffortTrack(stamps, 1.0 + noise + 7.0 * asked[:, None])
+    (text,) = motion_faults(smooth(motion), later, None, working)
+    assert "its motors work" in text and "blocked" in text and "motors off" not in text
+    times = float(text.split("they draw ")[1].split(" times")[0])
+    assert times == pytest.approx(8.16 / 1.16, rel=0.05)
+    # Motors that are off draw what they draw without commands.
+    (text,) = motion_faults(smooth(motion), later, None, EffortTrack(stamps, 1.0 + noise))
+    assert "motors off" in text
+    (text,) = motion_faults(smooth(motion), later, None, None)
     assert "motors off" in text
 
 

@@ -157,7 +157,9 @@ def _prepare(evidence: Evidence, robot: RobotModel, samples: np.ndarray, stride:
     starts = window_starts(smoothed.motion, smoothed.stretches, float(samples[-1]), stride)
     # What somebody drove with a joystick, or wheels that turned in place, is not how the robot follows its commands.
     starts = starts[~not_comparable(evidence, robot, starts, float(samples[-1]))]
-    found = motion_faults(smoothed, evidence.commands, evidence.wheels) or complaints(evidence, starts)
+    found = motion_faults(smoothed, evidence.commands, evidence.wheels, evidence.efforts) or complaints(
+        evidence, starts
+    )
     if found:
         raise ValueError("; ".join(found))
     data = evidence.cut(starts, samples)

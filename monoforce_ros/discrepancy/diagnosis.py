@@ -173,7 +173,7 @@ def diagnose(
     )
     known = None if nominal is None else nominal.efforts
     efforts = changed_efforts(evidence.commands, evidence.efforts, evidence.wheels, robot, known, settings.thresholds)
-    faults = motion_faults(smoothed, evidence.commands, evidence.wheels)
+    faults = motion_faults(smoothed, evidence.commands, evidence.wheels, evidence.efforts)
     if faults:
         return Diagnosis(Verdict.NOT_IDENTIFIABLE, advice=faults, remarks=(*left_out, *efforts))
     found = complaints(evidence, starts)

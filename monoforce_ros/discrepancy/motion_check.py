@@ -10,9 +10,18 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from scipy.stats import mannwhitneyu
 
 from monoforce_ros.bags import SmoothedMotion
-from monoforce_ros.core import NANOSECOND, CommandTrack, DelayCorrelation, MotionTrack, WheelTrack, wrap_angle
+from monoforce_ros.core import (
+    NANOSECOND,
+    CommandTrack,
+    DelayCorrelation,
+    EffortTrack,
+    MotionTrack,
+    WheelTrack,
+    wrap_angle,
+)
 
 _LAGS = np.arange(-0.5, 1.525, 0.025)
 """Delays from command to motion that a base may have [s]: dead times of real Warthogs reach 0.65 s, and their poses are
@@ -53,12 +62,17 @@ _BROKEN = 0.1
 window at any rate of odometry above 5 Hz."""
 _GAP = 0.5
 """Time without a pose in which motion is unknown [s]."""
+_ALPHA = 0.05
+"""Probability that motors which work no harder while something is commanded pass for blocked ones."""
 _SHIFTS = 19
 """Shifts of the commands against which the correlation is tested: it must exceed 95 % of them."""
 
 
 def motion_faults(
-    smoothed: SmoothedMotion, commands: CommandTrack, wheels: WheelTrack | None = None
+    smoothed: SmoothedMotion,
+    commands: CommandTrack,
+    wheels: WheelTrack | None = None,
+    efforts: EffortTrack | None = None,
 ) -> tuple[str, ...]:
     """What makes any comparison of this motion with these commands meaningless; empty where nothing does.
 
@@ -66,6 +80,7 @@ def motion_faults(
         smoothed: measured motion.
         commands: commands to the base.
         wheels: measured wheel speeds, if there are any.
+        efforts: currents or torques of the motors, if there are any.
 
     Returns:
         one sentence each, with what to do.
@@ -87,7 +102,7 @@ def motion_faults(
             f"commands and poses do not overlap in time, they are {apart:.0f} s apart: different clocks stamped them; "
             "synchronise the robot's clocks before recording",
         )
-    still = _standing(smoothed, commands, wheels)
+    still = _standing(smoothed, commands, wheels, efforts)
     if still:
         return (still,)
     # Speeds of wrong poses are wrong, too: whether they follow the commands says nothing then.
@@ -176,7 +191,9 @@ def _sampled(smoothed: SmoothedMotion) -> Iterator[tuple[np.ndarray, np.ndarray,
         yield at, places, np.interp(at, times, headings)
 
 
-def _standing(smoothed: SmoothedMotion, commands: CommandTrack, wheels: WheelTrack | None) -> str:
+def _standing(
+    smoothed: SmoothedMotion, commands: CommandTrack, wheels: WheelTrack | None, efforts: EffortTrack | None
+) -> str:
     """That the robot does not move; empty if it does."""
     span = round(_SPAN / _STEP)
     least = max(_MOVED, _NOISES * smoothed.position_noise), max(_TURNED, _NOISES * smoothed.rotation_noise)
@@ -200,10 +217,32 @@ def _standing(smoothed: SmoothedMotion, commands: CommandTrack, wheels: WheelTra
             f"the robot does not move although its wheels turn, at up to {fastest:.1f} rad/s ({asked}): they are off "
             "the ground, dug in, or the robot is blocked; or the poses are of something that stands"
         )
+    strained = _strained(commands, efforts)
+    if strained is not None:
+        return (
+            f"the robot does not move although {asked}, and its motors work: they draw {strained:.2g} times the "
+            "current that they draw while nothing is commanded; it is blocked, dug in, or a brake holds it"
+        )
     return (
         f"the robot does not move although {asked}: emergency stop, motors off, wrong command topic, or poses of "
         "something that stands; check them and record again"
     )
+
+
+def _strained(commands: CommandTrack, efforts: EffortTrack | None) -> float | None:
+    """How many times the current of the motors is larger while something is commanded; None if that is not certain."""
+    if efforts is None or len(efforts) < 2:
+        return None
+    asked = (np.abs(commands.sample(efforts.stamps)) >= _COMMANDED).any(axis=1)
+    numbers = (efforts.stamps - efforts.stamps[0]) // round(_SPAN / NANOSECOND)
+    driven, idle = [], []
+    for number in np.unique(numbers):
+        inside = numbers == number
+        if asked[inside].all() or not asked[inside].any():
+            (driven if asked[inside].all() else idle).append(float(efforts.efforts[inside].mean()))
+    if not driven or not idle or mannwhitneyu(driven, idle, alternative="greater").pvalue >= _ALPHA:
+        return None
+    return float(np.median(driven)) / max(float(np.median(idle)), 1e-9)
 
 
 def _pose_faults(smoothed: SmoothedMotion, *, crabs: bool = False) -> Iterator[str]:

@@ -54,6 +54,7 @@ def report_content(
         "inputs": dict(inputs),
         "advice": list(diagnosis.advice),
         "part": diagnosis.part or None,
+        "partial": list(diagnosis.partial),
         "area": None if diagnosis.details is None else _area_entry(diagnosis.details.area),
         "candidates": [asdict(candidate) for candidate in diagnosis.candidates],
         "regimes": [asdict(row) for row in diagnosis.regimes],

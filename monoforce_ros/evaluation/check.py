@@ -101,7 +101,7 @@ def _contents(
         yield from _offset_findings(motion, recording.motion)
         motion = recording.motion
     smoothed = smooth(motion)
-    faults = motion_faults(smoothed, recording.commands, recording.wheels)
+    faults = motion_faults(smoothed, recording.commands, recording.wheels, recording.efforts)
     yield from (missing(text) for text in faults)
     yield from _motion_findings(recording, smoothed, span)
     if len(recording.commands):

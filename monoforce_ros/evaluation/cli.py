@@ -177,7 +177,7 @@ def run(options: argparse.Namespace) -> None:
     robot = load_robot(options.robot)
     recording = reading.open(bag, robot)
     robot = reading.robot_in_bag(robot)
-    for text in motion_faults(smooth(recording.motion), recording.commands, recording.wheels):
+    for text in motion_faults(smooth(recording.motion), recording.commands, recording.wheels, recording.efforts):
         print(f"warning: {text}", file=sys.stderr)
     material = TerrainDefaults(friction=options.friction)
     source = choose_terrain_source(
