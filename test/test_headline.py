@@ -17,6 +17,7 @@ from monoforce_ros.discrepancy.page import diagnosis_page
 from monoforce_ros.discrepancy.partial_effects import effects_for_file, file_entry, with_advice
 from monoforce_ros.discrepancy.preflight import advice
 from monoforce_ros.discrepancy.report import report_content, summary_lines
+from monoforce_ros.discrepancy.verdict import Losses
 from monoforce_ros.discrepancy.wording import cause, finding, remedy
 from monoforce_ros.effects import CATALOGUE, identifiable_effects
 from monoforce_ros.robots import load_robot, write_robot
@@ -77,6 +78,30 @@ def test_a_robot_that_was_blocked_is_not_all_right_because_its_model_is():
     assert any(seen in line for line in summary_lines(blocked))
     assert "but the robot stays where it is" in diagnosis_page(blocked, {}, None)
     assert headline(replace(blocked, observed=())).tone is Tone.GOOD
+
+
+@pytest.mark.parametrize(("share", "told"), [(0.55, True), (0.3, False)])
+def test_what_explains_most_of_an_unknown_effect_is_said_with_its_share(share, told):
+    part = effect("drive_gain", gain=(1.12, 1.08, 1.16))
+    found = Diagnosis(
+        Verdict.UNKNOWN_EFFECT, known_parts=(part,), gap={"position_2s": row(0.16, None)},
+        losses=Losses(4.5, 2.0, 0.69, share),
+    )  # fmt: skip
+    top = headline(found)
+    assert top.tone is Tone.UNKNOWN
+    assert any("55 %" in text and "12 % faster than commanded" in text for text in top.findings) == told
+    assert top.sentence.startswith("Something is wrong; what is known explains a part of it") == told
+
+
+def test_what_is_less_than_in_the_robots_file_is_said_to_be_less():
+    late = replace(DELAY, in_file={"delay": 0.5})
+    text = "The drives react 0.30 s late to every command. The robot's file says delay 0.5 s, which is more."
+    assert finding(late) == text
+    top = headline(diagnosed((0.5, 0.06), (8.0, 1.0), effects=(late,)))
+    assert any("less than in the robot's file" in text and "commission" in text for text in top.actions)
+    later = replace(DELAY, in_file={"delay": 0.1})
+    assert finding(later).endswith("The robot's file says delay 0.1 s.")
+    assert remedy("command_delay") in headline(diagnosed((0.5, 0.06), (8.0, 1.0), effects=(later,))).actions
 
 
 def test_what_the_localisation_errs_by_itself_is_said_beside_what_is_unexplained():

@@ -151,3 +151,18 @@ def test_indistinguishable_effects_are_written_under_the_new_and_the_former_name
     (written,) = yaml.safe_load(file.read_text())["effects"]
     assert written["provenance"]["indistinguishable"] == written["provenance"]["rivals"] == ["turning_scrub"]
     assert dict(load_robot(file).effects) == {"drive_gain": {"gain": 0.9}}
+
+
+def test_the_wheel_radius_is_that_of_the_driven_wheels(tmp_path):
+    """Wheel speeds are those of the drives: a small caster behind must not count."""
+    robot = {
+        "name": "cart", "mass": 80.0, "inertia_box": [1.0, 0.7, 0.3], "command": {"track_width": 0.76},
+        "wheels": [
+            *({"name": side, "drive": side, "centre": [0.0, y, 0.0], "radius": 0.175, "width": 0.09}
+              for side, y in (("left", 0.38), ("right", -0.38))),
+            {"name": "rear", "drive": None, "centre": [-0.5, 0.0, -0.113], "radius": 0.062, "width": 0.04},
+        ],
+    }  # fmt: skip
+    file = tmp_path / "cart.yaml"
+    file.write_text(yaml.safe_dump(robot))
+    assert load_robot(file).wheel_radius == pytest.approx(0.175)

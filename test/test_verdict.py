@@ -44,7 +44,7 @@ def test_an_effect_that_explains_too_little_is_a_known_part_even_where_the_rest_
     first, second, *_ = decision.remarks
     share = (2.5 - after) / (2.5 - 0.5 * math.exp(Thresholds().drive_spread))
     assert first == f"drive_asymmetry explains only {100 * share:.0f} % of the excess loss"
-    assert second == "more than 30 % of the excess is left"
+    assert second == "more than 40 % of the excess is left"
 
 
 def test_a_rest_that_does_not_look_healthy_is_unknown_however_small():

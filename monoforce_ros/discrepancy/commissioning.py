@@ -118,19 +118,20 @@ def commission(
         prepared.append(_prepare(evidence, robot, np.array(samples), stride))
     overgrown = [shows_vegetation(entry.data) for entry in prepared]
     chosen = (*COMMISSIONED, *COMMISSIONED_IN_VEGETATION) if any(overgrown) else COMMISSIONED
-    fits = [_fitted(entry, chosen) for entry in prepared]
+    measured = [compare_with_wheels(evidence.commands, evidence.wheels, robot) for evidence in recordings]
+    drives = [wheels for wheels in measured if wheels is not None]
+    fits = [_started(entry, chosen, wheels) for entry, wheels in zip(prepared, measured, strict=True)]
     found: list[tuple[str, Mapping[str, float]]] = []
-    drives: list[WheelFinding] = []
     for number, (entry, fit) in enumerate(zip(prepared, fits, strict=True)):
         progress(0.3 + 0.4 * number / len(prepared), "searching for further effects")
-        wheels = compare_with_wheels(recordings[number].commands, recordings[number].wheels, robot)
-        drives += [] if wheels is None else [wheels]
-        found += _further(robot, entry, fit.effects, wheels)
+        known = {name for name, _ in chosen}
+        found += [(name, values) for name, values in fit.effects if name not in known]
+        found += _further(robot, entry, fit.effects, measured[number])
     counted = [name for name, _ in found]
     further = {name: values for name, values in found if counted.count(name) > 0.5 * len(prepared)}
     if further:
         # From what was found: from the starting values of all, no step may lead down.
-        fits = [_fitted(entry, (*fit.effects, *further.items())) for entry, fit in zip(prepared, fits, strict=True)]
+        fits = [_fitted(entry, _with(fit.effects, further, known)) for entry, fit in zip(prepared, fits, strict=True)]
     # Whose covariance tells the intervals: one that saw everything.
     first = fits[overgrown.index(True)] if any(overgrown) else fits[0]
     merged = replace(first, effects=_merged([fit.effects for fit in fits], overgrown))
@@ -176,6 +177,33 @@ def _fitted(entry: _Prepared, effects: Effects, iterations: int = 12) -> Fit:
     return fit_effects(
         entry.predictions, [effects], residual_scale(entry.floor, entry.data, None), iterations=iterations, prior=prior
     )
+
+
+def _started(entry: _Prepared, chosen: Effects, wheels: WheelFinding | None) -> Fit:
+    """The fit of what every robot has, and of what its wheel speeds show of the drives where that explains more.
+
+    Ramps of a base look like a long dead time to a fit that begins without them, and nothing leads away from there:
+    the fit begins at what the wheels show, too, where these have been measured.
+    """
+    fit = _fitted(entry, chosen)
+    shown = {} if wheels is None else dict(wheels.effects)
+    if not shown:
+        return fit
+    beginning = tuple((name, {**values, **shown[name]} if name in shown else values) for name, values in chosen)
+    others = tuple((name, values) for name, values in shown.items() if name not in dict(chosen))
+    by_wheels = _fitted(entry, (*beginning, *others))
+    # A further parameter is worth a log likelihood of half the logarithm of the number of blocks (Schwarz 1978).
+    count = len(np.unique(blocks_of(entry.data.starts)))
+    more = sum(len(values) for _, values in others)
+    gain = (float(fit.loss.mean()) - float(by_wheels.loss.mean())) * count
+    return by_wheels if gain > 0.5 * more * np.log(count) else fit
+
+
+def _with(effects: Effects, further: Mapping[str, Mapping[str, float]], always: set[str]) -> Effects:
+    """What every robot has, and further effects, each with the values of this fit where it has them."""
+    own = dict(effects)
+    kept = tuple((name, values) for name, values in effects if name in always)
+    return (*kept, *((name, own.get(name, values)) for name, values in further.items()))
 
 
 def _merged(fitted: Sequence[Effects], overgrown: Sequence[bool]) -> Effects:

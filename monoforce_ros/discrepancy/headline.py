@@ -12,7 +12,7 @@ from monoforce_ros.discrepancy.diagnosis import Diagnosis
 from monoforce_ros.discrepancy.estimates import EffectEstimate
 from monoforce_ros.discrepancy.learned import LEARNED
 from monoforce_ros.discrepancy.verdict import Verdict
-from monoforce_ros.discrepancy.wording import cause, finding, remedy
+from monoforce_ros.discrepancy.wording import cause, eased, finding, remedy
 
 _NEVER = "the robot's file was never commissioned: this may be how the healthy robot is (diagnose --commission)"
 _COMMISSION = "commission the robot while it is healthy: later reports then say what changed"
@@ -153,7 +153,12 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
     grew = [row for row in rows if row.grew]
     # A recording from before the fault says nothing of what explains it.
     elsewhere = bool(rows) and not counted and all(row.recording for row in rows)
-    remedies = [remedy(effect.name) for effect in effects]
+    remedies = [
+        f"{cause(effect.name)}: less than in the robot's file; if nothing was repaired, commission the robot again"
+        if eased(effect)
+        else remedy(effect.name)
+        for effect in effects
+    ]
     remedies += [
         f"if it is {cause(other)} instead: {remedy(other)}"
         for effect in named
@@ -178,6 +183,8 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
         f"{_class_of(effect)}. By all of it: {finding(effect)}" if effect.named_otherwise else finding(effect)
         for effect in effects
     )
+    if diagnosis.verdict == Verdict.UNKNOWN_EFFECT and not named:
+        findings += _of_parts(diagnosis)
     if not named:
         # Without a name for it, where the error shows is what is known.
         findings += tuple(
@@ -197,6 +204,8 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
 
     if diagnosis.verdict == Verdict.UNKNOWN_EFFECT:
         sentence = "Something is wrong that no known effect explains."
+        if _of_parts(diagnosis):
+            sentence = "Something is wrong; what is known explains a part of it, and not enough to be the cause alone."
         if named:
             sentence = "Something is wrong that no known effect explains, besides what was found."
         return result(Tone.UNKNOWN, sentence)
@@ -232,6 +241,17 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
     else:
         sentence = "A cause was found, with doubts."
     return result(Tone.PARTLY, sentence)
+
+
+def _of_parts(diagnosis: Diagnosis) -> tuple[str, ...]:
+    """What known effects explain of an unknown one, and how much of it; empty where that is not most of it."""
+    parts = [part for part in diagnosis.known_parts if part.name != LEARNED and not complaint(part)]
+    share = None if diagnosis.losses is None else diagnosis.losses.share_explained
+    if not parts or share is None or share < MOST:
+        return ()
+    found = " ".join(finding(part) for part in parts)
+    size = f"{100 * share:.0f} % of the loss in excess of a healthy robot's"
+    return (f"A part of the error ({size}) looks like this: {found}",)
 
 
 def _class_of(effect: EffectEstimate) -> str:

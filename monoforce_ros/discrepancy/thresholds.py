@@ -58,7 +58,10 @@ class Thresholds:
             MuJoCo platforms for choosing the true effects explain at least 0.5, 0.6, 0.7, 0.8 and 0.9 of what exceeds
             the mean on 69, 67, 66, 61 and 57 (``benchmarks/platforms/true_effects.py``, by their motion alone). What a
             search takes for the cause of an effect outside the catalogue explained 0.06, 0.12, 0.14, 0.52 and 0.62 of
-            it on five of these drives (``share_explained`` of run.py).
+            it on five of these drives (``share_explained`` of run.py). Of explanations whose rest looked healthy, on
+            all drives in MuJoCo, Newton and DART so far, four right ones (0.62 to 0.69) and two wrong ones (0.62, 0.66)
+            lie between 0.6 and 0.7, a half-right and three wrong ones between 0.5 and 0.6: at 0.6 fewest verdicts are
+            wrong.
         most_share: share of a loss that is most of it, by definition. Of a robot that was never commissioned nobody
             knows the healthy loss: there effects must not leave most of the loss, nor a formula explain most of that.
     """
@@ -77,5 +80,5 @@ class Thresholds:
     formula_error: float = 0.15
     smallest_share: float = 0.05
     further_share: float = 0.03
-    explained_share: float = 0.7
+    explained_share: float = 0.6
     most_share: float = 0.5

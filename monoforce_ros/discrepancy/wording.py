@@ -74,7 +74,22 @@ def _in_file(estimate: EffectEstimate) -> str:
         for key, value in estimate.in_file.items()
         if key in known and value != known[key].neutral
     ]
-    return f" The robot's file says {', '.join(said)}." if said else ""
+    if not said:
+        return ""
+    return f" The robot's file says {', '.join(said)}{', which is more' if eased(estimate) else ''}."
+
+
+def eased(estimate: EffectEstimate) -> bool:
+    """Whether an effect is in the robot's file already, and has become less: its main value lies on the same side of
+    that at which it does nothing, and nearer to it."""
+    effect = CATALOGUE.get(estimate.name)
+    key = "" if effect is None else next((key for key in effect.identified if key in estimate.parameters), "")
+    if effect is None or key not in estimate.in_file:
+        return False
+    neutral = next(parameter.neutral for parameter in effect.parameters if parameter.name == key)
+    away, in_file = estimate.parameters[key].value - neutral, estimate.in_file[key] - neutral
+    # Limits do less the higher they are: of these nothing is nearer.
+    return math.isfinite(away) and math.isfinite(in_file) and in_file != 0.0 and 0.0 <= away / in_file < 1.0
 
 
 _FACTORS_ON_MODEL = frozenset({"friction_scale", "terrain_softness", "turning_scrub"})

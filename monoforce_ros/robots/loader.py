@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +74,12 @@ def load_robot(name_or_file: str | Path, *, spacing: float = DEFAULT_SPACING) ->
     return _Reader(path).robot(content, spacing)
 
 
+def _driven_radius(wheels: Sequence[Mapping[str, Any]]) -> float | None:
+    """Mean radius of the driven wheels [m], without those of casters; of all wheels where none is driven."""
+    radii = [wheel["radius"] for wheel in wheels if wheel.get("drive") is not None] or [w["radius"] for w in wheels]
+    return float(np.mean(radii)) if radii else None
+
+
 class _Reader(FieldChecks):
     """Converts parsed YAML into a RobotModel; every error names the file and the field."""
 
@@ -139,7 +145,7 @@ class _Reader(FieldChecks):
             maximum_yaw_rate=self.number(
                 command.get("maximum_yaw_rate", math.inf), "command.maximum_yaw_rate", 0.01, math.inf, "rad/s"
             ),
-            wheel_radius=float(np.mean([wheel["radius"] for wheel in top["wheels"]])) if top.get("wheels") else None,
+            wheel_radius=_driven_radius(top.get("wheels", [])),
             sensors=self.sensors(top.get("sensors", {})),
             effects=self.effects(top.get("effects", [])),
             effect_intervals=self.intervals(top.get("effects", [])),

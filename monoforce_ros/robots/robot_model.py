@@ -79,7 +79,7 @@ class RobotModel:
     maximum_yaw_rate: float = float("inf")
     """Largest commanded yaw rate [rad/s]."""
     wheel_radius: float | None = None
-    """Mean radius of the wheels [m]; None without wheels."""
+    """Mean radius of the driven wheels [m]; None without wheels."""
     sensors: Mapping[str, Tensor] = field(default_factory=dict)
     """Pose of each sensor frame in the base frame: ``[4, 4]`` homogeneous matrix, base ← sensor."""
 
