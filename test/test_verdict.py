@@ -28,14 +28,14 @@ def found(after: float, *, before: float = 2.5, healthy: float = 0.5, p: float =
     return Findings(trial(before), trial(after, EFFECTS), fit, healthy_loss=healthy, commissioned=commissioned)
 
 
-@pytest.mark.parametrize("after", [0.4, 0.7, 1.05])
+@pytest.mark.parametrize("after", [0.4, 0.7, 1.3])
 def test_an_effect_that_explains_most_of_the_excess_is_named(after):
     decision = decide(found(after))
     assert decision.verdict is Verdict.EFFECT_FOUND
     assert decision.trial is not None and decision.trial.names == ("drive_asymmetry",)
 
 
-@pytest.mark.parametrize("after", [1.2, 1.6, 2.2])
+@pytest.mark.parametrize("after", [1.45, 1.6, 2.2])
 def test_an_effect_that_explains_too_little_is_a_known_part_even_where_the_rest_is_within_chance(after):
     decision = decide(found(after))
     assert decision.verdict is Verdict.UNKNOWN_EFFECT

@@ -25,6 +25,7 @@ from monoforce_ros.discrepancy.fit import (
     robust,
     robust_weights,
     with_values,
+    without,
 )
 from monoforce_ros.discrepancy.gap import noise_floor, noisy_motions, residual_scale
 from monoforce_ros.discrepancy.ground import slopes_of
@@ -41,7 +42,7 @@ from monoforce_ros.discrepancy.terrain_evidence import terrain_uncertainty
 from monoforce_ros.discrepancy.thresholds import Thresholds
 from monoforce_ros.discrepancy.trial import blocks_of
 from monoforce_ros.discrepancy.wheels import WheelFinding, best_of, changed_drives, compare_with_wheels
-from monoforce_ros.effects import CATALOGUE, identifiable_effects
+from monoforce_ros.effects import CATALOGUE, Effect, identifiable_effects
 from monoforce_ros.robots import RobotModel
 
 
@@ -57,6 +58,8 @@ COMMISSIONED = _commissioned("")
 """Effects that every robot needs, with the values at which their fit starts."""
 COMMISSIONED_IN_VEGETATION = _commissioned("vegetation")
 """Effects that every robot needs in addition where a recording leads through vegetation."""
+_OFTEN = {effect.name: effect.often_commissioned for effect in CATALOGUE.values() if effect.often_commissioned}
+"""Effects that many robots have, with the values at which a second fit starts."""
 _VEGETATION = frozenset(name for name, _ in COMMISSIONED_IN_VEGETATION)
 _FEWEST_SEGMENTS = 3
 """As many as parts: of two the variance between segments would have one degree of freedom."""
@@ -180,23 +183,35 @@ def _fitted(entry: _Prepared, effects: Effects, iterations: int = 12) -> Fit:
 
 
 def _started(entry: _Prepared, chosen: Effects, wheels: WheelFinding | None) -> Fit:
-    """The fit of what every robot has, and of what its wheel speeds show of the drives where that explains more.
+    """The fit of what every robot has, and of what else the drives do where that explains more.
 
     Ramps of a base look like a long dead time to a fit that begins without them, and nothing leads away from there:
-    the fit begins at what the wheels show, too, where these have been measured.
+    the fit begins also at what the wheels show, or with the ramps of many robots where no wheel speeds were measured.
     """
     fit = _fitted(entry, chosen)
-    shown = {} if wheels is None else dict(wheels.effects)
+    shown = _OFTEN if wheels is None else dict(wheels.effects)
     if not shown:
         return fit
-    beginning = tuple((name, {**values, **shown[name]} if name in shown else values) for name, values in chosen)
+    beginning = tuple((name, {**values, **shown.get(name, {})}) for name, values in chosen)
     others = tuple((name, values) for name, values in shown.items() if name not in dict(chosen))
-    by_wheels = _fitted(entry, (*beginning, *others))
-    # A further parameter is worth a log likelihood of half the logarithm of the number of blocks (Schwarz 1978).
+    other = _fitted(entry, (*beginning, *others))
+    for name, _ in others:
+        fewer = without(other.effects, name)
+        left = entry.predictions.residuals([fewer])[0] / residual_scale(entry.floor, entry.data, None)
+        if not _worth(entry, float(robust(left).mean()) - float(other.loss.mean()), CATALOGUE[name]):
+            # Such as a droop of 0 m/s.
+            other = _fitted(entry, fewer)
+    extra = [CATALOGUE[name] for name, _ in other.effects if name not in dict(chosen)]
+    return other if _worth(entry, float(fit.loss.mean()) - float(other.loss.mean()), *extra) else fit
+
+
+def _worth(entry: _Prepared, gain: float, *effects: Effect) -> bool:
+    """Whether a gain of the mean loss is worth the parameters of some effects.
+
+    A parameter is worth a log likelihood of half the logarithm of the number of independent blocks (Schwarz 1978).
+    """
     count = len(np.unique(blocks_of(entry.data.starts)))
-    more = sum(len(values) for _, values in others)
-    gain = (float(fit.loss.mean()) - float(by_wheels.loss.mean())) * count
-    return by_wheels if gain > 0.5 * more * np.log(count) else fit
+    return gain * count > 0.5 * sum(len(effect.identified) for effect in effects) * np.log(count)
 
 
 def _with(effects: Effects, further: Mapping[str, Mapping[str, float]], always: set[str]) -> Effects:

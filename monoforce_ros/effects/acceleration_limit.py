@@ -28,6 +28,8 @@ class AccelerationLimit(Effect):
     parameters = (Parameter("limit", "m/s²", math.inf, 0.05, 100.0, 1.0, "largest forward acceleration"),)
     order = 4
     identified = ("limit",)
+    # Default of Nav2's velocity smoother.
+    often_commissioned: ClassVar = {"limit": 2.5}
     manoeuvre = "steps of the speed from standing, small and large"
     separated_by: ClassVar = {
         "actuator_lag": "small and large steps of the speed from standing",

@@ -149,6 +149,9 @@ class Effect(ABC):
     """Terms of ``learned_term`` that are equivalent to this effect."""
     commissioning_start: ClassVar[Mapping[str, float]] = {}
     """Initial values for commissioning on a healthy robot; empty if commissioning does not fit this effect."""
+    often_commissioned: ClassVar[Mapping[str, float]] = {}
+    """Values at which commissioning also begins, of an effect that many robots have and that others stand in for if
+    they are fitted without it."""
     commissioned_over: ClassVar[str] = ""
     """``vegetation`` for an effect that commissioning fits only to recordings with it on their map: elsewhere it does
     nothing."""

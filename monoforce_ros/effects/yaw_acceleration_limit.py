@@ -29,6 +29,8 @@ class YawAccelerationLimit(Effect):
     parameters = (Parameter("limit", "rad/s²", math.inf, 0.05, 100.0, 1.0, "largest yaw acceleration"),)
     order = 6
     identified = ("limit",)
+    # Default of Nav2's velocity smoother.
+    often_commissioned: ClassVar = {"limit": 3.2}
     manoeuvre = "steps of the yaw rate, small and large, to both sides"
     separated_by: ClassVar = {
         "actuator_lag": "small and large steps of the yaw rate",
