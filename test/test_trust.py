@@ -131,7 +131,7 @@ def test_what_a_sweep_says_is_used_until_the_ground_says_otherwise():
     assert half[0] == 1.0 and (0.4 < half[-1] < 0.7 or half[-1] == 0.0)
 
 
-def test_one_place_alone_decides_nothing():
+def test_one_place_alone_says_nothing_against_a_sweep():
     """Level ground, of which prediction and fallback say the same, and one block where they differ."""
     place = 4.0
 
@@ -149,7 +149,7 @@ def test_one_place_alone_decides_nothing():
             report = trust.update(at(x), support, terrain, {}, 0.0, TerrainMap.flat(GRID))
         return report.share
 
-    assert share(1.0, 0.0, 0.2) == 1.0 and share(0.0, 0.1, 0.2) == 0.0
+    assert share(1.0, 0.0, 0.2) == 1.0
     assert share(1.0, 0.0, 2.5) < 0.5 and share(0.0, 0.1, 2.5) > 0.6
 
 

@@ -158,8 +158,8 @@ class TerrainTrust:
     three blocks of perfect predictions, and near 0 for pictures of another place. A sweep measures, and from one the
     encoder is right on average wherever robots drove in simulation (docs/training.md): w0 = 1 until the ground
     says otherwise. After three blocks of ground that it put as far off as it differs from the fallback, 1/4 is left.
-    The share stays w0 until three blocks tell something of it, for one tuft may differ by chance: the effective number
-    of blocks, (Σ d²)² / Σ d⁴, has to be three.
+    It stays 1 until three blocks tell something of it, for one tuft may differ by chance: the effective number of
+    blocks, (Σ d²)² / Σ d⁴, has to be three.
 
     Whether errors are as large as the predicted spreads say follows from the same comparisons: errors are Laplace
     distributed with the spreads times s as their scales. With the conjugate prior that weighs as much as three blocks,
@@ -319,9 +319,11 @@ class TerrainTrust:
     def _share(self) -> float:
         """The posterior mean of the share w, less its standard deviation where nothing is expected of it."""
         expected, count = self._expected, len(self._blocks)
+        if count < FEWEST_BLOCKS:
+            return expected
         squares = np.array([block.square for block in self._blocks])
         # Where prediction and fallback agree the ground tells nothing: the effective number of blocks with weights d².
-        if count < FEWEST_BLOCKS or squares.sum() ** 2 < FEWEST_BLOCKS * (1.0 - 1e-9) * (squares**2).sum():
+        if expected > 0.0 and squares.sum() ** 2 < FEWEST_BLOCKS * (1.0 - 1e-9) * (squares**2).sum():
             return expected
         product, square, ground = np.array([(b.product, b.square, b.ground) for b in self._blocks]).T.sum(axis=1)
 
