@@ -235,7 +235,8 @@ def _strained(commands: CommandTrack, efforts: EffortTrack | None) -> float | No
         return None
     asked = (np.abs(commands.sample(efforts.stamps)) >= _COMMANDED).any(axis=1)
     numbers = (efforts.stamps - efforts.stamps[0]) // round(_SPAN / NANOSECOND)
-    driven, idle = [], []
+    driven: list[float] = []
+    idle: list[float] = []
     for number in np.unique(numbers):
         inside = numbers == number
         if asked[inside].all() or not asked[inside].any():
