@@ -53,7 +53,7 @@ def sweep_features(
     window = (2 * reach + 1, 2 * reach + 1)
     floor = cv2.erode(lowest, np.ones(window, np.uint8), borderValue=np.inf).ravel()
     upper = placed[:, 2] > floor[flat] + _UPPER
-    thinnest, count = horizontal_scatter(placed[upper], flat[upper], reach, grid)
+    thinnest, count = horizontal_scatter(placed.compress(upper, axis=0), flat[upper], reach, grid)
     scatter = np.where(count >= _FEWEST, thinnest, 0.0) / _SCATTER_UNIT
     top, standing = _standing(placed, extremes, config)
     between = np.zeros_like(top)
@@ -81,7 +81,7 @@ def _placed(points: np.ndarray, ground: float, config: EncoderConfig) -> tuple[n
     raised = np.asarray(points, float) - np.array([0.0, 0.0, ground])
     rows, columns, inside = grid.cells(raised[:, :2])
     inside &= (raised[:, 2] > config.lowest) & (raised[:, 2] < config.highest)
-    return raised[inside], (rows * grid.columns + columns)[inside]
+    return raised.compress(inside, axis=0), (rows * grid.columns + columns)[inside]
 
 
 def _extremes(placed: np.ndarray, flat: np.ndarray, grid: Grid) -> np.ndarray:
