@@ -168,6 +168,20 @@ def test_an_effect_beside_another_that_is_found_again_in_fewer_than_half_of_the_
         confirmed = Repetition(0, repeated).confirmed(found, decision, SETTINGS.thresholds)
         return confirmed.trial.names, " ".join(confirmed.remarks)
 
+    # A single one that no repetition finds hangs on one part; one of two suffices, and so does another in its place.
+    def alone(*repeated):
+        return Repetition(0, repeated).confirmed(found, found.decision, SETTINGS.thresholds)
+
+    nothing, other = Repeated(), Repeated(named=("payload",))
+    lost = alone(nothing, other, nothing)
+    assert lost.verdict == Verdict.UNKNOWN_EFFECT and lost.trial is None and lost.parts.names == (name,)
+    assert f"{name} found again in none of the searches" in lost.remarks[-1] and "payload" in lost.remarks[-1]
+    assert alone(nothing, Repeated(named=(name,)), nothing).trial.names == (name,)
+    assert alone(other, other, nothing).trial.names == (name,)
+    with monkeypatch.context() as healthy:
+        healthy.setattr(found.search, "size_p", lambda trial: 0.5)
+        assert alone(nothing, nothing, nothing).verdict == Verdict.NO_DISCREPANCY
+
     delay, payload = Repeated(named=(name,)), Repeated(named=(name, "payload"))
     assert names(delay, payload, None)[0] == (name, "payload")
     for repeated in ((delay, delay, None), (delay, delay, payload)):
@@ -184,6 +198,3 @@ def test_an_effect_beside_another_that_is_found_again_in_fewer_than_half_of_the_
     # One without which the others are no measurements belongs to them.
     monkeypatch.setattr(found.search, "credible", lambda trial: len(trial.names) > 1)
     assert names(delay, delay, payload)[0] == (name, "payload")
-    # The only effect is kept: its doubt stands on the first screen.
-    alone = replace(decision, trial=found.decision.trial)
-    assert Repetition(0, (Repeated(), Repeated())).confirmed(found, alone, SETTINGS.thresholds) is alone

@@ -70,25 +70,30 @@ class Repetition:
         selection, Meinshausen and Bühlmann 2010), where another one that takes their place is the same finding.
 
         The rest is judged anew: without them it may leave what does not look like the healthy robot. Where none of
-        several effects is found again, the recording does not say what is wrong. An effect without which the values of
-        the others are no measurements belongs to them, and stays.
+        several effects is found again, or a single one by no repetition, the recording does not say what is wrong, or
+        nothing is where its errors are no larger than a healthy robot's. An effect without which the values of the
+        others are no measurements belongs to them, and stays.
         """
         trial, search = decision.trial, explanation.search
-        if trial is None or decision.verdict != Verdict.EFFECT_FOUND or len(trial.names) < 2:
+        if trial is None or decision.verdict != Verdict.EFFECT_FOUND:
             return decision
         alike, known = explanation.outcome.indistinguishable, dict(search.known)
-        missing = [
-            name for name in trial.names if name not in known and not self._support(name, alike, trial.names).often
-        ]
+        supported = {name: self._support(name, alike, trial.names) for name in trial.names if name not in known}
+        missing = [name for name, support in supported.items() if not support.often]
+        if len(trial.names) == 1:
+            missing = [name for name in missing if not supported[name].found]
         if not missing:
             return decision
         dropped = " and ".join(missing)
-        remark = f"{dropped} found again in fewer than half of the searches without a part of the recording"
+        how_often = "none" if len(trial.names) == 1 else "fewer than half"
+        remark = f"{dropped} found again in {how_often} of the searches without a part of the recording"
         kept = tuple(entry for entry in trial.effects if entry[0] not in missing)
         if not kept:
             others = dict.fromkeys(n for r in self.repeated if r is not None for n in r.named if n not in trial.names)
             instead = f"; these name {' or '.join(others)}" if others else ""
             remarks = (*decision.remarks, f"{remark}{instead}")
+            if explanation.dispensable:
+                return replace(decision, verdict=Verdict.NO_DISCREPANCY, trial=None, remarks=remarks)
             return replace(decision, verdict=Verdict.UNKNOWN_EFFECT, trial=None, parts=trial, remarks=remarks)
         best = search.judge(kept)
         if search.credible(trial) and not search.credible(best):
