@@ -114,6 +114,22 @@ def test_commissioning_knows_the_ramps_of_a_base_and_takes_them_for_no_dead_time
     assert not {name for name, _ in ramps} & set(without)
 
 
+@pytest.mark.parametrize("further", [(), (("drive_loss", {"loss": 0.05}),)])
+def test_what_one_of_two_recordings_shows_of_the_drives_is_not_commissioned(monkeypatch, further):
+    """All recordings must then have the same effects again."""
+    husky = load_robot("husky")
+    monkeypatch.setattr(commissioning, "_further", lambda *args: further)
+    recordings = []
+    for effects in ((), (("acceleration_limit", {"limit": 1.0}), ("yaw_acceleration_limit", {"limit": 1.5}))):
+        data = driven(replace(husky, effects=effects))
+        recordings.append(
+            Evidence(SmoothedMotion(data.motion, 0.002, 0.001, (slice(0, len(data.motion)),)), data.commands)
+        )
+    names = {effect.name for effect in commission(recordings, husky)[0]}
+    assert not {"acceleration_limit", "yaw_acceleration_limit"} & names
+    assert {name for name, _ in further} <= names
+
+
 def test_a_robot_commissioned_in_grass_knows_its_drag_and_not_a_gain_of_its_drives():
     injected = {"coefficient": 1.5e4, "yield_speed": 0.5}
     robot = replace(load_robot("husky"), effects=(("vegetation_drag", injected),))
@@ -144,8 +160,9 @@ def test_further_effects_are_fitted_from_what_was_found_before_them(monkeypatch)
 
     monkeypatch.setattr(commissioning, "fit_effects", watched)
     commissioned(replace(load_robot("husky"), effects=(("actuator_saturation", {"limit": 0.5}),)), [None])
-    (_, first), (again, _) = began[0], next(entry for entry in began if "actuator_saturation" in entry[0])
-    assert {name: again[name] for name in first} == first != dict(commissioning.COMMISSIONED)
+    number, again = next((n, start) for n, (start, _) in enumerate(began) if "actuator_saturation" in start)
+    kept = {name: values for name, values in again.items() if name != "actuator_saturation"}
+    assert kept in [fitted for _, fitted in began[:number]] and kept != dict(commissioning.COMMISSIONED)
 
 
 def test_a_supply_that_drains_is_no_supply_that_is_low():

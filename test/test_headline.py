@@ -93,12 +93,30 @@ def test_what_explains_most_of_an_unknown_effect_is_said_with_its_share(share, t
     assert top.sentence.startswith("Something is wrong; what is known explains a part of it") == told
 
 
+def test_what_no_search_without_a_part_finds_is_not_said_to_explain_too_little():
+    part = effect("drive_gain", gain=(1.12, 1.08, 1.16))
+    found = Diagnosis(
+        Verdict.UNKNOWN_EFFECT, known_parts=(part,), gap={"position_2s": row(0.16, None)},
+        losses=Losses(4.5, 0.8, 0.69, 0.96), not_found_again=True,
+    )  # fmt: skip
+    top = headline(found)
+    assert "hangs on a part of the recording" in top.sentence and not any("96 %" in text for text in top.findings)
+    assert any("searches without a part of it do not find" in text for text in top.findings)
+
+
 def test_what_is_less_than_in_the_robots_file_is_said_to_be_less():
     late = replace(DELAY, in_file={"delay": 0.5})
     text = "The drives react 0.30 s late to every command. The robot's file says delay 0.5 s, which is more."
     assert finding(late) == text
     top = headline(diagnosed((0.5, 0.06), (8.0, 1.0), effects=(late,)))
     assert any("less than in the robot's file" in text and "commission" in text for text in top.actions)
+    # Within the interval nothing has changed, and factors and forces have no least size.
+    for estimate in (
+        replace(DELAY, in_file={"delay": 0.31}),
+        replace(effect("drive_gain", gain=(1.03, 1.02, 1.04)), in_file={"gain": 1.15}),
+        replace(effect("constant_force", x=(9.9, 8.0, 11.0), y=(200.0, 190.0, 210.0)), in_file={"x": 10.0, "y": 0.0}),
+    ):
+        assert "which is more" not in finding(estimate)
     later = replace(DELAY, in_file={"delay": 0.1})
     assert finding(later).endswith("The robot's file says delay 0.1 s.")
     assert remedy("command_delay") in headline(diagnosed((0.5, 0.06), (8.0, 1.0), effects=(later,))).actions

@@ -185,10 +185,11 @@ def test_behind_the_edge_of_a_step_the_plateau_goes_on(husky, lidar):
 
 @pytest.mark.parametrize("camera_retention_time", [0.0, 10.0])
 @pytest.mark.parametrize("covered", [False, True], ids=["silent", "covered"])
-def test_a_wall_stays_for_a_while_when_the_lidar_dies(husky, covered, camera_retention_time):
+@pytest.mark.parametrize("fallback", [True, False])
+def test_a_wall_stays_for_a_while_when_the_lidar_dies(husky, fallback, covered, camera_retention_time):
     ground = -husky.ground_clearance
     source = choose_terrain_source(
-        "lidar_camera", husky, fallback=True, lidar_retention_time=10.0, retention_time=camera_retention_time
+        "lidar_camera", husky, fallback=fallback, lidar_retention_time=10.0, retention_time=camera_retention_time
     )
     camera = CameraModel(320, 240, np.array([[200.0, 0, 160], [0, 200.0, 120], [0, 0, 1]]), np.zeros(5))
     cloud = ray_cast(LIDARS["VLP-16"], ground, 0.65, [((3.0, -2.0, 0.0), (3.4, 2.0, 1.0))], columns=720)

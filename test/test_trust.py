@@ -22,6 +22,7 @@ from monoforce_ros.perception import (
     traced_ground,
 )
 from monoforce_ros.perception.ground_alignment import lowest_points
+from monoforce_ros.perception.trust import _weights
 from monoforce_ros.perception.trusted_terrain import blended
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap
@@ -151,6 +152,18 @@ def test_one_place_alone_says_nothing_against_a_sweep():
 
     assert share(1.0, 0.0, 0.2) == 1.0
     assert share(1.0, 0.0, 2.5) < 0.5 and share(0.0, 0.1, 2.5) > 0.6
+
+
+def test_a_block_that_is_far_more_wrong_does_not_give_trust_back():
+    """It would outweigh all others, and one place alone says nothing: it counts as much as lets three count."""
+    squares = np.array([0.01, 0.01, 0.01])
+    assert _weights(squares).tolist() == [1.0, 1.0, 1.0]
+    for further in (0.02, 0.09, 0.25, 4.0):
+        blocks = np.append(squares, further)
+        kept = _weights(blocks) * blocks
+        assert kept[:3] == pytest.approx(squares) and 0.01 <= kept[3] <= further
+        assert kept.sum() ** 2 / (kept**2).sum() > 2.999
+    assert _weights(np.array([0.0] * 12 + [0.25, 0.01])) is None
 
 
 def test_the_command_that_diagnostics_name_is_one():

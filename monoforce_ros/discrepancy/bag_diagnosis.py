@@ -234,7 +234,7 @@ def diagnose_bag(
     fitted = tuple(entry for entry in diagnosis.fitted if entry[0] in in_file)
     if diagnosis.verdict != Verdict.NOT_IDENTIFIABLE:
         progress(0.96, "comparing with a kinematic fit")
-        diagnosis = replace(diagnosis, steps=compare_after_steps(evidence, model, fitted))
+        diagnosis = replace(diagnosis, steps=compare_after_steps(evidence, model, (*fitted, *diagnosis.shift)))
     if others and elsewhere:
         remark = "held-out recordings are not compared: where on them the ground is like that is not known"
         diagnosis = replace(diagnosis, remarks=(*diagnosis.remarks, remark))
@@ -272,7 +272,7 @@ def diagnose_bag(
     credible = bool(for_file) and (bool(rest) or not ground.unknown)
     # Together, or a robot file of this diagnosis would lie beside the report of an earlier one.
     with uninterrupted():
-        if credible and not any(map(complaint, diagnosis.effects)):
+        if credible and not any(map(complaint, for_file)):
             effects = [file_entry(diagnosis, effect) for effect in for_file]
             robot_file = write_robot(robot, found_file, effects, [bag], data)
         elif found_file.exists():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -58,6 +58,8 @@ COMMISSIONED = _commissioned("")
 """Effects that every robot needs, with the values at which their fit starts."""
 COMMISSIONED_IN_VEGETATION = _commissioned("vegetation")
 """Effects that every robot needs in addition where a recording leads through vegetation."""
+_FEW_ITERATIONS = 4
+"""Of a fit that begins at that of all effects but one: from there it has not far to go."""
 _OFTEN = {effect.name: effect.often_commissioned for effect in CATALOGUE.values() if effect.often_commissioned}
 """Effects that many robots have, with the values at which a second fit starts."""
 _VEGETATION = frozenset(name for name, _ in COMMISSIONED_IN_VEGETATION)
@@ -125,16 +127,20 @@ def commission(
     drives = [wheels for wheels in measured if wheels is not None]
     fits = [_started(entry, chosen, wheels) for entry, wheels in zip(prepared, measured, strict=True)]
     found: list[tuple[str, Mapping[str, float]]] = []
+    always = [name for name, _ in chosen]
     for number, (entry, fit) in enumerate(zip(prepared, fits, strict=True)):
         progress(0.3 + 0.4 * number / len(prepared), "searching for further effects")
-        known = {name for name, _ in chosen}
-        found += [(name, values) for name, values in fit.effects if name not in known]
+        found += [(name, values) for name, values in fit.effects if name not in always]
         found += _further(robot, entry, fit.effects, measured[number])
     counted = [name for name, _ in found]
     further = {name: values for name, values in found if counted.count(name) > 0.5 * len(prepared)}
-    if further:
-        # From what was found: from the starting values of all, no step may lead down.
-        fits = [_fitted(entry, _with(fit.effects, further, known)) for entry, fit in zip(prepared, fits, strict=True)]
+    # From what was found: from the starting values of all, no step may lead down. What only a part of the recordings
+    # shows goes, so that all have the same.
+    starts = [_with(fit, further, always) for fit in fits]
+    fits = [
+        fit if _layout(fit.effects) == _layout(start) else _fitted(entry, start)
+        for entry, fit, start in zip(prepared, fits, starts, strict=True)
+    ]
     # Whose covariance tells the intervals: one that saw everything.
     first = fits[overgrown.index(True)] if any(overgrown) else fits[0]
     merged = replace(first, effects=_merged([fit.effects for fit in fits], overgrown))
@@ -196,11 +202,10 @@ def _started(entry: _Prepared, chosen: Effects, wheels: WheelFinding | None) -> 
     others = tuple((name, values) for name, values in shown.items() if name not in dict(chosen))
     other = _fitted(entry, (*beginning, *others))
     for name, _ in others:
-        fewer = without(other.effects, name)
-        left = entry.predictions.residuals([fewer])[0] / residual_scale(entry.floor, entry.data, None)
-        if not _worth(entry, float(robust(left).mean()) - float(other.loss.mean()), CATALOGUE[name]):
-            # Such as a droop of 0 m/s.
-            other = _fitted(entry, fewer)
+        fewer = _fitted(entry, without(other.effects, name), _FEW_ITERATIONS)
+        if not _worth(entry, float(fewer.loss.mean()) - float(other.loss.mean()), CATALOGUE[name]):
+            # Such as a droop of 0 m/s, or a ramp that a lag does as well.
+            other = fewer
     extra = [CATALOGUE[name] for name, _ in other.effects if name not in dict(chosen)]
     return other if _worth(entry, float(fit.loss.mean()) - float(other.loss.mean()), *extra) else fit
 
@@ -214,15 +219,23 @@ def _worth(entry: _Prepared, gain: float, *effects: Effect) -> bool:
     return gain * count > 0.5 * sum(len(effect.identified) for effect in effects) * np.log(count)
 
 
-def _with(effects: Effects, further: Mapping[str, Mapping[str, float]], always: set[str]) -> Effects:
+def _with(fit: Fit, further: Mapping[str, Mapping[str, float]], always: Collection[str]) -> Effects:
     """What every robot has, and further effects, each with the values of this fit where it has them."""
-    own = dict(effects)
-    kept = tuple((name, values) for name, values in effects if name in always)
-    return (*kept, *((name, own.get(name, values)) for name, values in further.items()))
+    own = dict(fit.effects)
+    kept = tuple((name, values) for name, values in fit.effects if name in always)
+    started = [(name, {k: own.get(name, {}).get(k, value) for k, value in v.items()}) for name, v in further.items()]
+    return (*kept, *started)
+
+
+def _layout(effects: Effects) -> list[tuple[str, tuple[str, ...]]]:
+    """Names of effects and of their parameters, in their order."""
+    return [(name, tuple(values)) for name, values in effects]
 
 
 def _merged(fitted: Sequence[Effects], overgrown: Sequence[bool]) -> Effects:
     """Medians of what was fitted to each recording; of an effect of vegetation, to those that lead through it."""
+    layouts = [_layout(effects) for effects in fitted]
+    assert all(layout == layouts[0] for layout in layouts), layouts
     rows = np.array([flat(effects) for effects in fitted])
     of_vegetation = np.array([name in _VEGETATION for name, values in fitted[0] for _ in values])
     if any(overgrown):

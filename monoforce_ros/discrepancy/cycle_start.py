@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 from monoforce_ros.discrepancy.evidence import Evidence
 from monoforce_ros.discrepancy.explanation import DiagnosisSettings, Explanation, Windows, explain
-from monoforce_ros.discrepancy.hypothesis import correct_measurements
+from monoforce_ros.discrepancy.hypothesis import Effects, correct_measurements
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.effects import CATALOGUE
 from monoforce_ros.robots import RobotModel
@@ -24,6 +24,8 @@ class Aligned:
 
     evidence: Evidence
     explanation: Explanation
+    shift: Effects = ()
+    """The effect by which commands were shifted."""
     remark: str = ""
     """By how much commands were shifted, in words; empty where they were not."""
 
@@ -63,4 +65,4 @@ def explain_aligned(
         f"commands act {abs(offset):.3f} s {when} than on the healthy robot: less than the time between two of them, "
         "by which a base may differ from one start to the next"
     )
-    return Aligned(shifted, again, remark)
+    return Aligned(shifted, again, shift, remark)

@@ -103,6 +103,10 @@ class Diagnosis:
     """Whether the robot's file knows the healthy robot."""
     remarks: tuple[str, ...] = ()
     """The reasons for the verdict."""
+    shift: Effects = ()
+    """The effect by which commands were shifted, since the base reads them later in its cycle; no fault."""
+    not_found_again: bool = False
+    """Whether the known parts explain the whole recording, and searches without a part of it do not find them."""
     losses: Losses | None = None
     details: Details | None = None
     localisation_error: float | None = None
@@ -214,11 +218,13 @@ def diagnose(
         judged = held_out(decision)
         # Without the rejected effects; the same windows, where nothing is left.
         compared = _without_effects(compared) if judged is None else compared_with(judged)
-    repetition = None
+    repetition, lost = None, False
     if decision.trial is not None:
         repetition = repeat(evidence, robot, explanation.windows, nominal, settings, _Steps(progress, 0.62, 0.95))
         if repetition is not None:
+            named = decision.verdict == Verdict.EFFECT_FOUND
             decision = repetition.confirmed(explanation, decision, settings.thresholds)
+            lost = named and decision.verdict == Verdict.UNKNOWN_EFFECT and decision.trial is None
             judged = None if decision.trial is None else repetition.held_out
             compared = compared_with(judged)
     gap = gap_table(compared, settings.seed, by_gyro)
@@ -297,6 +303,8 @@ def diagnose(
         regimes=() if at_horizon is None else tuple(regime_table(at_horizon)),
         fitted=fitted,
         remarks=decision.remarks,
+        shift=aligned.shift,
+        not_found_again=lost,
         losses=decision.losses,
         localisation_error=apart if apart > ABOVE_NOISE * noise else None,
         commissioned=search.commissioned,

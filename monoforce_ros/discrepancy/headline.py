@@ -204,7 +204,9 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
 
     if diagnosis.verdict == Verdict.UNKNOWN_EFFECT:
         sentence = "Something is wrong that no known effect explains."
-        if _of_parts(diagnosis):
+        if diagnosis.not_found_again:
+            sentence = "Something is wrong; what explains it hangs on a part of the recording, and is not named."
+        elif _of_parts(diagnosis):
             sentence = "Something is wrong; what is known explains a part of it, and not enough to be the cause alone."
         if named:
             sentence = "Something is wrong that no known effect explains, besides what was found."
@@ -250,7 +252,11 @@ def _of_parts(diagnosis: Diagnosis) -> tuple[str, ...]:
     if not parts or share is None or share < MOST:
         return ()
     found = " ".join(finding(part) for part in parts)
-    size = f"{100 * share:.0f} % of the loss in excess of a healthy robot's"
+    if diagnosis.not_found_again:
+        return (f"On the whole recording it looks like this, which searches without a part of it do not find: {found}",)
+    size = f"{100 * share:.0f} % of the loss"
+    if diagnosis.commissioned:
+        size += " in excess of a healthy robot's"
     return (f"A part of the error ({size}) looks like this: {found}",)
 
 

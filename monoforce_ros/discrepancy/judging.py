@@ -236,7 +236,7 @@ class Judging:
         reached = self.screening.quick_loss(self.refit(best.effects).effects if best.effects else self.known)
         found = [without(best.effects, name) for name in best.names[self.fixed_count(best.effects) :]]
         trials = [self._with_start_of_cycle(base, interval, reached) for base in found]
-        better = [trial for trial in trials if trial is not None and trial.loss < best.loss]
+        better = [trial for trial in trials if trial is not None and self._gain(best, trial)[1] > 0.0]
         beside = None if explained else self._with_start_of_cycle(best.effects or self.known, interval, reached)
         if beside is not None and self._adds(best, beside):
             better.append(beside)

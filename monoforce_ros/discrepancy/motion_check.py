@@ -62,6 +62,9 @@ _BROKEN = 0.1
 window at any rate of odometry above 5 Hz."""
 _GAP = 0.5
 """Time without a pose in which motion is unknown [s]."""
+_WORKING, _IDLE = 1.5, 100.0
+"""Times the current at rest from which motors work, and from which that at rest is none. Both are choices, not
+calibrated: a reading that drifts changes by some hundredths, and a drive that is blocked draws a multiple."""
 _ALPHA = 0.05
 """Probability that motors which work no harder while something is commanded pass for blocked ones."""
 _SHIFTS = 19
@@ -219,9 +222,10 @@ def _standing(
         )
     strained = _strained(commands, efforts)
     if strained is not None:
+        than = f"{strained:.2g} times the current that they draw" if strained < _IDLE else "current, and hardly any"
         return (
-            f"the robot does not move although {asked}, and its motors work: they draw {strained:.2g} times the "
-            "current that they draw while nothing is commanded; it is blocked, dug in, or a brake holds it"
+            f"the robot does not move although {asked}, and its motors work: they draw {than} while nothing is "
+            "commanded; it is blocked, dug in, or a brake holds it"
         )
     return (
         f"the robot does not move although {asked}: emergency stop, motors off, wrong command topic, or poses of "
@@ -243,7 +247,8 @@ def _strained(commands: CommandTrack, efforts: EffortTrack | None) -> float | No
             (driven if asked[inside].all() else idle).append(float(efforts.efforts[inside].mean()))
     if not driven or not idle or mannwhitneyu(driven, idle, alternative="greater").pvalue >= _ALPHA:
         return None
-    return float(np.median(driven)) / max(float(np.median(idle)), 1e-9)
+    ratio = float(np.median(driven)) / max(float(np.median(idle)), 1e-9)
+    return ratio if ratio >= _WORKING else None
 
 
 def _pose_faults(smoothed: SmoothedMotion, *, crabs: bool = False) -> Iterator[str]:

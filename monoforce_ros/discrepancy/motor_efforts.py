@@ -35,6 +35,9 @@ _FEWEST_SEGMENTS = 3
 """Of fewer nobody knows how much they differ."""
 _LEAST = 1e-3
 """Effort, as a share of the expected one, that counts as none: the logarithm of none is not a number."""
+_BATTERY = 1.1
+"""Factor by which currents change with the charge alone: for the same power they go with the inverse of the voltage,
+and that of a lead or lithium battery falls by about a fifth from full to empty."""
 _HARDLY = 0.5
 """Share of the healthy effort below which most of it is missing: by the meaning of "most"."""
 
@@ -123,7 +126,7 @@ class HealthyEfforts:
                 return None
             pieces = _Pieces.of(commands, efforts, robot)
             cut.append(_Pieces(pieces.terms, pieces.efforts, pieces.segments + first))
-            first = int(max(cut[-1].segments, default=0)) + 1
+            first = int(max(cut[-1].segments, default=first - 1)) + 1
         together = _Pieces(
             *(np.concatenate([getattr(c, name) for c in cut]) for name in ("terms", "efforts", "segments"))
         )
@@ -201,6 +204,8 @@ def changed_efforts(
             continue
         width = student.ppf(0.5 + 0.5 * thresholds.confidence, degrees[side]) * reach
         low, high = np.exp(middle - width), np.exp(middle + width)
+        if low < _BATTERY and high > 1.0 / _BATTERY:
+            continue
         texts.append(_sentence(name, float(np.exp(middle)), float(low), float(high), turning[side]))
     return tuple(texts)
 

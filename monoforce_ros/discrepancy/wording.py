@@ -80,16 +80,16 @@ def _in_file(estimate: EffectEstimate) -> str:
 
 
 def eased(estimate: EffectEstimate) -> bool:
-    """Whether an effect is in the robot's file already, and has become less: its main value lies on the same side of
-    that at which it does nothing, and nearer to it."""
+    """Whether an effect is in the robot's file already, and has become less beyond its interval.
+
+    Only of those that have one size, of which none is the least, such as a delay: factors and forces have no such end.
+    """
     effect = CATALOGUE.get(estimate.name)
-    key = "" if effect is None else next((key for key in effect.identified if key in estimate.parameters), "")
-    if effect is None or key not in estimate.in_file:
+    if effect is None or len(effect.identified) != 1 or effect.identified[0] not in estimate.in_file:
         return False
-    neutral = next(parameter.neutral for parameter in effect.parameters if parameter.name == key)
-    away, in_file = estimate.parameters[key].value - neutral, estimate.in_file[key] - neutral
-    # Limits do less the higher they are: of these nothing is nearer.
-    return math.isfinite(away) and math.isfinite(in_file) and in_file != 0.0 and 0.0 <= away / in_file < 1.0
+    (key,) = effect.identified
+    known, value = next(p for p in effect.parameters if p.name == key), estimate.parameters.get(key)
+    return value is not None and known.low == known.neutral and value.high < estimate.in_file[key]
 
 
 _FACTORS_ON_MODEL = frozenset({"friction_scale", "terrain_softness", "turning_scrub"})

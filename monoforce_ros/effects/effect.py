@@ -276,6 +276,7 @@ class Effect(ABC):
         listed = {
             "identified": self.identified, "refined": self.refined,
             "commissioning_start": tuple(self.commissioning_start),
+            "often_commissioned": tuple(self.often_commissioned),
             **{f"products: {product.name}": product.factors for product in self.products},
         }  # fmt: skip
         for label, keys in listed.items():

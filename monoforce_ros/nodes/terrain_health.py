@@ -32,7 +32,7 @@ class TerrainHealth:
         if self._source is None or self._source.report is None:
             return
         report = self._source.report
-        if "camera" in self._source.sensors:
+        if "camera" in report.sensors:
             report = replace(report, remedy=f"adapt the encoder to this robot: {self.adaptation}")
         self._report(PART, report)
         below = self._source.fallback_report
@@ -40,7 +40,7 @@ class TerrainHealth:
             self._report(SWEEP_PART, below)
             self._swept = True
         elif self._swept:
-            self._health.report(SWEEP_PART, STALE, "no sweep in the last map", reason="no sweep")
+            self._health.report(SWEEP_PART, STALE, "no usable sweep in the last map", reason="no sweep")
             self._health.set_values(SWEEP_PART, {})
 
     @property

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import torch
@@ -58,7 +58,7 @@ def _compliance(terrain: TerrainMap) -> tuple[Tensor, Tensor]:
     return compliance, ((compliance - _RIGID_BELOW) / (_COMPLIANT_FROM - _RIGID_BELOW)).clamp(0.0, 1.0)
 
 
-@dataclass(frozen=True)
+@dataclass
 class LidarCameraTerrain:
     """Lidar heights, lowered by the compliance that an encoder of images predicts (H_d); both on the encoder's grid.
 
@@ -71,6 +71,8 @@ class LidarCameraTerrain:
     camera: TerrainSource
     """Source of the encoder's maps, with or without temporal memory."""
     sensors: ClassVar[tuple[str, ...]] = ("lidar", "camera")
+    used: tuple[str, ...] = field(default=(), init=False)
+    """Sensors of which the last map was made: a sweep with too few points is left out beside images."""
 
     @property
     def grid(self) -> Grid:
@@ -79,15 +81,18 @@ class LidarCameraTerrain:
 
     def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
         """Fused map, or the map of the only available sensor; raises ``ValueError`` if neither suffices."""
+        self.used = ("camera",)
         if observation.cloud is None:
             return self.camera.terrain(observation, motion)
         if not observation.images:
+            self.used = ("lidar",)
             return self.lidar.terrain(observation, motion)
         seen = self.camera.terrain(observation, motion)
         try:
             measured = self.lidar.terrain(observation, motion)
         except TerrainError:
             return seen
+        self.used = self.sensors
         fused = apply_compliance(measured, seen)
         # What is still high is rigid.
         return clear_of_robot(fused, self.lidar.robot, motion)

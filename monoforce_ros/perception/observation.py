@@ -45,3 +45,15 @@ class TerrainSource(Protocol):
 
     def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
         """Map in the terrain frame (origin at the robot, x along its heading, z up)."""
+
+
+def used_sensors(source: TerrainSource, observation: Observation) -> tuple[str, ...]:
+    """Sensors of which a source made its last map: those that it says (``used``), else all that had measured.
+
+    A covered lidar measures too little to be used beside images.
+    """
+    used: tuple[str, ...] | None = getattr(source, "used", None)
+    if used is not None:
+        return used
+    measured = {"lidar": observation.cloud is not None, "camera": bool(observation.images)}
+    return tuple(name for name in source.sensors if measured[name])

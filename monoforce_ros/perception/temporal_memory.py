@@ -10,7 +10,7 @@ import torch
 from monoforce_ros.core import NANOSECOND, CameraModel, MotionState
 from monoforce_ros.perception.clearance import clear_of_robot
 from monoforce_ros.perception.ground_alignment import align_to_ground, standing
-from monoforce_ros.perception.observation import Observation, TerrainSource
+from monoforce_ros.perception.observation import Observation, TerrainSource, used_sensors
 from monoforce_ros.perception.trace import continues
 from monoforce_ros.robots import RobotModel, is_lidar
 from monoforce_ros.terrain import CHANNELS, Grid, TerrainMap, interpolated
@@ -73,6 +73,11 @@ class TemporalMemory:
         return self._source.sensors
 
     @property
+    def used(self) -> tuple[str, ...] | None:
+        """Sensors of which the source made its last map, if it says so."""
+        return getattr(self._source, "used", None)
+
+    @property
     def grid(self) -> Grid:
         """Grid of the source."""
         return self._source.grid
@@ -80,7 +85,7 @@ class TemporalMemory:
     def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
         """The source's current map with earlier observations; raises the source's errors."""
         now = self._source.terrain(observation, motion)
-        return self.recalled(now, observation, motion, swept=observation.cloud is not None)
+        return self.recalled(now, observation, motion, swept="lidar" in used_sensors(self._source, observation))
 
     def recalled(
         self, now: TerrainMap, observation: Observation, motion: MotionState, *, swept: bool = True
@@ -111,8 +116,9 @@ class TemporalMemory:
             obstacle = np.zeros_like(fresh)
             # What rose above the line of sight has gone: somebody walked by.
             sight = now.looked_over(self._lidar_height + float(motion.terrain_from_base[2, 3]))
-            # But where nothing is measured any more, nothing shows that it has.
-            kept = fresh & (values[0] <= sight + _SIGHT_TOLERANCE) if swept else fresh
+            # But where nothing is measured any more, nothing shows that it has, nor hides what images show now.
+            hidden = now.observed.numpy() & (now.height.numpy() - values[0] > _OBSTACLE_HEIGHT)
+            kept = fresh & (values[0] <= sight + _SIGHT_TOLERANCE if swept else ~hidden)
         else:
             obstacle = fresh & now.observed.numpy() & self._near & disappeared
             kept = (fresh & ~now.observed.numpy()) | obstacle

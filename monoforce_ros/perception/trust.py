@@ -321,11 +321,12 @@ class TerrainTrust:
         expected, count = self._expected, len(self._blocks)
         if count < FEWEST_BLOCKS:
             return expected
-        squares = np.array([block.square for block in self._blocks])
-        # Where prediction and fallback agree the ground tells nothing: the effective number of blocks with weights d².
-        if expected > 0.0 and squares.sum() ** 2 < FEWEST_BLOCKS * (1.0 - 1e-9) * (squares**2).sum():
+        # Where prediction and fallback agree the ground tells nothing.
+        weights = _weights(np.array([block.square for block in self._blocks])) if expected > 0.0 else np.ones(count)
+        if weights is None:
             return expected
-        product, square, ground = np.array([(b.product, b.square, b.ground) for b in self._blocks]).T.sum(axis=1)
+        sums = np.array([(b.product, b.square, b.ground) for b in self._blocks])
+        product, square, ground = weights @ sums
 
         def noise(share: float) -> float:
             return max(ground - 2.0 * share * product + share**2 * square, _SMALLEST_SQUARE) / count
@@ -374,6 +375,29 @@ def _mean(comparisons: Iterable[_Comparison]) -> _Comparison:
     """Mean of all numbers; of the camera the last one."""
     rows = list(comparisons)
     return _Comparison._make([*np.mean([row[:-1] for row in rows], axis=0).tolist(), rows[-1].camera])
+
+
+def _weights(squares: np.ndarray) -> np.ndarray | None:
+    """Weights of blocks ``[n]`` in which prediction and fallback differ by ``squares`` ``[n]`` [m²]; None if fewer than
+    :data:`FEWEST_BLOCKS` tell them apart.
+
+    A block that differs far more than all others would decide alone: its square is cut, so that the effective number
+    of blocks, (Σ d²)² / Σ d⁴, is no smaller.
+    """
+    if (squares > 0.0).sum() < FEWEST_BLOCKS:
+        return None
+
+    def enough(cut: float) -> bool:
+        kept = np.minimum(squares, cut)
+        return bool(kept.sum() ** 2 >= FEWEST_BLOCKS * (1.0 - 1e-9) * (kept**2).sum())
+
+    low, high = float(squares[squares > 0.0].min()), float(squares.max())
+    if not enough(high):
+        for _ in range(40):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if enough(middle) else (low, middle)
+        high = low
+    return np.minimum(1.0, high / np.maximum(squares, 1e-300))
 
 
 def _errors(comparisons: Sequence[_Comparison]) -> tuple[float, float]:

@@ -14,7 +14,7 @@ from monoforce_ros.core import MotionState
 from monoforce_ros.perception.encoder_terrain import EncoderTerrain
 from monoforce_ros.perception.ground_alignment import standing
 from monoforce_ros.perception.lidar import usable_returns
-from monoforce_ros.perception.observation import Observation, TerrainSource
+from monoforce_ros.perception.observation import Observation, TerrainSource, used_sensors
 from monoforce_ros.perception.temporal_memory import TemporalMemory
 from monoforce_ros.perception.trust import BLOCK, FEWEST_BLOCKS, TerrainTrust, TrustReport
 from monoforce_ros.terrain import Grid, LidarSettings, TerrainError, TerrainMap, cell_heights
@@ -87,7 +87,7 @@ class TrustedTerrain:
         for name, pose in observation.base_from_cameras.items():
             axis = (motion.terrain_from_base @ pose)[:3, 2]
             cameras[name] = float(np.arctan2(axis[1], axis[0]))
-        swept = observation.cloud is not None and ("lidar" in encoder.used or "lidar" not in encoder.sensors)
+        swept = "lidar" in used_sensors(self.source, observation)
         present = {"lidar": swept, "camera": bool(observation.images)}
         sensors = tuple(name for name in self.sensors if present[name])
         in_use = self._trusts.setdefault(sensors, TerrainTrust(self.grid, self._expected))
@@ -100,7 +100,7 @@ class TrustedTerrain:
             sensors=sensors,
             missing=tuple(name for name in self.sensors if not present[name]),
         )
-        if "camera" not in self.sensors:
+        if "camera" not in sensors:
             # Adaptation needs images.
             report = replace(report, remedy="use terrain_source lidar_interpolation")
         self.report = report
