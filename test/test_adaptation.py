@@ -239,6 +239,19 @@ def test_bands_hold_what_they_say_in_nine_of_ten_scenes(encoder, recording):
     assert calibrated(encoder, scenes, SWEEP).config.image_spread_factor == 1.0
 
 
+def test_an_adaptation_leaves_the_factors_on_the_bands_as_they_are(recording, tmp_path, one_thread):
+    """A network that is trained under them makes up for them: bands would be as narrow as before the calibration."""
+    weights = []
+    for factor in (1.0, 4.0):
+        torch.manual_seed(0)
+        start = new_encoder(replace(CONFIG, image_spread_factor=factor, geometric_spread_factor=factor))
+        settings = AdaptationSettings(steps=3, rate=5e-3)
+        adapted = adapt(start, load_robot("husky"), [recording], [], tmp_path / f"{factor:g}", settings)
+        assert adapted.config == start.config
+        weights.append(adapted.heads.weight)
+    assert torch.equal(*weights)
+
+
 def test_wheels_alone_teach_an_encoder_of_a_robot_without_a_lidar(demo_bag, tmp_path, one_thread):
     bag = tmp_path / "wheels"
     with BagReader(demo_bag) as reader, BagWriter(bag) as writer:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from scipy import stats
 
-from monoforce_ros.encoder import Encoder
+from monoforce_ros.encoder import SPREAD_FACTORS, Encoder
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.training.judgement import CAMERAS, SWEEP, Judgement, judge, sample_errors, widened
 from monoforce_ros.training.losses import LossWeights
@@ -175,6 +175,8 @@ def adapt(
         report: called with the step and its losses.
     """
     adapted = copy.deepcopy(encoder)
+    # The factors on its bands are no part of what the network learns, which would make up for them.
+    adapted.config = replace(encoder.config, **dict.fromkeys(SPREAD_FACTORS, 1.0))
     training = TrainingSettings(
         steps=settings.steps, batch=settings.batch, rate=settings.rate, warm_up=max(1, settings.steps // 10),
         weights=LossWeights(trajectory=0.0), seed=settings.seed, validate_every=settings.steps,
@@ -182,6 +184,7 @@ def adapt(
     )  # fmt: skip
     trainer = Trainer(adapted, robot, balanced(own, replay), [], out, training, Process("cpu"))
     trainer.run(report)
+    adapted.config = encoder.config
     return adapted.eval()
 
 
