@@ -368,7 +368,7 @@ def test_unusable_checkpoints_are_refused(tmp_path):
         ({"image_width": 130}, "multiples of 16"),
         ({"map_features": 16}, "the weights do not match the network"),
         ({"backbone": "resnet"}, "got 'resnet'"),
-        ({"colour": "red"}, "not an encoder configuration"),
+        ({"colour": "red"}, "does not know; was it written by a newer one"),
         ({"depth_bins": 1e9}, "depth_bins"),
     ):
         path.with_suffix(".json").write_text(json.dumps(config | change))

@@ -227,8 +227,10 @@ def diagnose_bag(
     doubts = list(dict.fromkeys(text for text in (*wrong, ground.complaint, *rest, steeper, harder, large) if text))
     if diagnosis.verdict == Verdict.NOT_IDENTIFIABLE:
         diagnosis = _with_wheels(diagnosis, evidence, model)
-    diagnosis = with_advice(diagnosis, local=local_effects)
     for_file = effects_for_file(diagnosis, local=local_effects)
+    # On ground that no map shows slopes pass for effects: of that only what sensors measured belongs into a robot file.
+    credible = bool(for_file) and (bool(rest) or not ground.unknown) and not any(map(complaint, for_file))
+    diagnosis = with_advice(diagnosis, local=local_effects, written=credible)
     elsewhere = len(for_file) < len(diagnosis.effects)
     in_file = {effect.name for effect in for_file}
     fitted = tuple(entry for entry in diagnosis.fitted if entry[0] in in_file)
@@ -268,11 +270,9 @@ def diagnose_bag(
     }
     # Files last: what ends the work before leaves none of it, and those of an earlier run together.
     robot_file = None
-    # On ground that no map shows slopes pass for effects: of that only what sensors measured belongs into a robot file.
-    credible = bool(for_file) and (bool(rest) or not ground.unknown)
     # Together, or a robot file of this diagnosis would lie beside the report of an earlier one.
     with uninterrupted():
-        if credible and not any(map(complaint, for_file)):
+        if credible:
             effects = [file_entry(diagnosis, effect) for effect in for_file]
             robot_file = write_robot(robot, found_file, effects, [bag], data)
         elif found_file.exists():

@@ -13,6 +13,7 @@ from typing import Any
 
 from monoforce_ros.discrepancy.diagnosis import Diagnosis
 from monoforce_ros.discrepancy.estimates import EffectEstimate
+from monoforce_ros.discrepancy.learned import LEARNED
 from monoforce_ros.discrepancy.report import effect_entry
 
 _ELSEWHERE = "on all other ground predictions get worse with it"
@@ -39,18 +40,25 @@ def file_entry(diagnosis: Diagnosis, effect: EffectEstimate) -> Mapping[str, Any
     return entry
 
 
-def with_advice(diagnosis: Diagnosis, *, local: bool = False) -> Diagnosis:
-    """The diagnosis with what the robot's file is good for, where effects act in a part of the recording only."""
-    if not diagnosis.partial:
+def with_advice(diagnosis: Diagnosis, *, local: bool = False, written: bool = True) -> Diagnosis:
+    """The diagnosis with what the robot's file is good for, where effects act in a part of the recording only.
+
+    Args:
+        diagnosis: the result.
+        local: whether effects of a part of the ground are written.
+        written: whether a robot file is.
+    """
+    if not diagnosis.partial or (not written and (local or not diagnosis.regional)):
         return diagnosis
-    names = " and ".join(diagnosis.partial)
+    names = " and ".join("the formula" if name == LEARNED else name for name in diagnosis.partial)
+    one = len(diagnosis.partial) == 1
     if not diagnosis.regional:
         text = f"the robot's new file describes the robot as it is since then: {_BEFORE}"
     elif local:
         text = f"use the robot's new file on such ground only: {_ELSEWHERE}"
     else:
         text = (
-            f"{names} is not written into a robot file, since it belongs to the ground: {_ELSEWHERE} (--local-effects "
-            "writes it all the same)"
+            f"{names} {'is' if one else 'are'} not written into a robot file, since {'it belongs' if one else 'they belong'}"
+            f" to the ground: {_ELSEWHERE} (--local-effects writes {'it' if one else 'them'} all the same)"
         )
     return replace(diagnosis, advice=(text, *diagnosis.advice))

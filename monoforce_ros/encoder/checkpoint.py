@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 
 import torch
@@ -71,11 +71,18 @@ def load_encoder(path: str | Path, sensor: str | None = None) -> Encoder:
             raise CheckpointError(f"{file}: got {file.stat().st_size} bytes, expected at most {MAXIMUM_BYTES}")
     try:
         # Files of the first format do not name it, those of networks without scatter not their channels.
-        config = EncoderConfig(
-            **({"format": 1, "sweep_channels": HEIGHT_CHANNELS} | json.loads(description.read_text(encoding="utf-8")))
-        )
+        entries = {"format": 1, "sweep_channels": HEIGHT_CHANNELS} | json.loads(description.read_text(encoding="utf-8"))
+        unknown = sorted(set(entries) - {field.name for field in fields(EncoderConfig)})
+        config = EncoderConfig(**{name: value for name, value in entries.items() if name not in unknown})
+    except OSError as error:
+        raise CheckpointError(f"{description}: cannot be read: {error}") from error
     except (TypeError, ValueError) as error:
         raise CheckpointError(f"{description}: not an encoder configuration: {error}") from error
+    if unknown:
+        raise CheckpointError(
+            f"{description}: got the settings {', '.join(unknown)}, which this release does not know; was it written "
+            "by a newer one? Use that, or train again"
+        )
     if sensor is not None and sensor not in config.sensor.split("_"):
         raise CheckpointError(f"{path}: got an encoder for {config.sensor}, expected one for {sensor}")
     encoder = new_encoder(config)

@@ -53,10 +53,10 @@ class TerrainHealth:
 
     def _report(self, part: str, report: TrustReport) -> None:
         if report.trusted:
-            self._health.report(part, OK, report.explanation, reason=f"trusted, {report.sensors}")
+            self._health.report(part, OK, report.explanation, reason="trusted")
         else:
             text = f"falling back, the encoder is not used: {report.explanation}"
-            self._health.report(part, WARN, text, reason=f"not trusted, {report.sensors}")
+            self._health.report(part, WARN, text, reason="not trusted")
         self._health.set_values(part, _values(report))
 
 

@@ -29,6 +29,8 @@ SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
 """Shares of the change of the weights that :func:`keep_obstacles` tries."""
 BLOCK = 2.0
 """Length of the blocks of a held-out part whose mean errors are compared [s]: neighbouring samples see one ground."""
+_MATTERS = 0.005
+"""Increase of an error from which it counts as worse [m]: half of what the predictor's trust tolerates."""
 _LEVEL = 0.05
 """Error rate at which an adaptation that made nothing worse is taken back."""
 LOST_OBSTACLES = 0.02
@@ -241,7 +243,7 @@ def got_worse(before: Encoder, after: Encoder, held_out: Sequence[RecordingSampl
     """What became worse beyond chance on samples that the adaptation did not see: ``surface``, ``support``.
 
     Differences of the errors are averaged over blocks of :data:`BLOCK`, and their mean is compared with its standard
-    error (Student's t, one-sided, 5 %). A single block has none; there any increase counts.
+    error (Student's t, one-sided, 5 %). A single block has none. An increase of less than 5 mm is none.
     """
     sensors = _sensors(before)
     found: dict[str, list[float]] = {"surface": [], "support": []}
@@ -258,9 +260,9 @@ def got_worse(before: Encoder, after: Encoder, held_out: Sequence[RecordingSampl
 def _above_zero(values: np.ndarray) -> bool:
     mean = float(values.mean())
     if len(values) < 2:
-        return mean > 0.0
+        return mean > _MATTERS
     error = float(values.std(ddof=1)) / np.sqrt(len(values))
-    return mean > error * float(stats.t.ppf(1.0 - _LEVEL, len(values) - 1))
+    return mean > _MATTERS and mean > error * float(stats.t.ppf(1.0 - _LEVEL, len(values) - 1))
 
 
 def calibration_and_judging(
