@@ -51,14 +51,14 @@ def with_advice(diagnosis: Diagnosis, *, local: bool = False, written: bool = Tr
     if not diagnosis.partial or (not written and (local or not diagnosis.regional)):
         return diagnosis
     names = " and ".join("the formula" if name == LEARNED else name for name in diagnosis.partial)
-    one = len(diagnosis.partial) == 1
+    is_, belongs, it = ("is", "it belongs", "it") if len(diagnosis.partial) == 1 else ("are", "they belong", "them")
     if not diagnosis.regional:
         text = f"the robot's new file describes the robot as it is since then: {_BEFORE}"
     elif local:
         text = f"use the robot's new file on such ground only: {_ELSEWHERE}"
     else:
         text = (
-            f"{names} {'is' if one else 'are'} not written into a robot file, since {'it belongs' if one else 'they belong'}"
-            f" to the ground: {_ELSEWHERE} (--local-effects writes {'it' if one else 'them'} all the same)"
+            f"{names} {is_} not written into a robot file, since {belongs} to the ground: {_ELSEWHERE} "
+            f"(--local-effects writes {it} all the same)"
         )
     return replace(diagnosis, advice=(text, *diagnosis.advice))
