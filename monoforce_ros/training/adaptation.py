@@ -6,6 +6,7 @@ import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy import stats
@@ -178,7 +179,8 @@ def adapt(
     """
     adapted = copy.deepcopy(encoder)
     # The factors on its bands are no part of what the network learns, which would make up for them.
-    adapted.config = replace(encoder.config, **dict.fromkeys(SPREAD_FACTORS, 1.0))
+    none: dict[str, Any] = dict.fromkeys(SPREAD_FACTORS, 1.0)
+    adapted.config = replace(encoder.config, **none)
     training = TrainingSettings(
         steps=settings.steps, batch=settings.batch, rate=settings.rate, warm_up=max(1, settings.steps // 10),
         weights=LossWeights(trajectory=0.0), seed=settings.seed, validate_every=settings.steps,
