@@ -112,12 +112,14 @@ class TemporalMemory:
         values, age, distance = memory.read(motion)
         fresh = (age < self._retention_time) & (distance < self._retention_distance)
         disappeared = values[0] - now.height.numpy() > _OBSTACLE_HEIGHT
+        posed, support = standing(self._robot, observation.flipper_angles, motion, self._stiffness)
         if self._blind_zone_only:
             obstacle = np.zeros_like(fresh)
             # What rose above the line of sight has gone: somebody walked by.
             sight = now.looked_over(self._lidar_height + float(motion.terrain_from_base[2, 3]))
-            # But where nothing is measured any more, nothing shows that it has, nor hides what images show now.
-            hidden = now.observed.numpy() & (now.height.numpy() - values[0] > _OBSTACLE_HEIGHT)
+            # But where nothing is measured any more, nothing shows that it has, nor hides an obstacle in images.
+            above = now.height.numpy() - np.maximum(values[0], np.median(support[:, 2]))
+            hidden = now.observed.numpy() & (above > _OBSTACLE_HEIGHT)
             kept = fresh & (values[0] <= sight + _SIGHT_TOLERANCE if swept else ~hidden)
         else:
             obstacle = fresh & now.observed.numpy() & self._near & disappeared
@@ -132,7 +134,6 @@ class TemporalMemory:
         if not kept.any():
             return now
         joined = now.with_cells(torch.from_numpy(kept), dict(zip(CHANNELS, torch.from_numpy(values), strict=True)))
-        posed, support = standing(self._robot, observation.flipper_angles, motion, self._stiffness)
         return clear_of_robot(align_to_ground(joined, support), posed, motion)
 
 

@@ -378,26 +378,22 @@ def _mean(comparisons: Iterable[_Comparison]) -> _Comparison:
 
 
 def _weights(squares: np.ndarray) -> np.ndarray | None:
-    """Weights of blocks ``[n]`` in which prediction and fallback differ by ``squares`` ``[n]`` [m²]; None if fewer than
-    :data:`FEWEST_BLOCKS` tell them apart.
+    """Which blocks count ``[n]``, 0 or 1, where prediction and fallback differ by ``squares`` ``[n]`` [m²]; None if
+    fewer than :data:`FEWEST_BLOCKS` tell them apart.
 
-    A block that differs far more than all others would decide alone: its square is cut, so that the effective number
-    of blocks, (Σ d²)² / Σ d⁴, is no smaller.
+    A block that differs far more than all others would decide alone: it is left out, until the effective number of
+    blocks, (Σ d²)² / Σ d⁴, is no smaller.
     """
-    if (squares > 0.0).sum() < FEWEST_BLOCKS:
-        return None
-
-    def enough(cut: float) -> bool:
-        kept = np.minimum(squares, cut)
-        return bool(kept.sum() ** 2 >= FEWEST_BLOCKS * (1.0 - 1e-9) * (kept**2).sum())
-
-    low, high = float(squares[squares > 0.0].min()), float(squares.max())
-    if not enough(high):
-        for _ in range(40):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if enough(middle) else (low, middle)
-        high = low
-    return np.minimum(1.0, high / np.maximum(squares, 1e-300))
+    order = np.argsort(-squares, kind="stable")
+    for left_out in range(len(squares)):
+        kept = squares[order[left_out:]]
+        if (kept > 0.0).sum() < FEWEST_BLOCKS:
+            break
+        if kept.sum() ** 2 >= FEWEST_BLOCKS * (1.0 - 1e-9) * (kept**2).sum():
+            weights = np.ones(len(squares))
+            weights[order[:left_out]] = 0.0
+            return weights
+    return None
 
 
 def _errors(comparisons: Sequence[_Comparison]) -> tuple[float, float]:
