@@ -80,8 +80,8 @@ def test_a_robot_that_was_blocked_is_not_all_right_because_its_model_is():
     assert headline(replace(blocked, observed=())).tone is Tone.GOOD
 
 
-@pytest.mark.parametrize(("share", "told"), [(0.55, True), (0.3, False)])
-def test_what_explains_most_of_an_unknown_effect_is_said_with_its_share(share, told):
+@pytest.mark.parametrize(("share", "said"), [(0.55, True), (0.3, False)])
+def test_what_explains_most_of_an_unknown_effect_is_said_with_its_share(share, said):
     part = effect("drive_gain", gain=(1.12, 1.08, 1.16))
     found = Diagnosis(
         Verdict.UNKNOWN_EFFECT, known_parts=(part,), gap={"position_2s": row(0.16, None)},
@@ -89,8 +89,8 @@ def test_what_explains_most_of_an_unknown_effect_is_said_with_its_share(share, t
     )  # fmt: skip
     top = headline(found)
     assert top.tone is Tone.UNKNOWN
-    assert any("55 %" in text and "12 % faster than commanded" in text for text in top.findings) == told
-    assert top.sentence.startswith("Something is wrong; what is known explains a part of it") == told
+    assert any("55 %" in text and "12 % faster than commanded" in text for text in top.findings) == said
+    assert top.sentence.startswith("Something is wrong; what is known explains a part of it") == said
 
 
 def test_what_no_search_without_a_part_finds_is_not_said_to_explain_too_little():

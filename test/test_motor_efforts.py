@@ -1,4 +1,4 @@
-"""Currents of the drives beside those of the healthy robot: told where they differ beyond chance, and never else."""
+"""Currents of the drives beside those of the healthy robot: said where they differ beyond chance, and never else."""
 
 from dataclasses import fields, replace
 

@@ -20,8 +20,8 @@ from monoforce_ros.discrepancy.trial import BLOCK, blocks_of
 from monoforce_ros.robots import RobotModel
 
 HORIZONS = (1.0, 2.0, 5.0)
-"""At which errors are told [s]: half and whole of the windows to which effects are fitted, and beyond them, where only
-the effects' form predicts. Those of 5 s decide nothing (:data:`JUDGED`)."""
+"""At which errors are reported [s]: half and whole of the windows to which effects are fitted, and beyond them, where
+only the effects' form predicts. Those of 5 s decide nothing (:data:`JUDGED`)."""
 ABOVE_NOISE = 2.0
 """An error counts if it is at least so many times the noise floor: the noise is then the smaller part of it."""
 FEWEST_WINDOWS = 6

@@ -36,8 +36,8 @@ _MOVED, _TURNED = 0.1, np.radians(5.0)
 _LEAST_MOVING = 2.0
 """Time that a robot must move: a single window [s]."""
 _COMMANDED = 0.05
-"""Speed [m/s] or yaw rate [rad/s] from which on a command asks for motion: that by which a robot that stands is told
-(:data:`_MOVED`) from one that moves."""
+"""Speed [m/s] or yaw rate [rad/s] from which on a command asks for motion: that which separates a robot that moves from
+one that stands (:data:`_MOVED`)."""
 _NOISES, _COURSE_NOISES = 5.0, 10.0
 """Standard deviations of the poses' noise beyond which a robot moved: noise alone does in less than one of a million
 cases; and from which on its course is known within 8° (√2 / 10), less than half of a curve that counts."""

@@ -23,7 +23,7 @@ _MOST_SAMPLES = 80
 """Samples of a block that are used at most: every so many are taken, so that 10 to 20 Hz remain, about 13 Hz of a rate
 of 40 or 50 Hz. One time constant of 0.08 s then lies between two samples."""
 _FEWEST_SAMPLES = 10
-"""Of a block that is used: 2.5 Hz, at which commands that are held for a second are still told apart."""
+"""Of a block that is used: 2.5 Hz, at which commands that are held for a second can still be distinguished."""
 
 _SETTLED = 1.5
 """Time for which a command must have been constant where the ratio of wheels and commands is taken [s]: a real

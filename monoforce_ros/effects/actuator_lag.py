@@ -50,7 +50,7 @@ class ActuatorLag(Effect):
         speeds=_lagging,
         starts=lambda fastest: (0.1, 0.4),
         bounds=lambda fastest: (0.0, 3.0),
-        # One interval at about 13 Hz, to which blocks of wheel speeds are thinned.
+        # One interval at about 13 Hz, at which blocks of wheel speeds are subsampled.
         counts=lambda value, fastest: value >= 0.08,
         wording="with a time constant of {:.2f} s",
     )

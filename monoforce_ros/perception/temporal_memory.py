@@ -111,19 +111,20 @@ class TemporalMemory:
         memory.move_to(motion.position[:2])
         values, age, distance = memory.read(motion)
         fresh = (age < self._retention_time) & (distance < self._retention_distance)
-        disappeared = values[0] - now.height.numpy() > _OBSTACLE_HEIGHT
+        height, observed = now.height.numpy(), now.observed.numpy()
         posed, support = standing(self._robot, observation.flipper_angles, motion, self._stiffness)
-        if self._blind_zone_only:
-            obstacle = np.zeros_like(fresh)
+        obstacle = np.zeros_like(fresh)
+        if not self._blind_zone_only:
+            obstacle = fresh & observed & self._near & (values[0] - height > _OBSTACLE_HEIGHT)
+            kept = (fresh & ~observed) | obstacle
+        elif swept:
             # What rose above the line of sight has gone: somebody walked by.
             sight = now.looked_over(self._lidar_height + float(motion.terrain_from_base[2, 3]))
-            # But where nothing is measured any more, nothing shows that it has, nor hides an obstacle in images.
-            above = now.height.numpy() - np.maximum(values[0], np.median(support[:, 2]))
-            hidden = now.observed.numpy() & (above > _OBSTACLE_HEIGHT)
-            kept = fresh & (values[0] <= sight + _SIGHT_TOLERANCE if swept else ~hidden)
+            kept = fresh & (values[0] <= sight + _SIGHT_TOLERANCE)
         else:
-            obstacle = fresh & now.observed.numpy() & self._near & disappeared
-            kept = (fresh & ~now.observed.numpy()) | obstacle
+            # Where nothing is measured any more, nothing shows that it has, nor hides an obstacle in images.
+            above = height - np.maximum(values[0], np.median(support[:, 2]))
+            kept = fresh & ~(observed & (above > _OBSTACLE_HEIGHT))
         seen = now.observed & ~torch.from_numpy(obstacle)
         if not self._blind_zone_only:
             memory.write(replace(now, observed=seen), motion)
