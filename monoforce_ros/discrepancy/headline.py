@@ -183,8 +183,8 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
         f"{_class_of(effect)}. By all of it: {finding(effect)}" if effect.named_otherwise else finding(effect)
         for effect in effects
     )
-    if diagnosis.verdict == Verdict.UNKNOWN_EFFECT and not named:
-        findings += _of_parts(diagnosis)
+    parts = _of_parts(diagnosis) if diagnosis.verdict == Verdict.UNKNOWN_EFFECT and not named else ()
+    findings += parts
     if not named:
         # Without a name for it, where the error shows is what is known.
         findings += tuple(
@@ -206,7 +206,7 @@ def headline(diagnosis: Diagnosis, complaints: Sequence[str] = ()) -> Headline:
         sentence = "Something is wrong that no known effect explains."
         if diagnosis.not_found_again:
             sentence = "Something is wrong; what explains it hangs on a part of the recording, and is not named."
-        elif _of_parts(diagnosis):
+        elif parts:
             sentence = "Something is wrong; what is known explains a part of it, and not enough to be the cause alone."
         if named:
             sentence = "Something is wrong that no known effect explains, besides what was found."
