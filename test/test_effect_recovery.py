@@ -235,6 +235,21 @@ def test_a_further_effect_in_whose_presence_the_first_one_goes_must_explain_more
     assert search._further(first, 2)[0] is None
 
 
+@pytest.mark.parametrize("force", [0.0, 120.0])
+def test_what_is_left_that_is_too_large_for_the_error_of_a_formula_lets_a_further_effect_be_found(force):
+    """Where a healthy robot varies much in one direction no test shows that this is it: what it predicts does."""
+    husky = load_robot("husky")
+    hidden = (("drive_gain", {"gain": 0.8}), ("constant_force", {"x": 0.0, "y": force}))
+    names = [effect.name for effect in identifiable_effects(husky)]
+    varying = {**dict.fromkeys(names, 0.3), "constant_force": 8.0, "gravity_tilt": 8.0}
+    healthy = NominalModel(SCALE, varying, segments=5, loss=0.4, loss_spread=0.2)
+    search = Search(husky, driven(replace(husky, effects=hidden)), SCALE, nominal=healthy)
+    found = search.run(2, exchange=False)
+    second = [candidate for candidate in found.tried if candidate.name == "constant_force" and candidate.round == 2]
+    assert all(candidate.p > search.thresholds.further_rate for candidate in second)
+    assert found.best.names == (("drive_gain", "constant_force") if force else ("drive_gain",))
+
+
 @pytest.mark.parametrize(("delay", "found"), [(0.035, False), (0.12, True)])
 def test_a_shift_of_less_than_the_time_between_two_commands_is_no_fault(delay, found):
     """The base reads commands in its own cycle, which begins anew with each start of a healthy robot."""

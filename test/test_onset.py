@@ -110,10 +110,10 @@ def test_a_weak_effect_that_begins_late_is_significant_from_its_onset_on(gain):
     healthy = NominalModel(residual, dict.fromkeys(names, 0.25), segments=5, loss=0.5, loss_spread=0.2)
     search = Search(load_robot("husky"), data, residual, nominal=healthy)
     outcome = search.run(2, exchange=False)
-    rate = search.thresholds.effect_rate
+    whole_rate, rate = search.thresholds.whole_rate, search.thresholds.part_rate
     assert not outcome.best.effects and outcome.fit.passed(search.thresholds)
     whole = min(entry.test.adjusted for entry in search.screening.candidates((), 0, "").screened)
-    assert whole > rate
+    assert whole > whole_rate
     assert search.part_p() <= rate if gain < 1.0 else search.part_p() > rate
 
 

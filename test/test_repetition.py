@@ -198,3 +198,15 @@ def test_an_effect_beside_another_that_is_found_again_in_fewer_than_half_of_the_
     # One without which the others are no measurements belongs to them.
     monkeypatch.setattr(found.search, "credible", lambda trial: len(trial.names) > 1)
     assert names(delay, delay, payload)[0] == (name, "payload")
+
+
+def test_an_effect_without_which_held_out_windows_are_predicted_worse_is_kept_however_rarely_it_is_found_again(husky):
+    """Two thirds of a recording miss what the whole of it shows."""
+    hidden = (("command_delay", {"delay": 0.3}), ("drive_gain", {"gain": 0.8}))
+    motion, commands = simulated_recording(husky, hidden, seconds=40.0)
+    evidence, windows = windows_of(motion, commands)
+    found = explain(evidence, husky, windows, None, DiagnosisSettings(max_effects=2))
+    assert found.decision.verdict == Verdict.EFFECT_FOUND
+    delay, gain = found.decision.trial.names
+    once = Repetition(0, (Repeated(named=(delay,)), Repeated(named=(delay, gain)), Repeated(named=(delay,))))
+    assert once.confirmed(found, found.decision, SETTINGS.thresholds).trial.names == (delay, gain)

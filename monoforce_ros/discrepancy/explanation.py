@@ -174,7 +174,7 @@ def explain(
     whole, first = windows, outcome.best
     part: Part | None = None
     passed, found = outcome.fit.passed(thresholds), len(outcome.best.effects) > len(search.known)
-    partly = not repeated and passed and not found and search.part_p() <= thresholds.effect_rate
+    partly = not repeated and passed and not found and search.part_p() <= thresholds.part_rate
     if not repeated and (partly or not passed):
         starts = windows.data.starts
         trials = [outcome.best]

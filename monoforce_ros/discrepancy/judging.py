@@ -341,6 +341,10 @@ class Judging:
         explained = self._without_effects.loss - before.loss
         return self._pays(before, after, least=self.thresholds.further_share * explained)
 
+    def needs(self, trial: Trial, name: str) -> bool:
+        """Whether held-out windows are predicted worse beyond chance without one of several effects."""
+        return self._gain(self.judge(without(trial.effects, name)), trial)[1] > 0.0
+
     @cached_property
     def _without_effects(self) -> Trial:
         return Trial((), ((),) * self.fold_count, self.loss_of(()))

@@ -55,7 +55,7 @@ class Search(Judging):
         """
         measured = self.measured()
         nominal, start = measured.nominal, measured.best
-        judged, tried = self._round(start, 1, self.thresholds.effect_rate, missing=missing)
+        judged, tried = self._round(start, 1, self.thresholds.whole_rate, missing=missing)
         ratio = self.screening.candidates(self.known, len(self.known), "1: ").variance_ratio(self.directions)
         if not judged:
             return Outcome(nominal, start, self.fit_test(start, nominal), tuple(tried), ratio)
@@ -244,8 +244,8 @@ class Search(Judging):
     ) -> tuple[list[Trial], list[CandidateScore]]:
         """Trials with one more effect that is significant, smallest held-out loss first, and the scores of all."""
         base = self.refit(best.effects).effects if best.effects else ()
-        # Beside effects that were found the size only shows that these are not exact.
-        size_p = self.size_p(best) if number == 1 else None
+        # What effects leave is larger than a healthy robot's, for no formula is exact: that is expected of its size.
+        size_p = self.size_p(best)
         incomplete = missing or (size_p is not None and size_p <= self.thresholds.fit_rate)
         found = self.screening.candidates(base, self.fixed_count(base), f"{number}: ", incomplete=incomplete)
         screened = self._beside(base, found, rate)
@@ -267,6 +267,9 @@ class Search(Judging):
                 CandidateScore(entry.name, number, float(gain), entry.test.adjusted, judged=trial is not None)
             )
         kept = [trial for trial in judged if self._adds(best, trial) and self.credible(trial, last=1)]
+        if number > 1 and all(entry.test.adjusted > rate for entry in screened):
+            # By its size something is missing, but no test says what: that must show in what it predicts.
+            kept = [trial for trial in kept if self._gain(best, trial)[1] > 0.0]
         return sorted(kept, key=lambda trial: trial.loss), listed
 
     def _beside(self, base: Effects, found: Candidates, rate: float) -> Sequence[Screened]:
@@ -330,7 +333,8 @@ class Search(Judging):
             effect = next(entry for entry in best.effects if entry[0] == name)
             influence = self.directions.influence(base, effect)
             (test,) = self.screening.tested(base, self.fixed_count(base), residual, [influence])
-            if test.p > self.thresholds.further_rate or not self._adds(fewer, best):
+            needed = test.p <= self.thresholds.further_rate or self._gain(fewer, best)[1] > 0.0
+            if not needed or not self._adds(fewer, best):
                 best = fewer
         return best
 

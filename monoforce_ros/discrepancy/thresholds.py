@@ -10,7 +10,8 @@ class Thresholds:
     """Numbers that decide a verdict.
 
     Attributes:
-        effect_rate: stated rate at which a healthy recording yields an effect, over all candidates together.
+        effect_rate: stated rate at which a healthy recording yields an effect, over all candidates together, half of it
+            (``whole_rate``) one that acts in all of the recording, half of it (``part_rate``) one in a part of it.
         fit_rate: stated rate at which a healthy recording, or one whose effects are all known, yields
             ``unknown_effect``. Together with ``effect_rate`` it is the usual 5 % of false alarms.
         further_rate: stated rate at which a further effect is added though none is missing.
@@ -82,3 +83,13 @@ class Thresholds:
     further_share: float = 0.03
     explained_share: float = 0.6
     most_share: float = 0.5
+
+    @property
+    def whole_rate(self) -> float:
+        """Of effects that act in all of a recording."""
+        return 0.5 * self.effect_rate
+
+    @property
+    def part_rate(self) -> float:
+        """Of effects that act in a part of a recording."""
+        return self.effect_rate - self.whole_rate
