@@ -263,6 +263,16 @@ def test_a_shift_of_less_than_the_time_between_two_commands_is_no_fault(delay, f
     assert bool(shifts) == found
 
 
+@pytest.mark.parametrize(("gain", "kept"), [(0.8, True), (1.2, False)])
+def test_what_a_sensor_measured_acts_unless_the_motion_contradicts_it(gain, kept):
+    husky = load_robot("husky")
+    measured = (("drive_gain", {"gain": gain}),)
+    data = driven(replace(husky, effects=(("drive_gain", {"gain": 0.8}),)))
+    search = Search(husky, data, SCALE, known=measured)
+    assert search.known == (measured if kept else ())
+    assert search.measured().best.names == (("drive_gain",) if kept else ())
+
+
 @pytest.mark.parametrize("measured", [True, False])
 def test_an_effect_is_exchanged_for_one_that_predicts_better_and_is_a_measurement(monkeypatch, measured):
     husky = load_robot("husky")

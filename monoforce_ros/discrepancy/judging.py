@@ -57,7 +57,7 @@ class Judging:
         data: the recording's windows.
         scale: expected size of a residual, ``[W, K, C]``.
         nominal: what commissioning learned; None for a robot that was never commissioned.
-        known: effects that another sensor measured: they always act and keep their values.
+        known: effects that another sensor measured: they act and keep their values unless the motion contradicts them.
         hints: values that another sensor suggests; fits start there, too.
         excluded: effects that another sensor rules out.
         of_time: whether effects that grow with time are candidates, too, without a hint.
@@ -82,7 +82,7 @@ class Judging:
     ):
         self.robot, self.data, self.nominal, self.thresholds = robot, data, nominal, thresholds
         self.scale = np.broadcast_to(scale, (len(data.starts), len(data.samples), len(data.components)))
-        self.known, self.seed = known, seed
+        self.seed = seed
         self.predictions = Predictions(robot, data)
         self.directions = Directions(self.predictions, self.scale, nominal, thresholds)
         self._progress = progress
@@ -95,6 +95,13 @@ class Judging:
         self._folds = folds_of(starts, self.fold_count)
         self._ends = folds_of(np.r_[starts[0], starts + round(data.horizon * 1e9)], self.fold_count)[1:]
         self._fits: dict[tuple[tuple[str, ...], ...], Fit] = {}
+        self.known = () if known and self._contradicts(known) else known
+        """Effects that another sensor measured, unless the motion contradicts them."""
+
+    def _contradicts(self, known: Effects) -> bool:
+        """Whether the motion is predicted better beyond chance without effects that a sensor measured."""
+        measured = Trial(known, (known,) * self.fold_count, self.loss_of(known))
+        return self._gain(measured, self._without_effects)[1] > 0
 
     @property
     def commissioned(self) -> bool:

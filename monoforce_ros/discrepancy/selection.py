@@ -134,9 +134,6 @@ class Search(Judging):
         nominal = start = self._without_effects
         if self.known:
             start = Trial(self.known, (self.known,) * self.fold_count, self.loss_of(self.known))
-            _, low = self._gain(start, nominal)
-            if low > 0:
-                self.known, start = (), nominal
         return Outcome(nominal, start, FitTest(1.0, ""))
 
     def _extended(self, best: Trial, most_effects: int) -> tuple[Trial, list[CandidateScore]]:
