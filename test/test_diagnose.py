@@ -100,7 +100,7 @@ def test_injected_parameters_are_recovered_by_the_fit(husky, name, parameters):
     predictions = Predictions(husky, EvidenceWindows(motion, commands, starts, 2.0, SAMPLES))
     scale = np.tile([0.01, 0.01, 0.005], (4, 1))
     before = np.abs(predictions.residuals([()])[0]).mean()
-    fit = fit_effects(predictions, first_values(CATALOGUE[name]), scale)
+    fit = fit_effects(predictions, first_values(CATALOGUE[name], husky), scale)
     for key, value in parameters.items():
         assert dict(fit.effects)[name][key] == pytest.approx(value, rel=0.05, abs=0.012)
     after = np.abs(predictions.residuals([fit.effects])[0]).mean()

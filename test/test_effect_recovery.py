@@ -31,6 +31,42 @@ GRID = Grid.square(40.0, 0.2)
 SCALE = np.tile([0.01, 0.01, 0.005], (4, 1))
 
 
+_LOADS = {
+    "constant_force": {"x": 0.0, "y": 120.0},
+    "payload": {"mass": 25.0, "x": 0.2, "y": 0.0},
+    "viscous_drag": {"coefficient": 300.0},
+}
+"""Of a robot of 50 kg."""
+
+
+@pytest.mark.parametrize(
+    ("name", "size"),
+    # Of a light robot on firm ground a load shows as a shifted centre alone.
+    [
+        ("constant_force", 0.2),
+        ("viscous_drag", 0.2),
+        ("constant_force", 10.0),
+        ("viscous_drag", 10.0),
+        ("payload", 10.0),
+    ],
+)
+def test_forces_and_loads_are_found_on_robots_of_any_mass(name, size):
+    """As shares of the mass: 1200 N move a robot of 500 kg as 120 N do one of 50 kg, and 250 kg of load as 25 kg."""
+    husky = load_robot("husky")
+    robot = replace(husky, mass=size * husky.mass, inertia=size * husky.inertia)
+    hidden = {key: value if key == "x" and name == "payload" else size * value for key, value in _LOADS[name].items()}
+    data = driven(replace(robot, effects=((name, hidden),)))
+    names = [effect.name for effect in identifiable_effects(husky)]
+    healthy = NominalModel(SCALE, dict.fromkeys(names, 0.1), segments=5, loss=0.4, loss_spread=0.2)
+    found = Search(robot, data, SCALE, nominal=healthy).run(1, exchange=False).best
+    assert found.names == (name,)
+    estimated = dict(found.effects)[name]
+    if name == "payload":
+        estimated, hidden = ({"moment": v["mass"] * v["x"]} for v in (estimated, hidden))
+    for key, value in hidden.items():
+        assert estimated[key] == pytest.approx(value, rel=0.15, abs=0.02 * size * 50.0)
+
+
 def rough_and_grassy():
     """Bumps of 4 cm, and vegetation up to 0.4 m high on one half."""
     x, y = (torch.from_numpy(values).float() for values in np.meshgrid(GRID.x, GRID.y))
@@ -82,7 +118,7 @@ def test_injected_values_are_recovered_from_motion(name, parameters, tolerance):
     data = driven(replace(husky, effects=((name, injected),)), terrain)
     predictions = Predictions(husky, data)
     before, floor = (np.abs(predictions.residuals([effects])[0]).mean() for effects in ((), ((name, injected),)))
-    fit = fit_effects(predictions, first_values(CATALOGUE[name]), SCALE)
+    fit = fit_effects(predictions, first_values(CATALOGUE[name], husky), SCALE)
     found = dict(fit.effects)[name]
     for key, value in parameters.items():
         assert found[key] == pytest.approx(value, rel=tolerance), key

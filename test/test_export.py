@@ -384,7 +384,7 @@ def test_values_of_the_robot_file_have_its_interval_or_none(husky, tmp_path):
 @pytest.mark.parametrize("kind", ["mujoco", "diff_drive", "nav2"])
 def test_every_effect_is_exported_or_said(husky, tmp_path, kind):
     for name, effect in CATALOGUE.items():
-        values = (effect.first_values() if effect.identified else None) or [
+        values = (effect.first_values(husky) if effect.identified else None) or [
             {p.name: p.neutral + p.scale for p in effect.parameters[:2]}
         ]
         # Estimates at a bound of their parameter are no result, and are not exported.

@@ -503,7 +503,7 @@ def test_an_unknown_effect_or_parameter_is_refused():
 @pytest.mark.parametrize("name", [known.name for known in identifiable_effects()])
 def test_every_effect_is_said_in_words(name):
     kind = CATALOGUE[name]
-    for values in kind.first_values():
+    for values in kind.first_values(load_robot("husky")):
         units = {parameter.name: parameter.unit for parameter in kind.parameters}
         estimate = EffectEstimate(name, {k: ParameterEstimate(v, v, v, units[k]) for k, v in values.items()})
         text = finding(estimate)

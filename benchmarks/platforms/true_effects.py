@@ -87,7 +87,7 @@ def fitted_truth(search: Search, hidden: list[dict]) -> Effects:
         fits = [
             fit_effects(
                 search.predictions,
-                [base + start for start in first_values(CATALOGUE[name])],
+                [base + start for start in first_values(CATALOGUE[name], search.robot)],
                 search.scale,
                 iterations=6,
             )

@@ -386,7 +386,7 @@ def _directions(entry: _Prepared, effects: Effects, scale: np.ndarray) -> Iterat
     for effect in identifiable_effects(predictions.robot):
         if effect.name in present:
             continue
-        starts = first_values(effect)
+        starts = first_values(effect, predictions.robot)
         # The influence of an effect is not linear: the larger variation of two values counts.
         for start in (starts[len(starts) // 2 - 1], starts[len(starts) // 2]):
             direction = directions.influence(effects, start[0])

@@ -84,7 +84,7 @@ class Directions:
         else:
             neutral = {key: own.get(key, known[key].neutral) for key in values}
             for key, value in values.items():
-                least = _SMALLEST_SECANT * known[key].scale
+                least = _SMALLEST_SECANT * known[key].typical(self.predictions.robot)
                 away = value - neutral[key]
                 changed = value if abs(away) > least else neutral[key] + (least if away >= 0 else -least)
                 if not known[key].low <= changed <= known[key].high:

@@ -14,6 +14,7 @@ from monoforce_ros.discrepancy.evidence import MOTION, EvidenceWindows
 from monoforce_ros.discrepancy.hypothesis import Effects, Predictions
 from monoforce_ros.discrepancy.score_test import block_numbers, motion_count
 from monoforce_ros.effects import CATALOGUE, Effect
+from monoforce_ros.robots import RobotModel
 
 OUTLIER = 3.0
 """Scaled residuals beyond this are weighted linearly instead of quadratically."""
@@ -88,11 +89,10 @@ def neutral_values(effects: Effects) -> np.ndarray:
     )
 
 
-def scales(effects: Effects) -> np.ndarray:
-    """Typical distance of each parameter from its neutral value, ``[P]``."""
-    return np.array(
-        [{p.name: p for p in CATALOGUE[name].parameters}[key].scale for name, values in effects for key in values]
-    )
+def scales(effects: Effects, robot: RobotModel) -> np.ndarray:
+    """Typical distance of each parameter from its neutral value on a robot, ``[P]``."""
+    known = {name: {parameter.name: parameter for parameter in CATALOGUE[name].parameters} for name, _ in effects}
+    return np.array([known[name][key].typical(robot) for name, values in effects for key in values])
 
 
 def without(effects: Effects, name: str) -> Effects:
@@ -124,7 +124,7 @@ def fit_effects(
 
     def distance(effects: Effects) -> np.ndarray:
         # Limits are infinite where they do nothing: no value of theirs is nearer to that than another.
-        away = (flat(effects) - neutral) / scales(effects)
+        away = (flat(effects) - neutral) / scales(effects, predictions.robot)
         return np.where(np.isfinite(away), away, 0.0)
 
     def total(hypotheses: Sequence[Effects], scaled: np.ndarray) -> np.ndarray:
@@ -136,7 +136,7 @@ def fit_effects(
     best = int(np.argmin(losses))
     current, residual, loss = starts[best], tried[best], float(losses[best])
     fixed = sum(len(parameters) for _, parameters in current[:free])
-    typical, values = scales(current), flat(current)
+    typical, values = scales(current, predictions.robot), flat(current)
     rows = None
     for _ in range(iterations if fixed < len(values) else 0):
         rows = jacobian(predictions, current, residual, scale, fixed)
@@ -194,7 +194,7 @@ def jacobian(
         scale: expected size of a residual, ``[K, 3]`` or ``[W, K, 3]``.
         fixed: number of leading parameters that are left out.
     """
-    values, typical = flat(current), scales(current)
+    values, typical = flat(current), scales(current, predictions.robot)
     resolutions = [
         {parameter.name: parameter.resolution for parameter in CATALOGUE[name].parameters}[key]
         for name, parameters in current
@@ -236,9 +236,9 @@ def _covariance(jacobian: np.ndarray, residual: np.ndarray, typical: np.ndarray,
     return small_sample * inverse @ (block_scores.T @ block_scores) @ inverse * np.outer(typical, typical)
 
 
-def first_values(effect: Effect) -> list[Effects]:
-    """Starts over the range where an effect is typically found, its neutral value excepted."""
-    return [((effect.name, values),) for values in effect.first_values()]
+def first_values(effect: Effect, robot: RobotModel) -> list[Effects]:
+    """Starts over the range where an effect is typically found on a robot, its neutral value excepted."""
+    return [((effect.name, values),) for values in effect.first_values(robot)]
 
 
 def estimate_effects(

@@ -127,7 +127,8 @@ class Judging:
         """Cross-validate: judge each fold with the values that the effects have without it."""
         fit = self.refit(effects)
         unchanged = np.concatenate([self._without(name, values) for name, values in fit.effects] or [np.zeros(0)])
-        parts = values_without_parts(fit, self._folds, self._ends, self.fold_count, unchanged)
+        typical = scales(fit.effects, self.robot)
+        parts = values_without_parts(fit, self._folds, self._ends, self.fold_count, unchanged, typical)
         residuals = self.predictions.residuals_by_part(self._folds, parts)
         return Trial(fit.effects, parts, robust(residuals / self.scale))
 
@@ -160,7 +161,7 @@ class Judging:
         covariance = np.zeros((count, count))
         if self.nominal is None or fit.derivatives is None:
             return covariance
-        typical, at = scales(fit.effects), 0
+        typical, at = scales(fit.effects, self.robot), 0
         for name, values in fit.effects:
             place = np.arange(at, at + len(values))
             at += len(values)

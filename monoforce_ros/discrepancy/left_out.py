@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from monoforce_ros.discrepancy.fit import Fit, flat, robust_weights, scales, with_values
+from monoforce_ros.discrepancy.fit import Fit, flat, robust_weights, with_values
 from monoforce_ros.discrepancy.hypothesis import Effects
 
 _PRIOR = 0.01
@@ -21,7 +21,7 @@ is left out is all there is."""
 
 
 def values_without_parts(
-    fit: Fit, parts: np.ndarray, ends: np.ndarray, count: int, unchanged: np.ndarray
+    fit: Fit, parts: np.ndarray, ends: np.ndarray, count: int, unchanged: np.ndarray, typical: np.ndarray
 ) -> tuple[Effects, ...]:
     """Effects with the values that a fit has without each part.
 
@@ -31,11 +31,12 @@ def values_without_parts(
         ends: number of the part in which it ends, ``[W]``: a window that reaches into a part shares its motion.
         count: number of parts; those without windows keep the values of the fit.
         unchanged: values of all parameters without the effects, ``[P]``, not finite where there is none.
+        typical: distance of each from that, ``[P]``.
     """
     if fit.derivatives is None or fit.residual is None:
         return (fit.effects,) * count
     fixed = len(flat(fit.effects)) - len(fit.derivatives)
-    typical, values = scales(fit.effects)[fixed:], flat(fit.effects)
+    typical, values = typical[fixed:], flat(fit.effects)
     away = np.nan_to_num((values - unchanged)[fixed:] / typical, nan=0.0, posinf=0.0, neginf=0.0)
     residual = np.nan_to_num(fit.residual)
     weights = robust_weights(residual)

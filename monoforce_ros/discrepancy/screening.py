@@ -254,7 +254,7 @@ class Screening:
         """Initial values of an effect's fits: over its range, from the robot's file, and what a sensor suggests."""
         name = effect.name
         own = dict(self._robot.effects)
-        starts = first_values(effect)
+        starts = first_values(effect, self._robot)
         if name in own and effect.stage != "measurement":
             known = {key: float(value) for key, value in dict(own[name]).items()}
             starts = [((name, {**known, **_changed(effect, values, known)}),) for ((_, values),) in starts]

@@ -105,7 +105,7 @@ class Search(Judging):
         """Whether an effect that grows with time is significant beside those of a trial."""
         base = self.refit(best.effects).effects if best.effects else ()
         fixed, residual = self.fixed_count(base), self.directions.scaled(base)
-        entries = [first_values(effect)[0][0] for effect in self.screening.growing(best.names)]
+        entries = [first_values(effect, self.robot)[0][0] for effect in self.screening.growing(best.names)]
         directions = [self.directions.influence(base, entry) for entry in entries]
         tests = self.screening.tested(base, fixed, residual, directions) if directions else []
         return any(test.adjusted <= self.thresholds.further_rate for test in tests)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from monoforce_ros.effects.effect import Effect, Parameter, Values, WheelResponse
 from monoforce_ros.effects.ramp import ramped, ramped_array
+from monoforce_ros.robots import RobotModel
 
 
 def _ramped(twists: np.ndarray, value: np.ndarray | float, step: float) -> np.ndarray:
@@ -47,7 +48,7 @@ class AccelerationLimit(Effect):
         wording="accelerating at up to {:.2f} m/s²",
     )
 
-    def first_values(self) -> list[dict[str, float]]:
+    def first_values(self, robot: RobotModel) -> list[dict[str, float]]:
         """Ramps from very soft to those of most bases; the neutral value is infinite."""
         return [{"limit": value} for value in (0.2, 0.4, 0.8, 1.6, 3.2)]
 

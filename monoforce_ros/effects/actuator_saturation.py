@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from monoforce_ros.effects.effect import Effect, Parameter, Values, WheelResponse, per_trajectory
+from monoforce_ros.robots import RobotModel
 
 
 class ActuatorSaturation(Effect):
@@ -36,9 +37,9 @@ class ActuatorSaturation(Effect):
         excludes=("actuator_deadband", "drive_gain"),
     )
 
-    def first_values(self) -> list[dict[str, float]]:
-        """Limits from slow walking speed to the top speed of most robots; the neutral value is infinite."""
-        return [{"limit": value} for value in (0.15, 0.3, 0.5, 0.7, 0.9, 1.5)]
+    def first_values(self, robot: RobotModel) -> list[dict[str, float]]:
+        """Limits from slow walking speed to the top speed of fast robots; the neutral value is infinite."""
+        return [{"limit": value} for value in (0.15, 0.3, 0.5, 0.7, 0.9, 1.5, 2.5, 4.0)]
 
     def drive_speeds(self, speeds: Tensor, values: Values, time_step: float, offsets: Tensor) -> Tensor:
         """Drive speeds with this effect applied; see :class:`Effect`."""

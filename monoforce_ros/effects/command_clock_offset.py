@@ -8,6 +8,7 @@ from typing import ClassVar
 
 from monoforce_ros.core import CommandTrack
 from monoforce_ros.effects.effect import Effect, Parameter
+from monoforce_ros.robots import RobotModel
 
 
 class CommandClockOffset(Effect):
@@ -28,7 +29,7 @@ class CommandClockOffset(Effect):
         "pose_clock_offset": "record an IMU: its gyro shows whether the poses or the base are late"
     }
 
-    def first_values(self) -> list[dict[str, float]]:
+    def first_values(self, robot: RobotModel) -> list[dict[str, float]]:
         """Early and late commands: a late base is a delay as well, an early one only this."""
         return [{"offset": value} for value in (-0.2, 0.1, 0.3)]
 

@@ -18,8 +18,8 @@ class ConstantForce(Effect):
     formula = "f = f_0 in body axes"
     source = "rigid-body mechanics"
     parameters = (
-        Parameter("x", "N", 0.0, -1000.0, 1000.0, 50.0, "force forward"),
-        Parameter("y", "N", 0.0, -1000.0, 1000.0, 50.0, "force to the left"),
+        Parameter("x", "N", 0.0, -1e5, 1e5, 50.0, "force forward", of_mass=True),
+        Parameter("y", "N", 0.0, -1e5, 1e5, 50.0, "force to the left", of_mass=True),
     )
     identified = ("x", "y")
     manoeuvre = "the same stretch forward and in reverse"

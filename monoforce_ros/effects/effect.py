@@ -17,6 +17,8 @@ from monoforce_ros.robots import Flipper, RobotModel
 from monoforce_ros.terrain import TerrainMap
 
 STAGES = ("command", "contact", "body", "measurement")
+REFERENCE_MASS = 50.0
+"""Of the robot for which typical forces and loads are listed [kg]: a Clearpath Husky."""
 Values = Mapping[str, Tensor]
 """Parameter values by name, each a scalar or ``[B]``."""
 
@@ -38,6 +40,12 @@ class Parameter:
     """Smallest change that predictions show; finite differences are at least as large."""
     attainable: bool = False
     """Whether a robot can have the values at the bounds, as the whole of a share; else they only limit a search."""
+    of_mass: bool = False
+    """Whether ``scale`` is that of a robot of ``REFERENCE_MASS`` and grows with the mass, as forces and loads do."""
+
+    def typical(self, robot: RobotModel) -> float:
+        """Typical deviation from neutral on a robot."""
+        return self.scale * float(robot.mass) / REFERENCE_MASS if self.of_mass else self.scale
 
 
 @dataclass(frozen=True)
@@ -247,12 +255,12 @@ class Effect(ABC):
         """Commands as recorded under this effect."""
         return commands
 
-    def first_values(self) -> list[dict[str, float]]:
-        """Initial values of the identified parameters for a fit, spread over the typical range."""
+    def first_values(self, robot: RobotModel) -> list[dict[str, float]]:
+        """Initial values of the identified parameters for a fit on a robot, spread over the typical range."""
         known = {parameter.name: parameter for parameter in self.parameters}
         neutral = {key: known[key].neutral for key in self.identified}
         main = known[self.identified[0]]
-        starts = [main.neutral + factor * main.scale for factor in (-2.0, -1.0, -0.4, 0.4, 1.0, 2.0)]
+        starts = [main.neutral + factor * main.typical(robot) for factor in (-2.0, -1.0, -0.4, 0.4, 1.0, 2.0)]
         return [neutral | {main.name: float(value)} for value in starts if main.low <= value <= main.high]
 
     def complaint(self) -> str:

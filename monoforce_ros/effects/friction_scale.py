@@ -10,6 +10,7 @@ from torch import Tensor
 
 from monoforce_ros.effects.effect import Effect, Parameter, Values
 from monoforce_ros.effects.setup import Setup
+from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import TerrainMap
 
 
@@ -27,7 +28,7 @@ class FrictionScale(Effect):
     separated_by: ClassVar = {"turning_scrub": "turns on the spot and hard starts"}
     commissioning_start: ClassVar = {"factor": 1.0}
 
-    def first_values(self) -> list[dict[str, float]]:
+    def first_values(self, robot: RobotModel) -> list[dict[str, float]]:
         """Initial values for a fit. Friction acts only where more of it is asked for: what is far lower looks like no
         change at all from values near 1."""
         return [{"factor": factor} for factor in (0.1, 0.2, 0.4, 0.7, 1.4)]

@@ -25,10 +25,11 @@ class LearnedTerm(Effect):
             f"{row}:{feature}",
             "N" if row.startswith("force") else "N m",
             0.0,
-            -2000.0,
-            2000.0,
+            -1e5,
+            1e5,
             20.0,
             f"weight of {feature} in the {row.replace('_', ' along ' if row.startswith('force') else ' about ')}",
+            of_mass=True,
         )
         for row in _ROWS
         for feature in FEATURES

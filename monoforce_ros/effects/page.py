@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from monoforce_ros.effects.catalogue import CATALOGUE, speed_effects
-from monoforce_ros.effects.effect import STAGES
+from monoforce_ros.effects.effect import REFERENCE_MASS, STAGES
 
 _INTRODUCTION = """# Effects
 
@@ -25,6 +25,8 @@ Limits of the twist act before it becomes drive speeds.
 Delay and lag use the commands from before the start. Contact and body effects act in the rollout, in both backends, and
 every parameter is differentiable. Measurement effects change recorded data, not the motion itself.
 
+Typical forces and loads "of 50 kg" are those of such a robot; on others they are as much of its mass.
+
 This page is generated: `python -m monoforce_ros.effects.page > docs/effects.md`.
 """
 
@@ -41,7 +43,8 @@ def catalogue_page() -> str:
             rows = ["| parameter | unit | neutral | bounds | typical | meaning |", "|---|---|---|---|---|---|"]
             listed = effect.parameters if len(effect.parameters) < 8 else effect.parameters[:3]
             rows += [
-                f"| `{p.name}` | {p.unit} | {p.neutral:g} | {p.low:g} … {p.high:g} | ± {p.scale:g} | {p.meaning} |"
+                f"| `{p.name}` | {p.unit} | {p.neutral:g} | {p.low:g} … {p.high:g} | ± {p.scale:g}"
+                f"{f' of {REFERENCE_MASS:g} kg' if p.of_mass else ''} | {p.meaning} |"
                 for p in listed
             ]
             rows = [row.replace("vx|vx|", "vx\\|vx\\|") for row in rows]

@@ -9,7 +9,10 @@ import torch
 
 from monoforce_ros.effects.effect import Effect, Parameter, Product, Values
 from monoforce_ros.effects.setup import Setup
-from monoforce_ros.robots import add_point_mass
+from monoforce_ros.robots import RobotModel, add_point_mass
+
+_MOST_MISSING = -0.5
+"""Share of a robot's mass of which at most it may be lighter than its file says."""
 
 
 class Payload(Effect):
@@ -21,7 +24,7 @@ class Payload(Effect):
     formula = "M ← M + m, c and J by the parallel-axis theorem"
     source = "rigid-body mechanics"
     parameters = (
-        Parameter("mass", "kg", 0.0, -20.0, 200.0, 10.0, "added mass"),
+        Parameter("mass", "kg", 0.0, -1e4, 1e4, 10.0, "added mass", of_mass=True),
         Parameter("x", "m", 0.0, -1.0, 1.0, 0.2, "position forward of the base frame"),
         Parameter("y", "m", 0.0, -1.0, 1.0, 0.2, "position to the left"),
         Parameter("z", "m", 0.0, -0.5, 1.5, 0.2, "position above"),
@@ -40,14 +43,21 @@ class Payload(Effect):
         "friction_scale": "driving up and across a slope",
     }
 
-    def first_values(self) -> list[dict[str, float]]:
-        """Loads at the front and the rear; a centred load changes the motion too little for an initial value."""
-        return [{"mass": mass, "x": x, "y": 0.0} for mass in (8.0, 20.0) for x in (-0.3, 0.3)]
+    def first_values(self, robot: RobotModel) -> list[dict[str, float]]:
+        """Loads of a sixth and of two fifths of the robot's mass at the front and the rear; a centred load changes the
+        motion too little for an initial value."""
+        length = float(robot.points[:, 0].max() - robot.points[:, 0].min())
+        return [
+            {"mass": share * float(robot.mass), "x": place * length, "y": 0.0}
+            for share in (0.16, 0.4)
+            for place in (-0.3, 0.3)
+        ]
 
     def setup(self, setup: Setup, values: Values) -> Setup:
         """The setup with this effect applied."""
         robot = setup.robot
-        added = values["mass"]
+        # What is missing on a robot is a part of it.
+        added = torch.maximum(values["mass"], _MOST_MISSING * robot.mass)
         position = torch.stack(torch.broadcast_tensors(values["x"], values["y"], values["z"]), dim=-1).to(robot.mass)
         total, centre, inertia = add_point_mass(robot.mass, robot.centre_of_mass, robot.inertia, added, position)
         return replace(setup, robot=replace(robot, mass=total, centre_of_mass=centre, inertia=inertia))

@@ -16,7 +16,7 @@ class QuadraticDrag(Effect):
     summary = "A force against the motion grows with the square of the speed."
     formula = "f = -c |v| v"
     source = "fluid drag"
-    parameters = (Parameter("coefficient", "N s²/m²", 0.0, 0.0, 2000.0, 30.0, "drag coefficient"),)
+    parameters = (Parameter("coefficient", "N s²/m²", 0.0, 0.0, 1e5, 30.0, "drag coefficient", of_mass=True),)
     identified = ("coefficient",)
     manoeuvre = "slow and fast stretches straight ahead"
     formula_terms = ("force_x:vx", "force_x:vx|vx|")

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from monoforce_ros.effects.effect import Effect, Parameter, Values
 from monoforce_ros.effects.setup import Setup
+from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import TerrainMap
 
 
@@ -30,7 +31,7 @@ class TerrainSoftness(Effect):
         "payload": "over bumps, and hard starts",
     }
 
-    def first_values(self) -> list[dict[str, float]]:
+    def first_values(self, robot: RobotModel) -> list[dict[str, float]]:
         """From hard ground to mud, by equal ratios: stiffness varies by orders of magnitude."""
         return [{"factor": value} for value in (0.2, 0.5, 2.0, 5.0, 15.0, 50.0)]
 

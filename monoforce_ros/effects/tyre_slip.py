@@ -7,6 +7,7 @@ from typing import ClassVar
 
 from monoforce_ros.effects.effect import Effect, Parameter, Values
 from monoforce_ros.effects.setup import Setup
+from monoforce_ros.robots import RobotModel
 
 
 class TyreSlip(Effect):
@@ -35,7 +36,7 @@ class TyreSlip(Effect):
         "drive_compliance": "wide turns at high speed, with measured wheel speeds",
     }
 
-    def first_values(self) -> list[dict[str, float]]:
+    def first_values(self, robot: RobotModel) -> list[dict[str, float]]:
         """From road tyres to soft ones at low pressure; close to none its influence vanishes with its square."""
         return [{"ratio": 0.1}, {"ratio": 0.4}]
 

@@ -7,6 +7,7 @@ from typing import ClassVar
 
 from monoforce_ros.effects.effect import Effect, Parameter, Values
 from monoforce_ros.effects.setup import Setup
+from monoforce_ros.robots import RobotModel
 
 
 class VegetationDrag(Effect):
@@ -34,7 +35,7 @@ class VegetationDrag(Effect):
     commissioning_start: ClassVar = {"coefficient": 1e4, "yield_speed": 0.5}
     commissioned_over = "vegetation"
 
-    def first_values(self) -> list[dict[str, float]]:
+    def first_values(self, robot: RobotModel) -> list[dict[str, float]]:
         """From grass to brush; stems bend as much as they drag at walking speed."""
         return [{"coefficient": value, "yield_speed": 0.5} for value in (2e3, 1e4, 4e4, 1.6e5)]
 

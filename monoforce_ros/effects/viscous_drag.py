@@ -17,7 +17,7 @@ class ViscousDrag(Effect):
     summary = "A force against the motion grows linearly with speed."
     formula = "f = -c v"
     source = "fluid drag"
-    parameters = (Parameter("coefficient", "N s/m", 0.0, 0.0, 2000.0, 30.0, "drag coefficient"),)
+    parameters = (Parameter("coefficient", "N s/m", 0.0, 0.0, 1e5, 30.0, "drag coefficient", of_mass=True),)
     identified = ("coefficient",)
     manoeuvre = "slow and fast stretches straight ahead"
     separated_by: ClassVar = {"quadratic_drag": "slow and fast stretches straight ahead"}

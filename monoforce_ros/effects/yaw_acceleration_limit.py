@@ -11,6 +11,7 @@ from torch import Tensor
 
 from monoforce_ros.effects.effect import Effect, Parameter, Values, WheelResponse
 from monoforce_ros.effects.ramp import ramped, ramped_array
+from monoforce_ros.robots import RobotModel
 
 
 def _ramped(twists: np.ndarray, value: np.ndarray | float, step: float) -> np.ndarray:
@@ -48,7 +49,7 @@ class YawAccelerationLimit(Effect):
         wording="turning faster by up to {:.2f} rad/s²",
     )
 
-    def first_values(self) -> list[dict[str, float]]:
+    def first_values(self, robot: RobotModel) -> list[dict[str, float]]:
         """Ramps from very soft to those of most bases; the neutral value is infinite."""
         return [{"limit": value} for value in (0.3, 0.6, 1.2, 2.4, 4.8)]
 

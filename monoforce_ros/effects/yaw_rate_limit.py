@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from monoforce_ros.effects.effect import Effect, Parameter, Values, WheelResponse, per_trajectory
+from monoforce_ros.robots import RobotModel
 
 
 def _clamped(twists: np.ndarray, value: np.ndarray | float, step: float) -> np.ndarray:
@@ -44,7 +45,7 @@ class YawRateLimit(Effect):
         wording="turning at up to {:.2f} rad/s",
     )
 
-    def first_values(self) -> list[dict[str, float]]:
+    def first_values(self, robot: RobotModel) -> list[dict[str, float]]:
         """Limits from slow turns to those of most bases; the neutral value is infinite."""
         return [{"limit": value} for value in (0.15, 0.3, 0.6, 1.0, 1.5, 2.5)]
 
