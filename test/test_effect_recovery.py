@@ -257,6 +257,27 @@ def test_what_explains_little_of_as_little_as_a_healthy_robot_shows_makes_up_for
     assert search._makes_up(first, second) == made_up
 
 
+@pytest.mark.parametrize(
+    ("without", "with_it", "needed"),
+    [
+        (4.0, 1.2, True),  # Most of what the other one leaves.
+        (4.0, 3.0, False),  # Little of it.
+        (0.9, 0.6, False),  # All of it, but no more than a healthy robot may well have.
+        (18.0, 8.0, True),  # Most of what both explain.
+    ],
+)
+def test_one_of_two_effects_is_needed_that_explains_most_of_the_rest(monkeypatch, without, with_it, needed):
+    gain, both = (("drive_gain", {"gain": 0.85}),), (("drive_gain", {"gain": 0.85}), ("drive_loss", {"loss": 0.05}))
+    husky = load_robot("husky")
+    varying = dict.fromkeys((effect.name for effect in identifiable_effects(husky)), 0.1)
+    healthy = NominalModel(SCALE, varying, segments=5, loss=0.8, loss_spread=0.2)
+    search = Search(husky, driven(husky), SCALE, nominal=healthy)
+    windows = np.ones(len(search.loss_of(())))
+    monkeypatch.setattr(search, "_without_effects", Trial((), ((),) * 2, 20.0 * windows))
+    monkeypatch.setattr(search, "judge", lambda effects: Trial(gain, (gain,) * 2, without * windows))
+    assert search.needs(Trial(both, (both,) * 2, with_it * windows), "drive_loss") == needed
+
+
 def test_a_further_effect_in_whose_presence_the_first_one_goes_must_explain_more_than_that(monkeypatch):
     """Of two effects that the motion shows only together, the first one may not be significant beside the other."""
     husky = load_robot("husky")

@@ -350,8 +350,14 @@ class Judging:
         return self._pays(before, after, least=self.thresholds.further_share * explained)
 
     def needs(self, trial: Trial, name: str) -> bool:
-        """Whether held-out windows are predicted worse beyond chance without one of several effects."""
-        return self._gain(self.judge(without(trial.effects, name)), trial)[1] > 0.0
+        """Whether one of several effects takes away most of what the others leave above a healthy robot's loss, or most
+        of what all explain, and held-out windows are predicted worse beyond chance without it."""
+        fewer = self.judge(without(trial.effects, name))
+        gain, low = self._gain(fewer, trial)
+        most, explained = self.thresholds.explained_share, self._without_effects.loss - trial.loss
+        left = excess_share(fewer.loss, trial.loss, self.healthy_loss, self.healthy_spread)
+        above = fewer.loss > self.healthy_loss * np.exp(self.healthy_spread)
+        return low > 0.0 and ((above and left >= most) or gain >= most * explained)
 
     @cached_property
     def _without_effects(self) -> Trial:

@@ -72,8 +72,8 @@ class Repetition:
         The rest is judged anew: without them it may leave what does not look like the healthy robot. Where none of
         several effects is found again, or a single one by no repetition, the recording does not say what is wrong, or
         nothing is where its errors are no larger than a healthy robot's. An effect without which the values of the
-        others are no measurements belongs to them, and stays, as does one without which held-out windows are predicted
-        worse beyond chance: a search in two thirds of a recording misses much of what is there.
+        others are no measurements belongs to them, and stays, as does one that explains most of the rest, on held-out
+        windows and beyond chance: a search in two thirds of a recording misses much of what is there.
         """
         trial, search = decision.trial, explanation.search
         if trial is None or decision.verdict != Verdict.EFFECT_FOUND:
