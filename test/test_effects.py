@@ -505,6 +505,29 @@ def test_drives_lose_speed_in_proportion_to_their_traction(husky, backend):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
+def test_a_motor_loses_speed_by_its_torque_however_much_of_it_a_load_demands(husky, backend):
+    """A load in the centre of mass makes a robot of twice the mass, whose drives lose twice as much at its traction."""
+    x, y, z = (float(value) for value in husky.centre_of_mass)
+    load = {"mass": float(husky.mass), "x": x, "y": y, "z": z}
+    loaded = having(husky, payload=load, drive_compliance={"speed_loss": 0.2})
+    heavy = having(dataclasses.replace(husky, mass=2.0 * husky.mass), drive_compliance={"speed_loss": 0.4})
+    state = State.at_rest(husky.ground_clearance, dtype=torch.float64)
+    one, other, empty = (
+        run(robot, (0.3, 0.8), 1.5, state=state, backend=backend).angular_velocity[0, -1, 2]
+        for robot in (loaded, heavy, having(husky, drive_compliance={"speed_loss": 0.2}))
+    )
+    assert float(one) == pytest.approx(float(other), rel=1e-9)
+    assert float(one) < 0.85 * float(empty)
+    # With a load to the left that side rolls with more resistance, and loses more.
+    aside = {"payload": {**load, "mass": 15.0, "y": 0.2}, "rolling_resistance": {"coefficient": 0.2}}
+    held, soft = (
+        float(run(having(husky, **aside, **given), (0.6, 0.0), 3.0, backend=backend).angular_velocity[0, -1, 2])
+        for given in ({}, {"drive_compliance": {"speed_loss": 0.4}})
+    )
+    assert soft > held + 1e-3
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_tyres_slip_in_proportion_to_how_fast_they_roll(husky, backend):
     """Against a force F on a load of M g they lose κ u F / sqrt((μ M g)² - F²); a locked wheel has all its friction."""
     friction, weight = TerrainDefaults().friction, float(husky.mass) * 9.81

@@ -324,3 +324,13 @@ def test_parameters_are_declared_once_and_typed():
 def test_faults_are_listed_with_their_ranges(tmp_path, capsys):
     assert cli.main([str(tmp_path / "drive"), "--hide", "list"]) == 0
     assert "payload: mass = 20 (1 to 300)" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("y", [0.0, 0.2])
+def test_soft_drives_lose_more_speed_under_a_load_and_on_its_side(husky, level, y):
+    """A motor loses speed by its torque: of two sides that scrub alike the heavier one turns slower."""
+    soft, loads = "drive_compliance:0.2", (f"payload:mass=25,x=0.0,y={y},z=0.2",)
+    there = [steady(husky, level, (0.0, 0.8), soft, *load) for load in ((), loads)]
+    load = {"payload": {"mass": 25.0, "x": 0.0, "y": y, "z": 0.2}}
+    here = [predicted((0.0, 0.8), drive_compliance={"speed_loss": 0.2}, **effects) for effects in ({}, load)]
+    assert here[0][2] - here[1][2] == pytest.approx(there[0][2] - there[1][2], rel=0.25)

@@ -19,11 +19,19 @@ class DriveCompliance(Effect):
     name = "drive_compliance"
     stage = "contact"
     summary = "Each drive loses speed in proportion to its traction."
-    formula = "u ← u - c f / N, with traction f and load N of the wheel"
+    formula = "u ← u - c f / N, with traction f, and load N of the wheel on the robot of the file"
     source = "speed-torque line of a motor without integral control"
     # Typical: a drive that loses 0.1 m/s at the limit of friction on average ground.
     parameters = (
-        Parameter("speed_loss", "m/s", 0.0, 0.0, 2.0, 0.2, "speed lost when a wheel pulls with as much as its load"),
+        Parameter(
+            "speed_loss",
+            "m/s",
+            0.0,
+            0.0,
+            2.0,
+            0.2,
+            "speed lost when a wheel pulls with as much as its load, of the robot without payload",
+        ),
     )
     identified = ("speed_loss",)
     manoeuvre = "turns on the spot, hard starts, and slow and fast stretches straight ahead"

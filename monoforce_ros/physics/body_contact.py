@@ -44,6 +44,8 @@ class BodyContact:
     """Drive index of each point, ``[N]`` int64; -1 on the hull."""
     friction_factors: Tensor
     """As of :class:`Problem`, ``[B, 2, 3 or 4]``."""
+    drive_loads: Tensor
+    """Load of each drive beside that of the robot's file; the last entry is the hull, at zero, ``[B, D + 1]`` [-]."""
     ground_factors: Tensor
     """Divisor of the ground's stiffness and damping, and vegetation drag [N s/m⁴], ``[B, 2]``."""
     rolling_resistance: Tensor
@@ -71,6 +73,7 @@ class BodyContact:
             speeds=torch.cat([problem.drive_speeds, torch.zeros_like(problem.drive_speeds[..., :1])], dim=-1),
             drives=problem.point_drives,
             friction_factors=problem.friction_factors,
+            drive_loads=torch.cat([problem.drive_loads, torch.zeros_like(problem.drive_loads[:, :1])], dim=-1),
             ground_factors=problem.ground_factors,
             rolling_resistance=rolling,
             yield_speed=yield_speed,
@@ -139,6 +142,7 @@ class BodyContact:
             self.masses,
             self.weights,
             self.friction_factors,
+            self.drive_loads[:, self.drives],
             self.ground_factors,
             self.rolling_resistance,
             self.yield_speed,

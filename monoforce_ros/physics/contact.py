@@ -131,6 +131,7 @@ def contact(
     masses: Tensor,
     weights: Tensor,
     friction_factors: Tensor,
+    drive_loads: Tensor,
     ground_factors: Tensor,
     rolling_resistance: Tensor,
     yield_speed: Tensor,
@@ -159,6 +160,8 @@ def contact(
         weights: share of the robot's weight m g per point, ``[B, N]`` or ``[N]`` [N] (``sigmoid`` only).
         friction_factors: longitudinal and lateral factor on the ground's friction, the compliance of drives that give
             way, see :func:`held_slip`, and the slip ratio of tyres, which soft soil replaces; ``[B, 2, 3 or 4]``.
+        drive_loads: load of each point's drive beside that of the robot's file, 0 on the hull, which has no drive that
+            could give way, ``[B, N]``.
         ground_factors: divisor of the ground's stiffness and damping [-], and force of vegetation per area, height and
             speed [N s/m⁴], ``[B, 2]``.
         rolling_resistance: force against rolling as a fraction of the load, ``[B]``.
@@ -210,8 +213,7 @@ def contact(
         slip_square = slip_square + (friction_factors[:, 3, None] * rolling) ** 2
     kept = None
     if friction_factors.shape[1] >= 3:
-        # The hull has no drive that could give way.
-        giving = friction_factors[:, 2, None] * friction[:, 0] * (1.0 - (outward * outward).sum(1))
+        giving = friction_factors[:, 2, None] * drive_loads * friction[:, 0]
         kept = held_slip(slip, giving, slip_square)
         slip = torch.stack([kept * slip[:, 0], slip[:, 1]], dim=1)
     if soil is not None:

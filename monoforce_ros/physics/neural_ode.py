@@ -121,7 +121,7 @@ class _System(nn.Module):
         return (
             *soil,
             body.lookup.channels, body.points, body.tangents, body.areas, body.weights, body.speeds,
-            body.friction_factors, body.ground_factors, body.rolling_resistance, body.yield_speed,
+            body.friction_factors, body.drive_loads, body.ground_factors, body.rolling_resistance, body.yield_speed,
             loads.weight, loads.linear_drag, loads.quadratic_drag, loads.wrench, self.mass, self.inertia,
         )  # fmt: skip
 
@@ -130,12 +130,12 @@ class _System(nn.Module):
         body = self.body
         if body.soil is not None:
             body, tensors = replace(body, soil=replace(body.soil, parameters=tensors[0])), tensors[1:]
-        channels, points, tangents, areas, weights, speeds, friction, ground, rolling, yield_speed, *rest = tensors
-        *loads, mass, inertia = rest
+        channels, points, tangents, areas, weights, speeds, friction, carried, *rest = tensors
+        ground, rolling, yield_speed, *loads, mass, inertia = rest
         body = replace(
             body, lookup=body.lookup.with_channels(channels), points=points, tangents=tangents, areas=areas,
-            weights=weights, speeds=speeds, friction_factors=friction, ground_factors=ground,
-            rolling_resistance=rolling, yield_speed=yield_speed,
+            weights=weights, speeds=speeds, friction_factors=friction, drive_loads=carried,
+            ground_factors=ground, rolling_resistance=rolling, yield_speed=yield_speed,
         )  # fmt: skip
         return _System(body, LoadModel(*loads), mass, inertia, self.options)
 

@@ -10,6 +10,7 @@ from torch import Tensor
 from monoforce_ros.effects import applied_setup
 from monoforce_ros.physics.articulation import Articulation, BodyMass
 from monoforce_ros.physics.contact_summary import ContactSummary
+from monoforce_ros.physics.drive_loads import drive_loads
 from monoforce_ros.physics.identity_cache import IdentityCache
 from monoforce_ros.physics.soil import Soil
 from monoforce_ros.physics.state import State
@@ -54,6 +55,8 @@ class Problem:
     friction_factors: Tensor
     """Longitudinal and lateral factor on the ground's friction and, of drives that give way or tyres that slip, the
     compliance of the drives [m/s] and the slip ratio of the tyres [-], ``[B, 2, 3 or 4]``."""
+    drive_loads: Tensor
+    """Load of each drive beside that of the robot's file, by which drives that give way lose speed, ``[B, D]`` [-]."""
     gravity_tilt: Tensor
     """Tilt of gravity about x and y [rad], ``[B, 2]``."""
     resistance: Tensor
@@ -87,7 +90,8 @@ class Problem:
         if isinstance(controls, Tensor):
             controls = Controls(controls)
         batch, dtype, device = state.position.shape[0], state.position.dtype, state.position.device
-        setup = applied_setup(terrain.to(dtype, device), robot.to(dtype, device))
+        file = robot.to(dtype, device)
+        setup = applied_setup(terrain.to(dtype, device), file)
         terrain, robot, loads = setup.terrain, setup.robot, setup.loads
         drive_speeds = controls.drive_speeds
         values = (state.position, state.rotation, state.velocity, state.angular_velocity, drive_speeds.to(dtype))
@@ -124,6 +128,9 @@ class Problem:
             factors.append(torch.zeros_like(robot.mass) if compliance is None else compliance.to(dtype))
         if slip is not None:
             factors.append(slip.to(dtype))
+        carried = drive_speeds.new_ones(batch, drive_speeds.shape[2], dtype=dtype)
+        if compliance is not None:
+            carried = drive_loads(file, robot.mass.expand(batch), centre_of_mass)
         problem = cls(
             terrain=terrain,
             centre=position + offset,
@@ -141,6 +148,7 @@ class Problem:
             centre_of_mass=centre_of_mass,
             inertia=robot.inertia.expand(batch, 3, 3),
             friction_factors=torch.stack([value.expand(batch) for value in factors], dim=-1),
+            drive_loads=carried,
             gravity_tilt=loads.gravity_tilt.expand(batch, 2),
             resistance=torch.stack([value.expand(batch) for value in resistance], dim=-1),
             vegetation=vegetation,

@@ -121,6 +121,7 @@ class _System:
             body.masses,
             body.weights,
             body.friction_factors,
+            body.drive_loads[:, body.drives],
             body.ground_factors,
             body.rolling_resistance,
             body.yield_speed,

@@ -72,6 +72,7 @@ def integrate(
             problem.resistance,
             problem.wrench,
             problem.mass.new_zeros(1, SOIL_PARAMETERS) if problem.soil is None else problem.soil,
+            problem.drive_loads,
         )
 
     start = (problem.centre, problem.rotation, problem.velocity, problem.angular_velocity)

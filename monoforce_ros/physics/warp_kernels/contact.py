@@ -224,7 +224,7 @@ def contact_functions(double: bool, soft: bool) -> ContactFunctions:
             # Drives give way under their load; the hull has none.
             kept = scalar(1.0)
             if options.compliant == 1 and body.drives[i] >= 0:
-                giving = factors[2] * friction_along
+                giving = factors[2] * robots.loads[b, body.drives[i]] * friction_along
                 sliding = wp.abs(slip_along)
                 square_across = slip_across * slip_across + slip_square
                 least = wp.sqrt(square_across)

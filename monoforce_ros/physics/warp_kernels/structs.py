@@ -90,6 +90,7 @@ def types(double: bool) -> Types:
         resistance: wp.array(dtype=vec4)  # rolling, linear drag, quadratic drag, yield speed of vegetation
         wrench: wp.array(dtype=wrench_matrix)
         soil: wp.array(dtype=soil_values)  # parameters of soft soil
+        loads: wp.array2d(dtype=scalar)  # of drives beside those of the robot's file, [B, D]
 
     @wp.struct
     class States:  # [B, T + 1]
