@@ -37,7 +37,7 @@ def drive_loads(robot: RobotModel, mass: Tensor, centre_of_mass: Tensor) -> Tens
 
 
 def _standing(robot: RobotModel) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean ``[2]`` and inverse covariance ``[2, 2]`` of the points of wheels and tracks, and means by drive ``[D, 2]``."""
+    """Mean ``[2]``, inverse covariance ``[2, 2]`` of the points of wheels and tracks, and means by drive ``[D, 2]``."""
     points, drives, areas = robot.points[:, :2], robot.point_drives, robot.point_areas
     weights = areas * (drives >= 0)
     mean = (weights[:, None] * points).sum(0) / weights.sum()
