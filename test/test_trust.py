@@ -1,6 +1,5 @@
 """Trust: predictions are compared with the ground found later, and a harmful encoder is not used."""
 
-import shlex
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +9,6 @@ from scipy.spatial.transform import Rotation
 
 from monoforce_ros.core import CameraModel, MotionState, MotionTrack
 from monoforce_ros.encoder import EncoderConfig, new_encoder
-from monoforce_ros.nodes.terrain_health import TerrainHealth
 from monoforce_ros.perception import (
     DrivenGround,
     EncoderTerrain,
@@ -26,7 +24,6 @@ from monoforce_ros.perception.trust_blocks import telling_blocks
 from monoforce_ros.perception.trusted_terrain import blended
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainDefaults, TerrainMap
-from monoforce_ros.training.train_cli import build_parser
 
 GRID = Grid.square(12.8, 0.2)
 WHEELS = np.array([[0.3, 0.3], [0.3, -0.3], [-0.3, 0.3], [-0.3, -0.3]])
@@ -192,16 +189,6 @@ def test_a_block_that_is_far_more_wrong_does_not_give_trust_back():
     for further in (0.09, 0.25, 4.0):
         assert telling_blocks(np.append(squares, further)).tolist() == [1.0, 1.0, 1.0, 0.0]
     assert telling_blocks(np.array([0.0] * 12 + [0.25, 0.01])) is None
-
-
-def test_the_command_that_diagnostics_name_is_one():
-    source = TrustedTerrain(FlatTerrain(load_robot("husky"), GRID, TerrainDefaults()), None, [])
-    health = TerrainHealth(None, source, "my robots/husky.yaml", "own.safetensors")
-    words = shlex.split(health.adaptation.partition(" (then ")[0])
-    assert words[:4] == ["ros2", "run", "monoforce_ros", "train"]
-    found = build_parser().parse_args(words[4:])
-    assert found.adapt and [str(bag) for bag in found.bags] == ["BAG"] and str(found.out) == "adapted"
-    assert (found.robot, str(found.start_from)) == ("my robots/husky.yaml", "own.safetensors")
 
 
 def test_half_of_the_ground_is_used_by_half():
