@@ -10,6 +10,7 @@ import torch
 
 from monoforce_ros.bags import BagReader, BagWriter
 from monoforce_ros.encoder import EncoderConfig, EncoderInput, load_encoder, new_encoder, save_encoder
+from monoforce_ros.encoder.sweep import HIT
 from monoforce_ros.robots import load_robot
 from monoforce_ros.training.adaptation import (
     AdaptationSettings,
@@ -219,8 +220,22 @@ def test_bands_of_images_alone_are_wider_than_those_of_a_sweep(recording):
     with torch.no_grad():
         one, other = (entry(EncoderInput.stack([alone, both, swept])) for entry in (encoder, wider))
     torch.testing.assert_close(other.geometric_spread[0], 1.5 * one.geometric_spread[0])
-    torch.testing.assert_close(other.geometric_spread[1:], one.geometric_spread[1:])
+    ratio = other.geometric_spread / one.geometric_spread
+    hit = torch.stack([entry.sweep[0, HIT] > 0 for entry in (alone, both, swept)])
+    torch.testing.assert_close(ratio[hit], torch.ones_like(ratio[hit]))
     torch.testing.assert_close(other.decrease_spread, one.decrease_spread)
+    # A sweep of the left side alone says nothing of the right one.
+    half = both.sweep.clone()
+    y = torch.as_tensor(CONFIG.grid.y)
+    half[:, :, y < 0.0] = 0.0
+    with torch.no_grad():
+        one, other = (entry(replace(both, sweep=half)) for entry in (encoder, wider))
+    ratio = (other.geometric_spread / one.geometric_spread)[0]
+    right, left = ratio[y < -1.1], ratio[half[0, HIT] > 0]
+    torch.testing.assert_close(right, torch.full_like(right, 1.5))
+    torch.testing.assert_close(left, torch.ones_like(left))
+    between = ratio[(y < -0.5) & (y > -0.9)]
+    assert bool((between > 1.0).all()) and bool((between <= 1.5).all()) and float(between.min()) < 1.4
 
 
 def test_bands_hold_what_they_say_in_nine_of_ten_scenes(encoder, recording):

@@ -64,8 +64,8 @@ class EncoderConfig:
     decrease_spread_factor: float = 1.0
     """Factors on the predicted spreads of H_g and H_d, calibrated on held-out samples so that 90 % bands hold 90 %."""
     image_spread_factor: float = 1.0
-    """Further factor on the spread of H_g where there is no sweep: errors within one scene go together, and with images
-    alone some scenes are off as a whole (docs/training.md)."""
+    """Further factor on the spread of H_g where no sweep measured anything nearby: errors within one scene go together,
+    and with images alone some scenes are off as a whole (docs/training.md)."""
 
     def __post_init__(self):
         if self.sensor not in SENSORS:
