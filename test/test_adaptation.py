@@ -208,14 +208,15 @@ def test_bands_are_widened_on_one_half_of_the_held_out_part_and_judged_on_the_ot
     sure = copy.deepcopy(encoder)
     sure.config = replace(sure.config, geometric_spread_factor=50.0, decrease_spread_factor=50.0)
     assert widened(sure, first).config == sure.config
-    assert chosen.config.geometric_spread_factor == encoder.config.geometric_spread_factor
+    for name in ("geometric_spread_factor", "decrease_spread_factor"):
+        assert getattr(chosen.config, name) == getattr(encoder.config, name)
 
 
 def test_bands_of_images_alone_are_wider_than_those_of_a_sweep(recording):
     torch.manual_seed(3)
     encoder = new_encoder(CONFIG).eval()
     wider = copy.deepcopy(encoder)
-    wider.config = replace(CONFIG, image_spread_factor=1.5)
+    wider.config = replace(CONFIG, image_spread_factor=1.5, image_decrease_spread_factor=1.2)
     alone, both, swept = (sample(recording, 0, CONFIG, sensors, chunks=1)[0] for sensors in (CAMERAS, BOTH, SWEEP))
     with torch.no_grad():
         one, other = (entry(EncoderInput.stack([alone, both, swept])) for entry in (encoder, wider))
@@ -223,7 +224,9 @@ def test_bands_of_images_alone_are_wider_than_those_of_a_sweep(recording):
     ratio = other.geometric_spread / one.geometric_spread
     hit = torch.stack([entry.sweep[0, HIT] > 0 for entry in (alone, both, swept)])
     torch.testing.assert_close(ratio[hit], torch.ones_like(ratio[hit]))
-    torch.testing.assert_close(other.decrease_spread, one.decrease_spread)
+    ratio = other.decrease_spread / one.decrease_spread
+    torch.testing.assert_close(ratio[0], torch.full_like(ratio[0], 1.2))
+    torch.testing.assert_close(ratio[hit], torch.ones_like(ratio[hit]))
     # A sweep of the left side alone says nothing of the right one.
     half = both.sweep.clone()
     y = torch.as_tensor(CONFIG.grid.y)
@@ -287,7 +290,9 @@ def test_wheels_alone_teach_an_encoder_of_a_robot_without_a_lidar(demo_bag, tmp_
     # What the wheels traced calibrates the bands, too.
     sure = lifted(start, 0.7)
     wider = widened(sure, [held_out]).config
-    assert wider.image_spread_factor > 1.0 and wider.decrease_spread_factor > 1.0
+    assert wider.image_spread_factor > 1.0 and wider.image_decrease_spread_factor > 1.0
+    # Those of a sweep, of which nothing was judged, stay.
+    assert wider.geometric_spread_factor == wider.decrease_spread_factor == 1.0
 
 
 @pytest.mark.unhurried

@@ -140,31 +140,31 @@ def maps_from_heads(
             # What is believed is not corrected: pictures or points of another world would spoil what was measured.
             geometric = geometric * (1.0 - believed * standing - between)
         geometric, below = geometric + rise, below + (1.0 - carries) * rise.clamp_min(0.0)
+    alone = torch.zeros_like(geometric) if training else _images_alone(batch, config)
+    wider = config.geometric_spread_factor * config.image_spread_factor**alone
+    deeper = config.decrease_spread_factor * config.image_decrease_spread_factor**alone
     return EncodedMaps(
         geometric_height=geometric + batch.anchor + batch.ground[:, None, None],
         decrease=below if config.decreases else torch.zeros_like(below),
         stiffness=config.stiffness * torch.exp(stiffness.clamp(-4.0, 4.0)),
         damping=config.damping * torch.exp(damping.clamp(-4.0, 4.0)),
         friction=config.friction * torch.exp(friction.clamp(-3.0, 1.0)),
-        geometric_spread=_spread(geometric_spread) * (1.0 if training else _spread_factor(batch, config)),
-        decrease_spread=_spread(decrease_spread) * (1.0 if training else config.decrease_spread_factor),
+        geometric_spread=_spread(geometric_spread) * (1.0 if training else wider),
+        decrease_spread=_spread(decrease_spread) * (1.0 if training else deeper),
         covered=covered,
         evidence=evidence,
         depth=depth,
     )
 
 
-def _spread_factor(batch: EncoderInput, config: EncoderConfig) -> Tensor:
-    """Factor on the spread of H_g ``[B, rows, columns]``: a further one where no sweep measured anything nearby."""
-    factor = batch.sweep.new_full(batch.sweep[:, HIT].shape, config.geometric_spread_factor)
-    if config.image_spread_factor == 1.0:
-        return factor
+def _images_alone(batch: EncoderInput, config: EncoderConfig) -> Tensor:
+    """How far a map rests on images alone, with no return of a sweep nearby: 0 to 1, ``[B, rows, columns]``."""
     hit = batch.sweep[:, HIT].cpu().numpy() > 0
     if not (config.takes_sweeps and hit.any()):
-        return factor * config.image_spread_factor
+        return torch.ones_like(batch.anchor)
     limits = tuple(distance / config.resolution for distance in _SUPPORTED)
     measured = np.stack([_fading(cells, limits) if cells.any() else np.zeros(cells.shape) for cells in hit])
-    return factor * config.image_spread_factor ** (1.0 - torch.as_tensor(measured).to(factor))
+    return 1.0 - torch.as_tensor(measured).to(batch.anchor)
 
 
 def _spread(output: Tensor) -> Tensor:
