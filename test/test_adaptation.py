@@ -10,6 +10,7 @@ import torch
 
 from monoforce_ros.bags import BagReader, BagWriter
 from monoforce_ros.encoder import EncoderConfig, EncoderInput, load_encoder, new_encoder, save_encoder
+from monoforce_ros.encoder.sweep import HIT
 from monoforce_ros.robots import load_robot
 from monoforce_ros.training.adaptation import (
     AdaptationSettings,
@@ -207,20 +208,37 @@ def test_bands_are_widened_on_one_half_of_the_held_out_part_and_judged_on_the_ot
     sure = copy.deepcopy(encoder)
     sure.config = replace(sure.config, geometric_spread_factor=50.0, decrease_spread_factor=50.0)
     assert widened(sure, first).config == sure.config
-    assert chosen.config.geometric_spread_factor == encoder.config.geometric_spread_factor
+    for name in ("geometric_spread_factor", "decrease_spread_factor"):
+        assert getattr(chosen.config, name) == getattr(encoder.config, name)
 
 
 def test_bands_of_images_alone_are_wider_than_those_of_a_sweep(recording):
     torch.manual_seed(3)
     encoder = new_encoder(CONFIG).eval()
     wider = copy.deepcopy(encoder)
-    wider.config = replace(CONFIG, image_spread_factor=1.5)
+    wider.config = replace(CONFIG, image_spread_factor=1.5, image_decrease_spread_factor=1.2)
     alone, both, swept = (sample(recording, 0, CONFIG, sensors, chunks=1)[0] for sensors in (CAMERAS, BOTH, SWEEP))
     with torch.no_grad():
         one, other = (entry(EncoderInput.stack([alone, both, swept])) for entry in (encoder, wider))
     torch.testing.assert_close(other.geometric_spread[0], 1.5 * one.geometric_spread[0])
-    torch.testing.assert_close(other.geometric_spread[1:], one.geometric_spread[1:])
-    torch.testing.assert_close(other.decrease_spread, one.decrease_spread)
+    ratio = other.geometric_spread / one.geometric_spread
+    hit = torch.stack([entry.sweep[0, HIT] > 0 for entry in (alone, both, swept)])
+    torch.testing.assert_close(ratio[hit], torch.ones_like(ratio[hit]))
+    ratio = other.decrease_spread / one.decrease_spread
+    torch.testing.assert_close(ratio[0], torch.full_like(ratio[0], 1.2))
+    torch.testing.assert_close(ratio[hit], torch.ones_like(ratio[hit]))
+    # A sweep of the left side alone says nothing of the right one.
+    half = both.sweep.clone()
+    y = torch.as_tensor(CONFIG.grid.y)
+    half[:, :, y < 0.0] = 0.0
+    with torch.no_grad():
+        one, other = (entry(replace(both, sweep=half)) for entry in (encoder, wider))
+    ratio = (other.geometric_spread / one.geometric_spread)[0]
+    right, left = ratio[y < -1.1], ratio[half[0, HIT] > 0]
+    torch.testing.assert_close(right, torch.full_like(right, 1.5))
+    torch.testing.assert_close(left, torch.ones_like(left))
+    between = ratio[(y < -0.5) & (y > -0.9)]
+    assert bool((between > 1.0).all()) and bool((between <= 1.5).all()) and float(between.min()) < 1.4
 
 
 def test_bands_hold_what_they_say_in_nine_of_ten_scenes(encoder, recording):
@@ -272,7 +290,9 @@ def test_wheels_alone_teach_an_encoder_of_a_robot_without_a_lidar(demo_bag, tmp_
     # What the wheels traced calibrates the bands, too.
     sure = lifted(start, 0.7)
     wider = widened(sure, [held_out]).config
-    assert wider.image_spread_factor > 1.0 and wider.decrease_spread_factor > 1.0
+    assert wider.image_spread_factor > 1.0 and wider.image_decrease_spread_factor > 1.0
+    # Those of a sweep, of which nothing was judged, stay.
+    assert wider.geometric_spread_factor == wider.decrease_spread_factor == 1.0
 
 
 @pytest.mark.unhurried

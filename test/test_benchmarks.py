@@ -156,3 +156,22 @@ def test_every_real_drive_is_there_where_the_data_are():
             assert (data / name).exists(), name
     bags = {folder.name for folder in (data / "doughnut").iterdir() if folder.is_dir()}
     assert bags <= {Path(drive.file).name for drive in warthog_reports.DRIVES}
+
+
+def test_a_repeated_drive_goes_on_where_it_ended(tmp_path, demo_bag):
+    import long_recording
+    import numpy as np
+
+    from monoforce_ros.bags import Recording
+
+    once = Recording.open(demo_bag)
+    length = float(once.motion.stamps[-1] - once.motion.stamps[0]) * 1e-9
+    long_recording.repeat(demo_bag, 2.5 * length, tmp_path / "long")
+    found = Recording.open(tmp_path / "long")
+    assert (found.motion.stamps[-1] - found.motion.stamps[0]) * 1e-9 == pytest.approx(2.5 * length, abs=0.2)
+    assert len(found.commands) > 2.2 * len(once.commands)
+    count = len(once.motion)
+    moved = np.linalg.norm(np.diff(found.motion.positions, axis=0), axis=1)
+    # The second drive begins where the first one ended, and moves as it did.
+    assert moved[count - 1] < 1e-6 and np.diff(found.motion.stamps)[count - 1] == long_recording.PAUSE
+    np.testing.assert_allclose(moved[count : 2 * count - 1], moved[: count - 1], atol=1e-6)

@@ -187,6 +187,16 @@ def test_what_acts_on_a_part_of_the_ground_is_written_into_a_robot_file_only_if_
             assert said in text
             assert "on all other ground predictions get worse with it" in text
     assert report_content(found, {}, None)["partial"] == ["friction_scale"]
+    # The report of a file says what that one holds.
+    for written in ((DELAY, ICE), (DELAY,)):
+        names = [entry.name for entry in written]
+        page = diagnosis_page(found, {}, tmp_path / "husky.yaml", (), names)
+        assert ("robot file with the added effects" in page) is (len(written) == 2)
+        only = "o predict with command_delay, give husky.yaml of this folder as the robot; friction_scale is not in it"
+        assert (only in page) is (len(written) == 1)
+        assert ("robot file with command_delay" in page) is (len(written) == 1)
+        assert report_content(found, {}, tmp_path / "husky.yaml", (), names)["in_robot_file"] == names
+    assert report_content(found, {}, None)["in_robot_file"] == []
     file = write_robot("husky", tmp_path / "husky.yaml", [file_entry(found, e) for e in (DELAY, ICE)], [], "0")
     lines = file.read_text().splitlines()
     above = [lines[lines.index(f"- name: {name}") - 1] for name in ("command_delay", "friction_scale")]

@@ -1,13 +1,21 @@
 """The log of a part's states: nothing new is lost, and a part that flickers does not fill it."""
 
+import shlex
 import time
+from dataclasses import replace
 
 import pytest
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
 from rosgraph_msgs.msg import Clock
 
 from monoforce_ros.nodes.clocks import STEADY
 from monoforce_ros.nodes.health import ERROR, OK, WARN, Health
+from monoforce_ros.nodes.terrain_health import PART, TerrainHealth
+from monoforce_ros.perception import FlatTerrain, TrustedTerrain, TrustReport
+from monoforce_ros.robots import load_robot
+from monoforce_ros.terrain import Grid, TerrainDefaults
+from monoforce_ros.training.train_cli import build_parser
 
 
 @pytest.fixture
@@ -89,3 +97,28 @@ def test_every_new_state_is_logged_at_once(node, capfd):
     assert [line.rpartition(" ")[2] for line in lines(capfd, "lidar")] == ["a", "b", "c"]
     spun(node, 1.3)
     assert not lines(capfd, "lidar")
+
+
+def test_terrain_s_values_are_those_of_its_message_and_its_command_can_be_pasted(node):
+    source = TrustedTerrain(FlatTerrain(load_robot("husky"), Grid.square(), TerrainDefaults()), None, [])
+    health = TerrainHealth(Health(node, [PART]), source, "my robots/husky.yaml", "own.safetensors")
+    published = []
+    node.create_subscription(DiagnosticArray, "/diagnostics", lambda array: published.append(array.status[0]), 10)
+    # Nothing is published on a change before the subscription is matched.
+    assert spun(node, 10.0, lambda: bool(published))
+    trusted = TrustReport(True, 0.8, 3.0, 0.01, 0.1, 0.0, sensors=("camera",))
+    for report, level in ((trusted, OK), (replace(trusted, trusted=False, share=0.0, error=0.4), WARN)):
+        source.report = report
+        health.report()
+        assert spun(node, 10.0, lambda wanted=level: published[-1].level == wanted)
+        first = next(status for status in published if status.level == level)
+        values = {entry.key: entry.value for entry in first.values}
+        assert values["used of what the encoder adds [%]"] == f"{100 * report.share:.0f}"
+        assert values["error [cm] (level ground)"] == f"{100 * report.error:.1f} (10.0)"
+    # Nothing follows the command, which a shell would take for a part of it.
+    assert "checkpoint:=adapted/encoder.safetensors: ros2" in first.message
+    command = shlex.split(first.message[first.message.index("ros2 run") :])
+    assert command[:4] == ["ros2", "run", "monoforce_ros", "train"]
+    found = build_parser().parse_args(command[4:])
+    assert found.adapt and [str(bag) for bag in found.bags] == ["BAG"] and str(found.out) == "adapted"
+    assert (found.robot, str(found.start_from)) == ("my robots/husky.yaml", "own.safetensors")

@@ -11,8 +11,9 @@ from monoforce_ros.bags import BagWriter, Recording, SmoothedMotion, builders
 from monoforce_ros.core import CommandTrack, EffortTrack, WheelTrack
 from monoforce_ros.datasets.drive import DriveRecording, DriveRun, drive_to_bag
 from monoforce_ros.discrepancy import DiagnosisSettings, Evidence, diagnose
+from monoforce_ros.discrepancy.comparable_windows import left_out_stretches
 from monoforce_ros.discrepancy.headline import headline
-from monoforce_ros.discrepancy.motor_efforts import HealthyEfforts, changed_efforts
+from monoforce_ros.discrepancy.motor_efforts import NOTHING, HealthyEfforts, changed_efforts
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.wheel_motion import half_track, side_speeds
 from monoforce_ros.robots import load_robot, write_robot
@@ -33,12 +34,44 @@ def drive(seed, factors=(1.0, 1.0), spread=0.1, seconds=120.0):
     return commands, EffortTrack(stamps, np.abs(currents + 0.3 * random.standard_normal(currents.shape)))
 
 
+def learned(*drives, left_out=NOTHING):
+    return HealthyEfforts.learned([(*entry, left_out) for entry in drives], HUSKY)
+
+
 def said(drive_, healthy, wheels=None):
     return changed_efforts(*drive_, wheels, HUSKY, healthy)
 
 
+def test_what_was_driven_with_a_joystick_counts_neither_as_healthy_nor_as_changed():
+    """Commands fall silent at some speed, and a joystick drives slowly back."""
+    motion, commands = simulated_recording(HUSKY, (), seconds=120.0)
+    stamps = commands.stamps[::10]
+    twists = commands.sample(stamps)
+    currents = 2.0 + 3.0 * np.abs(side_speeds(HUSKY, twists)) + 8.0 * half_track(HUSKY) * np.abs(twists[:, 1:2])
+    middle = len(stamps) // 6
+    first = commands.stamps <= stamps[middle]
+    silent = CommandTrack(commands.stamps[first], commands.twists[first])
+    by_commands = (np.arange(len(stamps)) < middle)[:, None]
+    wheels = WheelTrack(stamps, np.where(by_commands, side_speeds(HUSKY, twists), -0.3) / HUSKY.wheel_radius)
+    evidence = Evidence(
+        SmoothedMotion(motion, 0.003, 0.002, (slice(0, len(motion)),)),
+        silent,
+        wheels=wheels,
+        efforts=EffortTrack(stamps, np.where(by_commands, currents, 0.5)),
+    )
+    stretches = left_out_stretches(evidence, HUSKY)
+    assert (np.diff(stretches, axis=1).sum() > 15e9) and stretches[0, 0] > stamps[middle]
+    healthy = learned(drive(1), drive(2))
+    assert changed_efforts(silent, evidence.efforts, wheels, HUSKY, healthy)
+    nominal = NominalModel(np.tile([0.01, 0.01, 0.005], (4, 1)), efforts=healthy)
+    found = diagnose(evidence, HUSKY, nominal=nominal, settings=DiagnosisSettings(sensors_only=True))
+    assert not any("motors draw" in text for text in (*found.observed, *found.remarks))
+    assert any("without commands (a joystick?)" in text for text in found.remarks)
+    assert learned((silent, evidence.efforts), left_out=stretches) is None
+
+
 def test_motors_that_draw_more_are_told_with_an_interval_and_the_other_side_is_not():
-    healthy = HealthyEfforts.learned([drive(1), drive(2)], HUSKY)
+    healthy = learned(drive(1), drive(2))
     (text,) = said(drive(3, factors=(2.4, 1.0)), healthy)
     assert text.startswith("the left motors draw 2.")
     low, high = (float(number) for number in text.split("(")[1].split(")")[0].split(" to "))
@@ -47,7 +80,7 @@ def test_motors_that_draw_more_are_told_with_an_interval_and_the_other_side_is_n
 
 
 def test_wheels_in_the_air_and_motors_that_are_off_are_told_apart_by_whether_the_wheels_turn():
-    healthy = HealthyEfforts.learned([drive(1), drive(2)], HUSKY)
+    healthy = learned(drive(1), drive(2))
     idle = drive(3, factors=(0.2, 0.2))
     turning = WheelTrack(idle[0].stamps, side_speeds(HUSKY, idle[0].twists) / HUSKY.wheel_radius)
     texts = said(idle, healthy, turning)
@@ -64,7 +97,7 @@ def test_healthy_drives_are_named_about_as_often_as_stated():
     named, count = 0, 300
     for seed in range(count):
         random = np.random.default_rng(10_000 + seed)
-        healthy = HealthyEfforts.learned([drive(3 * seed)], HUSKY)
+        healthy = learned(drive(3 * seed))
         factor = np.exp(0.1 * np.sqrt(0.5) * random.standard_normal())
         named += bool(said(drive(3 * seed + 1, factors=(factor, factor)), healthy))
     # Both sides share the variation here, so that they alarm together: at least half of the stated 2.5 %.
@@ -72,7 +105,7 @@ def test_healthy_drives_are_named_about_as_often_as_stated():
 
 
 def test_what_commissioning_learned_is_kept_in_the_robot_file(tmp_path):
-    healthy = HealthyEfforts.learned([drive(1), drive(2)], HUSKY)
+    healthy = learned(drive(1), drive(2))
     samples = (0.5, 1.0, 1.5, 2.0)
     nominal = NominalModel(np.full((4, 3), 0.01), efforts=healthy)
     file = write_robot("husky", tmp_path / "husky.yaml", [], [], "0", nominal.entry(samples))
@@ -85,11 +118,11 @@ def test_what_commissioning_learned_is_kept_in_the_robot_file(tmp_path):
 
 
 def test_too_little_says_nothing():
-    healthy = HealthyEfforts.learned([drive(1)], HUSKY)
-    assert HealthyEfforts.learned([drive(1, seconds=20.0)], HUSKY) is None
+    healthy = learned(drive(1))
+    assert learned(drive(1, seconds=20.0)) is None
     commands, efforts = drive(1)
-    assert HealthyEfforts.learned([(commands, efforts), (commands, None)], HUSKY) is None
-    assert HealthyEfforts.learned([(commands, EffortTrack(efforts.stamps, 0.0 * efforts.efforts))], HUSKY) is None
+    assert learned((commands, efforts), (commands, None)) is None
+    assert learned((commands, EffortTrack(efforts.stamps, 0.0 * efforts.efforts))) is None
     assert said(drive(2, factors=(9.0, 9.0), seconds=20.0), healthy) == ()
     assert changed_efforts(commands, None, None, HUSKY, healthy) == ()
     assert changed_efforts(commands, efforts, None, HUSKY, None) == ()
@@ -98,7 +131,7 @@ def test_too_little_says_nothing():
 
 
 def test_an_observation_stands_in_the_diagnosis_and_names_no_effect():
-    healthy = HealthyEfforts.learned([drive(1), drive(2)], HUSKY)
+    healthy = learned(drive(1), drive(2))
     motion, commands = simulated_recording(HUSKY, (), seconds=60.0)
     stamps = commands.stamps[::10]
     twists = commands.sample(stamps)

@@ -1,15 +1,17 @@
 """What a robot passes under: ceilings, bars and crowns are no ground, and what is too low for it is an obstacle."""
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
+import torch
 
 from monoforce_ros.core import CameraModel, MotionState
 from monoforce_ros.perception import Observation, choose_terrain_source
 from monoforce_ros.perception.lidar import usable_returns
+from monoforce_ros.perception.temporal_memory import TemporalMemory
 from monoforce_ros.robots import load_robot
-from monoforce_ros.terrain import Grid, without_overhead
+from monoforce_ros.terrain import Grid, TerrainMap, without_overhead
 
 GRID = Grid.square(12.8, 0.1)
 LIMITS = {"lowest": -4.0, "highest": 3.0}
@@ -121,8 +123,19 @@ def test_a_wall_whose_foot_the_lidar_does_not_see_is_no_ramp(husky, distance):
     assert before.max() < 0.3 and np.median(at) > 0.6
 
 
-@pytest.mark.parametrize("kind", ["lidar", "lidar_interpolation"])
+CAMERA = CameraModel(320, 240, np.array([[200.0, 0, 160], [0, 200.0, 120], [0, 0, 1]]), np.zeros(5))
+FORWARD = np.array([[0.0, 0, 1, 0.3], [-1, 0, 0, 0], [0, -1, 0, 0.3], [0, 0, 0, 1]])
+
+
+def grey(stamp, cloud):
+    """A sweep, or none, and a picture that says nothing."""
+    picture = np.full((240, 320, 3), 90, np.uint8)
+    return Observation(stamp, cloud, {"front": picture}, {"front": CAMERA}, {"front": FORWARD})
+
+
+@pytest.mark.parametrize("kind", ["lidar", "lidar_interpolation", "lidar_camera"])
 def test_what_the_lidar_looks_over_when_near_is_remembered(husky, kind):
+    """Also where a camera sees the place, of which its image tells nothing."""
     ground = -husky.ground_clearance
 
     def heights(retention):
@@ -132,7 +145,7 @@ def test_what_the_lidar_looks_over_when_near_is_remembered(husky, kind):
             cloud = wall_in_the_blind_zone(husky, 4.0 - x, 0.3, width=0.8).astype(np.float32)
             motion = replace(STILL, stamp=step * 400_000_000, position=np.array([x, 0.0, 0.0]),
                              linear_velocity=np.array([0.5, 0.0, 0.0]))  # fmt: skip
-            terrain = source.terrain(Observation(motion.stamp, cloud=cloud), motion)
+            terrain = source.terrain(grey(motion.stamp, cloud), motion)
         near = (np.abs(GRID.x - 1.05) < 0.3)[None, :] & (np.abs(GRID.y) < 0.4)[:, None]
         return float(terrain.height.numpy()[near].max()) - ground
 
@@ -191,16 +204,12 @@ def test_a_wall_stays_for_a_while_when_the_lidar_dies(husky, fallback, covered, 
     source = choose_terrain_source(
         "lidar_camera", husky, fallback=fallback, lidar_retention_time=10.0, retention_time=camera_retention_time
     )
-    camera = CameraModel(320, 240, np.array([[200.0, 0, 160], [0, 200.0, 120], [0, 0, 1]]), np.zeros(5))
     cloud = ray_cast(LIDARS["VLP-16"], ground, 0.65, [((3.0, -2.0, 0.0), (3.4, 2.0, 1.0))], columns=720)
     front, across = np.abs(GRID.x - 3.0) < 0.25, np.abs(GRID.y) < 1.5
 
     def wall(seconds, sweep):
         motion = replace(STILL, stamp=round(seconds * 1e9))
-        picture = np.full((240, 320, 3), 90, np.uint8)
-        pose = np.array([[0.0, 0, 1, 0.3], [-1, 0, 0, 0], [0, -1, 0, 0.3], [0, 0, 0, 1]])
-        observation = Observation(motion.stamp, sweep, {"front": picture}, {"front": camera}, {"front": pose})
-        height = source.terrain(observation, motion).height.numpy() - ground
+        height = source.terrain(grey(motion.stamp, sweep), motion).height.numpy() - ground
         return float(np.median(height[across][:, front].max(axis=1)))
 
     for step in range(5):
@@ -210,6 +219,37 @@ def test_a_wall_stays_for_a_while_when_the_lidar_dies(husky, fallback, covered, 
     assert wall(12.0, dead) < 0.1
     # It is back, and somebody has taken the wall away.
     assert wall(12.3, ray_cast(LIDARS["VLP-16"], ground, 0.65, [], columns=720)) < 0.1
+
+
+@dataclass
+class Walled:
+    """A source of both sensors whose images show a wall 3 m ahead, until they show none."""
+
+    wall: bool = True
+    sensors: tuple[str, ...] = ("lidar", "camera")
+    grid: Grid = field(default=GRID)
+
+    def terrain(self, observation, motion):
+        height = torch.full((GRID.rows, GRID.columns), float(observation.cloud[:, 2].min()))
+        height[:, np.abs(GRID.x - 3.0) < 0.3] += 1.0 if self.wall else 0.0
+        return TerrainMap.from_height(height, GRID)
+
+
+def test_only_what_the_lidar_measured_is_kept_when_it_dies(husky):
+    """What images said then would outlive its time, although nothing confirmed it."""
+    source = Walled()
+    memory = TemporalMemory(source, husky, stiffness=2e6, retention_time=10.0, blind_zone_only=True)
+    ground = -husky.ground_clearance
+    behind = ray_cast(LIDARS["VLP-16"], ground, 0.65, [], columns=720)
+    behind = behind[behind[:, 0] < 0.0]
+    for step in range(5):
+        motion = replace(STILL, stamp=round(0.3e9 * step))
+        memory.recalled(source.terrain(grey(motion.stamp, behind), motion), grey(motion.stamp, behind), motion)
+    source.wall = False
+    now = source.terrain(grey(motion.stamp, behind), motion)
+    later = replace(STILL, stamp=2_000_000_000)
+    found = memory.recalled(now, grey(later.stamp, None), later, swept=False)
+    assert float(found.height[:, np.abs(GRID.x - 3.0) < 0.3].max()) - ground < 0.1
 
 
 @pytest.mark.parametrize("kind", ["lidar", "lidar_interpolation"])

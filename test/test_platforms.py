@@ -409,6 +409,13 @@ def test_platforms_are_reported_by_one_code_only(tmp_path):
     assert reported_before(other[:1], "b", ledger) == []
     add_to_ledger(first, "a", "2026-01-03", ledger)
     assert {entry.date for entry in read_ledger(ledger)} == {"2026-01-02"}
+    # Platform by platform, as they are shown.
+    for case in first[::-1]:
+        add_to_ledger([case], "c", "2026-01-04", ledger)
+    assert [(e.engine, e.first, e.last) for e in read_ledger(ledger) if e.code == "c"] == [
+        ("newton", 701, 701), ("mujoco", 700, 702), ("mujoco", 708, 708),
+    ]  # fmt: skip
+    assert [entry.code for entry in read_ledger(ledger)] == ["a"] * 3 + ["c"] * 3
 
 
 def test_the_next_set_for_reporting_is_not_in_the_ledger():
@@ -456,6 +463,19 @@ def test_a_second_report_of_a_platform_is_refused_and_one_that_is_asked_for_is_m
     assert again["verdict"] == "error" and again["independent"] is False
     assert "Not independent" in capsys.readouterr().out
     assert [entry.code for entry in read_ledger(tmp_path / "reported.json")] == ["code", "changed"]
+    # An interruption after the first row was shown, or while what was seen is diagnosed again.
+    arguments[arguments.index("changed")] = "interrupted"
+    arguments[arguments.index("--ledger") + 1] = str(tmp_path / "other.json")
+
+    def interrupt(shown):
+        raise KeyboardInterrupt
+
+    for stage, stop in (("row_line", interrupt), ("forget", lambda case, judged: interrupt(case))):
+        monkeypatch.setattr(platforms_run, stage, stop)
+        with pytest.raises(KeyboardInterrupt):
+            run(*(["--again"] if stage == "forget" else []))
+        assert [entry.code for entry in read_ledger(tmp_path / "other.json")] == ["interrupted"]
+        (tmp_path / "other.json").unlink()
 
 
 def test_a_platform_without_a_sensor_has_no_row_without_it(tmp_path):

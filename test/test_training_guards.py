@@ -89,6 +89,20 @@ def test_fine_tuning_without_held_out_recordings_keeps_the_calibration_of_its_st
     assert config.decrease_spread_factor == start.config.decrease_spread_factor
 
 
+def test_fine_tuning_learns_nothing_from_the_calibration_of_its_start(recording, husky, tmp_path):
+    """A network that is trained under factors on its bands makes up for them: they would be calibrated for nothing."""
+    weights = []
+    for factor in (1.0, 4.0):
+        torch.manual_seed(0)
+        encoder = new_encoder(replace(CONFIG, geometric_spread_factor=factor, decrease_spread_factor=factor))
+        settings = TrainingSettings(steps=3, warm_up=1, batch=2, rate=5e-3, weights=LossWeights(trajectory=0.0))
+        Trainer(encoder, husky, [recording], [], tmp_path / f"{factor:g}", settings, Process("cpu")).run()
+        saved = load_encoder(tmp_path / f"{factor:g}" / "encoder.safetensors")
+        assert saved.config == encoder.config
+        weights.append(saved.heads.weight)
+    assert torch.equal(*weights)
+
+
 @pytest.mark.parametrize("slope", [0.2, 0.36])
 def test_the_geometric_loss_of_a_true_hillside_is_none(recording, slope):
     batch, targets = sample(recording, 3, CONFIG)

@@ -201,6 +201,11 @@ def _children_seconds() -> float:
     return usage.ru_utime + usage.ru_stime
 
 
+def has_result(case: Case, judged: Judged) -> bool:
+    """Whether a case was diagnosed, so that its result may have been seen."""
+    return (judged.results / "cases" / f"{case.name}.json").exists()
+
+
 def forget(case: Case, judged: Judged) -> None:
     """Remove the result and the report of a case, so that it is diagnosed again."""
     (judged.results / "cases" / f"{case.name}.json").unlink(missing_ok=True)

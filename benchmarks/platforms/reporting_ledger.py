@@ -53,15 +53,27 @@ def reported_before(cases: Sequence[Case], code: str, file: Path = LEDGER) -> li
 
 
 def add_to_ledger(cases: Sequence[Case], code: str, date: str, file: Path = LEDGER) -> None:
-    """Add the platforms of a complete run, unless this code is listed with them."""
+    """Add the platforms of cases whose results are about to be seen, unless this code is listed with them.
+
+    A run adds each platform by itself: what was seen of an interrupted one is listed, too.
+    """
     entries = read_ledger(file)
     known = [entry for entry in entries if entry.code == code]
     fresh = [case for case in cases if not any(entry.holds(case) for entry in known)]
+    if not fresh:
+        return
     for engine in dict.fromkeys(case.engine for case in fresh):
-        seeds = sorted({case.platform_seed for case in fresh if case.engine == engine})
-        # Two engines take turns: the seeds of one are two apart.
-        ends = [number for number, seed in enumerate(seeds[:-1]) if seeds[number + 1] - seed > 2]
-        for begin, end in zip([0, *(number + 1 for number in ends)], [*ends, len(seeds) - 1], strict=True):
-            entries.append(ReportedPlatforms(engine, seeds[begin], seeds[end], date, code))
+        seeds = {case.platform_seed for case in fresh if case.engine == engine}
+        joined = [entry for entry in known if (entry.engine, entry.date) == (engine, date)]
+        entries = [entry for entry in entries if entry not in joined]
+        seeds.update(*(range(entry.first, entry.last + 1) for entry in joined))
+        entries += [ReportedPlatforms(engine, first, last, date, code) for first, last in _ranges(sorted(seeds))]
     lines = ",\n".join(f" {json.dumps(asdict(entry))}" for entry in entries)
     write_text(file, f"[\n{lines}\n]\n")
+
+
+def _ranges(seeds: Sequence[int]) -> list[tuple[int, int]]:
+    """First and last of each part of sorted seeds; two engines take turns, so that the seeds of one are two apart."""
+    ends = [number for number, seed in enumerate(seeds[:-1]) if seeds[number + 1] - seed > 2]
+    begins = [0, *(number + 1 for number in ends)]
+    return [(seeds[begin], seeds[end]) for begin, end in zip(begins, [*ends, len(seeds) - 1], strict=True)]

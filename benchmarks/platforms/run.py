@@ -13,7 +13,7 @@ import json
 import multiprocessing
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, as_completed, wait
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -23,7 +23,16 @@ from benchmark_case import CASE_KINDS, ENGINES, SETS, WORLD_GROUNDS, Case, all_c
 from benchmark_score import ENGINES as SCORED
 from benchmark_score import row_line, scores, table
 from case_recording import CaseFiles, record_platform, record_together
-from diagnosis_run import ABLATIONS, Judged, add_baselines, code_version, commission_platform, diagnose_case, forget
+from diagnosis_run import (
+    ABLATIONS,
+    Judged,
+    add_baselines,
+    code_version,
+    commission_platform,
+    diagnose_case,
+    forget,
+    has_result,
+)
 from drive_session import DriveJob, Trace
 from method_table import ablation_table, baseline_table
 from reporting_ledger import LEDGER, ReportedPlatforms, add_to_ledger, reported_before
@@ -62,11 +71,14 @@ def main() -> int:
     results = options.work / "results" / "-".join(part for part in (label, options.without) if part)
     judged = Judged(code, results, options.without or "", options.timeout)
     print(f"{len(cases)} cases, code {code} ({label}), results in {results}", flush=True)
+    seen = _listing(label, options)
+    # Of an earlier call, which may have been interrupted.
+    seen([case for case in cases if has_result(case, judged)])
     if options.again:
         for case in cases:
             forget(case, judged)
     began = time.monotonic()
-    rows = in_parallel(cases, options, judged)
+    rows = in_parallel(cases, options, judged, seen)
     spent["diagnoses"] = time.monotonic() - began
     if options.baselines:
         began = time.monotonic()
@@ -90,10 +102,20 @@ def main() -> int:
     if options.docs:
         write_between(options.docs, "platforms", text)
     if options.set == "reporting":
-        # Whoever has seen these figures may change the code for them.
-        add_to_ledger(cases, label, datetime.now(UTC).date().isoformat(), options.ledger)
         print(f"listed as reported in {options.ledger}: commit it")
     return 0
+
+
+def _listing(label: str, options: argparse.Namespace) -> Callable[[Sequence[Case]], None]:
+    """What lists platforms as reported by this code before their results are shown: whoever has seen these may change
+    the code for them."""
+    date = datetime.now(UTC).date().isoformat()
+
+    def listed(cases: Sequence[Case]) -> None:
+        if options.set == "reporting":
+            add_to_ledger(cases, label, date, options.ledger)
+
+    return listed
 
 
 def refusal(reported: Sequence[ReportedPlatforms]) -> str:
@@ -235,8 +257,16 @@ def _record_with_newton(platforms: Sequence[Sequence[Case]], work: Path) -> None
     record_together(platforms, work, simulate)
 
 
-def in_parallel(cases: Sequence[Case], options: argparse.Namespace, judged: Judged) -> list[dict]:
-    """The rows of the cases that can be judged; each platform is commissioned before its first case."""
+def in_parallel(
+    cases: Sequence[Case],
+    options: argparse.Namespace,
+    judged: Judged,
+    seen: Callable[[Sequence[Case]], None] = lambda cases: None,
+) -> list[dict]:
+    """The rows of the cases that can be judged; each platform is commissioned before its first case.
+
+    ``seen`` gets the cases of a platform before a row of it is shown.
+    """
     platforms: dict[str, list[Case]] = {}
     for case in cases:
         platforms.setdefault(case.platform_name, []).append(case)
@@ -256,6 +286,7 @@ def in_parallel(cases: Sequence[Case], options: argparse.Namespace, judged: Judg
                     continue
                 bar.update()
                 if result is not None:
+                    seen([case for case in cases if case.name == result["case"]])
                     rows.append(result)
                     bar.write(row_line(result))
     return rows

@@ -278,7 +278,7 @@ def diagnose_bag(
         elif found_file.exists():
             # Rename the robot file of an earlier diagnosis, which would be mistaken for a result of this one.
             found_file.replace(found_file.with_suffix(".earlier.yaml"))
-        report, page = write_diagnosis(out, diagnosis, inputs, robot_file, doubts)
+        report, page = write_diagnosis(out, diagnosis, inputs, robot_file, doubts, in_file)
     return BagDiagnosis(bag, diagnosis, report, page, robot_file, recording.warnings, tuple(doubts), ground)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from monoforce_ros.discrepancy.areas import shows_vegetation
 from monoforce_ros.discrepancy.attitude import lean_of
 from monoforce_ros.discrepancy.command_changes import covered_changes
-from monoforce_ros.discrepancy.comparable_windows import not_comparable
+from monoforce_ros.discrepancy.comparable_windows import left_out_stretches, not_comparable
 from monoforce_ros.discrepancy.directions import Directions
 from monoforce_ros.discrepancy.estimates import EffectEstimate, beyond_file
 from monoforce_ros.discrepancy.evidence import MOTION, Evidence, EvidenceWindows, window_starts
@@ -156,7 +156,9 @@ def commission(
         if recordings[0].with_attitude
         else None,
         wheels=_healthy_wheels(recordings, drives, replace(robot, effects=_together(robot, merged.effects))),
-        efforts=HealthyEfforts.learned([(evidence.commands, evidence.efforts) for evidence in recordings], robot),
+        efforts=HealthyEfforts.learned(
+            [(entry.commands, entry.efforts, left_out_stretches(entry, robot)) for entry in recordings], robot
+        ),
     )
     progress(1.0, "done")
     return beyond_file(estimate_effects(merged, {}), robot), nominal

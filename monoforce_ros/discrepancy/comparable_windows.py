@@ -13,7 +13,7 @@ from monoforce_ros.discrepancy.explanation import DiagnosisSettings, Windows
 from monoforce_ros.discrepancy.gap import noise_floor
 from monoforce_ros.discrepancy.terrain_evidence import terrain_uncertainty
 from monoforce_ros.discrepancy.trial import BLOCK
-from monoforce_ros.discrepancy.wheel_motion import undriven_stretches, wheels_without_motion
+from monoforce_ros.discrepancy.wheel_motion import WheelsWithoutMotion, undriven_stretches, wheels_without_motion
 from monoforce_ros.robots import RobotModel
 
 
@@ -25,6 +25,8 @@ class Comparable:
     """``[W]`` [ns]."""
     left_out: tuple[str, ...]
     """In words what was left out for which reason."""
+    stretches: np.ndarray
+    """Start and end of each stretch that windows must not overlap, ``[n, 2]`` [ns]."""
     blocked: str
     """When wheels turn while the robot, or one side of it, stays where it is; empty where they do not."""
 
@@ -34,41 +36,45 @@ def comparable_windows(evidence: Evidence, robot: RobotModel, settings: Diagnosi
     smoothed = evidence.smoothed
     starts = window_starts(smoothed.motion, smoothed.stretches, settings.horizon, settings.stride)
     starts = subsampled(starts, BLOCK, settings.max_windows)
-    left_out, remarks, blocked = _left_out(evidence, robot, starts, settings.horizon)
-    return Comparable(starts[~left_out], remarks, blocked)
+    undriven, in_place, spinning = _left_out(evidence, robot)
+    blocked = "" if spinning is None else spinning.summary()
+    remarks = []
+    if _overlapping(undriven, starts, settings.horizon).any():
+        seconds = float(np.diff(undriven, axis=1).sum()) * 1e-9
+        remarks.append(f"{seconds:.0f} s are left out in which the robot moved without commands (a joystick?)")
+    if blocked and len(starts) and len(evidence.commands):
+        remarks.append(blocked + ("; this time is left out" if len(in_place) else ""))
+    stretches = np.concatenate([undriven, in_place])
+    left_out = _overlapping(stretches, starts, settings.horizon)
+    return Comparable(starts[~left_out], tuple(remarks), stretches, blocked)
 
 
 def not_comparable(evidence: Evidence, robot: RobotModel, starts: np.ndarray, horizon: float) -> np.ndarray:
     """Windows in which something else than ground and commands moves or holds the robot, ``[W]`` bool."""
-    return _left_out(evidence, robot, starts, horizon)[0]
+    return _overlapping(left_out_stretches(evidence, robot), starts, horizon)
 
 
-def _left_out(
-    evidence: Evidence, robot: RobotModel, starts: np.ndarray, horizon: float
-) -> tuple[np.ndarray, tuple[str, ...], str]:
-    """What is not comparable ``[W]``, why, and when wheels turn in place."""
-    spinning = wheels_without_motion(evidence.smoothed.motion, evidence.wheels, evidence.commands, robot)
-    blocked = "" if spinning is None else spinning.summary()
-    if not len(starts) or not len(evidence.commands):
-        return np.zeros(len(starts), bool), (), blocked
-    smoothed = evidence.smoothed
+def left_out_stretches(evidence: Evidence, robot: RobotModel) -> np.ndarray:
+    """Start and end of each stretch in which something else moves or holds the robot, ``[n, 2]`` int64 [ns]."""
+    return np.concatenate(_left_out(evidence, robot)[:2])
 
-    def overlapping(stretches: np.ndarray) -> np.ndarray:
-        low, high = stretches.reshape(-1, 2).T
-        return ((starts[:, None] < high) & (starts[:, None] + round(horizon * 1e9) > low)).any(axis=1)
 
-    remarks = []
-    undriven = undriven_stretches(evidence.commands, evidence.wheels, smoothed.motion, robot)
-    left_out = overlapping(undriven)
-    if left_out.any():
-        seconds = float(np.diff(undriven, axis=1).sum()) * 1e-9
-        remarks.append(f"{seconds:.0f} s are left out in which the robot moved without commands (a joystick?)")
-    if spinning is not None:
-        remarks.append(blocked)
-        if spinning.side == "both":
-            left_out |= overlapping(np.array(spinning.stretches, np.int64))
-            remarks[-1] += "; this time is left out"
-    return left_out, tuple(remarks), blocked
+def _overlapping(stretches: np.ndarray, starts: np.ndarray, horizon: float) -> np.ndarray:
+    low, high = stretches.T
+    return ((starts[:, None] < high) & (starts[:, None] + round(horizon * 1e9) > low)).any(axis=1)
+
+
+def _left_out(evidence: Evidence, robot: RobotModel) -> tuple[np.ndarray, np.ndarray, WheelsWithoutMotion | None]:
+    """Stretches driven without commands and those in which all wheels turn in place, each ``[n, 2]`` [ns]; and when
+    wheels turn in place."""
+    motion, nothing = evidence.smoothed.motion, np.zeros((0, 2), np.int64)
+    spinning = wheels_without_motion(motion, evidence.wheels, evidence.commands, robot)
+    if not len(evidence.commands):
+        return nothing, nothing, spinning
+    undriven = undriven_stretches(evidence.commands, evidence.wheels, motion, robot)
+    if spinning is None or spinning.side != "both":
+        return undriven, nothing, spinning
+    return undriven, np.array(spinning.stretches, np.int64).reshape(-1, 2), spinning
 
 
 def windows_of(

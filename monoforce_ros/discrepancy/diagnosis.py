@@ -176,7 +176,10 @@ def diagnose(
         changed_lean(lean_of(smoothed.motion), nominal.lean) if nominal is not None and evidence.with_attitude else ""
     )
     known = None if nominal is None else nominal.efforts
-    efforts = changed_efforts(evidence.commands, evidence.efforts, evidence.wheels, robot, known, settings.thresholds)
+    efforts = changed_efforts(
+        evidence.commands, evidence.efforts, evidence.wheels, robot, known, settings.thresholds,
+        left_out=comparable.stretches,
+    )  # fmt: skip
     faults = motion_faults(smoothed, evidence.commands, evidence.wheels, evidence.efforts)
     if faults:
         return Diagnosis(Verdict.NOT_IDENTIFIABLE, advice=faults, remarks=(*left_out, *efforts))

@@ -40,6 +40,8 @@ _BATTERY = 1.1
 and that of a lead or lithium battery falls by about a fifth from full to empty."""
 _HARDLY = 0.5
 """Share of the healthy effort below which most of it is missing: by the meaning of "most"."""
+NOTHING = np.zeros((0, 2), np.int64)
+"""No stretches."""
 
 
 @dataclass(frozen=True)
@@ -54,8 +56,9 @@ class _Pieces:
     """Number of the segment of each, ``[n]``."""
 
     @classmethod
-    def of(cls, commands: CommandTrack, efforts: EffortTrack, robot: RobotModel) -> _Pieces:
-        """Of a recording; commands beyond what the robot's base carries out count as its limits."""
+    def of(cls, commands: CommandTrack, efforts: EffortTrack, robot: RobotModel, left_out: np.ndarray) -> _Pieces:
+        """Of a recording without stretches ``[n, 2]`` [ns] of it; commands beyond what the robot's base carries out
+        count as its limits."""
         stamps = efforts.stamps
         twists = commands.sample(stamps)
         bounds = np.array([robot.maximum_speed, robot.maximum_yaw_rate, robot.maximum_lateral_speed])[: twists.shape[1]]
@@ -64,6 +67,8 @@ class _Pieces:
         apart = np.broadcast_to(half_track(robot) * np.abs(twists[:, 1:2]), speeds.shape)
         terms = np.stack([np.ones_like(speeds), speeds, apart], axis=-1)
         driven = (speeds > _COMMANDED).all(axis=1) & (stamps >= commands.stamps[0])
+        for low, high in left_out:
+            driven &= (stamps < low) | (stamps > high)
         numbers = (stamps - stamps[0]) // round(_PIECE * 1e9)
         kept = []
         for number in np.unique(numbers[driven]):
@@ -114,17 +119,21 @@ class HealthyEfforts:
 
     @classmethod
     def learned(
-        cls, recordings: Sequence[tuple[CommandTrack, EffortTrack | None]], robot: RobotModel
+        cls, recordings: Sequence[tuple[CommandTrack, EffortTrack | None, np.ndarray]], robot: RobotModel
     ) -> HealthyEfforts | None:
         """From recordings of the healthy robot; None where one has no efforts, or all together too few segments.
 
         Each segment is predicted by the others.
+
+        Args:
+            recordings: commands, efforts and the stretches that are left out, see :func:`changed_efforts`.
+            robot: whose track width is used.
         """
         cut, first = [], 0
-        for commands, efforts in recordings:
+        for commands, efforts, left_out in recordings:
             if efforts is None or not len(commands):
                 return None
-            pieces = _Pieces.of(commands, efforts, robot)
+            pieces = _Pieces.of(commands, efforts, robot, left_out)
             cut.append(_Pieces(pieces.terms, pieces.efforts, pieces.segments + first))
             first = int(max(cut[-1].segments, default=first - 1)) + 1
         together = _Pieces(
@@ -170,6 +179,8 @@ def changed_efforts(
     robot: RobotModel,
     healthy: HealthyEfforts | None,
     thresholds: Thresholds = Thresholds(),  # noqa: B008
+    *,
+    left_out: np.ndarray = NOTHING,
 ) -> tuple[str, ...]:
     """Sides whose motors work harder, or less hard, than the healthy robot's for the same commands, one sentence each.
 
@@ -183,10 +194,12 @@ def changed_efforts(
         robot: whose track width is used.
         healthy: what commissioning learned; None if unknown.
         thresholds: stated rates, and how much healthy drives differ.
+        left_out: start and end of stretches in which something else moves or holds the robot, ``[n, 2]`` [ns]: a
+            joystick, under which the last command counts for nothing, or wheels that turn in place.
     """
     if efforts is None or healthy is None or not len(efforts) or not len(commands):
         return ()
-    pieces = _Pieces.of(commands, efforts, robot)
+    pieces = _Pieces.of(commands, efforts, robot, left_out)
     if not pieces.known:
         return ()
     ratios = pieces.ratios(healthy.coefficients)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -64,7 +64,11 @@ _MOST_LISTED = 6
 
 
 def diagnosis_page(
-    diagnosis: Diagnosis, inputs: Mapping[str, object], robot_file: Path | None, complaints: Sequence[str] = ()
+    diagnosis: Diagnosis,
+    inputs: Mapping[str, object],
+    robot_file: Path | None,
+    complaints: Sequence[str] = (),
+    written: Collection[str] | None = None,
 ) -> str:
     """The whole page as HTML.
 
@@ -73,9 +77,12 @@ def diagnosis_page(
         inputs: bag, robot and settings, by name; ``bag``, ``robot``, ``recording_s`` and ``ground`` go to the top.
         robot_file: the written robot file.
         complaints: reasons for doubt that are not part of the diagnosis.
+        written: names of the effects in the robot file; by default all.
     """
     top = headline(diagnosis, complaints)
-    parts = [_STYLE, _facts(inputs), _result(top, robot_file)]
+    names = [effect.name for effect in diagnosis.effects]
+    in_file = [name for name in names if written is None or name in written]
+    parts = [_STYLE, _facts(inputs), _result(top, robot_file, in_file, [name for name in names if name not in in_file])]
     if diagnosis.remarks and diagnosis.verdict != Verdict.NOT_IDENTIFIABLE:
         reasons = f"<ul>{_list_items(diagnosis.remarks)}</ul>"
         parts.append(card(reasons, heading=f"Why the verdict is {diagnosis.verdict}"))
@@ -111,7 +118,8 @@ def diagnosis_page(
         parts.append(card(_image(candidates_figure(diagnosis), "gain of each effect"), heading="Effects tested"))
     entries = {_INPUTS.get(key, key): value for key, value in inputs.items() if key != "ground_unknown"}
     if robot_file is not None:
-        entries["robot file with the added effects"] = robot_file
+        added = "the added effects" if len(in_file) == len(names) else " and ".join(in_file)
+        entries[f"robot file with {added}"] = robot_file
     parts.append(card(definition_list(entries), heading="Inputs"))
     robot = Path(str(inputs.get("robot", ""))).stem
     return page("Diagnosis", "".join(parts), heading=f"Diagnosis of {robot}" if robot else "Diagnosis")
@@ -135,10 +143,22 @@ def _facts(inputs: Mapping[str, object]) -> str:
     return f"<div class='facts'>{''.join(f'<span>{k} <b>{html.escape(v)}</b></span>' for k, v in facts)}</div>"
 
 
-def _result(top: Headline, robot_file: Path | None) -> str:
-    """What is wrong, how sure, and what to do."""
+def _result(top: Headline, robot_file: Path | None, in_file: Sequence[str], left_out: Sequence[str]) -> str:
+    """What is wrong, how sure, and what to do.
+
+    Args:
+        top: the result.
+        robot_file: the written robot file.
+        in_file, left_out: names of the effects that this file has, and of the others.
+    """
     actions = list(top.actions)
-    if robot_file is not None and top.helps:
+    if robot_file is not None and left_out:
+        # Errors before and after are those with all effects: they say nothing of this file alone.
+        lacks = f"{' and '.join(left_out)} {'is' if len(left_out) == 1 else 'are'} not in it"
+        actions.insert(
+            0, f"to predict with {' and '.join(in_file)}, give {robot_file.name} of this folder as the robot; {lacks}"
+        )
+    elif robot_file is not None and top.helps:
         actions.insert(0, f"to predict with these effects, give {robot_file.name} of this folder as the robot")
     elif robot_file is not None:
         actions.insert(0, f"keep your robot file: {robot_file.name} of this folder does not predict better")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -36,9 +36,14 @@ def effect_entry(effect: EffectEstimate) -> dict:
 
 
 def report_content(
-    diagnosis: Diagnosis, inputs: Mapping[str, object], robot_file: Path | None, complaints: Sequence[str] = ()
+    diagnosis: Diagnosis,
+    inputs: Mapping[str, object],
+    robot_file: Path | None,
+    complaints: Sequence[str] = (),
+    written: Collection[str] | None = None,
 ) -> dict:
-    """The content of ``report.json``; ``complaints`` are reasons for doubt that are not part of the diagnosis."""
+    """The content of ``report.json``; see :func:`diagnosis_page` for the arguments."""
+    names = [effect.name for effect in diagnosis.effects]
     top = headline(diagnosis, complaints)
     return {
         "verdict": str(diagnosis.verdict),
@@ -51,6 +56,7 @@ def report_content(
         "noise_floor": _noise_entries(diagnosis.noise_floor),
         "localisation_error_deg": diagnosis.localisation_error,
         "robot_file": None if robot_file is None else str(robot_file),
+        "in_robot_file": [name for name in names if robot_file is not None and (written is None or name in written)],
         "inputs": dict(inputs),
         "advice": list(diagnosis.advice),
         "part": diagnosis.part or None,
@@ -121,11 +127,12 @@ def write_diagnosis(
     inputs: Mapping[str, object],
     robot_file: Path | None,
     complaints: Sequence[str] = (),
+    written: Collection[str] | None = None,
 ) -> tuple[Path, Path]:
-    """Write ``report.json`` and ``report.html``; returns both paths."""
-    content = report_content(diagnosis, inputs, robot_file, complaints)
+    """Write ``report.json`` and ``report.html``; returns both paths. See :func:`diagnosis_page` for the arguments."""
+    content = report_content(diagnosis, inputs, robot_file, complaints, written)
     write_text(folder / "report.json", json.dumps(content, indent=2))
-    write_text(folder / "report.html", diagnosis_page(diagnosis, inputs, robot_file, complaints))
+    write_text(folder / "report.html", diagnosis_page(diagnosis, inputs, robot_file, complaints, written))
     return folder / "report.json", folder / "report.html"
 
 

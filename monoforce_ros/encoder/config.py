@@ -14,7 +14,9 @@ BACKBONES = ("efficientnet_lite0",)
 HEIGHT_CHANNELS, SCATTER_CHANNELS, SWEEP_CHANNELS = 3, 7, 8
 """Features of a lidar sweep: its heights; with scatter and the height of ground and objects; with the interpolation,
 which are all (:mod:`sweep`)."""
-SPREAD_FACTORS = ("geometric_spread_factor", "decrease_spread_factor", "image_spread_factor")
+SPREAD_FACTORS = (
+    "geometric_spread_factor", "decrease_spread_factor", "image_spread_factor", "image_decrease_spread_factor",
+)  # fmt: skip
 """Settings that a calibration determines, not the network."""
 FEATURE_STRIDE = 8
 """Stride of the lifted features in pixels of the resized image."""
@@ -64,8 +66,10 @@ class EncoderConfig:
     decrease_spread_factor: float = 1.0
     """Factors on the predicted spreads of H_g and H_d, calibrated on held-out samples so that 90 % bands hold 90 %."""
     image_spread_factor: float = 1.0
-    """Further factor on the spread of H_g where there is no sweep: errors within one scene go together, and with images
-    alone some scenes are off as a whole (docs/training.md)."""
+    """Further factor on the spread of H_g where no sweep measured anything nearby: errors within one scene go together,
+    and with images alone some scenes are off as a whole (docs/training.md)."""
+    image_decrease_spread_factor: float = 1.0
+    """The same of H_d, from an adaptation to a place that was judged by images alone."""
 
     def __post_init__(self):
         if self.sensor not in SENSORS:
@@ -96,6 +100,7 @@ class EncoderConfig:
             ("geometric_spread_factor", 0.01, 100.0),
             ("decrease_spread_factor", 0.01, 100.0),
             ("image_spread_factor", 0.01, 100.0),
+            ("image_decrease_spread_factor", 0.01, 100.0),
         ):
             value = getattr(self, name)
             whole = isinstance(low, int)

@@ -33,7 +33,8 @@ class LidarEncoder(nn.Module):
         features = torch.cat([sweep, batch.support], dim=1).to(self.bird.dtype)
         outputs = self.heads(self.bird(features).to(self.heads.weight.dtype)).float()
         hit = batch.sweep[:, HIT]
-        return maps_from_heads(outputs, batch, self.config, torch.ones_like(hit, dtype=torch.bool), hit)
+        covered = torch.ones_like(hit, dtype=torch.bool)
+        return maps_from_heads(outputs, batch, self.config, covered, hit, training=self.training)
 
     @torch.no_grad()
     def terrain(

@@ -127,7 +127,7 @@ class TerrainEncoder(nn.Module):
         outputs = self.heads(self.bird(features).to(self.heads.weight.dtype)).float()
         hit = batch.sweep[:, HIT]
         evidence = hit if evidence is None else evidence + hit
-        maps = maps_from_heads(outputs, batch, config, covered | (hit > 0), evidence, depth)
+        maps = maps_from_heads(outputs, batch, config, covered | (hit > 0), evidence, depth, training=self.training)
         return with_edges(maps, config) if config.edges and not self.training else maps
 
     def _splat(self, batch: EncoderInput) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -77,13 +78,25 @@ class Health:
                 Defaults to the message.
             values: values to add to the diagnostics.
         """
+        self._set(part, level, message, reason, {name.replace("_", " "): str(value) for name, value in values.items()})
+
+    def report_anew(
+        self, part: str, level: bytes, message: str, values: Mapping[str, str], *, reason: str = ""
+    ) -> None:
+        """As :meth:`report`, with all values in the diagnostics, so that none remains of what no longer holds."""
+        self._set(part, level, message, reason, values, anew=True)
+
+    def _set(
+        self, part: str, level: bytes, message: str, reason: str, values: Mapping[str, str], *, anew: bool = False
+    ) -> None:
         reason = reason or message
         with self._lock:
             state = self._parts.setdefault(part, _Part())
             changed = state.key != (level, reason)
             started = state.level == STALE and level == OK
             state.level, state.message, state.reason = level, message, reason
-            state.values.update({name.replace("_", " "): str(value) for name, value in values.items()})
+            # A change is published at once, with the values that belong to it.
+            state.values = {**({} if anew else state.values), **values}
             due = changed and state.due(time.monotonic())
         if due and not started:
             self._log(part, level, message)
@@ -135,11 +148,6 @@ class Health:
         """Attach values to a part without changing its state."""
         with self._lock:
             self._parts[part].values.update(values)
-
-    def set_values(self, part: str, values: dict[str, str]) -> None:
-        """Replace a part's values, so that none remains of what no longer holds."""
-        with self._lock:
-            self._parts[part].values = dict(values)
 
     def level(self, part: str) -> bytes:
         """The level last reported for a part."""

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import shlex
 from dataclasses import replace
+from pathlib import Path
 
 from monoforce_ros.nodes.health import OK, STALE, WARN, Health
 from monoforce_ros.perception import TerrainSource, TrustedTerrain, TrustReport
 
 PART, SWEEP_PART = "terrain", "terrain from the sweep alone"
 """Of the source, and of what ``lidar_camera`` uses as far as images are not trusted."""
+
+_ADAPTED = Path("adapted/encoder.safetensors")
+"""Where the encoder is after the command that adapts it."""
 
 
 class TerrainHealth:
@@ -33,31 +37,31 @@ class TerrainHealth:
             return
         report = self._source.report
         if "camera" in report.sensors:
-            report = replace(report, remedy=f"adapt the encoder to this robot: {self.adaptation}")
+            remedy = f"adapt the encoder to this robot and start with checkpoint:={_ADAPTED}: {self.adaptation}"
+            report = replace(report, remedy=remedy)
         self._report(PART, report)
         below = self._source.fallback_report
         if below is not None:
             self._report(SWEEP_PART, below)
             self._swept = True
         elif self._swept:
-            self._health.report(SWEEP_PART, STALE, "no usable sweep in the last map", reason="no sweep")
-            self._health.set_values(SWEEP_PART, {})
+            self._health.report_anew(SWEEP_PART, STALE, "no usable sweep in the last map", {}, reason="no sweep")
 
     @property
     def adaptation(self) -> str:
-        """The command that adapts the encoder to this robot, and what to do with the result."""
+        """The command that adapts the encoder to this robot, as a shell takes it."""
         start = ["--start-from", self._checkpoint] if self._checkpoint else []
         robot = ["--robot", self._robot]
-        command = shlex.join(["ros2", "run", "monoforce_ros", "train", "--adapt", "BAG", *robot, *start])
-        return f"{command} --out adapted (then checkpoint:=adapted/encoder.safetensors)"
+        out = ["--out", str(_ADAPTED.parent)]
+        return shlex.join(["ros2", "run", "monoforce_ros", "train", "--adapt", "BAG", *robot, *start, *out])
 
     def _report(self, part: str, report: TrustReport) -> None:
+        values = _values(report)
         if report.trusted:
-            self._health.report(part, OK, report.explanation, reason="trusted")
+            self._health.report_anew(part, OK, report.explanation, values, reason="trusted")
         else:
             text = f"falling back, the encoder is not used: {report.explanation}"
-            self._health.report(part, WARN, text, reason="not trusted")
-        self._health.set_values(part, _values(report))
+            self._health.report_anew(part, WARN, text, values, reason="not trusted")
 
 
 def _values(report: TrustReport) -> dict[str, str]:

@@ -10,10 +10,11 @@ import torch
 from monoforce_ros.core import NANOSECOND, CameraModel, MotionState
 from monoforce_ros.perception.clearance import clear_of_robot
 from monoforce_ros.perception.ground_alignment import align_to_ground, standing
+from monoforce_ros.perception.lidar import usable_returns
 from monoforce_ros.perception.observation import Observation, TerrainSource, used_sensors
 from monoforce_ros.perception.trace import continues
 from monoforce_ros.robots import RobotModel, is_lidar
-from monoforce_ros.terrain import CHANNELS, Grid, TerrainMap, interpolated
+from monoforce_ros.terrain import CHANNELS, Grid, LidarSettings, TerrainMap, cell_heights, interpolated
 
 _SIGHT_TOLERANCE = 0.1
 """How far above a lidar's line of sight remembered ground may be [m]: a cell."""
@@ -39,7 +40,8 @@ class TemporalMemory:
         retention_distance: distance travelled after which a cell is forgotten, since odometry drifts [m].
         blind_zone_only: fill only what lies nearer than all that is observed in its direction. A lidar looks all
             around, and what it sees behind a place shows that nothing stands there any more; what it cannot see below
-            its lowest row of returns may still be there. Without a sweep all that it measured is kept.
+            its lowest row of returns may still be there. Without a sweep all that it measured is kept. Only what it
+            measured is remembered, and cells that images alone cover count as its blind zone.
     """
 
     def __init__(
@@ -117,25 +119,38 @@ class TemporalMemory:
         if not self._blind_zone_only:
             obstacle = fresh & observed & self._near & (values[0] - height > _OBSTACLE_HEIGHT)
             kept = (fresh & ~observed) | obstacle
-        elif swept:
-            # What rose above the line of sight has gone: somebody walked by.
-            sight = now.looked_over(self._lidar_height + float(motion.terrain_from_base[2, 3]))
-            kept = fresh & (values[0] <= sight + _SIGHT_TOLERANCE)
         else:
-            # Where nothing is measured any more, nothing shows that it has, nor hides an obstacle in images.
+            # An obstacle in images counts all the same.
             above = height - np.maximum(values[0], np.median(support[:, 2]))
             kept = fresh & ~(observed & (above > _OBSTACLE_HEIGHT))
+        measured = now
+        if self._blind_zone_only and swept:
+            # Images cover the blind zone, too, and may say nothing of it.
+            measured = replace(now, observed=self._hit(observation, motion, posed, support, now))
+            # What rose above the line of sight has gone: somebody walked by. Without a sweep nothing shows that it has.
+            sight = measured.looked_over(self._lidar_height + float(motion.terrain_from_base[2, 3]))
+            kept &= values[0] <= sight + _SIGHT_TOLERANCE
         seen = now.observed & ~torch.from_numpy(obstacle)
         if not self._blind_zone_only:
             memory.write(replace(now, observed=seen), motion)
         elif swept and memory.is_due(motion):
             # A row of returns hits single cells, which would be lost between those of the memory.
-            nearby = torch.from_numpy(now.measured_nearby(1.5 * now.grid.resolution))
+            nearby = torch.from_numpy(measured.measured_nearby(1.5 * now.grid.resolution))
             memory.write(replace(now, observed=nearby), motion)
         if not kept.any():
             return now
         joined = now.with_cells(torch.from_numpy(kept), dict(zip(CHANNELS, torch.from_numpy(values), strict=True)))
         return clear_of_robot(align_to_ground(joined, support), posed, motion)
+
+    def _hit(
+        self, observation: Observation, motion: MotionState, posed: RobotModel, support: np.ndarray, now: TerrainMap
+    ) -> torch.Tensor:
+        """Observed cells that the lidar's sweep measured, ``[rows, columns]`` bool."""
+        if observation.cloud is None or "camera" not in self.sensors:
+            return now.observed
+        points = usable_returns(observation.cloud, posed, motion, support, now.grid)
+        _, hit = cell_heights(points, now.grid, replace(LidarSettings(), headroom=self._robot.headroom))
+        return now.observed & torch.from_numpy(hit)
 
 
 def _equal(camera: CameraModel, other: CameraModel) -> bool:

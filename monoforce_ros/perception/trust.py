@@ -4,30 +4,33 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 from scipy import stats
 
 from monoforce_ros.core import MotionState, transform_points
 from monoforce_ros.perception.trace import continues
+from monoforce_ros.perception.trust_blocks import (
+    BLOCK,
+    FEWEST_BLOCKS,
+    LENGTH,
+    Blocks,
+    Comparison,
+    effective_number,
+    mean_comparison,
+    telling_blocks,
+)
 from monoforce_ros.terrain import Grid, TerrainMap
 
-BLOCK = 0.5
-"""Distance travelled in one block of comparisons [m], about a robot's length: errors within it are not independent."""
-LENGTH = 6.0
-"""Distance travelled over which predictions are judged [m]."""
 ERROR_RATE = 0.01
 """Rate at which an encoder as good as level ground is taken for a worse one, for each test; there are two per metre."""
 TOLERANCE = 0.01
 """Difference between two mean errors that does not matter [m]: wheels sink in by as much (8 mm on firm soil)."""
 _STEP = 0.01
 """Distance between two comparisons [m]: a robot that stands still finds nothing new."""
-FEWEST_BLOCKS = 3
-"""Blocks before which comparisons decide nothing."""
 _SMALLEST_SQUARE = 1e-9
 """Of differences of heights: where there are none the share is what was expected [m²]."""
 _NEAREST, _FARTHEST = 0.8, 5.0
@@ -100,29 +103,6 @@ class TrustReport:
         return f"{compared}{camera}: {self.remedy}"
 
 
-class _Comparison(NamedTuple):
-    """Means over points of the ground under the wheels, of which one earlier prediction had said something."""
-
-    error: float
-    """Of the prediction [m]."""
-    level: float
-    """Error of level ground [m]."""
-    product: float
-    """d g of :class:`TerrainTrust` [m²]."""
-    square: float
-    """d² [m²]."""
-    ground: float
-    """g² [m²]."""
-    off: float
-    """|g|, the error of the fallback [m]."""
-    ratio: float
-    """Error of the prediction in units of its spread; NaN where it tells none."""
-    distance: float
-    """From which the prediction was made [m]."""
-    camera: str
-    """That looked at the place."""
-
-
 @dataclass(frozen=True)
 class _Said:
     """A prediction made earlier."""
@@ -143,23 +123,50 @@ class _Said:
     """Direction of each camera's optical axis in that frame [rad]."""
 
 
+def _comparison(said: _Said, ground: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> Comparison:
+    """A prediction and ground ``[m, 3]`` in its terrain frame [m], in cells of ``rows`` and ``columns`` ``[m]``."""
+    x, y = ground[:, :2].mean(axis=0)
+    towards = float(np.arctan2(y, x))
+    away = {name: abs((axis - towards + np.pi) % (2 * np.pi) - np.pi) for name, axis in said.cameras.items()}
+    height, other = said.height[rows, columns], said.fallback[rows, columns]
+    error = np.abs(height - ground[:, 2])
+    ratio = float("nan")
+    if said.spread is not None:
+        ratio = float((error / np.maximum(said.spread[rows, columns], TOLERANCE)).mean())
+    said_more, was_more = height - other, ground[:, 2] - other
+    return Comparison(
+        error=float(error.mean()),
+        level=float(np.abs(said.level - ground[:, 2]).mean()),
+        product=float((said_more * was_more).mean()),
+        square=float((said_more**2).mean()),
+        ground=float((was_more**2).mean()),
+        off=float(np.abs(was_more).mean()),
+        ratio=ratio,
+        distance=float(np.hypot(ground[:, 0], ground[:, 1]).mean()),
+        camera=min(away, key=lambda name: away[name]) if away else "",
+    )
+
+
 class TerrainTrust:
     """Compares predictions with the ground found later.
 
     Level ground at the height of the wheels is the rival: an encoder that loses against it over the last metres harms.
-    Errors are averaged over blocks of half a metre of travel; a paired t-test over the blocks decides.
+    Errors are averaged over blocks of half a metre of travel; a paired t-test over the blocks decides. A place counts
+    in the block whose wheels found it first: that the wheels behind find the same is no further evidence.
 
     The share w of a prediction's difference d to the fallback's heights that is used is the regression of the ground's
     difference g on d, g = w d + noise, with the prior w ~ N(w0, 1). The posterior mean is (Σ d g + w0 σ²) / (Σ d² + σ²)
-    over blocks; for σ², the variance of the noise, stands that of g - w0 d, which it is if w is w0.
+    over blocks; for σ², the variance of the noise, stands that of g - w0 d, which it is if w is w0. The share stays w0
+    until three blocks tell something of it, for one place may differ by chance, and level ground of which both maps
+    say the same tells nothing: the effective number of blocks, (Σ d²)² / Σ d⁴, has to be three.
 
     What images say has to be earned, w0 = 0: they may be of another place, or of a world that looks different. One
     standard deviation less is used, because two hills may be alike by chance. The share is 0 at the start, 3/4 after
-    three blocks of perfect predictions, and near 0 for pictures of another place. A sweep measures, and from one the
-    encoder is right on average wherever robots drove in simulation (docs/training.md): w0 = 1 until the ground
-    says otherwise. After three blocks of ground that it put as far off as it differs from the fallback, 1/4 is left.
-    It stays 1 until three blocks tell something of it, for one tuft may differ by chance: the effective number of
-    blocks, (Σ d²)² / Σ d⁴, has to be three.
+    three blocks of perfect predictions, and near 0 for pictures of another place. σ² is that of as many blocks as the
+    effective number: level ground between two hills makes their agreement no less likely to be chance. A sweep
+    measures, and from one the encoder is right on average wherever robots drove in simulation (docs/training.md):
+    w0 = 1 until the ground says otherwise. After three blocks of ground that it put as far off as it differs from the
+    fallback, 1/4 is left.
 
     Whether errors are as large as the predicted spreads say follows from the same comparisons: errors are Laplace
     distributed with the spreads times s as their scales. With the conjugate prior that weighs as much as three blocks,
@@ -177,11 +184,10 @@ class TerrainTrust:
 
     def _start_over(self) -> None:
         self._said: deque[_Said] = deque(maxlen=round((LENGTH + _FARTHEST) / BLOCK))
-        self._blocks: deque[_Comparison] = deque(maxlen=round(LENGTH / BLOCK))
+        self._comparisons = Blocks()
+        self._blocks: list[Comparison] = []
         """Means over the comparisons of each block."""
-        self._pending: list[_Comparison] = []
-        """Comparisons of the current block."""
-        self._compared: deque[_Comparison] = deque(maxlen=2000)
+        self._compared: deque[Comparison] = deque(maxlen=2000)
         self._measured: deque[tuple[float, float]] = deque(maxlen=round(LENGTH / BLOCK))
         """Mean errors of the visible surface, and of level ground, where a lidar measured it [m]."""
         self._travelled = self._uncompared = 0.0
@@ -215,11 +221,9 @@ class TerrainTrust:
             self._compare_surface(transform_points(motion.odometry_from_terrain, measured))
         if self._travelled >= BLOCK:
             self._travelled, self._due = 0.0, True
-            if self._pending:
-                self._blocks.append(_mean(self._pending))
-                self._compared.extend(self._pending)
-                self._pending = []
-                self._judge()
+            self._comparisons.close()
+            self._blocks = self._comparisons.means
+            self._judge()
 
     def update(
         self,
@@ -254,39 +258,17 @@ class TerrainTrust:
 
     def _compare(self, points: np.ndarray) -> None:
         """Compare ground ``[m, 3]`` in the odometry frame with what was said of it."""
+        block_of = self._comparisons.of_places(points)
         for said in self._said:
             local = transform_points(np.linalg.inv(said.motion.odometry_from_terrain), points)
             distance = np.hypot(local[:, 0], local[:, 1])
             rows, columns, inside = self._grid.cells(local[:, :2])
             usable = inside & (distance > _NEAREST) & (distance < _FARTHEST) & said.observed[rows, columns]
-            if not usable.any():
-                continue
-            height = said.height[rows, columns][usable]
-            error = float(np.abs(height - local[usable, 2]).mean())
-            level = float(np.abs(said.level - local[usable, 2]).mean())
-            middle = local[usable, :2].mean(axis=0)
-            towards = float(np.arctan2(middle[1], middle[0]))
-            away = {name: abs((axis - towards + np.pi) % (2 * np.pi) - np.pi) for name, axis in said.cameras.items()}
-            camera = min(away, key=lambda name: away[name]) if away else ""
-            ratio = float("nan")
-            if said.spread is not None:
-                expected = np.maximum(said.spread[rows, columns][usable], TOLERANCE)
-                ratio = float((np.abs(height - local[usable, 2]) / expected).mean())
-            other = said.fallback[rows, columns][usable]
-            said_more, was_more = height - other, local[usable, 2] - other
-            self._pending.append(
-                _Comparison(
-                    error=error,
-                    level=level,
-                    product=float((said_more * was_more).mean()),
-                    square=float((said_more**2).mean()),
-                    ground=float((was_more**2).mean()),
-                    off=float(np.abs(was_more).mean()),
-                    ratio=ratio,
-                    distance=float(distance[usable].mean()),
-                    camera=camera,
-                )
-            )
+            for block in np.unique(block_of[usable]).tolist():
+                at = usable & (block_of == block)
+                found = _comparison(said, local[at], rows[at], columns[at])
+                self._comparisons.add(block, found)
+                self._compared.append(found)
 
     def _compare_surface(self, points: np.ndarray) -> None:
         """Compare the visible surface ``[n, 3]`` in the odometry frame with what was said of it."""
@@ -322,11 +304,19 @@ class TerrainTrust:
         if count < FEWEST_BLOCKS:
             return expected
         # Where prediction and fallback agree the ground tells nothing.
-        weights = _weights(np.array([block.square for block in self._blocks])) if expected > 0.0 else np.ones(count)
-        if weights is None:
+        squares = np.array([block.square for block in self._blocks])
+        telling = telling_blocks(squares)
+        if telling is None:
             return expected
-        sums = np.array([(b.product, b.square, b.ground) for b in self._blocks])
-        product, square, ground = weights @ sums
+        if expected > 0.0:
+            return self._regression(telling, count)
+        # A block that would decide alone neither earns trust nor hides that it was wrong.
+        return min(self._regression(kept, effective_number(kept * squares)) for kept in (telling, np.ones(count)))
+
+    def _regression(self, weights: np.ndarray, count: float) -> float:
+        """The share from blocks with weights ``[n]`` that count as much as ``count`` independent ones."""
+        expected = self._expected
+        product, square, ground = weights @ np.array([(b.product, b.square, b.ground) for b in self._blocks])
 
         def noise(share: float) -> float:
             return max(ground - 2.0 * share * product + share**2 * square, _SMALLEST_SQUARE) / count
@@ -341,7 +331,7 @@ class TerrainTrust:
         return max(1.0, (FEWEST_BLOCKS + sum(ratios)) / (FEWEST_BLOCKS + len(ratios)))
 
     def _report(self, start_error: float) -> TrustReport:
-        last = _mean(self._blocks) if self._blocks else None
+        last = mean_comparison(self._blocks) if self._blocks else None
         nothing = float("nan")
         entries = list(self._compared)
         by_distance = {
@@ -371,31 +361,6 @@ class TerrainTrust:
         )
 
 
-def _mean(comparisons: Iterable[_Comparison]) -> _Comparison:
-    """Mean of all numbers; of the camera the last one."""
-    rows = list(comparisons)
-    return _Comparison._make([*np.mean([row[:-1] for row in rows], axis=0).tolist(), rows[-1].camera])
-
-
-def _weights(squares: np.ndarray) -> np.ndarray | None:
-    """Which blocks count ``[n]``, 0 or 1, where prediction and fallback differ by ``squares`` ``[n]`` [m²]; None if
-    fewer than :data:`FEWEST_BLOCKS` tell them apart.
-
-    A block that differs far more than all others would decide alone: it is left out, until the effective number of
-    blocks, (Σ d²)² / Σ d⁴, is no smaller.
-    """
-    order = np.argsort(-squares, kind="stable")
-    for left_out in range(len(squares)):
-        kept = squares[order[left_out:]]
-        if (kept > 0.0).sum() < FEWEST_BLOCKS:
-            break
-        if kept.sum() ** 2 >= FEWEST_BLOCKS * (1.0 - 1e-9) * (kept**2).sum():
-            weights = np.ones(len(squares))
-            weights[order[:left_out]] = 0.0
-            return weights
-    return None
-
-
-def _errors(comparisons: Sequence[_Comparison]) -> tuple[float, float]:
+def _errors(comparisons: Sequence[Comparison]) -> tuple[float, float]:
     """Mean error of the prediction and of level ground [m]."""
     return float(np.mean([entry.error for entry in comparisons])), float(np.mean([e.level for e in comparisons]))

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy import stats
 
-from monoforce_ros.encoder import SPREAD_FACTORS, Encoder
+from monoforce_ros.encoder import Encoder
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.training.judgement import CAMERAS, SWEEP, Judgement, judge, sample_errors, widened
 from monoforce_ros.training.losses import LossWeights
@@ -178,9 +177,6 @@ def adapt(
         report: called with the step and its losses.
     """
     adapted = copy.deepcopy(encoder)
-    # The factors on its bands are no part of what the network learns, which would make up for them.
-    none: dict[str, Any] = dict.fromkeys(SPREAD_FACTORS, 1.0)
-    adapted.config = replace(encoder.config, **none)
     training = TrainingSettings(
         steps=settings.steps, batch=settings.batch, rate=settings.rate, warm_up=max(1, settings.steps // 10),
         weights=LossWeights(trajectory=0.0), seed=settings.seed, validate_every=settings.steps,
@@ -188,7 +184,6 @@ def adapt(
     )  # fmt: skip
     trainer = Trainer(adapted, robot, balanced(own, replay), [], out, training, Process("cpu"))
     trainer.run(report)
-    adapted.config = encoder.config
     return adapted.eval()
 
 

@@ -140,7 +140,8 @@ def calibrated(encoder: Encoder, recordings: Sequence[RecordingSamples], sensors
 
     With images alone some scenes are off as a whole, so that bands that hold 90 % of all cells hold far less there.
     Where there are recordings of at least nine scenes, bands from images are made to hold 90 % of the cells of 90 % of
-    the scenes (:func:`scene_factor`); fewer leave ``image_spread_factor`` as it is.
+    the scenes (:func:`scene_factor`); fewer leave ``image_spread_factor`` as it is. That of H_d, which comes from one
+    place, ends.
 
     Args:
         encoder: the encoder.
@@ -149,13 +150,17 @@ def calibrated(encoder: Encoder, recordings: Sequence[RecordingSamples], sensors
     """
     ratios = [band_ratios(encoder, [recording], sensors) for recording in recordings]
     config = encoder.config
-    alone = config.image_spread_factor if sensors.sweep_share == 0.0 else 1.0
+    by_images = sensors.sweep_share == 0.0
+    alone = config.image_spread_factor if by_images else 1.0
     geometric = _quantile([alone * entry.geometric for entry in ratios])
+    deeper = config.image_decrease_spread_factor if by_images else 1.0
+    decrease = _quantile([deeper * entry.decrease for entry in ratios])
     factors = {
         "geometric_spread_factor": config.geometric_spread_factor * geometric,
-        "decrease_spread_factor": config.decrease_spread_factor * _quantile([entry.decrease for entry in ratios]),
+        "decrease_spread_factor": config.decrease_spread_factor * decrease,
+        "image_decrease_spread_factor": 1.0,
     }
-    if sensors.sweep_share == 0.0:
+    if by_images:
         scenes = [_quantile([alone * entry.geometric]) / geometric for entry in ratios if len(entry.geometric)]
         factors["image_spread_factor"] = scene_factor(scenes) or config.image_spread_factor
     return _with_factors(encoder, factors)
@@ -180,15 +185,18 @@ def widened(encoder: Encoder, recordings: Sequence[RecordingSamples], sensors: A
     """A copy of an encoder whose 90 % bands hold 90 % of what was measured in a robot's own recordings, and which are
     nowhere narrower than before: one place does not show how wrong it is elsewhere.
 
-    Without a lidar what the wheels traced decides, and widens H_g and H_d alike.
+    Without a lidar what the wheels traced decides, and widens H_g and H_d alike. Bands of a sweep stay where images
+    alone were judged.
     """
     ratios = [band_ratios(encoder, [recording], sensors) for recording in recordings]
     surface, below = (_quantile([getattr(entry, name) for entry in ratios]) for name in ("geometric", "decrease"))
     if not any(len(entry.geometric) for entry in ratios):
         surface = below = _quantile([entry.support for entry in ratios])
     # A sweep's own bands need not be as wide as those of images.
-    of_surface = "image_spread_factor" if sensors.sweep_share == 0.0 else "geometric_spread_factor"
-    wider = {of_surface: surface, "decrease_spread_factor": below}
+    judged = ("image_spread_factor", "image_decrease_spread_factor")
+    if sensors.sweep_share != 0.0:
+        judged = ("geometric_spread_factor", "decrease_spread_factor")
+    wider = dict(zip(judged, (surface, below), strict=True))
     return _with_factors(
         encoder, {name: getattr(encoder.config, name) * max(1.0, factor) for name, factor in wider.items()}
     )
