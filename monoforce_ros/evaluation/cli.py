@@ -187,6 +187,7 @@ def run(options: argparse.Namespace) -> None:
         checkpoint=options.checkpoint,
         retention_time=options.retention_time,
         lidar_retention_time=LIDAR_RETENTION_TIME,
+        motion_stereo=True,
         fallback=True,
         warn=lambda message: print(f"warning: {message}", file=sys.stderr),
     )
