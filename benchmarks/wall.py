@@ -1,7 +1,7 @@
 """Walls and posts ahead (the paper's Figure 9): which terrain sources predict the stop that occurs in the simulator.
 
-    scripts/run.sh python benchmarks/wall.py [--quick] [--checkpoint SYSTEM=FILE ...] [--seed N] [--json FILE]
-        [--png FILE] [--docs FILE]
+    scripts/run.sh python benchmarks/wall.py [--quick] [--driving] [--checkpoint SYSTEM=FILE ...] [--seed N]
+        [--json FILE] [--png FILE] [--docs FILE]
 
 draws walls and posts of any texture and colour, 0.15 to 1.2 m high and 0.6 to 6 m away, and soft vegetation that looks
 like a wall. The robot is commanded to drive straight ahead for eight seconds. In simulation it drives until something
@@ -9,18 +9,22 @@ stops it; each source predicts the same motion from one image or sweep. A stop i
 metre of where it happens. The command reports precision and recall of that, and writes a log of the seeds it used.
 Systems are those of benchmarks/terrain.py, each with one checkpoint per training seed, whose scenes are counted
 together; without any, the shipped encoder is tested with images, with a lidar sweep and with both.
+
+With --driving the robot has driven 1.6 m towards the obstacle when the prediction is made, with five images a second
+and odometry that drifts: the shipped encoder on images is compared with and without motion stereo.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
+from approach import RUN_UP, Seen, driven_up
 from matplotlib.figure import Figure
 from terrain import CHOOSING, ROOT, described_use, judged_source, log_use, parse_checkpoints, reporting_seeds
 from terrain_tables import LEARNED
@@ -29,7 +33,7 @@ from tqdm import tqdm
 from monoforce_ros.core import MotionState, write_text
 from monoforce_ros.evaluation.tables import LIDAR, System
 from monoforce_ros.messages import decoding
-from monoforce_ros.perception import Observation
+from monoforce_ros.perception import Observation, TerrainSource, choose_terrain_source
 from monoforce_ros.prediction import Prediction, Predictor
 from monoforce_ros.reporting import write_between
 from monoforce_ros.robots import RobotModel, load_robot
@@ -49,9 +53,12 @@ FOUND_WITHIN = 0.5
 """Largest distance between the predicted and the simulated stop that was found [m]: half a Husky's length."""
 FIRST_SEED = 446_000
 """First reporting seed; with --quick that of those for choosing."""
+FIRST_DRIVING_SEED = 452_000
+"""The same with --driving."""
 PUBLISHED_LOG = ROOT / "docs" / "wall_tables.log.jsonl"
 BOOTSTRAPS = 2000
 SCENES = {"wall": 40, "post": 20, "vegetation": 20}
+DRIVING_SCENES = {"wall": 12, "post": 6, "vegetation": 6}
 QUICK_SCENES = {"wall": 8, "post": 4, "vegetation": 4}
 
 
@@ -63,6 +70,8 @@ class Scene:
     observation: Observation
     start: MotionState
     driven: float
+    approach: tuple[Seen, ...] = ()
+    """What was seen before on the way there."""
 
     @property
     def stops(self) -> bool:
@@ -70,9 +79,19 @@ class Scene:
         return self.driven < STOPPED * SPEED * HORIZON
 
 
-def observed(world: LiveWorld, robot: RobotModel) -> tuple[Observation, MotionState]:
+@dataclass(frozen=True)
+class Judged:
+    """A source whose predictions are counted."""
+
+    title: str
+    source: Callable[[], TerrainSource]
+    """Makes it anew."""
+    approaches: bool = False
+    """Whether it sees what the robot saw on its way."""
+
+
+def observed(world: LiveWorld, robot: RobotModel, stamp: int = 10**9) -> tuple[Observation, MotionState]:
     """What the robot's sensors measure at the moment, and its state."""
-    stamp = 10**9
     state, _, _ = decoding.decode_odometry(world.odometry(stamp))
     cloud = decoding.decode_cloud(world.cloud(stamp))
     frame, message, info = next(iter(world.images(stamp)))
@@ -141,6 +160,62 @@ def scene(kind: str, seed: int) -> Scene:
     return Scene(ahead, *simulated(settings, HORIZON))
 
 
+def driving_scene(kind: str, seed: int) -> Scene:
+    """As :func:`scene`, when the robot has driven :data:`approach.RUN_UP` towards it."""
+    robot = load_robot("husky")
+    ahead = draw_wall_ahead(kind, seed, float(robot.points[:, 0].max()) + RUN_UP)
+    world = LiveWorld(LiveSettings(seed=seed, scenery=ahead.scenery, camera=CameraSettings()))
+    try:
+        seen, state = driven_up(world, lambda live, stamp: observed(live, robot, stamp), SPEED, seed)
+        world.advance(world.time + HORIZON)
+        end, _, _ = decoding.decode_odometry(world.odometry(10**9))
+    finally:
+        world.close()
+    driven = float(np.linalg.norm(end.position[:2] - state.position[:2]))
+    return Scene(ahead, seen[-1].observation, seen[-1].motion, driven, tuple(seen[:-1]))
+
+
+def driving_systems(robot: RobotModel) -> list[Judged]:
+    """The shipped encoder on images with and without motion stereo, as it is and as the node uses it, and lidars."""
+
+    def images(*, fallback: bool = False, stereo: bool = False) -> Callable[[], TerrainSource]:
+        return lambda: choose_terrain_source("camera", robot, fallback=fallback, motion_stereo=stereo)
+
+    def lidar(kind: str) -> Callable[[], TerrainSource]:
+        return lambda: choose_terrain_source(kind, robot)
+
+    return [
+        Judged("images, standing", images()),
+        Judged("images, driving", images(), approaches=True),
+        Judged("images, driving, motion stereo", images(stereo=True), approaches=True),
+        Judged("images, driving, as the node uses them without motion stereo", images(fallback=True), approaches=True),
+        Judged("images, driving, as the node uses them", images(fallback=True, stereo=True), approaches=True),
+        Judged("lidar → H_t", lidar("lidar")),
+        Judged("lidar interpolation [19]", lidar("lidar_interpolation")),
+    ]
+
+
+def compared_systems(checkpoints: Mapping[str, Sequence[Path]], robot: RobotModel) -> list[list[Judged]]:
+    """Systems of benchmarks/terrain.py, each with its training seeds, and lidar interpolation."""
+
+    def judged(system: System) -> Judged:
+        made = judged_source(system, robot)
+        return Judged(system.title, lambda: made)
+
+    systems = [[System(name, *LEARNED[name], file) for file in files] for name, files in checkpoints.items()]
+    return [[judged(system) for system in own] for own in (*systems, [LIDAR])]
+
+
+def predicted_after(judged: Judged, robot: RobotModel, found: Scene) -> Prediction:
+    """A scene's prediction by a source that has seen, if it does, what the robot saw on its way."""
+    predictor = Predictor(robot, judged.source(), horizon=HORIZON)
+    images = "lidar" not in predictor.source.sensors
+    for seen in found.approach if judged.approaches else ():
+        predictor.source.terrain(seen.observation, seen.motion)
+    observation = replace(found.observation, cloud=None) if images else found.observation
+    return predicted(predictor, observation, found.start)
+
+
 def counted(title: str, scenes: Sequence[Scene], driven: np.ndarray) -> dict:
     """Precision, recall and stopping position of predicted distances ``driven`` ``[training seeds, scenes]`` [m].
 
@@ -206,39 +281,47 @@ def main() -> None:
     parser.add_argument("--checkpoint", action="append", default=[], metavar="SYSTEM=FILE", help="repeat for other "
                         f"systems and training seeds; systems: {', '.join(LEARNED)}")  # fmt: skip
     parser.add_argument("--robot", default="husky", help="name or file (default: %(default)s)")
-    parser.add_argument("--quick", action="store_true", help="16 scenes instead of 80, of seeds for choosing")
-    parser.add_argument("--seed", type=int, help=f"seed of the first scene ({FIRST_SEED}; with --quick "
-                        f"{CHOOSING.first}, of those for choosing)")  # fmt: skip
+    parser.add_argument(
+        "--quick", action="store_true", help="16 scenes, of seeds for choosing, instead of 80 (24 with --driving)"
+    )
+    parser.add_argument("--driving", action="store_true", help="compare sources of a robot that drives there")
+    parser.add_argument("--seed", type=int, help=f"seed of the first scene ({FIRST_SEED}, with --driving "
+                        f"{FIRST_DRIVING_SEED}; with --quick {CHOOSING.first}, of those for choosing)")  # fmt: skip
     parser.add_argument("--json", type=Path, help="write the figures to this file")
     parser.add_argument("--png", type=Path, help="draw a stop, and what each source predicts, into this file")
     parser.add_argument("--docs", type=Path, help="write the table between the comments of this document")
     options = parser.parse_args()
-    torch.set_num_threads(2)
+    # Sources of a driving robot see many images: on a busy machine one thread is faster.
+    torch.set_num_threads(1 if options.driving else 2)
     robot = load_robot(options.robot)
-    counts = QUICK_SCENES if options.quick else SCENES
-    first = (CHOOSING.first if options.quick else FIRST_SEED) if options.seed is None else options.seed
+    counts = QUICK_SCENES if options.quick else DRIVING_SCENES if options.driving else SCENES
+    usual = FIRST_DRIVING_SEED if options.driving else FIRST_SEED
+    first = (CHOOSING.first if options.quick else usual) if options.seed is None else options.seed
+    if options.driving and options.checkpoint:
+        parser.error("--driving compares sources of the shipped encoder: leave --checkpoint out")
     try:
         checkpoints = parse_checkpoints(options.checkpoint)
         if not (options.quick and options.seed is None):
             reporting_seeds(first, 1000 * len(counts))
     except ValueError as error:
         parser.error(str(error))
-    systems = [[System(name, *LEARNED[name], file) for file in files] for name, files in checkpoints.items()]
     jobs = [(kind, first + 1000 * index + i) for index, kind in enumerate(counts) for i in range(counts[kind])]
-    scenes = [scene(*job) for job in tqdm(jobs, desc="scenes")]
+    scenes = [(driving_scene if options.driving else scene)(*job) for job in tqdm(jobs, desc="scenes")]
     pictured = min(scenes, key=lambda s: (not s.stops, abs(s.ahead.distance - 2.5)))
+    groups = (
+        [[judged] for judged in driving_systems(robot)] if options.driving else compared_systems(checkpoints, robot)
+    )
     rows, drawn = [], {}
-    for own in (*systems, [LIDAR]):
-        predictors = [Predictor(robot, judged_source(system, robot), horizon=HORIZON) for system in own]
+    for own in groups:
         title = own[0].title + (f", {len(own)} training seeds" if len(own) > 1 else "")
         driven = [
-            distance(predicted(predictor, found.observation, found.start))
-            for predictor in predictors
+            distance(predicted_after(judged, robot, found))
+            for judged in own
             for found in tqdm(scenes, desc=title, leave=False)
         ]
-        rows.append(counted(title, scenes, np.array(driven).reshape(len(predictors), len(scenes))))
+        rows.append(counted(title, scenes, np.array(driven).reshape(len(own), len(scenes))))
         if options.png:
-            drawn[own[0].title] = predicted(predictors[0], pictured.observation, pictured.start)
+            drawn[own[0].title] = predicted_after(own[0], robot, pictured)
     text = table(rows)
     print(text)
     entry = described_use([seed for _, seed in jobs], checkpoints) | {"robot": options.robot}
@@ -255,7 +338,8 @@ def main() -> None:
         options.png.parent.mkdir(parents=True, exist_ok=True)
         draw(pictured, drawn).savefig(options.png, dpi=130)
     if options.docs:
-        write_between(options.docs, "walls of any texture", text)
+        marker = "walls while driving" if options.driving else "walls of any texture"
+        write_between(options.docs, marker, text)
 
 
 if __name__ == "__main__":

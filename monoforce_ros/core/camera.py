@@ -86,6 +86,14 @@ class CameraModel:
         """Whether any distortion coefficient differs from zero."""
         return bool(np.any(self.distortion != 0.0))
 
+    def same(self, other: CameraModel) -> bool:
+        """Whether another calibration has the same values."""
+        return (
+            (self.width, self.height, self.distortion_model) == (other.width, other.height, other.distortion_model)
+            and np.array_equal(self.matrix, other.matrix)
+            and np.array_equal(self.distortion, other.distortion)
+        )
+
     def check(self) -> None:
         """Raise ``ValueError`` if no lens has these values.
 

@@ -61,7 +61,7 @@ class _FormerOption(argparse.Action):
         setattr(namespace, self.dest, values)
 
 
-_OF_CAMERAS = ("retention_time", "images")
+_OF_CAMERAS = ("retention_time", "images", "motion_stereo")
 
 
 def _parser() -> OptionParser:
@@ -90,6 +90,12 @@ def _parser() -> OptionParser:
     )
     parser.add_argument("--memory", type=float, dest="retention_time", action=_FormerOption, help=argparse.SUPPRESS)
     parser.add_argument("--images", nargs="+", default=None, metavar="TOPIC", help="image topics (default: all)")
+    parser.add_argument(
+        "--motion-stereo",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="add what images of the moving camera show to stand on the ground (default: yes, as in the node)",
+    )
     add_read_options(parser)
     parser.add_argument("--horizons", nargs="+", type=float, default=[1.0, 2.0, 5.0], metavar="S",
                         help="times at which errors are reported [s] (default: 1 2 5)")  # fmt: skip
@@ -187,6 +193,7 @@ def run(options: argparse.Namespace) -> None:
         checkpoint=options.checkpoint,
         retention_time=options.retention_time,
         lidar_retention_time=LIDAR_RETENTION_TIME,
+        motion_stereo=options.motion_stereo,
         fallback=True,
         warn=lambda message: print(f"warning: {message}", file=sys.stderr),
     )

@@ -225,6 +225,7 @@ class PredictorNode(ManagedNode):
             threads=min(settings.encoder_threads, os.cpu_count() or 1),
             retention_time=settings.camera_retention_time,
             lidar_retention_time=settings.lidar_retention_time,
+            motion_stereo=settings.motion_stereo,
             fallback=settings.camera_fallback,
             warn=self.get_logger().warning,
         )

@@ -7,6 +7,7 @@ from monoforce_ros.perception.fusion import LidarCameraTerrain
 from monoforce_ros.perception.ground_alignment import ground_around, support_points
 from monoforce_ros.perception.lidar import LidarTerrain
 from monoforce_ros.perception.observation import Observation, TerrainSource
+from monoforce_ros.perception.seen_obstacles import SeenObstacles
 from monoforce_ros.perception.sources import (
     CAMERA_SOURCES,
     LIDAR_RETENTION_TIME,
@@ -27,6 +28,7 @@ __all__ = [
     "LidarCameraTerrain",
     "LidarTerrain",
     "Observation",
+    "SeenObstacles",
     "TerrainSource",
     "TerrainTrust",
     "TrustReport",

@@ -32,13 +32,20 @@ def apply_compliance(lidar: TerrainMap, camera: TerrainMap) -> TerrainMap:
         camera: map from an encoder, on the same grid.
     """
     compliance, share = _compliance(camera)
-    # A surface far above the predicted one is another object, which the encoder has not recognised.
-    above = (lidar.height - camera.height).clamp_min(0.0)
-    height = lidar.height - share * torch.minimum(above, compliance + _HEIGHT_TOLERANCE)
+    height = lowered_where_compliant(lidar.height, camera, camera.height)
     surfaces = replace(
         material_by_compliance(lidar, camera), height=height, geometric_height=height + share * compliance
     )
     return replace(surfaces, observed=lidar.observed | camera.observed)
+
+
+def lowered_where_compliant(surface: Tensor, predicted: TerrainMap, ground: Tensor) -> Tensor:
+    """A measured surface ``[rows, columns]`` [m], lowered to the supporting ground, shaped like it, where a predicted
+    map says that it is compliant (H_d)."""
+    compliance, share = _compliance(predicted)
+    # A surface far above the predicted one is another object, which the encoder has not recognised.
+    above = (surface - ground).clamp_min(0.0)
+    return surface - share * torch.minimum(above, compliance + _HEIGHT_TOLERANCE)
 
 
 def material_by_compliance(rigid: TerrainMap, predicted: TerrainMap) -> TerrainMap:

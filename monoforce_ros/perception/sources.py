@@ -11,6 +11,7 @@ from monoforce_ros.perception.flat import FlatTerrain
 from monoforce_ros.perception.fusion import LidarCameraTerrain
 from monoforce_ros.perception.lidar import LidarTerrain
 from monoforce_ros.perception.observation import TerrainSource
+from monoforce_ros.perception.seen_obstacles import ObstacleTerrain, SeenObstacles
 from monoforce_ros.perception.temporal_memory import TemporalMemory
 from monoforce_ros.perception.trusted_terrain import TrustedTerrain
 from monoforce_ros.robots import RobotModel
@@ -37,6 +38,7 @@ def choose_terrain_source(
     threads: int | None = None,
     retention_time: float = 0.0,
     lidar_retention_time: float = 0.0,
+    motion_stereo: bool = False,
     fallback: bool = False,
     warn: Callable[[str], None] = lambda message: None,
 ) -> TerrainSource:
@@ -57,6 +59,8 @@ def choose_terrain_source(
         retention_time: how long terrain seen by cameras is kept after it leaves the images [s]; 0 disables it.
         lidar_retention_time: how long terrain measured by the lidar is kept after it comes so near that the lidar looks
             over it [s]; 0 disables it.
+        motion_stereo: whether sources with cameras add what images from several places show to stand on the ground, as
+            long as no lidar measures it; see :class:`monoforce_ros.perception.SeenObstacles`.
         warn: called with the reason if the source ``lidar`` only interpolates.
 
     Raises:
@@ -104,6 +108,7 @@ def choose_terrain_source(
     learned: TerrainSource = own
     if retention_time and "camera" in sensors:
         learned = TemporalMemory(learned, robot, stiffness=own.stiffness, retention_time=retention_time)
+    obstacles = SeenObstacles(robot, own.stiffness, own_grid) if motion_stereo and "camera" in kind else None
     level, lidar = FlatTerrain(robot, learned.grid, material), LidarTerrain(robot, learned.grid, material)
     if kind == "lidar_camera" and "lidar" not in sensors:
         learned = LidarCameraTerrain(lidar, learned)
@@ -113,11 +118,12 @@ def choose_terrain_source(
         if kind == "lidar":
             return TrustedTerrain(learned, own, [lidar], expected=1.0, memory=recall)
         if kind == "camera":
-            return TrustedTerrain(learned, own, [level])
+            return TrustedTerrain(learned, own, [level], obstacles=obstacles)
         without_images: TerrainSource = lidar
         if "lidar" in sensors:
             # What images say has to be confirmed; what the encoder makes of the sweep is there from the start.
             sweep = EncoderTerrain(encoder, robot, ("lidar",), threads=threads, material=material)
             without_images = TrustedTerrain(sweep, sweep, [lidar], expected=1.0)
-        return TrustedTerrain(learned, own, [without_images, level], memory=recall)
-    return recall or learned
+        return TrustedTerrain(learned, own, [without_images, level], memory=recall, obstacles=obstacles)
+    learned = recall or learned
+    return learned if obstacles is None else ObstacleTerrain(learned, obstacles)

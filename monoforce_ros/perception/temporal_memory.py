@@ -100,7 +100,7 @@ class TemporalMemory:
             swept: whether a lidar's sweep was part of it, without which a memory of the blind zone learns nothing.
         """
         recalibrated = any(
-            not _equal(camera, self._cameras.get(name, camera)) for name, camera in observation.cameras.items()
+            not camera.same(self._cameras.get(name, camera)) for name, camera in observation.cameras.items()
         )
         self._cameras |= observation.cameras
         # A wrong calibration put earlier observations in the wrong place.
@@ -151,15 +151,6 @@ class TemporalMemory:
         points = usable_returns(observation.cloud, posed, motion, support, now.grid)
         _, hit = cell_heights(points, now.grid, replace(LidarSettings(), headroom=self._robot.headroom))
         return now.observed & torch.from_numpy(hit)
-
-
-def _equal(camera: CameraModel, other: CameraModel) -> bool:
-    """Whether two calibrations are equal."""
-    return (
-        (camera.width, camera.height, camera.distortion_model) == (other.width, other.height, other.distortion_model)
-        and np.array_equal(camera.matrix, other.matrix)
-        and np.array_equal(camera.distortion, other.distortion)
-    )
 
 
 class _Memory:

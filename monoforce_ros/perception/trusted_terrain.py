@@ -15,6 +15,7 @@ from monoforce_ros.perception.encoder_terrain import EncoderTerrain
 from monoforce_ros.perception.ground_alignment import standing
 from monoforce_ros.perception.lidar import usable_returns
 from monoforce_ros.perception.observation import Observation, TerrainSource, used_sensors
+from monoforce_ros.perception.seen_obstacles import SeenObstacles
 from monoforce_ros.perception.temporal_memory import TemporalMemory
 from monoforce_ros.perception.trust import BLOCK, FEWEST_BLOCKS, TerrainTrust, TrustReport
 from monoforce_ros.terrain import Grid, LidarSettings, TerrainError, TerrainMap, cell_heights
@@ -38,6 +39,7 @@ class TrustedTerrain:
             enough.
         expected: see :class:`TerrainTrust`.
         memory: of earlier observations, which fill the map that results.
+        obstacles: what images from several places show to stand on the ground, for maps without a sweep.
     """
 
     def __init__(
@@ -47,11 +49,12 @@ class TrustedTerrain:
         fallbacks: Sequence[TerrainSource],
         expected: float = 0.0,
         memory: TemporalMemory | None = None,
+        obstacles: SeenObstacles | None = None,
     ):
         self.source = source
         """Source of the encoder's maps."""
         self._encoder, self._fallbacks, self._memory = encoder, tuple(fallbacks), memory
-        self._expected = expected
+        self._expected, self._obstacles = expected, obstacles
         self._trusts: dict[tuple[str, ...], TerrainTrust] = {}
         """By the sensors that an observation had."""
         self.report: TrustReport | None = None
@@ -107,6 +110,11 @@ class TrustedTerrain:
         used = blended(other, predicted, report.share, report.spread_factor)
         if not (report.trusted or other.spreads):
             used = _with_measured_error(used, report)
+        if self._obstacles is not None and swept:
+            self._obstacles.follow(observation, motion)
+        elif self._obstacles is not None:
+            # What looks soft need not be confirmed: it only takes back what stereo adds, to which hedges are walls.
+            used = self._obstacles.added(used, predicted, observation, motion)
         return used if self._memory is None else self._memory.recalled(used, observation, motion, swept=swept)
 
     def _measured(self, observation: Observation, motion: MotionState) -> np.ndarray | None:
