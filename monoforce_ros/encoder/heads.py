@@ -48,8 +48,8 @@ _CARRIED = 4.0, 10.0
 _SUPPORTED = 0.4, 1.0
 """Distances from a return up to which bands are as narrow as a sweep's, and from which on they are those of images [m].
 With sweeps of all directions and of a sector (11 worlds for choosing), a sweep's bands hold 89 to 98 % of the cells
-within half a metre (83 % just beyond the last ring of one that ends at 3 m), 85 to 89 % up to a metre, and 80 to 87 %
-from there on, where the worst scenes ask for twice as wide ones."""
+within half a metre (83 % just beyond the last ring of one that ends at 3 m), 85 to 89 % up to a metre, and 80 to 87
+% from there on, where the worst scenes ask for twice as wide ones."""
 _AT_THE_WHEELS = 0.999
 """Weight of the plane under the wheels above which the ground is that one, up to 1 m from the robot."""
 _PLANE, _PLANE_REACH, _FEWEST_CELLS, _LEAST_SPREAD = 0.04, 3, 8, 0.5
