@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from monoforce_ros.core import CommandTrack
 from monoforce_ros.discrepancy.evidence import COMPONENTS, EvidenceWindows, subsampled, window_starts
-from monoforce_ros.discrepancy.fit import fit_effects, flat, jacobian, robust
+from monoforce_ros.discrepancy.fit import fit_effects, flat, jacobian, robust, scales
 from monoforce_ros.discrepancy.hypothesis import Predictions, residuals_by_part
 from monoforce_ros.discrepancy.left_out import values_without_parts
 from monoforce_ros.discrepancy.selection import Search
@@ -57,7 +57,8 @@ def test_one_step_equals_a_new_fit_without_the_part(effects):
     folds = folds_of(data.starts, FOLDS)
     ends = folds_of(np.r_[data.starts[0], data.starts + 2_000_000_000], FOLDS)[1:]
     fit = fit_effects(Predictions(husky, data), [effects], SCALE)
-    found = values_without_parts(fit, folds, ends, FOLDS, np.full(len(flat(effects)), np.nan))
+    unchanged = np.full(len(flat(effects)), np.nan)
+    found = values_without_parts(fit, folds, ends, FOLDS, unchanged, scales(fit.effects, husky))
     moved = []
     for part in range(FOLDS):
         kept = (folds != part) & (ends != part)
@@ -78,7 +79,7 @@ def test_leaving_out_a_part_does_not_continue_a_fit_that_ended_early():
     residual = predictions.residuals([early])[0] / SCALE
     derivatives = jacobian(predictions, early, residual, SCALE, 0).reshape(1, *residual.shape)
     ended = replace(fit_effects(predictions, [early], SCALE), effects=early, residual=residual, derivatives=derivatives)
-    found = values_without_parts(ended, folds, folds, FOLDS, np.full(1, np.nan))
+    found = values_without_parts(ended, folds, folds, FOLDS, np.full(1, np.nan), scales(ended.effects, husky))
     moves = np.array([float(flat(effects)[0]) for effects in found]) - 0.75
     assert np.abs(moves).max() > 0.0 and np.abs(moves.mean()) < 0.3 * 0.05
 
