@@ -12,7 +12,7 @@ import numpy as np
 from monoforce_ros.core import NANOSECOND, CameraModel, MotionState
 from monoforce_ros.perception.epipolar import EpipolarPair, PinholeImage, pinhole_image
 from monoforce_ros.perception.observation import Observation
-from monoforce_ros.perception.relative_pose import RelativePose, refined
+from monoforce_ros.perception.relative_pose import GREY_NOISE, RelativePose, refined
 from monoforce_ros.perception.trace import continues
 
 BASELINES = (0.5, 1.0)
@@ -36,8 +36,6 @@ _UNIQUE = 10
 """By how many percent the second best displacement has to be worse."""
 _MATCHING_ERROR = 0.2
 """Standard deviation of where a window with plenty of texture is found in the other image [px]."""
-_NOISE = 3.0
-"""Standard deviation of a grey level: of the camera, and of JPEG."""
 _SUPPORT = 6.0
 """Windows whose texture tells a displacement: besides its own those before it on the matcher's five paths."""
 _AGREEING = 3.0
@@ -110,7 +108,7 @@ def matched(
     # where cells are smaller than pixels they repeat each other.
     slope = cv2.Sobel(pair.images[0], cv2.CV_32F, 1, 0, ksize=3, scale=1.0 / 8.0)
     energy = cv2.boxFilter(slope**2, -1, (_WINDOW, _WINDOW), normalize=False)[rows, columns] * np.minimum(1.0, pixels)
-    doubt = 2.0 * (_NOISE * pair.step * sine) ** 2 / np.maximum(_SUPPORT * energy, 1e-6)
+    doubt = 2.0 * (GREY_NOISE * pair.step * sine) ** 2 / np.maximum(_SUPPORT * energy, 1e-6)
     ranges, change = pair.ranges(columns, displacement)
     turned = corrected.rotation_error**2 + (corrected.direction_error * pair.baseline / np.maximum(ranges, 0.1)) ** 2
     errors = change * np.sqrt((_MATCHING_ERROR * newest.pixel) ** 2 + doubt + turned)

@@ -47,6 +47,32 @@ class TerrainSource(Protocol):
         """Map in the terrain frame (origin at the robot, x along its heading, z up)."""
 
 
+class DerivedTerrain:
+    """Maps made of those of another source: its sensors and its grid.
+
+    Args:
+        source: the other source.
+    """
+
+    def __init__(self, source: TerrainSource):
+        self._source = source
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Sensors of the source."""
+        return self._source.sensors
+
+    @property
+    def used(self) -> tuple[str, ...] | None:
+        """Sensors of which the source made its last map, if it says so."""
+        return getattr(self._source, "used", None)
+
+    @property
+    def grid(self) -> Grid:
+        """Grid of the source."""
+        return self._source.grid
+
+
 def used_sensors(source: TerrainSource, observation: Observation) -> tuple[str, ...]:
     """Sensors of which a source made its last map: those that it says (``used``), else all that had measured.
 

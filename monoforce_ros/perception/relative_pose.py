@@ -10,11 +10,11 @@ import numpy as np
 
 from monoforce_ros.perception.epipolar import EpipolarPair
 
-MATCHING_ERROR = 0.35
-"""Standard deviation of where a corner or a window is found in the other image [px]; see docs/training.md."""
+_MATCHING_ERROR = 0.35
+"""Standard deviation of where a corner is found in the other image [px]; see docs/training.md."""
 GREY_NOISE = 3.0
 """Standard deviation of a grey level: of the camera, and of JPEG."""
-ROTATION_ERROR, DIRECTION_ERROR = 0.01, 0.017
+_ROTATION_ERROR, _DIRECTION_ERROR = 0.01, 0.017
 """Standard deviations of what odometry says of the rotation between two images, about each axis [rad], and of the
 direction of the translation [rad]: half a degree for each of two noisy attitudes, and a centimetre or two across a
 baseline of three or four decimetres."""
@@ -90,9 +90,9 @@ def refined(pair: EpipolarPair, expected: np.ndarray) -> RelativePose | None:
         [-cot_earlier * cosine, -cot_earlier * sine, np.ones_like(sine), -nearness * sine, nearness * cosine], axis=1
     )
     error = np.hypot(
-        MATCHING_ERROR * pair.newest.pixel / np.sin(phi_earlier), pair.step * _doubt(pair.images[0], start)
+        _MATCHING_ERROR * pair.newest.pixel / np.sin(phi_earlier), pair.step * _doubt(pair.images[0], start)
     )
-    prior = np.diag([ROTATION_ERROR**-2] * 3 + [DIRECTION_ERROR**-2] * 2)
+    prior = np.diag([_ROTATION_ERROR**-2] * 3 + [_DIRECTION_ERROR**-2] * 2)
     unknowns, scale = np.zeros(5), 4.0
     for _ in range(_ITERATIONS):
         off = (offset - moves @ unknowns) / error

@@ -13,7 +13,7 @@ from monoforce_ros.perception.clearance import clear_of_robot
 from monoforce_ros.perception.fusion import lowered_where_compliant
 from monoforce_ros.perception.ground_alignment import standing
 from monoforce_ros.perception.motion_stereo import MeasuredPoints, MotionStereo
-from monoforce_ros.perception.observation import Observation, TerrainSource, used_sensors
+from monoforce_ros.perception.observation import DerivedTerrain, Observation, TerrainSource, used_sensors
 from monoforce_ros.perception.obstacle_memory import ObstacleMemory
 from monoforce_ros.perception.standing_points import standing_on
 from monoforce_ros.perception.trace import continues
@@ -41,7 +41,7 @@ class SeenObstacles:
         self._stereo, self._memory = MotionStereo(), ObstacleMemory(grid)
         self._previous: MotionState | None = None
         self.measured: list[MeasuredPoints] = []
-        """Points that the last images told, of each camera."""
+        """Points measured in the last images, of each camera."""
 
     def follow(self, observation: Observation, motion: MotionState) -> None:
         """Keep the images of an observation for later ones."""
@@ -94,26 +94,12 @@ def _beside(predicted: TerrainMap) -> TerrainMap:
     return replace(predicted, geometric_height=predicted.height + largest)
 
 
-class ObstacleTerrain:
+class ObstacleTerrain(DerivedTerrain):
     """A source of maps of images, with :class:`SeenObstacles`."""
 
     def __init__(self, source: TerrainSource, obstacles: SeenObstacles):
-        self._source, self._obstacles = source, obstacles
-
-    @property
-    def sensors(self) -> tuple[str, ...]:
-        """Sensors of the source."""
-        return self._source.sensors
-
-    @property
-    def used(self) -> tuple[str, ...] | None:
-        """Sensors of which the source made its last map, if it says so."""
-        return getattr(self._source, "used", None)
-
-    @property
-    def grid(self) -> Grid:
-        """Grid of the source."""
-        return self._source.grid
+        super().__init__(source)
+        self._obstacles = obstacles
 
     def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
         """The source's map with what stands on the ground, unless a lidar measured it; raises the source's errors."""

@@ -11,7 +11,7 @@ from monoforce_ros.core import NANOSECOND, CameraModel, MotionState
 from monoforce_ros.perception.clearance import clear_of_robot
 from monoforce_ros.perception.ground_alignment import align_to_ground, standing
 from monoforce_ros.perception.lidar import usable_returns
-from monoforce_ros.perception.observation import Observation, TerrainSource, used_sensors
+from monoforce_ros.perception.observation import DerivedTerrain, Observation, TerrainSource, used_sensors
 from monoforce_ros.perception.trace import continues
 from monoforce_ros.robots import RobotModel, is_lidar
 from monoforce_ros.terrain import CHANNELS, Grid, LidarSettings, TerrainMap, cell_heights, interpolated
@@ -25,7 +25,7 @@ _KEPT_WITHIN, _OBSTACLE_HEIGHT = 2.0, 0.25
 sees only a part of a wall does not recognise it."""
 
 
-class TemporalMemory:
+class TemporalMemory(DerivedTerrain):
     """A terrain source that adds earlier observations, moved along by odometry, to the current map.
 
     A forward-looking camera sees neither the ground under the robot's front nor a wall that the robot has just turned
@@ -59,7 +59,8 @@ class TemporalMemory:
                 f"temporal memory: got a retention time of {retention_time} s and a distance of {retention_distance} "
                 "m, expected more than 0"
             )
-        self._source, self._robot, self._stiffness = source, robot, stiffness
+        super().__init__(source)
+        self._robot, self._stiffness = robot, stiffness
         self._retention_time, self._retention_distance = retention_time, retention_distance
         self._blind_zone_only = blind_zone_only
         mounted = [float(pose[2, 3]) for name, pose in robot.sensors.items() if is_lidar(name)]
@@ -68,21 +69,6 @@ class TemporalMemory:
         self._memory = _Memory(source.grid)
         self._previous: MotionState | None = None
         self._cameras: dict[str, CameraModel] = {}
-
-    @property
-    def sensors(self) -> tuple[str, ...]:
-        """Sensors of the source."""
-        return self._source.sensors
-
-    @property
-    def used(self) -> tuple[str, ...] | None:
-        """Sensors of which the source made its last map, if it says so."""
-        return getattr(self._source, "used", None)
-
-    @property
-    def grid(self) -> Grid:
-        """Grid of the source."""
-        return self._source.grid
 
     def terrain(self, observation: Observation, motion: MotionState) -> TerrainMap:
         """The source's current map with earlier observations; raises the source's errors."""

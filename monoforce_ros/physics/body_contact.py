@@ -45,7 +45,7 @@ class BodyContact:
     friction_factors: Tensor
     """As of :class:`Problem`, ``[B, 2, 3 or 4]``."""
     drive_loads: Tensor
-    """Load of each drive beside that of the robot's file; the last entry is the hull, at zero, ``[B, D + 1]`` [-]."""
+    """Load of each point's drive beside that of the robot's file, 0 on the hull, ``[B, N]`` [-]."""
     ground_factors: Tensor
     """Divisor of the ground's stiffness and damping, and vegetation drag [N s/m⁴], ``[B, 2]``."""
     rolling_resistance: Tensor
@@ -73,7 +73,9 @@ class BodyContact:
             speeds=torch.cat([problem.drive_speeds, torch.zeros_like(problem.drive_speeds[..., :1])], dim=-1),
             drives=problem.point_drives,
             friction_factors=problem.friction_factors,
-            drive_loads=torch.cat([problem.drive_loads, torch.zeros_like(problem.drive_loads[:, :1])], dim=-1),
+            drive_loads=torch.cat([problem.drive_loads, torch.zeros_like(problem.drive_loads[:, :1])], dim=-1)[
+                :, problem.point_drives
+            ],
             ground_factors=problem.ground_factors,
             rolling_resistance=rolling,
             yield_speed=yield_speed,
@@ -99,6 +101,7 @@ class BodyContact:
             areas=self.areas[chosen],
             weights=self.weights[:, chosen],
             drives=self.drives[chosen],
+            drive_loads=self.drive_loads[:, chosen],
             soil=self.soil and self.soil.part(chosen),
         )
 
@@ -142,7 +145,7 @@ class BodyContact:
             self.masses,
             self.weights,
             self.friction_factors,
-            self.drive_loads[:, self.drives],
+            self.drive_loads,
             self.ground_factors,
             self.rolling_resistance,
             self.yield_speed,

@@ -121,7 +121,7 @@ class _System:
             body.masses,
             body.weights,
             body.friction_factors,
-            body.drive_loads[:, body.drives],
+            body.drive_loads,
             body.ground_factors,
             body.rolling_resistance,
             body.yield_speed,
