@@ -33,7 +33,7 @@ from monoforce_ros.discrepancy import (
     diagnose,
     diagnose_bag,
 )
-from monoforce_ros.discrepancy import diagnosis as diagnosis_module
+from monoforce_ros.discrepancy import conclusion as conclusion_module
 from monoforce_ros.discrepancy.clocks import compare_with_gyro
 from monoforce_ros.discrepancy.comparison import GapRow, compare, gets_worse
 from monoforce_ros.discrepancy.evidence import EvidenceWindows, subsampled, window_starts
@@ -302,7 +302,7 @@ def test_what_does_not_improve_held_out_windows_is_not_added(husky, monkeypatch,
         compared = compare(*arguments, **named)
         return [c if c.after is None else replace(c, after=1.1 * c.before) for c in compared]
 
-    monkeypatch.setattr(diagnosis_module, "compare", useless)
+    monkeypatch.setattr(conclusion_module, "compare", useless)
     motion, commands = simulated_recording(husky, (injected,), seconds=40.0)
     smoothed = SmoothedMotion(motion, 0.003, 0.002, (slice(0, len(motion)),))
     diagnosis = diagnose(Evidence(smoothed, commands), husky, settings=DiagnosisSettings(max_effects=1))
@@ -326,7 +326,7 @@ def test_an_effect_that_predicts_nothing_is_no_discrepancy_where_errors_are_a_he
         compared = compare(*arguments, **named)
         return [c if c.after is None else replace(c, after=1.1 * c.before) for c in compared]
 
-    monkeypatch.setattr(diagnosis_module, "compare", useless)
+    monkeypatch.setattr(conclusion_module, "compare", useless)
     motion, commands = simulated_recording(husky, (("drive_gain", {"gain": 0.97}),), seconds=40.0)
     evidence = Evidence(SmoothedMotion(motion, 0.003, 0.002, (slice(0, len(motion)),)), commands)
     settings = DiagnosisSettings(max_effects=1)
@@ -354,7 +354,7 @@ def test_what_does_not_help_in_windows_that_no_search_saw_is_not_added(husky, mo
         compared.append(found)
         return found if len(compared) == 1 else [replace(c, after=factor * c.before) for c in found]
 
-    monkeypatch.setattr(diagnosis_module, "compare", worse_when_repeated)
+    monkeypatch.setattr(conclusion_module, "compare", worse_when_repeated)
     motion, commands = simulated_recording(husky, (("drive_gain", {"gain": 0.8}),), seconds=40.0)
     smoothed = SmoothedMotion(motion, 0.003, 0.002, (slice(0, len(motion)),))
     diagnosis = diagnose(Evidence(smoothed, commands), husky, settings=DiagnosisSettings(max_effects=1))

@@ -97,6 +97,7 @@ def driven(robot, terrain=None, factor=1.0):
         ("yaw_rate_limit", {"limit": 0.5}, 0.03),
         ("acceleration_limit", {"limit": 0.7}, 0.05),
         ("yaw_acceleration_limit", {"limit": 0.9}, 0.05),
+        ("drive_torque_limit", {"acceleration": 0.9, "scrub": 0.4}, 0.05),
         ("drive_loss", {"loss": -0.25}, 0.05),
         ("drive_droop", {"loss": 0.15, "recovery": 2.0}, 0.12),
         ("supply_sag", {"sag": 0.3}, 0.08),
@@ -148,6 +149,25 @@ def test_commissioning_knows_the_ramps_of_a_base_and_takes_them_for_no_dead_time
     assert found["command_delay"]["delay"] == pytest.approx(0.08, abs=0.03)
     without = commissioned(replace(load_robot("husky"), effects=(("command_delay", {"delay": 0.08}),)), [None])
     assert not {name for name, _ in ramps} & set(without)
+
+
+def test_commissioning_knows_motors_of_a_largest_torque_and_takes_them_for_no_slippery_ground():
+    torque = {"acceleration": 1.6, "scrub": 0.4}
+    found = commissioned(replace(load_robot("husky"), effects=(("drive_torque_limit", torque),)), [None])
+    assert {key: found["drive_torque_limit"][key] for key in torque} == pytest.approx(torque, rel=0.1)
+    assert found["friction_scale"]["factor"] == pytest.approx(1.0, abs=0.2)
+    assert not {"acceleration_limit", "yaw_acceleration_limit"} & set(found)
+
+
+def test_a_fit_goes_on_where_limits_hardly_act():
+    """They have hardly a derivative, and steps as long as the bounds allow: with limits of 0.05 m/s² nothing moves."""
+    husky = load_robot("husky")
+    limits = {"acceleration_limit": (0.8, 6.0), "yaw_acceleration_limit": (1.0, 8.0)}
+    data = driven(replace(husky, effects=tuple((name, {"limit": true}) for name, (true, _) in limits.items())))
+    start = (*commissioning.COMMISSIONED, *((name, {"limit": first}) for name, (_, first) in limits.items()))
+    fit = fit_effects(Predictions(husky, data), [start], SCALE, iterations=12, prior=0.02)
+    for name, (true, _) in limits.items():
+        assert dict(fit.effects)[name]["limit"] == pytest.approx(true, rel=0.05)
 
 
 @pytest.mark.parametrize("further", [(), (("drive_loss", {"loss": 0.05}),)])

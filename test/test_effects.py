@@ -120,6 +120,7 @@ ALL_STAGES = {
     "supply_sag": {"sag": 0.25},
     "supply_drain": {"drain": 0.3, "time": 40.0},
     "drive_droop": {"loss": 0.06, "recovery": 0.8},
+    "drive_torque_limit": {"acceleration": 0.19, "scrub": 0.35},
     "acceleration_limit": {"limit": 0.13},
     "yaw_acceleration_limit": {"limit": 0.21},
 }

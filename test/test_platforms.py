@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import run as platforms_run
 import uncovered_changes
+import yaml
 from benchmark_case import SETS, Case, all_cases
 from benchmark_score import closed_share, covered, found_all, healthy_errors, scores, true_value
 from case_recording import CaseFiles, displacement, hidden_job, record_platform, record_together
@@ -34,7 +35,7 @@ from monoforce_ros.bags import Recording
 from monoforce_ros.core import CommandTrack, MotionTrack
 from monoforce_ros.discrepancy.evidence import EvidenceWindows
 from monoforce_ros.robots import load_robot
-from monoforce_ros.terrain import load_terrain
+from monoforce_ros.terrain import TerrainDefaults, load_terrain
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -363,6 +364,18 @@ def test_a_platform_that_tips_over_is_commissioned_on_another_drive(tmp_path):
     record_together([[empty]], tmp_path, simulate_in_turn)
     assert CaseFiles.of(empty, tmp_path).commissioning.exists()
     assert len(set(driven)) == len(driven) == 3, "each attempt has commands of its own"
+
+
+def test_motors_of_a_largest_torque_are_no_slippery_ground_in_the_other_engine(tmp_path):
+    """Stiff servos with heavy rotors reach their torque at every step: half the friction stood in for their ramps."""
+    case = next(case for case in all_cases("choosing") if case.platform_name == "mujoco-level-1000")
+    record_platform([case], tmp_path)
+    commission_platform(case, tmp_path, Judged(ROOT, tmp_path / "results" / "label", "", 300.0))
+    file = tmp_path / "results" / "label" / "nominal" / case.platform_name / "platform.yaml"
+    found = {effect["name"]: effect["parameters"] for effect in yaml.safe_load(file.read_text())["effects"]}
+    friction = found["friction_scale"]["factor"]["value"] * TerrainDefaults().friction
+    assert friction == pytest.approx(draw_platform(1000).friction, rel=0.25)
+    assert "drive_torque_limit" in found and "acceleration_limit" not in found
 
 
 def test_the_true_effect_explains_most_of_what_it_does_in_the_other_engine(tmp_path):

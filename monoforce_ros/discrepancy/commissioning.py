@@ -42,7 +42,7 @@ from monoforce_ros.discrepancy.terrain_evidence import terrain_uncertainty
 from monoforce_ros.discrepancy.thresholds import Thresholds
 from monoforce_ros.discrepancy.trial import blocks_of
 from monoforce_ros.discrepancy.wheels import WheelFinding, best_of, changed_drives, compare_with_wheels
-from monoforce_ros.effects import CATALOGUE, Effect, identifiable_effects
+from monoforce_ros.effects import CATALOGUE, identifiable_effects
 from monoforce_ros.robots import RobotModel
 
 
@@ -60,8 +60,17 @@ COMMISSIONED_IN_VEGETATION = _commissioned("vegetation")
 """Effects that every robot needs in addition where a recording leads through vegetation."""
 _FEW_ITERATIONS = 4
 """Of a fit that begins at that of all effects but one: from there it has not far to go."""
-_OFTEN = {effect.name: effect.often_commissioned for effect in CATALOGUE.values() if effect.often_commissioned}
-"""Effects that many robots have, with the values at which a second fit starts."""
+
+
+def _often(*, of_base: bool) -> dict[str, Mapping[str, float]]:
+    listed = (effect for effect in CATALOGUE.values() if effect.often_commissioned and effect.of_base == of_base)
+    return {effect.name: effect.often_commissioned for effect in listed}
+
+
+_OFTEN_OF_BASE = _often(of_base=True)
+"""What many base controllers do, with the values at which a second fit starts."""
+_OFTEN_OF_MOTORS = _often(of_base=False)
+"""What many motors do, with the values at which a third fit starts."""
 _VEGETATION = frozenset(name for name, _ in COMMISSIONED_IN_VEGETATION)
 _FEWEST_SEGMENTS = 3
 """As many as parts: of two the variance between segments would have one degree of freedom."""
@@ -193,32 +202,48 @@ def _fitted(entry: _Prepared, effects: Effects, iterations: int = 12) -> Fit:
 def _started(entry: _Prepared, chosen: Effects, wheels: WheelFinding | None) -> Fit:
     """The fit of what every robot has, and of what else the drives do where that explains more.
 
-    Ramps of a base look like a long dead time to a fit that begins without them, and nothing leads away from there:
-    the fit begins also at what the wheels show, or with the ramps of many robots where no wheel speeds were measured.
+    Ramps of a base look like a long dead time to a fit that begins without them, those of motors like slippery ground,
+    and nothing leads away from there. The fit begins also at what the wheels show, or with the ramps of many bases if
+    no wheel speeds were measured, and with motors that reach their largest torque, without such ramps and beside them.
     """
-    fit = _fitted(entry, chosen)
-    shown = _OFTEN if wheels is None else dict(wheels.effects)
+    best = _fitted(entry, chosen)
+    found = _OFTEN_OF_BASE if wheels is None else dict(wheels.effects)
+    best = _better(entry, best, _beginning(entry, chosen, found))
+    own = {name: values for name, values in best.effects if name not in dict(chosen)}
+    motors = {
+        name: values for name, values in _OFTEN_OF_MOTORS.items() if CATALOGUE[name].applies_to(entry.predictions.robot)
+    }
+    for beside in ({}, own) if own else ({},):
+        best = _better(entry, best, _beginning(entry, chosen, {**beside, **motors}))
+    return best
+
+
+def _beginning(entry: _Prepared, chosen: Effects, shown: Mapping[str, Mapping[str, float]]) -> Fit | None:
+    """The fit that begins with further effects, without those that are not worth their parameters; None without any."""
     if not shown:
-        return fit
+        return None
     beginning = tuple((name, {**values, **shown.get(name, {})}) for name, values in chosen)
     others = tuple((name, values) for name, values in shown.items() if name not in dict(chosen))
-    other = _fitted(entry, (*beginning, *others))
+    fit = _fitted(entry, (*beginning, *others))
     for name, _ in others:
-        fewer = _fitted(entry, without(other.effects, name), _FEW_ITERATIONS)
-        if not _worth(entry, float(fewer.loss.mean()) - float(other.loss.mean()), CATALOGUE[name]):
-            # Such as a droop of 0 m/s, or a ramp that a lag does as well.
-            other = fewer
-    extra = [CATALOGUE[name] for name, _ in other.effects if name not in dict(chosen)]
-    return other if _worth(entry, float(fit.loss.mean()) - float(other.loss.mean()), *extra) else fit
+        # Such as a droop of 0 m/s, or a ramp that a lag does as well.
+        fit = _better(entry, _fitted(entry, without(fit.effects, name), _FEW_ITERATIONS), fit)
+    return fit
 
 
-def _worth(entry: _Prepared, gain: float, *effects: Effect) -> bool:
-    """Whether a gain of the mean loss is worth the parameters of some effects.
-
-    A parameter is worth a log likelihood of half the logarithm of the number of independent blocks (Schwarz 1978).
-    """
+def _better(entry: _Prepared, fewer: Fit, more: Fit | None) -> Fit:
+    """One of two fits: the second one where its effects beyond those of the first one are worth their parameters."""
+    if more is None:
+        return fewer
+    extra, missing = (
+        [CATALOGUE[name] for name in one.names if name not in other.names]
+        for one, other in ((more, fewer), (fewer, more))
+    )
+    gain = float(fewer.loss.mean()) - float(more.loss.mean())
     count = len(np.unique(blocks_of(entry.data.starts)))
-    return gain * count > 0.5 * sum(len(effect.identified) for effect in effects) * np.log(count)
+    # A parameter is worth a log likelihood of half the logarithm of the number of independent blocks (Schwarz 1978).
+    added = sum(len(effect.identified) for effect in extra) - sum(len(effect.identified) for effect in missing)
+    return more if gain * count > 0.5 * added * np.log(count) else fewer
 
 
 def _with(fit: Fit, further: Mapping[str, Mapping[str, float]], always: Collection[str]) -> Effects:

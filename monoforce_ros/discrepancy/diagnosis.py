@@ -14,23 +14,18 @@ from monoforce_ros.discrepancy.comparison import (
     ABOVE_NOISE,
     Comparison,
     GapRow,
-    HeldOut,
     PathComparison,
     RegimeRow,
-    compare,
-    gap_table,
-    gets_worse,
-    improves,
     measured_paths,
     regime_table,
 )
+from monoforce_ros.discrepancy.conclusion import Judge, Measured, conclude
 from monoforce_ros.discrepancy.credibility import complaint
 from monoforce_ros.discrepancy.cycle_start import explain_aligned
 from monoforce_ros.discrepancy.estimates import EffectEstimate, beyond_file
 from monoforce_ros.discrepancy.evidence import MOTION, Evidence, EvidenceWindows
 from monoforce_ros.discrepancy.explanation import DiagnosisSettings
 from monoforce_ros.discrepancy.fit import Fit
-from monoforce_ros.discrepancy.flippers import BLOCKED
 from monoforce_ros.discrepancy.gap import (
     Localisation,
     NoiseFloor,
@@ -48,11 +43,7 @@ from monoforce_ros.discrepancy.preflight import advice, complaints
 from monoforce_ros.discrepancy.region import Region
 from monoforce_ros.discrepancy.repetition import prepare_processes, repeat
 from monoforce_ros.discrepancy.selection import Search
-from monoforce_ros.discrepancy.sensor_findings import (
-    bias_row,
-    changed_bias,
-    heading_noise,
-)
+from monoforce_ros.discrepancy.sensor_findings import SensorFindings
 from monoforce_ros.discrepancy.trial import CandidateScore, Outcome
 from monoforce_ros.discrepancy.verdict import Decision, Losses, Verdict
 from monoforce_ros.robots import RobotModel
@@ -201,89 +192,39 @@ def diagnose(
             aside, explanation = explanation.decision, by_sensors
             settings = replace(settings, sensors_only=True)
     search, outcome, sensors = explanation.search, explanation.outcome, explanation.sensors
-    data, uncertainty, decision = explanation.windows.data, explanation.windows.uncertainty, explanation.decision
+    data, uncertainty = explanation.windows.data, explanation.windows.uncertainty
     floor = np.sqrt((uncertainty**2).mean(axis=0))
     before = search.predictions.residuals([()])[0]
     progress(0.6, "comparing before and after")
-
-    def held_out(decision: Decision) -> HeldOut | None:
-        return None if decision.trial is None else HeldOut(decision.trial.parts, int(data.starts[0]))
-
-    def compared_with(judged: HeldOut | None) -> list[Comparison]:
-        return compare(robot, data, smoothed, judged, noisy, None if part is None else part.acting_in)
-
-    by_gyro = heading_noise(evidence, sensors.gyro)
-    # Whether an effect is added follows from the folds on which it was selected. How much it helps does not.
-    judged = held_out(decision)
-    compared = compared_with(judged)
-    if judged is not None and not improves(gap_table(compared, settings.seed)):
-        decision = decision.without_improvement(dispensable=explanation.dispensable)
-        judged = held_out(decision)
-        # Without the rejected effects; the same windows, where nothing is left.
-        compared = _without_effects(compared) if judged is None else compared_with(judged)
-    repetition, lost = None, False
-    if decision.trial is not None:
-        repetition = repeat(evidence, robot, explanation.windows, nominal, settings, _Steps(progress, 0.62, 0.95))
-        if repetition is not None:
-            named = decision.verdict == Verdict.EFFECT_FOUND
-            decision = repetition.confirmed(explanation, decision, settings.thresholds)
-            lost = named and decision.verdict == Verdict.UNKNOWN_EFFECT and decision.trial is None
-            judged = None if decision.trial is None else repetition.held_out
-            compared = compared_with(judged)
-    gap = gap_table(compared, settings.seed, by_gyro)
-    if judged is not None and not improves(gap):
-        # Searches that never saw the judged windows contradict what was found, or find nothing that helps.
-        errors = "increase" if gets_worse(gap) else "do not decrease"
-        decision, judged = decision.without_improvement(errors, dispensable=explanation.dispensable), None
-        compared = _without_effects(compared)
-        gap = gap_table(compared, settings.seed, by_gyro)
-    known_parts: tuple[EffectEstimate, ...] = ()
+    judge = Judge.of(evidence, robot, explanation, noisy, settings)
+    steps = _Steps(progress, 0.62, 0.95)
+    concluded = conclude(
+        explanation, judge, lambda: repeat(evidence, robot, explanation.windows, nominal, settings, steps)
+    )
+    decision, repetition = concluded.decision, concluded.repetition
     parts = decision.parts
     if aside is not None:
         parts = aside.trial if aside.verdict == Verdict.EFFECT_FOUND else aside.parts
-    if parts is not None:
-        partial = _estimated(search, search.refit(parts.effects), outcome)
-        known_parts = tuple(sensors.with_interval(estimate, search) for estimate in partial)
+    known_parts = () if parts is None else _estimated(search, search.refit(parts.effects), outcome, sensors)
     # Values for the robot's file are fitted to the whole recording.
-    effects: tuple[EffectEstimate, ...] = ()
-    fitted: Effects = ()
-    if decision.trial is not None:
-        whole = search.refit(decision.trial.effects)
-        estimates = _estimated(search, whole, outcome)
-        fitted = whole.effects
-        ranked = [estimates[i] for i in search.ranked(whole)]
-        # What is no measurement, such as a value at its bound, does not come first, whatever hangs on it.
-        doubted = [estimate.name != LEARNED and bool(complaint(estimate)) for estimate in ranked]
-        ranked = [estimate for _, estimate in sorted(zip(doubted, ranked, strict=True), key=lambda entry: entry[0])]
-        effects = tuple(sensors.with_interval(estimate, search) for estimate in ranked)
-        if repetition is not None:
-            effects = repetition.judged(effects)
-    motion_unexplained = False
-    gyro, bias = sensors.gyro, changed_bias(sensors.gyro, robot)
-    if gyro is not None and bias is not None and decision.verdict in (Verdict.NO_DISCREPANCY, Verdict.EFFECT_FOUND):
-        effects, gap = (*effects, bias), {**gap, "yaw_rate_gyro": bias_row(gyro)}
-        remarks = (*decision.remarks, "the gyro measures a rotation that the poses do not show")
-        decision = replace(decision, verdict=Verdict.EFFECT_FOUND, remarks=remarks)
-    if sensors.flippers is not None:
-        if decision.verdict in (Verdict.NO_DISCREPANCY, Verdict.NO_IMPROVEMENT, Verdict.EFFECT_FOUND):
-            # How the flippers move is measured, whatever it does to the path.
-            others = tuple(effect for effect in effects if effect.name != BLOCKED)
-            effects, gap = (*others, sensors.flippers.estimate), {**gap, "flippers": sensors.flippers.row}
-            motion_unexplained = decision.verdict == Verdict.NO_IMPROVEMENT
-            decision = replace(decision, verdict=Verdict.EFFECT_FOUND)
-        decision = replace(decision, remarks=(*decision.remarks, sensors.flippers.summary()))
-    said = (*left_out, *filter(None, (aligned.remark, leans, *efforts)))
-    if said:
-        decision = replace(decision, remarks=(*decision.remarks, *said))
+    whole = None if decision.trial is None else search.refit(decision.trial.effects)
+    effects = () if whole is None else _ranked(search, whole, _estimated(search, whole, outcome, sensors))
+    if repetition is not None:
+        effects = repetition.judged(effects)
+    fitted: Effects = () if whole is None else whole.effects
+    measured = Measured.beside(decision.verdict, effects, concluded.gap, sensors, robot)
+    verdict = measured.verdict
+    remarks = (*decision.remarks, *measured.remarks, *left_out, *filter(None, (aligned.remark, leans, *efforts)))
     if sensors.wheels is not None:
-        decision = replace(decision, remarks=(*decision.remarks, sensors.wheels.summary()))
+        remarks = (*remarks, sensors.wheels.summary())
+    compared = concluded.compared
     at_horizon = next((comparison for comparison in compared if comparison.horizon == settings.horizon), None)
     expected = floor if nominal is None else np.sqrt(floor**2 + (nominal.residual_in(data) ** 2).mean(axis=0))
-    paths = tuple(measured_paths(robot, data, smoothed.stretches, judged))
+    paths = tuple(measured_paths(robot, data, smoothed.stretches, concluded.judged))
     regimes = find_regimes(data)
-    hints = advice(decision.verdict, effects, gyro=evidence.gyro is not None)
+    hints = advice(verdict, measured.effects, gyro=evidence.gyro is not None)
     place = None
-    if part is None and decision.verdict == Verdict.UNKNOWN_EFFECT:
+    if part is None and verdict == Verdict.UNKNOWN_EFFECT:
         place = worst_place(data, search.loss_of(()), settings.thresholds.comparison_rate)
     if place is not None:
         regimes[place.place.words] = place.inside
@@ -292,32 +233,32 @@ def diagnose(
             f"look at the ground {place.place.words}: there errors are largest whenever the robot comes by",
             *hints,
         )
-    apart, noise = by_gyro.get(settings.horizon, 0.0), float(np.degrees(floor[-1, 2]))
+    apart, noise = judge.by_gyro.get(settings.horizon, 0.0), float(np.degrees(floor[-1, 2]))
     progress(1.0, "done")
     return Diagnosis(
-        verdict=decision.verdict,
-        effects=effects,
+        verdict=verdict,
+        effects=measured.effects,
         known_parts=known_parts,
         localisation=localise(before, expected, data, regimes),
-        gap=gap,
+        gap=measured.gap,
         noise_floor=NoiseFloor(float(samples[-1]), *(float(value) for value in floor[-1, : len(MOTION)])),
         advice=hints,
         candidates=outcome.tried,
         regimes=() if at_horizon is None else tuple(regime_table(at_horizon)),
         fitted=fitted,
-        remarks=decision.remarks,
+        remarks=remarks,
         shift=aligned.shift,
-        not_found_again=lost,
+        not_found_again=concluded.not_found_again,
         losses=decision.losses,
         localisation_error=apart if apart > ABOVE_NOISE * noise else None,
         commissioned=search.commissioned,
-        details=Details(data, before, floor, tuple(compared), paths, area, meaning, smoothed.stretches),
-        part="" if part is None or decision.verdict in _NOTHING_ADDED else part.remark,
+        details=Details(data, before, floor, compared, paths, area, meaning, smoothed.stretches),
+        part="" if part is None or verdict in _NOTHING_ADDED else part.remark,
         partial=() if part is None else tuple(name for name, _ in fitted if name not in dict(search.known)),
         regional=isinstance(part, Region),
         set_aside=None if aside is None else aside.verdict,
         repeated=repetition is not None,
-        motion_unexplained=motion_unexplained,
+        motion_unexplained=measured.motion_unexplained,
         healthy={} if nominal is None else _medians(expected[-1]),
         observed=tuple(filter(None, (comparable.blocked, leans, *efforts))),
     )
@@ -334,14 +275,18 @@ def _medians(rms: np.ndarray) -> dict[str, float]:
     }
 
 
-def _without_effects(compared: Sequence[Comparison]) -> list[Comparison]:
-    """The same windows, where nothing is added."""
-    return [replace(entry, after=None) for entry in compared]
+def _estimated(search: Search, fit: Fit, outcome: Outcome, sensors: SensorFindings) -> tuple[EffectEstimate, ...]:
+    """Estimates of a fit, with the intervals of sensors that measured them; those of sensors and clocks include what
+    the robot's file says already."""
+    estimates = beyond_file(search.estimates(fit, outcome.indistinguishable), search.robot)
+    return tuple(sensors.with_interval(estimate, search) for estimate in estimates)
 
 
-def _estimated(search: Search, fit: Fit, outcome: Outcome) -> tuple[EffectEstimate, ...]:
-    """Estimates of a fit; those of sensors and clocks include what the robot's file says already."""
-    return beyond_file(search.estimates(fit, outcome.indistinguishable), search.robot)
+def _ranked(search: Search, fit: Fit, estimates: Sequence[EffectEstimate]) -> tuple[EffectEstimate, ...]:
+    """Estimates by what the others leave without each; what is no measurement, such as a value at its bound, comes
+    last, whatever hangs on it."""
+    ranked = [estimates[i] for i in search.ranked(fit)]
+    return tuple(sorted(ranked, key=lambda estimate: estimate.name != LEARNED and bool(complaint(estimate))))
 
 
 class _Steps:

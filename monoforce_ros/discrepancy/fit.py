@@ -21,6 +21,9 @@ OUTLIER = 3.0
 _DAMPINGS = (1e-3, 1e-1, 3.0)
 """Shares of the diagonal of the normal equations (Marquardt 1963): hardly any, and more where that step fails. They
 change how many steps a fit takes, not where it ends."""
+_FARTHEST = 0.5
+"""Longest step of a parameter in units of its typical size, where longer ones fail: a limit that hardly acts has hardly
+a derivative, and an enormous step."""
 _NOT_FINITE = 1e3
 """Scaled residual assumed for a prediction that is not finite."""
 _BLOCK = 4.0
@@ -150,10 +153,13 @@ def fit_effects(
             gradient = gradient + prior * count * distance(current)[fixed:]
             curvature = curvature + prior * count * np.diag(np.isfinite(neutral[fixed:]).astype(float))
         diagonal = np.diag(np.diag(curvature) + 1e-6 * np.trace(curvature) + 1e-9)
+        # Along a bound: a step that leads beyond it leaves the other parameters where they do not fit.
+        kept = _kept(current, values, gradient, fixed)
         candidates = []
-        for damping in _DAMPINGS:
-            step = np.zeros(len(values))
-            step[fixed:] = typical[fixed:] * np.linalg.solve(curvature + damping * diagonal, gradient)
+        for damping, farthest in (*((d, np.inf) for d in _DAMPINGS), *((d, _FARTHEST) for d in _DAMPINGS[:2])):
+            step, moved = np.zeros(len(values)), np.zeros(len(gradient))
+            moved[kept] = np.linalg.solve((curvature + damping * diagonal)[np.ix_(kept, kept)], gradient[kept])
+            step[fixed:] = typical[fixed:] * np.clip(moved, -farthest, farthest)
             candidates.append(with_values(current, values - step))
         # Most steps need no damping: the others are rolled out only where that one fails.
         improved = False
@@ -180,6 +186,15 @@ def fit_effects(
         len(np.unique(block_numbers(predictions.data.starts, _BLOCK))),
         residual,
     )
+
+
+def _kept(current: Effects, values: np.ndarray, gradient: np.ndarray, fixed: int) -> np.ndarray:
+    """Parameters that a step may change: none that is at its bound and would leave it, ``[P]`` bool."""
+    bounds = [
+        {p.name: (p.low, p.high) for p in CATALOGUE[name].parameters}[key] for name, own in current for key in own
+    ][fixed:]
+    low, high = np.array(bounds).reshape(-1, 2).T
+    return ~((values[fixed:] <= low) & (gradient > 0) | (values[fixed:] >= high) & (gradient < 0))
 
 
 def jacobian(

@@ -28,6 +28,7 @@ _NOT_IN_DIFF_DRIVE = {
     "actuator_lag": "the controller has no model of the drives",
     "actuator_deadband": "the controller has no dead band; give it to the planner (nav2)",
     "drive_compliance": "the motor drivers need an integral part",
+    "drive_torque_limit": "the controller has no limit of a drive's torque; a limit of both accelerations comes near",
     "payload": "the controller has no mass; tune the gains of the motor drivers",
     "turning_scrub": "a drive in the middle turns no robot",
 }
@@ -44,6 +45,7 @@ _NOT_IN_NAV2 = {
     "drive_gain": "correct it in the base controller (ros2_control)",
     "drive_asymmetry": "correct it in the base controller (ros2_control)",
     "drive_compliance": "the motor drivers need an integral part",
+    "drive_torque_limit": "the smoother has no limit of a drive's torque; a limit of both accelerations comes near",
     "turning_scrub": "correct it in the base controller (ros2_control)",
     "payload": "MPPI's model has no mass",
 }

@@ -229,6 +229,10 @@ _FINDINGS: dict[str, Callable[[_Values], str]] = {
     "yaw_acceleration_limit": lambda v: (
         f"The base changes its yaw rate by no more than {v['limit']:.2f} rad/s in a second."
     ),
+    "drive_torque_limit": lambda v: (
+        f"The motors reach their largest torque: they change their speed by no more than {v['acceleration']:.2f} m/s "
+        f"in a second, and the scrub of a turn takes {100 * v['scrub']:.0f} % of that."
+    ),
     "drive_droop": lambda v: (
         f"The drives droop when a turn begins: each side loses {v['loss']:.2f} m/s, and needs {v['recovery']:.1f} s "
         "to win back most of it."
@@ -298,6 +302,7 @@ _REMEDIES = {
     "yaw_rate_limit": "look at the base controller's limit of the yaw rate, and enter it in the robot's file",
     "acceleration_limit": "look at the base controller's limit of the acceleration; plan with it",
     "yaw_acceleration_limit": "look at the base controller's limit of the yaw acceleration; plan with it",
+    "drive_torque_limit": "look at the current limit of the motor drivers, at battery and load; plan with this ramp",
     "friction_anisotropy": "look at the tread of the tyres, and for ruts that guide them",
     "tyre_slip": "look at the tyres' pressure and tread; plan fast turns with the new robot file",
     "terrain_softness": "look at the tyres' pressure, and for mud, sand or snow",
@@ -339,6 +344,7 @@ _CAUSES = {
     "yaw_rate_limit": "a limit of the yaw rate",
     "acceleration_limit": "a limit of the acceleration",
     "yaw_acceleration_limit": "a limit of the yaw acceleration",
+    "drive_torque_limit": "motors that reach their largest torque",
     "rotation_centre": "turning about another point",
     "terrain_softness": "soft ground or tyres",
     "tyre_slip": "tyres that give way",

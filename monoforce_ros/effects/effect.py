@@ -233,6 +233,11 @@ class Effect(ABC):
         return None
 
     @property
+    def of_base(self) -> bool:
+        """Whether it is one of the base controller, which changes twists before they become speeds of drives."""
+        return type(self).twists is not Effect.twists
+
+    @property
     def everywhere(self) -> bool:
         """Whether it acts wherever the robot is: what happens to commands and measurements has nothing to do with the
         ground."""

@@ -41,17 +41,48 @@ def _droop(
         held = held + share[row] * (load - held)
 
 
-def _overloads(kernel: wp.Kernel, factors: int) -> dict[torch.dtype, wp.Kernel]:
+@wp.kernel
+def _follow_loaded(
+    target: wp.array3d(dtype=Any),
+    change: wp.array(dtype=Any),
+    load: wp.array(dtype=Any),
+    turning: wp.array(dtype=Any),
+    result: wp.array3d(dtype=Any),
+):
+    row = wp.tid()
+    drives = target.shape[2]
+    for index in range(target.shape[1]):
+        before = wp.max(index - 1, 0)
+        mean = target.dtype(0.0)
+        for drive in range(drives):
+            if index == 0:
+                mean += target[row, 0, drive] / target.dtype(drives)
+            else:
+                mean += result[row, before, drive] / target.dtype(drives)
+        for drive in range(drives):
+            state = target[row, 0, drive]
+            if index > 0:
+                state = result[row, before, drive]
+            braked = target.dtype(0.0)
+            if wp.isfinite(change[row]):
+                share = wp.clamp((state - mean) / turning[row], target.dtype(-1.0), target.dtype(1.0))
+                braked = load[row] * change[row] * share
+            wanted = wp.max(target[row, index, drive], state - change[row] - braked)
+            result[row, index, drive] = wp.min(wanted, state + change[row] - braked)
+
+
+def _overloads(kernel: wp.Kernel, factors: int, signal: Any = wp.array2d) -> dict[torch.dtype, wp.Kernel]:
     """A kernel of a signal and some factors for each floating point type."""
     return {
         torch_type: wp.overload(
-            kernel, [wp.array2d(dtype=warp_type), *[wp.array(dtype=warp_type)] * factors, wp.array2d(dtype=warp_type)]
+            kernel, [signal(dtype=warp_type), *[wp.array(dtype=warp_type)] * factors, signal(dtype=warp_type)]
         )
         for torch_type, warp_type in ((torch.float32, wp.float32), (torch.float64, wp.float64))
     }
 
 
 _FOLLOW, _DROOP = _overloads(_follow, 1), _overloads(_droop, 2)
+_FOLLOW_LOADED = _overloads(_follow_loaded, 3, wp.array3d)
 
 
 def follow(target: Tensor, change: Tensor) -> Tensor:
@@ -64,8 +95,13 @@ def droop(wanted: Tensor, loss: Tensor, share: Tensor) -> Tensor:
     return _launched(_DROOP, wanted, loss, share)
 
 
+def follow_loaded(target: Tensor, change: Tensor, load: Tensor, turning: float) -> Tensor:
+    """See :func:`monoforce_ros.effects.recurrence.follow_loaded`."""
+    return _launched(_FOLLOW_LOADED, target, change, load, torch.tensor(turning, dtype=torch.float64))
+
+
 def _launched(kernels: Mapping[torch.dtype, wp.Kernel], signal: Tensor, *factors: Tensor) -> Tensor:
-    """What a kernel makes of ``signal`` ``[R, T]`` with factors, scalars or ``[R]``."""
+    """What a kernel makes of ``signal`` ``[R, T]`` or ``[R, T, D]`` with factors, scalars or ``[R]``."""
     signal = signal.detach().contiguous()
     result = torch.empty_like(signal)
     rows = [factor.detach().to(signal).expand(len(signal)).contiguous() for factor in factors]
