@@ -15,7 +15,8 @@ from monoforce_ros.discrepancy.commissioning import commission
 from monoforce_ros.discrepancy.cycle_start import explain_aligned
 from monoforce_ros.discrepancy.evidence import Evidence, EvidenceWindows, window_starts
 from monoforce_ros.discrepancy.explanation import DiagnosisSettings, Windows
-from monoforce_ros.discrepancy.fit import first_values, fit_effects
+from monoforce_ros.discrepancy.fit import first_values, fit_effects, robust
+from monoforce_ros.discrepancy.gap import residual_scale
 from monoforce_ros.discrepancy.hypothesis import Predictions
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.selection import Search
@@ -157,6 +158,22 @@ def test_commissioning_knows_motors_of_a_largest_torque_and_takes_them_for_no_sl
     assert {key: found["drive_torque_limit"][key] for key in torque} == pytest.approx(torque, rel=0.1)
     assert found["friction_scale"]["factor"] == pytest.approx(1.0, abs=0.2)
     assert not {"acceleration_limit", "yaw_acceleration_limit"} & set(found)
+
+
+def test_the_healthy_loss_is_the_mean_of_all_windows_where_one_segment_has_most_of_it():
+    """A later drive's mean loss is compared with it: the mean of logarithms is less, here by more than half."""
+    husky = load_robot("husky")
+    data = driven(husky)
+    evidence = Evidence(SmoothedMotion(data.motion, 0.002, 0.001, (slice(0, len(data.motion)),)), data.commands)
+    prepared = commissioning._prepare(evidence, husky, SAMPLES, 1.0)
+    late = prepared.data.starts > np.quantile(prepared.data.starts, 0.7)
+    size = np.where(late, 6.0, 0.2)[:, None, None]
+    residual = size * prepared.floor * np.random.default_rng(2).standard_normal(prepared.floor.shape)
+    healthy = commissioning._nominal([prepared], commissioning.COMMISSIONED, [residual])
+    later = Search(husky, prepared.data, residual_scale(prepared.floor, prepared.data, healthy), nominal=healthy)
+    losses = robust(residual / later.scale)
+    assert healthy.loss == pytest.approx(losses.mean(), rel=0.15)
+    assert np.exp(np.log([losses[late].mean(), losses[~late].mean()]).mean()) < 0.5 * losses.mean()
 
 
 def test_a_fit_goes_on_where_limits_hardly_act():

@@ -393,8 +393,9 @@ def _nominal(prepared: Sequence[_Prepared], effects: Effects, residuals: Sequenc
         nominal,
         variation={name: float(np.sqrt(np.mean(np.square(values)))) for name, values in changes.items()},
         segments=sum(segments),
-        loss=float(np.exp(np.mean(np.log(losses)))),
-        motion_loss=float(np.exp(np.mean(np.log(motion_losses)))) if nominal.with_attitude else None,
+        # The mean of losses, not of their logarithms: that is what a later drive's mean loss is compared with.
+        loss=float(np.mean(losses)),
+        motion_loss=float(np.mean(motion_losses)) if nominal.with_attitude else None,
         loss_spread=float(np.std(np.log(losses), ddof=1)),
     )
 
