@@ -22,10 +22,10 @@ class Thresholds:
             blocks share at most one window's motion.
         drive_spread: standard deviation of the logarithm of the mean loss between healthy drives of one robot, beyond
             the standard errors of both means (:mod:`residual_size`): another drive has other commands and ground. At
-            0.1, 0.175, 0.2, 0.25 and 0.3 of 74 empty drives of 38 platforms of both engines 17, 16, 14, 10 and 9 are
-            more than one standard deviation larger, where 12 are expected, and 3, 3, 3, 3 and 1 are too large at half
-            of ``fit_rate``, where 1 is (``benchmarks/platforms/null_rates.py``); by likelihood it is 0.26, 0.24 with
-            MuJoCo and 0.29 with Newton, of a distribution with longer tails 0.16.
+            0.1, 0.15, 0.2, 0.25 and 0.3 of 74 empty drives of 37 platforms of both engines 15, 13, 11, 9 and 6 are more
+            than one standard deviation larger, where 12 are expected, and 4, 3, 1, 1 and 1 are too large at half of
+            ``fit_rate``, where 1 is (``benchmarks/platforms/null_rates.py``; files whose healthy loss was a mean of
+            logarithms, to which half the variance of these was added).
         drive_share: variance of an effect's influence between healthy drives of one robot, as a share of that between
             segments of its commissioning drive. By their motion alone the same 60 drives show an effect at 0, 0.1,
             0.25, 0.35, 0.5 and 0.8 on 10, 8, 5, 3, 2 and 1 (the same command), where 1.5 are stated; diagnosed whole,
