@@ -34,9 +34,11 @@ _CHANGE, _JUMP = 8 * _WINDOW**2, 32 * _WINDOW**2
 (Hirschmüller 2008, in OpenCV's units)."""
 _UNIQUE = 10
 """By how many percent the second best displacement has to be worse."""
-_MATCHING_ERROR = 0.2
+_MATCHING_ERROR = 0.15
 """Standard deviation of where a window with plenty of texture is found in the other image [px]."""
-_SUPPORT = 6.0
+_MISMATCHED, _LEAST_NOISE = 4.0, 1.0
+"""Median differences of grey levels from which on cells are mismatched, and least noise of a grey level: its unit."""
+_SUPPORT = 12.0
 """Windows whose texture tells a displacement: besides its own those before it on the matcher's five paths."""
 _AGREEING = 3.0
 """Standard deviations within which the ranges of two baselines agree."""
@@ -52,6 +54,8 @@ class MeasuredPoints:
     """``[n, 3]`` [m]."""
     errors: np.ndarray
     """Standard deviation of each along its ray ``[n]`` [m]."""
+    shared: np.ndarray
+    """Its part that comes of the camera's motion and that all points share ``[n]`` [m]."""
     windows: np.ndarray
     """Share of a window's pixels that each stands for ``[n]``: the sum over points is the number of windows that were
     matched independently of each other."""
@@ -69,6 +73,8 @@ class _Matches:
     """``[n]`` [m]."""
     errors: np.ndarray
     """``[n]`` [m]."""
+    shared: np.ndarray
+    """``[n]`` [m], see :class:`MeasuredPoints`."""
     windows: np.ndarray
     """See :class:`MeasuredPoints`."""
 
@@ -108,7 +114,8 @@ def matched(
     # where cells are smaller than pixels they repeat each other.
     slope = cv2.Sobel(pair.images[0], cv2.CV_32F, 1, 0, ksize=3, scale=1.0 / 8.0)
     energy = cv2.boxFilter(slope**2, -1, (_WINDOW, _WINDOW), normalize=False)[rows, columns] * np.minimum(1.0, pixels)
-    doubt = 2.0 * (GREY_NOISE * pair.step * sine) ** 2 / np.maximum(_SUPPORT * energy, 1e-6)
+    noise = _grey_noise(pair, rows, columns, displacement)
+    doubt = 2.0 * (noise * pair.step * sine) ** 2 / np.maximum(_SUPPORT * energy, 1e-6)
     ranges, change = pair.ranges(columns, displacement)
     turned = corrected.rotation_error**2 + (corrected.direction_error * pair.baseline / np.maximum(ranges, 0.1)) ** 2
     errors = change * np.sqrt((_MATCHING_ERROR * newest.pixel) ** 2 + doubt + turned)
@@ -118,8 +125,23 @@ def matched(
         directions=pair.directions(rows, columns),
         ranges=ranges,
         errors=errors,
+        shared=change * np.sqrt(turned),
         windows=np.minimum(1.0, pixels) / _WINDOW**2 * np.maximum(1.0, pixels),
     )
+
+
+def _grey_noise(pair: EpipolarPair, rows: np.ndarray, columns: np.ndarray, displacement: np.ndarray) -> float:
+    """Standard deviation of a grey level, from the differences of matched cells ``[n]``: of the camera, of JPEG and of
+    what the resampling leaves."""
+    if not len(rows):
+        return GREY_NOISE
+    newest, earlier = pair.images
+    places = (columns - displacement).astype(np.float32)[None], rows.astype(np.float32)[None]
+    apart = newest[rows, columns] - cv2.remap(earlier, *places, cv2.INTER_LINEAR)[0].astype(np.float32)
+    # Exposure may change between images.
+    apart = np.abs(apart - np.median(apart))
+    usual = apart[apart <= _MISMATCHED * max(float(np.median(apart)), 1.0)]
+    return max(float(np.sqrt(np.mean(usual**2) / 2.0)), _LEAST_NOISE)
 
 
 def confirmed(first: _Matches, second: _Matches, shape: tuple[int, int]) -> _Matches:
@@ -174,7 +196,7 @@ class MotionStereo:
             found = _measured(newest, list(self._kept[name]), motion.terrain_from_base @ mounted, ground)
             if found is not None and len(found.ranges):
                 points = found.directions * found.ranges[:, None] @ mounted[:3, :3].T + mounted[:3, 3]
-                parts.append(MeasuredPoints(mounted[:3, 3], points, found.errors, found.windows))
+                parts.append(MeasuredPoints(mounted[:3, 3], points, found.errors, found.shared, found.windows))
             self._keep(name, newest)
         return parts
 
