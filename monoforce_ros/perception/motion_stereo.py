@@ -106,7 +106,8 @@ def matched(
     # The matcher counts in sixteenths.
     displacement = displaced[rows, columns] / 16.0
     found = np.rint(columns - displacement).astype(int)
-    shown = pair.earlier_seen[rows, np.maximum(found, 0)] & (found >= 0)
+    # Where the earlier image does not show what is far away, something nearer would be found in its place.
+    shown = pair.earlier_seen[rows, np.maximum(found, 0)] & (found >= 0) & pair.earlier_seen[rows, columns]
     rows, columns, displacement = rows[shown], columns[shown], displacement[shown]
     sine = np.sin(pair.phi[columns])
     pixels = (pair.step * sine / newest.pixel) ** 2
