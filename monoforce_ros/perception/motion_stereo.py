@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
-from monoforce_ros.core import NANOSECOND, CameraModel, MotionState
+from monoforce_ros.core import NANOSECOND, CameraModel, MotionState, transform_points
 from monoforce_ros.perception.epipolar import EpipolarPair, PinholeImage, pinhole_image
 from monoforce_ros.perception.observation import Observation
 from monoforce_ros.perception.relative_pose import GREY_NOISE, RelativePose, refined
@@ -25,6 +25,9 @@ _STORED_AFTER = 0.1
 """Distance after which an image is kept [m]."""
 _KEPT, _RETENTION_TIME = 16, 20.0
 """Images kept of each camera, and for how long [s]; odometry's drift is corrected, and what stands stays."""
+_REUSED_FOR = 0.5
+"""How long points are used again while the camera has moved less than :data:`_STORED_AFTER` [s]: hardly any parallax
+has arisen, and what came or went is noticed soon enough."""
 _NEAREST, _FARTHEST = 0.6, 8.0
 """Ranges that are sought [m]."""
 _WINDOW = 5
@@ -172,6 +175,10 @@ class _Keyframe:
     image: PinholeImage
     odometry_from_camera: np.ndarray
 
+    def seconds_after(self, other: _Keyframe) -> float:
+        """Time from another one to this one [s]."""
+        return (self.stamp - other.stamp) * NANOSECOND
+
 
 class MotionStereo:
     """Keeps images of each camera while the robot drives, and matches the newest one with two of them.
@@ -181,6 +188,8 @@ class MotionStereo:
 
     def __init__(self) -> None:
         self._kept: dict[str, deque[_Keyframe]] = {}
+        self._measured: dict[str, tuple[_Keyframe, MeasuredPoints | None]] = {}
+        """Where each camera measured last, and what, in the odometry frame."""
         self._models: dict[str, CameraModel] = {}
         self._previous: MotionState | None = None
 
@@ -193,11 +202,20 @@ class MotionStereo:
             ground: height of the ground under the robot in its terrain frame [m].
         """
         parts = []
+        base_from_odometry = np.linalg.inv(motion.odometry_from_base)
         for name, newest, mounted in self._newest(observation, motion):
-            found = _measured(newest, list(self._kept[name]), motion.terrain_from_base @ mounted, ground)
-            if found is not None and len(found.ranges):
-                points = found.directions * found.ranges[:, None] @ mounted[:3, :3].T + mounted[:3, 3]
-                parts.append(MeasuredPoints(mounted[:3, 3], points, found.errors, found.shared, found.windows))
+            last, seen = self._measured.get(name, (None, None))
+            if last is None or _distance(last, newest) >= _STORED_AFTER or newest.seconds_after(last) >= _REUSED_FOR:
+                found = _measured(newest, list(self._kept[name]), motion.terrain_from_base @ mounted, ground)
+                seen = None
+                if found is not None and len(found.ranges):
+                    pose = newest.odometry_from_camera
+                    points = transform_points(pose, found.directions * found.ranges[:, None])
+                    seen = MeasuredPoints(pose[:3, 3], points, found.errors, found.shared, found.windows)
+                self._measured[name] = newest, seen
+            if seen is not None:
+                origin, points = (transform_points(base_from_odometry, v) for v in (seen.origin[None], seen.points))
+                parts.append(replace(seen, origin=origin[0], points=points))
             self._keep(name, newest)
         return parts
 
@@ -209,7 +227,7 @@ class MotionStereo:
     def _newest(self, observation: Observation, motion: MotionState) -> Iterator[tuple[str, _Keyframe, np.ndarray]]:
         """Each usable image with its camera's name and pose in the base frame; forgets what no longer fits it."""
         if self._previous is None or not continues(motion, self._previous):
-            self._kept = {}
+            self._kept, self._measured = {}, {}
         self._previous = motion
         for name, image in observation.images.items():
             camera, mounted = observation.cameras.get(name), observation.base_from_cameras.get(name)
@@ -217,6 +235,7 @@ class MotionStereo:
                 continue
             if name in self._models and not self._models[name].same(camera):
                 self._kept.pop(name, None)
+                self._measured.pop(name, None)
             self._models[name] = camera
             kept = self._kept.setdefault(name, deque(maxlen=_KEPT))
             while kept and (motion.stamp - kept[0].stamp) * NANOSECOND > _RETENTION_TIME:
