@@ -182,6 +182,73 @@ def test_level_ground_stays_level(added, noise):
         assert raised.sum() < 25
 
 
+def bricks(_: int) -> np.ndarray:
+    """Courses of bricks of 48 by 24 cm."""
+    row, column = np.mgrid[:512, :512]
+    joints = (row % 12 < 2) | ((column + row // 12 % 2 * 12) % 24 < 2)
+    return np.where(joints, 200.0, 110.0)
+
+
+def curve(yaw_rate=0.4, late=0.0, scale=1.0, tilt=0.0, pitching=0.0, flicker=0.0, draw=texture, seed=21):
+    """Observations and measured motion of a robot that drives at 0.8 m/s on level ground, five images a second.
+
+    Args:
+        yaw_rate: [rad/s].
+        late: time by which images are older than their stamps say [s].
+        scale: of odometry's positions.
+        tilt: of the camera, more than its calibration says [°].
+        pitching: amplitude of the robot's pitch [°].
+        flicker: share by which rows are lit differently in each image.
+        draw, seed: texture of the ground.
+    """
+    random, model, calibrated = np.random.default_rng(seed), CAMERAS["pinhole"], mounted()
+    true = calibrated.copy()
+    true[:3, :3] = calibrated[:3, :3] @ Rotation.from_euler("x", tilt, degrees=True).as_matrix()
+
+    def pose(time):
+        angle = yaw_rate * time
+        position = 0.8 * time * np.array([np.sinc(angle / np.pi), 0.5 * angle * np.sinc(0.5 * angle / np.pi) ** 2, 0.0])
+        pitch = np.radians(pitching) * np.sin(9.0 * time)
+        return position, Rotation.from_euler("zy", [angle, pitch])
+
+    frames = []
+    for time in 0.2 * np.arange(15):
+        position, turn = pose(max(time - late, 0.0))
+        base = np.eye(4)
+        base[:3, :3], base[:3, 3] = turn.as_matrix(), position
+        image = picture(model, base @ true, draw=draw, seed=seed).astype(float)
+        image *= 1.0 + flicker * np.sin(np.linspace(0.0, 9.0, model.height) + random.uniform(0.0, 6.0))[:, None, None]
+        image = np.clip(image + 2.0 * random.standard_normal(image.shape), 0.0, 255.0).astype(np.uint8)
+        position, turn = pose(time)
+        noise = Rotation.from_rotvec(np.radians(0.2) * random.standard_normal(3))
+        motion = MotionState(
+            10**9 + round(time * 1e9), scale * position, (turn * noise).as_matrix(), np.array([0.8, 0.0, 0.0]),
+            np.array([0.0, 0.0, yaw_rate]),
+        )  # fmt: skip
+        frames.append((seen(image, model, calibrated, motion.stamp), motion))
+    return frames
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {},
+        {"late": 0.1},
+        {"scale": 1.05},
+        {"tilt": 1.0},
+        {"flicker": 0.15},
+        {"draw": bricks},
+        {"late": 0.1, "scale": 0.95, "tilt": -1.0, "pitching": 1.0, "flicker": 0.1},
+    ],
+    ids=["nothing", "late", "scale", "tilt", "flicker", "bricks", "all"],
+)
+@pytest.mark.parametrize("yaw_rate", [0.0, 0.4], ids=["straight", "curve"])
+def test_nothing_stands_on_level_ground_whatever_odometry_says(added, yaw_rate, wrong):
+    for seed in (31, 32):
+        _, maps = added(curve(yaw_rate=yaw_rate, seed=seed, **wrong))
+        assert all((terrain.height < GROUND + 0.1).all() for terrain in maps)
+
+
 @pytest.mark.parametrize("yaw", [np.pi / 2, np.pi], ids=["left", "back"])
 def test_cameras_that_look_aside_or_back_measure_too(yaw):
     heights, points = standing_after(drive(yaw=yaw))
@@ -299,6 +366,22 @@ def test_unusable_images_and_jumps_of_odometry_are_left_out():
     for observation, state_ in frames[:-1]:
         again.points(observation, state_, GROUND)
     assert not again.points(replace(last, cameras={"front": changed}), motion, GROUND)
+
+
+def test_a_robot_that_hardly_moves_uses_its_points_again():
+    frames = drive(distance=3.2)
+    stereo = MotionStereo()
+    for observation, motion in frames:
+        points = stereo.points(observation, motion, GROUND)
+    (measured,) = points
+    step = np.array([0.05, 0.0, 0.0])
+    blank = replace(observation, images={"front": np.full((240, 320, 3), 128, np.uint8)})
+    turn = Rotation.from_euler("z", 0.3).as_matrix()
+    moved = replace(motion, stamp=motion.stamp + 10**8, position=motion.position + step, rotation=turn)
+    (again,) = stereo.points(blank, moved, GROUND)
+    assert np.allclose(again.points, (measured.points - step) @ turn)
+    assert np.allclose(again.origin, (measured.origin - step) @ turn)
+    assert not stereo.points(blank, replace(moved, stamp=motion.stamp + 6 * 10**8), GROUND)
 
 
 def test_displacements_and_ranges_of_a_pair_agree():

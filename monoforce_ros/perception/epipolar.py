@@ -17,8 +17,12 @@ _CELLS = 24_000
 """Most cells of a resampled image, about a third of the image's pixels: the time of matching is in proportion."""
 _BORDER = 3
 """Pixels beside the edge of what a lens shows that are left out: half a window."""
-_NEAR_AXIS = 4.0
-"""Distance from the direction of motion within which nothing has a parallax worth measuring [px]."""
+_NEAR_AXIS = 10.0
+"""Distance from the direction of motion within which parallax places no obstacle, and a third of all cells would lie
+[px]."""
+_SIDEWAYS = math.radians(120.0)
+"""Greatest angle from straight down about the direction of motion [rad], if that lies in the image: what is above it is
+above the camera, and stands on something below."""
 _IN_FRONT = 0.05
 """Least cosine of the angle between a ray and the optical axis: 87°."""
 
@@ -149,7 +153,7 @@ class EpipolarPair:
             place = axis[:2] / axis[2]
             if (place >= 0.0).all() and (place < [width, height]).all():
                 # The direction of motion, or the opposite one, lies in the image.
-                first, last = -math.pi, math.pi
+                first, last = -_SIDEWAYS, _SIDEWAYS
                 low, high = (margin, high) if axis[2] > 0.0 else (low, math.pi - margin)
         if not (high > low and last > first):
             raise ValueError("the camera sees no direction with a parallax")

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
-from monoforce_ros.core import NANOSECOND, CameraModel, MotionState
+from monoforce_ros.core import NANOSECOND, CameraModel, MotionState, transform_points
 from monoforce_ros.perception.epipolar import EpipolarPair, PinholeImage, pinhole_image
 from monoforce_ros.perception.observation import Observation
 from monoforce_ros.perception.relative_pose import GREY_NOISE, RelativePose, refined
@@ -25,6 +25,9 @@ _STORED_AFTER = 0.1
 """Distance after which an image is kept [m]."""
 _KEPT, _RETENTION_TIME = 16, 20.0
 """Images kept of each camera, and for how long [s]; odometry's drift is corrected, and what stands stays."""
+_REUSED_FOR = 0.5
+"""How long points are used again while the camera has moved less than :data:`_STORED_AFTER` [s]: hardly any parallax
+has arisen, and what came or went is noticed soon enough."""
 _NEAREST, _FARTHEST = 0.6, 8.0
 """Ranges that are sought [m]."""
 _WINDOW = 5
@@ -34,9 +37,11 @@ _CHANGE, _JUMP = 8 * _WINDOW**2, 32 * _WINDOW**2
 (Hirschmüller 2008, in OpenCV's units)."""
 _UNIQUE = 10
 """By how many percent the second best displacement has to be worse."""
-_MATCHING_ERROR = 0.2
+_MATCHING_ERROR = 0.15
 """Standard deviation of where a window with plenty of texture is found in the other image [px]."""
-_SUPPORT = 6.0
+_MISMATCHED, _LEAST_NOISE = 4.0, 1.0
+"""Median differences of grey levels from which on cells are mismatched, and least noise of a grey level: its unit."""
+_SUPPORT = 12.0
 """Windows whose texture tells a displacement: besides its own those before it on the matcher's five paths."""
 _AGREEING = 3.0
 """Standard deviations within which the ranges of two baselines agree."""
@@ -52,6 +57,8 @@ class MeasuredPoints:
     """``[n, 3]`` [m]."""
     errors: np.ndarray
     """Standard deviation of each along its ray ``[n]`` [m]."""
+    shared: np.ndarray
+    """Its part that comes of the camera's motion and that all points share ``[n]`` [m]."""
     windows: np.ndarray
     """Share of a window's pixels that each stands for ``[n]``: the sum over points is the number of windows that were
     matched independently of each other."""
@@ -69,6 +76,8 @@ class _Matches:
     """``[n]`` [m]."""
     errors: np.ndarray
     """``[n]`` [m]."""
+    shared: np.ndarray
+    """``[n]`` [m], see :class:`MeasuredPoints`."""
     windows: np.ndarray
     """See :class:`MeasuredPoints`."""
 
@@ -100,7 +109,8 @@ def matched(
     # The matcher counts in sixteenths.
     displacement = displaced[rows, columns] / 16.0
     found = np.rint(columns - displacement).astype(int)
-    shown = pair.earlier_seen[rows, np.maximum(found, 0)] & (found >= 0)
+    # Where the earlier image does not show what is far away, something nearer would be found in its place.
+    shown = pair.earlier_seen[rows, np.maximum(found, 0)] & (found >= 0) & pair.earlier_seen[rows, columns]
     rows, columns, displacement = rows[shown], columns[shown], displacement[shown]
     sine = np.sin(pair.phi[columns])
     pixels = (pair.step * sine / newest.pixel) ** 2
@@ -108,7 +118,8 @@ def matched(
     # where cells are smaller than pixels they repeat each other.
     slope = cv2.Sobel(pair.images[0], cv2.CV_32F, 1, 0, ksize=3, scale=1.0 / 8.0)
     energy = cv2.boxFilter(slope**2, -1, (_WINDOW, _WINDOW), normalize=False)[rows, columns] * np.minimum(1.0, pixels)
-    doubt = 2.0 * (GREY_NOISE * pair.step * sine) ** 2 / np.maximum(_SUPPORT * energy, 1e-6)
+    noise = _grey_noise(pair, rows, columns, displacement)
+    doubt = 2.0 * (noise * pair.step * sine) ** 2 / np.maximum(_SUPPORT * energy, 1e-6)
     ranges, change = pair.ranges(columns, displacement)
     turned = corrected.rotation_error**2 + (corrected.direction_error * pair.baseline / np.maximum(ranges, 0.1)) ** 2
     errors = change * np.sqrt((_MATCHING_ERROR * newest.pixel) ** 2 + doubt + turned)
@@ -118,8 +129,23 @@ def matched(
         directions=pair.directions(rows, columns),
         ranges=ranges,
         errors=errors,
+        shared=change * np.sqrt(turned),
         windows=np.minimum(1.0, pixels) / _WINDOW**2 * np.maximum(1.0, pixels),
     )
+
+
+def _grey_noise(pair: EpipolarPair, rows: np.ndarray, columns: np.ndarray, displacement: np.ndarray) -> float:
+    """Standard deviation of a grey level, from the differences of matched cells ``[n]``: of the camera, of JPEG and of
+    what the resampling leaves."""
+    if not len(rows):
+        return GREY_NOISE
+    newest, earlier = pair.images
+    places = (columns - displacement).astype(np.float32)[None], rows.astype(np.float32)[None]
+    apart = newest[rows, columns] - cv2.remap(earlier, *places, cv2.INTER_LINEAR)[0].astype(np.float32)
+    # Exposure may change between images.
+    apart = np.abs(apart - np.median(apart))
+    usual = apart[apart <= _MISMATCHED * max(float(np.median(apart)), 1.0)]
+    return max(float(np.sqrt(np.mean(usual**2) / 2.0)), _LEAST_NOISE)
 
 
 def confirmed(first: _Matches, second: _Matches, shape: tuple[int, int]) -> _Matches:
@@ -149,6 +175,10 @@ class _Keyframe:
     image: PinholeImage
     odometry_from_camera: np.ndarray
 
+    def seconds_after(self, other: _Keyframe) -> float:
+        """Time from another one to this one [s]."""
+        return (self.stamp - other.stamp) * NANOSECOND
+
 
 class MotionStereo:
     """Keeps images of each camera while the robot drives, and matches the newest one with two of them.
@@ -158,6 +188,8 @@ class MotionStereo:
 
     def __init__(self) -> None:
         self._kept: dict[str, deque[_Keyframe]] = {}
+        self._measured: dict[str, tuple[_Keyframe, MeasuredPoints | None]] = {}
+        """Where each camera measured last, and what, in the odometry frame."""
         self._models: dict[str, CameraModel] = {}
         self._previous: MotionState | None = None
 
@@ -170,11 +202,20 @@ class MotionStereo:
             ground: height of the ground under the robot in its terrain frame [m].
         """
         parts = []
+        base_from_odometry = np.linalg.inv(motion.odometry_from_base)
         for name, newest, mounted in self._newest(observation, motion):
-            found = _measured(newest, list(self._kept[name]), motion.terrain_from_base @ mounted, ground)
-            if found is not None and len(found.ranges):
-                points = found.directions * found.ranges[:, None] @ mounted[:3, :3].T + mounted[:3, 3]
-                parts.append(MeasuredPoints(mounted[:3, 3], points, found.errors, found.windows))
+            last, seen = self._measured.get(name, (None, None))
+            if last is None or _distance(last, newest) >= _STORED_AFTER or newest.seconds_after(last) >= _REUSED_FOR:
+                found = _measured(newest, list(self._kept[name]), motion.terrain_from_base @ mounted, ground)
+                seen = None
+                if found is not None and len(found.ranges):
+                    pose = newest.odometry_from_camera
+                    points = transform_points(pose, found.directions * found.ranges[:, None])
+                    seen = MeasuredPoints(pose[:3, 3], points, found.errors, found.shared, found.windows)
+                self._measured[name] = newest, seen
+            if seen is not None:
+                origin, points = (transform_points(base_from_odometry, v) for v in (seen.origin[None], seen.points))
+                parts.append(replace(seen, origin=origin[0], points=points))
             self._keep(name, newest)
         return parts
 
@@ -186,7 +227,7 @@ class MotionStereo:
     def _newest(self, observation: Observation, motion: MotionState) -> Iterator[tuple[str, _Keyframe, np.ndarray]]:
         """Each usable image with its camera's name and pose in the base frame; forgets what no longer fits it."""
         if self._previous is None or not continues(motion, self._previous):
-            self._kept = {}
+            self._kept, self._measured = {}, {}
         self._previous = motion
         for name, image in observation.images.items():
             camera, mounted = observation.cameras.get(name), observation.base_from_cameras.get(name)
@@ -194,6 +235,7 @@ class MotionStereo:
                 continue
             if name in self._models and not self._models[name].same(camera):
                 self._kept.pop(name, None)
+                self._measured.pop(name, None)
             self._models[name] = camera
             kept = self._kept.setdefault(name, deque(maxlen=_KEPT))
             while kept and (motion.stamp - kept[0].stamp) * NANOSECOND > _RETENTION_TIME:
