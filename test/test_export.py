@@ -10,6 +10,7 @@ import yaml
 from monoforce_ros.discrepancy import EffectEstimate, ExportKind, ParameterEstimate, cli, export_effects
 from monoforce_ros.discrepancy.export import effects_to_export, export_target
 from monoforce_ros.discrepancy.turning_ratio import turning_ratio
+from monoforce_ros.discrepancy.wheel_motion import half_track
 from monoforce_ros.effects import CATALOGUE, applied_setup, drive_speeds
 from monoforce_ros.physics import State, rollout
 from monoforce_ros.robots import load_robot
@@ -338,6 +339,23 @@ def test_limits_of_the_twist_have_parameters(husky, tmp_path):
     assert mppi["ax_max"] == 0.9 and mppi["az_max"] == 1.4 and mppi["wz_max"] == 0.7
 
 
+def test_motors_of_a_largest_torque_limit_accelerations_and_those_of_turns_by_what_the_scrub_leaves(husky, tmp_path):
+    effects = (estimate("drive_torque_limit", acceleration=1.6, scrub=0.4), estimate("yaw_acceleration_limit", limit=9))
+    turning = 0.6 * 1.6 / half_track(husky)
+    parameters, exported, text = controller_of(tmp_path, husky, *effects)
+    assert not exported.not_exported and "acceleration_limit 9" not in text.split("linear.x")[0]
+    assert parameters["linear.x.max_acceleration"] == 1.6
+    assert parameters["angular.z.max_acceleration"] == pytest.approx(turning, abs=1e-4)
+    target = tmp_path / "x.nav2.yaml"
+    (exported,) = export_effects([str(target)], husky, effects)
+    content = yaml.safe_load(target.read_text())
+    assert not exported.not_exported
+    smoother = content["velocity_smoother"]["ros__parameters"]
+    assert smoother["max_accel"] == [1.6, 0.0, pytest.approx(turning, abs=1e-4)]
+    mppi = content["controller_server"]["ros__parameters"]["FollowPath"]
+    assert mppi["ax_max"] == 1.6 and mppi["az_max"] == pytest.approx(turning, abs=1e-3)
+
+
 @pytest.mark.parametrize("kind", ["diff_drive", "nav2"])
 @pytest.mark.parametrize("central", [False, True])
 def test_a_robot_without_top_speed_or_with_one_drive_is_exported(husky, tmp_path, kind, central):
@@ -350,6 +368,7 @@ def test_a_robot_without_top_speed_or_with_one_drive_is_exported(husky, tmp_path
         (estimate("acceleration_limit", limit=1.0), estimate("actuator_deadband", width=0.1)),
         (estimate("actuator_saturation", limit=0.4), estimate("drive_gain", gain=0.9)),
         (estimate("yaw_rate_limit", limit=0.4),),
+        (estimate("drive_torque_limit", acceleration=1.6, scrub=0.4),),
     ):
         target = tmp_path / f"{effects[0].name}.out"
         export_effects([f"{kind}:{target}"], robot, effects)

@@ -23,12 +23,13 @@ _GRAVITY = 9.81
 """[m/s²]."""
 _NO_PARAMETER = "has no parameter here"
 _LIMITS = ("actuator_saturation", "yaw_rate_limit", "acceleration_limit", "yaw_acceleration_limit")
+_RAMPS = (("acceleration_limit", "limit"), ("yaw_acceleration_limit", "limit"), ("drive_torque_limit", "acceleration"))
+"""Effects that limit accelerations, with the parameter that says by how much."""
 _NOT_IN_DIFF_DRIVE = {
     "command_delay": "the controller cannot send a command earlier; give it to the planner (nav2)",
     "actuator_lag": "the controller has no model of the drives",
     "actuator_deadband": "the controller has no dead band; give it to the planner (nav2)",
     "drive_compliance": "the motor drivers need an integral part",
-    "drive_torque_limit": "the controller has no limit of a drive's torque; a limit of both accelerations comes near",
     "payload": "the controller has no mass; tune the gains of the motor drivers",
     "turning_scrub": "a drive in the middle turns no robot",
 }
@@ -45,7 +46,6 @@ _NOT_IN_NAV2 = {
     "drive_gain": "correct it in the base controller (ros2_control)",
     "drive_asymmetry": "correct it in the base controller (ros2_control)",
     "drive_compliance": "the motor drivers need an integral part",
-    "drive_torque_limit": "the smoother has no limit of a drive's torque; a limit of both accelerations comes near",
     "turning_scrub": "correct it in the base controller (ros2_control)",
     "payload": "MPPI's model has no mass",
 }
@@ -118,7 +118,7 @@ def _diff_drive_text(robot: RobotModel, effects: _Effects) -> tuple[str, tuple[s
         "diff_drive_controller:",
         "  ros__parameters:",
     ]
-    done = {"drive_gain", "drive_asymmetry", *_LIMITS}
+    done = {"drive_gain", "drive_asymmetry", "drive_torque_limit", *_LIMITS}
     if scrub is not None and half_track(robot) > 0.0:
         done.add("turning_scrub")
         wanted = correction.separation
@@ -167,7 +167,8 @@ def _controller_limits(robot: RobotModel, effects: _Effects, limits: TwistLimits
                 f"    {axis}.min_velocity: {-largest:.4f}",
             ]
         if math.isfinite(ramp):
-            lines += [f"    # {stated_effect(own[-1], 'limit')}", f"    {axis}.has_acceleration_limits: true"]
+            other = "yaw_acceleration_limit" if axis == "linear.x" else "acceleration_limit"
+            lines += [f"    # {_stated_ramps(effects, other)}", f"    {axis}.has_acceleration_limits: true"]
             # Two signs for each direction of travel (control_toolbox' RateLimiter).
             lines += [
                 f"    {axis}.{key}: {sign * ramp:.4f}"
@@ -234,7 +235,8 @@ def nav2_text(robot: RobotModel, effects: _Effects) -> tuple[str, tuple[str, ...
             "    FollowPath:  # an MPPI controller (nav2_mppi_controller::MPPIController)",
             *mppi,
         ]
-    return _finished(lines, effects, {*_LIMITS, "actuator_deadband", "friction_scale", "command_delay"}, _NOT_IN_NAV2)
+    done = {*_LIMITS, "drive_torque_limit", "actuator_deadband", "friction_scale", "command_delay"}
+    return _finished(lines, effects, done, _NOT_IN_NAV2)
 
 
 def _planned_speeds(robot: RobotModel, effects: _Effects, limits: TwistLimits) -> tuple[list[str], list[str]]:
@@ -265,11 +267,10 @@ def _planned_speeds(robot: RobotModel, effects: _Effects, limits: TwistLimits) -
 
 def _planned_ramps(effects: _Effects, limits: TwistLimits) -> tuple[list[str], list[str]]:
     """Lines of the velocity smoother and of MPPI on accelerations: limits of the base, and of MPPI those of grip."""
-    own = [effects[name] for name in ("acceleration_limit", "yaw_acceleration_limit") if name in effects]
-    said = "; ".join(stated_effect(effect, "limit") for effect in own)
+    said = _stated_ramps(effects)
     lines, mppi = [], []
     known = (limits.acceleration, limits.yaw_acceleration)
-    if own:
+    if said:
         vector = [
             value if math.isfinite(value) else other
             for value, other in zip(known, _SMOOTHER_ACCELERATION, strict=True)
@@ -289,6 +290,11 @@ def _planned_ramps(effects: _Effects, limits: TwistLimits) -> tuple[list[str], l
     if math.isfinite(limits.yaw_acceleration):
         mppi.append(f"      az_max: {limits.yaw_acceleration:.3f}  # {said}")
     return lines, mppi
+
+
+def _stated_ramps(effects: _Effects, without: str = "") -> str:
+    """The effects that limit accelerations, in one line."""
+    return "; ".join(stated_effect(effects[name], key) for name, key in _RAMPS if name in effects and name != without)
 
 
 def _defaults(known: tuple[float, float]) -> str:

@@ -46,6 +46,13 @@ class TwistLimits:
         speed = min(robot.maximum_speed, share * drives)
         yaw_rate = min(robot.maximum_yaw_rate, turning)
         half = half_track(robot)
+        motors = effects.get("drive_torque_limit")
+        if motors is not None:
+            # The side that speeds up in a turn is braked by the scrub, and is the slower one of both.
+            largest = motors.parameters["acceleration"].value
+            scrub = motors.parameters["scrub"].value if "scrub" in motors.parameters else 0.0
+            ramp = min(ramp, largest)
+            turning_ramp = min(turning_ramp, (1.0 - scrub) * largest / half) if half > 0.0 else turning_ramp
         if robot.steered is not None:
             # Robots that steer all wheels turn on the spot: nothing but their file says how fast.
             curvature = robot.maximum_curvature
