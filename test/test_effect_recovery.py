@@ -21,6 +21,7 @@ from monoforce_ros.discrepancy.hypothesis import Predictions
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.selection import Search
 from monoforce_ros.discrepancy.trial import Trial
+from monoforce_ros.discrepancy.wheels import WheelFinding
 from monoforce_ros.effects import CATALOGUE, drive_speeds, identifiable_effects
 from monoforce_ros.physics import State, rollout
 from monoforce_ros.robots import load_robot
@@ -150,6 +151,20 @@ def test_commissioning_knows_the_ramps_of_a_base_and_takes_them_for_no_dead_time
     assert found["command_delay"]["delay"] == pytest.approx(0.08, abs=0.03)
     without = commissioned(replace(load_robot("husky"), effects=(("command_delay", {"delay": 0.08}),)), [None])
     assert not {name for name, _ in ramps} & set(without)
+
+
+def test_ramps_are_commissioned_where_the_wheels_show_something_else():
+    """Wheels of weak motors hardly turn on the spot and look limited in their yaw rate: that alone leads to no ramp."""
+    husky = load_robot("husky")
+    ramps = (("acceleration_limit", {"limit": 1.5}), ("yaw_acceleration_limit", {"limit": 2.0}))
+    data = driven(replace(husky, effects=(*ramps, ("drive_compliance", {"speed_loss": 0.35}))))
+    evidence = Evidence(SmoothedMotion(data.motion, 0.002, 0.001, (slice(0, len(data.motion)),)), data.commands)
+    prepared = commissioning._prepare(evidence, husky, SAMPLES, 1.0)
+    misled = WheelFinding((("yaw_rate_limit", {"limit": 0.2}),), ({"limit": 0.01},), 0.1, 0.05, 1.0)
+    found = dict(commissioning._started(prepared, commissioning.COMMISSIONED, misled).effects)
+    for name, values in ramps:
+        assert found[name]["limit"] == pytest.approx(values["limit"], rel=0.1)
+    assert "yaw_rate_limit" not in found
 
 
 def test_commissioning_knows_motors_of_a_largest_torque_and_takes_them_for_no_slippery_ground():

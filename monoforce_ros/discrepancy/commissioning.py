@@ -203,12 +203,13 @@ def _started(entry: _Prepared, chosen: Effects, wheels: WheelFinding | None) -> 
     """The fit of what every robot has, and of what else the drives do where that explains more.
 
     Ramps of a base look like a long dead time to a fit that begins without them, those of motors like slippery ground,
-    and nothing leads away from there. The fit begins also at what the wheels show, or with the ramps of many bases if
-    no wheel speeds were measured, and with motors that reach their largest torque, without such ramps and beside them.
+    and nothing leads away from there. The fit begins also at what the wheels show, with the ramps of many bases, and
+    with motors that reach their largest torque, without such ramps and beside them. Wheels alone do not say enough:
+    those of weak motors, which hardly turn on the spot, look limited in their yaw rate.
     """
     best = _fitted(entry, chosen)
-    found = _OFTEN_OF_BASE if wheels is None else dict(wheels.effects)
-    best = _better(entry, best, _beginning(entry, chosen, found))
+    for found in (_OFTEN_OF_BASE,) if wheels is None else (dict(wheels.effects), _OFTEN_OF_BASE):
+        best = _better(entry, best, _beginning(entry, chosen, found))
     own = {name: values for name, values in best.effects if name not in dict(chosen)}
     motors = {
         name: values for name, values in _OFTEN_OF_MOTORS.items() if CATALOGUE[name].applies_to(entry.predictions.robot)
