@@ -87,8 +87,8 @@ def test_robots_without_such_joints_are_left_alone(name):
 def test_candidates_are_the_effects_on_joints_that_a_robot_has(robots):
     found = {kind: {effect.name for effect in identifiable_effects(robot)} for kind, robot in robots.items()}
     assert found["steering"] - found["flippers"] == set(STEERING)
-    # Steered wheels roll through turns: there is no scrub under which drives could droop.
-    assert found["flippers"] - found["steering"] == {"blocked_flipper", "drive_droop"}
+    # Steered wheels roll through turns: there is no scrub under which drives could droop, or that brakes motors.
+    assert found["flippers"] - found["steering"] == {"blocked_flipper", "drive_droop", "drive_torque_limit"}
 
 
 @pytest.mark.parametrize("name", STRONG)

@@ -102,7 +102,7 @@ def test_drives_that_become_slow_at_once_have_no_supply_that_drains(gain):
     assert [name for name, _ in found.decision.trial.effects] == ["drive_gain"]
 
 
-@pytest.mark.parametrize("gain", [0.9, 1.0])
+@pytest.mark.parametrize("gain", [0.89, 1.0])
 def test_a_weak_effect_that_begins_late_is_significant_from_its_onset_on(gain):
     data = _recording(ONSET, gain)
     residual = np.tile([0.03, 0.03, 0.015], (4, 1))
