@@ -16,7 +16,9 @@ from monoforce_ros.physics import State, rollout
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainMap
 
-mujoco = pytest.importorskip("mujoco")
+pytest.importorskip("mujoco")
+# With the graphics library that tests of images in the same process need.
+mujoco = pytest.importorskip("monoforce_ros.synthetic.graphics").mujoco
 STEP = 0.002
 MODEL = """<mujoco>
   <option integrator="implicitfast"/>
