@@ -16,7 +16,6 @@ from monoforce_ros.physics import State, rollout
 from monoforce_ros.robots import load_robot
 from monoforce_ros.terrain import Grid, TerrainMap
 
-pytest.importorskip("mujoco")
 # With the graphics library that tests of images in the same process need.
 mujoco = pytest.importorskip("monoforce_ros.synthetic.graphics").mujoco
 STEP = 0.002
