@@ -12,6 +12,7 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from monoforce_ros.core import CommandTrack, MotionTrack
+from monoforce_ros.effects import drive_torque_limit
 from monoforce_ros.effects.catalogue import (
     CATALOGUE,
     EffectError,
@@ -649,3 +650,7 @@ def test_an_effect_grows_linearly_between_two_times():
         values_growing("drive_gian", {"gain": 0.5}, starts, 0.0, 5.0)
     with pytest.raises(EffectError, match="gain is 7"):
         values_from("drive_gain", {"gain": 7.0}, starts, 5.0)
+
+
+def test_the_scrub_of_motors_is_whole_where_the_dry_friction_of_the_physics_is():
+    assert PhysicsOptions().slip_regularisation == drive_torque_limit._TURNING

@@ -89,6 +89,11 @@ class _Prepared:
     floor: np.ndarray
     """Residuals by noise and map, ``[W, K, C]``."""
 
+    @property
+    def blocks(self) -> int:
+        """Number of independent blocks."""
+        return len(np.unique(blocks_of(self.data.starts)))
+
     def __getitem__(self, chosen: np.ndarray) -> _Prepared:
         data = replace(self.data, starts=self.data.starts[chosen])
         return _Prepared(data, Predictions(self.predictions.robot, data), self.floor[chosen])
@@ -193,10 +198,8 @@ def _prepare(evidence: Evidence, robot: RobotModel, samples: np.ndarray, stride:
 
 def _fitted(entry: _Prepared, effects: Effects, iterations: int = 12) -> Fit:
     # Blocks are roughly independent, windows within a block are not: the prior weighs as much as one block.
-    prior = 1.0 / len(np.unique(blocks_of(entry.data.starts)))
-    return fit_effects(
-        entry.predictions, [effects], residual_scale(entry.floor, entry.data, None), iterations=iterations, prior=prior
-    )
+    scale = residual_scale(entry.floor, entry.data, None)
+    return fit_effects(entry.predictions, [effects], scale, iterations=iterations, prior=1.0 / entry.blocks)
 
 
 def _started(entry: _Prepared, chosen: Effects, wheels: WheelFinding | None) -> Fit:
@@ -236,15 +239,11 @@ def _better(entry: _Prepared, fewer: Fit, more: Fit | None) -> Fit:
     """One of two fits: the second one where its effects beyond those of the first one are worth their parameters."""
     if more is None:
         return fewer
-    extra, missing = (
-        [CATALOGUE[name] for name in one.names if name not in other.names]
-        for one, other in ((more, fewer), (fewer, more))
-    )
+    fitted_more, fitted_fewer = (sum(len(CATALOGUE[name].identified) for name in fit.names) for fit in (more, fewer))
     gain = float(fewer.loss.mean()) - float(more.loss.mean())
-    count = len(np.unique(blocks_of(entry.data.starts)))
     # A parameter is worth a log likelihood of half the logarithm of the number of independent blocks (Schwarz 1978).
-    added = sum(len(effect.identified) for effect in extra) - sum(len(effect.identified) for effect in missing)
-    return more if gain * count > 0.5 * added * np.log(count) else fewer
+    least = 0.5 * (fitted_more - fitted_fewer) * np.log(entry.blocks)
+    return more if gain * entry.blocks > least else fewer
 
 
 def _with(fit: Fit, further: Mapping[str, Mapping[str, float]], always: Collection[str]) -> Effects:

@@ -13,7 +13,7 @@ from monoforce_ros.discrepancy.estimates import EffectEstimate, ParameterEstimat
 from monoforce_ros.discrepancy.evidence import MOTION, EvidenceWindows
 from monoforce_ros.discrepancy.hypothesis import Effects, Predictions
 from monoforce_ros.discrepancy.score_test import block_numbers, motion_count
-from monoforce_ros.effects import CATALOGUE, Effect
+from monoforce_ros.effects import CATALOGUE, Effect, Parameter
 from monoforce_ros.robots import RobotModel
 
 OUTLIER = 3.0
@@ -72,30 +72,27 @@ def flat(effects: Effects) -> np.ndarray:
     return np.array([float(value) for _, parameters in effects for value in parameters.values()])
 
 
+def _parameters(effects: Effects) -> list[Parameter]:
+    """The catalogue's parameters of the values in :func:`flat`."""
+    known = {name: {parameter.name: parameter for parameter in CATALOGUE[name].parameters} for name, _ in effects}
+    return [known[name][key] for name, values in effects for key in values]
+
+
 def with_values(effects: Effects, values: np.ndarray) -> Effects:
     """The same effects with other values, kept within their bounds."""
-    result, at = [], 0
-    for name, parameters in effects:
-        known = {p.name: p for p in CATALOGUE[name].parameters}
-        changed = {}
-        for key in parameters:
-            changed[key] = float(np.clip(values[at], known[key].low, known[key].high))
-            at += 1
-        result.append((name, changed))
-    return tuple(result)
+    listed = _parameters(effects)
+    bounded = iter(np.clip(values, [p.low for p in listed], [p.high for p in listed]).tolist())
+    return tuple((name, {key: next(bounded) for key in parameters}) for name, parameters in effects)
 
 
 def neutral_values(effects: Effects) -> np.ndarray:
     """Neutral values of the effects, ``[P]``."""
-    return np.array(
-        [{p.name: p for p in CATALOGUE[name].parameters}[key].neutral for name, values in effects for key in values]
-    )
+    return np.array([parameter.neutral for parameter in _parameters(effects)])
 
 
 def scales(effects: Effects, robot: RobotModel) -> np.ndarray:
     """Typical distance of each parameter from its neutral value on a robot, ``[P]``."""
-    known = {name: {parameter.name: parameter for parameter in CATALOGUE[name].parameters} for name, _ in effects}
-    return np.array([known[name][key].typical(robot) for name, values in effects for key in values])
+    return np.array([parameter.typical(robot) for parameter in _parameters(effects)])
 
 
 def without(effects: Effects, name: str) -> Effects:
@@ -190,11 +187,9 @@ def fit_effects(
 
 def _kept(current: Effects, values: np.ndarray, gradient: np.ndarray, fixed: int) -> np.ndarray:
     """Parameters that a step may change: none that is at its bound and would leave it, ``[P]`` bool."""
-    bounds = [
-        {p.name: (p.low, p.high) for p in CATALOGUE[name].parameters}[key] for name, own in current for key in own
-    ][fixed:]
-    low, high = np.array(bounds).reshape(-1, 2).T
-    return ~((values[fixed:] <= low) & (gradient > 0) | (values[fixed:] >= high) & (gradient < 0))
+    listed = _parameters(current)[fixed:]
+    at_low, at_high = values[fixed:] <= [p.low for p in listed], values[fixed:] >= [p.high for p in listed]
+    return ~(at_low & (gradient > 0) | at_high & (gradient < 0))
 
 
 def jacobian(
@@ -210,12 +205,7 @@ def jacobian(
         fixed: number of leading parameters that are left out.
     """
     values, typical = flat(current), scales(current, predictions.robot)
-    resolutions = [
-        {parameter.name: parameter.resolution for parameter in CATALOGUE[name].parameters}[key]
-        for name, parameters in current
-        for key in parameters
-    ]
-    steps = np.maximum(3e-2 * typical, resolutions)
+    steps = np.maximum(3e-2 * typical, [parameter.resolution for parameter in _parameters(current)])
     units = np.eye(len(values))
     # Step away from bounds, and from neutral values beyond which an effect is undefined.
     shifted_effects, actual = [], []

@@ -22,7 +22,7 @@ _NEAR_AXIS = 10.0
 [px]."""
 _SIDEWAYS = math.radians(120.0)
 """Greatest angle from straight down about the direction of motion [rad], if that lies in the image: what is above it is
-above the camera, and stands on something below."""
+above the camera, and has its foot below."""
 _IN_FRONT = 0.05
 """Least cosine of the angle between a ray and the optical axis: 87°."""
 

@@ -19,7 +19,7 @@ _SIZES = (3, 4, 6, 8, 12, 16, 24, 32)
 _BESIDE = 5
 """Directions to either side whose steepness is averaged: what is wide is more certain than each of its directions."""
 _STEEP = 1.0
-"""Rise per distance from which a surface stands on the ground: 45°, which no wheel climbs at a friction below 1."""
+"""Rise per distance from which a surface is an obstacle: 45°, which no wheel climbs at a friction below 1."""
 _CERTAIN = 3.0
 """Standard deviations by which a surface is steeper than that."""
 _SCATTER = 2.0
