@@ -69,6 +69,7 @@ STRONG = {
     "rolling_resistance": {"coefficient": 0.1},
     "drive_compliance": {"speed_loss": 0.2},
     "tyre_slip": {"ratio": 0.3},
+    "friction_creep": {"factor": 0.4},
     "vegetation_drag": {"coefficient": 3e4, "yield_speed": 0.4},
     "viscous_drag": {"coefficient": 40.0},
     "quadratic_drag": {"coefficient": 30.0},

@@ -35,6 +35,7 @@ _NOT_IN_MUJOCO = {
     "turning_scrub": "no element of a model: divide the difference of both sides' commands by the factor",
     "friction_anisotropy": "friction of a geometry is equal in both directions: use a contact pair",
     "tyre_slip": "MuJoCo's friction does not depend on how fast a wheel rolls",
+    "friction_creep": "MuJoCo's contacts creep by their own law: see impratio and solimp",
     "rolling_resistance": "a resistance on the wheels' joints would be overcome by their servos",
     "quadratic_drag": "MuJoCo's drag follows from density and shapes, not from a coefficient",
     "vegetation_drag": "a MuJoCo model has no vegetation",

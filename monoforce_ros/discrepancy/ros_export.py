@@ -306,8 +306,8 @@ def _defaults(known: tuple[float, float]) -> str:
 
 def _turning_robot(robot: RobotModel, effects: _Effects) -> RobotModel:
     """The robot with the effects that decide how fast it turns in the end; others are corrected by themselves."""
-    turning = ("turning_scrub", "friction_scale", "friction_anisotropy", "tyre_slip", "payload", "rotation_centre",
-               "terrain_softness")  # fmt: skip
+    turning = ("turning_scrub", "friction_scale", "friction_anisotropy", "tyre_slip", "friction_creep", "payload",
+               "rotation_centre", "terrain_softness")  # fmt: skip
     values = {name: {key: entry.value for key, entry in effects[name].parameters.items()} for name in turning
               if name in effects}  # fmt: skip
     return replace(robot, effects=tuple(values.items()))

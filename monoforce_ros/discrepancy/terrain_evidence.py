@@ -8,8 +8,9 @@ import numpy as np
 import torch
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
-from monoforce_ros.core import MotionTrack
-from monoforce_ros.discrepancy.evidence import EvidenceWindows
+from monoforce_ros.core import MotionTrack, transform_points
+from monoforce_ros.discrepancy.areas import reach_of
+from monoforce_ros.discrepancy.evidence import Evidence, EvidenceWindows
 from monoforce_ros.discrepancy.hypothesis import Predictions
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import Grid, TerrainMap
@@ -61,6 +62,25 @@ def supporting_terrain(
     spread = np.where(traced, change, spread) * fading
     height = visible.height + torch.from_numpy(spread.astype(np.float32))
     return replace(visible, height=height)
+
+
+def off_map_stretches(evidence: Evidence, robot: RobotModel) -> np.ndarray:
+    """Start and end of each stretch in which any part of the robot may be off the map, ``[n, 2]`` int64 [ns].
+
+    Beyond its edge a map says nothing: heights there would be those of the edge.
+    """
+    terrain, motion = evidence.terrain, evidence.smoothed.motion
+    if terrain is None or evidence.odometry_from_terrain is None or not len(motion):
+        return np.zeros((0, 2), np.int64)
+    places = transform_points(np.linalg.inv(evidence.odometry_from_terrain), motion.positions)[:, :2]
+    left, right, bottom, top = terrain.grid.extent
+    low, high = np.array([left, bottom]) + reach_of(robot), np.array([right, top]) - reach_of(robot)
+    off = ((places < low) | (places > high)).any(axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], off, [False]]).astype(np.int8)))
+    first, last = edges[::2], edges[1::2] - 1
+    # Between two poses the robot is where either of them says: the stretch reaches to the neighbours.
+    stamps = motion.stamps
+    return np.column_stack([stamps[np.maximum(first - 1, 0)], stamps[np.minimum(last + 1, len(stamps) - 1)]])
 
 
 def terrain_uncertainty(

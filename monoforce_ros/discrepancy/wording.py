@@ -244,6 +244,9 @@ _FINDINGS: dict[str, Callable[[_Values], str]] = {
         f"The tyres give way: rolling with {100 * v['ratio']:.0f} % of slip they have 71 % of the grip that the ground "
         "offers."
     ),
+    "friction_creep": lambda v: (
+        f"Where friction holds the robot, it creeps {_change(v['factor'], 'less', 'more')} than assumed."
+    ),
     "rotation_centre": lambda v: (
         f"The robot turns about a point {abs(v['x']):.2f} m {'ahead of' if v['x'] > 0 else 'behind'} the one that its "
         "model turns about."
@@ -305,6 +308,7 @@ _REMEDIES = {
     "drive_torque_limit": "look at the current limit of the motor drivers, at battery and load; plan with this ramp",
     "friction_anisotropy": "look at the tread of the tyres, and for ruts that guide them",
     "tyre_slip": "look at the tyres' pressure and tread; plan fast turns with the new robot file",
+    "friction_creep": "nothing is to be done: it is a property of tyres and ground",
     "terrain_softness": "look at the tyres' pressure, and for mud, sand or snow",
     "vegetation_drag": "look at how high and how dense the plants are; record a lidar so that the map shows them",
     "rotation_centre": "look for a load ahead or behind, and for tyres of unequal grip or pressure",
@@ -348,6 +352,7 @@ _CAUSES = {
     "rotation_centre": "turning about another point",
     "terrain_softness": "soft ground or tyres",
     "tyre_slip": "tyres that give way",
+    "friction_creep": "creeping against friction",
     "vegetation_drag": "plants",
     "drive_droop": "drives that droop when a turn begins",
     "turning_scrub": "turning faster or slower than the model",

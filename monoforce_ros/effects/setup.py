@@ -37,6 +37,8 @@ class Loads:
     """Speed at which the speed-independent bending force of vegetation equals its viscous drag [m/s]."""
     wrench: Tensor
     """Body-frame force [N] and torque [N m] per feature of ``FEATURES``, ``[6, F]`` or ``[B, 6, F]``."""
+    friction_creep: Tensor
+    """Factor on the slip at which friction on firm ground is mobilised [-]; one, not zero, is the physics' own."""
     drive_compliance: Tensor | None = None
     """Surface speed that a drive loses when it pulls with as much as the load on its wheel [m/s]; None: drives hold
     their speed, which takes less computing than a loss of zero."""
@@ -48,7 +50,7 @@ class Loads:
     def none(cls, like: Tensor) -> Loads:
         """No additional load, with the precision and device of ``like``."""
         zero = torch.zeros((), dtype=like.dtype, device=like.device)
-        return cls(zero.expand(2), zero, zero, zero, zero, zero, zero.expand(6, len(FEATURES)))
+        return cls(zero.expand(2), zero, zero, zero, zero, zero, zero.expand(6, len(FEATURES)), torch.ones_like(zero))
 
     def with_wrench(self, row: int, feature: str, weight: Tensor) -> Loads:
         """These loads with one more term of the body wrench.

@@ -162,8 +162,8 @@ def contact(
             way, see :func:`held_slip`, and the slip ratio of tyres, which soft soil replaces; ``[B, 2, 3 or 4]``.
         drive_loads: load of each point's drive beside that of the robot's file, 0 on the hull, which has no drive that
             could give way, ``[B, N]``.
-        ground_factors: divisor of the ground's stiffness and damping [-], and force of vegetation per area, height and
-            speed [N s/m⁴], ``[B, 2]``.
+        ground_factors: divisor of the ground's stiffness and damping [-], force of vegetation per area, height and
+            speed [N s/m⁴], and factor on the slip regularisation of friction on firm ground [-], ``[B, 3]``.
         rolling_resistance: force against rolling as a fraction of the load, ``[B]``.
         yield_speed: speed at which bending force and viscous drag of vegetation are equal, ``[B]`` [m/s].
         options: contact laws.
@@ -192,7 +192,7 @@ def contact(
     belt_speeds = torch.stack([tread(belt_velocities, directions[:, :, 1]), (across * belt_velocities).sum(1)], dim=1)
     slip = point_velocity[:, 1:] + belt_speeds
 
-    softness, drag = ground_factors[..., None].unbind(1)
+    softness, drag, creep = ground_factors[..., None].unbind(1)
     stiffness, ground_damping = ground.stiffness / softness * rigid, ground.damping / softness * rigid
     # Approach of the ground is motion against its normal.
     spring = stiffness * depth
@@ -206,7 +206,8 @@ def contact(
     if grip is not None:
         held = torch.stack([grip, torch.ones_like(grip)])
         slip, friction = slip * held, friction * held
-    slip_square: float | Tensor = options.slip_regularisation**2
+    # Soft soil has its own slip at which its shear builds up.
+    slip_square = (options.slip_regularisation * (creep if soil is None else torch.ones_like(creep))) ** 2
     if friction_factors.shape[1] == 4 and soil is None:
         # The hull does not roll; the tread of a free wheel moves as fast as the robot.
         rolling = belt_speeds[:, 0] if grip is None else grip * belt_speeds[:, 0] + (1.0 - grip) * point_velocity[:, 1]

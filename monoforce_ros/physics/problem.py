@@ -64,7 +64,8 @@ class Problem:
     vegetation: Tensor
     """Height of the vegetation above the ground [m], shaped like the terrain ``[(B,) rows, cols]``."""
     ground_factors: Tensor
-    """Divisor of stiffness and damping [-], and vegetation drag per area, height and speed [N s/m⁴], ``[B, 2]``."""
+    """Divisor of stiffness and damping [-], vegetation drag per area, height and speed [N s/m⁴], and factor on the slip
+    regularisation of friction on firm ground [-], ``[B, 3]``."""
     wrench: Tensor
     """Body-frame force and torque per feature of the motion, ``[B, 6, F]``."""
     soil: Tensor | None = None
@@ -122,6 +123,7 @@ class Problem:
             drift = (rotation @ centre_rate[:, 0, :, None])[..., 0]
         resistance = (loads.rolling_resistance, loads.linear_drag, loads.quadratic_drag, loads.vegetation_yield)
         vegetation = (terrain.geometric_height - terrain.height).clamp_min(0.0)
+        ground_factors = (setup.softness, loads.vegetation_drag, loads.friction_creep)
         factors = [robot.friction_longitudinal, robot.friction_lateral]
         compliance, slip = loads.drive_compliance, loads.tyre_slip
         if compliance is not None or slip is not None:
@@ -152,7 +154,7 @@ class Problem:
             gravity_tilt=loads.gravity_tilt.expand(batch, 2),
             resistance=torch.stack([value.expand(batch) for value in resistance], dim=-1),
             vegetation=vegetation,
-            ground_factors=torch.stack([setup.softness.expand(batch), loads.vegetation_drag.expand(batch)], dim=-1),
+            ground_factors=torch.stack([value.expand(batch) for value in ground_factors], dim=-1),
             wrench=loads.wrench.expand(batch, 6, -1),
             soil=None if soil is None else soil.table(position, batch),
             articulation=articulation,

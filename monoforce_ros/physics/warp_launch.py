@@ -208,7 +208,7 @@ def precision(tensor: Tensor) -> tuple[bool, Types]:
 def elements(kinds: Types) -> dict[str, Any]:
     """Warp element types of inputs and states."""
     s, v2, v3, v4, m = kinds.scalar, kinds.vec2, kinds.vec3, kinds.vec4, kinds.mat33
-    inputs = (s, v4, v3, s, v3, s, s, s, v3, m, v4, v2, v2, v4, kinds.wrench, kinds.soil, s)
+    inputs = (s, v4, v3, s, v3, s, s, s, v3, m, v4, v3, v2, v4, kinds.wrench, kinds.soil, s)
     return dict(zip((*INPUTS, *STATES), (*inputs, v3, m, v3, v3), strict=True))
 
 

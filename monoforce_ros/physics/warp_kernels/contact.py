@@ -219,6 +219,8 @@ def contact_functions(double: bool, soft: bool) -> ContactFunctions:
             # The hull does not roll; the tread of a free wheel moves as fast as the robot.
             slip_square = options.slip_square
             if wp.static(not soft):
+                # Soft soil has its own slip at which its shear builds up.
+                slip_square = ground_factors[2] * ground_factors[2] * slip_square
                 sliding_at = factors[3] * (grip * rolling_speed + (scalar(1.0) - grip) * velocity_along)
                 slip_square = slip_square + sliding_at * sliding_at
             # Drives give way under their load; the hull has none.

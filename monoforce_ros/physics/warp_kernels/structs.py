@@ -85,7 +85,7 @@ def types(double: bool) -> Types:
         centre_of_mass: wp.array(dtype=vec3)
         inertia: wp.array(dtype=mat33)
         friction: wp.array(dtype=vec4)  # longitudinal and lateral factor, compliance of drives, slip ratio of tyres
-        ground_factors: wp.array(dtype=vec2)  # divisor of stiffness and damping, drag of vegetation
+        ground_factors: wp.array(dtype=vec3)  # divisor of stiffness and damping, drag of vegetation, factor on slip
         tilt: wp.array(dtype=vec2)  # of gravity
         resistance: wp.array(dtype=vec4)  # rolling, linear drag, quadratic drag, yield speed of vegetation
         wrench: wp.array(dtype=wrench_matrix)
