@@ -11,8 +11,8 @@ from monoforce_ros.bags import BagWriter, Recording, SmoothedMotion, builders
 from monoforce_ros.core import CommandTrack, EffortTrack, WheelTrack
 from monoforce_ros.datasets.drive import DriveRecording, DriveRun, drive_to_bag
 from monoforce_ros.discrepancy import DiagnosisSettings, Evidence, diagnose
-from monoforce_ros.discrepancy.comparable_windows import left_out_stretches
 from monoforce_ros.discrepancy.headline import headline
+from monoforce_ros.discrepancy.left_out_stretches import LeftOut
 from monoforce_ros.discrepancy.motor_efforts import NOTHING, HealthyEfforts, changed_efforts
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.wheel_motion import half_track, side_speeds
@@ -59,7 +59,7 @@ def test_what_was_driven_with_a_joystick_counts_neither_as_healthy_nor_as_change
         wheels=wheels,
         efforts=EffortTrack(stamps, np.where(by_commands, currents, 0.5)),
     )
-    stretches = left_out_stretches(evidence, HUSKY)
+    stretches = LeftOut.of(evidence, HUSKY).stretches
     assert (np.diff(stretches, axis=1).sum() > 15e9) and stretches[0, 0] > stamps[middle]
     healthy = learned(drive(1), drive(2))
     assert changed_efforts(silent, evidence.efforts, wheels, HUSKY, healthy)

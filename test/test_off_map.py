@@ -16,6 +16,8 @@ from monoforce_ros.discrepancy.comparable_windows import comparable_windows
 from monoforce_ros.discrepancy.diagnosis import diagnose
 from monoforce_ros.discrepancy.evidence import COMPONENTS, Evidence
 from monoforce_ros.discrepancy.explanation import DiagnosisSettings
+from monoforce_ros.discrepancy.held_out_bags import HeldOutBag
+from monoforce_ros.discrepancy.step_errors import compare_after_steps
 from monoforce_ros.discrepancy.terrain_evidence import off_map_stretches
 from monoforce_ros.discrepancy.verdict import Verdict
 from monoforce_ros.effects import drive_speeds
@@ -48,6 +50,11 @@ def recording(known: TerrainMap, seconds: int = 60) -> Evidence:
     smoothed = SmoothedMotion(replace(motion, positions=noisy), 0.002, 0.001, (slice(0, len(motion)),))
     commands = CommandTrack(10**9 + np.arange(count) * 10_000_000, twists)
     return Evidence(smoothed, commands, known, np.eye(4), components=COMPONENTS)
+
+
+def evidence_on(size: float) -> Evidence:
+    """The drive on a map of a size [m]."""
+    return recording(hilly(Grid.square(size, 0.1)))
 
 
 def edge_of(evidence: Evidence, share: float) -> Grid:
@@ -88,6 +95,10 @@ def test_a_healthy_robot_that_leaves_its_map_is_healthy_and_the_page_says_what_w
     assert found.verdict == Verdict.NO_DISCREPANCY
     (remark,) = (text for text in found.remarks if "edge of the map" in text)
     assert "give a larger map (--terrain)" in remark
+    # Neither do errors hold what cannot be compared, at any horizon.
+    whole = diagnose(evidence_on(100.0), husky, settings=DiagnosisSettings(horizon=2.0, samples=tuple(SAMPLES)))
+    for metric in ("position_1s", "position_2s", "position_5s"):
+        assert found.gap[metric].before < 1.5 * whole.gap[metric].before + 0.002
 
 
 def test_what_lies_beyond_the_map_is_not_commissioned():
@@ -99,6 +110,17 @@ def test_what_lies_beyond_the_map_is_not_commissioned():
     assert len(starts) > 20 and not ((starts + 2 * 10**9 > off[-1, 0]) & (starts < off[-1, 1])).any()
     windows = comparable_windows(cut, husky, DiagnosisSettings())
     assert set(windows.starts) <= set(starts)
+
+
+def test_errors_on_other_recordings_and_after_steps_do_not_hold_what_lies_beyond_the_map():
+    husky, evidence = load_robot("husky"), evidence_on(100.0)
+    cut = replace(evidence, terrain=hilly(edge_of(evidence, 0.7)))
+    on, beyond = (HeldOutBag.of(entry, husky, None).table(()) for entry in (evidence, cut))
+    assert beyond["position_2s"].before < 1.5 * on["position_2s"].before + 0.002
+    steps = [compare_after_steps(entry, husky, ()) for entry in (evidence, cut)]
+    assert steps[1].windows < steps[0].windows
+    with pytest.raises(ValueError, match="and on its map"):
+        HeldOutBag.of(replace(evidence, terrain=hilly(Grid(50, 50, 0.1, (200.0, 200.0)))), husky, None)
 
 
 def test_a_drive_beside_its_map_is_not_diagnosed_and_the_page_says_why():

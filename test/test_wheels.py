@@ -11,8 +11,11 @@ from scipy.spatial.transform import Rotation
 from monoforce_ros.bags import Recording, SmoothedMotion
 from monoforce_ros.core import CommandTrack, MotionTrack, WheelTrack
 from monoforce_ros.discrepancy import commissioning
+from monoforce_ros.discrepancy.comparison import compare
 from monoforce_ros.discrepancy.evidence import Evidence
+from monoforce_ros.discrepancy.gap import noisy_motions
 from monoforce_ros.discrepancy.healthy_wheels import HealthyWheels, drives_of
+from monoforce_ros.discrepancy.left_out_stretches import LeftOut
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.wheel_motion import undriven_stretches, wheels_without_motion
 from monoforce_ros.discrepancy.wheel_units import contradictions, in_rad_per_second, wheel_unit
@@ -475,6 +478,20 @@ def test_what_somebody_drove_with_a_joystick_is_not_commissioned(husky):
     starts = (entry.data.starts - ORIGIN) * 1e-9
     assert not ((starts > 31.0) & (starts < 43.0)).any()
     assert (starts < 29.0).any() and (starts > 46.0).any()
+
+
+def test_what_somebody_drove_with_a_joystick_is_in_no_error_of_any_horizon(husky):
+    recorded, true = with_joystick(drawn_commands(80.0, 6), 30.0, 44.0, silent=False)
+    motion = driven(husky, true, HUSKY_BASE)
+    smoothed = SmoothedMotion(motion, 0.002, 0.001, (slice(0, len(motion)),))
+    evidence = Evidence(smoothed, recorded)
+    data = evidence.cut(np.zeros(0, np.int64), np.array([2.0]))
+    found = compare(husky, data, evidence, LeftOut.of(evidence, husky), None, noisy_motions(smoothed))
+    assert [entry.horizon for entry in found] == [1.0, 2.0, 5.0]
+    for entry in found:
+        starts = (entry.starts - ORIGIN) * 1e-9
+        assert not ((starts + entry.horizon > 31.5) & (starts < 43.0)).any()
+        assert (starts < 25.0).any() and (starts > 46.0).any()
 
 
 def test_a_base_that_keeps_its_last_command_is_driven_by_it(husky):

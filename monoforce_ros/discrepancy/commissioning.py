@@ -11,10 +11,9 @@ import numpy as np
 from monoforce_ros.discrepancy.areas import shows_vegetation
 from monoforce_ros.discrepancy.attitude import lean_of
 from monoforce_ros.discrepancy.command_changes import covered_changes
-from monoforce_ros.discrepancy.comparable_windows import left_out_stretches, not_comparable
 from monoforce_ros.discrepancy.directions import Directions
 from monoforce_ros.discrepancy.estimates import EffectEstimate, beyond_file
-from monoforce_ros.discrepancy.evidence import MOTION, Evidence, EvidenceWindows, window_starts
+from monoforce_ros.discrepancy.evidence import MOTION, Evidence, EvidenceWindows
 from monoforce_ros.discrepancy.fit import (
     Fit,
     estimate_effects,
@@ -31,6 +30,7 @@ from monoforce_ros.discrepancy.gap import noise_floor, noisy_motions, residual_s
 from monoforce_ros.discrepancy.ground import slopes_of
 from monoforce_ros.discrepancy.healthy_wheels import HealthyWheels, drives_of
 from monoforce_ros.discrepancy.hypothesis import Effects, Predictions, corrected_evidence
+from monoforce_ros.discrepancy.left_out_stretches import LeftOut
 from monoforce_ros.discrepancy.motion_check import motion_faults
 from monoforce_ros.discrepancy.motor_efforts import HealthyEfforts
 from monoforce_ros.discrepancy.nominal import SEGMENT, NominalModel
@@ -171,7 +171,7 @@ def commission(
         else None,
         wheels=_healthy_wheels(recordings, drives, replace(robot, effects=_together(robot, merged.effects))),
         efforts=HealthyEfforts.learned(
-            [(entry.commands, entry.efforts, left_out_stretches(entry, robot)) for entry in recordings], robot
+            [(entry.commands, entry.efforts, LeftOut.of(entry, robot).stretches) for entry in recordings], robot
         ),
     )
     progress(1.0, "done")
@@ -180,9 +180,8 @@ def commission(
 
 def _prepare(evidence: Evidence, robot: RobotModel, samples: np.ndarray, stride: float) -> _Prepared:
     smoothed = evidence.smoothed
-    starts = window_starts(smoothed.motion, smoothed.stretches, float(samples[-1]), stride)
     # What somebody drove with a joystick, or wheels that turned in place, is not how the robot follows its commands.
-    starts = starts[~not_comparable(evidence, robot, starts, float(samples[-1]))]
+    starts = LeftOut.of(evidence, robot).starts(evidence, float(samples[-1]), stride)
     found = motion_faults(smoothed, evidence.commands, evidence.wheels, evidence.efforts) or complaints(
         evidence, starts
     )

@@ -11,9 +11,9 @@ from monoforce_ros.core import MotionTrack
 from monoforce_ros.discrepancy.evidence import Evidence, subsampled, window_starts
 from monoforce_ros.discrepancy.explanation import DiagnosisSettings, Windows
 from monoforce_ros.discrepancy.gap import noise_floor
-from monoforce_ros.discrepancy.terrain_evidence import off_map_stretches, terrain_uncertainty
+from monoforce_ros.discrepancy.left_out_stretches import LeftOut, overlapping
+from monoforce_ros.discrepancy.terrain_evidence import terrain_uncertainty
 from monoforce_ros.discrepancy.trial import BLOCK
-from monoforce_ros.discrepancy.wheel_motion import WheelsWithoutMotion, undriven_stretches, wheels_without_motion
 from monoforce_ros.robots import RobotModel
 
 
@@ -36,58 +36,26 @@ def comparable_windows(evidence: Evidence, robot: RobotModel, settings: Diagnosi
     smoothed = evidence.smoothed
     starts = window_starts(smoothed.motion, smoothed.stretches, settings.horizon, settings.stride)
     starts = subsampled(starts, BLOCK, settings.max_windows)
-    undriven, in_place, off_map, spinning = _left_out(evidence, robot)
-    blocked = "" if spinning is None else spinning.summary()
+    left_out = LeftOut.of(evidence, robot)
+    blocked = "" if left_out.spinning is None else left_out.spinning.summary()
     remarks = []
-    if _overlapping(undriven, starts, settings.horizon).any():
-        remarks.append(f"{_seconds(undriven)} are left out in which the robot moved without commands (a joystick?)")
-    if _overlapping(off_map, starts, settings.horizon).any():
+    if overlapping(left_out.undriven, starts, settings.horizon).any():
         remarks.append(
-            f"{_seconds(off_map)} are left out in which the robot was at the edge of the map or beyond it: give a "
-            "larger map (--terrain)"
+            f"{_seconds(left_out.undriven)} are left out in which the robot moved without commands (a joystick?)"
+        )
+    if overlapping(left_out.off_map, starts, settings.horizon).any():
+        remarks.append(
+            f"{_seconds(left_out.off_map)} are left out in which the robot was at the edge of the map or beyond it: "
+            "give a larger map (--terrain)"
         )
     if blocked and len(starts) and len(evidence.commands):
-        remarks.append(blocked + ("; this time is left out" if len(in_place) else ""))
-    stretches = np.concatenate([undriven, in_place, off_map])
-    left_out = _overlapping(stretches, starts, settings.horizon)
-    return Comparable(starts[~left_out], tuple(remarks), stretches, blocked)
-
-
-def not_comparable(evidence: Evidence, robot: RobotModel, starts: np.ndarray, horizon: float) -> np.ndarray:
-    """Windows in which something else than ground and commands moves or holds the robot, or in which it is off the
-    map, ``[W]`` bool."""
-    return _overlapping(left_out_stretches(evidence, robot), starts, horizon)
-
-
-def left_out_stretches(evidence: Evidence, robot: RobotModel) -> np.ndarray:
-    """Start and end of each stretch in which something else moves or holds the robot, or in which it is off the map,
-    ``[n, 2]`` int64 [ns]."""
-    return np.concatenate(_left_out(evidence, robot)[:3])
-
-
-def _overlapping(stretches: np.ndarray, starts: np.ndarray, horizon: float) -> np.ndarray:
-    low, high = stretches.T
-    return ((starts[:, None] < high) & (starts[:, None] + round(horizon * 1e9) > low)).any(axis=1)
+        remarks.append(blocked + ("; this time is left out" if len(left_out.in_place) else ""))
+    kept = ~overlapping(left_out.stretches, starts, settings.horizon)
+    return Comparable(starts[kept], tuple(remarks), left_out.stretches, blocked)
 
 
 def _seconds(stretches: np.ndarray) -> str:
     return f"{float(np.diff(stretches, axis=1).sum()) * 1e-9:.0f} s"
-
-
-def _left_out(
-    evidence: Evidence, robot: RobotModel
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, WheelsWithoutMotion | None]:
-    """Stretches driven without commands, those in which all wheels turn in place, and those off the map, each
-    ``[n, 2]`` [ns]; and when wheels turn in place."""
-    motion, nothing = evidence.smoothed.motion, np.zeros((0, 2), np.int64)
-    spinning = wheels_without_motion(motion, evidence.wheels, evidence.commands, robot)
-    off_map = off_map_stretches(evidence, robot)
-    if not len(evidence.commands):
-        return nothing, nothing, off_map, spinning
-    undriven = undriven_stretches(evidence.commands, evidence.wheels, motion, robot)
-    if spinning is None or spinning.side != "both":
-        return undriven, nothing, off_map, spinning
-    return undriven, np.array(spinning.stretches, np.int64).reshape(-1, 2), off_map, spinning
 
 
 def windows_of(

@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from monoforce_ros.bags import SmoothedMotion
 from monoforce_ros.core import MotionTrack
-from monoforce_ros.discrepancy.evidence import MOTION, EvidenceWindows, window_starts
+from monoforce_ros.discrepancy.evidence import MOTION, Evidence, EvidenceWindows
 from monoforce_ros.discrepancy.gap import find_regimes, noise_residuals, relative_motion
 from monoforce_ros.discrepancy.hypothesis import Effects, Predictions, residuals_by_part
+from monoforce_ros.discrepancy.left_out_stretches import LeftOut
 from monoforce_ros.discrepancy.trial import BLOCK, blocks_of
 from monoforce_ros.robots import RobotModel
 
@@ -134,7 +134,8 @@ class PathComparison:
 def compare(
     robot: RobotModel,
     data: EvidenceWindows,
-    smoothed: SmoothedMotion,
+    evidence: Evidence,
+    left_out: LeftOut,
     held_out: HeldOut | None,
     noisy: Sequence[MotionTrack],
     acting_in: Callable[[EvidenceWindows], np.ndarray] | None = None,
@@ -144,14 +145,15 @@ def compare(
     Args:
         robot: the nominal model.
         data: the recording.
-        smoothed: the recording's motion and noise.
+        evidence: the whole of it.
+        left_out: stretches of it that cannot be compared.
         held_out: the effects that predict each window, or None.
         noisy: the motion with other noise, from :func:`noisy_motions`.
         acting_in: mask of those windows in which the effects act, ``[W]``; None for all.
     """
     results = []
     for horizon in HORIZONS:
-        starts = window_starts(data.motion, smoothed.stretches, horizon, 1.0)
+        starts = left_out.starts(evidence, horizon)
         if held_out is not None:
             starts = held_out.judged(starts, horizon)
         windows = replace(data, starts=starts, horizon=horizon, samples=np.array([horizon]))

@@ -19,6 +19,7 @@ from monoforce_ros.discrepancy.estimates import EffectEstimate
 from monoforce_ros.discrepancy.evidence import Evidence
 from monoforce_ros.discrepancy.explanation import DiagnosisSettings, Explanation
 from monoforce_ros.discrepancy.flippers import BLOCKED
+from monoforce_ros.discrepancy.left_out_stretches import LeftOut
 from monoforce_ros.discrepancy.repetition import Repetition
 from monoforce_ros.discrepancy.sensor_findings import SensorFindings, bias_row, changed_bias, heading_noise
 from monoforce_ros.discrepancy.verdict import Decision, Verdict
@@ -32,6 +33,8 @@ class Judge:
     evidence: Evidence
     robot: RobotModel
     explanation: Explanation
+    left_out: LeftOut
+    """Stretches that cannot be compared."""
     noisy: Sequence[MotionTrack]
     """The motion with other noise."""
     seed: int
@@ -49,7 +52,13 @@ class Judge:
     ) -> Judge:
         """The judge of an explanation of a recording."""
         return cls(
-            evidence, robot, explanation, noisy, settings.seed, heading_noise(evidence, explanation.sensors.gyro)
+            evidence,
+            robot,
+            explanation,
+            LeftOut.of(evidence, robot),
+            noisy,
+            settings.seed,
+            heading_noise(evidence, explanation.sensors.gyro),
         )
 
     def held_out(self, decision: Decision) -> HeldOut | None:
@@ -61,7 +70,7 @@ class Judge:
         """Windows by horizon, before and after held-out effects."""
         data, part = self.explanation.windows.data, self.explanation.part
         acting = None if part is None else part.acting_in
-        return tuple(compare(self.robot, data, self.evidence.smoothed, judged, self.noisy, acting))
+        return tuple(compare(self.robot, data, self.evidence, self.left_out, judged, self.noisy, acting))
 
     def table(self, compared: Sequence[Comparison]) -> dict[str, GapRow]:
         """Errors by metric, before and after."""

@@ -10,9 +10,10 @@ import numpy as np
 
 from monoforce_ros.discrepancy.clocks import compare_with_gyro
 from monoforce_ros.discrepancy.comparison import FEWEST_WINDOWS, HORIZONS, GapRow, HeldOut, compare, gap_table
-from monoforce_ros.discrepancy.evidence import Evidence, window_starts
+from monoforce_ros.discrepancy.evidence import Evidence
 from monoforce_ros.discrepancy.gap import noisy_motions
 from monoforce_ros.discrepancy.hypothesis import Effects, corrected_evidence
+from monoforce_ros.discrepancy.left_out_stretches import LeftOut
 from monoforce_ros.discrepancy.nominal import NominalModel, with_known_components
 from monoforce_ros.discrepancy.sensor_findings import heading_noise
 from monoforce_ros.robots import RobotModel, fingerprint
@@ -45,22 +46,22 @@ class HeldOutBag:
         evidence, _ = with_known_components(corrected_evidence(evidence, robot), nominal)
         if not len(evidence.commands):
             raise ValueError("no commands; record the commands of the base controller (cmd_vel)")
-        smoothed = evidence.smoothed
-        starts = window_starts(smoothed.motion, smoothed.stretches, HORIZONS[0], 1.0)
+        starts = LeftOut.of(evidence, robot).starts(evidence, HORIZONS[0])
         if len(starts) < FEWEST_WINDOWS:
             raise ValueError(
-                f"{len(starts)} gap-free windows of {HORIZONS[0]:g} s, expected at least {FEWEST_WINDOWS}: give a "
-                "recording of 10 s or longer"
+                f"{len(starts)} windows of {HORIZONS[0]:g} s, expected at least {FEWEST_WINDOWS}: give a "
+                "recording of 10 s or longer, without gaps, with commands and on its map"
             )
         return cls(evidence, robot)
 
     def table(self, effects: Effects) -> dict[str, GapRow]:
         """Errors without and with effects that were fitted to another recording, by metric and horizon."""
         smoothed = self.evidence.smoothed
-        starts = window_starts(smoothed.motion, smoothed.stretches, _HORIZON, 1.0)
+        left_out = LeftOut.of(self.evidence, self.robot)
+        starts = left_out.starts(self.evidence, _HORIZON)
         data = self.evidence.cut(starts, np.array([_HORIZON]))
         everywhere = HeldOut.everywhere(effects) if effects else None
-        compared = compare(self.robot, data, smoothed, everywhere, noisy_motions(smoothed))
+        compared = compare(self.robot, data, self.evidence, left_out, everywhere, noisy_motions(smoothed))
         by_gyro = heading_noise(self.evidence, compare_with_gyro(smoothed, self.evidence.gyro))
         return gap_table(compared, heading_noise=by_gyro)
 

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import wilcoxon
 
-from monoforce_ros.discrepancy.comparable_windows import not_comparable
 from monoforce_ros.discrepancy.estimates import EffectEstimate
-from monoforce_ros.discrepancy.evidence import Evidence, window_starts
+from monoforce_ros.discrepancy.evidence import Evidence
 from monoforce_ros.discrepancy.hypothesis import Predictions, corrected_evidence
+from monoforce_ros.discrepancy.left_out_stretches import LeftOut
 from monoforce_ros.discrepancy.trial import blocks_of
 from monoforce_ros.effects import CATALOGUE
 from monoforce_ros.robots import RobotModel
@@ -62,8 +62,7 @@ def _needed(recordings: Sequence[Evidence], robot: RobotModel, together: RobotMo
     gains: list[np.ndarray] = []
     for evidence in recordings:
         evidence = corrected_evidence(evidence, robot)
-        starts = window_starts(evidence.smoothed.motion, evidence.smoothed.stretches, _HORIZON, 1.0)
-        starts = starts[~not_comparable(evidence, robot, starts, _HORIZON)]
+        starts = LeftOut.of(evidence, robot).starts(evidence, _HORIZON)
         if not len(starts):
             continue
         data = evidence.cut(starts, np.array([_HORIZON]))

@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 
 from monoforce_ros.discrepancy.dead_reckoning import dead_reckoning_errors
-from monoforce_ros.discrepancy.evidence import MOTION, Evidence, window_starts
+from monoforce_ros.discrepancy.evidence import MOTION, Evidence
 from monoforce_ros.discrepancy.fit import fit_effects
 from monoforce_ros.discrepancy.gap import residual_scale
 from monoforce_ros.discrepancy.hypothesis import Effects, Predictions, corrected_evidence
 from monoforce_ros.discrepancy.kinematic_baseline import HORIZON, StepComparison, compare_on_steps, step_starts
+from monoforce_ros.discrepancy.left_out_stretches import LeftOut
 from monoforce_ros.discrepancy.trial import folds_of
 from monoforce_ros.robots import RobotModel
 
@@ -34,9 +35,8 @@ def compare_after_steps(evidence: Evidence, robot: RobotModel, effects: Effects)
     """
     evidence = replace(corrected_evidence(evidence, robot), components=MOTION)
     motion = evidence.smoothed.motion
-    starts = step_starts(
-        evidence.commands, np.sort(window_starts(motion, evidence.smoothed.stretches, HORIZON, _SPACING))
-    )
+    possible = LeftOut.of(evidence, robot).starts(evidence, HORIZON, _SPACING)
+    starts = step_starts(evidence.commands, np.sort(possible))
     starts = starts[:: max(1, -(-len(starts) // _MOST))]
     if not len(starts):
         return None
