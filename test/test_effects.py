@@ -460,6 +460,22 @@ def test_a_value_for_each_trajectory_gives_what_each_value_gives_alone(husky, na
     assert husky.number_of_drives == 2
 
 
+@pytest.mark.parametrize("factor", [0.05, 0.3, 3.0])
+def test_a_robot_that_friction_holds_on_a_slope_creeps_by_the_factor(husky, factor):
+    """At a slip far below that at which friction is mobilised the two are proportional; nothing trembles at 1 mm/s."""
+    x, _ = (torch.from_numpy(v) for v in np.meshgrid(GRID.x, GRID.y))
+    slope = TerrainMap.from_height(0.17 * x, GRID)
+    speeds = []
+    for creep in (1.0, factor):
+        robot = having(husky, friction_creep={"factor": creep})
+        still = torch.zeros(1, 400, 2, dtype=torch.float64)
+        result = rollout(slope, robot, still, State.at_rest(0.14, dtype=torch.float64), with_forces=False)
+        settled = result.velocity[0, -100:].norm(dim=-1)
+        assert float(settled.std()) < 0.02 * float(settled.mean())
+        speeds.append(float(settled.mean()))
+    assert speeds[1] / speeds[0] == pytest.approx(factor, rel=0.02)
+
+
 def test_every_effect_has_strong_values_to_be_tested_with():
     # Those on joints: test_joint_effects.py.
     acting = {name for name, effect in CATALOGUE.items() if effect.stage != "measurement" and not effect.needs}
