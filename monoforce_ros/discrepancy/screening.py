@@ -19,6 +19,9 @@ from monoforce_ros.robots import RobotModel
 _FITTED = 8
 """Effects with one parameter that are fitted in one round, those that promise the smallest loss first. More than are
 judged afterwards; fewer than all of them only to save time."""
+_ITERATIONS = 3
+"""Of these fits: what is far lower than expected is reached in three from any of its initial values, also beside an
+effect that moves with it (``test_effect_recovery.py``); later fits go on from there."""
 _HOPELESS = 0.3
 """p-value of an effect by itself at its best initial value above which it is not fitted: ten times the rate at which
 effects count as significant among all candidates. It only saves time."""
@@ -200,11 +203,13 @@ class Screening:
         if not incomplete:
             influences = [self._directions.influence(base, start[-1]) for _, _, start in tried]
             possible = np.array([test.p <= _HOPELESS for test in self.tested(base, fixed, residual, influences)])
-        # Only what may be significant, and promises to reduce the loss, is fitted; others keep their initial values.
+        # Only what may be significant, and promises to reduce the loss, is fitted; others keep their initial values. The
+        # base's effects are fitted again beside it: alone they took over some of what a further one does, and with the
+        # values that they have then nothing leads to it.
         fits = []
         for rank, (_, effect, start) in enumerate(tried):
             promising = possible[rank] and (rank < _FITTED or len(effect.identified) > 1)
-            fits.append(self.quick_fit(start, len(base), 2 if promising else 0))
+            fits.append(self.quick_fit(start, fixed, _ITERATIONS if promising else 0))
         influences = [
             influences[rank] if not incomplete and fit == start else self._directions.influence(base, fit[-1])
             for rank, ((_, _, start), (fit, _)) in enumerate(zip(tried, fits, strict=True))
@@ -248,7 +253,10 @@ class Screening:
         slopes = (weights * residual * changes).sum(axis=(1, 2, 3))
         curvatures = np.maximum((weights * changes**2).sum(axis=(1, 2, 3)), 1e-12)
         promised = robust(residual).mean() - 0.5 * slopes**2 / curvatures / motion_count(residual)
-        return float(min(promised.min(), losses.min())), effect, starts[int(np.argmin(losses))]
+        # One that changes nothing, as the robot file's own, has the smallest loss where every other one is too far, and
+        # shows nothing.
+        best = int(np.argmin(np.where((changes**2).sum(axis=(1, 2, 3)) > 0.0, losses, np.inf)))
+        return float(min(promised.min(), losses.min())), effect, starts[best]
 
     def starts(self, effect: Effect) -> list[Effects]:
         """Initial values of an effect's fits: over its range, from the robot's file, and what a sensor suggests."""
