@@ -291,6 +291,22 @@ def test_friction_that_fell_far_below_that_of_the_file_is_found():
     assert dict(found.effects)["friction_scale"]["factor"] == pytest.approx(0.05, rel=0.1)
 
 
+@pytest.mark.parametrize("friction", [0.12, 0.2])
+def test_an_effect_is_found_beside_one_that_took_over_some_of_it(friction):
+    """On ice the robot turns less than its limited drives make it: another limit alone takes over some of that. From
+    there no friction explains much, unless the limit moves with it."""
+    husky = load_robot("husky")
+    weak = replace(husky, effects=(("drive_compliance", {"speed_loss": 0.1}), ("friction_scale", {"factor": 1.2})))
+    hidden = (("actuator_saturation", {"limit": 0.45}), ("friction_scale", {"factor": friction}))
+    search = Search(weak, driven(replace(weak, effects=(weak.effects[0], *hidden))), SCALE)
+    alone = (("actuator_saturation", {"limit": 0.52}),)
+    further = search.screening.candidates(alone, 0, "2: ")
+    found = next(entry for entry in further.screened if entry.name == "friction_scale")
+    assert found.loss < 0.05 * further.before and found.test.adjusted < 0.025
+    assert dict(found.effects)["friction_scale"]["factor"] == pytest.approx(friction, rel=0.15)
+    assert dict(found.effects)["actuator_saturation"]["limit"] == pytest.approx(0.45, rel=0.03)
+
+
 @pytest.mark.parametrize(("difference", "names"), [(0.02, ["drive_gain"]), (0.06, ["drive_gain", "drive_loss"])])
 def test_what_is_no_more_than_the_error_of_a_formula_is_no_further_effect(difference, names):
     """Formulas are exact only in our own simulator: elsewhere a second effect makes up for the first one's error."""
