@@ -203,9 +203,9 @@ class Screening:
         if not incomplete:
             influences = [self._directions.influence(base, start[-1]) for _, _, start in tried]
             possible = np.array([test.p <= _HOPELESS for test in self.tested(base, fixed, residual, influences)])
-        # Only what may be significant, and promises to reduce the loss, is fitted; others keep their initial values. The
-        # base's effects are fitted again beside it: alone they took over some of what a further one does, and with the
-        # values that they have then nothing leads to it.
+        # Only what may be significant, and promises to reduce the loss, is fitted; others keep their initial values.
+        # The base's effects are fitted again beside it: alone they took over some of what a further one does, and with
+        # the values that they have then nothing leads to it.
         fits = []
         for rank, (_, effect, start) in enumerate(tried):
             promising = possible[rank] and (rank < _FITTED or len(effect.identified) > 1)
