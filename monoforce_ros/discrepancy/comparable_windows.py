@@ -35,7 +35,6 @@ def comparable_windows(evidence: Evidence, robot: RobotModel, settings: Diagnosi
     """Windows of a recording in which the ground moves the robot as its commands ask."""
     smoothed = evidence.smoothed
     starts = window_starts(smoothed.motion, smoothed.stretches, settings.horizon, settings.stride)
-    starts = subsampled(starts, BLOCK, settings.max_windows)
     left_out = LeftOut.of(evidence, robot)
     blocked = "" if left_out.spinning is None else left_out.spinning.summary()
     remarks = []
@@ -51,7 +50,9 @@ def comparable_windows(evidence: Evidence, robot: RobotModel, settings: Diagnosi
     if blocked and len(starts) and len(evidence.commands):
         remarks.append(blocked + ("; this time is left out" if len(left_out.in_place) else ""))
     kept = ~overlapping(left_out.stretches, starts, settings.horizon)
-    return Comparable(starts[kept], tuple(remarks), left_out.stretches, blocked)
+    # Of what is left: a recording that is long beside its map would lose nearly all of it otherwise.
+    starts = subsampled(starts[kept], BLOCK, settings.max_windows)
+    return Comparable(starts, tuple(remarks), left_out.stretches, blocked)
 
 
 def _seconds(stretches: np.ndarray) -> str:
