@@ -10,8 +10,9 @@ from monoforce_ros.bags import SmoothedMotion, smoothing
 from monoforce_ros.core import CommandTrack, MotionTrack
 from monoforce_ros.discrepancy.comparison import Comparison, measured_paths
 from monoforce_ros.discrepancy.diagnosis import Details
-from monoforce_ros.discrepancy.evidence import EvidenceWindows
+from monoforce_ros.discrepancy.evidence import Evidence, EvidenceWindows
 from monoforce_ros.discrepancy.figures import map_figure, timeline_figure, with_gaps
+from monoforce_ros.discrepancy.left_out_stretches import LeftOut
 from monoforce_ros.discrepancy.nominal_residual import residual_complaint
 from monoforce_ros.robots import load_robot
 
@@ -50,7 +51,8 @@ def test_times_are_those_of_the_recording_where_windows_begin_later():
     figure = timeline_figure(Details(data, zeros, zeros[0], (), ()))
     np.testing.assert_allclose(figure.axes[0].lines[0].get_xdata(), np.arange(8.0, 14.0))
     np.testing.assert_allclose(figure.axes[3].lines[0].get_xdata(), np.arange(8.0, 14.0))
-    paths = measured_paths(load_robot("husky"), data, smoothed.stretches, None)
+    evidence, husky = Evidence(smoothed, commands), load_robot("husky")
+    paths = measured_paths(husky, data, evidence, LeftOut.of(evidence, husky), None)
     assert min(path.start for path in paths) >= 8.0 and figure.axes[3].get_xlabel() == "time in the recording [s]"
 
 
@@ -73,7 +75,8 @@ def test_neither_the_map_nor_a_path_leads_across_a_gap():
     lines = map_figure(details).axes[0].collections[0].get_segments()
     assert max(np.linalg.norm(np.diff(line, axis=0), axis=1).max() for line in lines) < 0.1
     assert sum(map(len, lines)) == 400
-    for path in measured_paths(load_robot("husky"), data, stretches, None, count=20):
+    evidence, husky = Evidence(replace(smoothed, motion=motion, stretches=stretches), commands), load_robot("husky")
+    for path in measured_paths(husky, data, evidence, LeftOut.of(evidence, husky), None, count=20):
         assert not 8.0 - 5.0 < path.start < 8.0
         assert np.hypot(*path.measured[-1, :2]) < 3.0
 

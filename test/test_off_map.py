@@ -95,10 +95,34 @@ def test_a_healthy_robot_that_leaves_its_map_is_healthy_and_the_page_says_what_w
     assert found.verdict == Verdict.NO_DISCREPANCY
     (remark,) = (text for text in found.remarks if "edge of the map" in text)
     assert "give a larger map (--terrain)" in remark
+    assert off_map_stretches(cut, husky).shape == (1, 2)
+    end = (off_map_stretches(cut, husky)[0, 0] - 10**9) * 1e-9
+    assert found.details.paths and all(path.start + 5.0 < end + 0.2 for path in found.details.paths)
     # Neither do errors hold what cannot be compared, at any horizon.
     whole = diagnose(evidence_on(100.0), husky, settings=DiagnosisSettings(horizon=2.0, samples=tuple(SAMPLES)))
     for metric in ("position_1s", "position_2s", "position_5s"):
         assert found.gap[metric].before < 1.5 * whole.gap[metric].before + 0.002
+
+
+def test_the_time_off_the_map_holds_no_gap_of_the_poses():
+    husky, evidence = load_robot("husky"), evidence_on(100.0)
+    smoothed = evidence.smoothed
+    cut = replace(evidence, terrain=hilly(edge_of(evidence, 0.7)))
+    (whole,) = off_map_stretches(cut, husky)
+    # Somewhere within that time the poses pause for 300 s.
+    middle = int(np.searchsorted(smoothed.motion.stamps, whole.mean()))
+    count = len(smoothed.motion)
+    late = (np.arange(count) >= middle) * 300 * 10**9
+    paused = replace(
+        smoothed,
+        motion=replace(smoothed.motion, stamps=smoothed.motion.stamps + late),
+        stretches=(slice(0, middle), slice(middle, count)),
+    )
+    found = off_map_stretches(replace(cut, smoothed=paused), husky)
+    assert len(found) == 2
+    # But for the time between the two poses beside the pause.
+    between = smoothed.motion.stamps[middle] - smoothed.motion.stamps[middle - 1]
+    assert np.diff(found, axis=1).sum() == whole[1] - whole[0] - between
 
 
 def test_what_lies_beyond_the_map_is_not_commissioned():

@@ -297,7 +297,7 @@ def _commission(options: argparse.Namespace) -> int:
         print(f"{bag}: ground: {ground.description}")
         if ground.unknown:
             print(f"diagnose: {bag}: {ground.complaint}", file=sys.stderr)
-        for remark in (*remarks, *comparable_windows(evidence, robot, DiagnosisSettings()).left_out):
+        for remark in (*remarks, *comparable_windows(evidence, robot, DiagnosisSettings()).remarks):
             print(f"{bag}: {remark}")
     settings = DiagnosisSettings()
     effects, nominal = commission(recordings, robot, samples=settings.samples)

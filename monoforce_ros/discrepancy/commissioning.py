@@ -88,6 +88,8 @@ class _Prepared:
     predictions: Predictions
     floor: np.ndarray
     """Residuals by noise and map, ``[W, K, C]``."""
+    left_out: LeftOut
+    """Of the recording."""
 
     @property
     def blocks(self) -> int:
@@ -96,7 +98,7 @@ class _Prepared:
 
     def __getitem__(self, chosen: np.ndarray) -> _Prepared:
         data = replace(self.data, starts=self.data.starts[chosen])
-        return _Prepared(data, Predictions(self.predictions.robot, data), self.floor[chosen])
+        return _Prepared(data, Predictions(self.predictions.robot, data), self.floor[chosen], self.left_out)
 
 
 def commission(
@@ -171,7 +173,11 @@ def commission(
         else None,
         wheels=_healthy_wheels(recordings, drives, replace(robot, effects=_together(robot, merged.effects))),
         efforts=HealthyEfforts.learned(
-            [(entry.commands, entry.efforts, LeftOut.of(entry, robot).stretches) for entry in recordings], robot
+            [
+                (entry.commands, entry.efforts, part.left_out.stretches)
+                for entry, part in zip(recordings, prepared, strict=True)
+            ],
+            robot,
         ),
     )
     progress(1.0, "done")
@@ -181,7 +187,8 @@ def commission(
 def _prepare(evidence: Evidence, robot: RobotModel, samples: np.ndarray, stride: float) -> _Prepared:
     smoothed = evidence.smoothed
     # What somebody drove with a joystick, or wheels that turned in place, is not how the robot follows its commands.
-    starts = LeftOut.of(evidence, robot).starts(evidence, float(samples[-1]), stride)
+    left_out = LeftOut.of(evidence, robot)
+    starts = left_out.starts(evidence, float(samples[-1]), stride)
     found = motion_faults(smoothed, evidence.commands, evidence.wheels, evidence.efforts) or complaints(
         evidence, starts
     )
@@ -192,7 +199,7 @@ def _prepare(evidence: Evidence, robot: RobotModel, samples: np.ndarray, stride:
         noise_floor(smoothed.motion, noisy_motions(smoothed), data),
         terrain_uncertainty(robot, data, evidence.split_maps),
     )
-    return _Prepared(data, Predictions(robot, data), floor)
+    return _Prepared(data, Predictions(robot, data), floor, left_out)
 
 
 def _fitted(entry: _Prepared, effects: Effects, iterations: int = 12) -> Fit:

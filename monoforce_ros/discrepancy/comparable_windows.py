@@ -23,10 +23,10 @@ class Comparable:
 
     starts: np.ndarray
     """``[W]`` [ns]."""
-    left_out: tuple[str, ...]
+    remarks: tuple[str, ...]
     """In words what was left out for which reason."""
-    stretches: np.ndarray
-    """Start and end of each stretch that windows must not overlap, ``[n, 2]`` [ns]."""
+    left_out: LeftOut
+    """Stretches that windows must not overlap."""
     blocked: str
     """When wheels turn while the robot, or one side of it, stays where it is; empty where they do not."""
 
@@ -52,7 +52,7 @@ def comparable_windows(evidence: Evidence, robot: RobotModel, settings: Diagnosi
     kept = ~overlapping(left_out.stretches, starts, settings.horizon)
     # Of what is left: a recording that is long beside its map would lose nearly all of it otherwise.
     starts = subsampled(starts[kept], BLOCK, settings.max_windows)
-    return Comparable(starts, tuple(remarks), left_out.stretches, blocked)
+    return Comparable(starts, tuple(remarks), left_out, blocked)
 
 
 def _seconds(stretches: np.ndarray) -> str:

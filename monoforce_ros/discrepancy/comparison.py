@@ -15,7 +15,7 @@ from monoforce_ros.core import MotionTrack
 from monoforce_ros.discrepancy.evidence import MOTION, Evidence, EvidenceWindows
 from monoforce_ros.discrepancy.gap import find_regimes, noise_residuals, relative_motion
 from monoforce_ros.discrepancy.hypothesis import Effects, Predictions, residuals_by_part
-from monoforce_ros.discrepancy.left_out_stretches import LeftOut
+from monoforce_ros.discrepancy.left_out_stretches import LeftOut, overlapping
 from monoforce_ros.discrepancy.trial import BLOCK, blocks_of
 from monoforce_ros.robots import RobotModel
 
@@ -260,7 +260,8 @@ def regime_table(comparison: Comparison) -> list[RegimeRow]:
 def measured_paths(
     robot: RobotModel,
     data: EvidenceWindows,
-    stretches: Sequence[slice],
+    evidence: Evidence,
+    left_out: LeftOut,
     held_out: HeldOut | None,
     count: int = 6,
 ) -> list[PathComparison]:
@@ -269,14 +270,17 @@ def measured_paths(
     Args:
         robot: the nominal model.
         data: the recording.
-        stretches: parts of its motion without gaps; each path lies within one.
+        evidence: the whole of it; each path lies within a part without gaps.
+        left_out: stretches of it that cannot be compared.
         held_out: the effects that predict each window, or None.
         count: largest number of paths.
     """
     horizon, stamps = 5.0, data.motion.stamps
-    spans = np.array([(stamps[part.start], stamps[part.stop - 1]) for part in stretches], np.int64).reshape(-1, 2)
+    spans = np.array([(stamps[part.start], stamps[part.stop - 1]) for part in evidence.smoothed.stretches], np.int64)
+    spans = spans.reshape(-1, 2)
     begins, ends = data.starts[:, None], data.starts[:, None] + round((horizon + 0.1) * 1e9)
     starts = data.starts[((begins >= spans[:, 0]) & (ends < spans[:, 1])).any(axis=1)]
+    starts = starts[~overlapping(left_out.stretches, starts, horizon)]
     if held_out is not None:
         starts = held_out.judged(starts, horizon)
     if not len(starts):

@@ -47,6 +47,7 @@ class Judge:
         evidence: Evidence,
         robot: RobotModel,
         explanation: Explanation,
+        left_out: LeftOut,
         noisy: Sequence[MotionTrack],
         settings: DiagnosisSettings,
     ) -> Judge:
@@ -55,7 +56,7 @@ class Judge:
             evidence,
             robot,
             explanation,
-            LeftOut.of(evidence, robot),
+            left_out,
             noisy,
             settings.seed,
             heading_noise(evidence, explanation.sensors.gyro),

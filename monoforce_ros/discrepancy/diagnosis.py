@@ -162,14 +162,14 @@ def diagnose(
     evidence, nominal = with_known_components(evidence, nominal)
     smoothed = evidence.smoothed
     comparable = comparable_windows(evidence, robot, settings)
-    starts, left_out = comparable.starts, comparable.left_out
+    starts, left_out = comparable.starts, comparable.remarks
     leans = (
         changed_lean(lean_of(smoothed.motion), nominal.lean) if nominal is not None and evidence.with_attitude else ""
     )
     known = None if nominal is None else nominal.efforts
     efforts = changed_efforts(
         evidence.commands, evidence.efforts, evidence.wheels, robot, known, settings.thresholds,
-        left_out=comparable.stretches,
+        left_out=comparable.left_out.stretches,
     )  # fmt: skip
     faults = motion_faults(smoothed, evidence.commands, evidence.wheels, evidence.efforts)
     if faults:
@@ -196,7 +196,7 @@ def diagnose(
     floor = np.sqrt((uncertainty**2).mean(axis=0))
     before = search.predictions.residuals([()])[0]
     progress(0.6, "comparing before and after")
-    judge = Judge.of(evidence, robot, explanation, noisy, settings)
+    judge = Judge.of(evidence, robot, explanation, comparable.left_out, noisy, settings)
     steps = _Steps(progress, 0.62, 0.95)
     concluded = conclude(
         explanation, judge, lambda: repeat(evidence, robot, explanation.windows, nominal, settings, steps)
@@ -220,7 +220,7 @@ def diagnose(
     compared = concluded.compared
     at_horizon = next((comparison for comparison in compared if comparison.horizon == settings.horizon), None)
     expected = floor if nominal is None else np.sqrt(floor**2 + (nominal.residual_in(data) ** 2).mean(axis=0))
-    paths = tuple(measured_paths(robot, data, smoothed.stretches, concluded.judged))
+    paths = tuple(measured_paths(robot, data, evidence, comparable.left_out, concluded.judged))
     regimes = find_regimes(data)
     hints = advice(verdict, measured.effects, gyro=evidence.gyro is not None)
     place = None

@@ -30,6 +30,8 @@ class HeldOutBag:
     """Corrected for what the robot's file says of its sensors."""
     robot: RobotModel
     """The nominal model."""
+    left_out: LeftOut
+    """What of the recording cannot be compared."""
 
     @classmethod
     def of(cls, evidence: Evidence, robot: RobotModel, nominal: NominalModel | None) -> HeldOutBag:
@@ -46,22 +48,22 @@ class HeldOutBag:
         evidence, _ = with_known_components(corrected_evidence(evidence, robot), nominal)
         if not len(evidence.commands):
             raise ValueError("no commands; record the commands of the base controller (cmd_vel)")
-        starts = LeftOut.of(evidence, robot).starts(evidence, HORIZONS[0])
+        left_out = LeftOut.of(evidence, robot)
+        starts = left_out.starts(evidence, HORIZONS[0])
         if len(starts) < FEWEST_WINDOWS:
             raise ValueError(
                 f"{len(starts)} windows of {HORIZONS[0]:g} s, expected at least {FEWEST_WINDOWS}: give a "
                 "recording of 10 s or longer, without gaps, with commands and on its map"
             )
-        return cls(evidence, robot)
+        return cls(evidence, robot, left_out)
 
     def table(self, effects: Effects) -> dict[str, GapRow]:
         """Errors without and with effects that were fitted to another recording, by metric and horizon."""
         smoothed = self.evidence.smoothed
-        left_out = LeftOut.of(self.evidence, self.robot)
-        starts = left_out.starts(self.evidence, _HORIZON)
+        starts = self.left_out.starts(self.evidence, _HORIZON)
         data = self.evidence.cut(starts, np.array([_HORIZON]))
         everywhere = HeldOut.everywhere(effects) if effects else None
-        compared = compare(self.robot, data, self.evidence, left_out, everywhere, noisy_motions(smoothed))
+        compared = compare(self.robot, data, self.evidence, self.left_out, everywhere, noisy_motions(smoothed))
         by_gyro = heading_noise(self.evidence, compare_with_gyro(smoothed, self.evidence.gyro))
         return gap_table(compared, heading_noise=by_gyro)
 

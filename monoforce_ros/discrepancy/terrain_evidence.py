@@ -12,6 +12,7 @@ from monoforce_ros.core import MotionTrack, transform_points
 from monoforce_ros.discrepancy.areas import reach_of
 from monoforce_ros.discrepancy.evidence import Evidence, EvidenceWindows
 from monoforce_ros.discrepancy.hypothesis import Predictions
+from monoforce_ros.discrepancy.wheel_motion import runs
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import Grid, TerrainMap
 from monoforce_ros.training import traced_heights
@@ -76,11 +77,14 @@ def off_map_stretches(evidence: Evidence, robot: RobotModel) -> np.ndarray:
     left, right, bottom, top = terrain.grid.extent
     low, high = np.array([left, bottom]) + reach_of(robot), np.array([right, top]) - reach_of(robot)
     off = ((places < low) | (places > high)).any(axis=1)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], off, [False]]).astype(np.int8)))
-    first, last = edges[::2], edges[1::2] - 1
-    # Between two poses the robot is where either of them says: the stretch reaches to the neighbours.
-    stamps = motion.stamps
-    return np.column_stack([stamps[np.maximum(first - 1, 0)], stamps[np.minimum(last + 1, len(stamps) - 1)]])
+    found = []
+    for part in evidence.smoothed.stretches:
+        stamps = motion.stamps[part]
+        # Between two poses the robot is where either of them says: the stretch reaches to the neighbours.
+        found += [
+            (stamps[max(first - 1, 0)], stamps[min(last + 1, len(stamps) - 1)]) for first, last in runs(off[part])
+        ]
+    return np.array(found, np.int64).reshape(-1, 2)
 
 
 def terrain_uncertainty(

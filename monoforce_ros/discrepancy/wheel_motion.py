@@ -213,8 +213,8 @@ def wheel_ways(motion: MotionTrack, wheels: WheelTrack, robot: RobotModel) -> Wh
 
 def _stretches(mask: np.ndarray, starts: np.ndarray, width: int) -> list[tuple[int, int]]:
     """First and last step of each run of pieces; pauses of the wheels do not divide it."""
-    runs = [(int(starts[low]), int(starts[high]) + width) for low, high in _runs(mask)]
-    return [(low, high) for low, high in _merged(runs, width) if (high - low) * _STEP >= _SHORTEST]
+    found = [(int(starts[low]), int(starts[high]) + width) for low, high in runs(mask)]
+    return [(low, high) for low, high in _merged(found, width) if (high - low) * _STEP >= _SHORTEST]
 
 
 def undriven_stretches(
@@ -268,7 +268,7 @@ def undriven_stretches(
     follows = np.abs(measured - held).max(axis=1) < 0.3 * np.abs(held).max(axis=1)
     moving = quiet & known & ~follows & (np.abs(measured).max(axis=1) > floor)
     # Pauses of a joystick drive belong to it.
-    spans = _merged(_runs(moving), round(1.0 / _STEP))
+    spans = _merged(runs(moving), round(1.0 / _STEP))
     if not by_wheels:
         spans = [(low, high) for low, high in spans if low > 0 and quiet[low - 1] and known[low - 1]]
     margin = round(0.5 / _STEP)
@@ -310,15 +310,15 @@ def _followed(
     return float(np.median(speeds[driven, column] / commanded[driven])) if driven.any() else None
 
 
-def _runs(mask: np.ndarray) -> list[tuple[int, int]]:
-    """First and last index of each run of true values."""
+def runs(mask: np.ndarray) -> list[tuple[int, int]]:
+    """First and last index of each run of true values of a mask ``[n]``."""
     edges = np.flatnonzero(np.diff(np.r_[0, mask.astype(int), 0]))
     return [(int(low), int(high) - 1) for low, high in zip(edges[::2], edges[1::2], strict=True)]
 
 
-def _merged(runs: list[tuple[int, int]], gap: int) -> list[tuple[int, int]]:
+def _merged(found: list[tuple[int, int]], gap: int) -> list[tuple[int, int]]:
     merged: list[tuple[int, int]] = []
-    for low, high in runs:
+    for low, high in found:
         if merged and low - merged[-1][1] <= gap:
             merged[-1] = (merged[-1][0], high)
         else:

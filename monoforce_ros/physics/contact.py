@@ -206,8 +206,10 @@ def contact(
     if grip is not None:
         held = torch.stack([grip, torch.ones_like(grip)])
         slip, friction = slip * held, friction * held
-    # Soft soil has its own slip at which its shear builds up.
-    slip_square = (options.slip_regularisation * (creep if soil is None else torch.ones_like(creep))) ** 2
+    slip_square: float | Tensor = options.slip_regularisation**2
+    if soil is None:
+        # Soft soil has its own slip at which its shear builds up.
+        slip_square = slip_square * creep**2
     if friction_factors.shape[1] == 4 and soil is None:
         # The hull does not roll; the tread of a free wheel moves as fast as the robot.
         rolling = belt_speeds[:, 0] if grip is None else grip * belt_speeds[:, 0] + (1.0 - grip) * point_velocity[:, 1]
