@@ -71,7 +71,7 @@ bench: build interfaces
 	@scripts/run.sh python benchmarks/integrators.py --json out/integrators.json
 	@scripts/run.sh python benchmarks/mujoco_check.py --json out/mujoco_check.json
 	@scripts/run.sh python benchmarks/encoder.py --json out/encoder.json
-	@if [ -d "$(SCENES)" ]; then scripts/run.sh python benchmarks/real_scenes.py "$(SCENES)" --json out/real_scenes.json; \
+	@if [ -d "$(SCENES)" ]; then scripts/run.sh python benchmarks/real_scenes.py "$(SCENES)" --adapt 8 --json out/real_scenes.json; \
 	  else echo "[bench] no real scenes at $(SCENES)"; fi
 
 REAL_DATA ?= $(or $(MONOFORCE_REAL_DATA),../shared/data)

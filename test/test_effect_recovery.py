@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import torch
 from recorded_rollout import recorded
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation
 
 from monoforce_ros.bags import SmoothedMotion
 from monoforce_ros.core import CommandTrack
@@ -289,6 +291,47 @@ def test_friction_that_fell_far_below_that_of_the_file_is_found():
     found = Search(file, data, SCALE).run(1, exchange=False).best
     assert found.names == ("friction_scale",)
     assert dict(found.effects)["friction_scale"]["factor"] == pytest.approx(0.05, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("hidden", "other", "worse"),
+    [
+        (("gravity_tilt", {"about_x": 0.0, "about_y": 0.05}), "constant_force", 1.0),
+        (("command_delay", {"delay": 0.2}), "command_clock_offset", 1.0),
+        # They differ where the robot starts and stops, which a better localisation shows.
+        (("actuator_deadband", {"width": 0.06}), "rolling_resistance", 3.0),
+    ],
+)
+def test_effects_that_a_drive_cannot_separate_are_one_class(hidden, other, worse):
+    """On level ground, straight ahead: of each pair the motion says the same."""
+    husky = load_robot("husky")
+    robot = replace(husky, effects=(("drive_compliance", {"speed_loss": 0.3}),))
+    data = straight(replace(robot, effects=(*robot.effects, hidden)), worse)
+    outcome = Search(robot, data, worse * SCALE).run(1)
+    (found,) = outcome.best.names
+    assert {hidden[0], other} <= {found, *outcome.indistinguishable[found]}
+
+
+def straight(robot, worse=1.0):
+    """Windows of a drive straight ahead, on level ground, at two speeds between stops, with the errors of a
+    localisation: 8 mm and 0.2°, or so many times ``worse``, correlated over half a second."""
+    step = np.arange(2700)
+    commanded = np.zeros((2700, 2))
+    commanded[:, 0] = np.where(step % 540 < 400, np.where(step % 1080 < 540, 0.3, 0.7), 0.0)
+    speeds = drive_speeds(robot, torch.as_tensor(commanded[None], dtype=torch.float32), 0.01)
+    result = rollout(TerrainMap.flat(GRID), robot, speeds, State.at_rest(0.14), with_forces=False)
+    motion = recorded(result, 10**9)
+    random = np.random.default_rng(5)
+
+    def error(size):
+        samples = 0.5e9 / float(motion.stamps[1] - motion.stamps[0])
+        rough = gaussian_filter1d(random.standard_normal((len(motion), 3)), samples, axis=0)
+        return worse * size * rough / rough.std()
+
+    turned = Rotation.from_quat(motion.quaternions) * Rotation.from_rotvec(error(np.radians(0.2)) * [0.0, 0.0, 1.0])
+    motion = replace(motion, positions=motion.positions + error(0.008), quaternions=turned.as_quat())
+    commands = CommandTrack(10**9 + step * 10_000_000, commanded)
+    return EvidenceWindows(motion, commands, window_starts(motion, [slice(0, len(motion))], 2.0, 1.0), 2.0, SAMPLES)
 
 
 @pytest.mark.parametrize("friction", [0.12, 0.2])

@@ -19,7 +19,7 @@ from monoforce_ros.discrepancy.preflight import advice
 from monoforce_ros.discrepancy.report import report_content, summary_lines
 from monoforce_ros.discrepancy.verdict import Losses
 from monoforce_ros.discrepancy.wording import cause, finding, remedy
-from monoforce_ros.effects import CATALOGUE, identifiable_effects
+from monoforce_ros.effects import CATALOGUE, identifiable_effects, separating_manoeuvre, separating_sensor
 from monoforce_ros.robots import load_robot, write_robot
 
 
@@ -391,6 +391,32 @@ def test_every_verdict_has_a_sentence_a_page_and_a_tone(verdict):
     assert report_content(diagnosis, inputs, None)["headline"]["tone"] == top.tone
     if verdict == Verdict.UNKNOWN_EFFECT:
         assert "no known effect" in top.sentence and "torque_z = 231 vx" in top.findings[0]
+
+
+def test_nothing_is_lost_that_has_no_room_on_the_first_screen():
+    hints = tuple(f"record manoeuvre number {number:02d}" for number in range(12))
+    page = diagnosis_page(diagnosed((0.5, 0.1), (8.0, 1.5), advice=hints), {}, None).lower()
+    for hint in hints:
+        assert page.count(hint) == 1, hint
+    assert page.index("also</h2>") < page.index(hints[-1])
+    assert "also</h2>" not in diagnosis_page(diagnosed((0.5, 0.1), (8.0, 1.5)), {}, None).lower()
+
+
+@pytest.mark.parametrize(
+    ("one", "other"), [("actuator_deadband", "rolling_resistance"), ("rolling_resistance", "constant_force")]
+)
+def test_a_class_of_causes_comes_with_the_manoeuvre_that_separates_them(one, other):
+    parameters = {p.name: (p.neutral + p.scale, p.neutral, p.neutral + 2 * p.scale) for p in CATALOGUE[one].parameters}
+    hints = advice(Verdict.EFFECT_FOUND, [effect(one, indistinguishable=(other,), **parameters)])
+    assert any(f"would distinguish {one} from {other}" in hint for hint in hints)
+
+
+def test_every_pair_of_effects_has_a_manoeuvre_or_a_sensor():
+    names = [entry.name for entry in identifiable_effects()]
+    for one in names:
+        for other in names:
+            if one != other:
+                assert separating_manoeuvre(one, other) or separating_sensor(one, other), (one, other)
 
 
 def test_a_model_that_misses_the_healthy_robot_does_not_say_that_nothing_is_wrong():

@@ -55,6 +55,7 @@ PARAMETERS = {
     "constant_force": {"x": 20.0, "y": -10.0},
     "learned_term": {"force_x:vx": -10.0, "torque_z:wz": -5.0},
     "friction_scale": {"factor": 0.8},
+    "friction_creep": {"factor": 2.0},
     "terrain_softness": {"factor": 2.0},
     "drive_gain": {"gain": 0.9},
     "actuator_lag": {"time_constant": 0.2},
@@ -91,6 +92,20 @@ def test_the_adjoint_gives_the_gradient_of_every_parameter():
         assert scale > 0.0, name
         assert got is not None, name
         assert float((got - expected).abs().max()) < 0.02 * scale, name
+
+
+def test_friction_that_is_mobilised_at_little_slip_is_integrated_in_shorter_steps():
+    """At steps of 1 ms the derivative by the factor grows to 1e21 within 0.6 s, and the robot trembles."""
+    robot = load_robot("husky", spacing=0.3).to(torch.float64)
+    value = torch.tensor(0.2, dtype=torch.float64, requires_grad=True)
+    robot = dataclasses.replace(robot, effects=(("friction_creep", {"factor": value}),))
+    speeds = torch.full((1, 40, 2), 0.5, dtype=torch.float64)
+    state = State.at_rest(0.14, dtype=torch.float64)
+    result = rollout(TerrainMap.flat(GRID).to(torch.float64), robot, speeds, state, ode=OdeOptions(), with_forces=False)
+    assert float(result.angular_velocity[0, -5:].detach().abs().max()) < 0.05
+    # Straight ahead it hardly matters at which slip friction is mobilised.
+    (derivative,) = torch.autograd.grad(result.position[0, -1, 0], value)
+    assert abs(float(derivative)) < 0.01
 
 
 @pytest.mark.parametrize("adjoint", [False, True])

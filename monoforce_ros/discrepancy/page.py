@@ -173,9 +173,11 @@ def _result(top: Headline, robot_file: Path | None, in_file: Sequence[str], left
             ("What to do", f"<ul>{_list_items(actions[:_MOST_LISTED])}</ul>"),
         )
     )
+    rest = [text for texts in (top.findings, top.doubts, top.confidence, actions) for text in texts[_MOST_LISTED:]]
+    below = card(f"<ul>{_list_items(rest)}</ul>", heading="Also") if rest else ""
     return (
         f"<section class='card result' style='--tone:{_COLOURS[top.tone]}'><h2>{html.escape(top.sentence)}</h2>{left}"
-        f"<div class='columns'>{columns}</div></section>"
+        f"<div class='columns'>{columns}</div></section>{below}"
     )
 
 

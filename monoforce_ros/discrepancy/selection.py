@@ -22,7 +22,7 @@ from monoforce_ros.discrepancy.learned import learned_terms
 from monoforce_ros.discrepancy.pairing import promising_pairs
 from monoforce_ros.discrepancy.screening import Candidates, Screened, admitted
 from monoforce_ros.discrepancy.trial import CandidateScore, FitTest, Outcome, Trial
-from monoforce_ros.effects import CATALOGUE, separating_sensor
+from monoforce_ros.effects import CATALOGUE
 
 _JUDGED = 6
 """Effects that are cross-validated in one round, those with the smallest screening loss first."""
@@ -372,7 +372,9 @@ class Search(Judging):
             residual = self.directions.scaled(base)
             direction = self.directions.direction(effect, np.nan_to_num(chosen - residual)[None])
             (test,) = self.screening.tested(base, self.fixed_count(base), residual, [direction])
-            if test.p > self.thresholds.comparison_rate or separating_sensor(other, effect):
+            # Both shift the motion against the commands: that they differ at all is how poses are interpolated.
+            same = CATALOGUE[other].shifts and CATALOGUE[effect].shifts
+            if test.p > self.thresholds.comparison_rate or same:
                 found.append(other)
         return found
 

@@ -76,9 +76,16 @@ def wheel_effects() -> tuple[Effect, ...]:
 
 
 def separating_manoeuvre(first: str, second: str) -> str:
-    """Manoeuvre for which a recording separates two effects; empty if neither effect defines one."""
+    """Manoeuvre for which a recording separates two effects.
+
+    Where neither effect defines one, a recording with that which makes each of them observable is the best there is;
+    empty for an effect without one, and where only a sensor separates the two.
+    """
     one, two = _catalogued(first), _catalogued(second)
-    return one.separated_by.get(second, "") or two.separated_by.get(first, "")
+    known = one.separated_by.get(second, "") or two.separated_by.get(first, "")
+    if known or separating_sensor(first, second) or not (one.manoeuvre and two.manoeuvre):
+        return known
+    return one.manoeuvre if one.manoeuvre == two.manoeuvre else f"{one.manoeuvre}, and {two.manoeuvre}"
 
 
 def separating_sensor(first: str, second: str) -> str:

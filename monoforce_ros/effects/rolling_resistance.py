@@ -20,7 +20,12 @@ class RollingResistance(Effect):
     parameters = (Parameter("coefficient", "-", 0.0, 0.0, 1.0, 0.05, "resistance over load"),)
     identified = ("coefficient",)
     manoeuvre = "slow and fast stretches straight ahead"
-    separated_by: ClassVar = {"viscous_drag": "slow and fast stretches straight ahead"}
+    separated_by: ClassVar = {
+        "viscous_drag": "slow and fast stretches straight ahead",
+        "quadratic_drag": "slow and fast stretches straight ahead",
+        "constant_force": "straight ahead and back the same way",
+        "actuator_deadband": "slow commands on level ground and up a slope, with measured wheel speeds",
+    }
 
     def setup(self, setup: Setup, values: Values) -> Setup:
         """The setup with this effect applied."""

@@ -68,6 +68,11 @@ class TerrainLookup:
         other.channels = channels
         return other
 
+    @property
+    def largest_friction(self) -> Tensor:
+        """Of all maps, a scalar."""
+        return self.channels[3].detach().max()
+
     def __call__(self, points: Tensor) -> Ground:
         """Ground below points ``[B, ≥ 2, N]`` [m]."""
         return self._bilinear(points) if self._kind == "bilinear" else self._constant(points)
