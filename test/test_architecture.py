@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 from conftest import ROOT
 
+from monoforce_ros.effects import CATALOGUE
+
 PACKAGE = ROOT / "monoforce_ros"
 PAGE = ROOT / "docs" / "architecture.md"
 FILES = sorted(PACKAGE.rglob("*.py"))
@@ -135,3 +137,20 @@ def test_numbers_of_a_diagnosis_say_where_they_come_from():
             if not isinstance(text, str):
                 silent.append(f"{path.name}:{node.lineno} {', '.join(names)}")
     assert not silent, f"{silent}: expected a docstring that says where the number comes from"
+
+
+_TRANSLATIONS = ("discrepancy/mujoco_export.py", "discrepancy/ros_export.py")
+"""Files that write effects in the words of other tools, which have a place for some of them."""
+
+
+def test_no_rule_names_an_effect_outside_its_own_file():
+    """What is particular to an effect is a property of it; the synthetic worlds plant effects by name."""
+    named = {}
+    for path in sorted((ROOT / "monoforce_ros").rglob("*.py")):
+        inside = path.relative_to(ROOT / "monoforce_ros").as_posix()
+        if inside.startswith(("effects/", "synthetic/")) or inside in _TRANSLATIONS or path.name == "__init__.py":
+            continue
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Constant) and node.value in CATALOGUE:
+                named.setdefault(inside, []).append((node.lineno, node.value))
+    assert not named, f"effects are named by hand: {named}"

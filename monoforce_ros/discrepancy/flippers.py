@@ -14,7 +14,8 @@ from monoforce_ros.discrepancy.estimates import EffectEstimate, ParameterEstimat
 from monoforce_ros.effects import CATALOGUE, flipper_place
 from monoforce_ros.robots import RobotModel, servo_response
 
-BLOCKED = "blocked_flipper"
+BLOCKED = next(name for name, effect in CATALOGUE.items() if effect.joints_measure)
+"""Effect that measured angles of flippers show."""
 _PIECE, _STEP = 2.0, 0.02
 """Length of the pieces, that of a diagnosed window, and time step of the modelled servos, below their time constants
 (0.05 s of the shipped robot's) [s]."""

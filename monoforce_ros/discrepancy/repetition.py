@@ -22,6 +22,7 @@ from monoforce_ros.discrepancy.estimates import EffectEstimate
 from monoforce_ros.discrepancy.evidence import Evidence
 from monoforce_ros.discrepancy.explanation import DiagnosisSettings, Explanation, Windows, explain
 from monoforce_ros.discrepancy.hypothesis import Effects
+from monoforce_ros.discrepancy.jackknife import widened
 from monoforce_ros.discrepancy.learned import LEARNED
 from monoforce_ros.discrepancy.nominal import NominalModel
 from monoforce_ros.discrepancy.thresholds import Thresholds
@@ -108,11 +109,13 @@ class Repetition:
         return replace(again, remarks=(*again.remarks, f"not added: {remark}"), losses=losses)
 
     def judged(self, effects: Sequence[EffectEstimate]) -> tuple[EffectEstimate, ...]:
-        """The effects of the whole recording, each with how often it was found again.
+        """The effects of the whole recording, each with how often it was found again, and with intervals as wide as
+        the values that were found then ask for.
 
         Where another effect is found in its place half of the time, the recording does not tell the two apart. Where
         fewer than half of the repetitions find it, it is one class with all that they name in its place.
         """
+        done = [entry for entry in self.repeated if entry is not None]
         names = [effect.name for effect in effects]
         alike = {effect.name: effect.indistinguishable for effect in effects}
         result = []
@@ -121,9 +124,10 @@ class Repetition:
                 result.append(effect)
                 continue
             support = self._support(effect.name, alike, names)
+            again = [values for entry in done for name, values in entry.effects if name == effect.name]
             result.append(
                 replace(
-                    effect,
+                    widened(effect, again, len(done)),
                     indistinguishable=(*effect.indistinguishable, *support.instead),
                     found_again=(support.found, support.repetitions),
                     named_otherwise=support.named_otherwise,

@@ -21,6 +21,11 @@ from monoforce_ros.discrepancy.wheels import WheelFinding, changed_drives, compa
 from monoforce_ros.effects import CATALOGUE
 from monoforce_ros.robots import RobotModel
 
+_CLOCK = next(name for name, effect in CATALOGUE.items() if effect.gyro_measures and effect.shifts)
+"""Effect by which the poses' clock differs from the gyro's."""
+_BIAS = next(name for name, effect in CATALOGUE.items() if effect.gyro_measures and not effect.identified)
+"""Effect of the gyro itself, which its readings show."""
+
 
 @dataclass(frozen=True)
 class SensorFindings:
@@ -63,7 +68,7 @@ class SensorFindings:
             healthy = None
         gyro = compare_with_gyro(evidence.smoothed, evidence.gyro)
         wheels = compare_with_wheels(evidence.commands, evidence.wheels, robot, healthy, thresholds.drive_spread)
-        excluded: tuple[str, ...] = () if gyro is None else ("pose_clock_offset",)
+        excluded: tuple[str, ...] = () if gyro is None else (_CLOCK,)
         stamps = evidence.smoothed.motion.stamps
         spans = [(stamps[part.start], stamps[part.stop - 1]) for part in evidence.smoothed.stretches]
         flippers = compare_with_commands(evidence.joints, robot, np.array(spans, np.int64).reshape(-1, 2))
@@ -81,7 +86,7 @@ class SensorFindings:
         if self.flippers is not None and estimate.name == BLOCKED:
             return self.flippers.estimate
         half_widths: Mapping[str, float]
-        if self.gyro is not None and estimate.name == "pose_clock_offset":
+        if self.gyro is not None and estimate.name == _CLOCK:
             half_widths = {"offset": self.gyro.offset_half_width}
         elif self.wheels is not None and estimate.name in dict(self.wheels.effects):
             names = [name for name, _ in self.wheels.effects]
@@ -96,7 +101,7 @@ def measured_effects(gyro: GyroFinding | None, wheels: WheelFinding | None, flip
     """Effects that the gyro, the wheel speeds and the joint angles measure, that of the gyro first."""
     measured: Effects = ()
     if gyro is not None and gyro.poses_late:
-        measured = (("pose_clock_offset", {"offset": gyro.offset}),)
+        measured = ((_CLOCK, {"offset": gyro.offset}),)
     if wheels is not None:
         measured += wheels.effects
     return measured if flippers is None else (*measured, flippers.effect)
@@ -113,10 +118,10 @@ def refined_clock(known: Effects, gyro: GyroFinding, predictions: Predictions, s
         predictions: of the recording's windows.
         scale: expected size of a residual, ``[W, K, 3]``.
     """
-    if not known or known[0][0] != "pose_clock_offset":
+    if not known or known[0][0] != _CLOCK:
         return known
     offsets = gyro.offset + gyro.offset_half_width * np.linspace(-1.5, 1.5, 13)
-    tried: Sequence[Effects] = [(("pose_clock_offset", {"offset": float(offset)}), *known[1:]) for offset in offsets]
+    tried: Sequence[Effects] = [((_CLOCK, {"offset": float(offset)}), *known[1:]) for offset in offsets]
     return min(tried, key=lambda effects: float(robust(predictions.residuals([effects])[0] / scale).mean()))
 
 
@@ -130,11 +135,11 @@ def heading_noise(evidence: Evidence, gyro: GyroFinding | None) -> dict[float, f
 
 def changed_bias(gyro: GyroFinding | None, robot: RobotModel) -> EffectEstimate | None:
     """The gyro's bias with its interval; None where it is what the robot's file says, or that of a healthy gyro."""
-    in_file = {key: float(value) for key, value in dict(robot.effects).get("gyro_bias", {}).items()}
+    in_file = {key: float(value) for key, value in dict(robot.effects).get(_BIAS, {}).items()}
     if gyro is None or not gyro.biased(in_file.get("bias", 0.0)):
         return None
     bias = ParameterEstimate(gyro.bias, gyro.bias, gyro.bias, "rad/s").with_half_width(gyro.bias_half_width)
-    return EffectEstimate("gyro_bias", {"bias": bias}, in_file=in_file)
+    return EffectEstimate(_BIAS, {"bias": bias}, in_file=in_file)
 
 
 def bias_row(gyro: GyroFinding) -> GapRow:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from monoforce_ros.discrepancy.estimates import EffectEstimate
 from monoforce_ros.discrepancy.wheel_motion import half_track
+from monoforce_ros.effects import CATALOGUE
 from monoforce_ros.robots import RobotModel
 
 
@@ -39,14 +40,15 @@ class TwistLimits:
             share: speed that a drive reaches over the one that it was commanded by a corrected controller.
             separation: multiplier on yaw rates in a corrected controller.
         """
+        limiting = {CATALOGUE[name].limits: effect for name, effect in effects.items() if name in CATALOGUE}
         drives, turning, ramp, turning_ramp = (
-            effects[name].parameters["limit"].value if name in effects else math.inf
-            for name in ("actuator_saturation", "yaw_rate_limit", "acceleration_limit", "yaw_acceleration_limit")
+            limiting[kind].parameters["limit"].value if kind in limiting else math.inf
+            for kind in ("drives", "yaw_rate", "acceleration", "yaw_acceleration")
         )
         speed = min(robot.maximum_speed, share * drives)
         yaw_rate = min(robot.maximum_yaw_rate, turning)
         half = half_track(robot)
-        motors = effects.get("drive_torque_limit")
+        motors = limiting.get("motors")
         if motors is not None:
             # The side that speeds up in a turn is braked by the scrub, and is the slower one of both.
             largest = motors.parameters["acceleration"].value

@@ -14,6 +14,7 @@ import numpy as np
 from monoforce_ros.core import CommandTrack, MotionTrack, WheelTrack
 from monoforce_ros.discrepancy.healthy_wheels import HealthyWheels
 from monoforce_ros.discrepancy.wheel_motion import half_track, side_speeds, wheel_ways
+from monoforce_ros.effects import CATALOGUE
 from monoforce_ros.robots import RobotModel
 
 PLAUSIBLE = (0.4, 2.5)
@@ -245,7 +246,7 @@ def contradictions(
                 f"they slip, or their radius is {radius / ground.value:.3g} m and not {radius:.3g} m as in the robot's "
                 "file, or the poses are to another scale"
             )
-    scrubs = "turning_scrub" in dict(robot.effects)
+    scrubs = any(CATALOGUE[name].like_track_width for name, _ in robot.effects)
     if turning is not None and commanded is not None and robot.steered is None and not scrubs:
         relative = turning.over(commanded)
         if relative.differs:

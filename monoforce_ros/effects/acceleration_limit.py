@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
@@ -26,6 +27,9 @@ class AccelerationLimit(Effect):
     summary = "The base controller ramps the forward speed up and down instead of stepping it."
     formula = "|dv/dt| ≤ limit"
     source = "linear.x.max_acceleration of ros2_controllers' diff_drive_controller"
+    cause = "a limit of the acceleration"
+    remedy = "look at the base controller's limit of the acceleration; plan with it"
+    limits = "acceleration"
     parameters = (Parameter("limit", "m/s²", math.inf, 0.05, 100.0, 1.0, "largest forward acceleration"),)
     order = 4
     identified = ("limit",)
@@ -56,3 +60,7 @@ class AccelerationLimit(Effect):
         """Twists with this effect applied; see :class:`Effect`."""
         forward = ramped(twists[..., 0], values["limit"], time_step)
         return torch.stack([forward, twists[..., 1]], dim=-1)
+
+    def sentence(self, values: Mapping[str, float]) -> str:
+        """What it means for the robot; see :class:`Effect`."""
+        return f"The base changes its speed by no more than {values['limit']:.2f} m/s in a second."

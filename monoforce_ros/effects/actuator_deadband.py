@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
@@ -19,6 +20,8 @@ class ActuatorDeadband(Effect):
     summary = "The drives ignore commanded speeds below the width; faster ones are reduced by it."
     formula = "u ← sign(u) max(|u| - width, 0)"
     source = "static friction in motor and gear"
+    cause = "small commands that the drives ignore"
+    remedy = "look at the smallest output of the motor controller, and for friction in motor and gear"
     parameters = (Parameter("width", "m/s", 0.0, 0.0, 1.0, 0.05, "half width of the dead band"),)
     order = 20
     identified = ("width",)
@@ -39,3 +42,7 @@ class ActuatorDeadband(Effect):
         """Drive speeds with this effect applied; see :class:`Effect`."""
         width = per_trajectory(values["width"], 3)
         return torch.sign(speeds) * (speeds.abs() - width).clamp_min(0.0)
+
+    def sentence(self, values: Mapping[str, float]) -> str:
+        """What it means for the robot; see :class:`Effect`."""
+        return f"The drives ignore commands below {values['width']:.2f} m/s, and run slower by as much above."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
@@ -32,6 +33,8 @@ class ActuatorLag(Effect):
     summary = "The drives approach the commanded speed exponentially."
     formula = "du/dt = (u_1 - u) / τ, du_1/dt = (u_cmd - u_1) / τ_2"
     source = "first-order servo response; two in series where a filter or a slow controller precedes the servo"
+    cause = "sluggish drives"
+    remedy = "look at the gains and ramps of the motor controller, and at the battery"
     parameters = (
         Parameter("time_constant", "s", 0.0, 0.0, 3.0, 0.2, "time to reach 63 % of a step"),
         Parameter("second_time_constant", "s", 0.0, 0.0, 3.0, 0.2, "that of a second lag in series with the first"),
@@ -58,3 +61,11 @@ class ActuatorLag(Effect):
     def drive_speeds(self, speeds: Tensor, values: Values, time_step: float, offsets: Tensor) -> Tensor:
         """Drive speeds with this effect applied; see :class:`Effect`."""
         return lagged(lagged(speeds, values["time_constant"], time_step), values["second_time_constant"], time_step)
+
+    def sentence(self, values: Mapping[str, float]) -> str:
+        """What it means for the robot; see :class:`Effect`."""
+        return (
+            "The drives are sluggish: "
+            f"{values['time_constant'] + values.get('second_time_constant', 0.0):.2f} s after a change of"
+            " the command a third is still missing."
+        )

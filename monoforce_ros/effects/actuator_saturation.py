@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
@@ -21,6 +22,9 @@ class ActuatorSaturation(Effect):
     summary = "The drives do not exceed this speed."
     formula = "u ← clamp(u, -limit, limit)"
     source = "limited voltage of the motors"
+    cause = "a speed limit of the drives"
+    remedy = "look at the controller's speed limit, at battery and load; plan below this speed"
+    limits = "drives"
     parameters = (Parameter("limit", "m/s", math.inf, 0.05, 20.0, 1.0, "largest surface speed of a drive"),)
     order = 30
     identified = ("limit",)
@@ -45,3 +49,7 @@ class ActuatorSaturation(Effect):
         """Drive speeds with this effect applied; see :class:`Effect`."""
         limit = per_trajectory(values["limit"], 3)
         return torch.minimum(torch.maximum(speeds, -limit), limit)
+
+    def sentence(self, values: Mapping[str, float]) -> str:
+        """What it means for the robot; see :class:`Effect`."""
+        return f"The drives run no faster than {values['limit']:.2f} m/s, whatever is commanded."

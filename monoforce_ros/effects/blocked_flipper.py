@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 
@@ -19,6 +21,9 @@ class BlockedFlipper(Effect):
     summary = "A flipper loses a share of its commanded motion: at 1 it stays where it is."
     formula = "q ← q_0 + (1 - share) (q_cmd - q_0)"
     source = "blocked gear, slipping clutch or dead motor that its gear holds"
+    cause = "a flipper that does not follow"
+    remedy = "look at gear, clutch and motor of this flipper"
+    joints_measure = True
     parameters = tuple(
         Parameter(
             place, "-", 0.0, 0.0, 1.0, 0.5, f"lost share of the {place.replace('_', ' ')} flipper", attainable=True
@@ -34,6 +39,13 @@ class BlockedFlipper(Effect):
         """Targets with this effect applied; see :class:`Effect`."""
         lost = torch.stack([values[flipper_place(flipper)].expand(len(targets)) for flipper in flippers], dim=-1)
         return targets - lost[:, None] * (targets - start[:, None])
+
+    def sentence(self, values: Mapping[str, float]) -> str:
+        """What it means for the robot; see :class:`Effect`."""
+        lost = [
+            f"the {place.replace('_', ' ')} one {100 * share:.0f} %" for place, share in values.items() if share > 0.0
+        ]
+        return f"Flippers lose a part of their commanded motion: {', '.join(lost)}."
 
 
 def flipper_place(flipper: Flipper) -> str:

@@ -24,7 +24,9 @@ class EffectError(ValueError):
     """Unknown effect, unknown parameter of an effect, or a value out of bounds."""
 
 
-_NO_EFFECTS = frozenset({"catalogue", "effect", "first_order", "joint_controls", "page", "ramp", "setup", "timing"})
+_NO_EFFECTS = frozenset(
+    {"catalogue", "effect", "first_order", "joint_controls", "page", "ramp", "sentences", "setup", "timing"}
+)
 """Modules of this package without an effect."""
 _SINGLE = float(torch.finfo(torch.float32).eps)
 """Relative spacing of single-precision numbers."""

@@ -8,6 +8,7 @@ from typing import ClassVar
 
 from monoforce_ros.core import CommandTrack
 from monoforce_ros.effects.effect import Effect, Parameter
+from monoforce_ros.effects.sentences import clock_sentence
 from monoforce_ros.robots import RobotModel
 
 
@@ -19,6 +20,8 @@ class CommandClockOffset(Effect):
     summary = "The clock that stamps commands is ahead by the offset."
     formula = "stamp ← stamp + offset"
     source = "unsynchronised clocks"
+    cause = "a wrong command clock"
+    remedy = "synchronise the clocks of planner and base"
     # Commands are held between stamps: an offset of less than some steps of a rollout may change nothing.
     parameters = (Parameter("offset", "s", 0.0, -2.0, 2.0, 0.2, "recorded minus true time", resolution=0.03),)
     identified = ("offset",)
@@ -36,3 +39,7 @@ class CommandClockOffset(Effect):
     def commands(self, commands: CommandTrack, values: Mapping[str, float]) -> CommandTrack:
         """Commands as recorded under this effect."""
         return replace(commands, stamps=commands.stamps + round(values["offset"] * 1e9))
+
+    def sentence(self, values: Mapping[str, float]) -> str:
+        """What it means for the robot; see :class:`Effect`."""
+        return clock_sentence("The commands", values["offset"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
@@ -28,6 +29,8 @@ class CommandDelay(Effect):
     summary = "The drives follow each command after a fixed delay."
     formula = "u(t) ← u(t - delay), linear between steps"
     source = "communication and controller latency"
+    cause = "drives that react late"
+    remedy = "look for the delay between planner and motor driver: network, bridges, controller rate"
     parameters = (Parameter("delay", "s", 0.0, 0.0, 2.0, 0.2, "dead time"),)
     order = 10
     acts_on_steering = True
@@ -65,3 +68,7 @@ class CommandDelay(Effect):
             return before + fraction[:, None] * (after - before)
         before, after = (speeds.gather(1, i[..., None].expand_as(speeds)) for i in (index, following))
         return before + fraction[..., None] * (after - before)
+
+    def sentence(self, values: Mapping[str, float]) -> str:
+        """What it means for the robot; see :class:`Effect`."""
+        return f"The drives react {values['delay']:.2f} s late to every command."

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import ClassVar
 
 from monoforce_ros.effects.effect import Effect, Parameter, Values
+from monoforce_ros.effects.sentences import in_directions
 from monoforce_ros.effects.setup import Setup
 
 
@@ -17,6 +19,8 @@ class ConstantForce(Effect):
     summary = "A constant force from a tether, wind, or a slope that the map does not contain."
     formula = "f = f_0 in body axes"
     source = "rigid-body mechanics"
+    cause = "a steady pull"
+    remedy = "look for a tether, wind, or a slope that the map does not have"
     parameters = (
         Parameter("x", "N", 0.0, -1e5, 1e5, 50.0, "force forward", of_mass=True),
         Parameter("y", "N", 0.0, -1e5, 1e5, 50.0, "force to the left", of_mass=True),
@@ -30,3 +34,7 @@ class ConstantForce(Effect):
         """The setup with this effect applied."""
         loads = setup.loads.with_wrench(0, "1", values["x"]).with_wrench(1, "1", values["y"])
         return replace(setup, loads=loads)
+
+    def sentence(self, values: Mapping[str, float]) -> str:
+        """What it means for the robot; see :class:`Effect`."""
+        return f"Something pulls the robot with {in_directions(values['x'], values['y'], 'N')} all the time."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import torch
@@ -18,6 +19,10 @@ class DriveAsymmetry(Effect):
     summary = "The right side is faster than the left by this fraction of the speed."
     formula = "u_left ← (1 - d/2) u, u_right ← (1 + d/2) u"
     source = "unequal tyres or motors"
+    cause = "sides of unequal speed"
+    remedy = "compare tyre pressure, wear, chain and motor of both sides"
+    uncertainty = "gain"
+    one_sided = True
     parameters = (Parameter("difference", "-", 0.0, -1.0, 1.0, 0.1, "right minus left, over their mean"),)
     order = 60
     identified = ("difference",)
@@ -31,3 +36,10 @@ class DriveAsymmetry(Effect):
         """Drive speeds with this effect applied; see :class:`Effect`."""
         side = torch.sign(offsets).to(speeds)
         return speeds * (1.0 - 0.5 * per_trajectory(values["difference"], 3) * side)
+
+    def sentence(self, values: Mapping[str, float]) -> str:
+        """What it means for the robot; see :class:`Effect`."""
+        difference = values["difference"]
+        fast, slow = ("right", "left") if difference > 0 else ("left", "right")
+        percent = f"{100 * abs(difference):.0f} %"
+        return f"The {fast} side runs {percent} faster than the {slow} side: the robot pulls to the {slow}."

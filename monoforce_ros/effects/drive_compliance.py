@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import ClassVar
 
@@ -21,6 +22,8 @@ class DriveCompliance(Effect):
     summary = "Each drive loses speed in proportion to its traction."
     formula = "u ← u - c f / N, with traction f, and load N of the wheel on the robot of the file"
     source = "speed-torque line of a motor without integral control"
+    cause = "drives that give way under load"
+    remedy = "give the motor controllers an integral part, or a larger gain"
     # Typical: a drive that loses 0.1 m/s at the limit of friction on average ground.
     parameters = (
         Parameter(
@@ -46,3 +49,10 @@ class DriveCompliance(Effect):
         loads, loss = setup.loads, values["speed_loss"]
         found = loss if loads.drive_compliance is None else loads.drive_compliance + loss
         return replace(setup, loads=replace(loads, drive_compliance=found))
+
+    def sentence(self, values: Mapping[str, float]) -> str:
+        """What it means for the robot; see :class:`Effect`."""
+        return (
+            "The drives give way: a wheel that pulls with as much as its load runs "
+            f"{values['speed_loss']:.2f} m/s slower."
+        )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
@@ -40,6 +41,8 @@ class DriveDroop(Effect):
     summary = "In turns the drives droop under the scrub of the tyres, until integral action restores their speed."
     formula = "d ← y - clip(y, -c, c), y = d + m, dm/dt = (clip(y, -c, c) - m) / T, d half the sides' difference"
     source = "proportional-integral speed control under dry friction"
+    cause = "drives that droop when a turn begins"
+    remedy = "raise the gains of the motors' speed controllers, first of the integral part"
     # Typical: a drive that loses 0.2 m/s to the scrub of a turn, and has it back after some seconds.
     parameters = (
         Parameter("loss", "m/s", 0.0, 0.0, 2.0, 0.2, "speed that each side loses at first when a turn begins"),
@@ -81,3 +84,11 @@ class DriveDroop(Effect):
         loss, recovery = (per_trajectory(values[key], 1) for key in self.identified)
         share = 1.0 - torch.exp(-time_step / recovery)
         return speeds - droop(wanted, loss, share)[..., None] * shape
+
+    def sentence(self, values: Mapping[str, float]) -> str:
+        """What it means for the robot; see :class:`Effect`."""
+        return (
+            f"The drives droop when a turn begins: each side loses {values['loss']:.2f} m/s, and needs "
+            f"{values['recovery']:.1f} s "
+            "to win back most of it."
+        )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
@@ -27,6 +28,9 @@ class DriveLoss(Effect):
     summary = "One side loses a share of its speed: 1 is a drive that stands still. The other side is healthy."
     formula = "u_left ← (1 - max(loss, 0)) u, u_right ← (1 - max(-loss, 0)) u"
     source = "dead motor, slipping belt or clutch; a drive that rolls freely is not covered"
+    cause = "a side that runs slow or not at all"
+    remedy = "look at motor, gear, chain, fuse and motor driver of this side"
+    one_sided = True
     parameters = (
         Parameter(
             "loss",
@@ -62,3 +66,11 @@ class DriveLoss(Effect):
         loss = per_trajectory(values["loss"], 3)
         left, right = (offsets > 0).to(speeds), (offsets < 0).to(speeds)
         return speeds * (1.0 - loss.clamp_min(0.0) * left - (-loss).clamp_min(0.0) * right)
+
+    def sentence(self, values: Mapping[str, float]) -> str:
+        """What it means for the robot; see :class:`Effect`."""
+        loss = values["loss"]
+        side, share = "left" if loss > 0 else "right", abs(loss)
+        if share > 0.95:
+            return f"The drives of the {side} side do not run."
+        return f"The drives of the {side} side run {100 * share:.0f} % slower than commanded."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import ClassVar
 
 from torch import Tensor
@@ -31,6 +32,9 @@ class DriveTorqueLimit(Effect):
     summary = "Motors reach their largest torque: each drive ramps, and turns begin slower than they end."
     formula = "-a - b ≤ du/dt ≤ a - b, b = a s sign(u - mean u), of each drive's speed u"
     source = "torque limit of a motor that accelerates its rotor, gear and load under dry friction"
+    cause = "motors that reach their largest torque"
+    remedy = "look at the current limit of the motor drivers, at battery and load; plan with this ramp"
+    limits = "motors"
     parameters = (
         Parameter("acceleration", "m/s²", math.inf, 0.05, 100.0, 1.0, "largest acceleration of a drive straight ahead"),
         Parameter("scrub", "", 0.0, 0.0, 0.95, 0.3, "share of the torque that the scrub of a turn takes"),
@@ -59,3 +63,11 @@ class DriveTorqueLimit(Effect):
     def drive_speeds(self, speeds: Tensor, values: Values, time_step: float, offsets: Tensor) -> Tensor:
         """Drive speeds with this effect applied; see :class:`Effect`."""
         return follow_loaded(speeds, values["acceleration"] * time_step, values["scrub"], _TURNING)
+
+    def sentence(self, values: Mapping[str, float]) -> str:
+        """What it means for the robot; see :class:`Effect`."""
+        return (
+            "The motors reach their largest torque: they change their speed by no more than "
+            f"{values['acceleration']:.2f} m/s "
+            f"in a second, and the scrub of a turn takes {100 * values['scrub']:.0f} % of that."
+        )

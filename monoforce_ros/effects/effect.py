@@ -123,6 +123,26 @@ class Effect(ABC):
     formula: ClassVar[str]
     source: ClassVar[str]
     parameters: ClassVar[tuple[Parameter, ...]]
+    cause: ClassVar[str] = ""
+    """The effect in a few words of somebody who repairs robots, for lists of what else it could be."""
+    remedy: ClassVar[str] = "use the written robot file, or mend the robot and record again"
+    """What to check on the robot where it was found, as an order without a full stop."""
+    uncertainty: ClassVar[str] = ""
+    """Setting of a prediction's ensemble, ``friction`` or ``gain``, that is the standard deviation of the first
+    parameter: about its value where that is a factor, else absolute."""
+    one_sided: ClassVar[bool] = False
+    """Whether it changes one side of the robot alone, so that the robot's mirror image moves otherwise."""
+    like_ratio: ClassVar[bool] = False
+    """Whether wheels show it as another ratio of their speeds to the commanded ones."""
+    like_track_width: ClassVar[bool] = False
+    """Whether wheels show it as another distance of both sides."""
+    limits: ClassVar[str] = ""
+    """What it limits for a planner: ``drives`` (their speed), ``yaw_rate``, ``acceleration``, ``yaw_acceleration`` of
+    the base, or ``motors`` (both accelerations)."""
+    nameless: ClassVar[bool] = False
+    """Whether it is a formula for what the catalogue has no name for."""
+    joints_measure: ClassVar[bool] = False
+    """Whether comparing measured joint angles with commanded ones measures it."""
     order: ClassVar[int | None] = None
     """Position among the effects on commands, smallest first: the base controller, electronics, mechanics, ground.
     Required for every effect that overrides :meth:`twists` or :meth:`drive_speeds`; all twists change first."""
@@ -260,6 +280,31 @@ class Effect(ABC):
         """Commands as recorded under this effect."""
         return commands
 
+    def sentence(self, values: Mapping[str, float]) -> str:
+        """What the effect means for the robot, as one sentence in the words of somebody who repairs robots.
+
+        Args:
+            values: the parameters that were estimated; not all need be there.
+
+        Raises:
+            KeyError: a parameter that the sentence needs is missing.
+        """
+        listed = ", ".join(f"{p.name} {values[p.name]:.3g} {p.unit}" for p in self.parameters if p.name in values)
+        return f"{self.summary.rstrip('.')}: {listed}."
+
+    def beyond(
+        self, values: Mapping[str, float], in_file: Mapping[str, float], outside: frozenset[str]
+    ) -> Mapping[str, float]:
+        """Values for :meth:`sentence` where the robot's file has the effect already: those beyond the file's of an
+        effect that the sentence compares with the model.
+
+        Args:
+            values: estimated.
+            in_file: of the robot's file.
+            outside: parameters whose confidence interval does not hold the file's value.
+        """
+        return values
+
     def first_values(self, robot: RobotModel) -> list[dict[str, float]]:
         """Initial values of the identified parameters for a fit on a robot, spread over the typical range."""
         known = {parameter.name: parameter for parameter in self.parameters}
@@ -286,6 +331,10 @@ class Effect(ABC):
             return f"order: got {self.order!r}, expected a whole number"
         if (changes_speeds or self.stage == "command") and self.order is None:
             return "changes drive speeds but has no order: set its position among the command effects"
+        if self.uncertainty not in ("", "friction", "gain"):
+            return f"uncertainty: got {self.uncertainty!r}, expected friction, gain or nothing"
+        if self.limits not in ("", "drives", "yaw_rate", "acceleration", "yaw_acceleration", "motors"):
+            return f"limits: got {self.limits!r}, expected drives, yaw_rate, acceleration, yaw_acceleration or motors"
         listed = {
             "identified": self.identified, "refined": self.refined,
             "commissioning_start": tuple(self.commissioning_start),

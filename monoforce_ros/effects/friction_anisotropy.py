@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import ClassVar
 
 from monoforce_ros.effects.effect import Effect, Parameter, Values
+from monoforce_ros.effects.sentences import percent_change
 from monoforce_ros.effects.setup import Setup
 
 
@@ -17,6 +19,8 @@ class FrictionAnisotropy(Effect):
     summary = "Only lateral friction is scaled."
     formula = "μ_lat ← factor μ_lat"
     source = "friction ellipse of tyres and grousers (Pacejka 2012)"
+    cause = "tyres that slip sideways"
+    remedy = "look at the tread of the tyres, and for ruts that guide them"
     parameters = (Parameter("factor", "-", 1.0, 0.05, 3.0, 0.3, "lateral over longitudinal friction"),)
     identified = ("factor",)
     commissioning_start: ClassVar = {"factor": 1.0}
@@ -32,3 +36,7 @@ class FrictionAnisotropy(Effect):
         """The setup with this effect applied."""
         robot = setup.robot
         return replace(setup, robot=replace(robot, friction_lateral=robot.friction_lateral * values["factor"]))
+
+    def sentence(self, values: Mapping[str, float]) -> str:
+        """What it means for the robot; see :class:`Effect`."""
+        return f"Sideways, tyres grip {percent_change(values['factor'], 'less', 'more')} than lengthways."

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import ClassVar
 
 from monoforce_ros.effects.effect import Effect, Parameter, Values
+from monoforce_ros.effects.sentences import percent_change
 from monoforce_ros.effects.setup import Setup
 
 
@@ -23,6 +25,8 @@ class FrictionCreep(Effect):
     summary = "Friction is mobilised at another slip: the robot creeps more or less against friction that holds it."
     formula = "f = -N diag(μ) s / sqrt(|s|² + (factor ε)²), with slip s and ε the physics' slip regularisation"
     source = "regularised Coulomb friction (paper III-D); its slip is chosen for computing, a robot has its own"
+    cause = "creeping against friction"
+    remedy = "nothing is to be done: it is a property of tyres and ground"
     # Down to 1 mm/s, where friction is rigid for any robot; up to 0.1 m/s, a tenth of a slow robot's speed.
     parameters = (Parameter("factor", "-", 1.0, 0.05, 5.0, 1.0, "slip at 71 % of full friction, over 0.02 m/s"),)
     commissioning_start: ClassVar = {"factor": 1.0}
@@ -32,3 +36,10 @@ class FrictionCreep(Effect):
         """The setup with this effect applied."""
         loads = setup.loads
         return replace(setup, loads=replace(loads, friction_creep=loads.friction_creep * values["factor"]))
+
+    def sentence(self, values: Mapping[str, float]) -> str:
+        """What it means for the robot; see :class:`Effect`."""
+        return (
+            f"Where friction holds the robot, it creeps {percent_change(values['factor'], 'less', 'more')} "
+            "than assumed."
+        )

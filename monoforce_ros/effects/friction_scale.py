@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import ClassVar
 
@@ -9,6 +10,7 @@ import torch
 from torch import Tensor
 
 from monoforce_ros.effects.effect import Effect, Parameter, Values
+from monoforce_ros.effects.sentences import percent_change
 from monoforce_ros.effects.setup import Setup
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import TerrainMap
@@ -22,6 +24,9 @@ class FrictionScale(Effect):
     summary = "The friction coefficient is scaled everywhere."
     formula = "μ ← factor μ"
     source = "wet, loose or icy ground"
+    cause = "slippery or grippy ground"
+    remedy = "look at tyres and ground; drive slower in turns and when braking"
+    uncertainty = "friction"
     parameters = (Parameter("factor", "-", 1.0, 0.02, 3.0, 0.3, "true over mapped friction"),)
     identified = ("factor",)
     manoeuvre = "turns on the spot and hard starts"
@@ -49,3 +54,14 @@ class FrictionScale(Effect):
                 friction_lateral=robot.friction_lateral * factor,
             ),
         )
+
+    def sentence(self, values: Mapping[str, float]) -> str:
+        """What it means for the robot; see :class:`Effect`."""
+        factor = values["factor"]
+        return f"The ground grips {percent_change(factor, 'less than assumed: it is slippery', 'more than assumed')}."
+
+    def beyond(
+        self, values: Mapping[str, float], in_file: Mapping[str, float], outside: frozenset[str]
+    ) -> Mapping[str, float]:
+        """A factor on the model's friction; see :class:`Effect`."""
+        return {**values, **{key: values[key] / known for key, known in in_file.items() if key in values}}

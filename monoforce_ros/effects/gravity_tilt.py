@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -20,6 +21,8 @@ class GravityTilt(Effect):
     summary = "Gravity is tilted in the odometry frame: unmapped slope or tilted localisation."
     formula = "g ← R_x(a) R_y(b) g"
     source = "slope missing from the map; localisation initialised with a tilt"
+    cause = "a slope or a tilted localisation"
+    remedy = "level the localisation's map frame, or give a map of the ground (--terrain)"
     parameters = (
         Parameter("about_x", "rad", 0.0, -0.5, 0.5, 0.05, "tilt about the odometry frame's x axis"),
         Parameter("about_y", "rad", 0.0, -0.5, 0.5, 0.05, "tilt about its y axis"),
@@ -38,3 +41,8 @@ class GravityTilt(Effect):
         about_x, about_y = (torch.as_tensor(values.get(key, 0.0)).to(heading) for key in ("about_x", "about_y"))
         cos, sin = torch.cos(heading), torch.sin(heading)
         return {"about_x": cos * about_x + sin * about_y, "about_y": cos * about_y - sin * about_x}
+
+    def sentence(self, values: Mapping[str, float]) -> str:
+        """What it means for the robot; see :class:`Effect`."""
+        angle = math.degrees(math.hypot(values.get("about_x", 0.0), values.get("about_y", 0.0)))
+        return f"Down is {angle:.1f}° off: the ground slopes, or the localisation is tilted."

@@ -19,7 +19,9 @@ class LearnedTerm(Effect):
     stage = "body"
     summary = "Forward force, lateral force and yaw torque, each a weighted sum of features."
     formula = "f = Σ w_k φ_k(v, ω, pitch, roll) in body axes"
+    nameless = True
     source = "sparse regression of the residual (Brunton et al. 2016)"
+    remedy = "repeat the manoeuvre with the largest error at half the speed, and look at the robot meanwhile"
     parameters = tuple(
         Parameter(
             f"{row}:{feature}",

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from monoforce_ros.core import MotionTrack
 from monoforce_ros.effects.effect import Effect, Parameter
+from monoforce_ros.effects.sentences import clock_sentence
 
 
 class PoseClockOffset(Effect):
@@ -17,6 +18,8 @@ class PoseClockOffset(Effect):
     summary = "The clock that stamps poses is ahead by the offset."
     formula = "stamp ← stamp + offset"
     source = "unsynchronised clocks, filter delay"
+    cause = "late poses"
+    remedy = "correct the stamps of the localisation, or synchronise its clock"
     parameters = (Parameter("offset", "s", 0.0, -2.0, 2.0, 0.2, "recorded minus true time"),)
     identified = ("offset",)
     manoeuvre = "stops and starts"
@@ -26,3 +29,7 @@ class PoseClockOffset(Effect):
     def motion(self, motion: MotionTrack, values: Mapping[str, float]) -> MotionTrack:
         """Motion as recorded under this effect."""
         return replace(motion, stamps=motion.stamps + round(values["offset"] * 1e9))
+
+    def sentence(self, values: Mapping[str, float]) -> str:
+        """What it means for the robot; see :class:`Effect`."""
+        return clock_sentence("The poses", values["offset"])

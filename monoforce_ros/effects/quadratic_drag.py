@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 from monoforce_ros.effects.effect import Effect, Parameter, Values
@@ -16,6 +17,8 @@ class QuadraticDrag(Effect):
     summary = "A force against the motion grows with the square of the speed."
     formula = "f = -c |v| v"
     source = "fluid drag"
+    cause = "drag that grows with the square of the speed"
+    remedy = "look for wind, tall grass or water"
     parameters = (Parameter("coefficient", "N s²/m²", 0.0, 0.0, 1e5, 30.0, "drag coefficient", of_mass=True),)
     identified = ("coefficient",)
     manoeuvre = "slow and fast stretches straight ahead"
@@ -25,3 +28,10 @@ class QuadraticDrag(Effect):
         """The setup with this effect applied."""
         loads = setup.loads
         return replace(setup, loads=replace(loads, quadratic_drag=loads.quadratic_drag + values["coefficient"]))
+
+    def sentence(self, values: Mapping[str, float]) -> str:
+        """What it means for the robot; see :class:`Effect`."""
+        return (
+            f"The robot is held back by {values['coefficient']:.0f} N at 1 m/s, and four times as much at "
+            "twice the speed."
+        )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import ClassVar
 
@@ -17,6 +18,8 @@ class RollingResistance(Effect):
     summary = "Each loaded point is resisted by a fraction of its load."
     formula = "f = -c N v / sqrt(v² + ε²) along the rolling direction"
     source = "Wong, Theory of Ground Vehicles"
+    cause = "rolling heavily"
+    remedy = "look for soft ground, low tyre pressure, a dragging brake or a tight bearing"
     parameters = (Parameter("coefficient", "-", 0.0, 0.0, 1.0, 0.05, "resistance over load"),)
     identified = ("coefficient",)
     manoeuvre = "slow and fast stretches straight ahead"
@@ -31,3 +34,10 @@ class RollingResistance(Effect):
         """The setup with this effect applied."""
         loads = setup.loads
         return replace(setup, loads=replace(loads, rolling_resistance=loads.rolling_resistance + values["coefficient"]))
+
+    def sentence(self, values: Mapping[str, float]) -> str:
+        """What it means for the robot; see :class:`Effect`."""
+        return (
+            f"The robot rolls heavily: it is held back by {100 * values['coefficient']:.0f} % of its weight "
+            "at any speed."
+        )

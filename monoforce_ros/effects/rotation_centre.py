@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import ClassVar
 
@@ -23,6 +24,8 @@ class RotationCentre(Effect):
     summary = "The weight rests further ahead or behind, and with it the point about which the robot turns."
     formula = "c_x ← c_x + x"
     source = "lateral friction in proportion to load; instantaneous centre of rotation (Mandow et al. 2007)"
+    cause = "turning about another point"
+    remedy = "look for a load ahead or behind, and for tyres of unequal grip or pressure"
     parameters = (Parameter("x", "m", 0.0, -0.5, 0.5, 0.1, "centre of mass forward of the modelled one"),)
     identified = ("x",)
     like_a_slope = False
@@ -40,3 +43,17 @@ class RotationCentre(Effect):
         zero = torch.zeros_like(shift)
         moved = robot.centre_of_mass + torch.stack([shift, zero, zero], dim=-1).to(robot.centre_of_mass)
         return replace(setup, robot=replace(robot, centre_of_mass=moved))
+
+    def sentence(self, values: Mapping[str, float]) -> str:
+        """What it means for the robot; see :class:`Effect`."""
+        return (
+            f"The robot turns about a point {abs(values['x']):.2f} m "
+            f"{'ahead of' if values['x'] > 0 else 'behind'} the one that its "
+            "model turns about."
+        )
+
+    def beyond(
+        self, values: Mapping[str, float], in_file: Mapping[str, float], outside: frozenset[str]
+    ) -> Mapping[str, float]:
+        """The distance from the model's centre; see :class:`Effect`."""
+        return {**values, **{key: values[key] - known for key, known in in_file.items() if key in values}}

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -20,6 +23,8 @@ class SteeringDeadband(Effect):
     )
     formula = "dδ/ds = -alignment δ, δ_cmd - width ≤ δ ≤ δ_cmd + width"
     source = "play in the linkage (backlash); a wheel that trails its steering axis, over the way s"
+    cause = "play in the steering"
+    remedy = "look for play in rods, joints and gear of the steering"
     parameters = (
         Parameter("width", "rad", 0.0, 0.0, 0.5, 0.03, "half of the play"),
         Parameter("alignment", "1/m", 1.0, 0.0, 20.0, 0.5, "share by which the wheels straighten in a metre"),
@@ -41,6 +46,10 @@ class SteeringDeadband(Effect):
                 listed.append(angle)
             return torch.stack(listed, 1)
         return torch.from_numpy(_within(*(tensor.cpu().numpy() for tensor in (angles, kept, low, high)))).to(angles)
+
+    def sentence(self, values: Mapping[str, float]) -> str:
+        """What it means for the robot; see :class:`Effect`."""
+        return f"The steering has a play of ±{math.degrees(values['width']):.1f}°."
 
 
 def _within(angles: np.ndarray, kept: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 from torch import Tensor
@@ -18,6 +19,8 @@ class SteeringLag(Effect):
     summary = "The steering approaches the commanded angle exponentially, in addition to the lag of the robot file."
     formula = "dδ/dt = (δ_cmd - δ) / τ"
     source = "first-order servo response"
+    cause = "sluggish steering"
+    remedy = "look at the steering servo, its supply and its gear"
     parameters = (Parameter("time_constant", "s", 0.0, 0.0, 3.0, 0.2, "time to reach 63 % of a step"),)
     order = 42
     needs = "steering"
@@ -31,3 +34,10 @@ class SteeringLag(Effect):
     def steering_angles(self, angles: Tensor, speeds: Tensor, values: Values, time_step: float) -> Tensor:
         """Steering angles with this effect applied; see :class:`Effect`."""
         return lagged(angles, values["time_constant"], time_step)
+
+    def sentence(self, values: Mapping[str, float]) -> str:
+        """What it means for the robot; see :class:`Effect`."""
+        return (
+            f"The steering is sluggish: {values['time_constant']:.2f} s after a change of the command a "
+            "third is still missing."
+        )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
@@ -30,6 +31,8 @@ class SupplyDrain(Effect):
     summary = "All drives slow down from minute to minute, as with a battery that empties."
     formula = "u ← u (1 - drain t), t the time since the supply was full, at least 0.1 u"
     source = "discharge curve of a battery, linearised, and motors without speed control"
+    cause = "a supply that drains"
+    remedy = "charge the battery, and look at its age; look at the temperature of motors and motor drivers"
     # Typical: a weak battery that loses a tenth of its voltage in a minute of driving.
     parameters = (
         Parameter("drain", "1/min", 0.0, 0.0, 2.0, 0.1, "share of the speed that is lost every minute"),
@@ -58,3 +61,7 @@ class SupplyDrain(Effect):
         """Drive speeds with this effect applied; see :class:`Effect`."""
         left = 1.0 - per_trajectory(values["drain"], 3) * per_trajectory(values["time"], 3) / 60.0
         return speeds * left.clamp(min=_LEAST)
+
+    def sentence(self, values: Mapping[str, float]) -> str:
+        """What it means for the robot; see :class:`Effect`."""
+        return f"The drives lose {100 * values['drain']:.0f} % of their speed every minute, as when a battery empties."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
@@ -28,6 +29,8 @@ class SupplySag(Effect):
     summary = "All drives slow down in proportion to the supply voltage, the more the faster they are to run together."
     formula = "u ← u / (1 + sag ū), ū the mean of |u| over the drives"
     source = "battery with internal resistance (Thévenin) and motors without speed control"
+    cause = "a supply that sags"
+    remedy = "look at charge and age of the battery, and at the resistance of its cables"
     parameters = (Parameter("sag", "s/m", 0.0, 0.0, 5.0, 0.2, "lost share of the voltage per speed, for small shares"),)
     order = 35
     identified = ("sag",)
@@ -52,3 +55,11 @@ class SupplySag(Effect):
     def drive_speeds(self, speeds: Tensor, values: Values, time_step: float, offsets: Tensor) -> Tensor:
         """Drive speeds with this effect applied; see :class:`Effect`."""
         return speeds / (1.0 + per_trajectory(values["sag"], 3) * speeds.abs().mean(dim=-1, keepdim=True))
+
+    def sentence(self, values: Mapping[str, float]) -> str:
+        """What it means for the robot; see :class:`Effect`."""
+        return (
+            "The faster the drives run, the more of their speed they lose, "
+            f"{100 * values['sag'] / (1.0 + values['sag']):.0f} % at "
+            "1 m/s: their supply sags."
+        )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import ClassVar
 
@@ -22,6 +23,8 @@ class TerrainSoftness(Effect):
     summary = "Stiffness and damping are divided by the factor."
     formula = "e ← e / factor, d ← d / factor"
     source = "loose soil"
+    cause = "soft ground or tyres"
+    remedy = "look at the tyres' pressure, and for mud, sand or snow"
     parameters = (Parameter("factor", "-", 1.0, 0.1, 100.0, 3.0, "mapped over true stiffness"),)
     identified = ("factor",)
     manoeuvre = "over bumps and edges, slow and fast"
@@ -47,3 +50,17 @@ class TerrainSoftness(Effect):
     def setup(self, setup: Setup, values: Values) -> Setup:
         """The setup with this effect applied."""
         return replace(setup, softness=setup.softness * values["factor"])
+
+    def sentence(self, values: Mapping[str, float]) -> str:
+        """What it means for the robot; see :class:`Effect`."""
+        return (
+            f"The ground or the tyres are {values['factor']:.1f} times as soft as assumed."
+            if values["factor"] >= 1.0
+            else f"The ground or the tyres are {1.0 / values['factor']:.1f} times as hard as assumed."
+        )
+
+    def beyond(
+        self, values: Mapping[str, float], in_file: Mapping[str, float], outside: frozenset[str]
+    ) -> Mapping[str, float]:
+        """A factor on the model's softness; see :class:`Effect`."""
+        return {**values, **{key: values[key] / known for key, known in in_file.items() if key in values}}

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from monoforce_ros.effects.effect import Effect, Parameter, Values, per_trajectory
+from monoforce_ros.effects.sentences import percent_change
 
 
 class TurningScrub(Effect):
@@ -18,6 +20,9 @@ class TurningScrub(Effect):
     summary = "The robot turns more slowly, like one with a wider track."
     formula = "u - ū ← (u - ū) / factor, ū the mean of the drives"
     source = "Mandow et al. 2007, experimental kinematics of skid-steer vehicles"
+    cause = "turning faster or slower than the model"
+    remedy = "set the wheel separation multiplier of the base controller (diagnose --export)"
+    like_track_width = True
     parameters = (Parameter("track_width_factor", "-", 1.0, 0.3, 4.0, 0.3, "effective over modelled track width"),)
     order = 70
     identified = ("track_width_factor",)
@@ -30,3 +35,16 @@ class TurningScrub(Effect):
         mean = speeds.mean(dim=-1, keepdim=True)
         factor = per_trajectory(values["track_width_factor"], 3)
         return torch.where(factor == 1.0, speeds, mean + (speeds - mean) / factor)
+
+    def sentence(self, values: Mapping[str, float]) -> str:
+        """What it means for the robot; see :class:`Effect`."""
+        factor = values["track_width_factor"]
+        return (
+            f"The robot turns {percent_change(1 / factor, 'less', 'more')} than its model does with these wheel speeds."
+        )
+
+    def beyond(
+        self, values: Mapping[str, float], in_file: Mapping[str, float], outside: frozenset[str]
+    ) -> Mapping[str, float]:
+        """A factor on the model's scrub; see :class:`Effect`."""
+        return {**values, **{key: values[key] / known for key, known in in_file.items() if key in values}}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import ClassVar
 
@@ -24,6 +25,8 @@ class TyreSlip(Effect):
     summary = "Friction is mobilised in proportion to slip over rolling speed, as on pneumatic tyres."
     formula = "f = -N diag(μ) s / sqrt(|s|² + ε² + (κ u)²), with slip s and rolling speed u"
     source = "slip stiffness of rolling tyres (Pacejka 2012, brush model)"
+    cause = "tyres that give way"
+    remedy = "look at the tyres' pressure and tread; plan fast turns with the new robot file"
     # Cornering stiffness of off-road tyres: 2 to 10 times the load per radian, κ of 0.4 to 0.08 at a friction of 0.8.
     parameters = (Parameter("ratio", "-", 0.0, 0.0, 2.0, 0.2, "slip over rolling speed at 71 % of full friction"),)
     identified = ("ratio",)
@@ -45,3 +48,11 @@ class TyreSlip(Effect):
         loads, ratio = setup.loads, values["ratio"]
         found = ratio if loads.tyre_slip is None else loads.tyre_slip + ratio
         return replace(setup, loads=replace(loads, tyre_slip=found))
+
+    def sentence(self, values: Mapping[str, float]) -> str:
+        """What it means for the robot; see :class:`Effect`."""
+        return (
+            f"The tyres give way: rolling with {100 * values['ratio']:.0f} % of slip they have 71 % of the "
+            "grip that the ground "
+            "offers."
+        )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import ClassVar
 
@@ -22,6 +23,8 @@ class VegetationDrag(Effect):
     summary = "Resistance at contact points, proportional to the vegetation height (visible minus supporting ground)."
     formula = "f = -c A (H_g - H_t) (v + v_y v/|v|)"
     source = "viscous resistance of grass and brush, and speed-independent bending of stems"
+    cause = "plants"
+    remedy = "look at how high and how dense the plants are; record a lidar so that the map shows them"
     parameters = (
         Parameter("coefficient", "N s/m⁴", 0.0, 0.0, 1e6, 1e4, "drag per area, height and speed"),
         Parameter("yield_speed", "m/s", 0.0, 0.0, 10.0, 0.5, "speed at which bending and viscous force are equal"),
@@ -50,3 +53,7 @@ class VegetationDrag(Effect):
                 vegetation_yield=loads.vegetation_yield + values["yield_speed"],
             ),
         )
+
+    def sentence(self, values: Mapping[str, float]) -> str:
+        """What it means for the robot; see :class:`Effect`."""
+        return f"Plants hold the robot back: {values['coefficient']:.0f} N per metre of height, square metre and m/s."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
@@ -27,6 +28,9 @@ class YawAccelerationLimit(Effect):
     summary = "The base controller ramps the yaw rate up and down instead of stepping it."
     formula = "|dω/dt| ≤ limit"
     source = "angular.z.max_acceleration of ros2_controllers' diff_drive_controller"
+    cause = "a limit of the yaw acceleration"
+    remedy = "look at the base controller's limit of the yaw acceleration; plan with it"
+    limits = "yaw_acceleration"
     parameters = (Parameter("limit", "rad/s²", math.inf, 0.05, 100.0, 1.0, "largest yaw acceleration"),)
     order = 6
     identified = ("limit",)
@@ -57,3 +61,7 @@ class YawAccelerationLimit(Effect):
         """Twists with this effect applied; see :class:`Effect`."""
         yaw_rate = ramped(twists[..., 1], values["limit"], time_step)
         return torch.stack([twists[..., 0], yaw_rate], dim=-1)
+
+    def sentence(self, values: Mapping[str, float]) -> str:
+        """What it means for the robot; see :class:`Effect`."""
+        return f"The base changes its yaw rate by no more than {values['limit']:.2f} rad/s in a second."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
@@ -26,6 +27,9 @@ class YawRateLimit(Effect):
     summary = "The base controller clamps the commanded yaw rate; the forward speed stays."
     formula = "ω ← clamp(ω, -limit, limit)"
     source = "angular.z.max_velocity of ros2_controllers' diff_drive_controller"
+    cause = "a limit of the yaw rate"
+    remedy = "look at the base controller's limit of the yaw rate, and enter it in the robot's file"
+    limits = "yaw_rate"
     parameters = (Parameter("limit", "rad/s", math.inf, 0.05, 20.0, 1.0, "largest yaw rate"),)
     order = 2
     identified = ("limit",)
@@ -54,3 +58,7 @@ class YawRateLimit(Effect):
         limit = per_trajectory(values["limit"], 2)
         yaw_rate = torch.minimum(torch.maximum(twists[..., 1], -limit), limit)
         return torch.stack([twists[..., 0], yaw_rate], dim=-1)
+
+    def sentence(self, values: Mapping[str, float]) -> str:
+        """What it means for the robot; see :class:`Effect`."""
+        return f"The base turns no faster than {values['limit']:.2f} rad/s, whatever is commanded."

@@ -9,10 +9,14 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from monoforce_ros.core import wrap_angle
+from monoforce_ros.effects import CATALOGUE
 from monoforce_ros.physics import State
 from monoforce_ros.prediction.predictor import Prediction, Predictor, start_states
 from monoforce_ros.robots import RobotModel
 from monoforce_ros.terrain import TerrainMap
+
+_STARTS = 5
+"""Random numbers of a member that vary its start; those of effects follow."""
 
 COVERAGE = 0.9
 """Share of outcomes that the band should contain."""
@@ -106,7 +110,7 @@ def spread(predictor: Predictor, prediction: Prediction, twists: np.ndarray, set
     """
     count = settings.members
     random = np.random.default_rng(settings.seed)
-    drawn = _antithetic(random, count, 8)
+    drawn = _antithetic(random, count, _STARTS + sum(bool(effect.uncertainty) for effect in CATALOGUE.values()))
     robot = _varied_robot(predictor.robot, drawn, settings)
     motions = [prediction.motion] * count
     start = _varied_start(start_states([prediction.motion]), drawn, settings)
@@ -199,13 +203,12 @@ def _varied_robot(robot: RobotModel, drawn: torch.Tensor, settings: EnsembleSett
             value = torch.as_tensor(varied[key], dtype=torch.float32)
             varied[key] = (value + unit * (high - low) / 3.92).clamp(low, high)
         effects[name] = varied
-    friction_scale = effects.setdefault("friction_scale", {"factor": 1.0})
-    factor = torch.as_tensor(friction_scale["factor"], dtype=torch.float32) * torch.exp(settings.friction * drawn[:, 5])
-    friction_scale["factor"] = factor.clamp(0.02, 3.0)
-    drive_gain = effects.setdefault("drive_gain", {"gain": 1.0})
-    gain = torch.as_tensor(drive_gain["gain"], dtype=torch.float32) * (1.0 + settings.gain * drawn[:, 6])
-    drive_gain["gain"] = gain.clamp(0.2, 2.0)
-    asymmetry = effects.setdefault("drive_asymmetry", {"difference": 0.0})
-    difference = torch.as_tensor(asymmetry["difference"], dtype=torch.float32) + settings.gain * drawn[:, 7]
-    asymmetry["difference"] = difference.clamp(-1.0, 1.0)
+    deviations = {"friction": settings.friction, "gain": settings.gain}
+    uncertain = [effect for effect in reversed(CATALOGUE.values()) if effect.uncertainty]
+    for column, effect in enumerate(uncertain, start=_STARTS):
+        parameter, change = effect.parameters[0], deviations[effect.uncertainty] * drawn[:, column]
+        values = effects.setdefault(effect.name, {parameter.name: parameter.neutral})
+        value = torch.as_tensor(values[parameter.name], dtype=torch.float32)
+        varied_value = value * torch.exp(change) if parameter.neutral == 1.0 else value + change
+        values[parameter.name] = varied_value.clamp(parameter.low, parameter.high)
     return replace(robot, effects=tuple(effects.items()))

@@ -14,6 +14,7 @@ import torch
 import torch.distributed
 from torch import Tensor, nn
 
+from monoforce_ros.effects import CATALOGUE
 from monoforce_ros.encoder import (
     EncodedMaps,
     Encoder,
@@ -344,8 +345,6 @@ class Trainer:
         return True
 
 
-_LEANING = {"drive_asymmetry", "drive_loss"}
-"""Effects of one side."""
 _MIDDLE = 0.01
 """How far the centre of mass of a robot may be beside its middle, and it still is its own mirror image [m]."""
 
@@ -353,7 +352,8 @@ _MIDDLE = 0.01
 def is_symmetric(robot: RobotModel) -> bool:
     """Whether a robot's mirror image moves as the robot does, mirrored."""
     aside = any(
-        name in _LEANING or any(key == "y" and float(value) for key, value in values.items())
+        (name in CATALOGUE and CATALOGUE[name].one_sided)
+        or any(key == "y" and float(value) for key, value in values.items())
         for name, values in robot.effects
     )
     return not aside and abs(float(robot.centre_of_mass[1])) < _MIDDLE
