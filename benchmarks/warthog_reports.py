@@ -209,7 +209,7 @@ def section(rows: Sequence[dict], before: str = "") -> str:
         parts.append("\n".join([head, "|---" * (head.count(" | ") + 1) + "|", *lines]))
     parts.insert(
         1,
-        "After steps of the command (medians after 2 s; all fitted on half of the blocks and tested on the other; "
+        "After steps of the command (medians after 2 s; all tested on parts without which they were fitted; "
         "brackets: 95 % interval of how far the effects are ahead of the kinematic fit):",
     )
     return "\n\n".join([*parts, *(["\n".join(held_out)] if held_out else [])])

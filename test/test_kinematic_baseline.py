@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 from monoforce_ros.bags import SmoothedMotion
 from monoforce_ros.core import AngularVelocityTrack, CommandTrack, MotionTrack, WheelTrack
 from monoforce_ros.discrepancy import Evidence
+from monoforce_ros.discrepancy.comparison import HeldOut
 from monoforce_ros.discrepancy.dead_reckoning import MeasuredDrive, dead_reckoning_errors
 from monoforce_ros.discrepancy.kinematic_baseline import (
     KinematicModel,
@@ -105,6 +106,23 @@ def test_effects_and_kinematic_fit_are_compared_on_the_same_windows():
     assert compare_after_steps(evidence, robot, ()).after is None
     still = CommandTrack(commands.stamps, np.tile([0.5, 0.1], (len(commands), 1)))
     assert compare_after_steps(Evidence(evidence.smoothed, still), robot, ()) is None
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_each_part_is_predicted_with_what_was_found_without_it():
+    """A search without the second part that found nothing leaves it to the nominal model, whatever the whole shows."""
+    motion, commands = recording(seconds=96.0)
+    evidence = Evidence(SmoothedMotion(motion, 0.001, 0.001, (slice(0, len(motion)),)), commands)
+    robot = load_robot("husky")
+    effects = (("command_delay", {"delay": 0.3}), ("turning_scrub", {"track_width_factor": 1.3}))
+    first = int(motion.stamps[0]) + 3 * 10**9
+    without = [compare_after_steps(evidence, robot, effects, HeldOut(found, first, 16.0)) for found in
+               ((effects, effects, effects), (effects, (), effects), ((), (), ()))]  # fmt: skip
+    assert all(found.selected_apart and len(found.models) == 3 for found in without)
+    assert without[0].windows == without[1].windows <= compare_after_steps(evidence, robot, effects).windows
+    assert without[0].after < without[1].after < without[1].before == without[0].before
+    assert without[2].after == without[2].before
+    assert not compare_after_steps(evidence, robot, effects).selected_apart
 
 
 def measured_drive(motion, *, late, gyro):

@@ -236,7 +236,9 @@ def diagnose_bag(
     fitted = tuple(entry for entry in diagnosis.fitted if entry[0] in in_file)
     if diagnosis.verdict != Verdict.NOT_IDENTIFIABLE:
         progress(0.96, "comparing with a kinematic fit")
-        diagnosis = replace(diagnosis, steps=compare_after_steps(evidence, model, (*fitted, *diagnosis.shift)))
+        parts = None if diagnosis.by_part is None or elsewhere else diagnosis.by_part.beside(diagnosis.shift)
+        after_steps = compare_after_steps(evidence, model, (*fitted, *diagnosis.shift), parts)
+        diagnosis = replace(diagnosis, steps=after_steps)
     if others and elsewhere:
         remark = "held-out recordings are not compared: where on them the ground is like that is not known"
         diagnosis = replace(diagnosis, remarks=(*diagnosis.remarks, remark))

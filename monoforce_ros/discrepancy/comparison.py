@@ -46,6 +46,10 @@ class HeldOut:
         """One part: effects of another recording."""
         return cls((effects,), 0)
 
+    def beside(self, others: Effects) -> HeldOut:
+        """The same, with further effects in each part that has any."""
+        return replace(self, effects=tuple((*effects, *others) if effects else () for effects in self.effects))
+
     def part_of(self, stamps: np.ndarray) -> np.ndarray:
         """Number of the part in which each stamp [ns] lies."""
         return ((stamps - self.first) // round(self.block * 1e9)).astype(int) % len(self.effects)

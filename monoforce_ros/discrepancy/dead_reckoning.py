@@ -90,14 +90,14 @@ def dead_reckoning_errors(
 ) -> np.ndarray | None:
     """Position errors of dead reckoning at the end of each window, ``[W]`` [m].
 
-    Two gains and the delay of the poses are fitted to one half of the blocks, and tested on the other.
+    Two gains and the delay of the poses are fitted without the part of the recording on which they are tested.
 
     Args:
         evidence: the recording.
         robot: its wheels' radius and track.
         starts: of the windows ``[W]`` [ns].
         samples: times since the start ``[K]`` [s].
-        folds: half of the recording in which each window lies ``[W]``, 0 or 1.
+        folds: part of the recording in which each window lies ``[W]``.
 
     Returns:
         None without measured wheel speeds over all windows.
@@ -116,7 +116,7 @@ def dead_reckoning_errors(
         return np.concatenate([(found[..., :2] / scale).ravel(), wrap_angle(found[..., 2]).ravel()])
 
     errors = np.zeros(len(starts))
-    for fold in (0, 1):
+    for fold in np.unique(folds):
         fits = [
             least_squares(
                 residuals, (1.0, 0.9, delay), bounds=((0.2, 0.1, 0.0), (2.0, 2.0, _LATEST)), loss="soft_l1",

@@ -14,6 +14,7 @@ from monoforce_ros.discrepancy.comparison import (
     ABOVE_NOISE,
     Comparison,
     GapRow,
+    HeldOut,
     PathComparison,
     RegimeRow,
     measured_paths,
@@ -122,6 +123,9 @@ class Diagnosis:
     repeated: bool = False
     """Whether the whole search was repeated without parts of the recording, which what it found then predicts; else
     windows are predicted with values fitted to other blocks, and effects were selected on all of them."""
+    by_part: HeldOut | None = None
+    """Effects that searches without each part of the recording found; None where nothing is added, or the search was
+    not repeated."""
     motion_unexplained: bool = False
     """Whether, besides what a sensor measured, the motion is not as predicted, and no effect improves it."""
 
@@ -258,6 +262,7 @@ def diagnose(
         regional=isinstance(part, Region),
         set_aside=None if aside is None else aside.verdict,
         repeated=repetition is not None,
+        by_part=None if repetition is None else concluded.judged,
         motion_unexplained=measured.motion_unexplained,
         healthy={} if nominal is None else _medians(expected[-1]),
         observed=tuple(filter(None, (comparable.blocked, leans, *efforts))),

@@ -1,8 +1,8 @@
 """Kinematic baseline: how far a fitted kinematic model gets, on windows that begin with a step of the command.
 
 The measure of the literature on commanded ground vehicles (Baril et al. 2024, DRIVE): position errors of open-loop
-predictions over windows of 2 s after a step. The baseline is fitted to alternate blocks of a recording and tested on
-the others, as the effects are; the measured speed at the start is given to both.
+predictions over windows of 2 s after a step. The baseline is tested on blocks of a recording to which it was not
+fitted, as the effects are; the measured speed at the start is given to both.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from monoforce_ros.discrepancy.gap import relative_motion
 HORIZON = 2.0
 """Length of the windows [s]."""
 FEWEST_STEPS = 6
-"""A comparison needs at least as many windows, three in each half."""
+"""A comparison needs at least as many windows, and half as many to fit to."""
 _STEP = 0.05
 """Time step of the kinematic model [s]."""
 _HISTORY = 2.0
@@ -98,10 +98,12 @@ class StepComparison:
     ideal: float
     """Of a differential drive that follows its commands at once [m]."""
     models: tuple[KinematicModel, ...]
-    """The kinematic model as fitted without each half of the blocks."""
+    """The kinematic model as fitted without each part of the recording."""
     ahead: tuple[float, float] | None = None
     """Median error of the kinematic fit less that of the effects: 95 % interval over blocks of 8 s [m]. One that holds
     zero tells neither from the other."""
+    selected_apart: bool = False
+    """Whether effects were also selected without the part on which they are tested; else on the whole recording."""
     reckoned: float | None = None
     """Of dead reckoning from measured wheel speeds and, where there is one, the gyro [m]; None without them."""
 
@@ -179,19 +181,21 @@ def compare_on_steps(
         motion: smoothed motion.
         commands: commands to the base.
         starts: starts of windows after steps ``[W]`` [ns].
-        folds: the half of the recording in which each lies ``[W]``, 0 or 1; neither half is fitted to itself.
+        folds: the part of the recording in which each lies ``[W]``; no part is fitted to itself.
         errors: position errors after 2 s of windows without and with the effects ``[W]`` [m], by starts and folds.
         reckoned: those of dead reckoning ``[W]`` [m].
 
     Returns:
         None where there are too few windows.
     """
-    if len(starts) < FEWEST_STEPS or min((folds == 0).sum(), (folds == 1).sum()) < FEWEST_STEPS // 2:
+    parts = np.unique(folds)
+    fewest = min((int((folds != part).sum()) for part in parts), default=0)
+    if len(starts) < FEWEST_STEPS or len(parts) < 2 or fewest < FEWEST_STEPS // 2:
         return None
     before, after = errors(starts, folds)
     kinematic = np.zeros(len(starts))
     models = []
-    for fold in (0, 1):
+    for fold in parts:
         model = fit_kinematics(motion, commands, starts[folds != fold])
         models.append(model)
         kinematic[folds == fold] = position_errors(model, motion, commands, starts[folds == fold])

@@ -282,9 +282,16 @@ def _steps_card(steps: StepComparison) -> str:
         table(("method", "median position error"), rows),
         heading="Two seconds after a step of the command",
         caption=f"The measure of the literature, on {steps.windows} windows that begin with a step; all methods know "
-        "the measured speed at the start. Kinematic fit and effects are fitted to every other block of 8 s, and tested "
-        f"on the others.{_beside_kinematic(steps)}{_limit_of_the_poses(steps)}",
+        f"the measured speed at the start. {_HELD_OUT[steps.selected_apart]}{_beside_kinematic(steps)}"
+        f"{_limit_of_the_poses(steps)}",
     )
+
+
+_HELD_OUT = {
+    False: "Kinematic fit and effects are fitted to every other block of 8 s, and tested on the others.",
+    True: "Kinematic fit and effects are tested on parts of the recording without which they were fitted, and without "
+    "which the effects were selected, too.",
+}
 
 
 def _beside_kinematic(steps: StepComparison) -> str:

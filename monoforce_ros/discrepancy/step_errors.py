@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from monoforce_ros.discrepancy.comparison import HeldOut
 from monoforce_ros.discrepancy.dead_reckoning import dead_reckoning_errors
 from monoforce_ros.discrepancy.evidence import MOTION, Evidence
 from monoforce_ros.discrepancy.fit import fit_effects
@@ -22,13 +23,17 @@ _SPACING = 0.05
 """Time between possible starts [s]."""
 
 
-def compare_after_steps(evidence: Evidence, robot: RobotModel, effects: Effects) -> StepComparison | None:
+def compare_after_steps(
+    evidence: Evidence, robot: RobotModel, effects: Effects, parts: HeldOut | None = None
+) -> StepComparison | None:
     """Position errors 2 s after steps: nominal model, effects and kinematic fit, each tested where it was not fitted.
 
     Args:
         evidence: the recording.
         robot: the nominal model.
-        effects: those found, with their values; they are fitted again to each half of the blocks.
+        effects: those found, with their values. Without ``parts`` they are fitted again to each half of the blocks.
+        parts: effects that searches without each part of the recording found, with their values: each part is predicted
+            with those, fitted again to the steps of the others, so that it had no say in the selection either.
 
     Returns:
         None where there are too few steps.
@@ -37,9 +42,15 @@ def compare_after_steps(evidence: Evidence, robot: RobotModel, effects: Effects)
     motion = evidence.smoothed.motion
     possible = LeftOut.of(evidence, robot).starts(evidence, HORIZON, _SPACING)
     starts = step_starts(evidence.commands, np.sort(possible))
+    if parts is not None:
+        starts = parts.judged(starts, HORIZON)
     starts = starts[:: max(1, -(-len(starts) // _MOST))]
     if not len(starts):
         return None
+    folds = folds_of(starts, 2) if parts is None else parts.part_of(starts)
+    found = dict.fromkeys(np.unique(folds).tolist(), effects)
+    if parts is not None:
+        found = {fold: parts.effects[fold] for fold in found}
     samples = np.array([0.5, 1.0, 1.5, HORIZON])
     scale = residual_scale(np.zeros((len(samples), 3)), evidence.cut(starts, samples), None)
 
@@ -50,15 +61,17 @@ def compare_after_steps(evidence: Evidence, robot: RobotModel, effects: Effects)
         before = _distance(predictions(at), ())
         if not effects:
             return before, None
-        after = np.zeros(len(at))
-        for fold in (0, 1):
-            fit = fit_effects(predictions(at[folds != fold]), [effects], scale, iterations=4)
+        after = before.copy()
+        for fold, acting in found.items():
+            if not acting:
+                continue
+            fit = fit_effects(predictions(at[folds != fold]), [acting], scale, iterations=4)
             after[folds == fold] = _distance(predictions(at[folds == fold]), fit.effects)
         return before, after
 
-    folds = folds_of(starts, 2)
     reckoned = dead_reckoning_errors(evidence, robot, starts, samples, folds)
-    return compare_on_steps(motion, evidence.commands, starts, folds, errors, reckoned)
+    compared = compare_on_steps(motion, evidence.commands, starts, folds, errors, reckoned)
+    return None if compared is None else replace(compared, selected_apart=parts is not None)
 
 
 def _distance(predictions: Predictions, effects: Effects) -> np.ndarray:
