@@ -330,6 +330,20 @@ def test_newton_drives_side_by_side_on_level_ground_and_hills():
     assert np.median(hilly.positions[:, 2] - under) == pytest.approx(clearance, abs=0.04)
 
 
+def test_newton_valleys_are_not_filled_where_another_robot_drives_on_level_ground():
+    newton_engine = pytest.importorskip("newton_engine", reason="newton is in benchmarks/engines.txt")
+    platform = draw_platform(1)
+    valley = draw_hills(27, platform.friction)
+    commands = np.tile([platform.maximum_speed, 0.0], (60, 1))
+    jobs = [DriveJob(platform, ground, ReplayedCommands(commands), (), 3.0) for ground in (Ground(), valley)]
+    _, hilly = newton_engine.simulate_together(jobs)
+    under = valley.height(hilly.positions[:, :2])
+    assert under.min() < -0.1
+    low = under < -0.1
+    clearance = platform.radius - platform.axle_height
+    assert np.median((hilly.positions[:, 2] - under)[low]) == pytest.approx(clearance, abs=0.05)
+
+
 def test_cases_recorded_together_have_files_only_where_the_effect_matters(tmp_path):
     def simulate_in_turn(jobs):
         return [simulate(job) for job in jobs]

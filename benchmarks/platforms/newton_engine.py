@@ -93,12 +93,13 @@ class _Worlds:
         wp.config.log_level = wp.LOG_WARNING
         builder = newton.ModelBuilder(gravity=(0.0, 0.0, -GRAVITY))
         slippery = newton.ModelBuilder.ShapeConfig(mu=0.0, density=0.0)
-        if any(job.ground.heights is None for job in jobs):
-            builder.add_ground_plane(cfg=slippery)
         self._robots = []
         for job in jobs:
             builder.begin_world()
-            if job.ground.heights is not None:
+            # In its own world: a plane for all would fill the valleys of the others.
+            if job.ground.heights is None:
+                builder.add_ground_plane(cfg=slippery)
+            else:
                 _add_hills(builder, job.ground, slippery)
             self._robots.append(_Robot(builder, job))
             builder.end_world()
