@@ -564,3 +564,12 @@ def test_every_effect_is_said_in_words(name):
 def test_sentences_have_the_right_sign(estimate, text):
     assert text in finding(estimate)
     assert "ahead" not in finding(estimate)
+
+
+def test_the_first_screen_has_no_empty_columns():
+    """Of a recording that cannot be diagnosed nothing is more or less sure."""
+    refused = Diagnosis(Verdict.NOT_IDENTIFIABLE, advice=("the robot does not move",))
+    page = diagnosis_page(refused, {"bag": "yard"}, None)
+    assert "What is wrong" in page and "What to do" in page
+    assert "How sure" not in page
+    assert "<ul></ul>" not in page

@@ -45,11 +45,11 @@ _STYLE = """<style>
 .result { border-left: 8px solid var(--tone); }
 .result h2 { font-size: 23px; margin: 0 0 4px; color: var(--tone); }
 .result p.left { font-size: 17px; margin: 0 0 12px; }
-.columns { display: grid; grid-template-columns: repeat(3, minmax(0, 1fr)); gap: 8px 28px; }
+.columns { display: grid; grid-auto-flow: column; grid-auto-columns: minmax(0, 1fr); gap: 8px 28px; }
 .columns h3 { font-size: 13px; text-transform: uppercase; letter-spacing: .06em; color: #6b7a88; margin: 6px 0 4px; }
 .columns ul { margin: 0; padding-left: 18px; } .columns li { margin-bottom: 5px; }
 .columns ul.found { font-size: 16px; } .columns li.doubt { color: #b3540e; }
-@media (max-width: 760px) { .columns { grid-template-columns: 1fr; } }
+@media (max-width: 760px) { .columns { grid-auto-flow: row; } }
 </style>"""
 _INPUTS = {
     "data": "fingerprint of the data",
@@ -162,16 +162,21 @@ def _result(top: Headline, robot_file: Path | None, in_file: Sequence[str], left
         actions.insert(0, f"to predict with these effects, give {robot_file.name} of this folder as the robot")
     elif robot_file is not None:
         actions.insert(0, f"keep your robot file: {robot_file.name} of this folder does not predict better")
-    wrong = f"<ul class='found'>{_list_items(top.findings[:_MOST_LISTED])}</ul>" if top.findings else "<p>–</p>"
-    sure = f"<ul>{_list_items(top.doubts[:_MOST_LISTED], 'doubt')}{_list_items(top.confidence[:_MOST_LISTED])}</ul>"
+    wrong = (
+        f"<ul class='found'>{_list_items(top.findings[:_MOST_LISTED])}</ul>"
+        if top.findings
+        else "<ul><li>Nothing</li></ul>"
+    )
+    sure = f"{_list_items(top.doubts[:_MOST_LISTED], 'doubt')}{_list_items(top.confidence[:_MOST_LISTED])}"
     left = f"<p class='left'>{html.escape(top.unexplained)}</p>" if top.unexplained else ""
     columns = "".join(
         f"<div><h3>{heading}</h3>{content}</div>"
         for heading, content in (
             ("What differs from the robot file" if top.of_file else "What is wrong", wrong),
-            ("How sure", sure),
-            ("What to do", f"<ul>{_list_items(actions[:_MOST_LISTED])}</ul>"),
+            ("How sure", f"<ul>{sure}</ul>" if sure else ""),
+            ("What to do", f"<ul>{_list_items(actions[:_MOST_LISTED])}</ul>" if actions else ""),
         )
+        if content
     )
     rest = [text for texts in (top.findings, top.doubts, top.confidence, actions) for text in texts[_MOST_LISTED:]]
     below = card(f"<ul>{_list_items(rest)}</ul>", heading="Also") if rest else ""
