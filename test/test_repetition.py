@@ -250,3 +250,16 @@ def test_a_widened_interval_keeps_to_bounds_and_to_its_side_of_neutral():
     assert widened(limit, [{"loss": 0.5}, {"loss": 1.0}, {"loss": 0.9}], 3).parameters["loss"].high == 1.0
     alone = widened(limit, [{"loss": 0.5}], 3)
     assert alone.parameters == limit.parameters
+
+
+def test_terms_of_a_formula_whose_interval_holds_zero_are_left_out(husky, monkeypatch):
+    """A torque turns the robot; a drag that the fit adds to it says nothing."""
+    hidden = (("learned_term", {"torque_z:1": 60.0}),)
+    motion, commands = simulated_recording(husky, hidden, seconds=60.0)
+    evidence, windows = windows_of(motion, commands)
+    search = explain(evidence, husky, windows, None, SETTINGS, repeated=True).search
+    both = (*search.known, ("learned_term", {"torque_z:1": 50.0, "force_x:vx|vx|": 5.0}))
+    monkeypatch.setattr("monoforce_ros.discrepancy.selection.learned_terms", lambda *_: [both])
+    before = search.estimates(search.refit(both))[-1].parameters
+    assert before["force_x:vx|vx|"].holds(0.0) and not before["torque_z:1"].holds(0.0)
+    assert dict(search.learn().effects)["learned_term"].keys() == {"torque_z:1"}

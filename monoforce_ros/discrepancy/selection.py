@@ -18,7 +18,7 @@ from monoforce_ros.discrepancy.areas import clusters
 from monoforce_ros.discrepancy.fit import first_values, without
 from monoforce_ros.discrepancy.hypothesis import Effects
 from monoforce_ros.discrepancy.judging import Judging
-from monoforce_ros.discrepancy.learned import learned_terms
+from monoforce_ros.discrepancy.learned import LEARNED, learned_terms
 from monoforce_ros.discrepancy.pairing import promising_pairs
 from monoforce_ros.discrepancy.screening import Candidates, Screened, admitted
 from monoforce_ros.discrepancy.trial import CandidateScore, FitTest, Outcome, Trial
@@ -223,7 +223,8 @@ class Search(Judging):
     def learn(self, base: Effects = (), most: int = 3) -> Trial:
         """The sparse formula that best explains the residuals left by ``base``, with one to ``most`` terms.
 
-        A further term must reduce the held-out loss beyond chance.
+        A further term must reduce the held-out loss beyond chance. Terms whose interval holds zero are left out, unless
+        that predicts worse beyond chance.
         """
         start = self.refit(base).effects if base else self.known
         trials = []
@@ -234,7 +235,13 @@ class Search(Judging):
         for trial in trials[1:]:
             if self._gain(best, trial)[1] > 0:
                 best = trial
-        return best
+        fit = self.refit(best.effects)
+        terms, measured = dict(fit.effects)[LEARNED], self.estimates(fit)[-1].parameters
+        kept = {key: value for key, value in terms.items() if not measured[key].holds(0.0)}
+        if not kept or len(kept) == len(terms):
+            return best
+        shorter = self.judge((*fit.effects[:-1], (LEARNED, kept)))
+        return best if self._gain(shorter, best)[1] > 0 else shorter
 
     def _round(
         self, best: Trial, number: int, rate: float, *, missing: bool = False
