@@ -11,7 +11,8 @@ from hidden_effect import KINDS, OUTSIDE, PAIRED, SINGLES, WITH_ONSET
 SETS = {"choosing": (1_000, 60), "reporting": (900_310, 108)}
 """First seed and number of platforms of each set. Rules and thresholds are chosen on one and reported on the other.
 
-Seeds from 900000 to 900151, and from 900300 to 900308, were reported once (docs/discrepancy.md) and are not used again."""
+Seeds from 900000 to 900151, and from 900300 to 900308, were reported once (docs/discrepancy.md) and are not used
+again."""
 ENGINES = ("mujoco", "newton")
 WORLDS = {"choosing": (1_060, 5), "reporting": (900_245, 5)}
 """First seed of each set in the package's own worlds, whose engine is called ``worlds``, and empty drives on each kind
